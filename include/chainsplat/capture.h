@@ -1,0 +1,100 @@
+// chainsplat/capture.h - a recording: cameras, object-masked image crops, depth, base trajectory (INTERFACE 2).
+//
+// Everything downstream works on crops: a rope covers 1-3 % of an image. Loading masks the images (black outside the
+// object), optionally undistorts them once, and crops every view to its mask's bounds plus a margin.
+#pragma once
+#include <array>
+#include <optional>
+#include <string>
+#include <vector>
+#include "chainsplat/chain.h"
+#include "chainsplat/core.h"
+#include "chainsplat/math.h"
+#include "chainsplat/trajectory.h"
+
+namespace chainsplat::capture {
+
+// Pinhole camera with OpenCV axes (x right, y down, z forward). Pixel (0,0) covers [0,1)^2, its center is (0.5, 0.5).
+struct Camera {
+  std::string name;
+  int width = 0, height = 0;
+  double fx = 0, fy = 0, cx = 0, cy = 0;      // px
+  std::array<double, 5> distortion{};         // OpenCV k1 k2 p1 p2 k3
+  math::Pose world_from_camera;
+  bool distorted() const;
+};
+
+// Pixel of a camera-frame point through the pinhole (no distortion).
+math::Vector2 project(const Camera& camera, const math::Vector3& camera_point);
+// Recorded (distorted) pixel of an undistorted pixel, and the inverse (fixed-point iteration to 1e-9 px).
+math::Vector2 distort(const Camera& camera, const math::Vector2& undistorted_pixel);
+math::Vector2 undistort(const Camera& camera, const math::Vector2& recorded_pixel);
+
+// One image of one camera, cropped: pixel (0,0) of the crop is pixel (x0, y0) of the image.
+struct View {
+  int camera = 0;                     // index into Capture::cameras
+  int frame = 0;                      // the camera's frame number
+  double time = 0.0;                  // s
+  int x0 = 0, y0 = 0, width = 0, height = 0;
+  std::vector<std::uint8_t> rgba;     // 4 * width * height, row-major; RGB is 0 where A is 0; A = mask coverage, 0..255
+  std::vector<float> depth;           // width * height, m along z, 0 = none; empty when not loaded
+};
+
+struct Table {
+  math::Vector3 point = math::Vector3::Zero();
+  math::Vector3 normal = math::Vector3::UnitZ();  // unit, world
+};
+
+struct Capture {
+  Path folder;
+  std::string name;
+  bool tabletop = false;
+  math::Vector3 gravity{0, 0, -9.81};         // world
+  double length = 0, diameter = 0;            // m
+  std::optional<double> mass;                 // kg
+  math::Vector3 direction, bending_axis;      // unit, base frame
+  std::optional<Table> table;
+  std::vector<Camera> cameras;
+  std::vector<std::vector<double>> times;     // frame times of each camera, s (all frames, loaded or not)
+  std::vector<View> views;                    // sorted by camera, then frame; only the frames asked for
+  trajectory::Trajectory base;
+  std::uint64_t hash = 0;                     // of capture.json, base file and the image files' sizes
+  bool has_depth = false;
+};
+
+struct LoadOptions {
+  bool images = true;        // false: capture.json and base only
+  bool undistort = true;     // false: recorded pixels (evaluation)
+  bool depth = false;
+  int margin = 24;           // px around the mask's bounds
+  int first = 0, last = -1;  // frames [first, last), last < 0: to the end (of each camera, by its own numbering)
+  std::string camera;        // only this one, empty: all
+};
+
+// Loads and checks. `path` is the folder or its capture.json. Throws InputError; unknown keys and other doubts warn.
+Capture load(const Path& path, const LoadOptions& options = {});
+
+// The text and the verdict of `chainsplat check`. `problems` would make load() throw, `doubts` are warnings.
+struct CheckReport {
+  std::vector<std::string> facts, doubts, problems;
+};
+CheckReport check(const Path& path);
+
+// truth/centreline.csv of a synthetic capture, for evaluation only: at every time, points x 3 (columns are points).
+struct TrueCenterline {
+  std::vector<double> time;
+  std::vector<math::MatrixX> points;  // 3 x count, equally spaced in arclength from the grasp to the free end
+};
+std::optional<TrueCenterline> load_true_centerline(const Path& capture_folder);
+
+// 8-bit PNG / float EXR in and out through OpenImageIO. Pixels row-major, interleaved.
+struct Image8 {
+  int width = 0, height = 0, channels = 0;
+  std::vector<std::uint8_t> pixels;
+};
+Image8 read_image8(const Path& file);
+void write_png(const Path& file, const Image8& image);
+void write_depth_exr(const Path& file, int width, int height, const std::vector<float>& meters);
+void write_video(const Path& file, double rate, const std::vector<Image8>& frames);  // H.264 mp4 through libav
+
+}  // namespace chainsplat::capture

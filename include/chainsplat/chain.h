@@ -1,0 +1,76 @@
+// chainsplat/chain.h - an open chain of screw joints and where its links are (SPEC 2.1-2.3; paper, "Chain kinematics").
+//
+// Home configuration (theta = 0): the rope lies straight from the base origin along `direction`. Link 0 is fixed to the
+// base. A joint is one, two or three angles with coincident axes (bending; second bending; twist); the bodies between
+// them have no mass, no length and no number. Angles are numbered base to tip, the axes of one joint side by side.
+#pragma once
+#include <string>
+#include <vector>
+#include "chainsplat/math.h"
+
+namespace chainsplat::chain {
+
+using math::Matrix3;
+using math::MatrixX;
+using math::Pose;
+using math::Vector3;
+using math::Vector6;
+using math::VectorX;
+
+enum class Bending { planar, spatial };
+
+struct Chain {
+  double length = 0.0;                       // m, grasp to free end
+  double diameter = 0.0;                     // m
+  Vector3 direction = -Vector3::UnitZ();     // d, unit, base frame
+  Vector3 bending_axis = Vector3::UnitY();   // a, unit, base frame, perpendicular to d
+  std::vector<Vector6> axes;                 // S_k, one an angle, base frame at home (space form)
+  std::vector<int> child_link;               // link moved by angle k, 1..links-1; its parent is child_link - 1
+  std::vector<double> joint_arclength;       // s_j of joint j = link j, m; size links() - 1, increasing, s_1 >= 0
+
+  int angles() const { return static_cast<int>(axes.size()); }              // n
+  int links() const { return static_cast<int>(joint_arclength.size()) + 1; }  // n_l + 1, with the base link
+  // Arclength range of link j: [start, end]. Link 0 is [0, s_1].
+  double link_start(int link) const { return link == 0 ? 0.0 : joint_arclength[link - 1]; }
+  double link_end(int link) const { return link + 1 == links() ? length : joint_arclength[link]; }
+  int last_angle(int link) const;            // k(j): index of the last angle that moves `link`, -1 for link 0
+};
+
+// `joints` joints at s_j = (j - 1) L / joints (SPEC 2.1 [D]). Axes a joint: a; a, b = d x a; with twist also d.
+// `first_joint` moves the first one: s_j = first_joint + (j-1)(L - first_joint)/joints.
+Chain make_chain(double length, double diameter, const Vector3& direction, const Vector3& bending_axis, int joints,
+                 Bending bending, bool twist, double first_joint = 0.0);
+
+// E_j for j = 0..n_l: world pose that carries home coordinates (base frame) of link j to the world. E_0 = base. SPEC 2.2.
+std::vector<Pose> link_motions(const Chain& chain, const VectorX& theta, const Pose& base);
+
+// s_k, world-frame screw axes at theta, 6 x n (columns). SPEC 2.3.
+MatrixX world_axes(const Chain& chain, const VectorX& theta, const Pose& base);
+
+// World position of the home point X (base frame) of link j, and its 3 x n Jacobian with respect to theta (base fixed)
+// from the world axes: column k is s_k^w x x + s_k^v for k <= last_angle(link), else 0.
+MatrixX point_jacobian(const Chain& chain, const MatrixX& world_axes, int link, const Vector3& world_point);
+
+// Link that carries the material point at `arclength` (a joint belongs to the link it starts).
+int link_at(const Chain& chain, double arclength);
+
+// World points of the centerline at the given arclengths (straight links; SPEC 2.2), 3 x count.
+MatrixX centerline(const Chain& chain, const std::vector<Pose>& motions, const std::vector<double>& arclengths);
+// The nodes: grasp, every joint, free end, 3 x (n_l + 2). Where s_1 = 0 the first two coincide.
+MatrixX nodes(const Chain& chain, const std::vector<Pose>& motions);
+// `count` equally spaced arclengths from 0 to the length.
+std::vector<double> equal_arclengths(const Chain& chain, int count);
+
+// dl/dtheta from dl/d(link motion): g is 6 x links, world twists about the world origin (SPEC 2.3): suffix sums.
+VectorX theta_gradient(const Chain& chain, const MatrixX& world_axes, const MatrixX& link_twist_gradient);
+
+// Angles along time. `thetadot` is empty or as long as `theta`.
+struct States {
+  std::vector<double> time;       // s
+  std::vector<VectorX> theta;     // rad, n each
+  std::vector<VectorX> thetadot;  // rad/s
+};
+// theta at any time: cubic (Catmull-Rom on the given times), clamped outside by linear extrapolation of at most one interval.
+VectorX interpolate(const States& states, double time);
+
+}  // namespace chainsplat::chain

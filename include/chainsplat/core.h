@@ -1,0 +1,100 @@
+// chainsplat/core.h - what every module needs and no module is about: errors, warnings, progress, files, threads, random.
+//
+// Errors are two exceptions, because they decide the exit code: InputError (2: the request or its input is wrong, nothing
+// was written) and WorkError (1: the work failed, what exists is kept). The library never prints and never aborts; the
+// tools catch both and print one line.
+#pragma once
+#include <cstdint>
+#include <filesystem>
+#include <functional>
+#include <stdexcept>
+#include <string>
+#include <string_view>
+#include <vector>
+
+namespace chainsplat {
+
+using Path = std::filesystem::path;
+
+// One line for the user: WHERE: WHAT; HOW TO MEND.
+struct InputError : std::runtime_error {
+  InputError(const std::string& where, const std::string& what, const std::string& mend)
+      : std::runtime_error(where + ": " + what + "; " + mend) {}
+};
+
+// The work failed half-way (device lost, disk full, diverged). Same form.
+struct WorkError : std::runtime_error {
+  WorkError(const std::string& where, const std::string& what, const std::string& mend)
+      : std::runtime_error(where + ": " + what + "; " + mend) {}
+};
+
+// Thrown by long work when stop_requested() turns true, after it has left a checkpoint.
+struct Interrupted : std::runtime_error {
+  explicit Interrupted(int signal) : std::runtime_error("interrupted"), signal(signal) {}
+  int signal;  // SIGINT, SIGTERM or SIGUSR1
+};
+
+namespace core {
+
+// A broken promise between our own functions: throws std::logic_error with file, line and the condition.
+[[noreturn]] void check_failed(const char* condition, const char* file, int line, const std::string& values);
+#define CHAINSPLAT_CHECK(condition, values)                                                      \
+  do {                                                                                           \
+    if (!(condition)) ::chainsplat::core::check_failed(#condition, __FILE__, __LINE__, (values)); \
+  } while (false)
+
+// One state of a long task, sent to whoever listens (terminal bar, log file). Numbers that do not apply are NaN.
+struct Progress {
+  std::string stage;      // "recognize", "identify", ...
+  std::int64_t step = 0;  // of `total`
+  std::int64_t total = 0;
+  double loss = 0.0;
+  double psnr = 0.0;      // dB inside the object
+  std::string note;       // what is being done, a few words
+};
+
+// Where warnings and progress go. Set once by the tool; the default swallows both. Thread-safe to call.
+struct Listener {
+  std::function<void(const std::string&)> warning;
+  std::function<void(const Progress&)> progress;
+};
+void set_listener(Listener listener);
+void warn(const std::string& line);  // one line, says what was assumed
+void report(const Progress& progress);
+
+// Set by the signal handler of the tool; long work polls it between steps.
+void request_stop(int signal) noexcept;
+int stop_requested() noexcept;  // 0 or the signal
+void clear_stop() noexcept;
+
+// Number of host threads for parallel_for: --threads, else the number of cores. Results never depend on it.
+void set_threads(int threads);
+int threads();
+// Calls body(i) for i in [0, count), each exactly once, on threads() threads. The first exception is rethrown.
+void parallel_for(std::int64_t count, const std::function<void(std::int64_t)>& body);
+
+// Writes `bytes` as `path` in one step (temporary file in the same folder, fsync, rename). Throws WorkError (disk full, ...).
+void write_file(const Path& path, std::string_view bytes);
+// The whole file. Throws InputError naming `path` when it is missing or unreadable.
+std::string read_file(const Path& path);
+// A double with the digits that read back exactly ("%.17g", shortest that round-trips).
+std::string exact(double value);
+// Seconds on a steady clock since an arbitrary origin.
+double seconds_now();
+// 64-bit FNV-1a, for capture hashes and checkpoints' checksums.
+std::uint64_t fnv1a(std::string_view bytes, std::uint64_t hash = 14695981039346656037ull);
+
+// SplitMix64: small, seeded, the same on every machine.
+class Random {
+ public:
+  explicit Random(std::uint64_t seed) : state_(seed) {}
+  std::uint64_t next();
+  double uniform();                       // [0, 1)
+  double uniform(double low, double high);
+  double normal();                        // mean 0, sd 1
+ private:
+  std::uint64_t state_;
+};
+
+}  // namespace core
+}  // namespace chainsplat
