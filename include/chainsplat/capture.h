@@ -4,6 +4,7 @@
 // object), optionally undistorts them once, and crops every view to its mask's bounds plus a margin.
 #pragma once
 #include <array>
+#include <memory>
 #include <optional>
 #include <string>
 #include <vector>
@@ -66,9 +67,10 @@ struct LoadOptions {
   bool images = true;        // false: capture.json and base only
   bool undistort = true;     // false: recorded pixels (evaluation)
   bool depth = false;
+  bool masked = true;        // false: whole frames, RGB as recorded, A = 255; masks are not looked for (to make them)
   int margin = 24;           // px around the mask's bounds
   int first = 0, last = -1;  // frames [first, last), last < 0: to the end (of each camera, by its own numbering)
-  std::string camera;        // only this one, empty: all
+  std::string camera;        // only this one (`cameras` then holds it alone, at index 0); empty: all
 };
 
 // Loads and checks. `path` is the folder or its capture.json. Throws InputError; unknown keys and other doubts warn.
@@ -95,6 +97,34 @@ struct Image8 {
 Image8 read_image8(const Path& file);
 void write_png(const Path& file, const Image8& image);
 void write_depth_exr(const Path& file, int width, int height, const std::vector<float>& meters);
-void write_video(const Path& file, double rate, const std::vector<Image8>& frames);  // H.264 mp4 through libav
+// 16-bit, value x scale = m; 0 = none (what is <= 0 or does not fit).
+void write_depth_png(const Path& file, int width, int height, const std::vector<float>& meters, double scale);
+
+// H.264 mp4 through libav (MPEG-4 part 2 where libx264 is missing), yuv420p (odd sizes: yuv444p), BT.601 limited range,
+// tagged. Frames RGB or RGBA of one size. The same frames give the same bytes.
+void write_video(const Path& file, double rate, const std::vector<Image8>& frames);
+
+// Decodes a video frame by frame, in display order. Colors: swscale's default bicubic, matrix and range from the stream's
+// tags, else BT.601 limited. Throws InputError (missing, not a video, a frame that cannot be decoded).
+class VideoReader {
+ public:
+  explicit VideoReader(const Path& file, int threads = 1);
+  ~VideoReader();
+  VideoReader(VideoReader&&) noexcept;
+  VideoReader& operator=(VideoReader&&) noexcept;
+  bool next(Image8& rgb);  // false at the end; reuses the memory of `rgb`
+  bool skip();             // the same without the conversion to RGB
+
+ private:
+  struct Implementation;
+  std::unique_ptr<Implementation> implementation_;
+};
+
+// What the container says, without decoding.
+struct VideoFacts {
+  int width = 0, height = 0, frames = 0;
+  double rate = 0.0;  // mean frames a second, 0 when unknown
+};
+VideoFacts video_facts(const Path& file);
 
 }  // namespace chainsplat::capture

@@ -30,7 +30,7 @@ struct WorkError : std::runtime_error {
 
 // Thrown by long work when stop_requested() turns true, after it has left a checkpoint.
 struct Interrupted : std::runtime_error {
-  explicit Interrupted(int signal) : std::runtime_error("interrupted"), signal(signal) {}
+  explicit Interrupted(int which) : std::runtime_error("interrupted"), signal(which) {}
   int signal;  // SIGINT, SIGTERM or SIGUSR1
 };
 

@@ -9,6 +9,7 @@
 #include <memory>
 #include <span>
 #include <string>
+#include <string_view>
 #include <vector>
 #include "chainsplat/core.h"
 
@@ -18,9 +19,15 @@ struct DeviceInfo {
   int index = 0;
   std::string name, driver, type;        // type: "discrete GPU", "integrated GPU", "CPU", ...
   std::uint32_t api_version = 0, vendor = 0;
+  // Every pipeline runs with subgroup_size lanes; only where a device with several sizes cannot fix it, with that or more.
   std::uint32_t subgroup_size = 0, max_workgroup_invocations = 0, shared_memory_bytes = 0;
-  std::uint64_t max_storage_range = 0, heap_bytes = 0;
+  std::uint32_t storage_buffers = 0;     // that one kernel may bind
+  std::uint64_t max_storage_range = 0;   // bytes of the largest buffer
+  std::uint64_t heap_bytes = 0;          // of the largest device-local heap
   bool software = false;                 // a CPU device such as lavapipe
+  bool unified_memory = false;           // the host reads and writes Domain::device at full speed: it is mapped
+  bool timestamps = false;               // false: Commands::timings() is empty
+  bool push_descriptors = false;         // false: Commands uses descriptor sets
   std::vector<std::string> refused;      // why it cannot be used; empty: it can
 };
 
@@ -30,9 +37,22 @@ std::vector<DeviceInfo> list_devices(std::string* why = nullptr);
 // its name. Throws InputError that lists the candidates and the reasons.
 DeviceInfo choose_device(const std::string& selector);
 
+// What `doctor` tells, as values; nothing throws.
+struct Doctor {
+  std::vector<DeviceInfo> devices;
+  int chosen = -1;                   // index into devices; -1: none
+  std::string reason;                // why that one, or why none and how to mend it
+  std::vector<std::string> missing;  // what else is absent, one line each, and what that costs
+  bool validation_layer = false;     // only tests need it
+  std::string pipeline_cache;        // folder of the pipeline cache; empty: there is no home folder, nothing is kept
+};
+Doctor examine(const std::string& selector = "");
+std::string doctor_text(const Doctor& doctor);  // several lines, for a terminal
+
 struct DeviceOptions {
   std::string selector;
-  bool validation = false;     // needs the layer; throws InputError when it is missing
+  bool validation = false;        // needs the layer; throws InputError when it is missing
+  bool push_descriptors = true;   // false: descriptor sets even where the device could push (for tests)
 };
 
 class Device;   // opened device; keep it alive longer than what was made from it
@@ -40,7 +60,7 @@ struct DeviceDeleter { void operator()(Device*) const; };
 using DevicePtr = std::unique_ptr<Device, DeviceDeleter>;
 DevicePtr open_device(const DeviceOptions& options = {});
 const DeviceInfo& info(const Device& device);
-// Validation messages (errors and warnings) since the device was opened; 0 when validation is off.
+// Validation messages (errors and warnings, synchronization included) since the device was opened; 0 when it is off.
 int validation_messages(const Device& device);
 std::vector<std::string> validation_texts(const Device& device);
 
@@ -51,13 +71,14 @@ enum class Domain {
 
 class Buffer {
  public:
-  Buffer() = default;
-  Buffer(Device& device, std::size_t bytes, Domain domain, const char* name);  // throws WorkError: out of device memory
+  Buffer();
+  // Its content is undefined until written. Throws WorkError: out of device memory, or larger than max_storage_range.
+  Buffer(Device& device, std::size_t bytes, Domain domain, const char* name);
   Buffer(Buffer&&) noexcept;
   Buffer& operator=(Buffer&&) noexcept;
   ~Buffer();
   std::size_t bytes() const { return bytes_; }
-  void* mapped() const { return mapped_; }      // null unless Domain::host (or a device whose memory is all host-visible)
+  void* mapped() const { return mapped_; }      // null unless Domain::host or unified_memory
   template <class T> std::span<T> as() const { return {static_cast<T*>(mapped_), bytes_ / sizeof(T)}; }
   struct Handles;
   const Handles& handles() const { return *handles_; }
@@ -68,6 +89,7 @@ class Buffer {
   void* mapped_ = nullptr;
 };
 
+// Host to buffer and back, finished on return. No submit that touches `buffer` may be under way.
 void upload(Device& device, Buffer& buffer, const void* data, std::size_t bytes, std::size_t offset = 0);
 void download(Device& device, const Buffer& buffer, void* data, std::size_t bytes, std::size_t offset = 0);
 
@@ -77,9 +99,9 @@ std::span<const std::uint32_t> shader_code(std::string_view name);
 
 class Pipeline {
  public:
-  Pipeline() = default;
+  Pipeline();
   // Compute pipeline of shaders/<name>.comp with `buffers` storage buffers at set 0, bindings 0.., `push_bytes` of push
-  // constants and specialization constants 0, 1, 2, ... = `constants` (uint).
+  // constants (at most 128) and specialization constants 0, 1, 2, ... = `constants` (uint).
   Pipeline(Device& device, const std::string& name, int buffers, std::size_t push_bytes,
            const std::vector<std::uint32_t>& constants);
   Pipeline(Pipeline&&) noexcept;
@@ -98,14 +120,16 @@ struct Timing {
 };
 
 // Records work once, submits it any number of times. Dispatches are ordered: every dispatch, fill and copy is preceded by
-// a full compute+transfer memory barrier unless `no_barrier()` was called since the last one.
+// a full compute+transfer memory barrier unless `no_barrier()` was called since the last one; the first one also waits for
+// what was submitted before. One thread at a time may use a Commands; several may share a device. A dispatch without
+// groups, a fill or copy of 0 bytes is skipped. Group counts above 65535 an axis are a broken promise (use y).
 class Commands {
  public:
   explicit Commands(Device& device);
   Commands(Commands&&) noexcept;
   Commands& operator=(Commands&&) noexcept;
   ~Commands();
-  void begin();   // forget what was recorded
+  void begin();   // forget what was recorded (waits for the last submit)
   void dispatch(const Pipeline& pipeline, std::span<const Buffer* const> buffers, const void* push, std::size_t push_bytes,
                 std::uint32_t x, std::uint32_t y = 1, std::uint32_t z = 1);
   // Group counts (3 uints) read from `arguments` at `offset` bytes.
@@ -115,7 +139,7 @@ class Commands {
   void copy(const Buffer& from, std::size_t from_offset, const Buffer& to, std::size_t to_offset, std::size_t bytes);
   void no_barrier();                    // the next command may overlap the one before
   void stamp(const char* label);        // time since the last stamp is charged to `label`
-  void submit();                        // asynchronous; host writes before it are seen by the device
+  void submit();                        // asynchronous; host writes before it are seen by the device; waits for the last one
   void wait();                          // until the last submit is done; throws WorkError when the device is lost
   std::vector<Timing> timings() const;  // of the last finished submit, summed by label
   struct State;

@@ -64,6 +64,7 @@ struct LossValues {
 struct Settings {
   int tile = 0;             // px, 8 or 16; 0: chosen for the device
   int pixels_per_lane = 0;  // 0: chosen for the device
+  bool projection_clamp = true;  // of SPEC 2.5; false where a reference has none
   bool exact_cutoffs = true;  // 1/255 cut, 0.99 cap, 1e-4 stop; false: none of them (for finite-difference tests)
 };
 
@@ -95,8 +96,22 @@ class Engine {
   void set_gaussians(const Gaussians& gaussians);   // resets Adam's moments and step count
   Gaussians gaussians() const;
   // One Adam step on the mean loss of the views in `batch`.
-  LossValues step(std::span<const int> batch, const LossWeights& weights, const AdamRates& rates, bool read_losses);
+  // `twists`: also the gradient of the mean loss with respect to each view's link motions (world twists, SPEC 2.3).
+  LossValues step(std::span<const int> batch, const LossWeights& weights, const AdamRates& rates, bool read_losses,
+                  std::vector<math::MatrixX>* twists = nullptr);
   std::vector<Picture> draw_views(std::span<const int> batch, bool depth = false);
+
+  // The paper's resets: opacity to at most `largest`, link probabilities to uniform; Adam's moments of that section to zero.
+  void reset_opacity(float largest);
+  void reset_links();
+  // Everything that a later step depends on, for checkpoints.
+  struct Snapshot {
+    Gaussians gaussians;
+    std::vector<float> first_moment, second_moment;  // in the order of the device's parameter buffer
+    int step = 0;
+  };
+  Snapshot snapshot() const;
+  void restore(const Snapshot& snapshot);
 
   std::vector<gpu::Timing> timings() const;   // of the last call, by pass
   struct State;

@@ -1,0 +1,75 @@
+// gaussian.glsl - where a Gaussian's numbers lie in the parameter buffer, and small functions of them.
+// Sections, each [row][component]: mean 3, rotation 4, log scale 3, opacity logit 1, SH 3 K, link logits L.
+
+uint at_mean(uint n, uint i) { return 3u * i; }
+uint at_rotation(uint n, uint i) { return 3u * n + 4u * i; }
+uint at_log_scale(uint n, uint i) { return 7u * n + 3u * i; }
+uint at_opacity(uint n, uint i) { return 10u * n + i; }
+uint at_sh(uint n, uint coefficients, uint i) { return 11u * n + 3u * coefficients * i; }
+uint at_link(uint n, uint coefficients, uint links, uint i) { return (11u + 3u * coefficients) * n + links * i; }
+
+// Rotation matrix of a unit quaternion q = (w, x, y, z).
+mat3 rotation_matrix(vec4 q) {
+  float w = q.x, x = q.y, y = q.z, z = q.w;
+  return mat3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),   // first column
+              2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
+              2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
+}
+
+// d/dq of sum_ij G_ij R(q/|q|)_ij; `columns` holds G by columns, `q` is the unit quaternion, `size` = |q| before.
+vec4 rotation_matrix_backward(vec4 q, float size, mat3 columns) {
+  float w = q.x, x = q.y, y = q.z, z = q.w;
+  float g00 = columns[0][0], g10 = columns[0][1], g20 = columns[0][2];
+  float g01 = columns[1][0], g11 = columns[1][1], g21 = columns[1][2];
+  float g02 = columns[2][0], g12 = columns[2][1], g22 = columns[2][2];
+  vec4 d = 2.0 * vec4(z * (g10 - g01) + y * (g02 - g20) + x * (g21 - g12),
+                      y * (g01 + g10) + z * (g02 + g20) + w * (g21 - g12) - 2.0 * x * (g11 + g22),
+                      x * (g01 + g10) + z * (g12 + g21) + w * (g02 - g20) - 2.0 * y * (g00 + g22),
+                      x * (g02 + g20) + y * (g12 + g21) + w * (g10 - g01) - 2.0 * z * (g00 + g11));
+  return (d - q * dot(q, d)) / size;
+}
+
+// Real spherical harmonics in the 3DGS order and signs (SPEC 2.4), one coefficient at a time, and its gradient.
+float sh_basis(uint l, vec3 r) {
+  float x = r.x, y = r.y, z = r.z;
+  switch (l) {
+    case 0u: return 0.28209479177387814;
+    case 1u: return -0.4886025119029199 * y;
+    case 2u: return 0.4886025119029199 * z;
+    case 3u: return -0.4886025119029199 * x;
+    case 4u: return 1.0925484305920792 * x * y;
+    case 5u: return -1.0925484305920792 * y * z;
+    case 6u: return 0.31539156525252005 * (2.0 * z * z - x * x - y * y);
+    case 7u: return -1.0925484305920792 * x * z;
+    case 8u: return 0.5462742152960396 * (x * x - y * y);
+    case 9u: return -0.5900435899266435 * y * (3.0 * x * x - y * y);
+    case 10u: return 2.890611442640554 * x * y * z;
+    case 11u: return -0.4570457994644658 * y * (4.0 * z * z - x * x - y * y);
+    case 12u: return 0.3731763325901154 * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y);
+    case 13u: return -0.4570457994644658 * x * (4.0 * z * z - x * x - y * y);
+    case 14u: return 1.445305721320277 * z * (x * x - y * y);
+    default: return -0.5900435899266435 * x * (x * x - 3.0 * y * y);
+  }
+}
+
+vec3 sh_basis_gradient(uint l, vec3 r) {
+  float x = r.x, y = r.y, z = r.z;
+  switch (l) {
+    case 0u: return vec3(0.0);
+    case 1u: return vec3(0.0, -0.4886025119029199, 0.0);
+    case 2u: return vec3(0.0, 0.0, 0.4886025119029199);
+    case 3u: return vec3(-0.4886025119029199, 0.0, 0.0);
+    case 4u: return 1.0925484305920792 * vec3(y, x, 0.0);
+    case 5u: return -1.0925484305920792 * vec3(0.0, z, y);
+    case 6u: return 0.31539156525252005 * vec3(-2.0 * x, -2.0 * y, 4.0 * z);
+    case 7u: return -1.0925484305920792 * vec3(z, 0.0, x);
+    case 8u: return 0.5462742152960396 * vec3(2.0 * x, -2.0 * y, 0.0);
+    case 9u: return -0.5900435899266435 * vec3(6.0 * x * y, 3.0 * x * x - 3.0 * y * y, 0.0);
+    case 10u: return 2.890611442640554 * vec3(y * z, x * z, x * y);
+    case 11u: return -0.4570457994644658 * vec3(-2.0 * x * y, 4.0 * z * z - x * x - 3.0 * y * y, 8.0 * y * z);
+    case 12u: return 0.3731763325901154 * vec3(-6.0 * x * z, -6.0 * y * z, 6.0 * z * z - 3.0 * x * x - 3.0 * y * y);
+    case 13u: return -0.4570457994644658 * vec3(4.0 * z * z - 3.0 * x * x - y * y, -2.0 * x * y, 8.0 * x * z);
+    case 14u: return 1.445305721320277 * vec3(2.0 * x * z, -2.0 * y * z, x * x - y * y);
+    default: return -0.5900435899266435 * vec3(3.0 * x * x - 3.0 * y * y, -6.0 * x * y, 0.0);
+  }
+}

@@ -1,0 +1,40 @@
+// project.glsl - the projection of one replica into one view (SPEC 2.5), used forward and backward so that both agree.
+// Needs: SplatView, rotation_matrix.
+
+const float kNear = 0.01;     // m; nearer is not drawn (SPEC 2.5)
+const float kLowPass = 0.3;   // px^2, added to the projected covariance (SPEC 2.5)
+
+struct Projection {
+  vec3 x;            // camera frame, m
+  mat3 link;         // rotation of camera_from_home
+  vec4 q;            // unit quaternion
+  float q_size;
+  mat3 local;        // link * R(q): columns are the ellipsoid's axes in the camera frame
+  vec3 scale;        // m
+  mat3 m;            // local * diag(scale)
+  vec3 j0, j1;       // rows of the projection's Jacobian
+  bvec2 clamped;
+  vec3 t0, t1;       // rows of J m
+  vec3 cov;          // xx, xy, yy of Sigma', px^2
+};
+
+Projection project(SplatView view, vec4 row0, vec4 row1, vec4 row2, vec3 mean, vec4 rotation, vec3 log_scale) {
+  Projection a;
+  a.link = transpose(mat3(row0.xyz, row1.xyz, row2.xyz));
+  a.x = vec3(dot(row0.xyz, mean) + row0.w, dot(row1.xyz, mean) + row1.w, dot(row2.xyz, mean) + row2.w);
+  a.q_size = length(rotation);
+  a.q = rotation / a.q_size;
+  a.local = a.link * rotation_matrix(a.q);
+  a.scale = exp(log_scale);
+  a.m = mat3(a.local[0] * a.scale.x, a.local[1] * a.scale.y, a.local[2] * a.scale.z);
+  float inverse_z = 1.0 / a.x.z;
+  vec2 slope = a.x.xy * inverse_z;
+  vec2 limited = clamp(slope, -view.limits.xy, view.limits.xy);
+  a.clamped = notEqual(slope, limited);
+  a.j0 = vec3(view.intrinsics.x * inverse_z, 0.0, -view.intrinsics.x * limited.x * inverse_z);
+  a.j1 = vec3(0.0, view.intrinsics.y * inverse_z, -view.intrinsics.y * limited.y * inverse_z);
+  a.t0 = a.j0 * a.m;
+  a.t1 = a.j1 * a.m;
+  a.cov = vec3(dot(a.t0, a.t0) + kLowPass, dot(a.t0, a.t1), dot(a.t1, a.t1) + kLowPass);
+  return a;
+}

@@ -1,0 +1,43 @@
+// loss_pixel.comp - one group an active tile: L1 of the color and of the mask (SPEC 2.7), their gradient with respect to the
+// image, and the tile's sums: |color|, |mask|, squared color error and number of pixels inside the object.
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "shared/splat.h"
+layout(local_size_x = 64) in;
+layout(constant_id = 1) const uint kTileWidth = 8u;
+layout(constant_id = 2) const uint kTileHeight = 8u;
+layout(push_constant) uniform Push { SplatPush p; };
+layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
+layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
+layout(std430, binding = 2) readonly buffer Image { vec4 image[]; };
+layout(std430, binding = 3) readonly buffer Target { uint target[]; };
+layout(std430, binding = 4) writeonly buffer PixelGradient { vec4 pixel_gradient[]; };
+layout(std430, binding = 5) writeonly buffer TileLoss { vec4 tile_loss[]; };
+
+shared vec4 lane_sum[64];
+
+void main() {
+  uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
+  SplatTile t = tiles[tile];
+  SplatView view = views[t.view];
+  vec4 sum = vec4(0.0);
+  for (uint k = lane; k < kTileWidth * kTileHeight; k += 64u) {
+    uint x = t.x * kTileWidth + k % kTileWidth, y = t.y * kTileHeight + k / kTileWidth;
+    if (x < view.width && y < view.height) {
+      uint pixel = view.pixel + y * view.width + x;
+      vec4 wanted = unpackUnorm4x8(target[view.target + y * view.width + x]);
+      vec4 error = image[pixel] - wanted;
+      vec3 shown = clamp(image[pixel].xyz, 0.0, 1.0) - wanted.xyz;
+      float object = wanted.w >= 128.0 / 255.0 ? 1.0 : 0.0;
+      sum += vec4(dot(abs(error.xyz), vec3(1.0)), abs(error.w), object * dot(shown, shown), object);
+      pixel_gradient[pixel] = vec4(p.weight_l1 * sign(error.xyz), p.weight_mask * sign(error.w));
+    }
+  }
+  lane_sum[lane] = sum;
+  barrier();
+  if (lane == 0u) {
+    for (uint k = 1u; k < 64u; ++k) sum += lane_sum[k];
+    tile_loss[2u * tile] = sum;
+    tile_loss[2u * tile + 1u] = vec4(0.0);
+  }
+}

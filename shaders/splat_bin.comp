@@ -1,0 +1,41 @@
+// splat_bin.comp - one invocation a (live replica, view): an entry into the list of every active tile that it touches.
+// Integer atomics hand out places in any order; splat_sort.comp puts the entries in an order that does not depend on it.
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "shared/splat.h"
+layout(local_size_x = 64) in;
+layout(push_constant) uniform Push { SplatPush p; };
+layout(std430, binding = 0) readonly buffer Live { uint live[]; };
+layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
+layout(std430, binding = 2) readonly buffer TileMap { uint tile_map[]; };
+layout(std430, binding = 3) readonly buffer Counters { uint counters[]; };
+layout(std430, binding = 4) readonly buffer Splats { vec4 splats[]; };
+layout(std430, binding = 5) readonly buffer InstancePrefix { uint instance_prefix[]; };
+layout(std430, binding = 6) readonly buffer InstanceBlock { uint instance_block[]; };
+layout(std430, binding = 7) readonly buffer TilePrefix { uint tile_prefix[]; };
+layout(std430, binding = 8) readonly buffer TileBlock { uint tile_block[]; };
+layout(std430, binding = 9) buffer TileCursor { uint tile_cursor[]; };
+layout(std430, binding = 10) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica number, splat, instance
+
+void main() {
+  uint r = gl_GlobalInvocationID.x, v = gl_GlobalInvocationID.y;
+  uint live_count = counters[kCounterLive];
+  if (r >= live_count || counters[kCounterOverflow] != 0u) return;
+  uint e = live[r];
+  uint replica = (e % p.gaussians) * p.links + e / p.gaussians;  // SPEC's index, breaks ties of depth
+  uint s = v * live_count + r;
+  uint columns = floatBitsToUint(splats[kSplatRows * s + 1u].w), rows = floatBitsToUint(splats[kSplatRows * s + 2u].w);
+  uint depth = floatBitsToUint(splats[kSplatRows * s].w);  // positive floats sort like their bits
+  uint instance = instance_prefix[s] + instance_block[s / kScanBlock];
+  SplatView view = views[v];
+  for (uint ty = rows & 0xffffu; ty < rows >> 16u; ++ty) {
+    for (uint tx = columns & 0xffffu; tx < columns >> 16u; ++tx) {
+      uint tile = tile_map[view.tile_map + ty * view.tiles_x + tx];
+      if (tile != kNoTile) {
+        uint place = tile_prefix[tile] + tile_block[tile / kScanBlock] + atomicAdd(tile_cursor[tile], 1u);
+        entries[place] = uvec4(depth, replica, s, instance);
+        ++instance;
+      }
+    }
+  }
+}

@@ -1,0 +1,110 @@
+// splat_blend_backward.comp - one group an active tile, layout as splat_blend.comp: gradient of each entry from the pixels
+// of the tile (SPEC 2.8), walked front to back: what lies behind entry k is the whole pixel minus what came up to k, so only
+// its product with the pixel's gradient is carried. Each subgroup stores its sum in a slot of its own (no atomics).
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#extension GL_KHR_shader_subgroup_basic : require
+#extension GL_KHR_shader_subgroup_shuffle : require
+#include "shared/splat.h"
+layout(local_size_x_id = 0) in;
+layout(constant_id = 1) const uint kTileWidth = 8u;
+layout(constant_id = 2) const uint kTileHeight = 8u;
+layout(constant_id = 3) const uint kPixels = 8u;
+layout(constant_id = 4) const uint kCutoffs = 1u;
+layout(push_constant) uniform Push { SplatPush p; };
+layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
+layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
+layout(std430, binding = 2) readonly buffer TilePrefix { uint tile_prefix[]; };
+layout(std430, binding = 3) readonly buffer TileBlock { uint tile_block[]; };
+layout(std430, binding = 4) readonly buffer TileCount { uint tile_count[]; };
+layout(std430, binding = 5) readonly buffer Sorted { uvec2 sorted[]; };
+layout(std430, binding = 6) readonly buffer Splats { vec4 splats[]; };
+layout(std430, binding = 7) readonly buffer Counters { uint counters[]; };
+layout(std430, binding = 8) readonly buffer Image { vec4 image[]; };
+layout(std430, binding = 9) readonly buffer TileUsed { uint tile_used[]; };
+layout(std430, binding = 10) readonly buffer PixelGradient { vec4 pixel_gradient[]; };  // of color and alpha
+layout(std430, binding = 11) writeonly buffer Partials { vec4 partials[]; };
+
+#include "inc/alpha.glsl"
+
+float subgroup_sum(float x) {
+  for (uint d = gl_SubgroupSize / 2u; d > 0u; d /= 2u) x += subgroupShuffleXor(x, d);
+  return x;
+}
+
+void main() {
+  uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
+  SplatTile t = tiles[tile];
+  SplatView view = views[t.view];
+  uint column = t.x * kTileWidth + lane % kTileWidth;
+  uint row = t.y * kTileHeight + lane / kTileWidth * kPixels;
+  float px = float(column) + 0.5, py = float(row) + 0.5;
+  uint start = tile_prefix[tile] + tile_block[tile / kScanBlock];
+  uint n = counters[kCounterOverflow] != 0u ? 0u : tile_count[tile];
+  uint used = min(tile_used[tile], n);
+
+  vec4 gamma[kPixels];
+  float transmittance[kPixels], behind[kPixels];  // behind: gradient times what lies behind the entries so far
+  bool open[kPixels];
+  for (uint k = 0u; k < kPixels; ++k) {
+    bool inside = column < view.width && row + k < view.height;
+    uint pixel = view.pixel + (row + k) * view.width + column;
+    gamma[k] = inside ? pixel_gradient[pixel] : vec4(0.0);
+    behind[k] = inside ? dot(gamma[k], image[pixel]) : 0.0;
+    transmittance[k] = 1.0;
+    open[k] = inside;
+  }
+  for (uint entry = 0u; entry < used; ++entry) {
+    uvec2 item = sorted[start + entry];
+    uint s = kSplatRows * item.x;
+    vec4 a = splats[s], b = splats[s + 1u];
+    vec4 c = vec4(splats[s + 2u].xyz, 1.0);
+    float dx = px - a.x;
+    vec2 grad_u = vec2(0.0);
+    vec3 grad_cov = vec3(0.0), grad_color = vec3(0.0);
+    float grad_opacity = 0.0;
+    for (uint k = 0u; k < kPixels; ++k) {
+      float dy = py + float(k) - a.y;
+      float falloff = gaussian_falloff(b.xyz, dx, dy);
+      float uncapped = falloff * a.z;
+      float alpha = min(uncapped, kAlphaCap);
+      float after = transmittance[k] * (1.0 - alpha);
+      bool seen = alpha >= kAlphaLeast && open[k];
+      open[k] = open[k] && (!seen || after >= kTransmittanceLeast);
+      seen = seen && open[k];
+      float weight = seen ? alpha * transmittance[k] : 0.0;
+      float gamma_color = dot(gamma[k], c);
+      behind[k] -= weight * gamma_color;
+      grad_color += weight * gamma[k].xyz;
+      float grad_alpha = transmittance[k] * gamma_color - behind[k] / max(1.0 - alpha, 1e-6);
+      grad_alpha = seen && uncapped <= kAlphaCap ? grad_alpha : 0.0;
+      grad_opacity += falloff * grad_alpha;
+      float g = uncapped * grad_alpha;
+      vec2 q = vec2(b.x * dx + b.y * dy, b.y * dx + b.z * dy);
+      grad_u += g * q;
+      grad_cov += g * vec3(q.x * q.x, q.x * q.y, q.y * q.y);
+      transmittance[k] = seen ? after : transmittance[k];
+    }
+    grad_u = vec2(subgroup_sum(grad_u.x), subgroup_sum(grad_u.y));
+    grad_cov = vec3(subgroup_sum(grad_cov.x), subgroup_sum(grad_cov.y), subgroup_sum(grad_cov.z));
+    grad_color = vec3(subgroup_sum(grad_color.x), subgroup_sum(grad_color.y), subgroup_sum(grad_color.z));
+    grad_opacity = subgroup_sum(grad_opacity);
+    if (subgroupElect()) {
+      uint slot = kPartialRows * (item.y * p.slots + gl_SubgroupID);
+      partials[slot] = vec4(grad_u, grad_opacity, grad_color.x);
+      partials[slot + 1u] = vec4(grad_cov, grad_color.y);
+      partials[slot + 2u] = vec4(grad_color.z, 0.0, 0.0, 0.0);
+    }
+  }
+  // entries that no pixel reached, and slots that a wider subgroup left free
+  for (uint k = used + lane; k < n; k += gl_WorkGroupSize.x) {
+    uint slot = kPartialRows * p.slots * sorted[start + k].y;
+    for (uint m = 0u; m < kPartialRows * p.slots; ++m) partials[slot + m] = vec4(0.0);
+  }
+  if (gl_NumSubgroups < p.slots) {
+    for (uint k = lane; k < used; k += gl_WorkGroupSize.x) {
+      uint slot = kPartialRows * (p.slots * sorted[start + k].y + gl_NumSubgroups);
+      for (uint m = 0u; m < kPartialRows * (p.slots - gl_NumSubgroups); ++m) partials[slot + m] = vec4(0.0);
+    }
+  }
+}

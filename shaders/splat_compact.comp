@@ -1,0 +1,17 @@
+// splat_compact.comp - one invocation a replica: the live ones, in order, into live[].
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "shared/splat.h"
+layout(local_size_x = 64) in;
+layout(push_constant) uniform Push { SplatPush p; };
+layout(std430, binding = 0) readonly buffer LiveFlag { uint live_flag[]; };
+layout(std430, binding = 1) readonly buffer Prefix { uint prefix[]; };
+layout(std430, binding = 2) readonly buffer BlockOffset { uint block_offset[]; };
+layout(std430, binding = 3) writeonly buffer Live { uint live[]; };
+
+void main() {
+  uint e = gl_GlobalInvocationID.x + gl_GlobalInvocationID.y * gl_NumWorkGroups.x * gl_WorkGroupSize.x;
+  if (e >= p.gaussians * p.links || live_flag[e] == 0u) return;
+  uint r = prefix[e] + block_offset[e / kScanBlock];
+  if (r < p.live_capacity) live[r] = e;
+}

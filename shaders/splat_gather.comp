@@ -1,0 +1,82 @@
+// splat_gather.comp - one invocation a Gaussian: sums the records of its live replicas over the views of the chunk, in order,
+// and ends the chain rule at opacity logit, link logits and SH coefficients (SPEC 2.8).
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "shared/splat.h"
+#include "inc/gaussian.glsl"
+layout(local_size_x = 64) in;
+layout(push_constant) uniform Push { SplatPush p; };
+layout(std430, binding = 0) readonly buffer Parameters { float parameters[]; };
+layout(std430, binding = 1) readonly buffer ReplicaOpacity { float replica_opacity[]; };
+layout(std430, binding = 2) readonly buffer LiveFlag { uint live_flag[]; };
+layout(std430, binding = 3) readonly buffer LivePrefix { uint live_prefix[]; };
+layout(std430, binding = 4) readonly buffer LiveBlock { uint live_block[]; };
+layout(std430, binding = 5) readonly buffer Views { SplatView views[]; };
+layout(std430, binding = 6) readonly buffer Motions { vec4 motions[]; };
+layout(std430, binding = 7) readonly buffer Counters { uint counters[]; };
+layout(std430, binding = 8) readonly buffer Records { vec4 records[]; };
+layout(std430, binding = 9) buffer Gradient { float gradient[]; };
+layout(std430, binding = 10) buffer ReplicaGradient { float replica_gradient[]; };  // d/d(opacity of replica)
+
+void put(uint at, float value) {
+  gradient[at] = (p.flags & kFlagAccumulate) != 0u ? gradient[at] + value : value;
+}
+
+void main() {
+  uint i = gl_GlobalInvocationID.x, n = p.gaussians;
+  if (i >= n) return;
+  uint live_count = counters[kCounterLive];
+  uint sh = at_sh(n, p.coefficients, i);
+  vec3 grad_mean = vec3(0.0), grad_scale = vec3(0.0), grad_dc = vec3(0.0);
+  vec4 grad_rotation = vec4(0.0);
+  if (p.coefficients > 1u && (p.flags & kFlagAccumulate) == 0u) {
+    for (uint l = 0u; l < 3u * p.coefficients; ++l) gradient[sh + l] = 0.0;
+  }
+  vec3 mean = vec3(parameters[at_mean(n, i)], parameters[at_mean(n, i) + 1u], parameters[at_mean(n, i) + 2u]);
+  for (uint j = 0u; j < p.links; ++j) {
+    uint e = j * n + i;
+    float grad_opacity = 0.0;
+    if (live_flag[e] != 0u) {
+      uint r = live_prefix[e] + live_block[e / kScanBlock];
+      if (r < live_count) {
+        for (uint v = 0u; v < p.views; ++v) {
+          uint record = kGradientRows * (v * live_count + r);
+          vec4 a = records[record], c = records[record + 3u];
+          grad_mean += a.xyz;
+          grad_opacity += a.w;
+          grad_rotation += records[record + 1u];
+          grad_scale += records[record + 2u].xyz;
+          grad_dc += c.xyz;
+          if (p.coefficients > 1u) {
+            uint motion = 3u * (views[v].motion + j);
+            mat3 link = transpose(mat3(motions[motion].xyz, motions[motion + 1u].xyz, motions[motion + 2u].xyz));
+            vec3 x = link * mean + vec3(motions[motion].w, motions[motion + 1u].w, motions[motion + 2u].w);
+            vec3 direction = normalize(x) * link;
+            for (uint l = 1u; l < p.coefficients; ++l) {
+              vec3 g = sh_basis(l, direction) * c.xyz;
+              gradient[sh + 3u * l] += g.x;
+              gradient[sh + 3u * l + 1u] += g.y;
+              gradient[sh + 3u * l + 2u] += g.z;
+            }
+          }
+        }
+      }
+    }
+    replica_gradient[e] = grad_opacity;
+  }
+  for (uint k = 0u; k < 3u; ++k) {
+    put(at_mean(n, i) + k, grad_mean[k]);
+    put(at_log_scale(n, i) + k, grad_scale[k]);
+    put(sh + k, sh_basis(0u, vec3(0.0)) * grad_dc[k]);
+  }
+  for (uint k = 0u; k < 4u; ++k) put(at_rotation(n, i) + k, grad_rotation[k]);
+  // replica opacity = sigma rho: with w_j = d/d(sigma rho_j), d/dsigma = sum rho_j w_j, d/dlambda_j = sigma rho_j (w_j - that)
+  float opacity = 1.0 / (1.0 + exp(-parameters[at_opacity(n, i)]));
+  float mean_gradient = 0.0;
+  for (uint j = 0u; j < p.links; ++j) mean_gradient += replica_opacity[j * n + i] / opacity * replica_gradient[j * n + i];
+  put(at_opacity(n, i), opacity * (1.0 - opacity) * mean_gradient);
+  uint logits = at_link(n, p.coefficients, p.links, i);
+  for (uint j = 0u; j < p.links; ++j) {
+    put(logits + j, replica_opacity[j * n + i] * (replica_gradient[j * n + i] - mean_gradient));
+  }
+}

@@ -1,0 +1,79 @@
+// splat_project.comp - one invocation a (live replica, view): its 2-D splat, the tiles that it may touch, and how many of
+// them are active. A splat reaches as far as its alpha reaches 1/255, not three sigma.
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "shared/splat.h"
+#include "inc/gaussian.glsl"
+#include "inc/project.glsl"
+layout(local_size_x = 64) in;
+layout(constant_id = 0) const uint kCutoffs = 1u;
+layout(constant_id = 1) const uint kTileWidth = 8u;
+layout(constant_id = 2) const uint kTileHeight = 8u;
+layout(push_constant) uniform Push { SplatPush p; };
+layout(std430, binding = 0) readonly buffer Parameters { float parameters[]; };
+layout(std430, binding = 1) readonly buffer ReplicaOpacity { float replica_opacity[]; };
+layout(std430, binding = 2) readonly buffer Live { uint live[]; };
+layout(std430, binding = 3) readonly buffer Views { SplatView views[]; };
+layout(std430, binding = 4) readonly buffer Motions { vec4 motions[]; };
+layout(std430, binding = 5) readonly buffer TileMap { uint tile_map[]; };
+layout(std430, binding = 6) readonly buffer Counters { uint counters[]; };
+layout(std430, binding = 7) writeonly buffer Splats { vec4 splats[]; };
+layout(std430, binding = 8) writeonly buffer InstanceCount { uint instance_count[]; };
+layout(std430, binding = 9) buffer TileCount { uint tile_count[]; };
+
+// exponent below which a Gaussian is 0 in float: the reach when there is no 1/255 cut
+const float kFullReach = 80.0;
+
+void main() {
+  uint r = gl_GlobalInvocationID.x, v = gl_GlobalInvocationID.y;
+  uint live_count = counters[kCounterLive];
+  if (r >= live_count) return;
+  uint e = live[r], n = p.gaussians, i = e % n, link = e / n;
+  uint out_index = v * live_count + r;
+  SplatView view = views[v];
+  uint motion = 3u * (view.motion + link);
+  uint at = at_mean(n, i), aq = at_rotation(n, i), as = at_log_scale(n, i);
+  vec3 mean = vec3(parameters[at], parameters[at + 1u], parameters[at + 2u]);
+  vec4 rotation = vec4(parameters[aq], parameters[aq + 1u], parameters[aq + 2u], parameters[aq + 3u]);
+  vec3 log_scale = vec3(parameters[as], parameters[as + 1u], parameters[as + 2u]);
+  Projection a = project(view, motions[motion], motions[motion + 1u], motions[motion + 2u], mean, rotation, log_scale);
+  float opacity = replica_opacity[e];
+  float determinant = a.cov.x * a.cov.z - a.cov.y * a.cov.y;
+  vec2 u = view.intrinsics.xy * a.x.xy / a.x.z + view.intrinsics.zw;
+  // half widths of the box where alpha can reach the cut
+  float reach = kCutoffs != 0u ? 2.0 * log(255.0 * opacity) : 2.0 * kFullReach;
+  bool seen = a.x.z >= kNear && reach > 0.0 && determinant > 0.0;
+  vec2 half_width = sqrt(max(reach, 0.0) * a.cov.xz);
+  // pixel centers are at +0.5: pixel k is inside the box when u - h <= k + 0.5 <= u + h
+  vec2 low = clamp(u - half_width - 0.5, vec2(-1.0), vec2(view.width, view.height) + 1.0);
+  vec2 high = clamp(u + half_width - 0.5, vec2(-1.0), vec2(view.width, view.height) + 1.0);
+  ivec2 first = max(ivec2(ceil(low)), ivec2(0));
+  ivec2 last = min(ivec2(floor(high)), ivec2(view.width, view.height) - 1);
+  seen = seen && all(lessThanEqual(first, last));
+  uvec2 t0 = uvec2(max(first, ivec2(0))) / uvec2(kTileWidth, kTileHeight);
+  uvec2 t1 = uvec2(max(last, ivec2(0))) / uvec2(kTileWidth, kTileHeight) + 1u;
+  if (!seen) t1 = t0;
+  uint count = 0u;
+  for (uint ty = t0.y; ty < t1.y; ++ty) {
+    for (uint tx = t0.x; tx < t1.x; ++tx) {
+      uint tile = tile_map[view.tile_map + ty * view.tiles_x + tx];
+      if (tile != kNoTile) {
+        atomicAdd(tile_count[tile], 1u);
+        ++count;
+      }
+    }
+  }
+  instance_count[out_index] = count;
+  if (count == 0u) t1 = t0;
+  vec3 direction = normalize(a.x) * a.link;  // R^T r: the view direction in the home frame
+  vec3 color = vec3(0.5);
+  uint sh = at_sh(n, p.coefficients, i);
+  for (uint l = 0u; l < p.coefficients; ++l) {
+    color += sh_basis(l, direction) * vec3(parameters[sh + 3u * l], parameters[sh + 3u * l + 1u], parameters[sh + 3u * l + 2u]);
+  }
+  float inverse = 1.0 / determinant;
+  splats[kSplatRows * out_index] = vec4(u, opacity, a.x.z);
+  splats[kSplatRows * out_index + 1u] =
+      vec4(a.cov.z * inverse, -a.cov.y * inverse, a.cov.x * inverse, uintBitsToFloat(t0.x | t1.x << 16u));
+  splats[kSplatRows * out_index + 2u] = vec4(max(color, vec3(0.0)), uintBitsToFloat(t0.y | t1.y << 16u));
+}

@@ -1,0 +1,93 @@
+// splat_project_backward.comp - one invocation a (live replica, view): sums its instances' partial gradients in their order
+// and takes them through the projection (SPEC 2.8) to the Gaussian's parameters and to the link's twist.
+// The link's moment is about the view's moment point, in the camera frame; the host turns it into the world's.
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "shared/splat.h"
+#include "inc/gaussian.glsl"
+#include "inc/project.glsl"
+layout(local_size_x = 64) in;
+layout(push_constant) uniform Push { SplatPush p; };
+layout(std430, binding = 0) readonly buffer Parameters { float parameters[]; };
+layout(std430, binding = 1) readonly buffer Live { uint live[]; };
+layout(std430, binding = 2) readonly buffer Views { SplatView views[]; };
+layout(std430, binding = 3) readonly buffer Motions { vec4 motions[]; };
+layout(std430, binding = 4) readonly buffer Counters { uint counters[]; };
+layout(std430, binding = 5) readonly buffer Splats { vec4 splats[]; };
+layout(std430, binding = 6) readonly buffer InstanceCount { uint instance_count[]; };
+layout(std430, binding = 7) readonly buffer InstancePrefix { uint instance_prefix[]; };
+layout(std430, binding = 8) readonly buffer InstanceBlock { uint instance_block[]; };
+layout(std430, binding = 9) readonly buffer Partials { vec4 partials[]; };
+layout(std430, binding = 10) writeonly buffer Records { vec4 records[]; };
+
+void main() {
+  uint r = gl_GlobalInvocationID.x, v = gl_GlobalInvocationID.y;
+  uint live_count = counters[kCounterLive];
+  if (r >= live_count) return;
+  uint s = v * live_count + r;
+  uint record = kGradientRows * s;
+  uint count = counters[kCounterOverflow] != 0u ? 0u : instance_count[s];
+  vec4 sum0 = vec4(0.0), sum1 = vec4(0.0);
+  float blue = 0.0;
+  uint first = kPartialRows * p.slots * (instance_prefix[s] + instance_block[s / kScanBlock]);
+  for (uint k = 0u; k < count * p.slots; ++k) {
+    sum0 += partials[first + kPartialRows * k];
+    sum1 += partials[first + kPartialRows * k + 1u];
+    blue += partials[first + kPartialRows * k + 2u].x;
+  }
+  if (count == 0u) {
+    for (uint k = 0u; k < kGradientRows; ++k) records[record + k] = vec4(0.0);
+    return;
+  }
+  uint e = live[r], n = p.gaussians, i = e % n, link = e / n;
+  SplatView view = views[v];
+  uint motion = 3u * (view.motion + link);
+  uint at = at_mean(n, i), aq = at_rotation(n, i), as = at_log_scale(n, i);
+  vec3 mean = vec3(parameters[at], parameters[at + 1u], parameters[at + 2u]);
+  vec4 rotation = vec4(parameters[aq], parameters[aq + 1u], parameters[aq + 2u], parameters[aq + 3u]);
+  vec3 log_scale = vec3(parameters[as], parameters[as + 1u], parameters[as + 2u]);
+  Projection a = project(view, motions[motion], motions[motion + 1u], motions[motion + 2u], mean, rotation, log_scale);
+
+  // color: zero where the max(0, .) acts
+  vec3 splat_color = splats[kSplatRows * s + 2u].xyz;
+  vec3 grad_color = vec3(sum0.w, sum1.w, blue) * vec3(greaterThan(splat_color, vec3(0.0)));
+  // Sigma' = T T^T, T = J M
+  vec3 h = 0.5 * sum1.xyz;  // dL/dSigma': xx, xy, yy
+  vec3 grad_t0 = 2.0 * (h.x * a.t0 + h.y * a.t1);
+  vec3 grad_t1 = 2.0 * (h.y * a.t0 + h.z * a.t1);
+  mat3 grad_m = outerProduct(a.j0, grad_t0) + outerProduct(a.j1, grad_t1);
+  vec3 grad_j0 = a.m * grad_t0, grad_j1 = a.m * grad_t1;
+  // position, camera frame
+  float inverse_z = 1.0 / a.x.z, fx = view.intrinsics.x * inverse_z, fy = view.intrinsics.y * inverse_z;
+  vec3 grad_x = vec3(fx * sum0.x, fy * sum0.y, -(fx * a.x.x * sum0.x + fy * a.x.y * sum0.y) * inverse_z);
+  grad_x.z -= inverse_z * (fx * grad_j0.x + fy * grad_j1.y);
+  grad_x.x -= a.clamped.x ? 0.0 : fx * inverse_z * grad_j0.z;
+  grad_x.y -= a.clamped.y ? 0.0 : fy * inverse_z * grad_j1.z;
+  grad_x.z -= inverse_z * ((a.clamped.x ? 1.0 : 2.0) * a.j0.z * grad_j0.z + (a.clamped.y ? 1.0 : 2.0) * a.j1.z * grad_j1.z);
+  // view direction of the spherical harmonics, home frame
+  vec3 turn = vec3(0.0);
+  if (p.coefficients > 1u) {
+    float distance = length(a.x);
+    vec3 camera_direction = a.x / distance;
+    vec3 direction = camera_direction * a.link;
+    vec3 grad_direction = vec3(0.0);
+    uint sh = at_sh(n, p.coefficients, i);
+    for (uint l = 1u; l < p.coefficients; ++l) {
+      vec3 coefficient = vec3(parameters[sh + 3u * l], parameters[sh + 3u * l + 1u], parameters[sh + 3u * l + 2u]);
+      grad_direction += dot(coefficient, grad_color) * sh_basis_gradient(l, direction);
+    }
+    vec3 grad_camera_direction = a.link * grad_direction;
+    grad_x += (grad_camera_direction - camera_direction * dot(camera_direction, grad_camera_direction)) / distance;
+    turn = -cross(camera_direction, grad_camera_direction);
+  }
+  vec3 grad_scale = vec3(dot(a.local[0], grad_m[0]), dot(a.local[1], grad_m[1]), dot(a.local[2], grad_m[2])) * a.scale;
+  mat3 grad_r = transpose(a.link) * mat3(grad_m[0] * a.scale.x, grad_m[1] * a.scale.y, grad_m[2] * a.scale.z);
+  vec3 moment = cross(a.x - view.moment_point.xyz, grad_x) + turn + cross(a.m[0], grad_m[0]) +
+                cross(a.m[1], grad_m[1]) + cross(a.m[2], grad_m[2]);
+  records[record] = vec4(grad_x * a.link, sum0.z);
+  records[record + 1u] = rotation_matrix_backward(a.q, a.q_size, grad_r);
+  records[record + 2u] = vec4(grad_scale, 0.0);
+  records[record + 3u] = vec4(grad_color, 0.0);
+  records[record + 4u] = vec4(moment, 0.0);
+  records[record + 5u] = vec4(grad_x, 0.0);
+}

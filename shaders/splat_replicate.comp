@@ -1,0 +1,30 @@
+// splat_replicate.comp - one invocation a Gaussian: opacity times link probability of each of its replicas (SPEC 2.4), and
+// which of them can be seen at all. Link-major order, so that a link's live replicas lie side by side.
+// reads parameters; writes replica_opacity[link * gaussians + i], live_flag[same].
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "shared/splat.h"
+#include "inc/gaussian.glsl"
+layout(local_size_x = 64) in;
+layout(constant_id = 0) const uint kCutoffs = 1u;  // 0: every replica lives (finite-difference tests)
+layout(push_constant) uniform Push { SplatPush p; };
+layout(std430, binding = 0) readonly buffer Parameters { float parameters[]; };
+layout(std430, binding = 1) writeonly buffer ReplicaOpacity { float replica_opacity[]; };
+layout(std430, binding = 2) writeonly buffer LiveFlag { uint live_flag[]; };
+
+void main() {
+  uint i = gl_GlobalInvocationID.x;
+  if (i >= p.gaussians) return;
+  float opacity = 1.0 / (1.0 + exp(-parameters[at_opacity(p.gaussians, i)]));
+  uint logits = at_link(p.gaussians, p.coefficients, p.links, i);
+  float largest = parameters[logits];
+  for (uint j = 1u; j < p.links; ++j) largest = max(largest, parameters[logits + j]);
+  float sum = 0.0;
+  for (uint j = 0u; j < p.links; ++j) sum += exp(parameters[logits + j] - largest);
+  float least = kCutoffs != 0u ? 1.0 / 255.0 : 0.0;
+  for (uint j = 0u; j < p.links; ++j) {
+    float value = opacity * exp(parameters[logits + j] - largest) / sum;
+    replica_opacity[j * p.gaussians + i] = value;
+    live_flag[j * p.gaussians + i] = value > least ? 1u : 0u;
+  }
+}

@@ -1,0 +1,31 @@
+#include "manifest.h"
+
+namespace chainsplat::capture {
+
+namespace {
+
+// The first problem as an exception; the others are counted.
+void throw_first(const Findings& findings) {
+  if (findings.problems.empty()) return;
+  const Problem& first = findings.problems.front();
+  const std::size_t others = findings.problems.size() - 1;
+  throw InputError(first.where, first.what,
+                   first.mend + (others ? " (and " + std::to_string(others) + " more: see 'chainsplat check')" : ""));
+}
+
+}  // namespace
+
+Capture load(const Path& path, const LoadOptions& options) {
+  Findings findings;
+  Manifest manifest = read_manifest(path, options.camera, options.images && options.masked, findings);
+  throw_first(findings);
+  if (manifest.cameras.size() == 1 && options.camera.empty())
+    findings.doubts.push_back(manifest.file.string() + ": cameras: only one; depth along its rays is hardly seen");
+  Capture capture = std::move(manifest.capture);
+  if (options.images) load_views(manifest, options, findings, capture.views);
+  for (const std::string& doubt : findings.doubts) core::warn(doubt);
+  throw_first(findings);
+  return capture;
+}
+
+}  // namespace chainsplat::capture

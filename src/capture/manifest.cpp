@@ -1,0 +1,582 @@
+#include "manifest.h"
+
+#include <algorithm>
+#include <charconv>
+#include <cmath>
+#include <initializer_list>
+#include <nlohmann/json.hpp>
+#include <set>
+
+namespace chainsplat::capture {
+
+using Json = nlohmann::json;
+using math::Matrix3;
+using math::Vector3;
+
+Path ImageSource::frame_file(int frame) const {
+  std::string number = std::to_string(frame);
+  if (static_cast<int>(number.size()) < digits) number.insert(0, digits - number.size(), '0');
+  return prefix + number + suffix;
+}
+
+namespace {
+
+constexpr int kLargestSide = 1 << 15;           // px, of an image
+constexpr double kRotationTolerance = 1e-3;     // |R R^T - I|: three digits pass
+constexpr double kUnitTolerance = 1e-3;         // of a direction's length before we doubt it
+constexpr double kPerpendicular = 1e-3;         // rad
+constexpr double kInversePixels = 1e-3;         // px, largest error of undistort(distort(.)) at the corners
+constexpr double kTopMeters = 5.0;              // a longer rope is doubted (millimeters?)
+
+int edit_distance(const std::string& a, const std::string& b) {
+  std::vector<int> row(b.size() + 1);
+  for (std::size_t j = 0; j <= b.size(); ++j) row[j] = static_cast<int>(j);
+  for (std::size_t i = 1; i <= a.size(); ++i) {
+    int diagonal = row[0];
+    row[0] = static_cast<int>(i);
+    for (std::size_t j = 1; j <= b.size(); ++j) {
+      const int substituted = diagonal + (a[i - 1] != b[j - 1]);
+      diagonal = row[j];
+      row[j] = std::min({row[j] + 1, row[j - 1] + 1, substituted});
+    }
+  }
+  return row[b.size()];
+}
+
+// One JSON object of the file: typed access that notes what is missing or wrong and goes on with a default.
+class Reader {
+ public:
+  Reader(const Json* object, std::string where, Findings& findings)
+      : object_(object), where_(std::move(where)), findings_(findings) {}
+
+  std::string at(const std::string& key) const { return where_ + (where_.ends_with(": ") ? "" : ".") + key; }
+  bool has(const std::string& key) const { return object_ && object_->contains(key); }
+  void problem(const std::string& key, const std::string& what, const std::string& mend) const {
+    findings_.problems.push_back({at(key), what, mend});
+  }
+  void doubt(const std::string& key, const std::string& what) const { findings_.doubts.push_back(at(key) + ": " + what); }
+
+  // Unknown keys are doubts that name the nearest known key.
+  void know(std::initializer_list<const char*> known) const {
+    if (!object_) return;
+    for (const auto& [key, value] : object_->items()) {
+      if (std::any_of(known.begin(), known.end(), [&](const char* k) { return key == k; })) continue;
+      const char* nearest = *std::min_element(known.begin(), known.end(), [&](const char* a, const char* b) {
+        return edit_distance(key, a) < edit_distance(key, b);
+      });
+      const bool similar = edit_distance(key, nearest) <= std::max<int>(2, static_cast<int>(key.size()) / 3);
+      doubt(key.substr(0, 60), std::string("unknown key, ignored") + (similar ? std::string("; is '").append(nearest).append("' meant?") : std::string()));
+    }
+  }
+
+  const Json* find(const std::string& key, bool required, const char* expected) const {
+    if (!object_) return nullptr;
+    const auto found = object_->find(key);
+    if (found != object_->end()) return &*found;
+    if (required) problem(key, "is missing", std::string("add it: ") + expected);
+    return nullptr;
+  }
+
+  std::optional<double> number(const std::string& key, bool required, const char* expected) const {
+    const Json* value = find(key, required, expected);
+    if (!value) return std::nullopt;
+    if (value->is_number() && std::isfinite(value->get<double>())) return value->get<double>();
+    problem(key, value->is_number() ? "is not finite" : "is not a number", std::string("write ") + expected);
+    return std::nullopt;
+  }
+
+  double positive(const std::string& key, const char* expected) const {
+    const auto value = number(key, true, expected);
+    if (!value) return 0.0;
+    if (*value <= 0.0) problem(key, core::exact(*value) + " is not positive", std::string("write ") + expected);
+    return *value;
+  }
+
+  int pixels(const std::string& key) const {
+    const auto value = number(key, true, "a whole number of pixels");
+    if (!value) return 0;
+    if (*value < 1 || *value > kLargestSide || *value != std::floor(*value)) {
+      problem(key, core::exact(*value) + " is not an image size", "write a whole number of pixels");
+      return 0;
+    }
+    return static_cast<int>(*value);
+  }
+
+  std::optional<std::vector<double>> numbers(const std::string& key, std::size_t count, bool required,
+                                             const char* expected) const {
+    const Json* value = find(key, required, expected);
+    if (!value) return std::nullopt;
+    if (!value->is_array() || value->size() != count) {
+      problem(key,
+              value->is_array() ? "has " + std::to_string(value->size()) + " entries instead of " + std::to_string(count)
+                                : "is not a list",
+              std::string("write ") + expected);
+      return std::nullopt;
+    }
+    std::vector<double> out;
+    for (const Json& entry : *value) {
+      if (!entry.is_number() || !std::isfinite(entry.get<double>())) {
+        problem(key + "[" + std::to_string(out.size()) + "]", "is not a finite number", std::string("write ") + expected);
+        return std::nullopt;
+      }
+      out.push_back(entry.get<double>());
+    }
+    return out;
+  }
+
+  std::optional<Vector3> vector(const std::string& key, bool required, const char* expected) const {
+    const auto values = numbers(key, 3, required, expected);
+    if (!values) return std::nullopt;
+    return Vector3((*values)[0], (*values)[1], (*values)[2]);
+  }
+
+  // Normalized.
+  std::optional<Vector3> direction(const std::string& key, const char* expected) const {
+    const auto value = vector(key, true, expected);
+    if (!value) return std::nullopt;
+    const double length = value->norm();
+    if (!(length > 0.0)) {
+      problem(key, "has no length", std::string("write ") + expected);
+      return std::nullopt;
+    }
+    if (std::abs(length - 1.0) > kUnitTolerance) doubt(key, "has length " + core::exact(length) + ", taken as a direction");
+    return *value / length;
+  }
+
+  std::optional<std::string> text(const std::string& key, bool required, const char* expected) const {
+    const Json* value = find(key, required, expected);
+    if (!value) return std::nullopt;
+    if (value->is_string()) return value->get<std::string>();
+    problem(key, "is not a text", std::string("write ") + expected);
+    return std::nullopt;
+  }
+
+  // A path inside the folder.
+  std::optional<std::string> path(const std::string& key, bool required, const char* expected) const {
+    const auto value = text(key, required, expected);
+    if (!value) return std::nullopt;
+    const Path normal = Path(*value).lexically_normal();
+    if (value->empty() || value->find('\0') != std::string::npos || normal.is_absolute() || normal == "." ||
+        *normal.begin() == "..") {
+      problem(key, "'" + *value + "' is not a path inside the capture's folder", "put the file into the folder");
+      return std::nullopt;
+    }
+    return value;
+  }
+
+  Reader child(const std::string& key, bool required, const char* expected) const {
+    const Json* value = find(key, required, expected);
+    if (value && !value->is_object()) {
+      problem(key, "is not an object", std::string("write ") + expected);
+      value = nullptr;
+    }
+    return Reader(value, at(key), findings_);
+  }
+
+  bool present() const { return object_ != nullptr; }
+
+ private:
+  const Json* object_;
+  std::string where_;
+  Findings& findings_;
+};
+
+// 'cam0.mp4' or 'cam0/%06d.png'.
+std::optional<ImageSource> image_source(const Reader& reader, const std::string& key, const Path& folder, bool required) {
+  const auto text = reader.path(key, required, "a video like cam0.mp4 or a pattern like cam0/%06d.png");
+  if (!text) return std::nullopt;
+  ImageSource source;
+  const std::size_t percent = text->find('%');
+  if (percent == std::string::npos) {
+    source.video = true;
+    source.file = folder / *text;
+    return source;
+  }
+  std::size_t end = percent + 1;
+  while (end < text->size() && std::isdigit(static_cast<unsigned char>((*text)[end]))) ++end;
+  const std::string width = text->substr(percent + 1, end - percent - 1);
+  const bool valid = end < text->size() && (*text)[end] == 'd' && width.size() <= 3 && (width.empty() || width[0] == '0') &&
+                     text->find('%', end) == std::string::npos;
+  if (!valid) {
+    reader.problem(key, "'" + *text + "' is not a frame pattern", "write the number once, as %d or %06d");
+    return std::nullopt;
+  }
+  source.prefix = (folder / text->substr(0, percent)).string();
+  source.suffix = text->substr(end + 1);
+  if (!width.empty()) std::from_chars(width.data(), width.data() + width.size(), source.digits);
+  return source;
+}
+
+bool is_file(const Path& file) {
+  std::error_code error;
+  return std::filesystem::is_regular_file(file, error);
+}
+
+// Sets source.frames; false and a problem when there are none or a number is left out.
+bool count_frames(ImageSource& source, const std::string& where, double* rate, const Camera* camera, Findings& findings) {
+  if (source.video) {
+    try {
+      const VideoFacts facts = video_facts(source.file);
+      source.frames = facts.frames;
+      if (rate) *rate = facts.rate;
+      if (camera && facts.width > 0 && (facts.width != camera->width || facts.height != camera->height)) {
+        findings.problems.push_back({source.file.string(),
+                                     "is " + std::to_string(facts.width) + "x" + std::to_string(facts.height) +
+                                         " pixels, the camera has " + std::to_string(camera->width) + "x" +
+                                         std::to_string(camera->height),
+                                     "correct width and height in capture.json or the video"});
+        return false;
+      }
+    } catch (const InputError& error) {
+      findings.problems.push_back({where, error.what(), "check the file"});
+      return false;
+    }
+    if (source.frames > 0) return true;
+    findings.problems.push_back({source.file.string(), "has no frame", "write the video again"});
+    return false;
+  }
+  while (is_file(source.frame_file(source.frames))) ++source.frames;
+  constexpr int kLookAhead = 16;  // frames: a longer gap is taken for the end
+  for (int k = source.frames + 1; k < source.frames + kLookAhead; ++k)
+    if (is_file(source.frame_file(k))) {
+      findings.problems.push_back({source.frame_file(source.frames).string(), "is missing, though later frames exist",
+                                   "number the frames from 0 without gaps"});
+      return false;
+    }
+  if (source.frames > 0) return true;
+  findings.problems.push_back({source.frame_file(0).string(), "is missing", "number the frames from 0, or correct the pattern"});
+  return false;
+}
+
+std::vector<double> read_timestamps(const Path& file) {
+  const std::string text = core::read_file(file);
+  std::vector<double> times;
+  int line_number = 0;
+  for (std::size_t begin = 0; begin < text.size();) {
+    const std::size_t end = std::min(text.find('\n', begin), text.size());
+    std::string line = text.substr(begin, end - begin);
+    begin = end + 1;
+    ++line_number;
+    line.resize(std::min(line.find('#'), line.size()));
+    const std::size_t first = line.find_first_not_of(" \t\r");
+    if (first == std::string::npos) continue;
+    const std::size_t last = line.find_last_not_of(" \t\r");
+    double time = 0.0;
+    const char* const stop = line.data() + last + 1;
+    const auto [after, error] = std::from_chars(line.data() + first, stop, time);
+    const std::string where = file.string() + ":" + std::to_string(line_number);
+    if (error != std::errc() || after != stop || !std::isfinite(time))
+      throw InputError(where, "not a time in seconds", "write one number a line");
+    if (!times.empty() && !(time > times.back()))
+      throw InputError(where, "does not come after the time before it", "sort the times; one a frame");
+    times.push_back(time);
+  }
+  return times;
+}
+
+void set_times(CameraSource& source, Findings& findings) {
+  const int frames = source.images.frames;
+  if (source.timestamps) {
+    try {
+      source.times = read_timestamps(*source.timestamps);
+    } catch (const InputError& error) {
+      findings.problems.push_back({source.where + ".timestamps", error.what(), "correct the file"});
+      return;
+    }
+    const int given = static_cast<int>(source.times.size());
+    if (given < frames) {
+      findings.problems.push_back({source.timestamps->string(),
+                                   "has " + std::to_string(given) + " times for " + std::to_string(frames) + " frames",
+                                   "write one number a frame"});
+      source.times.clear();
+      return;
+    }
+    if (given > frames)
+      findings.doubts.push_back(source.timestamps->string() + ": has " + std::to_string(given) + " times for " +
+                                std::to_string(frames) + " frames; the last ones are ignored");
+    source.times.resize(frames);
+    std::vector<double> intervals;
+    for (int k = 1; k < frames; ++k) intervals.push_back(source.times[k] - source.times[k - 1]);
+    if (!intervals.empty()) {
+      std::nth_element(intervals.begin(), intervals.begin() + intervals.size() / 2, intervals.end());
+      source.interval = intervals[intervals.size() / 2];
+    }
+  } else {
+    source.times.resize(frames);
+    for (int k = 0; k < frames; ++k) source.times[k] = source.start + k / source.rate;
+    source.interval = 1.0 / source.rate;
+  }
+}
+
+void read_pose(const Reader& reader, Camera& camera) {
+  const char* const expected = "a 4x4 matrix by rows, camera to world, camera axes x right, y down, z forward";
+  const auto m = reader.numbers("world_from_camera", 16, true, expected);
+  if (!m) return;
+  const double* a = m->data();
+  Matrix3 rotation;
+  rotation << a[0], a[1], a[2], a[4], a[5], a[6], a[8], a[9], a[10];
+  const bool bottom = a[12] == 0 && a[13] == 0 && a[14] == 0 && a[15] == 1;
+  if (!bottom) {
+    const bool by_columns = a[3] == 0 && a[7] == 0 && a[11] == 0 && a[15] == 1;
+    reader.problem("world_from_camera",
+                   by_columns ? "is written by columns (its last row is not 0 0 0 1)" : "its last row is not 0 0 0 1",
+                   by_columns ? "transpose it" : std::string("write ") + expected);
+    return;
+  }
+  if ((rotation * rotation.transpose() - Matrix3::Identity()).cwiseAbs().maxCoeff() > kRotationTolerance) {
+    reader.problem("world_from_camera", "its upper left 3x3 is not a rotation", "make its rows unit and perpendicular");
+    return;
+  }
+  if (rotation.determinant() < 0) {
+    reader.problem("world_from_camera", "its upper left 3x3 is a reflection", "turn the sign of one camera axis");
+    return;
+  }
+  camera.world_from_camera = {math::orthonormalized(rotation), {a[3], a[7], a[11]}};
+}
+
+// A strong lens model may fold the image over itself; then undistorting has no answer.
+void check_lens(const Reader& reader, const Camera& camera) {
+  if (!camera.distorted()) return;
+  const double w = camera.width, h = camera.height;
+  for (const math::Vector2& recorded : {math::Vector2(0, 0), math::Vector2(w, 0), math::Vector2(0, h), math::Vector2(w, h),
+                                        math::Vector2(0, h / 2), math::Vector2(w / 2, 0)}) {
+    const math::Vector2 back = distort(camera, undistort(camera, recorded));
+    if (!((back - recorded).norm() < kInversePixels)) {
+      reader.problem("distortion", "cannot be undone at pixel (" + core::exact(recorded.x()) + ", " +
+                                       core::exact(recorded.y()) + "): the model folds the image",
+                     "write OpenCV's k1, k2, p1, p2, k3 of this image size");
+      return;
+    }
+  }
+}
+
+bool good_name(const std::string& name) {
+  return !name.empty() && name.size() <= 64 && name[0] != '.' && std::all_of(name.begin(), name.end(), [](unsigned char c) {
+    return std::isalnum(c) || c == '_' || c == '-' || c == '.';
+  });
+}
+
+CameraSource read_camera(const Reader& reader, const std::string& where, const Path& folder) {
+  CameraSource source;
+  source.where = where;
+  Camera& camera = source.camera;
+  reader.know({"name", "width", "height", "fx", "fy", "cx", "cy", "distortion", "world_from_camera", "images", "masks", "depth",
+               "depth_scale", "rate", "start", "timestamps"});
+  camera.name = reader.text("name", true, "a short name like cam0").value_or("");
+  if (reader.has("name") && !good_name(camera.name))
+    reader.problem("name", "'" + camera.name.substr(0, 64) + "' cannot name a folder", "use letters, digits, - and _");
+  camera.width = reader.pixels("width");
+  camera.height = reader.pixels("height");
+  camera.fx = reader.positive("fx", "the focal length in pixels");
+  camera.fy = reader.positive("fy", "the focal length in pixels");
+  camera.cx = reader.number("cx", true, "the principal point in pixels").value_or(0.0);
+  camera.cy = reader.number("cy", true, "the principal point in pixels").value_or(0.0);
+  if (camera.width > 0 && camera.height > 0 && (camera.cx < 0 || camera.cx > camera.width || camera.cy < 0 || camera.cy > camera.height))
+    reader.doubt("cx", "the principal point lies outside the image");
+  if (const auto values = reader.numbers("distortion", 5, false, "OpenCV's [k1, k2, p1, p2, k3]"))
+    std::copy(values->begin(), values->end(), camera.distortion.begin());
+  if (camera.width > 0 && camera.height > 0 && camera.fx > 0 && camera.fy > 0) check_lens(reader, camera);
+  read_pose(reader, camera);
+
+  if (const auto images = image_source(reader, "images", folder, true)) source.images = *images;
+  source.masks = image_source(reader, "masks", folder, false);
+  source.depth = image_source(reader, "depth", folder, false);
+  if (source.depth && source.depth->video) {
+    reader.problem("depth", "is not a pattern", "write 16-bit images like depth/cam0/%06d.png");
+    source.depth.reset();
+  }
+  if (source.depth) source.depth_scale = reader.positive("depth_scale", "meters a unit, like 0.0001");
+  if (const auto file = reader.path("timestamps", false, "a text file with a time a line")) source.timestamps = folder / *file;
+  if (!reader.has("timestamps")) {
+    source.rate = reader.positive("rate", "frames a second");
+    source.start = reader.number("start", false, "the first frame's time in seconds").value_or(0.0);
+  }
+  return source;
+}
+
+std::string line_of(const std::string& text, std::size_t byte) {
+  const std::size_t end = std::min(byte, text.size());
+  return std::to_string(1 + std::count(text.begin(), text.begin() + static_cast<std::ptrdiff_t>(end), '\n'));
+}
+
+void survey(Manifest& manifest, bool masked, Findings& findings) {
+  std::vector<Findings> found(manifest.cameras.size());  // cameras in parallel, findings in order
+  core::parallel_for(static_cast<std::int64_t>(manifest.cameras.size()), [&](std::int64_t c) {
+    CameraSource& source = manifest.cameras[c];
+    Findings& mine = found[c];
+    if (source.images.file.empty() && source.images.prefix.empty()) return;
+    if (!count_frames(source.images, source.where + ".images", &source.video_rate, &source.camera, mine)) return;
+    const int frames = source.images.frames;
+    const auto compare = [&](std::optional<ImageSource>& other, const char* key) {
+      if (!other || !count_frames(*other, source.where + "." + key, nullptr, &source.camera, mine)) return;
+      if (other->frames < frames)
+        mine.problems.push_back({source.where + "." + key,
+                                 std::to_string(other->frames) + " frames, but images has " + std::to_string(frames),
+                                 "write one for every frame"});
+      else if (other->frames > frames)
+        mine.doubts.push_back(source.where + "." + key + ": " + std::to_string(other->frames) + " frames, but images has " +
+                              std::to_string(frames) + "; the last ones are ignored");
+    };
+    if (masked) compare(source.masks, "masks");
+    compare(source.depth, "depth");
+    if (source.timestamps || source.rate > 0) set_times(source, mine);
+  });
+  for (const Findings& one : found) {
+    findings.problems.insert(findings.problems.end(), one.problems.begin(), one.problems.end());
+    findings.doubts.insert(findings.doubts.end(), one.doubts.begin(), one.doubts.end());
+  }
+}
+
+void read_base(Manifest& manifest, const Path& file, Findings& findings) {
+  Capture& capture = manifest.capture;
+  try {
+    capture.base = trajectory::fit(trajectory::read_tum(file), file.string());
+  } catch (const InputError& error) {
+    findings.problems.push_back({manifest.file.string() + ": base", error.what(), "correct the file"});
+    return;
+  }
+  for (const CameraSource& source : manifest.cameras) {
+    if (source.times.empty()) continue;
+    const double slack = 0.5 * source.interval;
+    if (source.times.front() < capture.base.start() - slack || source.times.back() > capture.base.end() + slack)
+      findings.problems.push_back({file.string(),
+                                   "covers " + core::exact(capture.base.start()) + " to " + core::exact(capture.base.end()) +
+                                       " s, but the frames of " + source.camera.name + " are at " +
+                                       core::exact(source.times.front()) + " to " + core::exact(source.times.back()) + " s",
+                                   "record the base during all frames or correct start, rate or timestamps"});
+  }
+}
+
+std::uint64_t capture_hash(const std::string& text, const Manifest& manifest, const Path& base) {
+  std::uint64_t hash = core::fnv1a(text);
+  std::error_code error;
+  if (is_file(base)) hash = core::fnv1a(core::read_file(base), hash);
+  for (const CameraSource& source : manifest.cameras)
+    for (const ImageSource* images : {&source.images, source.masks ? &*source.masks : nullptr}) {
+      if (!images) continue;
+      for (int k = 0; k < (images->video ? 1 : images->frames); ++k) {
+        const auto size = std::filesystem::file_size(images->video ? images->file : images->frame_file(k), error);
+        hash = core::fnv1a(error ? "-" : std::to_string(size) + " ", hash);
+      }
+    }
+  return hash;
+}
+
+}  // namespace
+
+Manifest read_manifest(const Path& path, const std::string& camera, bool masked, Findings& findings) {
+  Manifest manifest;
+  std::error_code error;
+  manifest.file = std::filesystem::is_directory(path, error) ? path / "capture.json" : path;
+  Capture& capture = manifest.capture;
+  capture.folder = manifest.file.has_parent_path() ? manifest.file.parent_path() : Path(".");
+  const std::string text = core::read_file(manifest.file);
+  const std::string file = manifest.file.string();
+  Json json;
+  try {
+    json = Json::parse(text);
+  } catch (const Json::parse_error& failure) {
+    throw InputError(file + ":" + line_of(text, failure.byte), "is not JSON (a comma, bracket or quote is missing, or the file is cut off)",
+                     "correct this line or the one before");
+  } catch (const Json::exception&) {  // a number beyond double
+    throw InputError(file, "has a number that is too large", "write finite numbers");
+  }
+  if (!json.is_object()) throw InputError(file, "is not a JSON object", "write { \"format\": \"chainsplat-capture/1\", ... }");
+
+  const Reader top(&json, file + ": ", findings);
+  const auto format = top.text("format", true, "\"chainsplat-capture/1\"");
+  if (format && *format != "chainsplat-capture/1") {
+    top.problem("format", "'" + format->substr(0, 60) + "' is not chainsplat-capture/1", "convert the capture to this format");
+    return manifest;  // other keys would be judged by the wrong rules
+  }
+  top.know({"format", "name", "scenario", "gravity", "object", "grasp", "table", "base", "cameras"});
+  capture.name = top.text("name", false, "a short name").value_or(capture.folder.filename().string());
+  const std::string scenario = top.text("scenario", true, "\"free\" or \"tabletop\"").value_or("free");
+  if (scenario != "free" && scenario != "tabletop")
+    top.problem("scenario", "'" + scenario.substr(0, 60) + "' is unknown", "write \"free\" or \"tabletop\"");
+  capture.tabletop = scenario == "tabletop";
+  if (const auto gravity = top.vector("gravity", false, "[0, 0, -9.81]")) {
+    capture.gravity = *gravity;
+    constexpr double kLeast = 9.7, kMost = 9.9;  // m/s^2, anywhere on Earth
+    if (gravity->norm() < kLeast || gravity->norm() > kMost)
+      top.doubt("gravity", "has length " + core::exact(gravity->norm()) + " m/s^2, not Earth's");
+  } else if (!top.has("gravity")) {
+    top.doubt("gravity", "is missing; (0, 0, -9.81) is assumed");
+  }
+
+  const Reader object = top.child("object", true, "{ \"length\": 0.3, \"diameter\": 0.02, \"mass\": 0.06 }");
+  if (object.present()) {
+    object.know({"length", "diameter", "mass"});
+    capture.length = object.positive("length", "meters from the grasp to the free end");
+    capture.diameter = object.positive("diameter", "meters");
+    if (object.has("mass")) {
+      const double mass = object.positive("mass", "kilograms, or leave it out");
+      if (mass > 0) capture.mass = mass;
+    }
+    if (capture.length > kTopMeters) object.doubt("length", core::exact(capture.length) + " m: are these millimeters?");
+    if (capture.length > 0 && capture.diameter >= capture.length)
+      object.problem("diameter", "is not less than the length", "write both in meters");
+  }
+
+  const Reader grasp = top.child("grasp", true, "{ \"direction\": [0, 0, -1], \"bending_axis\": [0, 1, 0] }");
+  if (grasp.present()) {
+    grasp.know({"direction", "bending_axis"});
+    const auto direction = grasp.direction("direction", "where the rope leaves the gripper, base frame");
+    const auto axis = grasp.direction("bending_axis", "the axis of planar bending, base frame");
+    if (direction && axis) {
+      if (std::abs(direction->dot(*axis)) > kPerpendicular)
+        grasp.problem("bending_axis", "is not perpendicular to direction", "choose an axis across the rope");
+      capture.direction = *direction;
+      capture.bending_axis = (*axis - direction->dot(*axis) * *direction).normalized();
+    }
+  }
+
+  const Reader table = top.child("table", capture.tabletop, "{ \"point\": [0, 0, 0], \"normal\": [0, 0, 1] }");
+  if (table.present()) {
+    table.know({"point", "normal"});
+    const auto point = table.vector("point", true, "a point of the table, world frame");
+    const auto normal = table.direction("normal", "the table's upward normal, world frame");
+    if (!capture.tabletop)
+      top.doubt("table", "is ignored in free space");
+    else if (point && normal)
+      capture.table = Table{*point, *normal};
+  }
+
+  const auto base = top.path("base", true, "\"base.tum\"");
+  const Json* cameras = top.find("cameras", true, "a list of cameras");
+  if (cameras && (!cameras->is_array() || cameras->empty())) {
+    top.problem("cameras", "is not a list of at least one camera", "describe every camera as an object");
+    cameras = nullptr;
+  }
+  std::set<std::string> names;
+  std::string all_names;
+  for (std::size_t c = 0; cameras && c < cameras->size(); ++c) {
+    const std::string where = file + ": cameras[" + std::to_string(c) + "]";
+    const Json& value = (*cameras)[c];
+    if (!value.is_object()) {
+      findings.problems.push_back({where, "is not an object", "describe every camera as an object"});
+      continue;
+    }
+    const auto name = value.find("name");
+    const std::string given = name != value.end() && name->is_string() ? name->get<std::string>() : "";
+    all_names.append(c ? ", " : "").append(given);
+    if (!given.empty() && !names.insert(given).second)
+      findings.problems.push_back({where + ".name", "'" + given + "' is used twice", "give every camera its own name"});
+    if (!camera.empty() && given != camera) continue;
+    manifest.cameras.push_back(read_camera(Reader(&value, where, findings), where, capture.folder));
+  }
+  if (!camera.empty() && cameras && manifest.cameras.empty())
+    findings.problems.push_back({file, "has no camera '" + camera + "'", "choose one of " + all_names});
+
+  survey(manifest, masked, findings);
+  if (base) read_base(manifest, capture.folder / *base, findings);
+  for (const CameraSource& source : manifest.cameras) {
+    capture.cameras.push_back(source.camera);
+    capture.times.push_back(source.times);
+    capture.has_depth = capture.has_depth || source.depth.has_value();
+  }
+  capture.hash = capture_hash(text, manifest, base ? capture.folder / *base : Path());
+  return manifest;
+}
+
+}  // namespace chainsplat::capture

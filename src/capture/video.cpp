@@ -1,0 +1,337 @@
+// Videos through libav: decoding frame by frame, counting, encoding.
+extern "C" {
+#include <libavcodec/avcodec.h>
+#include <libavformat/avformat.h>
+#include <libavutil/opt.h>
+#include <libswscale/swscale.h>
+}
+
+#include <unistd.h>
+
+#include <cstring>
+#include <mutex>
+
+#include "chainsplat/capture.h"
+
+namespace chainsplat::capture {
+
+namespace {
+
+struct Free {
+  void operator()(AVFormatContext* c) const { avformat_close_input(&c); }
+  void operator()(AVCodecContext* c) const { avcodec_free_context(&c); }
+  void operator()(AVFrame* f) const { av_frame_free(&f); }
+  void operator()(AVPacket* p) const { av_packet_free(&p); }
+  void operator()(SwsContext* s) const { sws_freeContext(s); }
+};
+template <class T>
+using Owned = std::unique_ptr<T, Free>;
+
+constexpr int kMostPixels = 1 << 28;  // refuse sizes that only a damaged header claims
+
+std::string error_text(int code) {
+  char text[AV_ERROR_MAX_STRING_SIZE] = {};
+  av_strerror(code, text, sizeof text);
+  return text;
+}
+
+// libav writes to standard error by default; the library does not print.
+void silence() {
+  static std::once_flag once;
+  std::call_once(once, [] { av_log_set_level(AV_LOG_QUIET); });
+}
+
+struct Opened {
+  Owned<AVFormatContext> format;
+  int stream = 0;
+  const AVStream& video() const { return *format->streams[stream]; }
+};
+
+Opened open_video(const Path& file) {
+  silence();
+  std::error_code error;
+  if (!std::filesystem::exists(file, error)) throw InputError(file.string(), "does not exist", "check the path");
+  AVFormatContext* raw = nullptr;
+  int code = avformat_open_input(&raw, file.c_str(), nullptr, nullptr);
+  if (code < 0)
+    throw InputError(file.string(), "is not a readable video (" + error_text(code) + ")",
+                     "write it again, or name an image pattern like cam0/%06d.png");
+  Opened opened{Owned<AVFormatContext>(raw), 0};
+  code = avformat_find_stream_info(raw, nullptr);
+  if (code >= 0) code = av_find_best_stream(raw, AVMEDIA_TYPE_VIDEO, -1, -1, nullptr, 0);
+  if (code < 0) throw InputError(file.string(), "has no video stream", "write it again");
+  opened.stream = code;
+  return opened;
+}
+
+bool full_range(const AVFrame& frame) {
+  switch (frame.format) {
+    case AV_PIX_FMT_YUVJ420P:
+    case AV_PIX_FMT_YUVJ422P:
+    case AV_PIX_FMT_YUVJ444P:
+    case AV_PIX_FMT_YUVJ440P: return true;
+    default: return frame.color_range == AVCOL_RANGE_JPEG;
+  }
+}
+
+// An untagged stream is BT.601; the numbers of AVColorSpace and SWS_CS_* are the same.
+int matrix(AVColorSpace space) {
+  switch (space) {
+    case AVCOL_SPC_BT709:
+    case AVCOL_SPC_FCC:
+    case AVCOL_SPC_SMPTE240M:
+    case AVCOL_SPC_BT2020_NCL:
+    case AVCOL_SPC_BT2020_CL: return space;
+    default: return SWS_CS_ITU601;
+  }
+}
+
+}  // namespace
+
+struct VideoReader::Implementation {
+  Path file;
+  Opened input;
+  Owned<AVCodecContext> decoder;
+  Owned<AVFrame> frame{av_frame_alloc()};
+  Owned<AVPacket> packet{av_packet_alloc()};
+  Owned<SwsContext> scaler;
+  int scaler_width = 0, scaler_height = 0, scaler_format = -1, scaler_matrix = -1;
+  bool scaler_full = false, at_end = false;
+  int frames = 0;
+
+  bool decode();
+  void convert(Image8& rgb);
+};
+
+VideoReader::VideoReader(const Path& file, int threads) : implementation_(std::make_unique<Implementation>()) {
+  Implementation& self = *implementation_;
+  self.file = file;
+  self.input = open_video(file);
+  const AVCodecParameters& parameters = *self.input.video().codecpar;
+  const AVCodec* codec = avcodec_find_decoder(parameters.codec_id);
+  if (!codec)
+    throw InputError(file.string(), std::string("no decoder for ") + avcodec_get_name(parameters.codec_id),
+                     "write it as H.264");
+  self.decoder.reset(avcodec_alloc_context3(codec));
+  avcodec_parameters_to_context(self.decoder.get(), &parameters);
+  self.decoder->thread_count = std::max(1, threads);
+  self.decoder->pkt_timebase = self.input.video().time_base;
+  const int code = avcodec_open2(self.decoder.get(), codec, nullptr);
+  if (code < 0) throw InputError(file.string(), "cannot be decoded (" + error_text(code) + ")", "write it as H.264");
+}
+
+VideoReader::~VideoReader() = default;
+VideoReader::VideoReader(VideoReader&&) noexcept = default;
+VideoReader& VideoReader::operator=(VideoReader&&) noexcept = default;
+
+// Decodes the next frame in display order into `frame`; false at the end.
+bool VideoReader::Implementation::decode() {
+  for (;;) {
+    int code = avcodec_receive_frame(decoder.get(), frame.get());
+    if (code >= 0) return true;
+    if (code == AVERROR_EOF) return false;
+    if (code == AVERROR(EAGAIN) && !at_end) {
+      code = av_read_frame(input.format.get(), packet.get());
+      if (code == AVERROR_EOF) {
+        at_end = true;
+        avcodec_send_packet(decoder.get(), nullptr);
+        continue;
+      }
+      if (code >= 0) {
+        if (packet->stream_index == input.stream) code = avcodec_send_packet(decoder.get(), packet.get());
+        av_packet_unref(packet.get());
+      }
+    }
+    if (code < 0)
+      throw InputError(file.string() + ": frame " + std::to_string(frames), "cannot be decoded (" + error_text(code) + ")",
+                       "write the video again");
+  }
+}
+
+void VideoReader::Implementation::convert(Image8& rgb) {
+  const int width = frame->width, height = frame->height;
+  if (width <= 0 || height <= 0 || static_cast<std::int64_t>(width) * height > kMostPixels)
+    throw InputError(file.string(), "claims frames of " + std::to_string(width) + "x" + std::to_string(height) + " pixels",
+                     "write the video again");
+  const int coefficients = matrix(frame->colorspace);
+  const bool full = full_range(*frame);
+  if (!scaler || width != scaler_width || height != scaler_height || frame->format != scaler_format ||
+      coefficients != scaler_matrix || full != scaler_full) {
+    scaler_width = width;
+    scaler_height = height;
+    scaler_format = frame->format;
+    scaler_matrix = coefficients;
+    scaler_full = full;
+    // flags: exactly the default. Others move colors at chroma edges by up to 200 levels
+    scaler.reset(sws_getContext(width, height, static_cast<AVPixelFormat>(frame->format), width, height, AV_PIX_FMT_RGB24,
+                                SWS_BICUBIC, nullptr, nullptr, nullptr));
+    if (!scaler) throw InputError(file.string(), "has a pixel format without a way to RGB", "write it as yuv420p");
+    constexpr int kOne = 1 << 16;  // libswscale's fixed point
+    sws_setColorspaceDetails(scaler.get(), sws_getCoefficients(coefficients), full, sws_getCoefficients(SWS_CS_DEFAULT), 1, 0,
+                             kOne, kOne);
+  }
+  rgb.width = width;
+  rgb.height = height;
+  rgb.channels = 3;
+  rgb.pixels.resize(static_cast<std::size_t>(width) * height * 3);
+  std::uint8_t* planes[] = {rgb.pixels.data()};
+  const int strides[] = {3 * width};
+  sws_scale(scaler.get(), frame->data, frame->linesize, 0, height, planes, strides);
+}
+
+bool VideoReader::next(Image8& rgb) {
+  if (!implementation_->decode()) return false;
+  implementation_->convert(rgb);
+  ++implementation_->frames;
+  return true;
+}
+
+bool VideoReader::skip() {
+  if (!implementation_->decode()) return false;
+  ++implementation_->frames;
+  return true;
+}
+
+VideoFacts video_facts(const Path& file) {
+  Opened input = open_video(file);
+  const AVStream& video = input.video();
+  VideoFacts facts;
+  facts.width = video.codecpar->width;
+  facts.height = video.codecpar->height;
+  const AVRational rate = video.avg_frame_rate;
+  facts.rate = rate.num > 0 && rate.den > 0 ? av_q2d(rate) : 0.0;
+  Owned<AVPacket> packet(av_packet_alloc());
+  while (av_read_frame(input.format.get(), packet.get()) >= 0) {
+    if (packet->stream_index == input.stream && !(packet->flags & AV_PKT_FLAG_DISCARD)) ++facts.frames;
+    av_packet_unref(packet.get());
+  }
+  return facts;
+}
+
+void write_video(const Path& file, double rate, const std::vector<Image8>& frames) {
+  silence();
+  CHAINSPLAT_CHECK(!frames.empty() && rate > 0.0, file.string());
+  const int width = frames.front().width, height = frames.front().height;
+  for (const Image8& frame : frames)
+    CHAINSPLAT_CHECK(frame.width == width && frame.height == height && frame.channels >= 3, "frames of one size, RGB or RGBA");
+  const auto fail = [&](const std::string& what, int code) {
+    throw WorkError(file.string(), what + (code < 0 ? " (" + error_text(code) + ")" : ""),
+                    "check the folder, the free space and the encoders of libav");
+  };
+
+  // quality close to lossless for the eye; the noise of a camera stays visible
+  constexpr const char* kX264Quality = "16";
+  constexpr int kMpeg4Quality = 3;
+  const bool even = width % 2 == 0 && height % 2 == 0;
+  const AVCodec* codec = avcodec_find_encoder_by_name("libx264");
+  const bool x264 = codec != nullptr;
+  if (!codec) codec = avcodec_find_encoder(AV_CODEC_ID_MPEG4);
+  if (!codec) fail("no video encoder in libav", 0);
+  if (!even && !x264) fail("an odd size needs libx264", 0);
+
+  Owned<AVCodecContext> encoder(avcodec_alloc_context3(codec));
+  const AVRational frame_rate = av_d2q(rate, 1001000);
+  encoder->width = width;
+  encoder->height = height;
+  encoder->pix_fmt = even ? AV_PIX_FMT_YUV420P : AV_PIX_FMT_YUV444P;  // half-size chroma has no odd sizes
+  encoder->time_base = av_inv_q(frame_rate);
+  encoder->framerate = frame_rate;
+  encoder->color_range = AVCOL_RANGE_MPEG;
+  encoder->colorspace = AVCOL_SPC_SMPTE170M;  // BT.601
+  encoder->color_primaries = AVCOL_PRI_SMPTE170M;
+  encoder->color_trc = AVCOL_TRC_SMPTE170M;
+  encoder->thread_count = 1;  // x264's bits depend on it
+  encoder->flags |= AV_CODEC_FLAG_GLOBAL_HEADER | AV_CODEC_FLAG_BITEXACT;
+  if (x264) {
+    av_opt_set(encoder->priv_data, "crf", kX264Quality, 0);
+    av_opt_set(encoder->priv_data, "preset", "medium", 0);
+  } else {
+    encoder->flags |= AV_CODEC_FLAG_QSCALE;
+    encoder->global_quality = FF_QP2LAMBDA * kMpeg4Quality;
+  }
+  int code = avcodec_open2(encoder.get(), codec, nullptr);
+  if (code < 0) fail("the encoder refuses", code);
+
+  const Path temporary = file.string() + ".tmp" + std::to_string(::getpid());
+  AVFormatContext* raw = nullptr;
+  code = avformat_alloc_output_context2(&raw, nullptr, "mp4", temporary.c_str());
+  if (code < 0) fail("no mp4 writer in libav", code);
+  struct FreeOutput {
+    void operator()(AVFormatContext* c) const {
+      if (c->pb) avio_closep(&c->pb);
+      avformat_free_context(c);
+    }
+  };
+  std::unique_ptr<AVFormatContext, FreeOutput> output(raw);
+  output->flags |= AVFMT_FLAG_BITEXACT;  // no version and no date inside
+  const auto clean = [&](const std::string& what, int reason) {
+    output.reset();
+    ::unlink(temporary.c_str());
+    fail(what, reason);
+  };
+  AVStream* stream = avformat_new_stream(raw, nullptr);
+  stream->time_base = encoder->time_base;
+  stream->avg_frame_rate = frame_rate;
+  avcodec_parameters_from_context(stream->codecpar, encoder.get());
+  code = avio_open(&raw->pb, temporary.c_str(), AVIO_FLAG_WRITE);
+  if (code < 0) clean("cannot be opened for writing", code);
+  code = avformat_write_header(raw, nullptr);
+  if (code < 0) clean("writing failed", code);
+
+  Owned<AVFrame> picture(av_frame_alloc());
+  picture->width = width;
+  picture->height = height;
+  picture->format = encoder->pix_fmt;
+  picture->color_range = encoder->color_range;
+  picture->colorspace = encoder->colorspace;
+  code = av_frame_get_buffer(picture.get(), 0);
+  if (code < 0) clean("no memory", code);
+  const AVPixelFormat source = frames.front().channels == 3 ? AV_PIX_FMT_RGB24 : AV_PIX_FMT_RGBA;
+  Owned<SwsContext> scaler(sws_getContext(width, height, source, width, height, encoder->pix_fmt, SWS_BICUBIC, nullptr,
+                                          nullptr, nullptr));
+  if (!scaler) clean("no way from RGB to the encoder's format", 0);
+  constexpr int kOne = 1 << 16;
+  sws_setColorspaceDetails(scaler.get(), sws_getCoefficients(SWS_CS_DEFAULT), 1, sws_getCoefficients(SWS_CS_ITU601), 0, 0, kOne,
+                           kOne);
+
+  Owned<AVPacket> packet(av_packet_alloc());
+  const auto drain = [&] {
+    for (;;) {
+      int got = avcodec_receive_packet(encoder.get(), packet.get());
+      if (got == AVERROR(EAGAIN) || got == AVERROR_EOF) return;
+      if (got >= 0) {
+        packet->stream_index = stream->index;
+        packet->duration = 1;
+        av_packet_rescale_ts(packet.get(), encoder->time_base, stream->time_base);
+        got = av_interleaved_write_frame(raw, packet.get());
+      }
+      if (got < 0) clean("writing failed", got);
+    }
+  };
+  for (std::size_t k = 0; k < frames.size(); ++k) {
+    code = av_frame_make_writable(picture.get());
+    if (code < 0) clean("no memory", code);
+    const std::uint8_t* const planes[] = {frames[k].pixels.data()};
+    const int strides[] = {frames[k].channels * width};
+    sws_scale(scaler.get(), planes, strides, 0, height, picture->data, picture->linesize);
+    picture->pts = static_cast<std::int64_t>(k);
+    code = avcodec_send_frame(encoder.get(), picture.get());
+    if (code < 0) clean("encoding failed", code);
+    drain();
+  }
+  code = avcodec_send_frame(encoder.get(), nullptr);
+  if (code < 0) clean("encoding failed", code);
+  drain();
+  code = av_write_trailer(raw);
+  if (code >= 0) code = avio_closep(&raw->pb);
+  if (code < 0) clean("writing failed", code);
+  output.reset();
+  std::error_code error;
+  std::filesystem::rename(temporary, file, error);
+  if (error) {
+    ::unlink(temporary.c_str());
+    fail("renaming failed (" + error.message() + ")", 0);
+  }
+}
+
+}  // namespace chainsplat::capture

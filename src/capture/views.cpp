@@ -1,0 +1,331 @@
+// Decoding, masking, undistorting and cropping: from the files of a capture to its views.
+#include <algorithm>
+#include <cmath>
+
+#include "image_files.h"
+#include "manifest.h"
+
+namespace chainsplat::capture {
+
+using math::Vector2;
+
+namespace {
+
+constexpr std::uint8_t kInside = 128;   // mask values from here on are object (INTERFACE 2)
+// Without masks, what is brighter than this in any channel is object. Lossy coding does not keep black black.
+constexpr std::uint8_t kBlackLossless = 0, kBlackLossy = 16;
+constexpr double kMostCovered = 0.5;    // of an image: more means that nothing was masked
+
+using Pixels = std::vector<std::uint8_t>;
+
+struct Bounds {
+  int x0 = 0, y0 = 0, x1 = 0, y1 = 0;  // [x0, x1) x [y0, y1)
+  bool empty() const { return x1 <= x0 || y1 <= y0; }
+};
+
+Bounds grown(const Bounds& bounds, int margin, int width, int height) {
+  return {std::max(0, bounds.x0 - margin), std::max(0, bounds.y0 - margin), std::min(width, bounds.x1 + margin),
+          std::min(height, bounds.y1 + margin)};
+}
+
+// Of the pixels that are inside.
+Bounds bounds_of(const std::uint8_t* mask, int width, int height) {
+  Bounds bounds{width, height, 0, 0};
+  const auto inside = [](std::uint8_t value) { return value >= kInside; };
+  for (int y = 0; y < height; ++y) {
+    const std::uint8_t* const row = mask + static_cast<std::size_t>(y) * width;
+    const std::uint8_t* const first = std::find_if(row, row + width, inside);
+    if (first == row + width) continue;
+    int last = width;
+    while (!inside(row[last - 1])) --last;
+    bounds.x0 = std::min(bounds.x0, static_cast<int>(first - row));
+    bounds.x1 = std::max(bounds.x1, last);
+    bounds.y0 = std::min(bounds.y0, y);
+    bounds.y1 = y + 1;
+  }
+  return bounds;
+}
+
+// Bilinear sample at a pixel position (centers at +0.5) of channel `channel`. Outside: the nearest pixel's value.
+double sample(const std::uint8_t* image, int width, int height, int channels, int channel, const Vector2& position) {
+  const double x = std::clamp(position.x() - 0.5, 0.0, width - 1.0), y = std::clamp(position.y() - 0.5, 0.0, height - 1.0);
+  const int x0 = static_cast<int>(x), y0 = static_cast<int>(y);
+  const int x1 = std::min(x0 + 1, width - 1), y1 = std::min(y0 + 1, height - 1);
+  const double fx = x - x0, fy = y - y0;
+  const auto at = [&](int column, int row) {
+    return static_cast<double>(image[(static_cast<std::size_t>(row) * width + column) * channels + channel]);
+  };
+  return (1 - fy) * ((1 - fx) * at(x0, y0) + fx * at(x1, y0)) + fy * ((1 - fx) * at(x0, y1) + fx * at(x1, y1));
+}
+
+bool recorded(const Camera& camera, const Vector2& position) {
+  return position.x() >= 0 && position.y() >= 0 && position.x() <= camera.width && position.y() <= camera.height;
+}
+
+Vector2 center(int x, int y) { return {x + 0.5, y + 0.5}; }
+
+// A rectangle of undistorted pixels that holds everything the recorded rectangle shows: its border maps to the border.
+Bounds undistorted_bounds(const Camera& camera, const Bounds& bounds) {
+  constexpr int kStep = 8;   // px between border points
+  constexpr int kSlack = 2;  // px, for the curve between them and the bilinear footprint
+  Vector2 low(1e9, 1e9), high(-1e9, -1e9);
+  const auto include = [&](double x, double y) {
+    const Vector2 p = undistort(camera, {x, y});
+    low = low.cwiseMin(p);
+    high = high.cwiseMax(p);
+  };
+  for (int x = bounds.x0; x < bounds.x1 + kStep; x += kStep)
+    for (const int y : {bounds.y0, bounds.y1}) include(std::min(x, bounds.x1), y);
+  for (int y = bounds.y0; y < bounds.y1 + kStep; y += kStep)
+    for (const int x : {bounds.x0, bounds.x1}) include(x, std::min(y, bounds.y1));
+  const auto whole = [](double value, int size) { return static_cast<int>(std::clamp(value, 0.0, static_cast<double>(size))); };
+  return {whole(std::floor(low.x()) - kSlack, camera.width), whole(std::floor(low.y()) - kSlack, camera.height),
+          whole(std::ceil(high.x()) + kSlack, camera.width), whole(std::ceil(high.y()) + kSlack, camera.height)};
+}
+
+// Sets the crop and its alpha from a full recorded mask.
+void cut_mask(View& view, const Camera& camera, const Pixels& mask, bool undistorting, int margin) {
+  Bounds bounds = bounds_of(mask.data(), camera.width, camera.height);
+  if (bounds.empty()) return;
+  Pixels straight;  // the undistorted mask inside `region`
+  Bounds region;
+  if (undistorting) {
+    region = undistorted_bounds(camera, bounds);
+    const int width = region.x1 - region.x0, height = region.y1 - region.y0;
+    if (region.empty()) return;
+    straight.assign(static_cast<std::size_t>(width) * height, 0);
+    for (int y = 0; y < height; ++y)
+      for (int x = 0; x < width; ++x) {
+        const Vector2 position = distort(camera, center(region.x0 + x, region.y0 + y));
+        if (recorded(camera, position) && sample(mask.data(), camera.width, camera.height, 1, 0, position) >= kInside)
+          straight[static_cast<std::size_t>(y) * width + x] = 255;
+      }
+    bounds = bounds_of(straight.data(), width, height);
+    if (bounds.empty()) return;
+    bounds = {bounds.x0 + region.x0, bounds.y0 + region.y0, bounds.x1 + region.x0, bounds.y1 + region.y0};
+  }
+  const Bounds crop = grown(bounds, margin, camera.width, camera.height);
+  view.x0 = crop.x0;
+  view.y0 = crop.y0;
+  view.width = crop.x1 - crop.x0;
+  view.height = crop.y1 - crop.y0;
+  view.rgba.assign(static_cast<std::size_t>(4) * view.width * view.height, 0);
+  for (int y = bounds.y0; y < bounds.y1; ++y)
+    for (int x = bounds.x0; x < bounds.x1; ++x) {
+      const bool inside =
+          undistorting ? straight[static_cast<std::size_t>(y - region.y0) * (region.x1 - region.x0) + x - region.x0] != 0
+                       : mask[static_cast<std::size_t>(y) * camera.width + x] >= kInside;
+      if (inside) view.rgba[4 * (static_cast<std::size_t>(y - crop.y0) * view.width + x - crop.x0) + 3] = 255;
+    }
+}
+
+// Colors of the pixels inside the mask. The unmasked image is sampled, so that edges are not darkened.
+void fill_color(View& view, const Camera& camera, const Pixels& rgb, bool undistorting) {
+  for (int y = 0; y < view.height; ++y)
+    for (int x = 0; x < view.width; ++x) {
+      std::uint8_t* const out = &view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x)];
+      if (out[3] == 0) continue;
+      if (undistorting) {
+        const Vector2 position = distort(camera, center(view.x0 + x, view.y0 + y));
+        for (int c = 0; c < 3; ++c)
+          out[c] = static_cast<std::uint8_t>(std::lround(sample(rgb.data(), camera.width, camera.height, 3, c, position)));
+      } else {
+        std::copy_n(&rgb[3 * (static_cast<std::size_t>(view.y0 + y) * camera.width + view.x0 + x)], 3, out);
+      }
+    }
+}
+
+// The nearest recorded pixel: depth is not blended across edges.
+void fill_depth(View& view, const Camera& camera, const std::vector<float>& depth, bool undistorting) {
+  view.depth.assign(static_cast<std::size_t>(view.width) * view.height, 0.0f);
+  for (int y = 0; y < view.height; ++y)
+    for (int x = 0; x < view.width; ++x) {
+      Vector2 position = center(view.x0 + x, view.y0 + y);
+      if (undistorting) position = distort(camera, position);
+      const int column = static_cast<int>(std::floor(position.x())), row = static_cast<int>(std::floor(position.y()));
+      if (column < 0 || row < 0 || column >= camera.width || row >= camera.height) continue;
+      view.depth[static_cast<std::size_t>(y) * view.width + x] = depth[static_cast<std::size_t>(row) * camera.width + column];
+    }
+}
+
+void require_size(const CameraSource& source, const ImageSource& video, const Image8& image) {
+  if (image.width != source.camera.width || image.height != source.camera.height)
+    throw InputError(video.file.string(),
+                     "is " + std::to_string(image.width) + "x" + std::to_string(image.height) + " pixels, the camera has " +
+                         std::to_string(source.camera.width) + "x" + std::to_string(source.camera.height),
+                     "correct width and height in capture.json or the video");
+}
+
+void require_frame(const ImageSource& video, bool got, int frame) {
+  if (!got)
+    throw InputError(video.file.string(), "ends before frame " + std::to_string(frame) + " of " + std::to_string(video.frames),
+                     "write the video again");
+}
+
+Pixels gray_of(const Image8& rgb) {
+  Pixels gray(rgb.pixels.size() / 3);
+  for (std::size_t i = 0; i < gray.size(); ++i)
+    gray[i] = static_cast<std::uint8_t>((rgb.pixels[3 * i] + rgb.pixels[3 * i + 1] + rgb.pixels[3 * i + 2]) / 3);
+  return gray;
+}
+
+Pixels bright(const Pixels& rgb, std::uint8_t black) {
+  Pixels mask(rgb.size() / 3);
+  for (std::size_t i = 0; i < mask.size(); ++i)
+    mask[i] = std::max({rgb[3 * i], rgb[3 * i + 1], rgb[3 * i + 2]}) > black ? 255 : 0;
+  return mask;
+}
+
+// The frames [first, last) of one camera whose images are a video; `views` is theirs.
+void load_video_frames(const CameraSource& source, const LoadOptions& options, int first, int last, bool undistorting,
+                       int threads, View* views) {
+  const Camera& camera = source.camera;
+  VideoReader images(source.images.file, threads);
+  std::optional<VideoReader> masks;
+  if (options.masked && source.masks && source.masks->video) masks.emplace(source.masks->file, threads);
+  for (int k = 0; k < first; ++k) {
+    require_frame(source.images, images.skip(), k);
+    if (masks) require_frame(*source.masks, masks->skip(), k);
+  }
+  Image8 image, mask;
+  for (int k = first; k < last; ++k) {
+    require_frame(source.images, images.next(image), k);
+    require_size(source, source.images, image);
+    View& view = views[k - first];
+    if (masks) {
+      require_frame(*source.masks, masks->next(mask), k);
+      require_size(source, *source.masks, mask);
+      cut_mask(view, camera, gray_of(mask), undistorting, options.margin);
+    } else if (options.masked && !source.masks) {
+      cut_mask(view, camera, bright(image.pixels, kBlackLossy), undistorting, options.margin);
+    }
+    fill_color(view, camera, image.pixels, undistorting);
+  }
+}
+
+void load_mask_video(const CameraSource& source, const LoadOptions& options, int first, int last, bool undistorting, int threads,
+                     View* views) {
+  VideoReader masks(source.masks->file, threads);
+  for (int k = 0; k < first; ++k) require_frame(*source.masks, masks.skip(), k);
+  Image8 mask;
+  for (int k = first; k < last; ++k) {
+    require_frame(*source.masks, masks.next(mask), k);
+    require_size(source, *source.masks, mask);
+    cut_mask(views[k - first], source.camera, gray_of(mask), undistorting, options.margin);
+  }
+}
+
+bool lossless(const ImageSource& images) {
+  return images.suffix.ends_with(".png") || images.suffix.ends_with(".PNG") || images.suffix.ends_with(".bmp") ||
+         images.suffix.ends_with(".tif") || images.suffix.ends_with(".tiff");
+}
+
+}  // namespace
+
+void load_views(const Manifest& manifest, const LoadOptions& options, Findings& findings, std::vector<View>& views) {
+  struct Range {
+    int first = 0, last = 0;
+    std::size_t offset = 0;
+    bool undistorting = false;
+  };
+  std::vector<Range> ranges;
+  struct Frame {
+    int camera, frame;
+  };
+  std::vector<Frame> frames;
+  views.clear();
+  for (int c = 0; c < static_cast<int>(manifest.cameras.size()); ++c) {
+    const CameraSource& source = manifest.cameras[c];
+    Range range;
+    range.last = options.last < 0 ? source.images.frames : std::min(options.last, source.images.frames);
+    range.first = std::clamp(options.first, 0, range.last);
+    range.offset = views.size();
+    range.undistorting = options.undistort && source.camera.distorted();
+    ranges.push_back(range);
+    for (int k = range.first; k < range.last; ++k) {
+      frames.push_back({c, k});
+      View view;
+      view.camera = c;
+      view.frame = k;
+      view.time = source.times[k];
+      if (!options.masked) {
+        view.width = source.camera.width;
+        view.height = source.camera.height;
+        view.rgba.assign(static_cast<std::size_t>(4) * view.width * view.height, 255);
+      }
+      views.push_back(std::move(view));
+    }
+    if (options.masked && !source.masks)
+      findings.doubts.push_back(source.where + ".masks: is missing; the images are taken as masked already (black background)");
+  }
+  const auto total = static_cast<std::int64_t>(frames.size());
+  const auto view_of = [&](const Frame& f) -> View& { return views[ranges[f.camera].offset + f.frame - ranges[f.camera].first]; };
+
+  // masks by file first: they say which part of an image is kept
+  core::parallel_for(total, [&](std::int64_t i) {
+    const CameraSource& source = manifest.cameras[frames[i].camera];
+    if (!options.masked || !source.masks || source.masks->video) return;
+    const Pixels mask = read_mask(source.masks->frame_file(frames[i].frame), source.camera.width, source.camera.height);
+    cut_mask(view_of(frames[i]), source.camera, mask, ranges[frames[i].camera].undistorting, options.margin);
+  });
+  // videos: one camera a task. Fewer cameras than threads: the decoders use the rest (their output does not depend on it)
+  const int cameras = static_cast<int>(manifest.cameras.size());
+  const int decoder_threads = std::max(1, (core::threads() + cameras - 1) / std::max(1, cameras));
+  core::parallel_for(cameras, [&](std::int64_t c) {
+    const CameraSource& source = manifest.cameras[c];
+    const Range& range = ranges[c];
+    if (range.first == range.last) return;
+    View* const mine = views.data() + range.offset;
+    if (source.images.video)
+      load_video_frames(source, options, range.first, range.last, range.undistorting, decoder_threads, mine);
+    else if (options.masked && source.masks && source.masks->video)
+      load_mask_video(source, options, range.first, range.last, range.undistorting, decoder_threads, mine);
+  });
+  // images and depth by file
+  core::parallel_for(total, [&](std::int64_t i) {
+    const CameraSource& source = manifest.cameras[frames[i].camera];
+    const bool undistorting = ranges[frames[i].camera].undistorting;
+    View& view = view_of(frames[i]);
+    if (!source.images.video) {
+      const Pixels rgb = read_rgb(source.images.frame_file(frames[i].frame), source.camera.width, source.camera.height);
+      if (options.masked && !source.masks)
+        cut_mask(view, source.camera, bright(rgb, lossless(source.images) ? kBlackLossless : kBlackLossy), undistorting,
+                 options.margin);
+      fill_color(view, source.camera, rgb, undistorting);
+    }
+    if (options.depth && source.depth)
+      fill_depth(view, source.camera,
+                 read_depth(source.depth->frame_file(frames[i].frame), source.camera.width, source.camera.height,
+                            source.depth_scale),
+                 undistorting);
+  });
+
+  if (!options.masked) return;
+  for (int c = 0; c < cameras; ++c) {
+    const CameraSource& source = manifest.cameras[c];
+    const Range& range = ranges[c];
+    if (range.first == range.last) continue;
+    int seen = 0;
+    double covered = 0.0;
+    for (int k = range.first; k < range.last; ++k) {
+      const View& view = views[range.offset + k - range.first];
+      seen += view.width > 0;
+      for (std::size_t i = 3; i < view.rgba.size(); i += 4) covered += view.rgba[i] != 0;
+    }
+    covered /= static_cast<double>(range.last - range.first) * source.camera.width * source.camera.height;
+    if (covered > kMostCovered)
+      findings.problems.push_back(
+          {source.where + ".masks", source.masks ? "the masks cover more than half of the image"
+                                                 : "is missing and the background of the images is not black",
+           source.masks ? "the object must be 255 and the rest 0" : "make masks (chainsplat mask) and name them"});
+    if (seen == 0) {
+      const std::string what = source.camera.name + " never sees the object: every mask is empty";
+      if (range.first == 0 && range.last == source.images.frames)
+        findings.problems.push_back({source.where + ".masks", what, "mend the masks or remove the camera"});
+      else
+        findings.doubts.push_back(source.where + ".masks: " + what + " in the frames asked for");
+    }
+  }
+}
+
+}  // namespace chainsplat::capture

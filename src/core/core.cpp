@@ -1,0 +1,164 @@
+#include "chainsplat/core.h"
+
+#include <fcntl.h>
+#include <unistd.h>
+
+#include <atomic>
+#include <cerrno>
+#include <charconv>
+#include <chrono>
+#include <cmath>
+#include <cstring>
+#include <exception>
+#include <fstream>
+#include <mutex>
+#include <sstream>
+#include <thread>
+
+namespace chainsplat::core {
+
+namespace {
+
+std::mutex listener_mutex;
+Listener current_listener;
+std::atomic<int> stop_signal{0};
+std::atomic<int> thread_count{0};
+
+}  // namespace
+
+void check_failed(const char* condition, const char* file, int line, const std::string& values) {
+  std::ostringstream text;
+  text << file << ":" << line << ": broken promise: " << condition << " (" << values << ")";
+  throw std::logic_error(text.str());
+}
+
+void set_listener(Listener listener) {
+  std::lock_guard lock(listener_mutex);
+  current_listener = std::move(listener);
+}
+
+void warn(const std::string& line) {
+  std::lock_guard lock(listener_mutex);
+  if (current_listener.warning) current_listener.warning(line);
+}
+
+void report(const Progress& progress) {
+  std::lock_guard lock(listener_mutex);
+  if (current_listener.progress) current_listener.progress(progress);
+}
+
+void request_stop(int signal) noexcept { stop_signal.store(signal); }
+int stop_requested() noexcept { return stop_signal.load(); }
+void clear_stop() noexcept { stop_signal.store(0); }
+
+void set_threads(int threads) { thread_count.store(threads); }
+
+int threads() {
+  const int asked = thread_count.load();
+  return asked > 0 ? asked : std::max(1u, std::thread::hardware_concurrency());
+}
+
+void parallel_for(std::int64_t count, const std::function<void(std::int64_t)>& body) {
+  const int workers = static_cast<int>(std::min<std::int64_t>(count, threads()));
+  if (workers <= 1) {
+    for (std::int64_t i = 0; i < count; ++i) body(i);
+    return;
+  }
+  std::atomic<std::int64_t> next{0};
+  std::mutex failure_mutex;
+  std::exception_ptr failure;
+  auto work = [&] {
+    for (std::int64_t i = next++; i < count; i = next++) {
+      try {
+        body(i);
+      } catch (...) {
+        std::lock_guard lock(failure_mutex);
+        if (!failure) failure = std::current_exception();
+        next = count;
+      }
+    }
+  };
+  std::vector<std::jthread> pool;
+  for (int w = 1; w < workers; ++w) pool.emplace_back(work);
+  work();
+  pool.clear();  // joins
+  if (failure) std::rethrow_exception(failure);
+}
+
+void write_file(const Path& path, std::string_view bytes) {
+  const Path temporary = path.string() + ".tmp" + std::to_string(::getpid());
+  auto fail = [&](const char* what) {
+    const std::string reason = std::strerror(errno);
+    ::unlink(temporary.c_str());
+    throw WorkError(path.string(), std::string(what) + " failed (" + reason + ")",
+                    "make room or choose a folder that can be written");
+  };
+  const int file = ::open(temporary.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0644);
+  if (file < 0) fail("opening for writing");
+  std::size_t written = 0;
+  while (written < bytes.size()) {
+    const ssize_t n = ::write(file, bytes.data() + written, bytes.size() - written);
+    if (n < 0 && errno == EINTR) continue;
+    if (n <= 0) {
+      const int reason = errno;
+      ::close(file);
+      errno = reason;
+      fail("writing");
+    }
+    written += static_cast<std::size_t>(n);
+  }
+  if (::fsync(file) != 0) {
+    const int reason = errno;
+    ::close(file);
+    errno = reason;
+    fail("syncing");
+  }
+  ::close(file);
+  if (::rename(temporary.c_str(), path.c_str()) != 0) fail("renaming");
+}
+
+std::string read_file(const Path& path) {
+  std::error_code error;
+  if (std::filesystem::is_directory(path, error))
+    throw InputError(path.string(), "is a folder, not a file", "name a file");
+  std::ifstream file(path, std::ios::binary);
+  if (!file) throw InputError(path.string(), std::strerror(errno), "check the path and its permissions");
+  std::ostringstream text;
+  text << file.rdbuf();
+  if (file.bad()) throw InputError(path.string(), "cannot be read", "check the disk");
+  return std::move(text).str();
+}
+
+std::string exact(double value) {
+  if (std::isnan(value)) return "nan";
+  char text[40];
+  const auto end = std::to_chars(text, text + sizeof text, value);
+  return {text, end.ptr};
+}
+
+double seconds_now() {
+  return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
+
+std::uint64_t fnv1a(std::string_view bytes, std::uint64_t hash) {
+  constexpr std::uint64_t kPrime = 1099511628211ull;
+  for (const char byte : bytes) hash = (hash ^ static_cast<unsigned char>(byte)) * kPrime;
+  return hash;
+}
+
+std::uint64_t Random::next() {
+  std::uint64_t z = (state_ += 0x9e3779b97f4a7c15ull);
+  z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9ull;
+  z = (z ^ (z >> 27)) * 0x94d049bb133111ebull;
+  return z ^ (z >> 31);
+}
+
+double Random::uniform() { return static_cast<double>(next() >> 11) * 0x1.0p-53; }
+double Random::uniform(double low, double high) { return low + (high - low) * uniform(); }
+
+double Random::normal() {
+  const double radius = std::sqrt(-2.0 * std::log(1.0 - uniform()));
+  return radius * std::cos(6.283185307179586 * uniform());
+}
+
+}  // namespace chainsplat::core

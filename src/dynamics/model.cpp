@@ -1,0 +1,240 @@
+#include <cmath>
+#include <functional>
+
+#include "engine.h"
+
+namespace chainsplat::dynamics {
+namespace {
+
+void require(bool condition, const std::string& what, const std::string& mend) {
+  if (!condition) throw InputError("dynamics", what, mend);
+}
+
+void check_array(const std::vector<double>& values, int size, const char* name, bool may_be_negative = false) {
+  require(static_cast<int>(values.size()) == size,
+          std::string(name) + " has " + std::to_string(values.size()) + " entries", "give " + std::to_string(size));
+  for (double value : values)
+    require(std::isfinite(value) && (may_be_negative || value >= 0.0), std::string(name) + " is " + core::exact(value),
+            may_be_negative ? "give a finite number" : "give a number >= 0");
+}
+
+}  // namespace
+
+Model make_model(const chain::Chain& chain, const Parameters& p) {
+  const int links = chain.links() - 1, angles = chain.angles();
+  require(links >= 1 && angles >= 1, "the chain has no joint", "make it with at least one");
+  check_array(p.link_mass, links, "link_mass");
+  check_array(p.viscous_friction, links, "viscous_friction");
+  check_array(p.coulomb_friction, links, "coulomb_friction");
+  check_array(p.air_linear, links, "air_linear");
+  check_array(p.air_quadratic, links, "air_quadratic");
+  check_array(p.stiffness, angles, "stiffness");
+  check_array(p.rest_angle, angles, "rest_angle", true);
+  check_array(p.damping, angles, "damping");
+  check_array({p.tip_mass, p.radius}, 2, "tip_mass or radius");
+  check_array({p.coulomb_speed, p.drag_speed}, 2, "coulomb_speed or drag_speed");
+  require(p.coulomb_speed > 0.0 && p.drag_speed > 0.0, "a regularization speed is 0", "give a number > 0");
+  require(p.gravity.allFinite(), "gravity is not finite", "give three finite numbers");
+  require(p.substeps >= 1, "substeps is " + std::to_string(p.substeps), "give at least 1");
+
+  Model model;
+  model.chain = chain;
+  model.parameters = p;
+  if (p.table_normal) model.parameters.table_normal = p.table_normal->normalized();
+  for (int k = 0; k < angles; ++k) {
+    const int link = chain.child_link[k];
+    const math::Pose home{Matrix3::Identity(), chain.link_start(link) * chain.direction};
+    const Vector6 axis = math::transform_twist(home.inverse(), chain.axes[k]);
+    // of link_start: a joint's axes must meet in it
+    require(axis.tail<3>().norm() < 1e-9 * (1.0 + chain.length) && std::abs(axis.head<3>().norm() - 1.0) < 1e-9,
+            "axis " + std::to_string(k + 1) + " is no rotation about its joint", "use chain axes that pass through s_j d");
+    model.axis.push_back(axis);
+    model.home.push_back(home);
+    math::Matrix6 inertia = math::Matrix6::Zero();
+    if (chain.last_angle(link) == k) {
+      const auto add = [&](double mass, double center, double transverse, double axial) {
+        const RigidInertia body = world_inertia(mass, center, transverse, axial, Vector3::Zero(), chain.direction);
+        inertia.topLeftCorner<3, 3>() += body.rotational;
+        inertia.topRightCorner<3, 3>() += math::hat(body.moment);
+        inertia.bottomLeftCorner<3, 3>() -= math::hat(body.moment);
+        inertia.bottomRightCorner<3, 3>() += mass * Matrix3::Identity();
+      };
+      const double l = chain.link_end(link) - chain.link_start(link), m = p.link_mass[link - 1], r = p.radius;
+      add(m, 0.5 * l, m * (l * l / 12.0 + 0.25 * r * r), 0.5 * m * r * r);
+      if (link == links) add(p.tip_mass, l, 0.0, 0.0);
+    }
+    model.inertia.push_back(inertia);
+  }
+  return model;
+}
+
+trajectory::BaseMotion at_rest(const math::Pose& pose) {
+  trajectory::BaseMotion base;
+  base.pose = pose;
+  return base;
+}
+
+VectorX joint_law(const Model& model, const VectorX& theta, const VectorX& thetadot) {
+  VectorX torque(theta.size());
+  const Parameters& p = model.parameters;
+  for (Eigen::Index k = 0; k < theta.size(); ++k)
+    torque[k] = -p.stiffness[k] * (theta[k] - p.rest_angle[k]) - p.damping[k] * thetadot[k];
+  return torque;
+}
+
+VectorX inverse_dynamics(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
+                         const VectorX& thetadot, const VectorX& thetaddot) {
+  Engine engine(model);
+  engine.place(base, theta, thetadot, false);
+  engine.acceleration = thetaddot;
+  engine.inverse_torque();
+  return engine.inverse;
+}
+
+MatrixX mass_matrix(const Model& model, const VectorX& theta) {
+  Engine engine(model);
+  engine.place({}, theta, VectorX::Zero(theta.size()), false);
+  return engine.mass;
+}
+
+namespace {
+void factor_or_throw(Engine& engine) {
+  if (!engine.factor_mass())
+    throw WorkError("dynamics", "the mass matrix is not positive definite",
+                    "give every link mass, and a radius where it can twist");
+}
+}  // namespace
+
+VectorX forward_dynamics(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
+                         const VectorX& thetadot) {
+  Engine engine(model);
+  engine.place(base, theta, thetadot, false);
+  factor_or_throw(engine);
+  engine.accelerate();
+  return engine.acceleration;
+}
+
+VectorX forward_dynamics_articulated(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
+                                     const VectorX& thetadot) {
+  Engine engine(model);
+  engine.place(base, theta, thetadot, false);
+  engine.articulated_acceleration();
+  return engine.acceleration;
+}
+
+// Engine frames have world axes and the base origin: turn and shift into {i}.
+static MatrixX in_link_frames(const Engine& engine, bool wrenches) {
+  MatrixX out = MatrixX::Zero(6, engine.angles);
+  for (int j = 0; j < engine.link_count; ++j)
+    for (int k = engine.links[j].first_angle; k < engine.links[j].end_angle; ++k) {
+      const bool last = k + 1 == engine.links[j].end_angle;
+      const math::Pose frame{engine.rotation[k], engine.origin[j]};
+      if (wrenches) {
+        if (last) out.col(k) = math::adjoint(frame).transpose() * engine.wrench[j];
+      } else {
+        const Vector6 v = last ? engine.velocity[j] : engine.inner_velocity[k + 1];
+        out.col(k) = math::transform_twist(frame.inverse(), v);
+      }
+    }
+  return out;
+}
+
+MatrixX external_wrenches(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
+                          const VectorX& thetadot) {
+  Engine engine(model);
+  engine.place(base, theta, thetadot, false);
+  return in_link_frames(engine, true);
+}
+
+MatrixX body_twists(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
+                    const VectorX& thetadot) {
+  Engine engine(model);
+  engine.place(base, theta, thetadot, false);
+  return in_link_frames(engine, false);
+}
+
+Linearization linearize(const Model& model, const trajectory::BaseMotion& base, const Vector6& base_jerk,
+                        const VectorX& theta, const VectorX& thetadot) {
+  Engine engine(model);
+  engine.place(base, theta, thetadot, true);
+  factor_or_throw(engine);
+  engine.accelerate();
+  engine.linearize(base_jerk);
+  return {engine.acceleration, engine.mass, engine.stiffness, engine.damping, engine.drive_rate};
+}
+
+double potential_energy(const Model& model, const math::Pose& base, const VectorX& theta) {
+  const Parameters& p = model.parameters;
+  Vector3 gravity = p.gravity;
+  if (p.table_normal && p.table_carries_weight)
+    gravity -= p.table_normal->normalized() * p.table_normal->normalized().dot(gravity);
+  double energy = 0.0;
+  const auto motions = chain::link_motions(model.chain, theta, base);
+  const chain::Chain& chain = model.chain;
+  for (int link = 1; link < chain.links(); ++link) {
+    const double start = chain.link_start(link), end = chain.link_end(link);
+    energy -= p.link_mass[link - 1] * gravity.dot(motions[link] * (0.5 * (start + end) * chain.direction));
+    if (link + 1 == chain.links()) energy -= p.tip_mass * gravity.dot(motions[link] * (end * chain.direction));
+  }
+  for (int k = 0; k < chain.angles(); ++k) {
+    const double bend = theta[k] - p.rest_angle[k];
+    energy += 0.5 * p.stiffness[k] * bend * bend;
+  }
+  return energy;
+}
+
+VectorX static_equilibrium(const Model& model, const math::Pose& base, const VectorX& start) {
+  const int n = model.chain.angles();
+  VectorX theta = start.size() == n ? start : Eigen::Map<const VectorX>(model.parameters.rest_angle.data(), n).eval();
+  // an exactly inverted rope is at rest too: lean a little, more than rounding
+  if (start.size() != n) theta.array() += 1e-6;
+  constexpr int kMaxIterations = 500;
+  constexpr double kMaxTurn = 0.5;  // rad an iteration
+  Engine engine(model);
+  const VectorX rest = VectorX::Zero(n);
+  double energy = potential_energy(model, base, theta), damping = 0.0;
+  double torque_scale = 0.0;
+  for (int k = 0; k < n; ++k) torque_scale += model.parameters.stiffness[k];
+  torque_scale += model.chain.length * model.parameters.gravity.norm() * model.parameters.tip_mass;
+  for (double m : model.parameters.link_mass) torque_scale += m * model.chain.length * model.parameters.gravity.norm();
+  if (torque_scale <= 0.0) return theta;
+  for (int iteration = 0; iteration < kMaxIterations; ++iteration) {
+    engine.place(at_rest(base), theta, rest, true);
+    engine.acceleration = rest;
+    engine.linearize(Vector6::Zero());
+    const VectorX gradient = engine.bias - engine.torque;
+    if (!gradient.allFinite()) break;
+    const bool still = gradient.norm() <= 1e-12 * torque_scale;
+    // where the potential curves down no start is a minimum: shift the Hessian until it is positive definite
+    for (int attempt = 0;; ++attempt) {
+      MatrixX hessian = 0.5 * (engine.stiffness + engine.stiffness.transpose());
+      hessian.diagonal().array() += damping + 1e-12 * torque_scale;
+      const Eigen::LLT<MatrixX> factor(hessian);
+      if (factor.info() == Eigen::Success) {
+        if (still && damping == 0.0) return theta;
+        VectorX step = factor.solve(-gradient);
+        const double largest = step.cwiseAbs().maxCoeff();
+        if (largest > kMaxTurn) step *= kMaxTurn / largest;
+        const double next = potential_energy(model, base, theta + step);
+        // near the minimum the energy no longer resolves a Newton step: take it
+        if (next <= energy || (damping == 0.0 && largest < 1e-4)) {
+          theta += step;
+          energy = next;
+          damping = damping < 1e-9 * torque_scale ? 0.0 : 0.2 * damping;
+          if (largest < 1e-12 && damping == 0.0) return theta;
+          break;
+        }
+      } else if (still) {
+        theta.array() += 1e-4;  // a saddle: leave it
+        energy = potential_energy(model, base, theta);
+        damping = 1e-3 * torque_scale;
+        break;
+      }
+      damping = std::max(4.0 * damping, 1e-6 * torque_scale);
+      if (attempt > 60) throw WorkError("static equilibrium", "no descent found", "check masses and stiffnesses");
+    }
+  }
+  throw WorkError("static equilibrium", "no minimum of the potential energy found", "check masses and stiffnesses");
+}
+
+}  // namespace chainsplat::dynamics

@@ -1,0 +1,158 @@
+#include <array>
+#include <cstdlib>
+#include <cstring>
+#include <system_error>
+
+#include "gpu/device.h"
+
+namespace chainsplat::gpu {
+
+namespace {
+
+constexpr std::size_t kChecksumBytes = sizeof(std::uint64_t);  // before the driver's data in a cache file
+
+std::string hexadecimal(const std::uint8_t* bytes, std::size_t count) {
+  constexpr char kDigits[] = "0123456789abcdef";
+  std::string text;
+  for (std::size_t i = 0; i < count; ++i) {
+    text += kDigits[bytes[i] >> 4];
+    text += kDigits[bytes[i] & 15];
+  }
+  return text;
+}
+
+}  // namespace
+
+Path pipeline_cache_folder() {
+  const char* cache = std::getenv("XDG_CACHE_HOME");
+  if (cache && *cache == '/') return Path(cache) / "chainsplat";  // a relative one is void by the XDG rules
+  const char* home = std::getenv("HOME");
+  if (home && *home == '/') return Path(home) / ".cache" / "chainsplat";
+  return {};
+}
+
+VkPipelineCache load_pipeline_cache(VkDevice device, const VkPhysicalDeviceProperties& properties, Path* file) {
+  std::string content;
+  const Path folder = pipeline_cache_folder();
+  if (!folder.empty()) {
+    *file = folder / ("pipelines-" + hexadecimal(properties.pipelineCacheUUID, VK_UUID_SIZE) + ".bin");
+    try {
+      std::error_code error;
+      if (std::filesystem::exists(*file, error)) content = core::read_file(*file);
+    } catch (const std::exception&) {
+      content.clear();
+    }
+  }
+  // drivers check the header but trust the rest: a damaged file must not reach them
+  std::string_view data;
+  if (content.size() > kChecksumBytes) {
+    std::uint64_t checksum = 0;
+    std::memcpy(&checksum, content.data(), kChecksumBytes);
+    const std::string_view rest = std::string_view(content).substr(kChecksumBytes);
+    if (core::fnv1a(rest) == checksum) data = rest;
+  }
+  VkPipelineCacheCreateInfo create{VK_STRUCTURE_TYPE_PIPELINE_CACHE_CREATE_INFO};
+  create.initialDataSize = data.size();
+  create.pInitialData = data.data();
+  VkPipelineCache cache = VK_NULL_HANDLE;
+  return vkCreatePipelineCache(device, &create, nullptr, &cache) == VK_SUCCESS ? cache : VK_NULL_HANDLE;
+}
+
+void save_pipeline_cache(VkDevice device, VkPipelineCache cache, const Path& file) {
+  if (!cache || file.empty()) return;
+  std::size_t bytes = 0;
+  if (vkGetPipelineCacheData(device, cache, &bytes, nullptr) != VK_SUCCESS) return;
+  if (bytes <= sizeof(VkPipelineCacheHeaderVersionOne)) return;  // an empty cache
+  std::string content(kChecksumBytes + bytes, '\0');
+  if (vkGetPipelineCacheData(device, cache, &bytes, content.data() + kChecksumBytes) != VK_SUCCESS) return;
+  content.resize(kChecksumBytes + bytes);
+  const std::uint64_t checksum = core::fnv1a(std::string_view(content).substr(kChecksumBytes));
+  std::memcpy(content.data(), &checksum, kChecksumBytes);
+  try {
+    std::error_code error;
+    if (std::filesystem::file_size(file, error) == content.size() && !error && core::read_file(file) == content) return;
+    std::filesystem::create_directories(file.parent_path(), error);
+    if (!error) core::write_file(file, content);
+  } catch (const std::exception&) {
+    // a cache is a convenience: a full disk or a read-only home must not stop the work
+  }
+}
+
+Pipeline::Handles::~Handles() {
+  vkDestroyPipeline(device->handle, pipeline, nullptr);
+  vkDestroyPipelineLayout(device->handle, layout, nullptr);
+  vkDestroyDescriptorSetLayout(device->handle, set_layout, nullptr);
+}
+
+Pipeline::Pipeline(Device& device, const std::string& name, int buffers, std::size_t push_bytes,
+                   const std::vector<std::uint32_t>& constants)
+    : handles_(std::make_unique<Handles>()) {
+  Handles& h = *handles_;
+  h.device = &device;
+  CHAINSPLAT_CHECK(push_bytes <= kMostPushBytes && push_bytes % 4 == 0, name + ": " + std::to_string(push_bytes));
+  CHAINSPLAT_CHECK(buffers >= 0 && buffers <= static_cast<int>(kLeastStorageBuffers), name + ": " + std::to_string(buffers));
+  h.name = name;
+  h.buffers = static_cast<std::uint32_t>(buffers);
+  h.push_bytes = static_cast<std::uint32_t>(push_bytes);
+  h.pushes_descriptors = device.push_descriptors >= h.buffers && device.push_descriptor_set;
+
+  std::array<VkDescriptorSetLayoutBinding, kLeastStorageBuffers> bindings{};
+  for (std::uint32_t i = 0; i < h.buffers; ++i) {
+    bindings[i] = {i, VK_DESCRIPTOR_TYPE_STORAGE_BUFFER, 1, VK_SHADER_STAGE_COMPUTE_BIT, nullptr};
+  }
+  VkDescriptorSetLayoutCreateInfo set{VK_STRUCTURE_TYPE_DESCRIPTOR_SET_LAYOUT_CREATE_INFO};
+  set.flags = h.pushes_descriptors ? VK_DESCRIPTOR_SET_LAYOUT_CREATE_PUSH_DESCRIPTOR_BIT_KHR : 0;
+  set.bindingCount = h.buffers;
+  set.pBindings = bindings.data();
+  device.check(vkCreateDescriptorSetLayout(device.handle, &set, nullptr, &h.set_layout), "make a descriptor layout");
+
+  const VkPushConstantRange range{VK_SHADER_STAGE_COMPUTE_BIT, 0, h.push_bytes};
+  VkPipelineLayoutCreateInfo layout{VK_STRUCTURE_TYPE_PIPELINE_LAYOUT_CREATE_INFO};
+  layout.setLayoutCount = 1;
+  layout.pSetLayouts = &h.set_layout;
+  layout.pushConstantRangeCount = push_bytes > 0 ? 1 : 0;
+  layout.pPushConstantRanges = &range;
+  device.check(vkCreatePipelineLayout(device.handle, &layout, nullptr, &h.layout), "make a pipeline layout");
+
+  std::vector<VkSpecializationMapEntry> entries;
+  for (std::uint32_t i = 0; i < constants.size(); ++i) {
+    entries.push_back({i, i * static_cast<std::uint32_t>(sizeof(std::uint32_t)), sizeof(std::uint32_t)});
+  }
+  VkSpecializationInfo specialization{};
+  specialization.mapEntryCount = static_cast<std::uint32_t>(entries.size());
+  specialization.pMapEntries = entries.data();
+  specialization.dataSize = constants.size() * sizeof(std::uint32_t);
+  specialization.pData = constants.data();
+
+  const std::span<const std::uint32_t> code = shader_code(name);
+  VkShaderModuleCreateInfo module_create{VK_STRUCTURE_TYPE_SHADER_MODULE_CREATE_INFO};
+  module_create.codeSize = code.size_bytes();
+  module_create.pCode = code.data();
+  VkShaderModule module = VK_NULL_HANDLE;
+  device.check(vkCreateShaderModule(device.handle, &module_create, nullptr, &module), "take a shader");
+
+  VkPipelineShaderStageRequiredSubgroupSizeCreateInfo subgroup{
+      VK_STRUCTURE_TYPE_PIPELINE_SHADER_STAGE_REQUIRED_SUBGROUP_SIZE_CREATE_INFO};
+  subgroup.requiredSubgroupSize = device.info.subgroup_size;
+  VkComputePipelineCreateInfo create{VK_STRUCTURE_TYPE_COMPUTE_PIPELINE_CREATE_INFO};
+  create.stage = {VK_STRUCTURE_TYPE_PIPELINE_SHADER_STAGE_CREATE_INFO};
+  create.stage.pNext = device.fixes_subgroup_size ? &subgroup : nullptr;
+  create.stage.stage = VK_SHADER_STAGE_COMPUTE_BIT;
+  create.stage.module = module;
+  create.stage.pName = "main";
+  create.stage.pSpecializationInfo = &specialization;
+  create.layout = h.layout;
+  const VkResult result =
+      vkCreateComputePipelines(device.handle, device.pipeline_cache, 1, &create, nullptr, &h.pipeline);
+  vkDestroyShaderModule(device.handle, module, nullptr);
+  device.check(result, ("compile shader " + name).c_str());
+  device.pipelines_made = true;
+  device.name(VK_OBJECT_TYPE_PIPELINE, reinterpret_cast<std::uint64_t>(h.pipeline), name.c_str());
+}
+
+Pipeline::Pipeline() = default;
+Pipeline::Pipeline(Pipeline&&) noexcept = default;
+Pipeline& Pipeline::operator=(Pipeline&&) noexcept = default;
+Pipeline::~Pipeline() = default;
+
+}  // namespace chainsplat::gpu

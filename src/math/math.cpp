@@ -1,0 +1,118 @@
+#include "chainsplat/math.h"
+
+#include <cmath>
+
+namespace chainsplat::math {
+
+namespace {
+
+constexpr double kSmallAngle = 1e-2;  // rad; below it the series are exact to rounding (SPEC 1)
+
+struct ExpCoefficients {
+  double a, b, c;  // sin x/x, (1-cos x)/x^2, (x-sin x)/x^3
+};
+
+ExpCoefficients exp_coefficients(double angle) {
+  const double x2 = angle * angle;
+  if (angle < kSmallAngle) {
+    return {1 + x2 * (-1.0 / 6 + x2 * (1.0 / 120 - x2 / 5040)),
+            0.5 + x2 * (-1.0 / 24 + x2 * (1.0 / 720 - x2 / 40320)),
+            1.0 / 6 + x2 * (-1.0 / 120 + x2 * (1.0 / 5040 - x2 / 362880))};
+  }
+  // 1 - cos through the half angle keeps all digits for moderate angles
+  const double half = std::sin(0.5 * angle);
+  return {std::sin(angle) / angle, 2 * half * half / x2, (angle - std::sin(angle)) / (x2 * angle)};
+}
+
+}  // namespace
+
+Matrix3 hat(const Vector3& w) {
+  Matrix3 m;
+  m << 0, -w.z(), w.y(), w.z(), 0, -w.x(), -w.y(), w.x(), 0;
+  return m;
+}
+
+Matrix3 exp_so3(const Vector3& w) {
+  const auto [a, b, c] = exp_coefficients(w.norm());
+  (void)c;
+  const Matrix3 skew = hat(w);
+  return Matrix3::Identity() + a * skew + b * skew * skew;
+}
+
+Pose exp_se3(const Vector6& twist) {
+  const Vector3 w = twist.head<3>();
+  const auto [a, b, c] = exp_coefficients(w.norm());
+  const Matrix3 skew = hat(w), square = skew * skew;
+  return {Matrix3::Identity() + a * skew + b * square,
+          (Matrix3::Identity() + b * skew + c * square) * twist.tail<3>()};
+}
+
+Vector3 log_so3(const Matrix3& rotation) {
+  // largest-pivot quaternion: no loss of digits near pi
+  Eigen::Quaterniond q(rotation);
+  q.normalize();
+  if (q.w() < 0) q.coeffs() = -q.coeffs();
+  const double sine = q.vec().norm();
+  if (sine < 1e-7) return 2.0 / q.w() * (1.0 - sine * sine / (3.0 * q.w() * q.w())) * q.vec();
+  Vector3 w = 2.0 * std::atan2(sine, q.w()) / sine * q.vec();
+  if (q.w() < 1e-15) {  // exactly pi: the sign is a convention, first non-zero component positive
+    for (int i = 0; i < 3; ++i) {
+      if (w[i] != 0.0) {
+        if (w[i] < 0.0) w = -w;
+        break;
+      }
+    }
+  }
+  return w;
+}
+
+Vector6 log_se3(const Pose& pose) {
+  const Vector3 w = log_so3(pose.rotation);
+  const double angle = w.norm(), x2 = angle * angle;
+  const double d = angle < kSmallAngle ? 1.0 / 12 + x2 / 720 + x2 * x2 / 30240
+                                       : (1.0 - 0.5 * angle / std::tan(0.5 * angle)) / x2;
+  const Matrix3 skew = hat(w);
+  Vector6 twist;
+  twist << w, (Matrix3::Identity() - 0.5 * skew + d * skew * skew) * pose.translation;
+  return twist;
+}
+
+Matrix6 adjoint(const Pose& pose) {
+  Matrix6 m = Matrix6::Zero();
+  m.topLeftCorner<3, 3>() = pose.rotation;
+  m.bottomRightCorner<3, 3>() = pose.rotation;
+  m.bottomLeftCorner<3, 3>() = hat(pose.translation) * pose.rotation;
+  return m;
+}
+
+Matrix6 ad(const Vector6& twist) {
+  Matrix6 m = Matrix6::Zero();
+  m.topLeftCorner<3, 3>() = hat(twist.head<3>());
+  m.bottomRightCorner<3, 3>() = m.topLeftCorner<3, 3>();
+  m.bottomLeftCorner<3, 3>() = hat(twist.tail<3>());
+  return m;
+}
+
+Matrix6 coadjoint(const Vector6& wrench) {
+  Matrix6 m = Matrix6::Zero();
+  m.topLeftCorner<3, 3>() = hat(wrench.head<3>());
+  m.topRightCorner<3, 3>() = hat(wrench.tail<3>());
+  m.bottomLeftCorner<3, 3>() = m.topRightCorner<3, 3>();
+  return m;
+}
+
+Vector6 transform_twist(const Pose& pose, const Vector6& twist) {
+  Vector6 out;
+  const Vector3 w = pose.rotation * twist.head<3>();
+  out << w, pose.translation.cross(w) + pose.rotation * twist.tail<3>();
+  return out;
+}
+
+Matrix3 orthonormalized(const Matrix3& almost_rotation) {
+  const Eigen::JacobiSVD<Matrix3> svd(almost_rotation, Eigen::ComputeFullU | Eigen::ComputeFullV);
+  Matrix3 sign = Matrix3::Identity();
+  sign(2, 2) = (svd.matrixU() * svd.matrixV().transpose()).determinant() < 0 ? -1.0 : 1.0;
+  return svd.matrixU() * sign * svd.matrixV().transpose();
+}
+
+}  // namespace chainsplat::math

@@ -1,0 +1,127 @@
+#include "src/recognition/checkpoint.h"
+
+#include <cstring>
+
+namespace chainsplat::recognition {
+
+namespace {
+
+constexpr char kMagic[] = "chainsplat-checkpoint/1\n";
+constexpr char kFile[] = "recognize.bin";
+
+struct Writer {
+  std::string bytes;
+  template <class T>
+  void put(const T& value) {
+    bytes.append(reinterpret_cast<const char*>(&value), sizeof value);
+  }
+  template <class T>
+  void put_all(const std::vector<T>& values) {
+    put<std::uint64_t>(values.size());
+    bytes.append(reinterpret_cast<const char*>(values.data()), values.size() * sizeof(T));
+  }
+};
+
+struct Reader {
+  std::string_view bytes;
+  template <class T>
+  T get() {
+    if (bytes.size() < sizeof(T)) throw std::out_of_range("checkpoint");
+    T value;
+    std::memcpy(&value, bytes.data(), sizeof value);
+    bytes.remove_prefix(sizeof value);
+    return value;
+  }
+  template <class T>
+  std::vector<T> get_all() {
+    const auto count = get<std::uint64_t>();
+    if (bytes.size() / sizeof(T) < count) throw std::out_of_range("checkpoint");
+    std::vector<T> values(count);
+    std::memcpy(values.data(), bytes.data(), count * sizeof(T));
+    bytes.remove_prefix(count * sizeof(T));
+    return values;
+  }
+};
+
+std::vector<double> flat(const std::vector<math::VectorX>& rows) {
+  std::vector<double> all;
+  for (const auto& row : rows) all.insert(all.end(), row.data(), row.data() + row.size());
+  return all;
+}
+
+std::vector<math::VectorX> rows_of(const std::vector<double>& all, std::size_t count) {
+  std::vector<math::VectorX> rows;
+  const std::size_t width = count == 0 ? 0 : all.size() / count;
+  for (std::size_t k = 0; width > 0 && k < count; ++k)
+    rows.push_back(Eigen::Map<const math::VectorX>(all.data() + width * k, static_cast<Eigen::Index>(width)));
+  return rows;
+}
+
+}  // namespace
+
+void save_checkpoint(const Checkpoint& c, const Path& folder) {
+  Writer w;
+  w.put_all(std::vector<char>(c.job.begin(), c.job.end()));
+  w.put(c.stage);
+  w.put(c.spatial);
+  w.put(c.out_of_plane_rms);
+  w.put(c.deviation);
+  w.put_all(c.states.time);
+  w.put_all(flat(c.states.theta));
+  w.put_all(flat(c.states.thetadot));
+  const splat::Gaussians& g = c.snapshot.gaussians;
+  w.put(g.count);
+  w.put(g.links);
+  w.put(g.degree);
+  for (const auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits}) w.put_all(*part);
+  w.put_all(c.snapshot.first_moment);
+  w.put_all(c.snapshot.second_moment);
+  w.put(c.snapshot.step);
+  w.put_all(c.extra);
+  Writer head;
+  head.put(core::fnv1a(w.bytes));
+  std::filesystem::create_directories(folder);
+  core::write_file(folder / kFile, kMagic + head.bytes + w.bytes);
+}
+
+std::optional<Checkpoint> load_checkpoint(const Path& folder, const std::string& job) {
+  const Path file = folder / kFile;
+  if (!std::filesystem::exists(file)) return std::nullopt;
+  const std::string bytes = core::read_file(file);
+  const std::size_t head = sizeof kMagic - 1 + sizeof(std::uint64_t);
+  const auto damaged = [&] { return InputError(file.string(), "the checkpoint is damaged", "remove it and train anew"); };
+  if (bytes.size() < head || bytes.compare(0, sizeof kMagic - 1, kMagic) != 0) throw damaged();
+  Reader sum{std::string_view(bytes).substr(sizeof kMagic - 1)};
+  if (sum.get<std::uint64_t>() != core::fnv1a(std::string_view(bytes).substr(head))) throw damaged();
+  Reader r{std::string_view(bytes).substr(head)};
+  try {
+    Checkpoint c;
+    const auto name = r.get_all<char>();
+    c.job.assign(name.begin(), name.end());
+    if (c.job != job)
+      throw InputError(file.string(), "the checkpoint is of another job (" + c.job + ")",
+                       "resume with the options that it was started with, or start anew with --force");
+    c.stage = r.get<int>();
+    c.spatial = r.get<bool>();
+    c.out_of_plane_rms = r.get<double>();
+    c.deviation = r.get<double>();
+    c.states.time = r.get_all<double>();
+    c.states.theta = rows_of(r.get_all<double>(), c.states.time.size());
+    c.states.thetadot = rows_of(r.get_all<double>(), c.states.time.size());
+    splat::Gaussians& g = c.snapshot.gaussians;
+    g.count = r.get<int>();
+    g.links = r.get<int>();
+    g.degree = r.get<int>();
+    for (auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
+      *part = r.get_all<float>();
+    c.snapshot.first_moment = r.get_all<float>();
+    c.snapshot.second_moment = r.get_all<float>();
+    c.snapshot.step = r.get<int>();
+    c.extra = r.get_all<double>();
+    return c;
+  } catch (const std::out_of_range&) {
+    throw damaged();
+  }
+}
+
+}  // namespace chainsplat::recognition

@@ -1,0 +1,239 @@
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+
+#include "src/recognition/checkpoint.h"
+#include "src/recognition/modes.h"
+#include "src/recognition/place_gaussians.h"
+#include "src/recognition/refine_angles.h"
+
+namespace chainsplat::recognition {
+
+namespace {
+
+// The schedule: rounds of Adam on the Gaussians, additions where the images ask, and Gauss-Newton on the angles.
+constexpr int kRounds = 5;
+constexpr int kSteps = 80;             // Adam steps a round
+constexpr int kBatch = 9;              // views a step
+constexpr int kFirstGaussians = 700;
+constexpr int kAddedARound = 250;
+constexpr int kAngleIterations = 3;    // Gauss-Newton steps a round and frame
+constexpr int kFinalIterations = 4;    // for the frames that did not train
+constexpr int kFinalSteps = 120;       // Adam steps after the last round, rates falling
+constexpr float kMaskWeight = 0.3f;    // of the mask term: without it black hides transparency (DESIGN)
+
+splat::AdamRates rates(double fraction) {
+  // fraction: 0 at the start, 1 at the end of all steps; rates fall by ten
+  const auto fall = static_cast<float>(std::pow(0.1, fraction));
+  splat::AdamRates r;
+  r.mean = 2.5e-4f * fall;      // m: a tenth of a Gaussian's spacing on the rope
+  r.rotation = 0.02f * fall;
+  r.log_scale = 0.03f * fall;
+  r.opacity = 0.08f * fall;
+  r.sh0 = 0.06f * fall;         // 0.017 in color
+  r.sh_rest = 0.01f * fall;
+  r.link_logits = 0.0f;         // hard on their link: soft gained nothing (DESIGN, 'Recognition')
+  return r;
+}
+
+struct TrainingViews {
+  std::vector<int> frames;                            // that train
+  std::vector<int> views;                             // capture view of every training view
+  std::vector<int> frame_of;                          // its frame
+  std::vector<int> index_of;                          // capture view -> training view or -1
+};
+
+TrainingViews training_views(const capture::Capture& capture, const std::vector<FrameViews>& frames, int every) {
+  TrainingViews t;
+  t.index_of.assign(capture.views.size(), -1);
+  for (int k = 0; k < static_cast<int>(frames.size()); k += every) {
+    if (frames[k].views.empty()) continue;
+    t.frames.push_back(k);
+    for (const int v : frames[k].views) {
+      t.index_of[v] = static_cast<int>(t.views.size());
+      t.views.push_back(v);
+      t.frame_of.push_back(k);
+    }
+  }
+  return t;
+}
+
+double mean(const std::vector<double>& values) {
+  return values.empty() ? 0.0 : std::accumulate(values.begin(), values.end(), 0.0) / static_cast<double>(values.size());
+}
+
+}  // namespace
+
+Result recognize_fast(gpu::Device& device, const capture::Capture& capture, const Options& options) {
+  Result result;
+  const std::string job = job_text(capture, options);
+  const auto make = [&](chain::Bending bending) {
+    return chain::make_chain(capture.length, capture.diameter, capture.direction, capture.bending_axis, options.joints,
+                             bending, options.twist);
+  };
+  const int total_steps = kRounds * kSteps + kFinalSteps;
+  int done_steps = 0, first_round = 0;
+  splat::Gaussians gaussians;
+  chain::States states;
+
+  std::optional<Checkpoint> before;
+  if (options.resume && !options.checkpoint.empty()) before = load_checkpoint(options.checkpoint, job);
+  if (before) {
+    result.bending = {before->spatial ? chain::Bending::spatial : chain::Bending::planar, before->out_of_plane_rms,
+                      before->deviation};
+    result.chain = make(result.bending.bending);
+    states = before->states;
+    gaussians = before->snapshot.gaussians;
+    first_round = before->stage;
+    done_steps = first_round * kSteps;
+  } else {
+    // coarse: silhouettes
+    core::report({"recognize", 0, total_steps, NAN, NAN, "silhouettes"});
+    const bool decide = !options.bending && !capture.tabletop;
+    const chain::Bending first = options.bending.value_or(capture.tabletop ? chain::Bending::planar : chain::Bending::spatial);
+    result.bending.bending = first;
+    result.chain = make(first);
+    silhouette::SequenceFit fit = silhouette::fit_sequence(result.chain, capture);
+    if (decide) {
+      result.bending = silhouette::choose_bending(result.chain, capture, fit);
+      if (result.bending.bending == chain::Bending::planar) {
+        result.chain = make(chain::Bending::planar);
+        fit = silhouette::fit_sequence(result.chain, capture);
+      }
+    }
+    states = fit.states;
+  }
+  const std::vector<FrameViews> frames = assign_views(capture, states.time);
+  const TrainingViews training = training_views(capture, frames, std::max(1, options.every));
+  if (training.views.empty())
+    throw WorkError(capture.name, "no training frame shows the object", "use --every 1 or check the masks");
+  const chain::Chain& chain = result.chain;
+
+  splat::Engine engine(device);
+  std::vector<splat::ViewSpec> specs;
+  std::vector<const std::vector<std::uint8_t>*> targets;
+  const auto pose_views = [&] {
+    specs.clear();
+    for (std::size_t i = 0; i < training.views.size(); ++i) {
+      const int k = training.frame_of[i];
+      const capture::View& view = capture.views[training.views[i]];
+      specs.push_back(view_spec(capture, view, view_motions(chain, capture, states, frames[k], k, states.theta[k], view)));
+    }
+  };
+  pose_views();
+  for (const int v : training.views) targets.push_back(&capture.views[v].rgba);
+  engine.set_views(specs, targets);
+  if (!before) {
+    core::Random random(options.seed * 1000003 + 1);
+    gaussians = place_along_chain(chain, capture, states, frames, training.frames,
+                                  std::min(kFirstGaussians, options.budget), random);
+  }
+
+  const splat::LossWeights weights{1.0f, 0.0f, kMaskWeight};
+  const int batch_size = std::min<int>(kBatch, static_cast<int>(training.views.size()));
+  double loss = NAN, psnr = NAN;
+  const auto checkpoint = [&](int round) {
+    if (options.checkpoint.empty()) return;
+    Checkpoint c;
+    c.job = job;
+    c.stage = round;
+    c.spatial = result.bending.bending == chain::Bending::spatial;
+    c.out_of_plane_rms = result.bending.out_of_plane_rms;
+    c.deviation = result.bending.deviation;
+    c.states = states;
+    c.snapshot.gaussians = gaussians;
+    save_checkpoint(c, options.checkpoint);
+  };
+  const auto adam = [&](int steps, core::Random& random, const std::string& note) {
+    std::vector<int> order(training.views.size());
+    std::iota(order.begin(), order.end(), 0);
+    std::size_t next = order.size();
+    for (int step = 0; step < steps; ++step) {
+      if (const int signal = core::stop_requested()) throw Interrupted(signal);
+      std::vector<int> batch;
+      while (static_cast<int>(batch.size()) < batch_size) {
+        if (next == order.size()) {
+          for (std::size_t i = order.size() - 1; i > 0; --i) std::swap(order[i], order[random.next() % (i + 1)]);
+          next = 0;
+        }
+        batch.push_back(order[next++]);
+      }
+      constexpr int kReadEvery = 10;
+      const bool read = step % kReadEvery == 0;
+      const splat::LossValues values =
+          engine.step(batch, weights, rates(static_cast<double>(done_steps) / total_steps), read);
+      ++done_steps;
+      if (read) {
+        loss = values.total / static_cast<double>(batch.size());
+        psnr = mean(values.psnr_object);
+        if (!std::isfinite(loss))
+          throw WorkError("recognize", "the loss is not finite at step " + std::to_string(done_steps), "report the capture; try another --seed");
+        core::report({"recognize", done_steps, total_steps, loss, psnr, note});
+      }
+    }
+  };
+  const Draw draw_training = [&](std::span<const int> views, std::span<const std::vector<math::Pose>> motions) {
+    std::vector<int> batch;
+    for (std::size_t v = 0; v < views.size(); ++v) {
+      batch.push_back(training.index_of[views[v]]);
+      engine.set_motions(batch.back(), motions[v]);
+    }
+    return engine.draw_views(batch, true);
+  };
+  const std::vector<double> coarse_times = states.time;
+  const std::vector<math::VectorX> coarse = states.theta;  // to carry corrections to the frames that do not train
+
+  for (int round = first_round; round < kRounds; ++round) {
+    checkpoint(round);
+    core::Random random(options.seed * 1000003 + 100 + round);
+    const std::string note = "round " + std::to_string(round + 1) + " of " + std::to_string(kRounds);
+    engine.set_gaussians(gaussians);
+    adam(kSteps, random, note);
+    RefineOptions refine;
+    refine.iterations = kAngleIterations;
+    refine_angles(chain, capture, frames, training.frames, draw_training, refine, states);
+    pose_views();
+    for (std::size_t i = 0; i < specs.size(); ++i) engine.set_motions(static_cast<int>(i), specs[i].motions);
+    gaussians = engine.gaussians();
+    if (round + 1 < kRounds) {
+      std::vector<int> all(training.views.size());
+      std::iota(all.begin(), all.end(), 0);
+      const std::vector<splat::Picture> pictures = engine.draw_views(all, false);
+      std::vector<Drawn> drawn;
+      for (std::size_t i = 0; i < pictures.size(); ++i)
+        drawn.push_back({&capture.views[training.views[i]], &specs[i].motions, &pictures[i]});
+      add_and_prune(gaussians, chain, capture, drawn, options.budget, kAddedARound, random);
+    }
+  }
+  checkpoint(kRounds);
+  {
+    core::Random random(options.seed * 1000003 + 999);
+    engine.set_gaussians(gaussians);
+    adam(kFinalSteps, random, "last polish");
+    gaussians = engine.gaussians();
+  }
+
+  // every frame: start from the silhouettes plus the correction of the training frames around it
+  core::report({"recognize", total_steps, total_steps, loss, psnr, "all frames"});
+  chain::States correction;
+  for (const int k : training.frames) {
+    correction.time.push_back(states.time[k]);
+    correction.theta.push_back(states.theta[k] - coarse[k]);
+  }
+  std::vector<int> all_frames;
+  for (int k = 0; k < static_cast<int>(frames.size()); ++k) {
+    if (frames[k].views.empty()) continue;
+    all_frames.push_back(k);
+    if (std::find(training.frames.begin(), training.frames.end(), k) == training.frames.end())
+      states.theta[k] = coarse[k] + chain::interpolate(correction, states.time[k]);
+  }
+  const auto covariances = refine_all(engine, chain, capture, frames, gaussians, all_frames, kFinalIterations, states);
+  result.covariances.assign(frames.size(), math::MatrixX::Identity(chain.angles(), chain.angles()));
+  for (std::size_t i = 0; i < all_frames.size(); ++i) result.covariances[all_frames[i]] = covariances[i];
+  differentiate(states);
+  result.gaussians = std::move(gaussians);
+  result.states = std::move(states);
+  return result;
+}
+
+}  // namespace chainsplat::recognition

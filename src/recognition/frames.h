@@ -1,0 +1,27 @@
+// frames.h - which views show which frame, and where the links are in each of them.
+#pragma once
+#include <vector>
+
+#include "chainsplat/capture.h"
+#include "chainsplat/chain.h"
+#include "chainsplat/splat.h"
+
+namespace chainsplat::recognition {
+
+// One frame time of the first camera and the views that are nearest to it, at most half a frame away.
+struct FrameViews {
+  double time = 0.0;
+  std::vector<int> views;  // indices into Capture::views, empty masks left out
+};
+
+// One entry a state, in order.
+std::vector<FrameViews> assign_views(const capture::Capture& capture, const std::vector<double>& times);
+
+// Link motions of a view at its own time: cubic in theta where its camera is not synchronous with the first one.
+std::vector<math::Pose> view_motions(const chain::Chain& chain, const capture::Capture& capture,
+                                     const chain::States& states, const FrameViews& frame, int frame_index,
+                                     const math::VectorX& theta, const capture::View& view);
+
+splat::ViewSpec view_spec(const capture::Capture& capture, const capture::View& view, std::vector<math::Pose> motions);
+
+}  // namespace chainsplat::recognition

@@ -1,0 +1,22 @@
+// modes.h - the two ways of recognition, and what they share.
+#pragma once
+#include "chainsplat/recognition.h"
+#include "src/recognition/frames.h"
+
+namespace chainsplat::recognition {
+
+Result recognize_fast(gpu::Device& device, const capture::Capture& capture, const Options& options);
+Result recognize_paper(gpu::Device& device, const capture::Capture& capture, const Options& options);
+
+// Text of everything that the result depends on, to recognize a checkpoint of another job.
+std::string job_text(const capture::Capture& capture, const Options& options);
+
+// thetadot from theta by quadratic fits over seven frames.
+void differentiate(chain::States& states);
+
+// Improves every frame's angles with the Gaussians held. `frames` as assigned to states.time.
+std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain& chain, const capture::Capture& capture,
+                                      const std::vector<FrameViews>& frames, const splat::Gaussians& gaussians,
+                                      const std::vector<int>& selected, int iterations, chain::States& states);
+
+}  // namespace chainsplat::recognition

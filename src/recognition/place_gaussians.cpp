@@ -1,0 +1,202 @@
+#include "src/recognition/place_gaussians.h"
+
+#include <algorithm>
+#include <cmath>
+#include <numbers>
+
+namespace chainsplat::recognition {
+
+namespace {
+
+constexpr double kSh0 = 0.28209479177387814;   // degree-0 basis: color = 0.5 + kSh0 * coefficient
+constexpr float kOwnLinkLogit = 12.0f;         // softmax of 12 against zeros: other links below 1/255 by far
+constexpr double kShell = 0.75;                // of the radius, where Gaussians start: most of what is seen is the surface
+constexpr double kCoverage = 0.55;             // sigma in units of the spacing on the shell: neighbors overlap
+constexpr float kStartOpacity = 2.0f;          // logit, 0.88: ropes are opaque
+constexpr double kFacing = 0.35;               // least cosine between surface normal and view ray for a color sample
+constexpr float kLeastOpacity = -3.9f;         // logit, 0.02
+constexpr double kLargest = 1.5;               // of the rope's diameter: a larger Gaussian explains something else
+
+void set_gaussian(splat::Gaussians& g, int i, const math::Vector3& mean, double sigma, float opacity,
+                  const math::Vector3& color, int link) {
+  for (int c = 0; c < 3; ++c) {
+    g.mean[3 * i + c] = static_cast<float>(mean[c]);
+    g.log_scale[3 * i + c] = static_cast<float>(std::log(sigma));
+    g.sh[3 * g.sh_coefficients() * i + c] = static_cast<float>((color[c] - 0.5) / kSh0);
+  }
+  g.opacity_logit[i] = opacity;
+  for (int j = 0; j < g.links; ++j) g.link_logits[g.links * i + j] = j == link ? kOwnLinkLogit : 0.0f;
+}
+
+// Color under a crop pixel position; false outside the object.
+bool sample(const capture::View& view, const math::Vector2& image_pixel, math::Vector3& color) {
+  const int x = static_cast<int>(std::floor(image_pixel.x())) - view.x0;
+  const int y = static_cast<int>(std::floor(image_pixel.y())) - view.y0;
+  if (x < 0 || y < 0 || x >= view.width || y >= view.height) return false;
+  const std::uint8_t* p = &view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x)];
+  if (p[3] < 128) return false;
+  color = math::Vector3(p[0], p[1], p[2]) / 255.0;
+  return true;
+}
+
+}  // namespace
+
+splat::Gaussians place_along_chain(const chain::Chain& chain, const capture::Capture& capture,
+                                   const chain::States& states, const std::vector<FrameViews>& frames,
+                                   std::span<const int> training, int count, core::Random& random) {
+  splat::Gaussians g;
+  g.resize(count, chain.links(), 0);
+  const double radius = 0.5 * chain.diameter * kShell;
+  const double spacing = std::sqrt(2.0 * std::numbers::pi * radius * chain.length / count);
+  const math::Vector3 side = chain.bending_axis, other = chain.direction.cross(chain.bending_axis);
+
+  // motions of every training view once
+  std::vector<const capture::View*> views;
+  std::vector<std::vector<math::Pose>> motions;
+  for (const int k : training) {
+    for (const int v : frames[k].views) {
+      views.push_back(&capture.views[v]);
+      motions.push_back(view_motions(chain, capture, states, frames[k], k, states.theta[k], capture.views[v]));
+    }
+  }
+  math::Vector3 mean_color = math::Vector3::Constant(0.5);
+  std::vector<math::Vector3> colors(count);
+  std::vector<bool> colored(count, false);
+  std::vector<math::Vector3> means(count);
+  std::vector<int> links(count);
+  // golden-angle spiral along the tube: even coverage; jitter breaks the pattern
+  constexpr double kGoldenAngle = 2.399963229728653;
+  for (int i = 0; i < count; ++i) {
+    const double arclength = chain.length * (i + random.uniform()) / count;
+    const double angle = kGoldenAngle * i + random.uniform(-0.3, 0.3);
+    const math::Vector3 normal = std::cos(angle) * side + std::sin(angle) * other;
+    means[i] = arclength * chain.direction + radius * normal;
+    links[i] = chain::link_at(chain, std::min(arclength, chain.length * (1.0 - 1e-9)));
+    math::Vector3 sum = math::Vector3::Zero();
+    double weight = 0.0;
+    for (std::size_t v = 0; v < views.size(); ++v) {
+      const capture::Camera& camera = capture.cameras[views[v]->camera];
+      const math::Pose& motion = motions[v][links[i]];
+      const math::Vector3 x = camera.world_from_camera.inverse() * (motion * means[i]);
+      const math::Vector3 n = camera.world_from_camera.rotation.transpose() * (motion.rotation * normal);
+      const double facing = -n.dot(x.normalized());
+      math::Vector3 color;
+      if (facing < kFacing || x.z() <= 0 || !sample(*views[v], capture::project(camera, x), color)) continue;
+      sum += facing * color;
+      weight += facing;
+    }
+    if (weight > 0.0) {
+      colors[i] = sum / weight;
+      colored[i] = true;
+    }
+  }
+  math::Vector3 sum = math::Vector3::Zero();
+  int seen = 0;
+  for (int i = 0; i < count; ++i) {
+    if (!colored[i]) continue;
+    sum += colors[i];
+    ++seen;
+  }
+  if (seen > 0) mean_color = sum / seen;
+  for (int i = 0; i < count; ++i)
+    set_gaussian(g, i, means[i], kCoverage * spacing, kStartOpacity, colored[i] ? colors[i] : mean_color, links[i]);
+  return g;
+}
+
+Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, const capture::Capture& capture,
+                      std::span<const Drawn> drawn, int budget, int most_added, core::Random& random) {
+  Changed changed;
+  // prune
+  std::vector<int> kept;
+  const float largest = static_cast<float>(std::log(kLargest * chain.diameter));
+  for (int i = 0; i < gaussians.count; ++i) {
+    const float scale = std::max({gaussians.log_scale[3 * i], gaussians.log_scale[3 * i + 1], gaussians.log_scale[3 * i + 2]});
+    if (gaussians.opacity_logit[i] >= kLeastOpacity && scale <= largest && std::isfinite(gaussians.mean[3 * i])) kept.push_back(i);
+  }
+  changed.removed = gaussians.count - static_cast<int>(kept.size());
+  splat::Gaussians old = gaussians;
+  const int room = std::min(most_added, budget - static_cast<int>(kept.size()));
+
+  // candidates: pixels of all pictures, weighted by their squared error
+  struct Candidate {
+    std::size_t picture;
+    int pixel;
+  };
+  std::vector<Candidate> candidates;
+  std::vector<double> cumulative;
+  double total = 0.0;
+  for (std::size_t d = 0; d < drawn.size(); ++d) {
+    const capture::View& view = *drawn[d].view;
+    const splat::Picture& picture = *drawn[d].picture;
+    for (int k = 0; k < view.width * view.height; ++k) {
+      if (view.rgba[4 * k + 3] < 128) continue;
+      double error = std::pow(1.0 - picture.rgba[4 * k + 3], 2);
+      for (int c = 0; c < 3; ++c) error += std::pow(picture.rgba[4 * k + c] - view.rgba[4 * k + c] / 255.0, 2);
+      constexpr double kNoise = 0.03 * 0.03 * 3;  // codec and sensor noise, squared, three channels: not worth a Gaussian
+      if (error < kNoise) continue;
+      total += error;
+      candidates.push_back({d, k});
+      cumulative.push_back(total);
+    }
+  }
+  const int added = candidates.empty() ? 0 : std::max(0, room);
+  gaussians = splat::Gaussians{};
+  gaussians.resize(static_cast<int>(kept.size()) + added, old.links, old.degree);
+  const auto copy_row = [&](const std::vector<float>& from, std::vector<float>& to, int width, int i, int k) {
+    std::copy_n(from.begin() + static_cast<std::ptrdiff_t>(width) * k, width, to.begin() + static_cast<std::ptrdiff_t>(width) * i);
+  };
+  for (int i = 0; i < static_cast<int>(kept.size()); ++i) {
+    copy_row(old.mean, gaussians.mean, 3, i, kept[i]);
+    copy_row(old.rotation, gaussians.rotation, 4, i, kept[i]);
+    copy_row(old.log_scale, gaussians.log_scale, 3, i, kept[i]);
+    copy_row(old.opacity_logit, gaussians.opacity_logit, 1, i, kept[i]);
+    copy_row(old.sh, gaussians.sh, 3 * old.sh_coefficients(), i, kept[i]);
+    copy_row(old.link_logits, gaussians.link_logits, old.links, i, kept[i]);
+  }
+  const double spacing = std::sqrt(std::numbers::pi * chain.diameter * chain.length / std::max(1, gaussians.count));
+  int next = static_cast<int>(kept.size());
+  for (int a = 0; a < added; ++a) {
+    const auto at = std::lower_bound(cumulative.begin(), cumulative.end(), random.uniform() * total);
+    const Candidate& candidate = candidates[std::min<std::size_t>(at - cumulative.begin(), candidates.size() - 1)];
+    const Drawn& source = drawn[candidate.picture];
+    const capture::View& view = *source.view;
+    const capture::Camera& camera = capture.cameras[view.camera];
+    const math::Vector3 ray((view.x0 + candidate.pixel % view.width + 0.5 - camera.cx) / camera.fx,
+                            (view.y0 + candidate.pixel / view.width + 0.5 - camera.cy) / camera.fy, 1.0);
+    const math::Vector3 origin = camera.world_from_camera.translation;
+    const math::Vector3 along = (camera.world_from_camera.rotation * ray).normalized();
+    // the point of the ray nearest to the centerline, moved to the tube's near side
+    const std::vector<math::Pose>& motions = *source.motions;
+    double best = std::numeric_limits<double>::infinity();
+    math::Vector3 point;
+    int link = 1;
+    for (int j = 1; j < chain.links(); ++j) {
+      const math::Vector3 a0 = motions[j] * (chain.link_start(j) * chain.direction);
+      const math::Vector3 u = motions[j].rotation * chain.direction;
+      const double length = chain.link_end(j) - chain.link_start(j);
+      // closest points of a ray and a segment
+      const math::Vector3 w = origin - a0;
+      const double b = along.dot(u), d = along.dot(w), e = u.dot(w), det = std::max(1e-12, 1.0 - b * b);
+      const double s = std::clamp((e - b * d) / det, 0.0, length);
+      const double t = (a0 + s * u - origin).dot(along);
+      const double distance = (origin + t * along - a0 - s * u).norm();
+      if (distance < best) {
+        best = distance;
+        link = j;
+        const double half = 0.5 * chain.diameter * kShell;
+        point = origin + (t - std::sqrt(std::max(0.0, half * half - distance * distance))) * along;
+      }
+    }
+    constexpr double kReach = 1.2;  // of the radius: farther from the chain it is not rope
+    if (best > kReach * 0.5 * chain.diameter) continue;
+    const std::uint8_t* p = &view.rgba[4 * static_cast<std::size_t>(candidate.pixel)];
+    constexpr float kNewOpacity = 0.0f;  // logit: half
+    set_gaussian(gaussians, next++, motions[link].inverse() * point, 0.5 * kCoverage * spacing, kNewOpacity,
+                 math::Vector3(p[0], p[1], p[2]) / 255.0, link);
+  }
+  changed.added = next - static_cast<int>(kept.size());
+  gaussians.resize(next, old.links, old.degree);
+  return changed;
+}
+
+}  // namespace chainsplat::recognition

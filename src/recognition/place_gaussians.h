@@ -1,0 +1,36 @@
+// place_gaussians.h - Gaussians where the rope is: at first along the links, later where the images are not explained.
+#pragma once
+#include <span>
+#include <vector>
+
+#include "chainsplat/capture.h"
+#include "chainsplat/chain.h"
+#include "chainsplat/core.h"
+#include "chainsplat/splat.h"
+#include "src/recognition/frames.h"
+
+namespace chainsplat::recognition {
+
+// `count` Gaussians in the shell of the rope's tube (home configuration), hard on their own link, colored by the views that
+// see their side. Deterministic for one `random`.
+splat::Gaussians place_along_chain(const chain::Chain& chain, const capture::Capture& capture,
+                                   const chain::States& states, const std::vector<FrameViews>& frames,
+                                   std::span<const int> training, int count, core::Random& random);
+
+// One picture, its view and the link motions that drew it.
+struct Drawn {
+  const capture::View* view = nullptr;
+  const std::vector<math::Pose>* motions = nullptr;
+  const splat::Picture* picture = nullptr;
+};
+
+// Removes Gaussians whose opacity is below `least_opacity` or that are larger than the rope, then adds up to `budget` where
+// color or mask error is largest (drawn in proportion to the squared error), carried back to the home configuration by the
+// nearest link. Returns how many were removed and added.
+struct Changed {
+  int removed = 0, added = 0;
+};
+Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, const capture::Capture& capture,
+                      std::span<const Drawn> drawn, int budget, int most_added, core::Random& random);
+
+}  // namespace chainsplat::recognition

@@ -1,0 +1,813 @@
+#include <algorithm>
+#include <array>
+#include <bit>
+#include <cmath>
+#include <cstring>
+#include <utility>
+
+#include "chainsplat/splat.h"
+#include "shaders/shared/adam.h"
+#include "shaders/shared/splat.h"
+
+namespace chainsplat::splat {
+
+namespace {
+
+using gpu::Buffer;
+using gpu::Domain;
+using shared::AdamPush;
+using shared::SplatPush;
+using shared::SplatTile;
+using shared::SplatView;
+
+constexpr double kClampMargin = 1.3;        // of the half image, for the projection's Jacobian (SPEC 2.5)
+constexpr int kActiveMargin = 16;           // px around the mask that training draws and charges: SSIM's reach twice, and a bit
+constexpr std::uint32_t kMostTiles = 60000;  // of one submission: below every device's group count limit (65535)
+constexpr std::uint32_t kRankLimit = 256;   // longest tile list sorted by rank; longer ones by the bitonic network
+constexpr double kGrowth = 1.25;            // spare room when a capacity is raised
+constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;  // Adam, as in 3DGS
+
+struct SceneView {
+  double fx = 0, fy = 0, cx = 0, cy = 0;   // px, of the crop
+  double limit_x = 0, limit_y = 0;
+  int width = 0, height = 0, tiles_x = 0, tiles_y = 0;
+  math::Pose camera_from_world;
+  std::vector<math::Pose> motions;
+  std::size_t target = 0;                  // first pixel in the target buffer
+  std::vector<std::uint32_t> active;       // grid cells that are drawn
+};
+
+// Parameters and views that belong together: the training's, or those of one call.
+struct Scene {
+  int count = 0, links = 0, degree = 0;
+  Buffer parameters, gradient, first_moment, second_moment, target;
+  std::vector<SceneView> views;
+  std::size_t parameter_count = 0;
+  std::size_t target_pixels = 0;
+  double normalizer = 1.0;
+  int step = 0;
+  int coefficients() const { return (degree + 1) * (degree + 1); }
+};
+
+struct RunOptions {
+  LossWeights weights;
+  double color_scale = 0.0;   // what |I^ - I| sums are divided by
+  double mask_scale = 0.0;
+  bool loss = false, backward = false, twists = false, depth = false, accumulate = false;
+};
+
+struct ViewSums {
+  double l1 = 0, mask = 0, squared = 0, object = 0, dssim = 0;
+};
+
+std::vector<float> packed(const Gaussians& g) {
+  std::vector<float> all;
+  all.reserve(g.mean.size() + g.rotation.size() + g.log_scale.size() + g.opacity_logit.size() + g.sh.size() +
+              g.link_logits.size());
+  for (const auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
+    all.insert(all.end(), part->begin(), part->end());
+  return all;
+}
+
+Gaussians unpacked(const std::vector<float>& all, int count, int links, int degree) {
+  Gaussians g;
+  g.resize(count, links, degree);
+  auto from = all.begin();
+  for (auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits}) {
+    std::copy_n(from, part->size(), part->begin());
+    from += static_cast<std::ptrdiff_t>(part->size());
+  }
+  return g;
+}
+
+// Grid cells within kActiveMargin of a mask pixel.
+std::vector<std::uint32_t> active_cells(const SceneView& view, const std::vector<std::uint8_t>& rgba, int tile_width,
+                                        int tile_height) {
+  std::vector<std::uint32_t> sum(static_cast<std::size_t>(view.width + 1) * (view.height + 1), 0);
+  const auto at = [&](int x, int y) -> std::uint32_t& {
+    return sum[static_cast<std::size_t>(y) * (view.width + 1) + x];
+  };
+  for (int y = 0; y < view.height; ++y) {
+    for (int x = 0; x < view.width; ++x) {
+      const std::uint32_t object = rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] > 0 ? 1 : 0;
+      at(x + 1, y + 1) = object + at(x, y + 1) + at(x + 1, y) - at(x, y);
+    }
+  }
+  std::vector<std::uint32_t> cells;
+  for (int ty = 0; ty < view.tiles_y; ++ty) {
+    for (int tx = 0; tx < view.tiles_x; ++tx) {
+      const int x0 = std::max(0, tx * tile_width - kActiveMargin), y0 = std::max(0, ty * tile_height - kActiveMargin);
+      const int x1 = std::min(view.width, (tx + 1) * tile_width + kActiveMargin);
+      const int y1 = std::min(view.height, (ty + 1) * tile_height + kActiveMargin);
+      if (at(x1, y1) - at(x0, y1) - at(x1, y0) + at(x0, y0) > 0) cells.push_back(ty * view.tiles_x + tx);
+    }
+  }
+  return cells;
+}
+
+}  // namespace
+
+struct Engine::State {
+  gpu::Device& device;
+  std::uint32_t tile_width, tile_height, pixels_per_lane, slots;
+  bool cutoffs;
+  double clamp_margin;                      // of the half image
+  std::size_t range_limit;                  // bytes of one storage buffer
+
+  gpu::Pipeline replicate, compact, scan_block, scan_sums, project, bin, sort, blend, blend_depth, blend_backward,
+      project_backward, gather, link_twist, adam, loss_pixel, ssim_rows, ssim_columns, ssim_rows_backward,
+      ssim_columns_backward;
+  gpu::Commands commands;
+
+  // work buffers, grown as needed
+  Buffer replica_opacity, live_flag, live_prefix, live_block, live, replica_gradient, counters;
+  Buffer views, motions, tile_map, tiles;
+  Buffer splats, instance_count, instance_prefix, instance_block, records, link_twists;
+  Buffer tile_count, tile_prefix, tile_block, tile_cursor, tile_used, tile_loss;
+  Buffer entries, sorted, partials;
+  Buffer image, depth_image, pixel_gradient, ssim_row_sums, ssim_factors;
+  std::uint32_t live_capacity = 0, instance_capacity = 0;
+  int most_views = 1 << 20;                 // of one submission, lowered when a buffer would pass the device's limit
+  std::vector<gpu::Timing> timings;
+
+  Scene training, scratch;
+
+  // of the last run, for reading back
+  std::vector<std::uint32_t> chunk_tile_view;
+  std::vector<std::size_t> chunk_pixel;
+
+  State(gpu::Device& d, const Settings& settings);
+  void need(Buffer& buffer, std::size_t bytes, const char* name);
+  void write(Buffer& buffer, const void* data, std::size_t bytes, const char* name);
+  void load_gaussians(Scene& scene, const Gaussians& gaussians);
+  void load_views(Scene& scene, std::span<const ViewSpec> specs,
+                  std::span<const std::vector<std::uint8_t>* const> targets, bool near_mask_only);
+  std::vector<std::vector<int>> chunks(const Scene& scene, std::span<const int> batch, bool dssim) const;
+  bool run(Scene& scene, std::span<const int> chunk, const RunOptions& options, const AdamPush* adam_push);
+  template <class AfterChunk>
+  void run_all(Scene& scene, std::span<const int> batch, const RunOptions& options, const AdamPush* adam_push,
+               AfterChunk after);
+  void scan(const Buffer& values, const Buffer& prefix, const Buffer& block, SplatPush push, std::size_t most);
+  std::vector<ViewSums> sums(std::size_t chunk_views);
+  std::vector<Picture> pictures(const Scene& scene, std::span<const int> chunk, bool depth);
+  std::vector<math::MatrixX> twists(const Scene& scene, std::span<const int> chunk);
+};
+
+Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), commands(d) {
+  const gpu::DeviceInfo& device_info = gpu::info(d);
+  // lavapipe: one subgroup of 8 lanes a tile, a column of 8 pixels each (loads are what costs there: DESIGN, 'The size of
+  // the work'); a GPU: one subgroup of 32 a tile, 2 pixels each
+  const int tile = settings.tile > 0 ? settings.tile : 8;
+  const int pixels = settings.pixels_per_lane > 0 ? settings.pixels_per_lane : device_info.software ? 8 : 2;
+  CHAINSPLAT_CHECK(tile % pixels == 0, std::to_string(tile) + " " + std::to_string(pixels));
+  tile_width = tile_height = static_cast<std::uint32_t>(tile);
+  pixels_per_lane = static_cast<std::uint32_t>(pixels);
+  const std::uint32_t lanes = tile_width * tile_height / pixels_per_lane;
+  slots = std::max(1u, lanes / std::max(1u, device_info.subgroup_size));
+  cutoffs = settings.exact_cutoffs;
+  constexpr double kNoClamp = 1e6;
+  clamp_margin = settings.projection_clamp ? kClampMargin : kNoClamp;
+  range_limit = static_cast<std::size_t>(std::min<std::uint64_t>(device_info.max_storage_range, 1ull << 30));
+  const std::uint32_t cut = cutoffs ? 1 : 0;
+  const std::size_t push = sizeof(SplatPush);
+  replicate = gpu::Pipeline(d, "splat_replicate", 3, push, {cut});
+  compact = gpu::Pipeline(d, "splat_compact", 4, push, {});
+  scan_block = gpu::Pipeline(d, "scan_block", 4, push, {});
+  scan_sums = gpu::Pipeline(d, "scan_sums", 2, push, {});
+  project = gpu::Pipeline(d, "splat_project", 10, push, {cut, tile_width, tile_height});
+  bin = gpu::Pipeline(d, "splat_bin", 11, push, {});
+  constexpr std::uint32_t kSortLanes = 64;
+  sort = gpu::Pipeline(d, "splat_sort", 6, push, {kSortLanes, kRankLimit});
+  blend = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 0});
+  blend_depth = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 1});
+  blend_backward =
+      gpu::Pipeline(d, "splat_blend_backward", 12, push, {lanes, tile_width, tile_height, pixels_per_lane, cut});
+  project_backward = gpu::Pipeline(d, "splat_project_backward", 11, push, {});
+  gather = gpu::Pipeline(d, "splat_gather", 11, push, {});
+  link_twist = gpu::Pipeline(d, "splat_link_twist", 5, push, {});
+  adam = gpu::Pipeline(d, "splat_adam", 5, sizeof(AdamPush), {});
+  const std::vector<std::uint32_t> tile_constants{0, tile_width, tile_height};
+  loss_pixel = gpu::Pipeline(d, "loss_pixel", 6, push, tile_constants);
+  ssim_rows = gpu::Pipeline(d, "ssim_rows", 5, push, tile_constants);
+  ssim_columns = gpu::Pipeline(d, "ssim_columns", 5, push, tile_constants);
+  ssim_rows_backward = gpu::Pipeline(d, "ssim_rows_backward", 4, push, tile_constants);
+  ssim_columns_backward = gpu::Pipeline(d, "ssim_columns_backward", 6, push, tile_constants);
+  need(counters, shared::kCounters * sizeof(std::uint32_t), "counters");
+}
+
+void Engine::State::need(Buffer& buffer, std::size_t bytes, const char* name) {
+  constexpr std::size_t kLeast = 256;
+  if (buffer.bytes() < std::max(bytes, kLeast)) {
+    buffer = Buffer();  // the old one goes first
+    buffer = Buffer(device, std::max(bytes, kLeast), Domain::device, name);
+  }
+}
+
+void Engine::State::write(Buffer& buffer, const void* data, std::size_t bytes, const char* name) {
+  need(buffer, bytes, name);
+  if (bytes == 0) return;
+  if (buffer.mapped()) {
+    std::memcpy(buffer.mapped(), data, bytes);
+  } else {
+    gpu::upload(device, buffer, data, bytes);
+  }
+}
+
+void Engine::State::load_gaussians(Scene& scene, const Gaussians& gaussians) {
+  scene.count = gaussians.count;
+  scene.links = gaussians.links;
+  scene.degree = gaussians.degree;
+  const std::vector<float> all = packed(gaussians);
+  scene.parameter_count = all.size();
+  scene.step = 0;
+  write(scene.parameters, all.data(), all.size() * sizeof(float), "parameters");
+  need(scene.gradient, all.size() * sizeof(float), "gradient");
+}
+
+void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
+                               std::span<const std::vector<std::uint8_t>* const> targets, bool near_mask_only) {
+  scene.views.clear();
+  scene.target_pixels = 0;
+  double object_pixels = 0.0;
+  std::vector<std::uint8_t> all_targets;
+  for (std::size_t v = 0; v < specs.size(); ++v) {
+    const ViewSpec& spec = specs[v];
+    SceneView view;
+    view.fx = spec.camera->fx;
+    view.fy = spec.camera->fy;
+    view.cx = spec.camera->cx - spec.x0;
+    view.cy = spec.camera->cy - spec.y0;
+    view.limit_x = clamp_margin * 0.5 * spec.camera->width / view.fx;
+    view.limit_y = clamp_margin * 0.5 * spec.camera->height / view.fy;
+    view.width = spec.width;
+    view.height = spec.height;
+    view.tiles_x = (spec.width + static_cast<int>(tile_width) - 1) / static_cast<int>(tile_width);
+    view.tiles_y = (spec.height + static_cast<int>(tile_height) - 1) / static_cast<int>(tile_height);
+    view.camera_from_world = spec.camera->world_from_camera.inverse();
+    view.motions = spec.motions;
+    if (!targets.empty()) {
+      const std::vector<std::uint8_t>& target = *targets[v];
+      CHAINSPLAT_CHECK(target.size() == 4u * spec.width * spec.height, std::to_string(target.size()));
+      view.target = all_targets.size() / 4;
+      all_targets.insert(all_targets.end(), target.begin(), target.end());
+      for (std::size_t k = 3; k < target.size(); k += 4) object_pixels += target[k] >= 128 ? 1.0 : 0.0;
+      if (near_mask_only) view.active = active_cells(view, target, static_cast<int>(tile_width), static_cast<int>(tile_height));
+    }
+    if (!near_mask_only) {
+      view.active.resize(static_cast<std::size_t>(view.tiles_x) * view.tiles_y);
+      for (std::size_t k = 0; k < view.active.size(); ++k) view.active[k] = static_cast<std::uint32_t>(k);
+    }
+    scene.views.push_back(std::move(view));
+  }
+  scene.target_pixels = all_targets.size() / 4;
+  scene.normalizer = std::max(1.0, object_pixels / std::max<std::size_t>(1, specs.size()));
+  write(scene.target, all_targets.data(), all_targets.size(), "target");
+}
+
+// Views that go into one submission: bounded by buffer ranges and group counts of the device, never by time.
+std::vector<std::vector<int>> Engine::State::chunks(const Scene& scene, std::span<const int> batch, bool dssim) const {
+  const std::size_t row_bytes = dssim ? 4 * sizeof(glm::vec4) : sizeof(glm::vec4);
+  const std::size_t most_pixels = range_limit / row_bytes;
+  std::vector<std::vector<int>> out;
+  std::size_t pixels = 0, tile_total = 0;
+  for (const int v : batch) {
+    const SceneView& view = scene.views[v];
+    const std::size_t view_pixels = static_cast<std::size_t>(view.width) * view.height;
+    if (view_pixels > most_pixels || view.active.size() > kMostTiles)
+      throw WorkError("splat", "an image of " + std::to_string(view.width) + "x" + std::to_string(view.height) +
+                                   " pixels does not fit this device's buffers", "use smaller images or another device");
+    if (out.empty() || pixels + view_pixels > most_pixels || tile_total + view.active.size() > kMostTiles ||
+        static_cast<int>(out.back().size()) >= most_views) {
+      out.emplace_back();
+      pixels = tile_total = 0;
+    }
+    out.back().push_back(v);
+    pixels += view_pixels;
+    tile_total += view.active.size();
+  }
+  return out;
+}
+
+void Engine::State::scan(const Buffer& values, const Buffer& prefix, const Buffer& block, SplatPush push,
+                         std::size_t most) {
+  const auto groups = static_cast<std::uint32_t>((most + shared::kScanBlock - 1) / shared::kScanBlock);
+  const std::array block_buffers{&values, &prefix, &block, static_cast<const Buffer*>(&counters)};
+  commands.dispatch(scan_block, block_buffers, &push, sizeof push, groups);
+  const std::array sum_buffers{&block, static_cast<const Buffer*>(&counters)};
+  commands.dispatch(scan_sums, sum_buffers, &push, sizeof push, 1);
+}
+
+// Records and runs all passes for one chunk. False: a capacity was too small; it has been raised, run again.
+bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptions& options, const AdamPush* adam_push) {
+  const auto count = static_cast<std::uint32_t>(scene.count), links = static_cast<std::uint32_t>(scene.links);
+  const auto view_count = static_cast<std::uint32_t>(chunk.size());
+  const std::size_t replicas = static_cast<std::size_t>(count) * links;
+
+  // the chunk's views, tiles and poses
+  std::vector<SplatView> gpu_views(view_count);
+  std::vector<glm::vec4> rows(static_cast<std::size_t>(view_count) * links * 3);
+  std::vector<std::uint32_t> map;
+  std::vector<SplatTile> active;
+  chunk_tile_view.clear();
+  chunk_pixel.assign(view_count, 0);
+  std::size_t pixels = 0;
+  bool all_active = true;
+  for (std::uint32_t v = 0; v < view_count; ++v) {
+    const SceneView& view = scene.views[chunk[v]];
+    CHAINSPLAT_CHECK(view.motions.size() == links || count == 0, std::to_string(view.motions.size()));
+    SplatView& out = gpu_views[v];
+    out.intrinsics = {view.fx, view.fy, view.cx, view.cy};
+    out.limits = {view.limit_x, view.limit_y, 0, 0};
+    const math::Vector3 base =
+        view.motions.empty() ? math::Vector3::Zero() : view.camera_from_world * view.motions[0].translation;
+    out.moment_point = {base.x(), base.y(), base.z(), 0};
+    out.width = static_cast<std::uint32_t>(view.width);
+    out.height = static_cast<std::uint32_t>(view.height);
+    out.tiles_x = static_cast<std::uint32_t>(view.tiles_x);
+    out.tiles_y = static_cast<std::uint32_t>(view.tiles_y);
+    out.tile_map = static_cast<std::uint32_t>(map.size());
+    out.pixel = static_cast<std::uint32_t>(pixels);
+    out.target = static_cast<std::uint32_t>(view.target);
+    out.motion = v * links;
+    chunk_pixel[v] = pixels;
+    pixels += static_cast<std::size_t>(view.width) * view.height;
+    map.resize(map.size() + static_cast<std::size_t>(view.tiles_x) * view.tiles_y, shared::kNoTile);
+    all_active = all_active && view.active.size() == static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
+    for (const std::uint32_t cell : view.active) {
+      map[out.tile_map + cell] = static_cast<std::uint32_t>(active.size());
+      active.push_back({v, cell % out.tiles_x, cell / out.tiles_x, 0});
+      chunk_tile_view.push_back(v);
+    }
+    for (std::uint32_t j = 0; j < std::min<std::size_t>(links, view.motions.size()); ++j) {
+      const math::Pose pose = view.camera_from_world * view.motions[j];
+      for (int r = 0; r < 3; ++r)
+        rows[3 * (out.motion + j) + r] = {pose.rotation(r, 0), pose.rotation(r, 1), pose.rotation(r, 2),
+                                          pose.translation[r]};
+    }
+  }
+  const auto tile_total = static_cast<std::uint32_t>(active.size());
+  write(views, gpu_views.data(), gpu_views.size() * sizeof(SplatView), "views");
+  write(motions, rows.data(), rows.size() * sizeof(glm::vec4), "motions");
+  write(tile_map, map.data(), map.size() * sizeof(std::uint32_t), "tile map");
+  write(tiles, active.data(), active.size() * sizeof(SplatTile), "tiles");
+
+  // room
+  if (live_capacity == 0 || live_capacity > replicas)
+    live_capacity = static_cast<std::uint32_t>(std::max<std::size_t>(1, std::min<std::size_t>(replicas, 2 * count + 256)));
+  constexpr std::uint32_t kFirstInstances = 8;  // tiles a splat touches, first guess
+  const std::size_t pairs = static_cast<std::size_t>(live_capacity) * view_count;
+  if (instance_capacity == 0) instance_capacity = static_cast<std::uint32_t>(std::max<std::size_t>(1024, kFirstInstances * pairs / 2));
+  const auto words = [](std::size_t n) { return n * sizeof(std::uint32_t); };
+  const auto vectors = [](std::size_t n) { return n * sizeof(glm::vec4); };
+  const auto blocks = [](std::size_t n) { return n / shared::kScanBlock + 1; };
+  need(replica_opacity, words(replicas), "replica opacity");
+  need(live_flag, words(replicas), "live flag");
+  need(live_prefix, words(replicas), "live prefix");
+  need(live_block, words(blocks(replicas)), "live block");
+  need(live, words(live_capacity), "live");
+  need(splats, vectors(shared::kSplatRows * pairs), "splats");
+  need(instance_count, words(pairs), "instance count");
+  need(instance_prefix, words(pairs), "instance prefix");
+  need(instance_block, words(blocks(pairs)), "instance block");
+  need(tile_count, words(tile_total), "tile count");
+  need(tile_prefix, words(tile_total), "tile prefix");
+  need(tile_block, words(blocks(tile_total)), "tile block");
+  need(tile_cursor, words(tile_total), "tile cursor");
+  need(tile_used, words(tile_total), "tile used");
+  need(tile_loss, 2 * vectors(tile_total), "tile loss");
+  need(entries, vectors(instance_capacity), "entries");
+  need(sorted, 2 * words(instance_capacity), "sorted");
+  need(image, vectors(pixels), "image");
+  need(depth_image, options.depth ? words(pixels) : 0, "depth image");
+  const bool dssim = options.loss && options.weights.dssim > 0.0f;
+  if (options.loss) need(pixel_gradient, vectors(pixels), "pixel gradient");
+  if (dssim) {
+    need(ssim_row_sums, 4 * vectors(pixels), "ssim rows");
+    need(ssim_factors, 3 * vectors(pixels), "ssim factors");
+  }
+  if (options.backward) {
+    need(partials, vectors(static_cast<std::size_t>(shared::kPartialRows) * slots * instance_capacity), "partials");
+    need(records, vectors(shared::kGradientRows * pairs), "records");
+    need(replica_gradient, words(replicas), "replica gradient");
+    if (options.twists) need(link_twists, 2 * vectors(static_cast<std::size_t>(view_count) * links), "link twists");
+  }
+
+  SplatPush push{};
+  push.gaussians = count;
+  push.links = links;
+  push.coefficients = static_cast<std::uint32_t>(scene.coefficients());
+  push.views = view_count;
+  push.live_capacity = live_capacity;
+  push.instance_capacity = instance_capacity;
+  push.tiles = tile_total;
+  push.slots = slots;
+  push.weight_l1 = static_cast<float>(options.weights.l1 * options.color_scale);
+  push.weight_dssim = static_cast<float>(options.weights.dssim * options.color_scale);
+  push.weight_mask = static_cast<float>(options.weights.mask * options.mask_scale);
+  push.flags = options.accumulate ? shared::kFlagAccumulate : 0;
+  const auto dispatch = [&](const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers,
+                            std::uint32_t x, std::uint32_t y = 1) {
+    commands.dispatch(pipeline, {buffers.begin(), buffers.size()}, &push, sizeof push, x, y);
+  };
+  const auto dispatch_live = [&](const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers) {
+    commands.dispatch_indirect(pipeline, {buffers.begin(), buffers.size()}, &push, sizeof push, counters,
+                               words(shared::kCounterDispatch));
+  };
+  const auto groups = [](std::size_t n) { return static_cast<std::uint32_t>((n + shared::kGroup - 1) / shared::kGroup); };
+
+  commands.begin();
+  commands.fill(counters, 0, 0, words(shared::kCounters));
+  commands.fill(tile_count, 0, 0, words(std::max(1u, tile_total)));
+  commands.no_barrier();
+  commands.fill(tile_cursor, 0, 0, words(std::max(1u, tile_total)));
+  commands.no_barrier();
+  commands.fill(tile_used, 0, 0, words(std::max(1u, tile_total)));
+  if (dssim && !all_active) {
+    // neighbors of active tiles are read by the windows: black there
+    commands.fill(image, 0, 0, vectors(pixels));
+    commands.fill(ssim_row_sums, 0, 0, 4 * vectors(pixels));
+    commands.fill(ssim_factors, 0, 0, 3 * vectors(pixels));
+  }
+  commands.stamp("clear");
+  dispatch(replicate, {&scene.parameters, &replica_opacity, &live_flag}, groups(count));
+  push.scan_length = static_cast<std::uint32_t>(replicas);
+  push.scan_counter = shared::kCounterLive;
+  scan(live_flag, live_prefix, live_block, push, replicas);
+  constexpr std::uint32_t kRow = 32768;  // groups in x of a two-dimensional dispatch
+  const std::uint32_t replica_groups = groups(replicas);
+  dispatch(compact, {&live_flag, &live_prefix, &live_block, &live}, std::min(replica_groups, kRow),
+           (replica_groups + kRow - 1) / kRow);
+  commands.stamp("replicate");
+  dispatch_live(project, {&scene.parameters, &replica_opacity, &live, &views, &motions, &tile_map, &counters, &splats,
+                          &instance_count, &tile_count});
+  commands.stamp("project");
+  SplatPush scan_push = push;
+  scan_push.scan_per_live = view_count;
+  scan_push.scan_counter = shared::kCounterInstances;
+  scan(instance_count, instance_prefix, instance_block, scan_push, pairs);
+  scan_push.scan_per_live = 0;
+  scan_push.scan_length = tile_total;
+  scan_push.scan_counter = shared::kCounterTiles;
+  scan(tile_count, tile_prefix, tile_block, scan_push, tile_total);
+  commands.stamp("scan");
+  dispatch_live(bin, {&live, &views, &tile_map, &counters, &splats, &instance_prefix, &instance_block, &tile_prefix,
+                      &tile_block, &tile_cursor, &entries});
+  commands.stamp("bin");
+  dispatch(sort, {&tile_prefix, &tile_block, &tile_count, &entries, &sorted, &counters}, tile_total);
+  commands.stamp("sort");
+  dispatch(options.depth ? blend_depth : blend,
+           {&tiles, &views, &tile_prefix, &tile_block, &tile_count, &sorted, &splats, &counters, &image, &tile_used,
+            &depth_image},
+           tile_total);
+  commands.stamp("blend");
+  if (options.loss) {
+    dispatch(loss_pixel, {&tiles, &views, &image, &scene.target, &pixel_gradient, &tile_loss}, tile_total);
+    commands.stamp("loss");
+    if (dssim) {
+      dispatch(ssim_rows, {&tiles, &views, &image, &scene.target, &ssim_row_sums}, tile_total);
+      dispatch(ssim_columns, {&tiles, &views, &ssim_row_sums, &ssim_factors, &tile_loss}, tile_total);
+      dispatch(ssim_rows_backward, {&tiles, &views, &ssim_factors, &ssim_row_sums}, tile_total);
+      dispatch(ssim_columns_backward, {&tiles, &views, &ssim_row_sums, &image, &scene.target, &pixel_gradient}, tile_total);
+      commands.stamp("ssim");
+    }
+  }
+  if (options.backward) {
+    dispatch(blend_backward, {&tiles, &views, &tile_prefix, &tile_block, &tile_count, &sorted, &splats, &counters, &image,
+                              &tile_used, &pixel_gradient, &partials},
+             tile_total);
+    commands.stamp("blend backward");
+    dispatch_live(project_backward, {&scene.parameters, &live, &views, &motions, &counters, &splats, &instance_count,
+                                     &instance_prefix, &instance_block, &partials, &records});
+    commands.stamp("project backward");
+    dispatch(gather, {&scene.parameters, &replica_opacity, &live_flag, &live_prefix, &live_block, &views, &motions,
+                      &counters, &records, &scene.gradient, &replica_gradient},
+             groups(count));
+    if (options.twists && count > 0)
+      dispatch(link_twist, {&live_prefix, &live_block, &counters, &records, &link_twists}, links, view_count);
+    commands.stamp("gather");
+    if (adam_push) {
+      const std::array buffers{static_cast<const Buffer*>(&scene.parameters), static_cast<const Buffer*>(&scene.gradient),
+                               static_cast<const Buffer*>(&scene.first_moment),
+                               static_cast<const Buffer*>(&scene.second_moment), static_cast<const Buffer*>(&counters)};
+      const std::uint32_t parameter_groups = groups(scene.parameter_count);
+      commands.dispatch(adam, buffers, adam_push, sizeof *adam_push, std::min(parameter_groups, kRow),
+                        (parameter_groups + kRow - 1) / kRow);
+      commands.stamp("adam");
+    }
+  }
+  commands.submit();
+  commands.wait();
+  for (const gpu::Timing& timing : commands.timings()) {
+    const auto same = std::find_if(timings.begin(), timings.end(), [&](const auto& t) { return t.label == timing.label; });
+    if (same == timings.end()) {
+      timings.push_back(timing);
+    } else {
+      same->milliseconds += timing.milliseconds;
+    }
+  }
+
+  std::array<std::uint32_t, shared::kCounters> read{};
+  gpu::download(device, counters, read.data(), words(shared::kCounters));
+  if (read[shared::kCounterOverflow] == 0) return true;
+  // raise what was too small, as far as one buffer may reach
+  const std::size_t want_live = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantLive]) + 64;
+  const std::size_t want_instances = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantInstances]) + 1024;
+  if (read[shared::kCounterWantLive] > live_capacity)
+    live_capacity = static_cast<std::uint32_t>(std::min<std::size_t>(want_live, replicas));
+  if (read[shared::kCounterWantInstances] > instance_capacity) instance_capacity = static_cast<std::uint32_t>(want_instances);
+  const std::size_t record_bytes = vectors(shared::kGradientRows * static_cast<std::size_t>(live_capacity) * view_count);
+  const std::size_t partial_bytes = vectors(static_cast<std::size_t>(shared::kPartialRows) * slots * instance_capacity);
+  if (std::max(record_bytes, partial_bytes) > range_limit) {
+    if (view_count == 1)
+      throw WorkError("splat", "one view needs " + std::to_string(instance_capacity) + " tile entries, more than this device's buffers hold",
+                      "use fewer or smaller Gaussians");
+    most_views = static_cast<int>(view_count) / 2;
+    instance_capacity = 0;
+  }
+  return false;
+}
+
+template <class AfterChunk>
+void Engine::State::run_all(Scene& scene, std::span<const int> batch, const RunOptions& options, const AdamPush* adam_push,
+                            AfterChunk after) {
+  const bool dssim = options.loss && options.weights.dssim > 0.0f;
+  timings.clear();
+  std::size_t done = 0;
+  while (done < batch.size()) {
+    // planned anew after every chunk: an overflow may have lowered most_views
+    const std::vector<int> chunk = chunks(scene, batch.subspan(done), dssim).front();
+    RunOptions with = options;
+    with.accumulate = done > 0;
+    const bool last = done + chunk.size() == batch.size();
+    if (!run(scene, chunk, with, last ? adam_push : nullptr)) continue;
+    after(std::span<const int>(chunk), done);
+    done += chunk.size();
+  }
+}
+
+std::vector<ViewSums> Engine::State::sums(std::size_t chunk_views) {
+  std::vector<ViewSums> out(chunk_views);
+  std::vector<glm::vec4> rows(2 * chunk_tile_view.size());
+  if (!rows.empty()) gpu::download(device, tile_loss, rows.data(), rows.size() * sizeof(glm::vec4));
+  for (std::size_t t = 0; t < chunk_tile_view.size(); ++t) {
+    ViewSums& view = out[chunk_tile_view[t]];
+    view.l1 += rows[2 * t].x;
+    view.mask += rows[2 * t].y;
+    view.squared += rows[2 * t].z;
+    view.object += rows[2 * t].w;
+    view.dssim += rows[2 * t + 1].x;
+  }
+  return out;
+}
+
+std::vector<Picture> Engine::State::pictures(const Scene& scene, std::span<const int> chunk, bool depth) {
+  std::vector<Picture> out(chunk.size());
+  for (std::size_t v = 0; v < chunk.size(); ++v) {
+    const SceneView& view = scene.views[chunk[v]];
+    Picture& picture = out[v];
+    picture.width = view.width;
+    picture.height = view.height;
+    const std::size_t pixels = static_cast<std::size_t>(view.width) * view.height;
+    picture.rgba.assign(4 * pixels, 0.0f);
+    if (pixels == 0) continue;
+    gpu::download(device, image, picture.rgba.data(), 4 * pixels * sizeof(float), chunk_pixel[v] * sizeof(glm::vec4));
+    if (depth) {
+      picture.depth.resize(pixels);
+      gpu::download(device, depth_image, picture.depth.data(), pixels * sizeof(float), chunk_pixel[v] * sizeof(float));
+    }
+    if (view.active.size() == static_cast<std::size_t>(view.tiles_x) * view.tiles_y) continue;
+    // what was not drawn holds pixels of an earlier batch
+    std::vector<bool> drawn(static_cast<std::size_t>(view.tiles_x) * view.tiles_y, false);
+    for (const std::uint32_t cell : view.active) drawn[cell] = true;
+    for (int y = 0; y < view.height; ++y) {
+      for (int x = 0; x < view.width; ++x) {
+        if (drawn[static_cast<std::size_t>(y / static_cast<int>(tile_height)) * view.tiles_x + x / static_cast<int>(tile_width)]) continue;
+        const std::size_t k = static_cast<std::size_t>(y) * view.width + x;
+        std::fill_n(picture.rgba.begin() + 4 * k, 4, 0.0f);
+        if (depth) picture.depth[k] = 0.0f;
+      }
+    }
+  }
+  return out;
+}
+
+// Device: moment about the view's base origin, camera frame. Out: world twist about the world origin (SPEC 2.3).
+std::vector<math::MatrixX> Engine::State::twists(const Scene& scene, std::span<const int> chunk) {
+  std::vector<glm::vec4> rows(2 * chunk.size() * scene.links, glm::vec4(0.0f));
+  if (scene.count > 0) gpu::download(device, link_twists, rows.data(), rows.size() * sizeof(glm::vec4));
+  std::vector<math::MatrixX> out;
+  for (std::size_t v = 0; v < chunk.size(); ++v) {
+    const SceneView& view = scene.views[chunk[v]];
+    const math::Matrix3 world_from_camera = view.camera_from_world.rotation.transpose();
+    math::MatrixX twist = math::MatrixX::Zero(6, scene.links);
+    for (int j = 0; j < scene.links && scene.count > 0; ++j) {
+      const glm::vec4 m = rows[2 * (v * scene.links + j)], f = rows[2 * (v * scene.links + j) + 1];
+      const math::Vector3 force = world_from_camera * math::Vector3(f.x, f.y, f.z);
+      twist.col(j).head<3>() =
+          world_from_camera * math::Vector3(m.x, m.y, m.z) + view.motions[0].translation.cross(force);
+      twist.col(j).tail<3>() = force;
+    }
+    out.push_back(std::move(twist));
+  }
+  return out;
+}
+
+namespace {
+
+std::vector<int> everything(std::size_t count) {
+  std::vector<int> all(count);
+  for (std::size_t k = 0; k < count; ++k) all[k] = static_cast<int>(k);
+  return all;
+}
+
+void append(LossValues& values, const std::vector<ViewSums>& sums, const LossWeights& weights, double normalizer) {
+  for (const ViewSums& sum : sums) {
+    const double l1 = sum.l1 / (3.0 * normalizer), mask = sum.mask / normalizer, dssim = sum.dssim / (3.0 * normalizer);
+    values.l1.push_back(l1);
+    values.mask.push_back(mask);
+    values.ssim.push_back(1.0 - dssim);
+    values.psnr_object.push_back(-10.0 * std::log10(std::max(1e-12, sum.squared / std::max(1.0, 3.0 * sum.object))));
+    values.total += weights.l1 * l1 + weights.mask * mask + weights.dssim * dssim;
+  }
+}
+
+}  // namespace
+
+Engine::Engine(gpu::Device& device, const Settings& settings) : state_(std::make_unique<State>(device, settings)) {}
+Engine::~Engine() = default;
+Engine::Engine(Engine&&) noexcept = default;
+
+std::vector<Picture> Engine::draw(const Gaussians& gaussians, std::span<const ViewSpec> views, bool depth) {
+  State& s = *state_;
+  s.load_gaussians(s.scratch, gaussians);
+  s.load_views(s.scratch, views, {}, false);
+  RunOptions options;
+  options.depth = depth;
+  std::vector<Picture> out;
+  s.run_all(s.scratch, everything(views.size()), options, nullptr, [&](std::span<const int> chunk, std::size_t) {
+    for (Picture& picture : s.pictures(s.scratch, chunk, depth)) out.push_back(std::move(picture));
+  });
+  return out;
+}
+
+LossValues Engine::loss(const Gaussians& gaussians, std::span<const ViewSpec> views,
+                        std::span<const std::vector<std::uint8_t>* const> targets, const LossWeights& weights,
+                        double normalizer, Gradients* gradients, std::vector<Picture>* pictures) {
+  State& s = *state_;
+  s.load_gaussians(s.scratch, gaussians);
+  s.load_views(s.scratch, views, targets, false);
+  LossValues values;
+  if (gradients) {
+    gradients->gaussians = unpacked(std::vector<float>(s.scratch.parameter_count, 0.0f), gaussians.count, gaussians.links,
+                                    gaussians.degree);
+    std::fill(gradients->gaussians.rotation.begin(), gradients->gaussians.rotation.end(), 0.0f);
+    gradients->link_twists.clear();
+  }
+  // crops of different size have different means: one call a normalizer, summed here
+  std::vector<float> total(s.scratch.parameter_count, 0.0f), part(s.scratch.parameter_count);
+  const auto run_batch = [&](std::span<const int> batch, double pixels) {
+    RunOptions options;
+    options.weights = weights;
+    options.color_scale = 1.0 / (3.0 * pixels);
+    options.mask_scale = 1.0 / pixels;
+    options.loss = true;
+    options.backward = options.twists = gradients != nullptr;
+    s.run_all(s.scratch, batch, options, nullptr, [&](std::span<const int> chunk, std::size_t) {
+      append(values, s.sums(chunk.size()), weights, pixels);
+      if (gradients)
+        for (math::MatrixX& twist : s.twists(s.scratch, chunk)) gradients->link_twists.push_back(std::move(twist));
+      if (pictures)
+        for (Picture& picture : s.pictures(s.scratch, chunk, false)) pictures->push_back(std::move(picture));
+    });
+    if (gradients && !part.empty()) {
+      gpu::download(s.device, s.scratch.gradient, part.data(), part.size() * sizeof(float));
+      for (std::size_t k = 0; k < part.size(); ++k) total[k] += part[k];
+    }
+  };
+  if (pictures) pictures->clear();
+  if (normalizer > 0.0) {
+    run_batch(everything(views.size()), normalizer);
+  } else {
+    for (int v = 0; v < static_cast<int>(views.size()); ++v) {
+      const std::array one{v};
+      run_batch(one, std::max(1.0, static_cast<double>(views[v].width) * views[v].height));
+    }
+  }
+  if (gradients) gradients->gaussians = unpacked(total, gaussians.count, gaussians.links, gaussians.degree);
+  return values;
+}
+
+void Engine::set_views(std::span<const ViewSpec> views, std::span<const std::vector<std::uint8_t>* const> targets) {
+  state_->load_views(state_->training, views, targets, true);
+}
+
+void Engine::set_motions(int view, const std::vector<math::Pose>& motions) {
+  state_->training.views.at(view).motions = motions;
+}
+
+void Engine::set_gaussians(const Gaussians& gaussians) {
+  State& s = *state_;
+  s.load_gaussians(s.training, gaussians);
+  const std::vector<float> zero(s.training.parameter_count, 0.0f);
+  s.write(s.training.first_moment, zero.data(), zero.size() * sizeof(float), "first moment");
+  s.write(s.training.second_moment, zero.data(), zero.size() * sizeof(float), "second moment");
+}
+
+Gaussians Engine::gaussians() const {
+  const Scene& scene = state_->training;
+  std::vector<float> all(scene.parameter_count);
+  if (!all.empty()) gpu::download(state_->device, scene.parameters, all.data(), all.size() * sizeof(float));
+  return unpacked(all, scene.count, scene.links, scene.degree);
+}
+
+LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, const AdamRates& rates, bool read_losses,
+                        std::vector<math::MatrixX>* twists) {
+  State& s = *state_;
+  Scene& scene = s.training;
+  RunOptions options;
+  options.weights = weights;
+  options.mask_scale = 1.0 / (scene.normalizer * static_cast<double>(batch.size()));
+  options.color_scale = options.mask_scale / 3.0;
+  options.loss = options.backward = true;
+  options.twists = twists != nullptr;
+  if (twists) twists->clear();
+  ++scene.step;
+  AdamPush push{};
+  push.gaussians = static_cast<std::uint32_t>(scene.count);
+  push.links = static_cast<std::uint32_t>(scene.links);
+  push.coefficients = static_cast<std::uint32_t>(scene.coefficients());
+  push.total = static_cast<std::uint32_t>(scene.parameter_count);
+  push.mean = rates.mean;
+  push.rotation = rates.rotation;
+  push.log_scale = rates.log_scale;
+  push.opacity = rates.opacity;
+  push.sh0 = rates.sh0;
+  push.sh_rest = rates.sh_rest;
+  push.link_logits = rates.link_logits;
+  push.epsilon = kEpsilon;
+  push.beta1 = kBeta1;
+  push.beta2 = kBeta2;
+  push.correction1 = static_cast<float>(1.0 / (1.0 - std::pow(kBeta1, scene.step)));
+  push.correction2 = static_cast<float>(1.0 / (1.0 - std::pow(kBeta2, scene.step)));
+  LossValues values;
+  s.run_all(scene, batch, options, &push, [&](std::span<const int> chunk, std::size_t) {
+    if (read_losses) append(values, s.sums(chunk.size()), weights, scene.normalizer);
+    if (twists)
+      for (math::MatrixX& twist : s.twists(scene, chunk)) twists->push_back(std::move(twist));
+  });
+  return values;
+}
+
+std::vector<Picture> Engine::draw_views(std::span<const int> batch, bool depth) {
+  State& s = *state_;
+  RunOptions options;
+  options.depth = depth;
+  std::vector<Picture> out;
+  s.run_all(s.training, batch, options, nullptr, [&](std::span<const int> chunk, std::size_t) {
+    for (Picture& picture : s.pictures(s.training, chunk, depth)) out.push_back(std::move(picture));
+  });
+  return out;
+}
+
+Engine::Snapshot Engine::snapshot() const {
+  const Scene& scene = state_->training;
+  Snapshot out;
+  out.gaussians = gaussians();
+  out.step = scene.step;
+  for (const auto& [buffer, values] : {std::pair{&scene.first_moment, &out.first_moment},
+                                       std::pair{&scene.second_moment, &out.second_moment}}) {
+    values->resize(scene.parameter_count);
+    if (!values->empty()) gpu::download(state_->device, *buffer, values->data(), values->size() * sizeof(float));
+  }
+  return out;
+}
+
+void Engine::restore(const Snapshot& snapshot) {
+  State& s = *state_;
+  s.load_gaussians(s.training, snapshot.gaussians);
+  CHAINSPLAT_CHECK(snapshot.first_moment.size() == s.training.parameter_count, std::to_string(snapshot.first_moment.size()));
+  s.write(s.training.first_moment, snapshot.first_moment.data(), snapshot.first_moment.size() * sizeof(float), "first moment");
+  s.write(s.training.second_moment, snapshot.second_moment.data(), snapshot.second_moment.size() * sizeof(float), "second moment");
+  s.training.step = snapshot.step;
+}
+
+void Engine::reset_opacity(float largest) {
+  Snapshot now = snapshot();
+  const float logit = std::log(largest / (1.0f - largest));
+  for (float& value : now.gaussians.opacity_logit) value = std::min(value, logit);
+  const std::size_t first = 10u * now.gaussians.count;
+  for (auto* moment : {&now.first_moment, &now.second_moment}) std::fill_n(moment->begin() + first, now.gaussians.count, 0.0f);
+  restore(now);
+}
+
+void Engine::reset_links() {
+  Snapshot now = snapshot();
+  std::fill(now.gaussians.link_logits.begin(), now.gaussians.link_logits.end(), 0.0f);
+  for (auto* moment : {&now.first_moment, &now.second_moment})
+    std::fill(moment->end() - static_cast<std::ptrdiff_t>(now.gaussians.link_logits.size()), moment->end(), 0.0f);
+  restore(now);
+}
+
+std::vector<gpu::Timing> Engine::timings() const { return state_->timings; }
+
+}  // namespace chainsplat::splat

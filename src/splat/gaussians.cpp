@@ -1,0 +1,55 @@
+#include <algorithm>
+#include <cmath>
+
+#include "chainsplat/splat.h"
+
+namespace chainsplat::splat {
+
+void Gaussians::resize(int new_count, int new_links, int new_degree) {
+  CHAINSPLAT_CHECK(links == 0 || links == new_links, std::to_string(links));
+  const int old_coefficients = sh_coefficients(), old_count = std::min(count, new_count);
+  links = new_links;
+  degree = new_degree;
+  const int coefficients = sh_coefficients();
+  std::vector<float> old_sh = std::move(sh);
+  sh.assign(static_cast<std::size_t>(new_count) * coefficients * 3, 0.0f);
+  for (int i = 0; i < old_count; ++i) {
+    const int shared = 3 * std::min(coefficients, old_coefficients);
+    std::copy_n(old_sh.begin() + 3 * old_coefficients * i, shared, sh.begin() + 3 * coefficients * i);
+  }
+  mean.resize(3 * new_count, 0.0f);
+  log_scale.resize(3 * new_count, 0.0f);
+  opacity_logit.resize(new_count, 0.0f);
+  link_logits.resize(static_cast<std::size_t>(new_count) * links, 0.0f);
+  rotation.resize(4 * new_count, 0.0f);
+  for (int i = old_count; i < new_count; ++i) rotation[4 * i] = 1.0f;
+  count = new_count;
+}
+
+math::Vector3 sh_color(const Gaussians& gaussians, int index, const math::Vector3& r) {
+  const double x = r.x(), y = r.y(), z = r.z();
+  const double basis[16] = {0.28209479177387814,
+                            -0.4886025119029199 * y,
+                            0.4886025119029199 * z,
+                            -0.4886025119029199 * x,
+                            1.0925484305920792 * x * y,
+                            -1.0925484305920792 * y * z,
+                            0.31539156525252005 * (2 * z * z - x * x - y * y),
+                            -1.0925484305920792 * x * z,
+                            0.5462742152960396 * (x * x - y * y),
+                            -0.5900435899266435 * y * (3 * x * x - y * y),
+                            2.890611442640554 * x * y * z,
+                            -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+                            0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+                            -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+                            1.445305721320277 * z * (x * x - y * y),
+                            -0.5900435899266435 * x * (x * x - 3 * y * y)};
+  math::Vector3 color = math::Vector3::Constant(0.5);
+  const int coefficients = gaussians.sh_coefficients();
+  for (int l = 0; l < coefficients; ++l) {
+    for (int c = 0; c < 3; ++c) color[c] += basis[l] * gaussians.sh[3 * (coefficients * index + l) + c];
+  }
+  return color.cwiseMax(0.0);
+}
+
+}  // namespace chainsplat::splat

@@ -1,0 +1,425 @@
+#include "chainsplat/dynamics.h"
+
+#include <cmath>
+#include <doctest/doctest.h>
+#include <fstream>
+#include <nlohmann/json.hpp>
+
+using namespace chainsplat;
+using namespace chainsplat::dynamics;
+using nlohmann::json;
+using math::Matrix6;
+using math::Pose;
+
+namespace {
+
+const char* kFiles[] = {"chain_planar_1", "chain_planar_3", "chain_planar_8", "chain_universal_4"};
+
+json load(const std::string& name) {
+  return json::parse(core::read_file(Path(CHAINSPLAT_SOURCE_DIR) / "tests/data/vectors" / (name + ".json")));
+}
+VectorX vector_of(const json& j) {
+  VectorX v(j.size());
+  for (std::size_t i = 0; i < j.size(); ++i) v[i] = j[i];
+  return v;
+}
+MatrixX matrix_of(const json& j) {  // rows
+  MatrixX m(j.size(), j[0].size());
+  for (std::size_t i = 0; i < j.size(); ++i) m.row(i) = vector_of(j[i]).transpose();
+  return m;
+}
+Pose pose_of(const json& j) {
+  const MatrixX m = matrix_of(j);
+  return {m.topLeftCorner<3, 3>(), m.topRightCorner<3, 1>()};
+}
+double difference(const MatrixX& a, const MatrixX& b) {  // relative to the largest entry of b
+  REQUIRE(a.rows() == b.rows());
+  REQUIRE(a.cols() == b.cols());
+  return (a - b).cwiseAbs().maxCoeff() / std::max(b.cwiseAbs().maxCoeff(), 1e-300);
+}
+
+Model model_of(const json& file) {
+  const json& p = file["parameters"];
+  const int links = file["links"];
+  const bool universal = file["kind"] == "universal";
+  const Vector3 d = vector_of(p["direction"]), a = vector_of(p["axis_1"]);
+  const chain::Chain chain = chain::make_chain(p["length"], 2.0 * double(p["radius"]), d, a, links,
+                                               universal ? chain::Bending::spatial : chain::Bending::planar, false,
+                                               p["first_joint"]);
+  Parameters out;
+  out.link_mass = p["link_mass"].get<std::vector<double>>();
+  out.viscous_friction = p["viscous_friction"].get<std::vector<double>>();
+  out.coulomb_friction = p["coulomb_friction"].get<std::vector<double>>();
+  out.air_linear = p["air_linear"].get<std::vector<double>>();
+  out.air_quadratic = p["air_quadratic"].get<std::vector<double>>();
+  out.stiffness = p["stiffness"].get<std::vector<double>>();
+  out.rest_angle = p["rest_angle"].get<std::vector<double>>();
+  out.damping = p["damping"].get<std::vector<double>>();
+  out.tip_mass = p["tip_mass"];
+  out.radius = p["radius"];
+  out.gravity = vector_of(p["gravity"]);
+  out.table_normal = vector_of(p["table_normal"]);
+  out.table_carries_weight = false;
+  out.coulomb_speed = p["coulomb_speed"];
+  out.drag_speed = p["air_speed"];
+  return make_model(chain, out);
+}
+
+// p(t) = p0 + A (1 - cos w t), turned about z by psi (1 - cos(wpsi t)).
+BaseFunction base_of(const json& file) {
+  const json& b = file["base_motion"];
+  const Vector3 p0 = vector_of(b["p0"]), amplitude = vector_of(b["A"]), w = vector_of(b["w"]);
+  const double psi = b["psi"], wpsi = b["wpsi"];
+  return [=](double t) {
+    trajectory::BaseMotion base;
+    const double angle = psi * (1 - std::cos(wpsi * t)), rate = psi * wpsi * std::sin(wpsi * t);
+    Vector3 v, a;
+    for (int k = 0; k < 3; ++k) {
+      base.pose.translation[k] = p0[k] + amplitude[k] * (1 - std::cos(w[k] * t));
+      v[k] = amplitude[k] * w[k] * std::sin(w[k] * t);
+      a[k] = amplitude[k] * w[k] * w[k] * std::cos(w[k] * t);
+    }
+    const Vector3 z = Vector3::UnitZ();
+    base.pose.rotation = math::exp_so3(angle * z);
+    const Matrix3 back = base.pose.rotation.transpose();
+    base.velocity << rate * z, back * v;
+    base.acceleration << psi * wpsi * wpsi * std::cos(wpsi * t) * z, back * a - rate * z.cross(back * v);
+    return base;
+  };
+}
+Vector6 jerk_of(const BaseFunction& base, double t) {
+  const double e = 1e-4;  // central difference of fourth order
+  return (8.0 * (base(t + e).acceleration - base(t - e).acceleration) -
+          (base(t + 2 * e).acceleration - base(t - 2 * e).acceleration)) / (12.0 * e);
+}
+
+// A planar or spatial rope of n joints with every term switched on.
+Model rope(int joints, chain::Bending bending, bool twist = false) {
+  const chain::Chain chain = chain::make_chain(0.3, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), joints, bending, twist);
+  Parameters p;
+  const auto fill = [](int count, double value) { return std::vector<double>(count, value); };
+  p.link_mass = fill(joints, 0.06 / joints);
+  p.viscous_friction = fill(joints, 0.002), p.coulomb_friction = fill(joints, 0.05);
+  p.air_linear = fill(joints, 0.0005), p.air_quadratic = fill(joints, 0.0144 * 0.3 / joints);
+  p.stiffness = fill(chain.angles(), 0.012), p.rest_angle = fill(chain.angles(), 0.03);
+  p.damping = fill(chain.angles(), 3.6e-4);
+  p.tip_mass = 0.002, p.radius = 0.01;
+  p.table_normal = Vector3(0.1, 0.2, 1.0);
+  p.coulomb_speed = 0.02;
+  return make_model(chain, p);
+}
+Model without_losses(Model m) {
+  Parameters p = m.parameters;
+  for (auto* v : {&p.viscous_friction, &p.coulomb_friction, &p.air_linear, &p.air_quadratic, &p.damping})
+    std::fill(v->begin(), v->end(), 0.0);
+  p.table_normal.reset();
+  return make_model(m.chain, p);
+}
+VectorX random_vector(core::Random& random, int n, double scale) {
+  VectorX v(n);
+  for (int i = 0; i < n; ++i) v[i] = scale * random.normal();
+  return v;
+}
+trajectory::BaseMotion random_base(core::Random& random) {
+  trajectory::BaseMotion base;
+  base.pose = math::exp_se3(random_vector(random, 6, 1.0));
+  base.velocity = random_vector(random, 6, 1.0);
+  base.acceleration = random_vector(random, 6, 3.0);
+  return base;
+}
+
+}  // namespace
+
+TEST_CASE("constants of the model agree with the reference vectors") {
+  for (const char* name : kFiles) {
+    CAPTURE(name);
+    const json file = load(name);
+    const Model model = model_of(file);
+    for (int i = 0; i < model.chain.angles(); ++i) {
+      CHECK(difference(model.axis[i], vector_of(file["derived"]["A"][i])) < 1e-12);
+      CHECK(difference(model.chain.axes[i], vector_of(file["derived"]["S"][i])) < 1e-12);
+      CHECK((model.home[i].translation - pose_of(file["derived"]["home_frames"][i]).translation).norm() < 1e-12);
+      const MatrixX g = matrix_of(file["derived"]["G"][i]);
+      CHECK((model.inertia[i] - g).cwiseAbs().maxCoeff() <= 1e-12 * std::max(1e-3, g.cwiseAbs().maxCoeff()));
+    }
+  }
+}
+
+TEST_CASE("dynamics at single states agree with the reference vectors") {
+  for (const char* name : kFiles) {
+    CAPTURE(name);
+    const json file = load(name);
+    const Model model = model_of(file);
+    const BaseFunction base_at = base_of(file);
+    const int n = model.chain.angles();
+    for (const json& state : file["states"]) {
+      const double t = state["t"];
+      const trajectory::BaseMotion base = base_at(t);
+      CHECK((base.velocity - vector_of(state["V_b"])).norm() < 1e-12);
+      CHECK((base.acceleration - vector_of(state["Vdot_b"])).norm() < 1e-12);
+      const VectorX theta = vector_of(state["theta"]), thetadot = vector_of(state["thetadot"]),
+                    thetaddot = vector_of(state["thetaddot"]);
+      CHECK(difference(inverse_dynamics(model, base, theta, thetadot, thetaddot), vector_of(state["rnea_torque"])) < 1e-12);
+      CHECK(difference(mass_matrix(model, theta), matrix_of(state["mass_matrix"])) < 1e-12);
+      CHECK(difference(body_twists(model, base, theta, thetadot), matrix_of(state["link_twists_body"]).transpose()) < 1e-12);
+      CHECK(difference(external_wrenches(model, base, theta, thetadot),
+                       matrix_of(state["external_wrenches_body"]).transpose()) < 1e-12);
+      CHECK(difference(joint_law(model, theta, thetadot), vector_of(state["joint_law_torque"])) < 1e-12);
+      const VectorX a = vector_of(state["forward_dynamics"]);
+      CHECK(difference(forward_dynamics(model, base, theta, thetadot), a) < 1e-10);
+      CHECK(difference(forward_dynamics_articulated(model, base, theta, thetadot), a) < 1e-10);
+
+      const Linearization linear = linearize(model, base, jerk_of(base_at, t), theta, thetadot);
+      const auto solve = [&](const MatrixX& b) -> MatrixX { return linear.mass.ldlt().solve(b); };
+      CHECK(difference(-solve(linear.stiffness), matrix_of(state["da_dtheta"])) < 1e-10);
+      CHECK(difference(-solve(linear.damping), matrix_of(state["da_dthetadot"])) < 1e-10);
+      CHECK(difference(solve(linear.drive_rate), vector_of(state["da_dt"])) < 1e-8);  // the jerk is a difference
+
+      const ClosedForm closed = closed_form(model, base, theta, thetadot);
+      CHECK(difference(closed.mass, matrix_of(state["mass_matrix"])) < 1e-12);
+      CHECK((closed.coriolis - vector_of(state["coriolis_vector"])).norm() < 1e-12);
+      CHECK(difference(closed.gravity, vector_of(state["gravity_vector"])) < 1e-12);
+      CHECK(difference(closed.base, vector_of(state["base_motion_vector"])) < 1e-12);
+      CHECK(difference(-closed.friction, vector_of(state["friction_vector"])) < 1e-12);
+      CHECK(difference(closed.velocity_jacobian, matrix_of(state["da_dthetadot"])) < 1e-10);
+      CHECK(n == closed.mass.rows());
+    }
+  }
+}
+
+TEST_CASE("steps and rollouts agree with the reference vectors") {
+  for (const char* name : kFiles) {
+    CAPTURE(name);
+    const json file = load(name);
+    Model model = model_of(file);
+    const BaseFunction base = base_of(file);
+    const int n = model.chain.angles();
+    for (const json& state : file["states"]) {
+      const double t = state["t"];
+      const InitialState initial{t, vector_of(state["theta"]), vector_of(state["thetadot"])};
+      for (const bool rodas : {true, false}) {
+        const json& step = state[rodas ? "rodas3" : "implicit_velocity_euler"];
+        model.parameters.integrator = rodas ? Integrator::rodas3 : Integrator::implicit_velocity_euler;
+        model.parameters.substeps = rodas ? 4 : 1;
+        const chain::States end = rollout(model, base, initial, {t + double(step["h"])});
+        CHECK(difference(end.theta[0], vector_of(step["theta"])) < 1e-9);
+        CHECK(difference(end.thetadot[0], vector_of(step["thetadot"])) < 1e-9);
+      }
+    }
+    for (const bool rodas : {true, false}) {
+      const json& reference = file[rodas ? "rollout_rodas3" : "rollout_implicit_velocity_euler"];
+      model.parameters.integrator = rodas ? Integrator::rodas3 : Integrator::implicit_velocity_euler;
+      model.parameters.substeps = reference["substeps"];
+      std::vector<double> times;
+      for (int k = 0; k <= 150; ++k) times.push_back(k / 30.0);
+      const chain::States states = rollout(model, base, {0.0, VectorX::Zero(n), VectorX::Zero(n)}, times);
+      double worst = 0.0;
+      for (int k = 0; k <= 150; ++k)
+        worst = std::max(worst, (states.theta[k] - vector_of(reference["state"][k]).head(n)).cwiseAbs().maxCoeff());
+      CHECK(worst < 1e-8);
+    }
+  }
+}
+
+TEST_CASE("articulated, dense and inverse dynamics agree on chains with two and three axes a joint") {
+  core::Random random(3);
+  for (const bool twist : {false, true}) {
+    const Model model = rope(6, chain::Bending::spatial, twist);
+    const int n = model.chain.angles();
+    for (int trial = 0; trial < 5; ++trial) {
+      const trajectory::BaseMotion base = random_base(random);
+      const VectorX theta = random_vector(random, n, 0.4), thetadot = random_vector(random, n, 2.0);
+      const VectorX a = forward_dynamics(model, base, theta, thetadot);
+      CHECK(difference(forward_dynamics_articulated(model, base, theta, thetadot), a) < 1e-8);
+      CHECK(difference(inverse_dynamics(model, base, theta, thetadot, a), joint_law(model, theta, thetadot)) < 1e-8);
+      CHECK(difference(closed_form(model, base, theta, thetadot).mass, mass_matrix(model, theta)) < 1e-12);
+    }
+  }
+}
+
+TEST_CASE("the linearization agrees with central differences, table normal included") {
+  core::Random random(4);
+  const Model model = rope(5, chain::Bending::spatial, true);
+  const int n = model.chain.angles();
+  const trajectory::BaseMotion base = random_base(random);
+  const Vector6 jerk = random_vector(random, 6, 5.0);
+  const VectorX theta = random_vector(random, n, 0.4), thetadot = random_vector(random, n, 2.0);
+  const Linearization linear = linearize(model, base, jerk, theta, thetadot);
+  const double e = 1e-5;
+  const auto force = [&](const trajectory::BaseMotion& b, const VectorX& q, const VectorX& v) {  // M a - torque at fixed a
+    return VectorX(inverse_dynamics(model, b, q, v, linear.acceleration) - joint_law(model, q, v));
+  };
+  for (int k = 0; k < n; ++k) {
+    const VectorX unit = e * VectorX::Unit(n, k);
+    const VectorX by_angle = (force(base, theta + unit, thetadot) - force(base, theta - unit, thetadot)) / (2 * e);
+    const VectorX by_rate = (force(base, theta, thetadot + unit) - force(base, theta, thetadot - unit)) / (2 * e);
+    CHECK((by_angle - linear.stiffness.col(k)).norm() < 1e-7 * linear.stiffness.norm());
+    CHECK((by_rate - linear.damping.col(k)).norm() < 1e-7 * linear.damping.norm());
+  }
+  const auto moved = [&](double dt) {
+    trajectory::BaseMotion b = base;
+    b.pose = base.pose * math::exp_se3(dt * base.velocity);
+    b.velocity += dt * base.acceleration;
+    b.acceleration += dt * jerk;
+    return b;
+  };
+  const VectorX by_time = (force(moved(e), theta, thetadot) - force(moved(-e), theta, thetadot)) / (2 * e);
+  CHECK((by_time + linear.drive_rate).norm() < 1e-7 * linear.drive_rate.norm());
+}
+
+TEST_CASE("energy is kept without losses and falls by what the dampers take") {
+  const Model free = without_losses(rope(8, chain::Bending::spatial));
+  const int n = free.chain.angles();
+  core::Random random(6);
+  const InitialState initial{0.0, random_vector(random, n, 0.2), random_vector(random, n, 0.5)};
+  const auto energy = [](const Model& m, const VectorX& q, const VectorX& v) {
+    return potential_energy(m, Pose(), q) + 0.5 * v.dot(mass_matrix(m, q) * v);
+  };
+  const BaseFunction still = [](double) { return at_rest(Pose()); };
+  Model fine = free;
+  fine.parameters.substeps = 64;
+  const chain::States kept = rollout(fine, still, initial, {1.0});
+  const double before = energy(free, initial.theta, initial.thetadot);
+  const double swing = before - potential_energy(free, Pose(), static_equilibrium(free, Pose()));
+  CHECK(swing > 1e-3);
+  CHECK(std::abs(energy(free, kept.theta[0], kept.thetadot[0]) - before) < 1e-3 * swing);
+
+  Parameters p = free.parameters;
+  p.substeps = 32;
+  std::fill(p.damping.begin(), p.damping.end(), 5e-4);
+  const Model damped = make_model(free.chain, p);
+  std::vector<double> times;
+  const int count = 600;
+  for (int k = 0; k <= count; ++k) times.push_back(k / 600.0);
+  const chain::States states = rollout(damped, still, initial, times);
+  double taken = 0.0;  // Simpson's rule over thetadot^T D thetadot
+  for (int k = 0; k <= count; ++k)
+    taken += (k == 0 || k == count ? 1.0 : k % 2 ? 4.0 : 2.0) / 3.0 / 600.0 * 5e-4 * states.thetadot[k].squaredNorm();
+  const double after = energy(damped, states.theta.back(), states.thetadot.back());
+  CHECK(taken > 0.3 * swing);
+  CHECK(before - after == doctest::Approx(taken).epsilon(1e-3));
+}
+
+TEST_CASE("RODAS3 has third order, the Euler step first") {
+  const json file = load("chain_planar_8");
+  Model model = model_of(file);
+  model.parameters.coulomb_friction.assign(8, 0.0);  // its 20 mm/s corner hides the order at these steps
+  const BaseFunction base = base_of(file);
+  const InitialState initial{0.0, VectorX::Zero(8), VectorX::Zero(8)};
+  const auto end = [&](Integrator integrator, int substeps) {
+    model.parameters.integrator = integrator;
+    model.parameters.substeps = substeps;
+    return rollout(model, base, initial, {1.0}).theta[0];
+  };
+  const VectorX truth = end(Integrator::rodas3, 512);
+  const auto error = [&](Integrator integrator, int substeps) { return (end(integrator, substeps) - truth).norm(); };
+  const double third = std::log2(error(Integrator::rodas3, 16) / error(Integrator::rodas3, 32));
+  CHECK(third > 2.7);
+  CHECK(third < 3.6);
+  const double first = std::log2(error(Integrator::implicit_velocity_euler, 64) /
+                                 error(Integrator::implicit_velocity_euler, 128));
+  CHECK(first > 0.8);
+  CHECK(first < 1.2);
+}
+
+TEST_CASE("sensitivities agree with differences of rollouts") {
+  core::Random random(8);
+  Model model = rope(4, chain::Bending::spatial);
+  model.parameters.substeps = 64;
+  const int n = model.chain.angles(), links = 4;
+  const BaseFunction base = base_of(load("chain_planar_8"));
+  std::vector<double> times;
+  for (int k = 1; k <= 20; ++k) times.push_back(k / 30.0);
+  const auto grid = sample_base(base, 0.0, times, model.parameters.substeps);
+  const VectorX theta = random_vector(random, n, 0.2), thetadot = random_vector(random, n, 0.3);
+
+  std::vector<Tangent> unknowns(10);
+  const auto some = [&](int count, double scale) {
+    std::vector<double> v(count);
+    for (double& x : v) x = scale * random.uniform(0.5, 1.0);
+    return v;
+  };
+  unknowns[0].stiffness = some(n, 0.012);
+  unknowns[1].damping = some(n, 3e-4);
+  unknowns[2].rest_angle = some(n, 0.1);
+  unknowns[3].link_mass = some(links, 0.015);
+  unknowns[4].tip_mass = 0.002;
+  unknowns[5].viscous_friction = some(links, 0.002);
+  unknowns[6].coulomb_friction = some(links, 0.05);
+  unknowns[7].air_linear = some(links, 0.0005), unknowns[7].air_quadratic = some(links, 0.0005);
+  unknowns[8].theta = random_vector(random, n, 0.1);
+  unknowns[9].thetadot = random_vector(random, n, 0.1);
+  chain::States states;
+  Sensitivities sensitivities;
+  REQUIRE(simulate(model, grid, theta, thetadot, states, unknowns, &sensitivities));
+  for (std::size_t u = 0; u < unknowns.size(); ++u) {
+    CAPTURE(u);
+    const double e = 1e-4;
+    const auto shifted = [&](double step) {
+      const Tangent& d = unknowns[u];
+      Parameters p = model.parameters;
+      const auto add = [&](std::vector<double>& x, const std::vector<double>& dx) {
+        for (std::size_t i = 0; i < dx.size(); ++i) x[i] += step * dx[i];
+      };
+      add(p.stiffness, d.stiffness), add(p.damping, d.damping), add(p.rest_angle, d.rest_angle);
+      add(p.link_mass, d.link_mass), add(p.viscous_friction, d.viscous_friction);
+      add(p.coulomb_friction, d.coulomb_friction), add(p.air_linear, d.air_linear);
+      add(p.air_quadratic, d.air_quadratic);
+      p.tip_mass += step * d.tip_mass;
+      VectorX q = theta, v = thetadot;
+      if (d.theta.size()) q += step * d.theta;
+      if (d.thetadot.size()) v += step * d.thetadot;
+      chain::States out;
+      REQUIRE(simulate(make_model(model.chain, p), grid, q, v, out));
+      return out;
+    };
+    const chain::States up = shifted(e), down = shifted(-e);
+    double error = 0.0, size = 0.0;
+    for (std::size_t k = 0; k < times.size(); ++k) {
+      const VectorX d = (up.theta[k] - down.theta[k]) / (2 * e);
+      error += (d - sensitivities.theta[k].col(u)).squaredNorm();
+      size += d.squaredNorm();
+    }
+    CHECK(std::sqrt(error / size) < 2e-3);  // the variational equation is solved to second order only
+  }
+}
+
+TEST_CASE("static equilibrium hangs down, also from above, and is where a damped rollout ends") {
+  Model model = without_losses(rope(8, chain::Bending::spatial));
+  const Pose upside_down{math::exp_so3(Vector3(M_PI, 0, 0)), Vector3::Zero()};
+  Parameters p = model.parameters;
+  std::fill(p.stiffness.begin(), p.stiffness.end(), 0.0);
+  const Model slack = make_model(model.chain, p);
+  for (const Pose& pose : {Pose(), upside_down}) {
+    const VectorX theta = static_equilibrium(slack, pose);
+    const auto nodes = chain::nodes(slack.chain, chain::link_motions(slack.chain, theta, pose));
+    CHECK((nodes.col(nodes.cols() - 1) - Vector3(0, 0, -0.3)).norm() < 1e-6);
+  }
+  p = model.parameters;
+  std::fill(p.damping.begin(), p.damping.end(), 3e-3);
+  const Model damped = make_model(model.chain, p);
+  const Pose tilted{math::exp_so3(Vector3(0.4, -0.7, 0.2)), Vector3(0.1, 0.2, 0.3)};
+  const int n = model.chain.angles();
+  const VectorX theta = static_equilibrium(damped, tilted);
+  const chain::States end = rollout(damped, [&](double) { return at_rest(tilted); },
+                                    {0.0, VectorX::Zero(n), VectorX::Zero(n)}, {20.0});
+  CHECK((end.theta[0] - theta).norm() < 1e-6);
+}
+
+TEST_CASE("nonsense is refused and divergence is told") {
+  const Model model = rope(3, chain::Bending::planar);
+  Parameters p = model.parameters;
+  p.link_mass[1] = -1.0;
+  CHECK_THROWS_AS(make_model(model.chain, p), InputError);
+  p = model.parameters;
+  p.stiffness.pop_back();
+  CHECK_THROWS_AS(make_model(model.chain, p), InputError);
+  const BaseFunction wild = [](double t) {
+    trajectory::BaseMotion base;
+    base.acceleration[3] = t > 0.1 ? NAN : 0.0;
+    return base;
+  };
+  CHECK_THROWS_AS(rollout(model, wild, {0.0, VectorX::Zero(3), VectorX::Zero(3)}, {0.5}), WorkError);
+  const BaseFunction still = [](double) { return trajectory::BaseMotion(); };
+  CHECK_THROWS_AS(rollout(model, still, {0.0, VectorX::Zero(3), VectorX::Zero(3)}, {0.5, 0.4}), InputError);
+}
