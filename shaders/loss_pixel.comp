@@ -3,7 +3,7 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
-layout(local_size_x = 64) in;
+layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(push_constant) uniform Push { SplatPush p; };
@@ -14,14 +14,14 @@ layout(std430, binding = 3) readonly buffer Target { uint target[]; };
 layout(std430, binding = 4) writeonly buffer PixelGradient { vec4 pixel_gradient[]; };
 layout(std430, binding = 5) writeonly buffer TileLoss { vec4 tile_loss[]; };
 
-shared vec4 lane_sum[64];
+shared vec4 lane_sum[gl_WorkGroupSize.x];
 
 void main() {
   uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
   SplatTile t = tiles[tile];
   SplatView view = views[t.view];
   vec4 sum = vec4(0.0);
-  for (uint k = lane; k < kTileWidth * kTileHeight; k += 64u) {
+  for (uint k = lane; k < kTileWidth * kTileHeight; k += gl_WorkGroupSize.x) {
     uint x = t.x * kTileWidth + k % kTileWidth, y = t.y * kTileHeight + k / kTileWidth;
     if (x < view.width && y < view.height) {
       uint pixel = view.pixel + y * view.width + x;
@@ -36,7 +36,7 @@ void main() {
   lane_sum[lane] = sum;
   barrier();
   if (lane == 0u) {
-    for (uint k = 1u; k < 64u; ++k) sum += lane_sum[k];
+    for (uint k = 1u; k < gl_WorkGroupSize.x; ++k) sum += lane_sum[k];
     tile_loss[2u * tile] = sum;
     tile_loss[2u * tile + 1u] = vec4(0.0);
   }

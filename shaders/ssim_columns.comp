@@ -4,7 +4,7 @@
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
 #include "inc/ssim.glsl"
-layout(local_size_x = 64) in;
+layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(push_constant) uniform Push { SplatPush p; };
@@ -14,14 +14,14 @@ layout(std430, binding = 2) readonly buffer Rows { vec4 rows[]; };
 layout(std430, binding = 3) writeonly buffer Factors { vec4 factors[]; };
 layout(std430, binding = 4) buffer TileLoss { vec4 tile_loss[]; };
 
-shared float lane_sum[64];
+shared float lane_sum[gl_WorkGroupSize.x];
 
 void main() {
   uint lane = gl_LocalInvocationID.x;
   SplatTile t = tiles[gl_WorkGroupID.x];
   SplatView view = views[t.view];
   float sum = 0.0;
-  for (uint k = lane; k < kTileWidth * kTileHeight; k += 64u) {
+  for (uint k = lane; k < kTileWidth * kTileHeight; k += gl_WorkGroupSize.x) {
     uint x = t.x * kTileWidth + k % kTileWidth, y = t.y * kTileHeight + k / kTileWidth;
     if (x < view.width && y < view.height) {
       vec4 s0 = vec4(0.0), s1 = vec4(0.0), s2 = vec4(0.0), s3 = vec4(0.0);
@@ -52,7 +52,7 @@ void main() {
   lane_sum[lane] = sum;
   barrier();
   if (lane == 0u) {
-    for (uint k = 1u; k < 64u; ++k) sum += lane_sum[k];
+    for (uint k = 1u; k < gl_WorkGroupSize.x; ++k) sum += lane_sum[k];
     tile_loss[2u * gl_WorkGroupID.x + 1u].x = sum;
   }
 }

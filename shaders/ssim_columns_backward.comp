@@ -4,7 +4,7 @@
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
 #include "inc/ssim.glsl"
-layout(local_size_x = 64) in;
+layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(push_constant) uniform Push { SplatPush p; };
@@ -18,7 +18,7 @@ layout(std430, binding = 5) buffer PixelGradient { vec4 pixel_gradient[]; };
 void main() {
   SplatTile t = tiles[gl_WorkGroupID.x];
   SplatView view = views[t.view];
-  for (uint k = gl_LocalInvocationID.x; k < kTileWidth * kTileHeight; k += 64u) {
+  for (uint k = gl_LocalInvocationID.x; k < kTileWidth * kTileHeight; k += gl_WorkGroupSize.x) {
     uint x = t.x * kTileWidth + k % kTileWidth, y = t.y * kTileHeight + k / kTileWidth;
     if (x < view.width && y < view.height) {
       vec4 s0 = vec4(0.0), s1 = vec4(0.0);

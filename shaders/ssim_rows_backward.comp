@@ -3,7 +3,7 @@
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
 #include "inc/ssim.glsl"
-layout(local_size_x = 64) in;
+layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(push_constant) uniform Push { SplatPush p; };
@@ -15,7 +15,7 @@ layout(std430, binding = 3) writeonly buffer Rows { vec4 rows[]; };
 void main() {
   SplatTile t = tiles[gl_WorkGroupID.x];
   SplatView view = views[t.view];
-  for (uint k = gl_LocalInvocationID.x; k < kTileWidth * kTileHeight; k += 64u) {
+  for (uint k = gl_LocalInvocationID.x; k < kTileWidth * kTileHeight; k += gl_WorkGroupSize.x) {
     uint x = t.x * kTileWidth + k % kTileWidth, y = t.y * kTileHeight + k / kTileWidth;
     if (x < view.width && y < view.height) {
       vec3 s0 = vec3(0.0), s1 = vec3(0.0), s2 = vec3(0.0);

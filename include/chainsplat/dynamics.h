@@ -1,4 +1,5 @@
-// chainsplat/dynamics.h - motion of the chain under gravity, stiffness, damping, friction, drag and a moving base (SPEC 3, 4).
+// chainsplat/dynamics.h - motion of the chain under gravity, stiffness, damping, friction, drag and a moving base (SPEC
+// 3, 4).
 //
 // Twists and wrenches are (angular, linear), in the frame of their link. Equations are named by SPEC's numbers.
 #pragma once
@@ -23,23 +24,23 @@ enum class Integrator { rodas3, implicit_velocity_euler };  // SPEC 4 [D], [P] (
 
 // The numbers of SPEC 3.1. Arrays per moving link j = 1..n_l are indexed j - 1; per angle k = 1..n are indexed k - 1.
 struct Parameters {
-  std::vector<double> link_mass;          // kg
-  std::vector<double> viscous_friction;   // N s/m a link, against the table
-  std::vector<double> coulomb_friction;   // effective coefficient a link, -
-  std::vector<double> air_linear;         // N s/m a link, across the rope
-  std::vector<double> air_quadratic;      // N s^2/m^2 a link, across the rope
-  std::vector<double> stiffness;          // N m/rad an angle
-  std::vector<double> rest_angle;         // rad
-  std::vector<double> damping;            // N m s/rad
-  double tip_mass = 0.0;                  // kg, point mass at the free end
-  double radius = 0.0;                    // m, of the cylinder that gives the links' inertia; 0 allowed
-  Vector3 gravity{0, 0, -9.81};           // m/s^2, world
-  std::optional<Vector3> table_normal;    // unit, world; none: no table
-  bool table_carries_weight = true;       // gravity has no part along table_normal: the table holds the rope up
-  double coulomb_speed = 0.002;           // v_s, m/s
-  double drag_speed = 0.001;              // v_eps, m/s
+  std::vector<double> link_mass;         // kg
+  std::vector<double> viscous_friction;  // N s/m a link, against the table
+  std::vector<double> coulomb_friction;  // effective coefficient a link, -
+  std::vector<double> air_linear;        // N s/m a link, across the rope
+  std::vector<double> air_quadratic;     // N s^2/m^2 a link, across the rope
+  std::vector<double> stiffness;         // N m/rad an angle
+  std::vector<double> rest_angle;        // rad
+  std::vector<double> damping;           // N m s/rad
+  double tip_mass = 0.0;                 // kg, point mass at the free end
+  double radius = 0.0;                   // m, of the cylinder that gives the links' inertia; 0 allowed
+  Vector3 gravity{0, 0, -9.81};          // m/s^2, world
+  std::optional<Vector3> table_normal;   // unit, world; none: no table
+  bool table_carries_weight = true;      // gravity has no part along table_normal: the table holds the rope up
+  double coulomb_speed = 0.002;          // v_s, m/s
+  double drag_speed = 0.001;             // v_eps, m/s
   Integrator integrator = Integrator::rodas3;
-  int substeps = 4;                       // a frame of 1/30 s
+  int substeps = 4;  // a frame of 1/30 s
 };
 
 // State at one time: where a rollout starts.
@@ -50,26 +51,26 @@ struct InitialState {
 
 // What identification says of its numbers; one entry a fitted parameter, in the order of the covariance.
 struct Estimates {
-  std::vector<std::string> names;                // e.g. "log_stiffness", "rest_angle_3": a log where the name says so
-  std::vector<double> values, standard_errors;   // in the units of the name
+  std::vector<std::string> names;               // e.g. "log_stiffness", "rest_angle_3": a log where the name says so
+  std::vector<double> values, standard_errors;  // in the units of the name
   MatrixX covariance;
   std::vector<std::pair<std::string, std::string>> held;  // name -> why it was not fitted
 };
 
 using BaseFunction = std::function<trajectory::BaseMotion(double)>;  // base motion at a time, s
 
-// A chain and its parameters, with the constants that follow from them. {i} is the link frame of angle i (SPEC 2.2); bodies
-// between the coincident axes of one joint have no mass and no length.
+// A chain and its parameters, with the constants that follow from them. {i} is the link frame of angle i (SPEC 2.2);
+// bodies between the coincident axes of one joint have no mass and no length.
 struct Model {
   chain::Chain chain;
   Parameters parameters;
-  std::vector<Vector6> axis;               // A_i, in {i}; pure rotations through the origin of {i}
-  std::vector<math::Pose> home;            // M_i, {i} in the base frame at theta = 0
-  std::vector<math::Matrix6> inertia;      // G_i, in {i}; 0 for massless bodies, the tip mass in the last one
+  std::vector<Vector6> axis;           // A_i, in {i}; pure rotations through the origin of {i}
+  std::vector<math::Pose> home;        // M_i, {i} in the base frame at theta = 0
+  std::vector<math::Matrix6> inertia;  // G_i, in {i}; 0 for massless bodies, the tip mass in the last one
 };
 
-// Throws InputError where an array has the wrong length, a number is not finite or negative where it must not be, or an axis
-// does not pass through its joint.
+// Throws InputError where an array has the wrong length, a number is not finite or negative where it must not be, or an
+// axis does not pass through its joint.
 Model make_model(const chain::Chain& chain, const Parameters& parameters);
 
 // The base at rest in `pose`.
@@ -91,7 +92,8 @@ VectorX forward_dynamics_articulated(const Model& model, const trajectory::BaseM
 // W_i of SPEC 3.3 on every body, in {i}; and body twists V_i in {i}. 6 x n.
 MatrixX external_wrenches(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                           const VectorX& thetadot);
-MatrixX body_twists(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta, const VectorX& thetadot);
+MatrixX body_twists(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
+                    const VectorX& thetadot);
 
 // What the implicit integrators need at one state (SPEC 3.6): M a = torque - bias with
 // da/dtheta = -M^-1 stiffness, da/dthetadot = -M^-1 damping, da/dt = M^-1 drive_rate (through the base motion only).
@@ -106,33 +108,34 @@ struct Linearization {
 Linearization linearize(const Model& model, const trajectory::BaseMotion& base, const Vector6& base_jerk,
                         const VectorX& theta, const VectorX& thetadot);
 
-// The stacked matrices of SPEC 3.5 (paper, "Closed-form dynamics", corrected): for reading and checking, O(n^3), viscous
-// and other wrenches as in 3.3. M thetaddot + coriolis + gravity + base - friction = -K(theta - theta_0) - D thetadot.
+// The stacked matrices of SPEC 3.5 (paper, "Closed-form dynamics", corrected): for reading and checking, O(n^3),
+// viscous and other wrenches as in 3.3. M thetaddot + coriolis + gravity + base - friction = -K(theta - theta_0) - D
+// thetadot.
 struct ClosedForm {
-  MatrixX mass;                // A^T L^T G L A
-  VectorX coriolis;            // C thetadot, base at rest
-  VectorX gravity;             // g
-  VectorX base;                // M_0 dV_b - C_0 V_b: all that the base motion adds
-  VectorX friction;            // A^T L^T W_ext(V)
-  MatrixX velocity_jacobian;   // da/dthetadot = M^-1 M^
+  MatrixX mass;               // A^T L^T G L A
+  VectorX coriolis;           // C thetadot, base at rest
+  VectorX gravity;            // g
+  VectorX base;               // M_0 dV_b - C_0 V_b: all that the base motion adds
+  VectorX friction;           // A^T L^T W_ext(V)
+  MatrixX velocity_jacobian;  // da/dthetadot = M^-1 M^
 };
 ClosedForm closed_form(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                        const VectorX& thetadot);
 
 // Potential energy of gravity and stiffness, J, zero with the rope's mass at the world origin and the joints at rest.
 double potential_energy(const Model& model, const math::Pose& base, const VectorX& theta);
-// The angles at rest under a base at rest: least potential energy by damped Newton from `start` (empty: the rest angles).
-// Friction is left out. Throws WorkError where no minimum was found.
+// The angles at rest under a base at rest: least potential energy by damped Newton from `start` (empty: the rest
+// angles). Friction is left out. Throws WorkError where no minimum was found.
 VectorX static_equilibrium(const Model& model, const math::Pose& base, const VectorX& start = {});
 
 // The base motion on the integrator's own time grid, sampled once for many rollouts.
 struct BaseGrid {
   struct Node {
-    double time = 0.0;              // s
-    double step = 0.0;              // to the next node, s; 0 at the last
+    double time = 0.0;  // s
+    double step = 0.0;  // to the next node, s; 0 at the last
     trajectory::BaseMotion motion;
-    Vector6 jerk = Vector6::Zero(); // derivative of motion.acceleration
-    bool output = false;            // one of the asked times
+    Vector6 jerk = Vector6::Zero();  // derivative of motion.acceleration
+    bool output = false;             // one of the asked times
   };
   std::vector<Node> nodes;
 };
@@ -151,14 +154,15 @@ struct Sensitivities {
   std::vector<MatrixX> theta, thetadot;
 };
 
-// Integrates over the grid and fills `states` at the output nodes (allocated once, reused). False where the motion left all
-// bounds (then `states` is shorter). With `unknowns`, the variational equation is integrated beside (SPEC 4; RODAS3 only):
-// trapezoidal rule with the factorization of the step, second order, not the exact derivative of the discrete map.
+// Integrates over the grid and fills `states` at the output nodes (allocated once, reused). False where the motion left
+// all bounds (then `states` is shorter). With `unknowns`, the variational equation is integrated beside (SPEC 4; RODAS3
+// only): trapezoidal rule with the factorization of the step, second order, not the exact derivative of the discrete
+// map.
 bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta, const VectorX& thetadot,
               chain::States& states, std::span<const Tangent> unknowns = {}, Sensitivities* sensitivities = nullptr);
 
-// States at `times` from `initial` (times increasing, the first >= initial.time). Where a rollout diverges it is repeated
-// with finer steps, up to 32 times; then throws WorkError.
+// States at `times` from `initial` (times increasing, the first >= initial.time). Where a rollout diverges it is
+// repeated with finer steps, up to 32 times; then throws WorkError.
 chain::States rollout(const Model& model, const BaseFunction& base, const InitialState& initial,
                       const std::vector<double>& times);
 chain::States rollout(const Model& model, const trajectory::Trajectory& base, const InitialState& initial,

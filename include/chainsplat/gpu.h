@@ -52,7 +52,7 @@ std::string doctor_text(const Doctor& doctor);  // several lines, for a terminal
 struct DeviceOptions {
   std::string selector;
   bool validation = false;        // needs the layer; throws InputError when it is missing
-  bool push_descriptors = true;   // false: descriptor sets even where the device could push (for tests)
+  bool least = false;             // as on the least device: descriptor sets, staged transfers (for tests)
 };
 
 class Device;   // opened device; keep it alive longer than what was made from it

@@ -1,8 +1,9 @@
-// chainsplat/identification.h - recognized angles and the base's motion -> masses, stiffness, damping, friction (SPEC 5).
+// chainsplat/identification.h - recognized angles and the base's motion -> masses, stiffness, damping, friction (SPEC
+// 5).
 //
 // The whole capture is one open-loop rollout. Its centerline, relative to the base, is fitted to the recognized one by
-// Levenberg-Marquardt over a growing horizon, with priors on everything and sensitivities from the variational equation.
-// From kinematics only ratios to one mass are observable: the total mass is held at `mass`, else at 1 kg.
+// Levenberg-Marquardt over a growing horizon, with priors on everything and sensitivities from the variational
+// equation. From kinematics only ratios to one mass are observable: the total mass is held at `mass`, else at 1 kg.
 #pragma once
 #include <cstdint>
 #include <optional>
@@ -13,26 +14,26 @@
 namespace chainsplat::identification {
 
 struct Options {
-  bool tabletop = false;                                // Coulomb friction on a table, else air drag
-  math::Vector3 gravity{0, 0, -9.81};                   // m/s^2, world
-  math::Vector3 table_normal{0, 0, 1};                  // unit, world; used on a table
-  std::optional<double> mass;                           // kg, links and tip; none: 1 kg, forces are then per kilogram
-  bool fit_stiffness = true;                            // else 0
-  bool per_joint = true;                                // stiffness, damping and mass vary smoothly along the rope
-  bool paper = false;                                   // kappa = 0; d_j, m_j and viscous mu_j by Adam on the angles
+  bool tabletop = false;                // Coulomb friction on a table, else air drag
+  math::Vector3 gravity{0, 0, -9.81};   // m/s^2, world
+  math::Vector3 table_normal{0, 0, 1};  // unit, world; used on a table
+  std::optional<double> mass;           // kg, links and tip; none: 1 kg, forces are then per kilogram
+  bool fit_stiffness = true;            // else 0
+  bool per_joint = true;                // stiffness, damping and mass vary smoothly along the rope
+  bool paper = false;                   // kappa = 0; d_j, m_j and viscous mu_j by Adam on the angles
   dynamics::Integrator integrator = dynamics::Integrator::rodas3;  // paper: implicit_velocity_euler, one step a frame
-  int substeps = 0;                                     // a frame of 1/30 s; 0: 4, on a table 8 (stick and slip)
-  std::uint64_t seed = 0;                               // of further starts where the first ones fit poorly
-  int max_iterations = 25;                              // of Levenberg-Marquardt, a horizon
-  int adam_iterations = 300;                            // paper
+  int substeps = 0;           // a frame of 1/30 s; 0: 4, on a table 8 (stick and slip)
+  std::uint64_t seed = 0;     // of further starts where the first ones fit poorly
+  int max_iterations = 25;    // of Levenberg-Marquardt, a horizon
+  int adam_iterations = 300;  // paper
 };
 
 struct Result {
   dynamics::Parameters parameters;
-  dynamics::InitialState initial;   // at the first recognized time
-  chain::States rollout;            // at all recognized times, under the capture's base motion
+  dynamics::InitialState initial;  // at the first recognized time
+  chain::States rollout;           // at all recognized times, under the capture's base motion
   dynamics::Estimates estimates;
-  double node_rms = 0.0;            // m, rollout against recognized nodes, over nodes but the grasp and frames
+  double node_rms = 0.0;  // m, rollout against recognized nodes, over nodes but the grasp and frames
 };
 
 // `recognized`: at least 3 times, increasing. `covariances`: of each theta, n x n, or empty. Throws InputError for too

@@ -1,8 +1,10 @@
 // chainsplat/silhouette.h - masks and a chain -> joint angles: the coarse step of recognition and estimation (SPEC 6).
 //
-// Sampled mask pixels are drawn to the projected centerline of the rope, along its normal (pixels past the free end pull
-// with the whole vector), and sampled centerline points are drawn into the mask; Gauss-Newton over all views of a frame
-// with a Huber weight, weak priors between neighboring joints, warm-started from the frame before. DESIGN, 'Recognition'.
+// A frame in two stages, Gauss-Newton over all its views at once. Coarse: sampled mask pixels are drawn to the projected
+// centerline along its normal (those past the free end with the whole vector) and centerline samples into the mask: this
+// finds the rope from afar. Fine: the mask's outline, to a fraction of a pixel, is put at the tube's radius from the
+// centerline on either side, and its end at the free end. A sequence is warm-started frame by frame, repaired where that
+// failed, and smoothed over time with each frame's own normal equations as weights. DESIGN, 'Recognition'.
 #pragma once
 #include <span>
 #include <vector>
@@ -11,32 +13,43 @@
 
 namespace chainsplat::silhouette {
 
+// A Gaussian belief about theta, e.g. a filter's prediction. Both empty: none.
+struct Prior {
+  math::VectorX mean;         // rad, n
+  math::MatrixX information;  // 1/rad^2, n x n
+};
+
 struct Options {
-  int max_pixels = 500;          // mask pixels used a view
-  int iterations = 8;            // Gauss-Newton steps a frame
-  int first_iterations = 30;     // for a frame without a warm start
-  double huber_pixels = 8.0;     // px, after the first iterations
-  double joint_smoothness = 0.0; // weight of (theta_j - theta_{j-1})^2, set by the implementation when 0
+  int max_pixels = 500;          // mask pixels used a view (coarse stage)
+  int iterations = 8;            // Gauss-Newton steps of a warm-started frame, half of them coarse
+  int first_iterations = 30;     // coarse steps of a frame without a warm start, from each of several starts
+  double huber_pixels = 8.0;     // px, coarse stage, after the first iterations
+  double joint_smoothness = 0.0; // 1/rad^2, weight of (theta_j - theta_{j-1})^2 against edges known to 1 px; 0: default
+  bool smooth_in_time = true;    // fit_sequence: smooth the angles over time
+  Prior prior;                   // fit_frame only
 };
 
 struct FrameFit {
   math::VectorX theta;
-  double residual_pixels = 0.0;  // RMS distance of mask pixels from the tube's centerline along its normal, robust
+  double residual_pixels = 0.0;  // RMS distance of the mask's outline from the tube's, robust, px
   double covered = 0.0;          // share of mask pixels within the tube's half width + 2 px of the projected centerline
-  math::MatrixX covariance;      // n x n of theta, from the normal equations (pixel noise 1 px)
+  double inside = 0.0;           // share of the projected centerline that lies in the masks (occluders lower it)
+  double edge_offset = 0.0;      // px by which the masks are wider than the tube on each side
+  math::MatrixX covariance;      // n x n of theta, rad^2; directions that the views do not fix have their prior's
 };
 
-// One frame: all views taken at (nearly) one time. `views` must be undistorted crops with masks.
+// One frame: all views taken at (nearly) one time. `views` must be undistorted crops with masks; empty masks are allowed.
+// `warm`: `start` is near (the frame before); otherwise several starts are tried and the best is kept.
 FrameFit fit_frame(const chain::Chain& chain, const math::Pose& base, std::span<const capture::View* const> views,
                    const std::vector<capture::Camera>& cameras, const math::VectorX& start, bool warm,
                    const Options& options = {});
 
-// Every time of the first camera, in order; other cameras' nearest frame within half an interval joins it. Frames without
-// any mask pixel keep the prediction from their neighbors (and are named in one warning).
-// Also tries the reverse direction and re-fits frames whose residual jumps.
+// Every time of the first camera that has views, in order; other cameras' nearest frame within half an interval joins it
+// (with the base pose of its own time). Frames without any mask pixel keep the prediction from their neighbors (and are
+// named in one warning). Frames whose fit is far worse than the others' are fitted again from the frame after them.
 struct SequenceFit {
-  chain::States states;          // theta and smoothed thetadot
-  std::vector<FrameFit> frames;
+  chain::States states;          // theta (smoothed over time) and thetadot
+  std::vector<FrameFit> frames;  // each frame's own fit
 };
 SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capture, const Options& options = {});
 

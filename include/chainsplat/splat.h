@@ -90,8 +90,10 @@ class Engine {
                   Gradients* gradients, std::vector<Picture>* pictures = nullptr);
 
   // --- training: parameters, moments and targets stay on the device ----------------------------------------------------
-  // Targets of all views that will be used; `views` keep their indices. Poses can be changed later.
-  void set_views(std::span<const ViewSpec> views, std::span<const std::vector<std::uint8_t>* const> targets);
+  // Targets of all views that will be used; `views` keep their indices. Poses can be changed later. Only tiles near the mask
+  // are drawn and charged; with `everywhere` the whole crop is (D-SSIM still near the mask only: elsewhere L1 says enough).
+  void set_views(std::span<const ViewSpec> views, std::span<const std::vector<std::uint8_t>* const> targets,
+                 bool everywhere = false);
   void set_motions(int view, const std::vector<math::Pose>& motions);
   void set_gaussians(const Gaussians& gaussians);   // resets Adam's moments and step count
   Gaussians gaussians() const;

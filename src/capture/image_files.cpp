@@ -6,17 +6,36 @@
 
 #include <cmath>
 #include <filesystem>
+#include <fstream>
 #include <memory>
 #include <string>
+#include <string_view>
 
 namespace chainsplat::capture {
 
 namespace {
 
+// A PNG that ends before its last chunk. Found here, because libpng prints a line of its own about it.
+bool cut_off_png(const Path& file) {
+  std::ifstream stream(file, std::ios::binary);
+  constexpr std::string_view kSignature = "\x89PNG\r\n\x1a\n";
+  char start[8] = {};
+  if (!stream.read(start, sizeof start) || std::string_view(start, sizeof start) != kSignature) return false;
+  for (;;) {  // chunks: length, name, data, checksum
+    unsigned char head[8];
+    if (!stream.read(reinterpret_cast<char*>(head), sizeof head)) return true;
+    const std::streamoff length = (head[0] << 24u) | (head[1] << 16) | (head[2] << 8) | head[3];
+    if (std::string_view(reinterpret_cast<const char*>(head) + 4, 4) == "IEND") return false;
+    if (length < 0) return true;
+    stream.seekg(length + 4, std::ios::cur);
+  }
+}
+
 std::unique_ptr<OIIO::ImageInput> open_image(const Path& file) {
   std::error_code error;
   if (!std::filesystem::exists(file, error))
     throw InputError(file.string(), "does not exist", "check the path and the frame numbers");
+  if (cut_off_png(file)) throw InputError(file.string(), "is cut off", "write it again");
   OIIO::ImageSpec options;
   options.attribute("oiio:UnassociatedAlpha", 1);  // colors as stored, not multiplied by alpha
   auto input = OIIO::ImageInput::open(file.string(), &options);

@@ -28,6 +28,14 @@ constexpr double kPerpendicular = 1e-3;         // rad
 constexpr double kInversePixels = 1e-3;         // px, largest error of undistort(distort(.)) at the corners
 constexpr double kTopMeters = 5.0;              // a longer rope is doubted (millimeters?)
 
+// In quotes, cut to what fits on a line.
+std::string in_quotes(const std::string& text) {
+  constexpr std::size_t kMost = 60;
+  std::string out = "'";
+  out.append(text, 0, kMost).append(text.size() > kMost ? "...'" : "'");
+  return out;
+}
+
 int edit_distance(const std::string& a, const std::string& b) {
   std::vector<int> row(b.size() + 1);
   for (std::size_t j = 0; j <= b.size(); ++j) row[j] = static_cast<int>(j);
@@ -65,7 +73,7 @@ class Reader {
         return edit_distance(key, a) < edit_distance(key, b);
       });
       const bool similar = edit_distance(key, nearest) <= std::max<int>(2, static_cast<int>(key.size()) / 3);
-      doubt(key.substr(0, 60), std::string("unknown key, ignored") + (similar ? std::string("; is '").append(nearest).append("' meant?") : std::string()));
+      doubt(key, std::string("unknown key, ignored") + (similar ? "; is " + in_quotes(nearest) + " meant?" : ""));
     }
   }
 
@@ -158,7 +166,7 @@ class Reader {
     const Path normal = Path(*value).lexically_normal();
     if (value->empty() || value->find('\0') != std::string::npos || normal.is_absolute() || normal == "." ||
         *normal.begin() == "..") {
-      problem(key, "'" + *value + "' is not a path inside the capture's folder", "put the file into the folder");
+      problem(key, in_quotes(*value) + " is not a path inside the capture's folder", "put the file into the folder");
       return std::nullopt;
     }
     return value;
@@ -198,7 +206,7 @@ std::optional<ImageSource> image_source(const Reader& reader, const std::string&
   const bool valid = end < text->size() && (*text)[end] == 'd' && width.size() <= 3 && (width.empty() || width[0] == '0') &&
                      text->find('%', end) == std::string::npos;
   if (!valid) {
-    reader.problem(key, "'" + *text + "' is not a frame pattern", "write the number once, as %d or %06d");
+    reader.problem(key, in_quotes(*text) + " is not a frame pattern", "write the number once, as %d or %06d");
     return std::nullopt;
   }
   source.prefix = (folder / text->substr(0, percent)).string();
@@ -364,7 +372,7 @@ CameraSource read_camera(const Reader& reader, const std::string& where, const P
                "depth_scale", "rate", "start", "timestamps"});
   camera.name = reader.text("name", true, "a short name like cam0").value_or("");
   if (reader.has("name") && !good_name(camera.name))
-    reader.problem("name", "'" + camera.name.substr(0, 64) + "' cannot name a folder", "use letters, digits, - and _");
+    reader.problem("name", in_quotes(camera.name) + " cannot name a folder", "use letters, digits, - and _");
   camera.width = reader.pixels("width");
   camera.height = reader.pixels("height");
   camera.fx = reader.positive("fx", "the focal length in pixels");
@@ -486,14 +494,14 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
   const Reader top(&json, file + ": ", findings);
   const auto format = top.text("format", true, "\"chainsplat-capture/1\"");
   if (format && *format != "chainsplat-capture/1") {
-    top.problem("format", "'" + format->substr(0, 60) + "' is not chainsplat-capture/1", "convert the capture to this format");
+    top.problem("format", in_quotes(*format) + " is not chainsplat-capture/1", "convert the capture to this format");
     return manifest;  // other keys would be judged by the wrong rules
   }
   top.know({"format", "name", "scenario", "gravity", "object", "grasp", "table", "base", "cameras"});
   capture.name = top.text("name", false, "a short name").value_or(capture.folder.filename().string());
   const std::string scenario = top.text("scenario", true, "\"free\" or \"tabletop\"").value_or("free");
   if (scenario != "free" && scenario != "tabletop")
-    top.problem("scenario", "'" + scenario.substr(0, 60) + "' is unknown", "write \"free\" or \"tabletop\"");
+    top.problem("scenario", in_quotes(scenario) + " is unknown", "write \"free\" or \"tabletop\"");
   capture.tabletop = scenario == "tabletop";
   if (const auto gravity = top.vector("gravity", false, "[0, 0, -9.81]")) {
     capture.gravity = *gravity;
@@ -561,12 +569,12 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
     const std::string given = name != value.end() && name->is_string() ? name->get<std::string>() : "";
     all_names.append(c ? ", " : "").append(given);
     if (!given.empty() && !names.insert(given).second)
-      findings.problems.push_back({where + ".name", "'" + given + "' is used twice", "give every camera its own name"});
+      findings.problems.push_back({where + ".name", in_quotes(given) + " is used twice", "give every camera its own name"});
     if (!camera.empty() && given != camera) continue;
     manifest.cameras.push_back(read_camera(Reader(&value, where, findings), where, capture.folder));
   }
   if (!camera.empty() && cameras && manifest.cameras.empty())
-    findings.problems.push_back({file, "has no camera '" + camera + "'", "choose one of " + all_names});
+    findings.problems.push_back({file, "has no camera " + in_quotes(camera), "choose one of " + all_names});
 
   survey(manifest, masked, findings);
   if (base) read_base(manifest, capture.folder / *base, findings);

@@ -10,6 +10,7 @@ extern "C" {
 
 #include <cstring>
 #include <mutex>
+#include <new>
 
 #include "chainsplat/capture.h"
 
@@ -26,6 +27,18 @@ struct Free {
 };
 template <class T>
 using Owned = std::unique_ptr<T, Free>;
+
+// An RGB frame with libav's own padding, zeroed: libswscale's vector code reads and writes past the ends of tight rows.
+Owned<AVFrame> padded_frame(int width, int height, AVPixelFormat format) {
+  Owned<AVFrame> frame(av_frame_alloc());
+  frame->width = width;
+  frame->height = height;
+  frame->format = format;
+  if (av_frame_get_buffer(frame.get(), 0) < 0) throw std::bad_alloc();
+  for (int plane = 0; plane < AV_NUM_DATA_POINTERS && frame->buf[plane]; ++plane)
+    std::memset(frame->buf[plane]->data, 0, frame->buf[plane]->size);
+  return frame;
+}
 
 constexpr int kMostPixels = 1 << 28;  // refuse sizes that only a damaged header claims
 
@@ -95,6 +108,7 @@ struct VideoReader::Implementation {
   Owned<AVFrame> frame{av_frame_alloc()};
   Owned<AVPacket> packet{av_packet_alloc()};
   Owned<SwsContext> scaler;
+  Owned<AVFrame> converted;
   int scaler_width = 0, scaler_height = 0, scaler_format = -1, scaler_matrix = -1;
   bool scaler_full = false, at_end = false;
   int frames = 0;
@@ -166,6 +180,7 @@ void VideoReader::Implementation::convert(Image8& rgb) {
     scaler.reset(sws_getContext(width, height, static_cast<AVPixelFormat>(frame->format), width, height, AV_PIX_FMT_RGB24,
                                 SWS_BICUBIC, nullptr, nullptr, nullptr));
     if (!scaler) throw InputError(file.string(), "has a pixel format without a way to RGB", "write it as yuv420p");
+    converted = padded_frame(width, height, AV_PIX_FMT_RGB24);
     constexpr int kOne = 1 << 16;  // libswscale's fixed point
     sws_setColorspaceDetails(scaler.get(), sws_getCoefficients(coefficients), full, sws_getCoefficients(SWS_CS_DEFAULT), 1, 0,
                              kOne, kOne);
@@ -174,9 +189,10 @@ void VideoReader::Implementation::convert(Image8& rgb) {
   rgb.height = height;
   rgb.channels = 3;
   rgb.pixels.resize(static_cast<std::size_t>(width) * height * 3);
-  std::uint8_t* planes[] = {rgb.pixels.data()};
-  const int strides[] = {3 * width};
-  sws_scale(scaler.get(), frame->data, frame->linesize, 0, height, planes, strides);
+  sws_scale(scaler.get(), frame->data, frame->linesize, 0, height, converted->data, converted->linesize);
+  const std::size_t row = static_cast<std::size_t>(3) * width;
+  for (int y = 0; y < height; ++y)
+    std::memcpy(&rgb.pixels[y * row], converted->data[0] + static_cast<std::ptrdiff_t>(y) * converted->linesize[0], row);
 }
 
 bool VideoReader::next(Image8& rgb) {
@@ -213,7 +229,10 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
   CHAINSPLAT_CHECK(!frames.empty() && rate > 0.0, file.string());
   const int width = frames.front().width, height = frames.front().height;
   for (const Image8& frame : frames)
-    CHAINSPLAT_CHECK(frame.width == width && frame.height == height && frame.channels >= 3, "frames of one size, RGB or RGBA");
+    CHAINSPLAT_CHECK(frame.width == width && frame.height == height && frame.channels == frames.front().channels &&
+                         (frame.channels == 3 || frame.channels == 4) &&
+                         frame.pixels.size() == static_cast<std::size_t>(width) * height * frame.channels,
+                     "frames of one size, RGB or RGBA");
   const auto fail = [&](const std::string& what, int code) {
     throw WorkError(file.string(), what + (code < 0 ? " (" + error_text(code) + ")" : ""),
                     "check the folder, the free space and the encoders of libav");
@@ -278,17 +297,13 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
   code = avformat_write_header(raw, nullptr);
   if (code < 0) clean("writing failed", code);
 
-  Owned<AVFrame> picture(av_frame_alloc());
-  picture->width = width;
-  picture->height = height;
-  picture->format = encoder->pix_fmt;
+  Owned<AVFrame> picture = padded_frame(width, height, encoder->pix_fmt);
   picture->color_range = encoder->color_range;
   picture->colorspace = encoder->colorspace;
-  code = av_frame_get_buffer(picture.get(), 0);
-  if (code < 0) clean("no memory", code);
   const AVPixelFormat source = frames.front().channels == 3 ? AV_PIX_FMT_RGB24 : AV_PIX_FMT_RGBA;
   Owned<SwsContext> scaler(sws_getContext(width, height, source, width, height, encoder->pix_fmt, SWS_BICUBIC, nullptr,
                                           nullptr, nullptr));
+  const Owned<AVFrame> rgb = padded_frame(width, height, source);
   if (!scaler) clean("no way from RGB to the encoder's format", 0);
   constexpr int kOne = 1 << 16;
   sws_setColorspaceDetails(scaler.get(), sws_getCoefficients(SWS_CS_DEFAULT), 1, sws_getCoefficients(SWS_CS_ITU601), 0, 0, kOne,
@@ -311,9 +326,10 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
   for (std::size_t k = 0; k < frames.size(); ++k) {
     code = av_frame_make_writable(picture.get());
     if (code < 0) clean("no memory", code);
-    const std::uint8_t* const planes[] = {frames[k].pixels.data()};
-    const int strides[] = {frames[k].channels * width};
-    sws_scale(scaler.get(), planes, strides, 0, height, picture->data, picture->linesize);
+    const std::size_t row = static_cast<std::size_t>(frames[k].channels) * width;
+    for (int y = 0; y < height; ++y)
+      std::memcpy(rgb->data[0] + static_cast<std::ptrdiff_t>(y) * rgb->linesize[0], &frames[k].pixels[y * row], row);
+    sws_scale(scaler.get(), rgb->data, rgb->linesize, 0, height, picture->data, picture->linesize);
     picture->pts = static_cast<std::int64_t>(k);
     code = avcodec_send_frame(encoder.get(), picture.get());
     if (code < 0) clean("encoding failed", code);

@@ -1,5 +1,5 @@
-// The stacked matrices of SPEC 3.5 and 3.6, written as they are printed: to be read beside the paper, and a formulation of
-// its own to check the recursions against.
+// The stacked matrices of SPEC 3.5 and 3.6, written as they are printed: to be read beside the paper, and a formulation
+// of its own to check the recursions against.
 #include <cmath>
 
 #include "chainsplat/dynamics.h"
@@ -7,8 +7,8 @@
 namespace chainsplat::dynamics {
 namespace {
 
-using math::Matrix6;
 using math::hat;
+using math::Matrix6;
 
 // W_i and dW_i/dV_i of SPEC 3.3 in {i}, for link j (from 1) with body twist v; `normal` is N, zero without a table.
 void link_wrench(const Model& model, int j, const Vector6& v, const Vector3& normal, double normal_gravity,
@@ -32,7 +32,8 @@ void link_wrench(const Model& model, int j, const Vector6& v, const Vector3& nor
     const double mu = p.viscous_friction[j - 1], b = p.air_linear[j - 1], q = p.air_quadratic[j - 1];
     const Vector3 f = -(mu * vt + coulomb / st * vt + b * vn + q * sn * vn) * w;
     const Matrix3 df = -(mu * tangent + coulomb * (tangent / st - vt * vt.transpose() / (st * st * st)) + b * across +
-                         q * across * (sn * eye + vn * vn.transpose() / sn) * across) * w;
+                         q * across * (sn * eye + vn * vn.transpose() / sn) * across) *
+                       w;
     wrench += z * f;
     slope += z * df * z.transpose();
   }

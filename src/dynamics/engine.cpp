@@ -307,7 +307,8 @@ void Engine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces) 
     const auto inertial = [&](const RigidInertia& body) -> Vector6 {
       return body * link_acceleration[j] + cross_dual(velocity[j], body * velocity[j]);
     };
-    unit.mass = inertial(world_inertia(1.0, 0.5 * l, l * l / 12.0 + 0.25 * r * r, 0.5 * r * r, origin[j], direction[j]));
+    unit.mass =
+        inertial(world_inertia(1.0, 0.5 * l, l * l / 12.0 + 0.25 * r * r, 0.5 * r * r, origin[j], direction[j]));
     if (j + 1 == link_count) unit_tip_ = inertial(world_inertia(1.0, l, 0.0, 0.0, origin[j], direction[j]));
     for (Vector6* w : {&unit.viscous, &unit.coulomb, &unit.air_linear, &unit.air_quadratic}) w->setZero();
     for (int g = 0; g < 3; ++g) {

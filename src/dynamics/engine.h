@@ -1,15 +1,15 @@
 // Private to dynamics: one evaluation of the equations of motion, without allocation.
 //
-// Everything is resolved in world axes about the instantaneous base origin, an inertial frame at that instant. There all
-// bodies share one frame, so that the neighbor transforms of SPEC 3.2 vanish and the tangents of SPEC 3.6 become sums over
-// links: a unit turn of angle k displaces all outer links rigidly by s_k; seen from the displaced links only the inner
-// velocity and acceleration have changed, by u = V x s_k and psi = dV x s_k + V x u, and the table's normal. With composite
-// inertia I, velocity product matrix E = 2B - dW/dV and table term N of the links outside of i,
+// Everything is resolved in world axes about the instantaneous base origin, an inertial frame at that instant. There
+// all bodies share one frame, so that the neighbor transforms of SPEC 3.2 vanish and the tangents of SPEC 3.6 become
+// sums over links: a unit turn of angle k displaces all outer links rigidly by s_k; seen from the displaced links only
+// the inner velocity and acceleration have changed, by u = V x s_k and psi = dV x s_k + V x u, and the table's normal.
+// With composite inertia I, velocity product matrix E = 2B - dW/dV and table term N of the links outside of i,
 //   i >= k:  d tau_i / d theta_k = s_i^T (I_i psi_k + E_i u_k - N_i omega_k)
 //   i <  k:  d tau_i / d theta_k = s_i^T (I_k psi_k + E_k u_k - N_k omega_k + s_k x* F_k)
 //   with respect to dtheta_k the same with (psi, u) = (2 u_k, s_k) and neither N nor F.
-// 2B u = I (u x V) + u x* (I V) + V x* (I u) = [T 0; -2[p] 0] u, T = 2[w]J - tr(J)[w] - 2[h][v], for inertia J about the
-// origin, first moment h, momentum p.
+// 2B u = I (u x V) + u x* (I V) + V x* (I u) = [T 0; -2[p] 0] u, T = 2[w]J - tr(J)[w] - 2[h][v], for inertia J about
+// the origin, first moment h, momentum p.
 #pragma once
 #include <vector>
 
@@ -50,7 +50,7 @@ inline Vector6 cross_dual(const Vector6& x, const Vector6& f) {
 }
 
 struct LinkConstants {
-  double length, mass, center, transverse, axial;  // tip mass included; center along d, inertia about the center
+  double length, mass, center, transverse, axial;      // tip mass included; center along d, inertia about the center
   double viscous, coulomb, air_linear, air_quadratic;  // coulomb: mu^C m g_n, N
   double coulomb_per_coefficient, coulomb_per_mass;
   int first_angle, end_angle;
@@ -66,8 +66,8 @@ class Engine {
   // The calls build on one another: place, factor_mass, accelerate, linearize, unknown_forces.
   // Poses, axes, velocities, M, bias; with `slopes` also what linearize needs.
   void place(const trajectory::BaseMotion& base, const VectorX& theta, const VectorX& thetadot, bool slopes);
-  bool factor_mass();   // false where M is not positive definite
-  void accelerate();    // acceleration = M^-1 force
+  bool factor_mass();  // false where M is not positive definite
+  void accelerate();   // acceleration = M^-1 force
   // Adds `acceleration` to the placed bodies (once a place): fills body_force and `inverse`.
   void inverse_torque();
   // inverse_torque, then stiffness, damping and drive_rate (needs place with slopes).
@@ -91,10 +91,10 @@ class Engine {
   VectorX drive_rate;
 
   // per angle
-  std::vector<Vector6> axis;      // s_k
+  std::vector<Vector6> axis;                                // s_k
   std::vector<Vector6> inner_velocity, inner_acceleration;  // V_{k-1}, dV_{k-1}
-  std::vector<Vector6> turn;      // u_k
-  std::vector<Matrix3> rotation;  // of the body moved by angle k
+  std::vector<Vector6> turn;                                // u_k
+  std::vector<Matrix3> rotation;                            // of the body moved by angle k
   // per link
   std::vector<Vector3> origin, direction;
   std::vector<Vector6> velocity, link_acceleration, wrench, body_force;  // the last: of all outer bodies

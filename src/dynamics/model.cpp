@@ -47,7 +47,8 @@ Model make_model(const chain::Chain& chain, const Parameters& p) {
     const Vector6 axis = math::transform_twist(home.inverse(), chain.axes[k]);
     // of link_start: a joint's axes must meet in it
     require(axis.tail<3>().norm() < 1e-9 * (1.0 + chain.length) && std::abs(axis.head<3>().norm() - 1.0) < 1e-9,
-            "axis " + std::to_string(k + 1) + " is no rotation about its joint", "use chain axes that pass through s_j d");
+            "axis " + std::to_string(k + 1) + " is no rotation about its joint",
+            "use chain axes that pass through s_j d");
     model.axis.push_back(axis);
     model.home.push_back(home);
     math::Matrix6 inertia = math::Matrix6::Zero();
@@ -184,55 +185,56 @@ double potential_energy(const Model& model, const math::Pose& base, const Vector
 }
 
 VectorX static_equilibrium(const Model& model, const math::Pose& base, const VectorX& start) {
+  constexpr int kMaxIterations = 1000;
+  constexpr double kMaxTurn = 0.5;      // rad an iteration
+  constexpr double kRounding = 1e-12;   // of the torque scale: what energies and curvatures are known to
+  constexpr double kConverged = 1e-11;  // rad, Newton step at the minimum
   const int n = model.chain.angles();
-  VectorX theta = start.size() == n ? start : Eigen::Map<const VectorX>(model.parameters.rest_angle.data(), n).eval();
-  // an exactly inverted rope is at rest too: lean a little, more than rounding
-  if (start.size() != n) theta.array() += 1e-6;
-  constexpr int kMaxIterations = 500;
-  constexpr double kMaxTurn = 0.5;  // rad an iteration
-  Engine engine(model);
+  const Parameters& p = model.parameters;
   const VectorX rest = VectorX::Zero(n);
-  double energy = potential_energy(model, base, theta), damping = 0.0;
-  double torque_scale = 0.0;
-  for (int k = 0; k < n; ++k) torque_scale += model.parameters.stiffness[k];
-  torque_scale += model.chain.length * model.parameters.gravity.norm() * model.parameters.tip_mass;
-  for (double m : model.parameters.link_mass) torque_scale += m * model.chain.length * model.parameters.gravity.norm();
-  if (torque_scale <= 0.0) return theta;
+  VectorX theta = start.size() == n ? start : Eigen::Map<const VectorX>(p.rest_angle.data(), n).eval();
+  double scale = p.tip_mass;
+  for (double m : p.link_mass) scale += m;
+  scale *= p.gravity.norm() * model.chain.length;
+  for (double k : p.stiffness) scale += k;
+  if (!(scale > 0.0)) return theta;
+
+  Engine engine(model);
+  double energy = potential_energy(model, base, theta), shift = 0.0;
   for (int iteration = 0; iteration < kMaxIterations; ++iteration) {
     engine.place(at_rest(base), theta, rest, true);
     engine.acceleration = rest;
     engine.linearize(Vector6::Zero());
     const VectorX gradient = engine.bias - engine.torque;
-    if (!gradient.allFinite()) break;
-    const bool still = gradient.norm() <= 1e-12 * torque_scale;
-    // where the potential curves down no start is a minimum: shift the Hessian until it is positive definite
-    for (int attempt = 0;; ++attempt) {
-      MatrixX hessian = 0.5 * (engine.stiffness + engine.stiffness.transpose());
-      hessian.diagonal().array() += damping + 1e-12 * torque_scale;
-      const Eigen::LLT<MatrixX> factor(hessian);
-      if (factor.info() == Eigen::Success) {
-        if (still && damping == 0.0) return theta;
-        VectorX step = factor.solve(-gradient);
-        const double largest = step.cwiseAbs().maxCoeff();
-        if (largest > kMaxTurn) step *= kMaxTurn / largest;
-        const double next = potential_energy(model, base, theta + step);
-        // near the minimum the energy no longer resolves a Newton step: take it
-        if (next <= energy || (damping == 0.0 && largest < 1e-4)) {
-          theta += step;
-          energy = next;
-          damping = damping < 1e-9 * torque_scale ? 0.0 : 0.2 * damping;
-          if (largest < 1e-12 && damping == 0.0) return theta;
-          break;
-        }
-      } else if (still) {
-        theta.array() += 1e-4;  // a saddle: leave it
-        energy = potential_energy(model, base, theta);
-        damping = 1e-3 * torque_scale;
+    MatrixX hessian = 0.5 * (engine.stiffness + engine.stiffness.transpose());
+    hessian.diagonal().array() += kRounding * scale;
+    if (gradient.norm() <= kRounding * scale) {
+      // at rest; where the potential curves down it is a saddle (a rope standing upright): leave it
+      const Eigen::SelfAdjointEigenSolver<MatrixX> curvature(hessian);
+      if (curvature.eigenvalues()[0] >= 0.0) return theta;
+      theta += 0.1 * curvature.eigenvectors().col(0);
+      energy = potential_energy(model, base, theta);
+      continue;
+    }
+    for (;; shift = std::max(4.0 * shift, 1e-6 * scale)) {
+      MatrixX shifted = hessian;
+      shifted.diagonal().array() += shift;
+      const Eigen::LLT<MatrixX> factor(shifted);
+      if (factor.info() != Eigen::Success) continue;
+      VectorX step = factor.solve(-gradient);
+      const double largest = step.cwiseAbs().maxCoeff();
+      if (shift == 0.0 && largest < kConverged) return theta + step;
+      if (largest > kMaxTurn) step *= kMaxTurn / largest;
+      const double next = potential_energy(model, base, theta + step);
+      if (next <= energy + kRounding * scale || largest < kConverged) {
+        theta += step;
+        energy = next;
         break;
       }
-      damping = std::max(4.0 * damping, 1e-6 * torque_scale);
-      if (attempt > 60) throw WorkError("static equilibrium", "no descent found", "check masses and stiffnesses");
+      if (!(shift < 1e12 * scale)) break;
     }
+    shift = shift < 1e-5 * scale ? 0.0 : 0.1 * shift;
+    if (!theta.allFinite()) break;
   }
   throw WorkError("static equilibrium", "no minimum of the potential energy found", "check masses and stiffnesses");
 }

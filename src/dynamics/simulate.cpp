@@ -6,11 +6,11 @@
 namespace chainsplat::dynamics {
 namespace {
 
-constexpr double kFrame = 1.0 / 30.0;        // s, what `substeps` counts in
-constexpr double kAngleBound = 1e3;          // rad, beyond which a motion counts as diverged
-constexpr double kRateBound = 1e5;           // rad/s
-constexpr int kMaxRefinement = 32;           // of the steps of a diverging rollout
-constexpr double kJerkStep = 0.01;           // of a step, for the one-sided difference of the base acceleration
+constexpr double kFrame = 1.0 / 30.0;  // s, what `substeps` counts in
+constexpr double kAngleBound = 1e3;    // rad, beyond which a motion counts as diverged
+constexpr double kRateBound = 1e5;     // rad/s
+constexpr int kMaxRefinement = 32;     // of the steps of a diverging rollout
+constexpr double kJerkStep = 0.01;     // of a step, for the one-sided difference of the base acceleration
 
 bool bounded(const VectorX& theta, const VectorX& thetadot) {
   // written so that NaN fails
@@ -76,7 +76,8 @@ struct Variation {
     }
   }
 
-  // The engine is linearized at the new node; `factor` holds M + g damping + g^2 stiffness there, g half the step before.
+  // The engine is linearized at the new node; `factor` holds M + g damping + g^2 stiffness there, g half the step
+  // before.
   void advance(Engine& engine, const Factor& factor, std::span<const Tangent> unknowns, double g) {
     engine.unknown_forces(unknowns, forces);
     predicted_y = y + g * acceleration;
@@ -115,7 +116,8 @@ BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<d
       last.step = next - last.time;
       const double e = kJerkStep * last.step;
       last.jerk = (4.0 * base(last.time + e).acceleration - base(last.time + 2.0 * e).acceleration -
-                   3.0 * last.motion.acceleration) / (2.0 * e);
+                   3.0 * last.motion.acceleration) /
+                  (2.0 * e);
       grid.nodes.push_back({next, 0.0, base(next), Vector6::Zero(), s == steps});
     }
     now = times[i];
@@ -140,11 +142,13 @@ bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta0, c
 
   std::size_t count = 0;
   const auto write = [&](double time) {
-    if (states.time.size() <= count) states.time.emplace_back(), states.theta.emplace_back(), states.thetadot.emplace_back();
+    if (states.time.size() <= count)
+      states.time.emplace_back(), states.theta.emplace_back(), states.thetadot.emplace_back();
     if (states.thetadot.size() <= count) states.thetadot.resize(count + 1);
     states.time[count] = time, states.theta[count] = theta, states.thetadot[count] = thetadot;
     if (vary) {
-      if (sensitivities->theta.size() <= count) sensitivities->theta.emplace_back(), sensitivities->thetadot.emplace_back();
+      if (sensitivities->theta.size() <= count)
+        sensitivities->theta.emplace_back(), sensitivities->thetadot.emplace_back();
       sensitivities->theta[count] = variation.x, sensitivities->thetadot[count] = variation.y;
     }
     ++count;
@@ -262,7 +266,8 @@ chain::States rollout(const Model& model, const BaseFunction& base, const Initia
 
 chain::States rollout(const Model& model, const trajectory::Trajectory& base, const InitialState& initial,
                       const std::vector<double>& times) {
-  return rollout(model, [&](double time) { return base.at(time); }, initial, times);
+  return rollout(
+      model, [&](double time) { return base.at(time); }, initial, times);
 }
 
 }  // namespace chainsplat::dynamics

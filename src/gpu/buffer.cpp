@@ -67,7 +67,7 @@ Buffer::Buffer(Device& device, std::size_t bytes, Domain domain, const char* nam
                                mebibytes(device.info.max_storage_range),
                     "use a smaller picture, fewer Gaussians or fewer views at a time");
   }
-  VkBufferCreateInfo create{VK_STRUCTURE_TYPE_BUFFER_CREATE_INFO};
+  auto create = of_type<VkBufferCreateInfo>(VK_STRUCTURE_TYPE_BUFFER_CREATE_INFO);
   create.size = std::max(kBufferAlignment, (bytes + kBufferAlignment - 1) / kBufferAlignment * kBufferAlignment);
   create.usage = VK_BUFFER_USAGE_STORAGE_BUFFER_BIT | VK_BUFFER_USAGE_INDIRECT_BUFFER_BIT |
                  VK_BUFFER_USAGE_TRANSFER_SRC_BIT | VK_BUFFER_USAGE_TRANSFER_DST_BIT;
@@ -78,7 +78,7 @@ Buffer::Buffer(Device& device, std::size_t bytes, Domain domain, const char* nam
   vkGetBufferMemoryRequirements(device.handle, handles_->buffer, &needs);
   const int type = memory_type_for(device, needs.memoryTypeBits, domain);
   CHAINSPLAT_CHECK(type >= 0, where);
-  VkMemoryAllocateInfo allocate{VK_STRUCTURE_TYPE_MEMORY_ALLOCATE_INFO};
+  auto allocate = of_type<VkMemoryAllocateInfo>(VK_STRUCTURE_TYPE_MEMORY_ALLOCATE_INFO);
   allocate.allocationSize = needs.size;
   allocate.memoryTypeIndex = static_cast<std::uint32_t>(type);
   const VkResult result = vkAllocateMemory(device.handle, &allocate, nullptr, &handles_->memory);

@@ -18,12 +18,12 @@ constexpr VkAccessFlags2 kWorkReads =
 
 void memory_barrier(VkCommandBuffer commands, VkPipelineStageFlags2 source, VkAccessFlags2 writes,
                     VkPipelineStageFlags2 target, VkAccessFlags2 accesses) {
-  VkMemoryBarrier2 barrier{VK_STRUCTURE_TYPE_MEMORY_BARRIER_2};
+  auto barrier = of_type<VkMemoryBarrier2>(VK_STRUCTURE_TYPE_MEMORY_BARRIER_2);
   barrier.srcStageMask = source;
   barrier.srcAccessMask = writes;
   barrier.dstStageMask = target;
   barrier.dstAccessMask = accesses;
-  VkDependencyInfo dependency{VK_STRUCTURE_TYPE_DEPENDENCY_INFO};
+  auto dependency = of_type<VkDependencyInfo>(VK_STRUCTURE_TYPE_DEPENDENCY_INFO);
   dependency.memoryBarrierCount = 1;
   dependency.pMemoryBarriers = &barrier;
   vkCmdPipelineBarrier2(commands, &dependency);
@@ -56,7 +56,7 @@ struct Commands::State {
   }
 
   VkResult wait_for_timeline() const {
-    VkSemaphoreWaitInfo info{VK_STRUCTURE_TYPE_SEMAPHORE_WAIT_INFO};
+    auto info = of_type<VkSemaphoreWaitInfo>(VK_STRUCTURE_TYPE_SEMAPHORE_WAIT_INFO);
     info.semaphoreCount = 1;
     info.pSemaphores = &device.timeline;
     info.pValues = &submitted;
@@ -76,7 +76,7 @@ struct Commands::State {
     if (device.timestamp_mask == 0) return;
     const auto at = static_cast<std::uint32_t>(labels.size());
     if (at / kQueriesAPool >= query_pools.size()) {
-      VkQueryPoolCreateInfo create{VK_STRUCTURE_TYPE_QUERY_POOL_CREATE_INFO};
+      auto create = of_type<VkQueryPoolCreateInfo>(VK_STRUCTURE_TYPE_QUERY_POOL_CREATE_INFO);
       create.queryType = VK_QUERY_TYPE_TIMESTAMP;
       create.queryCount = kQueriesAPool;
       VkQueryPool made = VK_NULL_HANDLE;
@@ -116,7 +116,7 @@ struct Commands::State {
     const std::uint32_t at = sets_used++;
     if (at / kSetsAPool >= set_pools.size()) {
       const VkDescriptorPoolSize size{VK_DESCRIPTOR_TYPE_STORAGE_BUFFER, kSetsAPool * kLeastStorageBuffers};
-      VkDescriptorPoolCreateInfo create{VK_STRUCTURE_TYPE_DESCRIPTOR_POOL_CREATE_INFO};
+      auto create = of_type<VkDescriptorPoolCreateInfo>(VK_STRUCTURE_TYPE_DESCRIPTOR_POOL_CREATE_INFO);
       create.maxSets = kSetsAPool;
       create.poolSizeCount = 1;
       create.pPoolSizes = &size;
@@ -124,7 +124,7 @@ struct Commands::State {
       device.check(vkCreateDescriptorPool(device.handle, &create, nullptr, &made), "make a descriptor pool");
       set_pools.push_back(made);
     }
-    VkDescriptorSetAllocateInfo allocate{VK_STRUCTURE_TYPE_DESCRIPTOR_SET_ALLOCATE_INFO};
+    auto allocate = of_type<VkDescriptorSetAllocateInfo>(VK_STRUCTURE_TYPE_DESCRIPTOR_SET_ALLOCATE_INFO);
     allocate.descriptorPool = set_pools[at / kSetsAPool];
     allocate.descriptorSetCount = 1;
     allocate.pSetLayouts = &layout;
@@ -147,7 +147,7 @@ struct Commands::State {
       for (std::uint32_t i = 0; i < h.buffers; ++i) {
         CHAINSPLAT_CHECK(buffers[i] && &buffers[i]->handles(), h.name + ", binding " + std::to_string(i));
         infos[i] = {buffers[i]->handles().buffer, 0, VK_WHOLE_SIZE};
-        writes[i] = {VK_STRUCTURE_TYPE_WRITE_DESCRIPTOR_SET};
+        writes[i] = of_type<VkWriteDescriptorSet>(VK_STRUCTURE_TYPE_WRITE_DESCRIPTOR_SET);
         writes[i].dstSet = set;
         writes[i].dstBinding = i;
         writes[i].descriptorCount = 1;
@@ -166,10 +166,10 @@ struct Commands::State {
 };
 
 Commands::Commands(Device& device) : state_(std::make_unique<State>(device)) {
-  VkCommandPoolCreateInfo pool{VK_STRUCTURE_TYPE_COMMAND_POOL_CREATE_INFO};
+  auto pool = of_type<VkCommandPoolCreateInfo>(VK_STRUCTURE_TYPE_COMMAND_POOL_CREATE_INFO);
   pool.queueFamilyIndex = device.queue_family;
   device.check(vkCreateCommandPool(device.handle, &pool, nullptr, &state_->pool), "make a command pool");
-  VkCommandBufferAllocateInfo allocate{VK_STRUCTURE_TYPE_COMMAND_BUFFER_ALLOCATE_INFO};
+  auto allocate = of_type<VkCommandBufferAllocateInfo>(VK_STRUCTURE_TYPE_COMMAND_BUFFER_ALLOCATE_INFO);
   allocate.commandPool = state_->pool;
   allocate.level = VK_COMMAND_BUFFER_LEVEL_PRIMARY;
   allocate.commandBufferCount = 1;
@@ -256,12 +256,12 @@ void Commands::submit() {
   }
   for (VkQueryPool query_pool : s.query_pools) vkResetQueryPool(s.device.handle, query_pool, 0, kQueriesAPool);
 
-  VkCommandBufferSubmitInfo commands{VK_STRUCTURE_TYPE_COMMAND_BUFFER_SUBMIT_INFO};
+  auto commands = of_type<VkCommandBufferSubmitInfo>(VK_STRUCTURE_TYPE_COMMAND_BUFFER_SUBMIT_INFO);
   commands.commandBuffer = s.commands;
-  VkSemaphoreSubmitInfo signal{VK_STRUCTURE_TYPE_SEMAPHORE_SUBMIT_INFO};
+  auto signal = of_type<VkSemaphoreSubmitInfo>(VK_STRUCTURE_TYPE_SEMAPHORE_SUBMIT_INFO);
   signal.semaphore = s.device.timeline;
   signal.stageMask = VK_PIPELINE_STAGE_2_ALL_COMMANDS_BIT;
-  VkSubmitInfo2 info{VK_STRUCTURE_TYPE_SUBMIT_INFO_2};
+  auto info = of_type<VkSubmitInfo2>(VK_STRUCTURE_TYPE_SUBMIT_INFO_2);
   info.commandBufferInfoCount = 1;
   info.pCommandBufferInfos = &commands;
   info.signalSemaphoreInfoCount = 1;

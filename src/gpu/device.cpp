@@ -7,6 +7,7 @@
 #include <cstdlib>
 #include <cstring>
 #include <utility>
+#include <utility>
 
 namespace chainsplat::gpu {
 
@@ -40,7 +41,7 @@ VKAPI_ATTR VkBool32 VKAPI_CALL on_message(VkDebugUtilsMessageSeverityFlagBitsEXT
 
 // GENERAL messages are the loader's remarks on drivers and layers, no fault of ours, and are left out.
 VkDebugUtilsMessengerCreateInfoEXT messenger_info(Messages* messages) {
-  VkDebugUtilsMessengerCreateInfoEXT info{VK_STRUCTURE_TYPE_DEBUG_UTILS_MESSENGER_CREATE_INFO_EXT};
+  auto info = of_type<VkDebugUtilsMessengerCreateInfoEXT>(VK_STRUCTURE_TYPE_DEBUG_UTILS_MESSENGER_CREATE_INFO_EXT);
   info.messageSeverity =
       VK_DEBUG_UTILS_MESSAGE_SEVERITY_WARNING_BIT_EXT | VK_DEBUG_UTILS_MESSAGE_SEVERITY_ERROR_BIT_EXT;
   info.messageType = VK_DEBUG_UTILS_MESSAGE_TYPE_VALIDATION_BIT_EXT | VK_DEBUG_UTILS_MESSAGE_TYPE_PERFORMANCE_BIT_EXT;
@@ -91,10 +92,13 @@ std::string list_text(const std::vector<DeviceInfo>& devices) {
 }
 
 struct Features {  // the feature structs that we ask about and enable, chained
-  VkPhysicalDeviceFeatures2 all{VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_FEATURES_2};
-  VkPhysicalDeviceVulkan12Features v12{VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_VULKAN_1_2_FEATURES};
-  VkPhysicalDeviceVulkan13Features v13{VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_VULKAN_1_3_FEATURES};
+  VkPhysicalDeviceFeatures2 all{};
+  VkPhysicalDeviceVulkan12Features v12{};
+  VkPhysicalDeviceVulkan13Features v13{};
   Features() {
+    all.sType = VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_FEATURES_2;
+    v12.sType = VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_VULKAN_1_2_FEATURES;
+    v13.sType = VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_VULKAN_1_3_FEATURES;
     all.pNext = &v12;
     v12.pNext = &v13;
   }
@@ -123,11 +127,12 @@ Candidate examine_device(VkPhysicalDevice physical, int index) {
     return c;
   }
 
-  VkPhysicalDeviceProperties2 properties{VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_PROPERTIES_2};
-  VkPhysicalDeviceDriverProperties driver{VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_DRIVER_PROPERTIES};
-  VkPhysicalDeviceSubgroupProperties subgroup{VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_SUBGROUP_PROPERTIES};
-  VkPhysicalDeviceVulkan13Properties v13{VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_VULKAN_1_3_PROPERTIES};
-  VkPhysicalDevicePushDescriptorPropertiesKHR push{VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_PUSH_DESCRIPTOR_PROPERTIES_KHR};
+  auto properties = of_type<VkPhysicalDeviceProperties2>(VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_PROPERTIES_2);
+  auto driver = of_type<VkPhysicalDeviceDriverProperties>(VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_DRIVER_PROPERTIES);
+  auto subgroup = of_type<VkPhysicalDeviceSubgroupProperties>(VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_SUBGROUP_PROPERTIES);
+  auto v13 = of_type<VkPhysicalDeviceVulkan13Properties>(VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_VULKAN_1_3_PROPERTIES);
+  auto push = of_type<VkPhysicalDevicePushDescriptorPropertiesKHR>(
+      VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_PUSH_DESCRIPTOR_PROPERTIES_KHR);
   properties.pNext = &driver;
   driver.pNext = &subgroup;
   subgroup.pNext = &v13;
@@ -224,11 +229,15 @@ const char* result_name(VkResult result) {
   }
 }
 
-Instance::Instance(Instance&& other) noexcept
-    : handle(std::exchange(other.handle, VK_NULL_HANDLE)),
-      messenger(std::exchange(other.messenger, VK_NULL_HANDLE)),
-      messages(std::move(other.messages)),
-      debug_utils(other.debug_utils) {}
+Instance::Instance(Instance&& other) noexcept { *this = std::move(other); }
+
+Instance& Instance::operator=(Instance&& other) noexcept {
+  std::swap(handle, other.handle);
+  std::swap(messenger, other.messenger);
+  std::swap(messages, other.messages);
+  std::swap(debug_utils, other.debug_utils);
+  return *this;
+}
 
 Instance::~Instance() {
   if (!handle) return;
@@ -251,7 +260,7 @@ bool validation_layer_present() {
 
 Instance make_instance(bool validation, std::string* why) {
   Instance instance;
-  VkApplicationInfo application{VK_STRUCTURE_TYPE_APPLICATION_INFO};
+  auto application = of_type<VkApplicationInfo>(VK_STRUCTURE_TYPE_APPLICATION_INFO);
   application.pApplicationName = "chainsplat";
   application.apiVersion = VK_API_VERSION_1_3;
 
@@ -260,10 +269,10 @@ Instance make_instance(bool validation, std::string* why) {
                          (validation && instance_extension_present(kValidationLayer, VK_EXT_DEBUG_UTILS_EXTENSION_NAME));
   if (instance.debug_utils) extensions.push_back(VK_EXT_DEBUG_UTILS_EXTENSION_NAME);
 
-  VkInstanceCreateInfo create{VK_STRUCTURE_TYPE_INSTANCE_CREATE_INFO};
+  auto create = of_type<VkInstanceCreateInfo>(VK_STRUCTURE_TYPE_INSTANCE_CREATE_INFO);
   create.pApplicationInfo = &application;
   VkDebugUtilsMessengerCreateInfoEXT messenger = messenger_info(instance.messages.get());
-  VkValidationFeaturesEXT features{VK_STRUCTURE_TYPE_VALIDATION_FEATURES_EXT};
+  auto features = of_type<VkValidationFeaturesEXT>(VK_STRUCTURE_TYPE_VALIDATION_FEATURES_EXT);
   const VkValidationFeatureEnableEXT synchronization = VK_VALIDATION_FEATURE_ENABLE_SYNCHRONIZATION_VALIDATION_EXT;
   const char* const layers[] = {kValidationLayer};
   const bool watch = validation && instance.debug_utils;
@@ -393,7 +402,7 @@ void Device::check(VkResult result, const char* what) const {
 
 void Device::name(VkObjectType type, std::uint64_t object, const char* text) const {
   if (!set_name || !text) return;
-  VkDebugUtilsObjectNameInfoEXT object_name{VK_STRUCTURE_TYPE_DEBUG_UTILS_OBJECT_NAME_INFO_EXT};
+  auto object_name = of_type<VkDebugUtilsObjectNameInfoEXT>(VK_STRUCTURE_TYPE_DEBUG_UTILS_OBJECT_NAME_INFO_EXT);
   object_name.objectType = type;
   object_name.objectHandle = object;
   object_name.pObjectName = text;
@@ -427,13 +436,13 @@ DevicePtr open_device(const DeviceOptions& options) {
   const std::vector<Candidate> all = candidates(instance, &why);
   const Candidate& c = all[choose(infos(all), options.selector, why, nullptr)];
   Device& d = *device;
-  // the members keep the instance alive; the messenger's target does not move with it
-  std::construct_at((std::destroy_at(&d.instance), &d.instance), std::move(instance));
+  d.instance = std::move(instance);
   d.physical = c.handle;
   d.info = c.info;
   d.queue_family = c.queue_family;
-  d.push_descriptors = options.push_descriptors ? c.push_descriptors : 0;
+  d.push_descriptors = options.least ? 0 : c.push_descriptors;
   d.info.push_descriptors = d.push_descriptors > 0;
+  d.info.unified_memory = c.info.unified_memory && !options.least;
   d.fixes_subgroup_size = c.fixes_subgroup_size;
   d.timestamp_mask = c.timestamp_bits >= 64 ? ~0ull : (1ull << c.timestamp_bits) - 1;
   d.timestamp_period = c.timestamp_period;
@@ -450,12 +459,12 @@ DevicePtr open_device(const DeviceOptions& options) {
   wanted.v13.computeFullSubgroups = there.v13.computeFullSubgroups;
 
   const float priority = 1.0f;
-  VkDeviceQueueCreateInfo queue{VK_STRUCTURE_TYPE_DEVICE_QUEUE_CREATE_INFO};
+  auto queue = of_type<VkDeviceQueueCreateInfo>(VK_STRUCTURE_TYPE_DEVICE_QUEUE_CREATE_INFO);
   queue.queueFamilyIndex = d.queue_family;
   queue.queueCount = 1;
   queue.pQueuePriorities = &priority;
   const char* const extensions[] = {VK_KHR_PUSH_DESCRIPTOR_EXTENSION_NAME};
-  VkDeviceCreateInfo create{VK_STRUCTURE_TYPE_DEVICE_CREATE_INFO};
+  auto create = of_type<VkDeviceCreateInfo>(VK_STRUCTURE_TYPE_DEVICE_CREATE_INFO);
   create.pNext = &wanted.all;
   create.queueCreateInfoCount = 1;
   create.pQueueCreateInfos = &queue;
@@ -472,9 +481,9 @@ DevicePtr open_device(const DeviceOptions& options) {
         vkGetInstanceProcAddr(d.instance.handle, "vkSetDebugUtilsObjectNameEXT"));
   }
 
-  VkSemaphoreTypeCreateInfo timeline{VK_STRUCTURE_TYPE_SEMAPHORE_TYPE_CREATE_INFO};
+  auto timeline = of_type<VkSemaphoreTypeCreateInfo>(VK_STRUCTURE_TYPE_SEMAPHORE_TYPE_CREATE_INFO);
   timeline.semaphoreType = VK_SEMAPHORE_TYPE_TIMELINE;
-  VkSemaphoreCreateInfo semaphore{VK_STRUCTURE_TYPE_SEMAPHORE_CREATE_INFO};
+  auto semaphore = of_type<VkSemaphoreCreateInfo>(VK_STRUCTURE_TYPE_SEMAPHORE_CREATE_INFO);
   semaphore.pNext = &timeline;
   d.check(vkCreateSemaphore(d.handle, &semaphore, nullptr, &d.timeline), "make a semaphore");
 

@@ -19,6 +19,14 @@ inline constexpr std::uint32_t kLeastInvocations = 256;      // of a work group;
 inline constexpr std::uint32_t kLeastSharedBytes = 16384;    // the least maxComputeSharedMemorySize of Vulkan
 inline constexpr std::uint32_t kLeastStorageBuffers = 16;    // of a kernel; Vulkan itself promises 4
 
+// A Vulkan struct with its type set and everything else zero.
+template <class T>
+T of_type(VkStructureType type) {
+  T made{};
+  made.sType = type;
+  return made;
+}
+
 const char* result_name(VkResult result);
 
 struct Messages {  // of the validation layer, from any thread
@@ -33,6 +41,7 @@ struct Instance {
   bool debug_utils = false;
   Instance() = default;
   Instance(Instance&& other) noexcept;
+  Instance& operator=(Instance&& other) noexcept;
   ~Instance();
 };
 

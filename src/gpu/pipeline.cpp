@@ -51,7 +51,7 @@ VkPipelineCache load_pipeline_cache(VkDevice device, const VkPhysicalDevicePrope
     const std::string_view rest = std::string_view(content).substr(kChecksumBytes);
     if (core::fnv1a(rest) == checksum) data = rest;
   }
-  VkPipelineCacheCreateInfo create{VK_STRUCTURE_TYPE_PIPELINE_CACHE_CREATE_INFO};
+  auto create = of_type<VkPipelineCacheCreateInfo>(VK_STRUCTURE_TYPE_PIPELINE_CACHE_CREATE_INFO);
   create.initialDataSize = data.size();
   create.pInitialData = data.data();
   VkPipelineCache cache = VK_NULL_HANDLE;
@@ -100,14 +100,14 @@ Pipeline::Pipeline(Device& device, const std::string& name, int buffers, std::si
   for (std::uint32_t i = 0; i < h.buffers; ++i) {
     bindings[i] = {i, VK_DESCRIPTOR_TYPE_STORAGE_BUFFER, 1, VK_SHADER_STAGE_COMPUTE_BIT, nullptr};
   }
-  VkDescriptorSetLayoutCreateInfo set{VK_STRUCTURE_TYPE_DESCRIPTOR_SET_LAYOUT_CREATE_INFO};
+  auto set = of_type<VkDescriptorSetLayoutCreateInfo>(VK_STRUCTURE_TYPE_DESCRIPTOR_SET_LAYOUT_CREATE_INFO);
   set.flags = h.pushes_descriptors ? VK_DESCRIPTOR_SET_LAYOUT_CREATE_PUSH_DESCRIPTOR_BIT_KHR : 0;
   set.bindingCount = h.buffers;
   set.pBindings = bindings.data();
   device.check(vkCreateDescriptorSetLayout(device.handle, &set, nullptr, &h.set_layout), "make a descriptor layout");
 
   const VkPushConstantRange range{VK_SHADER_STAGE_COMPUTE_BIT, 0, h.push_bytes};
-  VkPipelineLayoutCreateInfo layout{VK_STRUCTURE_TYPE_PIPELINE_LAYOUT_CREATE_INFO};
+  auto layout = of_type<VkPipelineLayoutCreateInfo>(VK_STRUCTURE_TYPE_PIPELINE_LAYOUT_CREATE_INFO);
   layout.setLayoutCount = 1;
   layout.pSetLayouts = &h.set_layout;
   layout.pushConstantRangeCount = push_bytes > 0 ? 1 : 0;
@@ -125,17 +125,17 @@ Pipeline::Pipeline(Device& device, const std::string& name, int buffers, std::si
   specialization.pData = constants.data();
 
   const std::span<const std::uint32_t> code = shader_code(name);
-  VkShaderModuleCreateInfo module_create{VK_STRUCTURE_TYPE_SHADER_MODULE_CREATE_INFO};
+  auto module_create = of_type<VkShaderModuleCreateInfo>(VK_STRUCTURE_TYPE_SHADER_MODULE_CREATE_INFO);
   module_create.codeSize = code.size_bytes();
   module_create.pCode = code.data();
   VkShaderModule module = VK_NULL_HANDLE;
   device.check(vkCreateShaderModule(device.handle, &module_create, nullptr, &module), "take a shader");
 
-  VkPipelineShaderStageRequiredSubgroupSizeCreateInfo subgroup{
-      VK_STRUCTURE_TYPE_PIPELINE_SHADER_STAGE_REQUIRED_SUBGROUP_SIZE_CREATE_INFO};
+  auto subgroup = of_type<VkPipelineShaderStageRequiredSubgroupSizeCreateInfo>(
+      VK_STRUCTURE_TYPE_PIPELINE_SHADER_STAGE_REQUIRED_SUBGROUP_SIZE_CREATE_INFO);
   subgroup.requiredSubgroupSize = device.info.subgroup_size;
-  VkComputePipelineCreateInfo create{VK_STRUCTURE_TYPE_COMPUTE_PIPELINE_CREATE_INFO};
-  create.stage = {VK_STRUCTURE_TYPE_PIPELINE_SHADER_STAGE_CREATE_INFO};
+  auto create = of_type<VkComputePipelineCreateInfo>(VK_STRUCTURE_TYPE_COMPUTE_PIPELINE_CREATE_INFO);
+  create.stage = of_type<VkPipelineShaderStageCreateInfo>(VK_STRUCTURE_TYPE_PIPELINE_SHADER_STAGE_CREATE_INFO);
   create.stage.pNext = device.fixes_subgroup_size ? &subgroup : nullptr;
   create.stage.stage = VK_SHADER_STAGE_COMPUTE_BIT;
   create.stage.module = module;

@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <numeric>
 
 #include "unknowns.h"
 
@@ -12,33 +11,32 @@ namespace {
 
 using dynamics::BaseGrid;
 using math::Vector3;
-using math::Vector6;
 
 constexpr double kHorizons[] = {1.0 / 3, 2.0 / 3, 4.0 / 3, 8.0 / 3};  // s, then everything
-constexpr double kModelError = 1e-3;      // m, added to what the covariances say of a point
+constexpr double kModelError = 1e-3;                                  // m, added to what the covariances say of a point
 constexpr double kResidualShare = 1.0 / 9.0;  // of a residual that counts: neighbors in space and time err alike
-constexpr double kHuber = 3.0;            // in robust standard deviations of a point's residual
-constexpr double kThetaSd = 0.02;         // rad, initial angles about the recognized ones without covariances
-constexpr int kLag = 10;                  // frames over which residuals are taken to be correlated (SPEC 5)
+constexpr double kHuber = 3.0;                // in robust standard deviations of a point's residual
+constexpr double kThetaSd = 0.02;             // rad, initial angles about the recognized ones without covariances
+constexpr int kLag = 10;                      // frames over which residuals are taken to be correlated (SPEC 5)
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
 struct Problem {
   const chain::Chain& chain;
   Unknowns unknowns;
-  std::vector<double> times, arclengths;
-  std::vector<int> links;           // of each arclength
-  std::vector<Vector3> home;        // of each arclength, base frame
-  std::vector<MatrixX> target;      // a frame: 3 x points, base frame
-  std::vector<MatrixX> whitening;   // a frame: 3 x 3 blocks side by side
-  std::vector<VectorX> theta;       // recognized
+  std::vector<double> times;
+  std::vector<int> links;          // of each compared point: middles and ends of the links, two a link, then
+  std::vector<Vector3> home;       // where the rope can twist a point of its surface a link; base frame, at theta = 0
+  std::vector<MatrixX> target;     // a frame: 3 x points, base frame
+  std::vector<MatrixX> whitening;  // a frame: 3 x 3 blocks side by side
+  std::vector<VectorX> theta;      // recognized
   BaseGrid grid;
-  std::vector<std::size_t> nodes;   // of the grid, up to and with each output
+  std::vector<std::size_t> nodes;  // of the grid, up to and with each output
 };
 
 // Points of the centerline in the base frame and, where asked, their derivatives by theta.
 void place_points(const Problem& problem, const VectorX& theta, MatrixX& points, std::vector<MatrixX>* slopes) {
   const auto motions = chain::link_motions(problem.chain, theta, {});
-  const std::size_t count = problem.arclengths.size();
+  const std::size_t count = problem.home.size();
   points.resize(3, count);
   for (std::size_t i = 0; i < count; ++i) points.col(i) = motions[problem.links[i]] * problem.home[i];
   if (!slopes) return;
@@ -47,12 +45,6 @@ void place_points(const Problem& problem, const VectorX& theta, MatrixX& points,
   for (std::size_t i = 0; i < count; ++i)
     (*slopes)[i] = chain::point_jacobian(problem.chain, axes, problem.links[i], points.col(i));
 }
-
-// Whitened residuals, 3 x points a frame, over the first `frames` frames.
-struct Residuals {
-  std::vector<MatrixX> values;
-  chain::States states;
-};
 
 BaseGrid prefix(const Problem& problem, std::size_t frames) {
   BaseGrid grid;
@@ -122,16 +114,16 @@ double cost_of(const Problem& problem, const std::vector<MatrixX>& values, const
 }
 
 struct Normal {
-  MatrixX hessian;    // J^T W J
-  VectorX gradient;   // J^T W r
-  MatrixX scores;     // a frame's part of the gradient, unknowns x frames
+  MatrixX hessian;   // J^T W J
+  VectorX gradient;  // J^T W r
+  MatrixX scores;    // a frame's part of the gradient, unknowns x frames
 };
 
 Normal normal_equations(const Problem& problem, const chain::States& states, const dynamics::Sensitivities& slopes,
                         const std::vector<MatrixX>& values, double limit) {
   const Eigen::Index size = problem.unknowns.size();
   const std::size_t frames = values.size();
-  const Eigen::Index points = static_cast<Eigen::Index>(problem.arclengths.size());
+  const Eigen::Index points = static_cast<Eigen::Index>(problem.home.size());
   // blocks of frames, summed in fixed order: the result does not depend on the number of threads
   constexpr std::size_t kBlock = 10;
   const std::size_t blocks = (frames + kBlock - 1) / kBlock;
@@ -258,15 +250,21 @@ Problem make_problem(const chain::Chain& chain, const trajectory::Trajectory& ba
       throw InputError("identify", "a recognized state is not finite or of another chain", "recognize again");
   CHAINSPLAT_CHECK(covariances.empty() || covariances.size() == frames, std::to_string(covariances.size()));
 
-  Problem problem{chain, {}, recognized.time, {}, {}, {}, {}, {}, recognized.theta, {}, {}};
+  Problem problem{chain, {}, recognized.time, {}, {}, {}, {}, recognized.theta, {}, {}};
   for (int link = 1; link < chain.links(); ++link) {
-    problem.arclengths.push_back(0.5 * (chain.link_start(link) + chain.link_end(link)));
-    problem.arclengths.push_back(chain.link_end(link));
+    problem.home.push_back(0.5 * (chain.link_start(link) + chain.link_end(link)) * chain.direction);
+    problem.home.push_back(chain.link_end(link) * chain.direction);
     problem.links.insert(problem.links.end(), 2, link);
   }
-  for (double s : problem.arclengths) problem.home.push_back(s * chain.direction);
+  const bool twists = std::any_of(chain.axes.begin(), chain.axes.end(), [&](const math::Vector6& axis) {
+    return std::abs(axis.head<3>().dot(chain.direction)) > 0.5;
+  });
+  for (int link = 1; twists && link < chain.links(); ++link) {
+    problem.home.push_back(chain.link_end(link) * chain.direction + 0.5 * chain.diameter * chain.bending_axis);
+    problem.links.push_back(link);
+  }
 
-  const std::size_t points = problem.arclengths.size();
+  const std::size_t points = problem.home.size();
   std::vector<MatrixX> jacobians;
   for (std::size_t k = 0; k < frames; ++k) {
     MatrixX target, whitening(3, 3 * points);
@@ -327,9 +325,12 @@ Fit fit_centerline(const Problem& problem, const Options& options) {
     return fit;
   };
   const auto finish = [&](Fit fit) {
-    improve(problem, frames_within(problem, kHorizons[3]), options.max_iterations, fit);
-    improve(problem, all, options.max_iterations, fit);
-    improve(problem, all, options.max_iterations, fit);  // again with the threshold of the better fit
+    // the whole twice: again with the threshold of the better fit
+    for (std::size_t frames : {frames_within(problem, kHorizons[3]), all, all}) {
+      improve(problem, frames, options.max_iterations, fit);
+      core::report({"identify", static_cast<std::int64_t>(frames), static_cast<std::int64_t>(all), fit.cost, NAN,
+                    "fitting the rollout to the recognized motion"});
+    }
     return fit;
   };
   // a common scale for comparing: the plain robust cost of the trial horizon with a fixed threshold
@@ -376,8 +377,10 @@ Fit fit_angles(const Problem& problem, const Options& options) {
     dynamics::Sensitivities slopes;
     if (!simulate(problem, problem.grid, fit.p, states, &slopes)) {
       // beyond the step's stability: go back and step less
-      if (best.cost == kInfinity) fit.p.array() += 0.3;
-      else fit.p = best.p;
+      if (best.cost == kInfinity)
+        fit.p.array() += 0.3;
+      else
+        fit.p = best.p;
       rate *= 0.5;
       first.setZero();
       continue;
@@ -399,15 +402,15 @@ Fit fit_angles(const Problem& problem, const Options& options) {
   return best;
 }
 
-// Sandwich covariance of the estimate: residuals of frames up to kLag apart are correlated (Newey-West, SPEC 5).
+// Sandwich covariance of the estimate in the position metric ([P] included): residuals of frames up to kLag apart are
+// correlated (Newey-West, SPEC 5).
 MatrixX covariance_of(const Problem& problem, const Normal& normal) {
   const MatrixX& prior = problem.unknowns.precision;
   MatrixX meat = normal.scores * normal.scores.transpose();
   const Eigen::Index frames = normal.scores.cols();
   for (int lag = 1; lag <= kLag && lag < frames; ++lag) {
     const double weight = 1.0 - lag / (kLag + 1.0);
-    const MatrixX part =
-        normal.scores.rightCols(frames - lag) * normal.scores.leftCols(frames - lag).transpose();
+    const MatrixX part = normal.scores.rightCols(frames - lag) * normal.scores.leftCols(frames - lag).transpose();
     meat += weight * (part + part.transpose());
   }
   const MatrixX bread = (normal.hessian + prior).ldlt().solve(MatrixX::Identity(prior.rows(), prior.cols()));
@@ -445,7 +448,7 @@ Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, c
   MatrixX points;
   for (std::size_t k = 0; k < problem.times.size(); ++k) {
     place_points(problem, result.rollout.theta[k], points, nullptr);
-    for (Eigen::Index i = 1; i < points.cols(); i += 2, ++count)  // odd ones are the links' ends
+    for (int i = 1; i < 2 * (chain.links() - 1); i += 2, ++count)  // odd ones are the links' ends
       sum += (points.col(i) - problem.target[k].col(i)).squaredNorm();
   }
   result.node_rms = std::sqrt(sum / static_cast<double>(count));

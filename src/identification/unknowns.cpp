@@ -14,18 +14,18 @@ constexpr double kSmoothSd = 0.3;         // between neighbors, of those
 constexpr double kCoulombSd = 1.5;        // coefficient of one link
 constexpr double kCoulombSmoothSd = 1.0;  // between neighbors: a lifted link next to one that carries is usual
 constexpr double kViscousSd = 1.0;
-constexpr double kRestSd = 0.3;           // rad
-constexpr double kRateSd = 0.5;           // rad/s, initial velocity about the differences of the recognized angles
+constexpr double kRestSd = 0.3;  // rad
+constexpr double kRateSd = 0.5;  // rad/s, initial velocity about the differences of the recognized angles
 
 // Centers of the priors, and starts. Stiffness is relative to M g L.
 constexpr double kStiffnessPart = 0.1;
-constexpr double kRetardation = 0.07;        // s, damping over stiffness
-constexpr double kDampingPart = 0.004;       // s, damping over M g L, where there is no stiffness
-constexpr double kDragCoefficient = 1.2;     // C_D of a cylinder across the flow
-constexpr double kAirDensity = 1.2;          // kg/m^3
+constexpr double kRetardation = 0.07;     // s, damping over stiffness
+constexpr double kDampingPart = 0.004;    // s, damping over M g L, where there is no stiffness
+constexpr double kDragCoefficient = 1.2;  // C_D of a cylinder across the flow
+constexpr double kAirDensity = 1.2;       // kg/m^3
 constexpr double kTipPart = 0.03;
 constexpr double kCoulombMean = 0.3;
-constexpr double kViscousRate = 3.0;         // 1/s, friction over mass
+constexpr double kViscousRate = 3.0;  // 1/s, friction over mass
 
 std::string numbered(const char* name, int index) { return std::string(name) + "_" + std::to_string(index + 1); }
 
@@ -42,7 +42,8 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
 
   dynamics::Parameters& fixed = u.fixed;
   const auto zeros = [](int count) { return std::vector<double>(count, 0.0); };
-  fixed.link_mass = fixed.viscous_friction = fixed.coulomb_friction = fixed.air_linear = fixed.air_quadratic = zeros(links);
+  fixed.link_mass = fixed.viscous_friction = fixed.coulomb_friction = fixed.air_linear = fixed.air_quadratic =
+      zeros(links);
   fixed.stiffness = fixed.rest_angle = fixed.damping = zeros(n);
   fixed.radius = options.paper ? 0.0 : 0.5 * chain.diameter;
   fixed.gravity = options.gravity;
@@ -94,7 +95,8 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
     u.joint_damping = add_many("log_damping_joint", links, std::log(damping), kViscousSd, 0.0);
     u.link_mass = add_many("log_mass_link", links, 0.0, 0.3, 0.0);
     if (options.tabletop)
-      u.viscous = add_many("log_viscous_friction_link", links, std::log(kViscousRate * u.total_mass / links), kViscousSd, 0.0);
+      u.viscous =
+          add_many("log_viscous_friction_link", links, std::log(kViscousRate * u.total_mass / links), kViscousSd, 0.0);
     u.held.emplace_back("tip_mass", "0, as in the paper");
     u.held.emplace_back("rest_angle", "0, as in the paper");
     u.held.emplace_back("initial_state", "the recognized one, as in the paper");
@@ -112,7 +114,8 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
       u.held.emplace_back("tip_mass", "0: not observable on a table beside the friction");
       u.held.emplace_back("drag", "0 on a table");
     } else {
-      u.drag = add("log_drag", std::log(0.5 * kAirDensity * kDragCoefficient * std::max(chain.diameter, 1e-3)), kSharedSd);
+      u.drag =
+          add("log_drag", std::log(0.5 * kAirDensity * kDragCoefficient * std::max(chain.diameter, 1e-3)), kSharedSd);
       u.tip = add("logit_tip_mass_fraction", std::log(kTipPart / (1.0 - kTipPart)), kTipSd);
     }
     if (stiff)
@@ -146,8 +149,8 @@ State apply(const chain::Chain& chain, const Unknowns& u, const VectorX& p) {
   q.tip_mass = u.tip < 0 ? 0.0 : u.total_mass / (1.0 + std::exp(-p[u.tip]));
   double sum = 0.0;
   for (int j = 0; j < links; ++j)
-    sum += q.link_mass[j] = (chain.link_end(j + 1) - chain.link_start(j + 1)) *
-                            (u.link_mass < 0 ? 1.0 : std::exp(p[u.link_mass + j]));
+    sum += q.link_mass[j] =
+        (chain.link_end(j + 1) - chain.link_start(j + 1)) * (u.link_mass < 0 ? 1.0 : std::exp(p[u.link_mass + j]));
   for (int j = 0; j < links; ++j) {
     q.link_mass[j] *= (u.total_mass - q.tip_mass) / sum;
     if (u.coulomb >= 0) q.coulomb_friction[j] = std::exp(p[u.coulomb + j]);

@@ -21,6 +21,7 @@ constexpr int kAngleIterations = 3;    // Gauss-Newton steps a round and frame
 constexpr int kFinalIterations = 4;    // for the frames that did not train
 constexpr int kFinalSteps = 120;       // Adam steps after the last round, rates falling
 constexpr float kMaskWeight = 0.3f;    // of the mask term: without it black hides transparency (DESIGN)
+constexpr int kShRound = 3;            // from this round on colors depend on the view (SH degree 1): +0.7 dB in the object
 
 splat::AdamRates rates(double fraction) {
   // fraction: 0 at the start, 1 at the end of all steps; rates fall by ten
@@ -103,6 +104,11 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     }
     states = fit.states;
   }
+  std::vector<math::VectorX> coarse = states.theta;  // to carry corrections to the frames that do not train
+  if (before) {
+    for (std::size_t k = 0; k < coarse.size(); ++k)
+      coarse[k] = Eigen::Map<const math::VectorX>(before->extra.data() + k * result.chain.angles(), result.chain.angles());
+  }
   const std::vector<FrameViews> frames = assign_views(capture, states.time);
   const TrainingViews training = training_views(capture, frames, std::max(1, options.every));
   if (training.views.empty())
@@ -142,6 +148,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     c.deviation = result.bending.deviation;
     c.states = states;
     c.snapshot.gaussians = gaussians;
+    for (const math::VectorX& theta : coarse) c.extra.insert(c.extra.end(), theta.data(), theta.data() + theta.size());
     save_checkpoint(c, options.checkpoint);
   };
   const auto adam = [&](int steps, core::Random& random, const std::string& note) {
@@ -180,9 +187,6 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     }
     return engine.draw_views(batch, true);
   };
-  const std::vector<double> coarse_times = states.time;
-  const std::vector<math::VectorX> coarse = states.theta;  // to carry corrections to the frames that do not train
-
   for (int round = first_round; round < kRounds; ++round) {
     checkpoint(round);
     core::Random random(options.seed * 1000003 + 100 + round);
@@ -191,6 +195,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     adam(kSteps, random, note);
     RefineOptions refine;
     refine.iterations = kAngleIterations;
+    refine.mask_weight = kAngleMaskWeight;
     refine_angles(chain, capture, frames, training.frames, draw_training, refine, states);
     pose_views();
     for (std::size_t i = 0; i < specs.size(); ++i) engine.set_motions(static_cast<int>(i), specs[i].motions);
@@ -203,6 +208,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
       for (std::size_t i = 0; i < pictures.size(); ++i)
         drawn.push_back({&capture.views[training.views[i]], &specs[i].motions, &pictures[i]});
       add_and_prune(gaussians, chain, capture, drawn, options.budget, kAddedARound, random);
+      if (round + 1 == kShRound && gaussians.degree == 0) gaussians.resize(gaussians.count, gaussians.links, 1);
     }
   }
   checkpoint(kRounds);

@@ -5,6 +5,11 @@
 
 namespace chainsplat::recognition {
 
+// Of the mask residual against one color channel, when angles are refined. A rope that rolls carries its pattern along,
+// which a chain without twist can only follow by bending wrongly; its silhouette does not roll. Measured on the table:
+// 1: 0.94 mm, 3: 0.83, 8: 0.75; in free space no difference.
+constexpr double kAngleMaskWeight = 5.0;
+
 Result recognize_fast(gpu::Device& device, const capture::Capture& capture, const Options& options);
 Result recognize_paper(gpu::Device& device, const capture::Capture& capture, const Options& options);
 

@@ -77,6 +77,7 @@ std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain&
     };
     RefineOptions refine;
     refine.iterations = iterations;
+    refine.mask_weight = kAngleMaskWeight;
     RefineSummary summary = refine_angles(chain, capture, frames, part, draw, refine, states);
     for (auto& covariance : summary.covariances) covariances.push_back(std::move(covariance));
     from += part.size();

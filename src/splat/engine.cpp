@@ -34,7 +34,8 @@ struct SceneView {
   math::Pose camera_from_world;
   std::vector<math::Pose> motions;
   std::size_t target = 0;                  // first pixel in the target buffer
-  std::vector<std::uint32_t> active;       // grid cells that are drawn
+  std::vector<std::uint32_t> active;       // grid cells that are drawn and charged
+  std::size_t near = 0;                    // the first `near` of them get the D-SSIM term too
 };
 
 // Parameters and views that belong together: the training's, or those of one call.
@@ -48,6 +49,9 @@ struct Scene {
   int step = 0;
   int coefficients() const { return (degree + 1) * (degree + 1); }
 };
+
+// Which tiles of a view are drawn and charged.
+enum class Active { near_mask, everywhere, everywhere_dssim_near_mask };
 
 struct RunOptions {
   LossWeights weights;
@@ -141,7 +145,7 @@ struct Engine::State {
   void write(Buffer& buffer, const void* data, std::size_t bytes, const char* name);
   void load_gaussians(Scene& scene, const Gaussians& gaussians);
   void load_views(Scene& scene, std::span<const ViewSpec> specs,
-                  std::span<const std::vector<std::uint8_t>* const> targets, bool near_mask_only);
+                  std::span<const std::vector<std::uint8_t>* const> targets, Active active);
   std::vector<std::vector<int>> chunks(const Scene& scene, std::span<const int> batch, bool dssim) const;
   bool run(Scene& scene, std::span<const int> chunk, const RunOptions& options, const AdamPush* adam_push);
   template <class AfterChunk>
@@ -176,8 +180,9 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   scan_sums = gpu::Pipeline(d, "scan_sums", 2, push, {});
   project = gpu::Pipeline(d, "splat_project", 10, push, {cut, tile_width, tile_height});
   bin = gpu::Pipeline(d, "splat_bin", 11, push, {});
-  constexpr std::uint32_t kSortLanes = 64;
-  sort = gpu::Pipeline(d, "splat_sort", 6, push, {kSortLanes, kRankLimit});
+  // as many lanes a tile as a subgroup of the device: no lane waits at the barriers for another subgroup
+  const std::uint32_t tile_lanes = device_info.software ? 8 : 32;
+  sort = gpu::Pipeline(d, "splat_sort", 6, push, {tile_lanes, kRankLimit});
   blend = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 0});
   blend_depth = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 1});
   blend_backward =
@@ -186,7 +191,7 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   gather = gpu::Pipeline(d, "splat_gather", 11, push, {});
   link_twist = gpu::Pipeline(d, "splat_link_twist", 5, push, {});
   adam = gpu::Pipeline(d, "splat_adam", 5, sizeof(AdamPush), {});
-  const std::vector<std::uint32_t> tile_constants{0, tile_width, tile_height};
+  const std::vector<std::uint32_t> tile_constants{tile_lanes, tile_width, tile_height};
   loss_pixel = gpu::Pipeline(d, "loss_pixel", 6, push, tile_constants);
   ssim_rows = gpu::Pipeline(d, "ssim_rows", 5, push, tile_constants);
   ssim_columns = gpu::Pipeline(d, "ssim_columns", 5, push, tile_constants);
@@ -225,7 +230,7 @@ void Engine::State::load_gaussians(Scene& scene, const Gaussians& gaussians) {
 }
 
 void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
-                               std::span<const std::vector<std::uint8_t>* const> targets, bool near_mask_only) {
+                               std::span<const std::vector<std::uint8_t>* const> targets, Active active) {
   scene.views.clear();
   scene.target_pixels = 0;
   double object_pixels = 0.0;
@@ -251,11 +256,16 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
       view.target = all_targets.size() / 4;
       all_targets.insert(all_targets.end(), target.begin(), target.end());
       for (std::size_t k = 3; k < target.size(); k += 4) object_pixels += target[k] >= 128 ? 1.0 : 0.0;
-      if (near_mask_only) view.active = active_cells(view, target, static_cast<int>(tile_width), static_cast<int>(tile_height));
+      if (active != Active::everywhere) view.active = active_cells(view, target, static_cast<int>(tile_width), static_cast<int>(tile_height));
     }
-    if (!near_mask_only) {
-      view.active.resize(static_cast<std::size_t>(view.tiles_x) * view.tiles_y);
-      for (std::size_t k = 0; k < view.active.size(); ++k) view.active[k] = static_cast<std::uint32_t>(k);
+    view.near = view.active.size();
+    if (active != Active::near_mask) {
+      const auto cells = static_cast<std::uint32_t>(view.tiles_x * view.tiles_y);
+      std::vector<bool> there(cells, false);
+      for (const std::uint32_t cell : view.active) there[cell] = true;
+      for (std::uint32_t cell = 0; cell < cells; ++cell)
+        if (!there[cell]) view.active.push_back(cell);
+      if (active == Active::everywhere) view.near = view.active.size();
     }
     scene.views.push_back(std::move(view));
   }
@@ -332,18 +342,27 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
     chunk_pixel[v] = pixels;
     pixels += static_cast<std::size_t>(view.width) * view.height;
     map.resize(map.size() + static_cast<std::size_t>(view.tiles_x) * view.tiles_y, shared::kNoTile);
-    all_active = all_active && view.active.size() == static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
-    for (const std::uint32_t cell : view.active) {
-      map[out.tile_map + cell] = static_cast<std::uint32_t>(active.size());
-      active.push_back({v, cell % out.tiles_x, cell / out.tiles_x, 0});
-      chunk_tile_view.push_back(v);
-    }
+    all_active = all_active && view.near == static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
     for (std::uint32_t j = 0; j < std::min<std::size_t>(links, view.motions.size()); ++j) {
       const math::Pose pose = view.camera_from_world * view.motions[j];
       for (int r = 0; r < 3; ++r)
         rows[3 * (out.motion + j) + r] = {pose.rotation(r, 0), pose.rotation(r, 1), pose.rotation(r, 2),
                                           pose.translation[r]};
     }
+  }
+  // tiles with a D-SSIM term first, so that its passes run over a prefix of the list
+  std::uint32_t near_total = 0;
+  for (const bool near : {true, false}) {
+    for (std::uint32_t v = 0; v < view_count; ++v) {
+      const SceneView& view = scene.views[chunk[v]];
+      for (std::size_t k = near ? 0 : view.near; k < (near ? view.near : view.active.size()); ++k) {
+        const std::uint32_t cell = view.active[k];
+        map[gpu_views[v].tile_map + cell] = static_cast<std::uint32_t>(active.size());
+        active.push_back({v, cell % gpu_views[v].tiles_x, cell / gpu_views[v].tiles_x, 0});
+        chunk_tile_view.push_back(v);
+      }
+    }
+    if (near) near_total = static_cast<std::uint32_t>(active.size());
   }
   const auto tile_total = static_cast<std::uint32_t>(active.size());
   write(views, gpu_views.data(), gpu_views.size() * sizeof(SplatView), "views");
@@ -464,10 +483,10 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
     dispatch(loss_pixel, {&tiles, &views, &image, &scene.target, &pixel_gradient, &tile_loss}, tile_total);
     commands.stamp("loss");
     if (dssim) {
-      dispatch(ssim_rows, {&tiles, &views, &image, &scene.target, &ssim_row_sums}, tile_total);
-      dispatch(ssim_columns, {&tiles, &views, &ssim_row_sums, &ssim_factors, &tile_loss}, tile_total);
-      dispatch(ssim_rows_backward, {&tiles, &views, &ssim_factors, &ssim_row_sums}, tile_total);
-      dispatch(ssim_columns_backward, {&tiles, &views, &ssim_row_sums, &image, &scene.target, &pixel_gradient}, tile_total);
+      dispatch(ssim_rows, {&tiles, &views, &image, &scene.target, &ssim_row_sums}, near_total);
+      dispatch(ssim_columns, {&tiles, &views, &ssim_row_sums, &ssim_factors, &tile_loss}, near_total);
+      dispatch(ssim_rows_backward, {&tiles, &views, &ssim_factors, &ssim_row_sums}, near_total);
+      dispatch(ssim_columns_backward, {&tiles, &views, &ssim_row_sums, &image, &scene.target, &pixel_gradient}, near_total);
       commands.stamp("ssim");
     }
   }
@@ -640,7 +659,7 @@ Engine::Engine(Engine&&) noexcept = default;
 std::vector<Picture> Engine::draw(const Gaussians& gaussians, std::span<const ViewSpec> views, bool depth) {
   State& s = *state_;
   s.load_gaussians(s.scratch, gaussians);
-  s.load_views(s.scratch, views, {}, false);
+  s.load_views(s.scratch, views, {}, Active::everywhere);
   RunOptions options;
   options.depth = depth;
   std::vector<Picture> out;
@@ -655,7 +674,7 @@ LossValues Engine::loss(const Gaussians& gaussians, std::span<const ViewSpec> vi
                         double normalizer, Gradients* gradients, std::vector<Picture>* pictures) {
   State& s = *state_;
   s.load_gaussians(s.scratch, gaussians);
-  s.load_views(s.scratch, views, targets, false);
+  s.load_views(s.scratch, views, targets, Active::everywhere);
   LossValues values;
   if (gradients) {
     gradients->gaussians = unpacked(std::vector<float>(s.scratch.parameter_count, 0.0f), gaussians.count, gaussians.links,
@@ -697,8 +716,9 @@ LossValues Engine::loss(const Gaussians& gaussians, std::span<const ViewSpec> vi
   return values;
 }
 
-void Engine::set_views(std::span<const ViewSpec> views, std::span<const std::vector<std::uint8_t>* const> targets) {
-  state_->load_views(state_->training, views, targets, true);
+void Engine::set_views(std::span<const ViewSpec> views, std::span<const std::vector<std::uint8_t>* const> targets,
+                       bool everywhere) {
+  state_->load_views(state_->training, views, targets, everywhere ? Active::everywhere_dssim_near_mask : Active::near_mask);
 }
 
 void Engine::set_motions(int view, const std::vector<math::Pose>& motions) {

@@ -1,0 +1,12 @@
+// test_add.comp - one invocation an element: to[i] = from[i] + kAdd. Reads one buffer, writes another: a chain of them
+// needs a barrier between, which synchronization validation can see.
+#version 460
+layout(local_size_x_id = 0) in;
+layout(constant_id = 1) const uint kAdd = 0u;
+layout(std430, binding = 0) readonly buffer From { uint from[]; };
+layout(std430, binding = 1) writeonly buffer To { uint to[]; };
+
+void main() {
+  uint i = gl_GlobalInvocationID.x;
+  if (i < from.length()) to[i] = from[i] + kAdd;
+}

@@ -1,0 +1,13 @@
+// test_arguments.comp - one invocation: the group counts of an indirect dispatch for `count` elements in groups of kLanes,
+// written after three words that belong to somebody else.
+#version 460
+layout(local_size_x = 1) in;
+layout(constant_id = 0) const uint kLanes = 64u;
+layout(push_constant) uniform Push { uint count; };
+layout(std430, binding = 0) writeonly buffer Arguments { uint arguments[]; };
+
+void main() {
+  arguments[3] = (count + kLanes - 1u) / kLanes;
+  arguments[4] = 1u;
+  arguments[5] = 1u;
+}

@@ -1,0 +1,321 @@
+// What is in a capture and what is wrong or odd with it, in plain words.
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <limits>
+#include <numbers>
+
+#include "manifest.h"
+
+namespace chainsplat::capture {
+
+using math::Pose;
+using math::Vector2;
+using math::Vector3;
+
+namespace {
+
+// What we doubt. Lengths are compared in the image through the distance of the grasp.
+constexpr double kGripperReach = 0.015;    // m of rope that fingers may hide beyond the grasp
+constexpr double kPoseSlack = 3.0;         // px of reprojection error that a calibrated camera may have
+constexpr double kThinRope = 5.0;          // px across; thinner ropes leave too few pixels
+constexpr double kSaturated = 250;         // of 255, any channel
+constexpr double kMostSaturated = 0.05;    // share of the object's pixels
+constexpr double kDark = 20;               // of 255, mean of the object
+constexpr double kFlicker = 0.15;          // relative spread of a camera's object brightness between frames
+constexpr double kRateTolerance = 0.01;    // between `rate` and the container's
+constexpr double kStill = 1e-3;            // m of base travel below which it counts as at rest
+constexpr double kNoisyBase = 2e-3;        // m
+constexpr double kAlong = 0.1;             // rad between the bending axis and the table's normal
+constexpr double kBehind = 0.2;            // share of the mask on the wrong side of the grasp
+constexpr double kForeshortened = 0.3;     // a rope seen shorter than this, relative to its length, has no side to judge
+constexpr int kMostLag = 4;                // frames of delay between base and images that are tried
+constexpr double kLagGain = 0.7;           // a delay is believed when it leaves less than this share of the error
+constexpr double kLagPixels = 1.0;         // px and when the error shrinks by at least this
+constexpr int kLagFrames = 50;             // frames of a camera that the search for a delay looks at
+constexpr int kFarPixels = 100000;         // px, "no mask"
+constexpr double kDegrees = 180.0 / std::numbers::pi;
+
+std::string text(const char* format, auto... values) {
+  char line[512];
+  std::snprintf(line, sizeof line, format, values...);
+  return line;
+}
+
+double median(std::vector<double> values) {
+  if (values.empty()) return std::numeric_limits<double>::quiet_NaN();
+  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
+}
+
+// Distance from an image position to the nearest mask pixel, px.
+double mask_distance(const View& view, const Vector2& position) {
+  double nearest = static_cast<double>(kFarPixels) * kFarPixels;
+  for (int y = 0; y < view.height; ++y)
+    for (int x = 0; x < view.width; ++x)
+      if (view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] != 0)
+        nearest = std::min(nearest, (Vector2(view.x0 + x + 0.5, view.y0 + y + 0.5) - position).squaredNorm());
+  return std::sqrt(nearest);
+}
+
+// Share of the mask that lies against the direction in which the rope leaves the gripper, beyond the gripper's reach.
+// NaN when the rope points at the camera.
+double share_behind(const View& view, const Camera& camera, const Vector3& grasp, const Vector3& direction, double length) {
+  const Vector3 along = grasp + length * direction;
+  if (along.z() <= 0) return std::numeric_limits<double>::quiet_NaN();
+  const Vector2 start = project(camera, grasp), step = project(camera, along) - start;
+  const double scale = camera.fx / grasp.z();  // px a meter
+  if (step.norm() < kForeshortened * length * scale) return std::numeric_limits<double>::quiet_NaN();
+  const Vector2 forward = step.normalized();
+  int behind = 0, all = 0;
+  for (int y = 0; y < view.height; ++y)
+    for (int x = 0; x < view.width; ++x) {
+      if (view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] == 0) continue;
+      ++all;
+      behind += forward.dot(Vector2(view.x0 + x + 0.5, view.y0 + y + 0.5) - start) < -kGripperReach * scale - kPoseSlack;
+    }
+  return all ? static_cast<double>(behind) / all : 0.0;
+}
+
+struct ViewFacts {
+  int pixels = 0, saturated = 0;
+  double brightness = 0.0;  // mean of the object's pixels and channels, 0..255
+  bool at_border = false;
+  double depth = std::numeric_limits<double>::quiet_NaN();  // m, mean inside the mask
+};
+
+ViewFacts facts_of(const View& view, const Camera& camera) {
+  ViewFacts facts;
+  double depth = 0.0;
+  int with_depth = 0;
+  for (int y = 0; y < view.height; ++y)
+    for (int x = 0; x < view.width; ++x) {
+      const std::size_t i = static_cast<std::size_t>(y) * view.width + x;
+      const std::uint8_t* const p = &view.rgba[4 * i];
+      if (p[3] == 0) continue;
+      ++facts.pixels;
+      facts.brightness += (p[0] + p[1] + p[2]) / 3.0;
+      facts.saturated += std::max({p[0], p[1], p[2]}) >= kSaturated;
+      const int column = view.x0 + x, row = view.y0 + y;
+      facts.at_border |= column == 0 || row == 0 || column + 1 == camera.width || row + 1 == camera.height;
+      if (!view.depth.empty() && view.depth[i] > 0) {
+        depth += view.depth[i];
+        ++with_depth;
+      }
+    }
+  if (facts.pixels > 0) facts.brightness /= facts.pixels;
+  if (with_depth > 0) facts.depth = depth / with_depth;
+  return facts;
+}
+
+void check_base(const Manifest& manifest, CheckReport& report) {
+  const Capture& capture = manifest.capture;
+  const auto& samples = capture.base.samples();
+  Vector3 low = samples.front().pose.translation, high = low;
+  for (const trajectory::Sample& sample : samples) {
+    low = low.cwiseMin(sample.pose.translation);
+    high = high.cwiseMax(sample.pose.translation);
+  }
+  const Vector3 travel = high - low;
+  const double seconds = capture.base.end() - capture.base.start();
+  double speed = 0.0, acceleration = 0.0, turning = 0.0;
+  for (const trajectory::Sample& sample : samples) {
+    const trajectory::BaseMotion motion = capture.base.at(sample.time);
+    const Vector3 w = motion.velocity.head<3>(), v = motion.velocity.tail<3>();
+    speed = std::max(speed, v.norm());
+    turning = std::max(turning, w.norm());
+    acceleration = std::max(acceleration, (motion.acceleration.tail<3>() + w.cross(v)).norm());
+  }
+  const double rate = seconds > 0 ? (static_cast<double>(samples.size()) - 1.0) / seconds : 0.0;
+  report.facts.push_back(text("base: %zu poses, %.3f to %.3f s, %.4g Hz; travels %.3f, %.3f, %.3f m along x, y, z; at most %.2f m/s, "
+                              "%.2f m/s^2, %.2f rad/s; position noise %.2g m",
+                              samples.size(), capture.base.start(), capture.base.end(), rate, travel.x(), travel.y(), travel.z(),
+                              speed, acceleration, turning, capture.base.noise()));
+  if (travel.norm() < kStill && turning * seconds < kStill)
+    report.doubts.push_back("base: it stays at rest; masses, damping and friction are hardly observable from such a capture");
+  if (capture.base.noise() > kNoisyBase)
+    report.doubts.push_back(text("base: position noise of %.1f mm; accelerations from it are uncertain", 1e3 * capture.base.noise()));
+  for (const CameraSource& source : manifest.cameras)
+    if (rate > 0 && source.interval > 0 && rate < (1.0 - kRateTolerance) / source.interval) {
+      report.doubts.push_back(text("base: %.4g Hz is less than the %.4g Hz of %s; fast motion between the poses is lost", rate,
+                                   1.0 / source.interval, source.camera.name.c_str()));
+      break;
+    }
+  if (capture.table) {
+    const Pose& first = samples.front().pose;
+    const Vector3 axis = first.rotation * capture.bending_axis;
+    const double angle = std::acos(std::min(1.0, std::abs(axis.dot(capture.table->normal))));
+    if (angle > kAlong)
+      report.doubts.push_back(text("grasp.bending_axis: is %.0f degrees off the table's normal at the first pose", angle * kDegrees));
+    const double height = capture.table->normal.dot(first.translation - capture.table->point);
+    if (height < -kStill || height > capture.length)
+      report.doubts.push_back(text("base: the grasp is %.3f m above the table at the first pose", height));
+  }
+}
+
+// Reprojection of the grasp, exposure, borders, depth of one camera. `views` are all of it, undistorted.
+void check_camera(const Manifest& manifest, const CameraSource& source, const View* views, int count, CheckReport& report) {
+  const Camera& camera = source.camera;
+  const trajectory::Trajectory& base = manifest.capture.base;
+  const Pose camera_from_world = camera.world_from_camera.inverse();
+  const std::string name = camera.name;
+  int seen = 0, border = 0, behind = 0;
+  double pixels = 0.0, saturated = 0.0;
+  std::vector<double> brightness, distance, wrong_side, grasp_depth, object_depth;
+  std::vector<std::vector<double>> shifted(2 * kMostLag + 1);
+  for (int k = 0; k < count; ++k) {
+    const View& view = views[k];
+    const ViewFacts facts = facts_of(view, camera);
+    if (facts.pixels == 0) continue;
+    ++seen;
+    pixels += facts.pixels;
+    saturated += facts.saturated;
+    border += facts.at_border;
+    brightness.push_back(facts.brightness);
+    if (std::isfinite(facts.depth)) object_depth.push_back(facts.depth);
+    const Pose pose = base.pose(view.time);
+    const Vector3 grasp = camera_from_world * pose.translation;
+    if (grasp.z() <= 0) {
+      ++behind;
+      continue;
+    }
+    grasp_depth.push_back(grasp.z());
+    distance.push_back(mask_distance(view, project(camera, grasp)));
+    const double side = share_behind(view, camera, grasp,
+                                     camera_from_world.rotation * pose.rotation * manifest.capture.direction,
+                                     manifest.capture.length);
+    if (std::isfinite(side)) wrong_side.push_back(side);
+    if (k % std::max(1, count / kLagFrames) != 0) continue;
+    for (int lag = -kMostLag; lag <= kMostLag; ++lag) {
+      const Vector3 moved = camera_from_world * base.pose(view.time + lag * source.interval).translation;
+      shifted[lag + kMostLag].push_back(moved.z() > 0 ? mask_distance(view, project(camera, moved)) : kFarPixels);
+    }
+  }
+  const double z = median(grasp_depth), miss = median(distance), bright = median(brightness);
+  const double across = manifest.capture.diameter * camera.fx / z;
+  std::string line = text("%s: %dx%d, %d frames, %.3f to %.3f s, %s; sees the object in %d, %.0f px in the mean (%.2f %%)", name.c_str(),
+                          camera.width, camera.height, count, source.times.front(), source.times.back(),
+                          camera.distorted() ? "lens distortion is taken out" : "no lens distortion", seen, seen ? pixels / seen : 0.0,
+                          seen ? 100.0 * pixels / seen / camera.width / camera.height : 0.0);
+  if (seen > 0) line += text("; brightness %.0f of 255", bright);
+  if (std::isfinite(z)) line += text("; grasp %.2f m away, the rope about %.1f px across, the grasp %.1f px from the mask", z, across, miss);
+  report.facts.push_back(line);
+
+  if (source.video_rate > 0 && source.interval > 0 && std::abs(source.video_rate * source.interval - 1.0) > kRateTolerance)
+    report.doubts.push_back(text("%s: the video says %.4g frames a second, the capture %.4g", name.c_str(), source.video_rate,
+                                 1.0 / source.interval));
+  if (seen == 0) return;  // a problem already
+  if (seen < count) report.doubts.push_back(text("%s: the mask is empty in %d of %d frames", name.c_str(), count - seen, count));
+  if (border > 0)
+    report.doubts.push_back(text("%s: the mask touches the image's border in %d of %d frames: part of the rope may be out of sight",
+                                 name.c_str(), border, count));
+  if (saturated > kMostSaturated * pixels)
+    report.doubts.push_back(text("%s: %.0f %% of the object's pixels are overexposed", name.c_str(), 100.0 * saturated / pixels));
+  if (bright < kDark) report.doubts.push_back(text("%s: the object is very dark (%.0f of 255 in the mean)", name.c_str(), bright));
+  const auto [darkest, brightest] = std::minmax_element(brightness.begin(), brightness.end());
+  std::vector<double> jumps;
+  for (std::size_t k = 1; k < brightness.size(); ++k) jumps.push_back(std::abs(brightness[k] - brightness[k - 1]));
+  if (!jumps.empty() && bright > 0 && *std::max_element(jumps.begin(), jumps.end()) > kFlicker * bright)
+    report.doubts.push_back(text("%s: the object's brightness jumps between frames (%.0f to %.0f of 255): is the exposure fixed?",
+                                 name.c_str(), *darkest, *brightest));
+  if (behind > 0)
+    report.doubts.push_back(text("%s: the grasp is behind the camera in %d frames: does world_from_camera use OpenCV's axes (z forward)?",
+                                 name.c_str(), behind));
+  if (std::isfinite(across) && across < kThinRope)
+    report.doubts.push_back(text("%s: the rope is only %.1f px across", name.c_str(), across));
+  const double allowed = kGripperReach * camera.fx / z + kPoseSlack;
+  if (miss > allowed)
+    report.doubts.push_back(text("%s: the grasp projects %.0f px from the mask (at most %.0f expected): check the camera's pose, the base "
+                                 "trajectory and their times",
+                                 name.c_str(), miss, allowed));
+  else if (median(wrong_side) > kBehind)
+    report.doubts.push_back(text("%s: %.0f %% of the mask lies behind the grasp, against grasp.direction: check the camera's pose, the base "
+                                 "trajectory and the direction",
+                                 name.c_str(), 100.0 * median(wrong_side)));
+  // a wrong clock shows as a distance that shrinks when the base is moved in time; rests tell nothing, so all frames count
+  const auto rms = [](const std::vector<double>& values) {
+    double sum = 0.0;
+    for (const double v : values) sum += v * v;
+    return values.empty() ? 0.0 : std::sqrt(sum / static_cast<double>(values.size()));
+  };
+  int best = 0;
+  for (int lag = -kMostLag; lag <= kMostLag; ++lag)
+    if (!shifted[lag + kMostLag].empty() && rms(shifted[lag + kMostLag]) < rms(shifted[best + kMostLag])) best = lag;
+  const double now = rms(shifted[kMostLag]), then = rms(shifted[best + kMostLag]);
+  if (best != 0 && then < kLagGain * now && now - then > kLagPixels)
+    report.doubts.push_back(text("%s: the images fit the base better %d frames %s (%.1f px instead of %.1f): are start and the base's times "
+                                 "on one clock?",
+                                 name.c_str(), std::abs(best), best > 0 ? "later" : "earlier", then, now));
+  if (source.depth) {
+    const double depth = median(object_depth);
+    if (!std::isfinite(depth))
+      report.doubts.push_back(name + ": no depth inside the masks");
+    else if (std::isfinite(z) && std::abs(depth - z) > manifest.capture.length + kGripperReach)
+      report.doubts.push_back(text("%s: the depth images say %.2f m, the grasp is %.2f m away: check depth_scale", name.c_str(), depth, z));
+  }
+}
+
+}  // namespace
+
+CheckReport check(const Path& path) {
+  CheckReport report;
+  Findings findings;
+  const auto finish = [&] {
+    for (const Problem& problem : findings.problems)
+      report.problems.push_back(problem.where + ": " + problem.what + "; " + problem.mend);
+    report.doubts.insert(report.doubts.begin(), findings.doubts.begin(), findings.doubts.end());
+    return report;
+  };
+  Manifest manifest;
+  try {
+    manifest = read_manifest(path, "", true, findings);
+  } catch (const InputError& error) {
+    report.problems.push_back(error.what());
+    return finish();
+  }
+  const Capture& capture = manifest.capture;
+  report.facts.push_back(text("capture '%.100s': %s, %zu cameras", capture.name.c_str(), capture.tabletop ? "on a table" : "free space",
+                              manifest.cameras.size()));
+  report.facts.push_back(text("rope: %.4g m long, %.4g m thick, ", capture.length, capture.diameter) +
+                         (capture.mass ? text("%.4g kg", *capture.mass) : std::string("mass not given")));
+  if (!capture.mass) report.doubts.push_back("object.mass: is missing; masses and forces will be relative to a total mass of 1");
+  if (manifest.cameras.size() == 1) report.doubts.push_back("cameras: only one; depth along its rays is hardly seen");
+  if (!capture.base.samples().empty()) check_base(manifest, report);
+
+  // images are judged as far as their files are whole: a camera with a problem of its own does not hide the others'
+  for (std::size_t c = 0; c < manifest.cameras.size(); ++c) {
+    const CameraSource& source = manifest.cameras[c];
+    const auto of_this_camera = [&](const Problem& problem) {
+      return problem.where.starts_with(source.where) ||
+             (source.images.video && problem.where.starts_with(source.images.file.string())) ||
+             (!source.images.prefix.empty() && problem.where.starts_with(source.images.prefix)) ||
+             (source.masks && !source.masks->prefix.empty() && problem.where.starts_with(source.masks->prefix)) ||
+             (source.depth && !source.depth->prefix.empty() && problem.where.starts_with(source.depth->prefix)) ||
+             (source.timestamps && problem.where.starts_with(source.timestamps->string()));
+    };
+    if (source.times.empty() || capture.base.samples().empty() ||
+        std::any_of(findings.problems.begin(), findings.problems.end(), of_this_camera))
+      continue;
+    Manifest one = manifest;
+    one.cameras = {source};
+    std::vector<View> views;
+    LoadOptions options;
+    options.depth = true;
+    options.margin = 0;
+    try {
+      load_views(one, options, findings, views);
+    } catch (const InputError& error) {
+      report.problems.push_back(error.what());
+      continue;
+    }
+    check_camera(manifest, source, views.data(), static_cast<int>(views.size()), report);
+  }
+  report.facts.push_back(capture.has_depth ? "depth: given, for evaluation" : "depth: none, so no Chamfer distance");
+  std::error_code error;
+  if (std::filesystem::is_directory(capture.folder / "truth", error))
+    report.facts.push_back("truth: given, for evaluation; training never opens it");
+  return finish();
+}
+
+}  // namespace chainsplat::capture

@@ -1,0 +1,647 @@
+#include <algorithm>
+#include <cmath>
+
+#include "src/silhouette/frame.h"
+
+namespace chainsplat::silhouette {
+
+using math::MatrixX;
+using math::Pose;
+using math::Vector3;
+using math::VectorX;
+
+namespace {
+
+constexpr double kNear = 0.01;  // m, nothing nearer than this is in front of a camera (SPEC 2.5)
+
+// coarse stage
+constexpr double kFarHuber = 50.0;       // px, before `huber_pixels` takes over: everything pulls
+constexpr double kFarShare = 1.0 / 3.0;  // share of the coarse iterations with kFarHuber
+constexpr int kReverseSamples = 4;       // centerline samples a link that must lie in the mask
+constexpr double kReverseWeight = 0.5;   // of all of them together, against all mask pixels of the view
+constexpr double kCoarseVariance = 100;  // px^2, what a mask pixel's distance says about the centerline: half widths,
+                                         // strongly correlated; scales the priors
+constexpr double kCoarseStep = 1e-3;     // rad, smaller steps end the stage
+constexpr double kLongestStep = 0.5;     // rad, largest change of an angle in one step
+
+// fine stage
+constexpr double kAligned = 0.7;         // least cosine between outline and tube normals
+constexpr double kFirstCut = 8.0;        // px, Tukey's cut-off before residuals are known
+constexpr double kLeastCut = 2.5, kLargestCut = 12.0;  // px
+constexpr double kCutDeviations = 4.685; // Tukey's constant
+constexpr double kDeviationOfMedian = 1.4826;  // standard deviation from a median of absolute values
+constexpr double kFineStep = 1e-5;       // rad
+constexpr double kOffsetDeviation = 1.0; // px, how much wider than the rope a mask may be, each side
+
+// priors, rad
+constexpr double kJointDifference = 0.3;  // between neighboring joints, along one axis
+constexpr double kJointSize = 1.5;        // of an angle
+constexpr double kWarmChange = 0.2;       // from the frame before: 6 rad/s at 30 Hz
+constexpr double kTwist = 0.5;            // unseen by silhouettes, held
+
+// An outline point counts as one observation with this deviation: noise of 0.3 px, correlated over some ten pixels, and
+// what straight links cannot follow. Chosen so that three deviations hold on captures with truth.
+constexpr double kEdgeDeviation = 1.0;  // px
+
+// cold start
+constexpr double kStartBend = 1.5;  // rad, whole bend of the extra starts
+
+// blobs
+constexpr double kReach = 5.0;      // diameters: farther from the prediction (median) a blob is not the rope
+constexpr double kLastReach = 1.0;  // the same after the coarse stage
+constexpr double kLeastArea = 0.05, kLargestArea = 2.0;  // of the straight rope's area: what can be the rope alone
+
+using Vector7 = Eigen::Matrix<double, 7, 1>;
+using Matrix7 = Eigen::Matrix<double, 7, 7>;
+
+// One link's segment seen by one camera.
+struct Segment {
+  int link;
+  Vector3 a, b;            // camera frame, m
+  Vector2 from, step;      // px: image of a, and from there to the image of b
+  Vector2 tangent, normal; // unit
+  double per_length2;      // 1 / |step|^2
+};
+
+struct Nearest {
+  int segment = -1;
+  double t = 0.0;         // along the segment in the image, 0 to 1
+  double distance2 = 1e300;
+};
+
+// Normal equations of one view by link, in camera coordinates: a row is (x cross g, g, offset derivative), SPEC 2.3.
+struct LinkSums {
+  std::vector<Matrix7> normal;
+  std::vector<Vector7> right;
+};
+
+struct ViewWork {
+  const FrameView* view;
+  Pose camera_from_base;
+  std::vector<Segment> segments;
+  LinkSums sums;
+  std::vector<char> active;  // by blob
+  double diameter = 0.0;     // px, at the base or the first visible node
+};
+
+struct Problem {
+  const chain::Chain* chain;
+  std::vector<ViewWork> views;
+  std::vector<char> held;      // by angle: twist, which silhouettes do not show
+  MatrixX axes;                // 6 x n in the base frame, at the angles of the last pose()
+  MatrixX normal;              // (n + 1) x (n + 1), the last row is the edge offset's
+  VectorX right;
+  std::vector<double> sizes;   // residuals' absolute values, px
+};
+
+Vector2 image_of(const capture::Camera& camera, const Vector3& x) {
+  return {camera.fx * x.x() / x.z() + camera.cx, camera.fy * x.y() / x.z() + camera.cy};
+}
+
+// d(m . u)/dx of a camera-frame point.
+Vector3 projected_gradient(const capture::Camera& camera, const Vector3& x, const Vector2& m) {
+  const double gx = camera.fx * m.x() / x.z(), gy = camera.fy * m.y() / x.z();
+  return {gx, gy, -(gx * x.x() + gy * x.y()) / x.z()};
+}
+
+// Puts the chain at theta into every view.
+void pose(Problem& problem, const VectorX& theta) {
+  const chain::Chain& chain = *problem.chain;
+  const std::vector<Pose> motions = chain::link_motions(chain, theta, Pose{});
+  const MatrixX nodes = chain::nodes(chain, motions);
+  problem.axes = chain::world_axes(chain, theta, Pose{});
+  for (ViewWork& work : problem.views) {
+    const capture::Camera& camera = *work.view->camera;
+    work.segments.clear();
+    for (int link = 0; link < chain.links(); ++link) {
+      Segment s;
+      s.link = link;
+      s.a = work.camera_from_base * Vector3(nodes.col(link));
+      s.b = work.camera_from_base * Vector3(nodes.col(link + 1));
+      if (!(chain.link_end(link) > chain.link_start(link)) || s.a.z() < kNear || s.b.z() < kNear) continue;
+      s.from = image_of(camera, s.a);
+      s.step = image_of(camera, s.b) - s.from;
+      const double length2 = std::max(s.step.squaredNorm(), 1e-12);
+      s.per_length2 = 1.0 / length2;
+      s.tangent = s.step / std::sqrt(length2);
+      s.normal = Vector2(-s.tangent.y(), s.tangent.x());
+      work.segments.push_back(s);
+    }
+  }
+}
+
+Nearest nearest(const std::vector<Segment>& segments, const Vector2& pixel) {
+  Nearest best;
+  for (int i = 0; i < static_cast<int>(segments.size()); ++i) {
+    const Segment& s = segments[i];
+    const Vector2 offset = pixel - s.from;
+    const double t = std::clamp(offset.dot(s.step) * s.per_length2, 0.0, 1.0);
+    const double distance2 = (offset - t * s.step).squaredNorm();
+    if (distance2 < best.distance2) best = {i, t, distance2};
+  }
+  return best;
+}
+
+// Camera-frame point of image position t along a segment.
+Vector3 point_at(const Segment& s, double t) {
+  const double from = t * s.a.z(), to = (1.0 - t) * s.b.z();
+  return s.a + from / (from + to) * (s.b - s.a);
+}
+
+void add(LinkSums& sums, int link, const Vector3& x, const Vector3& g, double offset, double residual, double weight) {
+  Vector7 row;
+  row << x.cross(g), g, offset;
+  sums.normal[link].noalias() += (weight * row) * row.transpose();
+  sums.right[link] += (weight * residual) * row;
+}
+
+double huber_weight(double residual, double cut) { return residual <= cut ? 1.0 : cut / residual; }
+
+double tukey_weight(double residual, double cut) {
+  const double u = residual / cut;
+  return std::abs(u) >= 1.0 ? 0.0 : (1.0 - u * u) * (1.0 - u * u);
+}
+
+bool past_end(const ViewWork& work, const Nearest& at) {
+  return at.segment + 1 == static_cast<int>(work.segments.size()) && at.t >= 1.0;
+}
+
+// --- blobs ------------------------------------------------------------------------------------------------------------
+
+// The blob that holds the rope when nothing else is known: of those that could be a rope, the one nearest to the grasp.
+int anchor_blob(const ViewWork& work, double straight_length) {
+  const MaskPoints& mask = *work.view->mask;
+  const Vector2 grasp = work.segments.empty() ? Vector2(0, 0) : work.segments[0].from;
+  const double straight_area = straight_length * work.diameter;
+  int best = -1;
+  double best_distance2 = 1e300;
+  for (int b = 0; b < static_cast<int>(mask.blobs.size()); ++b) {
+    const Blob& blob = mask.blobs[b];
+    if (blob.area < kLeastArea * straight_area || blob.area > kLargestArea * straight_area) continue;
+    for (int i = blob.first_pixel; i < blob.last_pixel; ++i) {
+      const double distance2 = (mask.pixels[i] - grasp).squaredNorm();
+      if (distance2 < best_distance2) {
+        best_distance2 = distance2;
+        best = b;
+      }
+    }
+  }
+  return best >= 0 || mask.blobs.empty() ? best : 0;
+}
+
+// Keeps the blobs whose median pixel is within `reach` diameters of the posed chain; without any, the anchor.
+void choose_blobs(Problem& problem, double reach) {
+  for (ViewWork& work : problem.views) {
+    const MaskPoints& mask = *work.view->mask;
+    work.active.assign(mask.blobs.size(), 0);
+    bool any = false;
+    for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
+      const Blob& blob = mask.blobs[b];
+      problem.sizes.clear();
+      for (int i = blob.first_pixel; i < blob.last_pixel; ++i)
+        problem.sizes.push_back(nearest(work.segments, mask.pixels[i]).distance2);
+      if (problem.sizes.empty()) continue;
+      const auto middle = problem.sizes.begin() + problem.sizes.size() / 2;
+      std::nth_element(problem.sizes.begin(), middle, problem.sizes.end());
+      const double limit = reach * work.diameter;
+      work.active[b] = *middle <= limit * limit;
+      any = any || work.active[b];
+    }
+    if (any || mask.blobs.empty()) continue;
+    const double pixels_per_meter = work.diameter / problem.chain->diameter;
+    work.active[anchor_blob(work, problem.chain->length * pixels_per_meter)] = 1;
+  }
+}
+
+// --- the two stages' observations ---------------------------------------------------------------------------------------
+
+void clear(LinkSums& sums) {
+  std::fill(sums.normal.begin(), sums.normal.end(), Matrix7::Zero());
+  std::fill(sums.right.begin(), sums.right.end(), Vector7::Zero());
+}
+
+// Nearest sampled pixel of the active blobs.
+Vector2 nearest_pixel(const ViewWork& work, const Vector2& to) {
+  const MaskPoints& mask = *work.view->mask;
+  Vector2 best = to;
+  double best_distance2 = 1e300;
+  for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
+    if (!work.active[b]) continue;
+    for (int i = mask.blobs[b].first_pixel; i < mask.blobs[b].last_pixel; ++i) {
+      const double distance2 = (mask.pixels[i] - to).squaredNorm();
+      if (distance2 < best_distance2) {
+        best_distance2 = distance2;
+        best = mask.pixels[i];
+      }
+    }
+  }
+  return best;
+}
+
+// Calls body(segment, image t, pixel) for the centerline samples that should be seen: in the image.
+template <typename Body>
+void for_each_sample(const ViewWork& work, const Body& body) {
+  const capture::Camera& camera = *work.view->camera;
+  for (const Segment& s : work.segments) {
+    for (int i = 0; i < kReverseSamples; ++i) {
+      const double t = (i + 1.0) / kReverseSamples;
+      const Vector2 pixel = s.from + t * s.step;
+      if (pixel.x() < 0 || pixel.y() < 0 || pixel.x() >= camera.width || pixel.y() >= camera.height) continue;
+      body(s, t, pixel);
+    }
+  }
+}
+
+bool in_mask(const ViewWork& work, const Vector2& pixel) {
+  const int blob = work.view->mask->blob_at(pixel);
+  return blob >= 0 && work.active[blob];
+}
+
+void add_coarse(ViewWork& work, double cut) {
+  const capture::Camera& camera = *work.view->camera;
+  const MaskPoints& mask = *work.view->mask;
+  int count = 0;
+  for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
+    if (!work.active[b]) continue;
+    count += mask.blobs[b].last_pixel - mask.blobs[b].first_pixel;
+    for (int i = mask.blobs[b].first_pixel; i < mask.blobs[b].last_pixel; ++i) {
+      const Nearest at = nearest(work.segments, mask.pixels[i]);
+      if (at.segment < 0) return;
+      const Segment& s = work.segments[at.segment];
+      const Vector2 offset = mask.pixels[i] - (s.from + at.t * s.step);
+      const Vector3 x = point_at(s, at.t);
+      const double weight = huber_weight(std::sqrt(at.distance2), cut);
+      add(work.sums, s.link, x, projected_gradient(camera, x, s.normal), 0.0, s.normal.dot(offset), weight);
+      if (past_end(work, at))
+        add(work.sums, s.link, x, projected_gradient(camera, x, s.tangent), 0.0, s.tangent.dot(offset), weight);
+    }
+  }
+  if (count == 0) return;
+  const double share = kReverseWeight * count / (kReverseSamples * static_cast<double>(work.segments.size()));
+  for_each_sample(work, [&](const Segment& s, double t, const Vector2& pixel) {
+    if (in_mask(work, pixel)) return;
+    const Vector2 offset = nearest_pixel(work, pixel) - pixel;
+    const double size = offset.norm();
+    const double weight = share * huber_weight(size, cut);
+    const Vector3 x = point_at(s, t);
+    for (const Vector2& m : {s.normal, s.tangent})
+      add(work.sums, s.link, x, projected_gradient(camera, x, m), 0.0, m.dot(offset), weight);
+  });
+}
+
+struct FineSums {
+  double weighted_square = 0.0, weight = 0.0;  // of the residuals, px^2
+};
+
+void add_fine(Problem& problem, ViewWork& work, double offset, double cut, FineSums& total) {
+  const capture::Camera& camera = *work.view->camera;
+  const MaskPoints& mask = *work.view->mask;
+  const double radius = 0.5 * problem.chain->diameter;
+  if (work.segments.empty()) return;
+  const Segment& last = work.segments.back();
+  const bool has_end = last.link + 1 == problem.chain->links();
+  const Vector2 end = last.from + last.step;
+  const double end_radius = radius * projected_gradient(camera, last.b, last.normal).norm();
+  // the end is a flat disk, seen as an ellipse: this is its half axis along the rope
+  const double end_depth = end_radius * std::abs((last.b - last.a).normalized().dot(last.b.normalized()));
+  const auto observe = [&](const Segment& s, const Vector3& x, const Vector3& g, double residual, double length) {
+    const double weight = length * tukey_weight(residual, cut);
+    problem.sizes.push_back(std::abs(residual));
+    if (weight == 0.0) return;
+    add(work.sums, s.link, x, g, 1.0, residual, weight);
+    total.weighted_square += weight * residual * residual;
+    total.weight += weight;
+  };
+  for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
+    if (!work.active[b]) continue;
+    for (int i = mask.blobs[b].first_edge; i < mask.blobs[b].last_edge; ++i) {
+      const Edge& edge = mask.edges[i];
+      const Vector2 from_end = edge.point - end;
+      if (has_end && from_end.squaredNorm() < 4.0 * end_radius * end_radius &&
+          edge.outward.dot(last.tangent) > kAligned) {
+        const double side = last.normal.dot(from_end) / end_radius;
+        const double bulge = end_depth * std::sqrt(std::max(0.0, 1.0 - side * side));
+        observe(last, last.b, projected_gradient(camera, last.b, last.tangent),
+                last.tangent.dot(from_end) - bulge - offset, edge.weight);
+        continue;
+      }
+      const Nearest at = nearest(work.segments, edge.point);
+      if (past_end(work, at)) continue;
+      const Segment& s = work.segments[at.segment];
+      const Vector2 from_center = edge.point - (s.from + at.t * s.step);
+      // the side of the tube is the one the outline faces; about a bend's outer corner the tube is round
+      Vector2 m = s.normal.dot(edge.outward) < 0 ? Vector2(-s.normal) : s.normal;
+      const double distance = std::sqrt(at.distance2);
+      if ((at.t <= 0.0 || at.t >= 1.0) && distance > 1.0 && from_center.dot(edge.outward) > 0.0)
+        m = from_center / distance;
+      if (m.dot(edge.outward) < kAligned) continue;  // an occluder's outline, or a corner
+      const Vector3 x = point_at(s, at.t);
+      Vector3 g = projected_gradient(camera, x, m);
+      const double half_width = radius * g.norm();
+      g.z() -= half_width / x.z();  // farther is thinner
+      observe(s, x, g, m.dot(from_center) - half_width - offset, edge.weight);
+    }
+  }
+}
+
+// H and b of all views: link sums to angles by suffix sums (SPEC 2.3), for squares of the angles' joint effect.
+void assemble(Problem& problem) {
+  const chain::Chain& chain = *problem.chain;
+  const int n = chain.angles();
+  problem.normal.setZero(n + 1, n + 1);
+  problem.right.setZero(n + 1);
+  MatrixX columns(7, n);  // of one view: the axes in camera coordinates, and 0 for the offset
+  for (ViewWork& work : problem.views) {
+    for (int k = 0; k < n; ++k) {
+      columns.col(k).head<6>() = math::transform_twist(work.camera_from_base, problem.axes.col(k));
+      columns(6, k) = 0.0;
+    }
+    LinkSums& sums = work.sums;
+    for (int link = chain.links() - 2; link >= 0; --link) {
+      sums.normal[link] += sums.normal[link + 1];
+      sums.right[link] += sums.right[link + 1];
+    }
+    for (int k = 0; k < n; ++k) {
+      const int link = chain.child_link[k];
+      const Vector7 moved = sums.normal[link] * columns.col(k);
+      for (int l = 0; l <= k; ++l) problem.normal(l, k) += moved.dot(columns.col(l));
+      problem.normal(k, n) += moved[6];
+      problem.right[k] += sums.right[link].dot(columns.col(k));
+    }
+    problem.normal(n, n) += sums.normal[0](6, 6);
+    problem.right[n] += sums.right[0][6];
+  }
+  problem.normal.triangularView<Eigen::StrictlyLower>() = problem.normal.transpose();
+}
+
+// --- priors and steps -------------------------------------------------------------------------------------------------
+
+// Index of the angle before k about the same axis, -1 for the first.
+int neighbor(const chain::Chain& chain, int k) {
+  for (int l = k - 1; l >= 0; --l)
+    if (std::abs(chain.axes[l].head<3>().dot(chain.axes[k].head<3>())) > 0.5) return l;
+  return -1;
+}
+
+MatrixX joint_prior(const chain::Chain& chain, const Options& options) {
+  const int n = chain.angles();
+  const double difference =
+      options.joint_smoothness > 0.0 ? options.joint_smoothness : 1.0 / (kJointDifference * kJointDifference);
+  MatrixX information = MatrixX::Identity(n, n) / (kJointSize * kJointSize);
+  for (int k = 0; k < n; ++k) {
+    const int l = neighbor(chain, k);
+    if (l < 0) continue;
+    information(k, k) += difference;
+    information(l, l) += difference;
+    information(k, l) -= difference;
+    information(l, k) -= difference;
+  }
+  return information;
+}
+
+// One step from `theta` (and `offset`, when it is free) for the assembled equations and priors. Returns the largest change.
+double step(Problem& problem, const MatrixX& prior, const VectorX& prior_pull, double variance, bool free_offset,
+            VectorX& theta, double& offset) {
+  const int n = static_cast<int>(theta.size());
+  problem.normal.topLeftCorner(n, n) += variance * prior;
+  problem.right.head(n) += variance * prior_pull;
+  const double offset_weight = free_offset ? 1.0 / (kOffsetDeviation * kOffsetDeviation) : 0.0;
+  problem.normal(n, n) += offset_weight;
+  problem.right[n] -= offset_weight * offset;
+  for (int k = 0; k <= n; ++k) {
+    if (k < n ? !problem.held[k] : free_offset) continue;
+    problem.normal.row(k).setZero();
+    problem.normal.col(k).setZero();
+    problem.normal(k, k) = 1.0;
+    problem.right[k] = 0.0;
+  }
+  const VectorX change = problem.normal.ldlt().solve(problem.right);
+  if (!change.allFinite()) return 0.0;
+  const double largest = change.head(n).cwiseAbs().maxCoeff();
+  const double scale = largest > kLongestStep ? kLongestStep / largest : 1.0;
+  theta += scale * change.head(n);
+  offset += scale * change[n];
+  return largest;
+}
+
+// Information and pull (information times the way to its mean) of what is believed before looking.
+struct Belief {
+  MatrixX joints, all;  // all: with the frame before or the caller's prior
+  VectorX all_mean_pull;  // all = sum of informations; pull = sum of information_i mean_i
+  VectorX pull(const VectorX& theta) const { return all_mean_pull - all * theta; }
+};
+
+void coarse_stage(Problem& problem, const Belief& belief, int iterations, bool choose, const Options& options,
+                  VectorX& theta) {
+  double offset = 0.0;
+  for (int i = 0; i < iterations; ++i) {
+    pose(problem, theta);
+    if (choose) choose_blobs(problem, i == 0 ? kReach : kReach + (kLastReach - kReach) * i / iterations);
+    const double cut = i < kFarShare * iterations ? kFarHuber : options.huber_pixels;
+    for (ViewWork& work : problem.views) {
+      clear(work.sums);
+      add_coarse(work, cut);
+    }
+    assemble(problem);
+    if (step(problem, belief.all, belief.pull(theta), kCoarseVariance, false, theta, offset) < kCoarseStep &&
+        cut == options.huber_pixels)
+      break;
+  }
+}
+
+double median(std::vector<double>& values) {
+  if (values.empty()) return 0.0;
+  const auto middle = values.begin() + values.size() / 2;
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
+}
+
+// Edge observations at theta; returns their sums and sets the next cut-off.
+FineSums fine_equations(Problem& problem, const VectorX& theta, double offset, double& cut) {
+  pose(problem, theta);
+  problem.sizes.clear();
+  FineSums total;
+  for (ViewWork& work : problem.views) {
+    clear(work.sums);
+    add_fine(problem, work, offset, cut, total);
+  }
+  assemble(problem);
+  if (!problem.sizes.empty())
+    cut = std::clamp(kCutDeviations * kDeviationOfMedian * median(problem.sizes), kLeastCut, kLargestCut);
+  return total;
+}
+
+// Mask pixels away from the tube and centerline samples away from the mask, mean squares, capped; and the two shares.
+void judge(const Problem& problem, FrameSolution& out) {
+  constexpr double kMargin = 2.0;  // px, of `covered`
+  constexpr double kCap = 3.0;     // diameters
+  const double radius = 0.5 * problem.chain->diameter;
+  double pixels = 0, covered = 0, samples = 0, inside = 0, cost = 0;
+  int seen = 0;
+  out.mask_pixels = 0;
+  for (const ViewWork& work : problem.views) {
+    const MaskPoints& mask = *work.view->mask;
+    out.mask_pixels += mask.area;
+    if (mask.pixels.empty() || work.segments.empty()) continue;
+    ++seen;
+    const double cap = kCap * work.diameter;
+    double view_cost = 0;
+    const double area = static_cast<double>(mask.area) / mask.pixels.size();  // px a sample stands for
+    for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
+      for (int i = mask.blobs[b].first_pixel; i < mask.blobs[b].last_pixel; ++i) {
+        const Nearest at = nearest(work.segments, mask.pixels[i]);
+        const Segment& s = work.segments[at.segment];
+        const Vector3 x = point_at(s, at.t);
+        const double away = std::sqrt(at.distance2) - radius * projected_gradient(*work.view->camera, x, s.normal).norm();
+        pixels += area;
+        if (away <= kMargin) covered += area;
+        const double size = std::clamp(away, 0.0, cap);
+        view_cost += size * size / mask.pixels.size();
+      }
+    }
+    double reverse = 0;
+    int count = 0;
+    for_each_sample(work, [&](const Segment&, double, const Vector2& pixel) {
+      ++samples;
+      ++count;
+      if (mask.blob_at(pixel) >= 0) {
+        ++inside;
+        return;
+      }
+      const double size = std::min(cap, (nearest_pixel(work, pixel) - pixel).norm());
+      reverse += size * size;
+    });
+    cost += view_cost + (count > 0 ? reverse / count : cap * cap);
+  }
+  out.fit.covered = pixels > 0 ? covered / pixels : 0.0;
+  out.fit.inside = samples > 0 ? inside / samples : 0.0;
+  out.cost = seen > 0 ? cost / seen : 0.0;
+}
+
+// `start`, and bends to every side, of one size.
+std::vector<VectorX> cold_starts(const chain::Chain& chain, const VectorX& start) {
+  std::vector<VectorX> starts{start};
+  std::vector<int> first;  // angles of the first joint: their axes
+  for (int k = 0; k < chain.angles() && chain.child_link[k] == chain.child_link[0]; ++k) first.push_back(k);
+  const int joints = chain.links() - 1;
+  for (const int axis : first) {
+    const Vector3 about = chain.axes[axis].head<3>();
+    if (std::abs(about.dot(chain.direction)) > 0.5) continue;
+    for (const double sign : {1.0, -1.0}) {
+      VectorX bent = VectorX::Zero(chain.angles());
+      for (int k = 0; k < chain.angles(); ++k)
+        if (std::abs(chain.axes[k].head<3>().dot(about)) > 0.5) bent[k] = sign * kStartBend / joints;
+      starts.push_back(bent);
+    }
+  }
+  return starts;
+}
+
+}  // namespace
+
+FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView>& views, const VectorX& start, bool warm,
+                          const Options& options) {
+  const int n = chain.angles();
+  Problem problem;
+  problem.chain = &chain;
+  problem.held.assign(n, 0);
+  for (int k = 0; k < n; ++k) problem.held[k] = std::abs(chain.axes[k].head<3>().dot(chain.direction)) > 0.5;
+  for (const FrameView& view : views) {
+    ViewWork work;
+    work.view = &view;
+    work.camera_from_base = view.camera->world_from_camera.inverse() * view.base;
+    work.sums.normal.resize(chain.links());
+    work.sums.right.resize(chain.links());
+    const double depth = std::max(kNear, work.camera_from_base.translation.z());
+    work.diameter = chain.diameter * 0.5 * (view.camera->fx + view.camera->fy) / depth;
+    work.active.assign(view.mask->blobs.size(), 0);
+    problem.views.push_back(std::move(work));
+  }
+
+  Belief belief;
+  belief.joints = joint_prior(chain, options);
+  belief.all = belief.joints;
+  belief.all_mean_pull = VectorX::Zero(n);
+  if (options.prior.mean.size() == n && options.prior.information.rows() == n) {
+    belief.all += options.prior.information;
+    belief.all_mean_pull += options.prior.information * options.prior.mean;
+  } else if (warm) {
+    const double weight = 1.0 / (kWarmChange * kWarmChange);
+    belief.all.diagonal().array() += weight;
+    belief.all_mean_pull += weight * start;
+  }
+
+  FrameSolution out;
+  VectorX theta = start;
+  if (warm) {
+    coarse_stage(problem, belief, std::max(1, options.iterations / 2), true, options, theta);
+  } else {
+    double best = 1e300;
+    for (const VectorX& candidate : cold_starts(chain, start)) {
+      VectorX tried = candidate;
+      // the anchor's blob first, whatever its distance; then what lies near the rope found
+      pose(problem, tried);
+      choose_blobs(problem, 0.0);
+      coarse_stage(problem, belief, options.first_iterations, false, options, tried);
+      coarse_stage(problem, belief, std::max(1, options.iterations / 2), true, options, tried);
+      pose(problem, tried);
+      judge(problem, out);
+      if (out.cost < best) {
+        best = out.cost;
+        theta = tried;
+      }
+    }
+  }
+  pose(problem, theta);
+  choose_blobs(problem, kLastReach);
+
+  double offset = 0.0, cut = kFirstCut;
+  const double variance = kEdgeDeviation * kEdgeDeviation;
+  for (int i = 0; i < std::max(1, options.iterations - options.iterations / 2); ++i) {
+    fine_equations(problem, theta, offset, cut);
+    if (step(problem, belief.all, belief.pull(theta), variance, true, theta, offset) < kFineStep) break;
+  }
+
+  // once more at the result: what the data say about it
+  const FineSums total = fine_equations(problem, theta, offset, cut);
+  const double offset_weight = 1.0 / (kOffsetDeviation * kOffsetDeviation);
+  const double offset_normal = problem.normal(n, n) + offset_weight;
+  const double offset_right = problem.right[n] - offset_weight * offset;
+  const VectorX coupling = problem.normal.col(n).head(n);
+  out.information = (problem.normal.topLeftCorner(n, n) - coupling * coupling.transpose() / offset_normal) / variance;
+  out.gradient = (problem.right.head(n) - coupling * (offset_right / offset_normal)) / variance;
+  for (int k = 0; k < n; ++k) {
+    if (!problem.held[k]) continue;
+    out.information.row(k).setZero();
+    out.information.col(k).setZero();
+    out.gradient[k] = 0.0;
+  }
+  out.information += belief.joints;
+  out.gradient -= belief.joints * theta;
+  MatrixX held = MatrixX::Zero(n, n);
+  for (int k = 0; k < n; ++k)
+    if (problem.held[k]) held(k, k) = 1.0 / (kTwist * kTwist);
+  MatrixX posterior = out.information + held;
+  if (options.prior.mean.size() == n) posterior += options.prior.information;
+  out.fit.theta = theta;
+  out.fit.covariance = posterior.ldlt().solve(MatrixX::Identity(n, n));
+  out.fit.edge_offset = offset;
+  out.fit.residual_pixels = total.weight > 0 ? std::sqrt(total.weighted_square / total.weight) : 0.0;
+  judge(problem, out);
+  return out;
+}
+
+FrameFit fit_frame(const chain::Chain& chain, const Pose& base, std::span<const capture::View* const> views,
+                   const std::vector<capture::Camera>& cameras, const VectorX& start, bool warm, const Options& options) {
+  std::vector<MaskPoints> masks;
+  masks.reserve(views.size());
+  std::vector<FrameView> frame_views;
+  for (const capture::View* const view : views) {
+    const capture::Camera& camera = cameras.at(view->camera);
+    masks.push_back(mask_points(*view, camera, options.max_pixels));
+    frame_views.push_back({&masks.back(), &camera, base});
+  }
+  return solve_frame(chain, frame_views, start, warm, options).fit;
+}
+
+}  // namespace chainsplat::silhouette

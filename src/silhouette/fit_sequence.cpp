@@ -1,0 +1,270 @@
+#include <Eigen/Sparse>
+#include <algorithm>
+#include <array>
+#include <cmath>
+
+#include "chainsplat/core.h"
+#include "src/silhouette/frame.h"
+
+namespace chainsplat::silhouette {
+
+using math::MatrixX;
+using math::Pose;
+using math::VectorX;
+
+namespace {
+
+// A frame is fitted again when it is worse than most by more than this.
+constexpr double kLessCovered = 0.1;     // share of the mask
+constexpr double kLessInside = 0.15;     // share of the centerline
+constexpr double kMoreResidual = 2.0;    // times the median, and
+constexpr double kMoreResidualPixels = 0.5;  // px more
+constexpr double kBetter = 0.9;          // share of the old cost that a new fit must stay under
+
+// Smoothing over time: random angular accelerations of this size (measured on moving ropes: 3.5 to 5.2 rad/s^2 RMS over
+// all joints), with heavy tails for contacts (up to 107).
+constexpr double kAcceleration = 5.0;     // rad/s^2
+// Share of a fit's variance that is new in every frame; the rest (a bend that straight links cannot follow, the masks'
+// width) stays and would be taken for motion if the smoothing trusted the frames less.
+constexpr double kIndependent = 0.4;
+constexpr double kTailDeviations = 2.0;  // beyond this many of them the penalty grows linearly
+constexpr int kSmoothingRounds = 4;      // of reweighting
+constexpr int kDerivativeReach = 2;      // frames on each side of a local cubic fit
+
+// Times of the frames and, for each, the views (by index) that belong to it.
+struct Frames {
+  std::vector<double> times;
+  std::vector<std::vector<int>> views;
+};
+
+Frames frames_of(const capture::Capture& capture) {
+  Frames frames;
+  const auto& views = capture.views;
+  if (views.empty()) return frames;
+  // all frames of the first camera between its first and last loaded one, views or not
+  const int camera = views.front().camera;
+  int low = views.front().frame, high = low;
+  for (const capture::View& view : views) {
+    if (view.camera != camera) continue;
+    low = std::min(low, view.frame);
+    high = std::max(high, view.frame);
+  }
+  const bool listed = camera < static_cast<int>(capture.times.size()) &&
+                      high < static_cast<int>(capture.times[camera].size());
+  if (listed) {
+    frames.times.assign(capture.times[camera].begin() + low, capture.times[camera].begin() + high + 1);
+  } else {
+    for (const capture::View& view : views)
+      if (view.camera == camera) frames.times.push_back(view.time);
+  }
+  const int count = static_cast<int>(frames.times.size());
+  frames.views.resize(count);
+  const double interval = count > 1 ? (frames.times.back() - frames.times.front()) / (count - 1) : 1.0;
+  std::vector<std::vector<int>> chosen(count, std::vector<int>(capture.cameras.size(), -1));
+  for (int v = 0; v < static_cast<int>(views.size()); ++v) {
+    const auto above = std::lower_bound(frames.times.begin(), frames.times.end(), views[v].time);
+    int at = static_cast<int>(above - frames.times.begin());
+    if (at == count || (at > 0 && views[v].time - frames.times[at - 1] < frames.times[at] - views[v].time)) --at;
+    const double distance = std::abs(views[v].time - frames.times[at]);
+    if (distance > 0.5 * interval) continue;
+    int& best = chosen[at][views[v].camera];
+    if (best < 0 || distance < std::abs(views[best].time - frames.times[at])) best = v;
+  }
+  for (int f = 0; f < count; ++f)
+    for (const int v : chosen[f])
+      if (v >= 0) frames.views[f].push_back(v);
+  return frames;
+}
+
+double median(std::vector<double> values) {
+  if (values.empty()) return 0.0;
+  const auto middle = values.begin() + values.size() / 2;
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
+}
+
+// Second difference of three unevenly spaced values as an acceleration: weights of the three.
+std::array<double, 3> acceleration_weights(double t0, double t1, double t2) {
+  const double a = t1 - t0, b = t2 - t1;
+  return {2.0 / (a * (a + b)), -2.0 / (a * b), 2.0 / (b * (a + b))};
+}
+
+// Most likely angles for every frame's quadratic and random accelerations.
+std::vector<VectorX> smoothed(const std::vector<double>& times, const std::vector<FrameSolution>& solutions) {
+  const int count = static_cast<int>(times.size()), n = static_cast<int>(solutions[0].fit.theta.size());
+  std::vector<VectorX> theta(count);
+  for (int f = 0; f < count; ++f) theta[f] = solutions[f].fit.theta;
+  if (count < 3) return theta;
+
+  VectorX right(count * n);
+  std::vector<Eigen::Triplet<double>> data;
+  for (int f = 0; f < count; ++f) {
+    const FrameSolution& s = solutions[f];
+    right.segment(f * n, n) = (s.information * s.fit.theta + s.gradient) / kIndependent;
+    for (int k = 0; k < n; ++k)
+      for (int l = 0; l <= k; ++l) data.emplace_back(f * n + k, f * n + l, s.information(k, l) / kIndependent);
+  }
+  Eigen::SimplicialLDLT<Eigen::SparseMatrix<double>, Eigen::Lower, Eigen::NaturalOrdering<int>> solver;
+  for (int round = 0; round < kSmoothingRounds; ++round) {
+    std::vector<Eigen::Triplet<double>> entries = data;
+    for (int f = 1; f + 1 < count; ++f) {
+      const std::array<double, 3> w = acceleration_weights(times[f - 1], times[f], times[f + 1]);
+      for (int k = 0; k < n; ++k) {
+        const double a = w[0] * theta[f - 1][k] + w[1] * theta[f][k] + w[2] * theta[f + 1][k];
+        const double size = std::abs(a) / (kTailDeviations * kAcceleration);
+        const double weight = (round > 0 && size > 1.0 ? 1.0 / size : 1.0) / (kAcceleration * kAcceleration);
+        for (int i = 0; i < 3; ++i)
+          for (int j = 0; j <= i; ++j)
+            entries.emplace_back((f - 1 + i) * n + k, (f - 1 + j) * n + k, weight * w[i] * w[j]);
+      }
+    }
+    Eigen::SparseMatrix<double> normal(count * n, count * n);
+    normal.setFromTriplets(entries.begin(), entries.end());
+    if (round == 0) solver.analyzePattern(normal);
+    solver.factorize(normal);
+    const VectorX all = solver.solve(right);
+    if (solver.info() != Eigen::Success || !all.allFinite()) break;
+    for (int f = 0; f < count; ++f) theta[f] = all.segment(f * n, n);
+  }
+  return theta;
+}
+
+// Slopes of local cubics over the nearest 2 kDerivativeReach + 1 frames (fewer than four: of a line or parabola).
+std::vector<VectorX> derivative(const std::vector<double>& times, const std::vector<VectorX>& theta) {
+  const int count = static_cast<int>(times.size()), n = static_cast<int>(theta[0].size());
+  std::vector<VectorX> out(count, VectorX::Zero(n));
+  if (count < 2) return out;
+  const int width = std::min(count, 2 * kDerivativeReach + 1), terms = std::min(width, 4);
+  for (int f = 0; f < count; ++f) {
+    const int first = std::clamp(f - kDerivativeReach, 0, count - width);
+    const double scale = times[first + width - 1] - times[first];
+    MatrixX powers(width, terms), values(width, n);
+    for (int i = 0; i < width; ++i) {
+      const double t = (times[first + i] - times[f]) / scale;
+      for (int p = 0; p < terms; ++p) powers(i, p) = std::pow(t, p);
+      values.row(i) = theta[first + i].transpose();
+    }
+    out[f] = powers.householderQr().solve(values).row(1).transpose() / scale;
+  }
+  return out;
+}
+
+}  // namespace
+
+SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capture, const Options& options) {
+  SequenceFit out;
+  const Frames frames = frames_of(capture);
+  const int count = static_cast<int>(frames.times.size()), n = chain.angles();
+  if (count == 0) return out;
+
+  std::vector<MaskPoints> masks(capture.views.size());
+  core::parallel_for(static_cast<std::int64_t>(masks.size()), [&](std::int64_t v) {
+    const capture::View& view = capture.views[v];
+    masks[v] = mask_points(view, capture.cameras[view.camera], options.max_pixels);
+  });
+  std::vector<std::vector<FrameView>> views(count);
+  std::vector<char> seen(count, 0);
+  for (int f = 0; f < count; ++f) {
+    for (const int v : frames.views[f]) {
+      const capture::View& view = capture.views[v];
+      views[f].push_back({&masks[v], &capture.cameras[view.camera], capture.base.pose(view.time)});
+      seen[f] = seen[f] || masks[v].area > 0;
+    }
+  }
+  const int first = static_cast<int>(std::find(seen.begin(), seen.end(), 1) - seen.begin());
+  Options each = options;
+  each.prior = {};
+
+  // forward
+  std::vector<FrameSolution> solutions(count);
+  std::vector<int> unseen;
+  VectorX start = VectorX::Zero(n);
+  for (int f = 0; f < count; ++f) {
+    if (!seen[f]) unseen.push_back(f);
+    solutions[f] = solve_frame(chain, views[f], start, f != first && f > 0, each);
+    if (seen[f]) start = solutions[f].fit.theta;
+  }
+
+  // repair: runs of bad frames, once backward from the good frame after them, and from scratch
+  std::vector<double> covered, inside, residual;
+  for (int f = 0; f < count; ++f) {
+    if (!seen[f]) continue;
+    covered.push_back(solutions[f].fit.covered);
+    inside.push_back(solutions[f].fit.inside);
+    residual.push_back(solutions[f].fit.residual_pixels);
+  }
+  const double usual_covered = median(covered), usual_inside = median(inside), usual_residual = median(residual);
+  const auto bad = [&](int f) {
+    const FrameFit& fit = solutions[f].fit;
+    return seen[f] && (fit.covered < usual_covered - kLessCovered || fit.inside < usual_inside - kLessInside ||
+                       fit.residual_pixels > kMoreResidual * usual_residual + kMoreResidualPixels);
+  };
+  const auto try_again = [&](int f, const VectorX& from, bool warm) {
+    FrameSolution again = solve_frame(chain, views[f], from, warm, each);
+    if (again.cost < kBetter * solutions[f].cost) solutions[f] = std::move(again);
+  };
+  for (int f = count - 1; f >= 0; --f) {
+    if (!bad(f)) continue;
+    if (f + 1 < count) try_again(f, solutions[f + 1].fit.theta, true);
+    if (bad(f)) try_again(f, VectorX::Zero(n), false);
+  }
+  for (int f = 1; f < count; ++f)
+    if (bad(f)) try_again(f, solutions[f - 1].fit.theta, true);
+
+  out.states.time = frames.times;
+  for (FrameSolution& s : solutions) out.frames.push_back(s.fit);
+  if (!unseen.empty() && unseen.size() < solutions.size()) {
+    const int last = unseen.back();
+    core::warn(capture.name + ": " + std::to_string(unseen.size()) + " of " + std::to_string(count) +
+               " frames have no mask pixel in any camera (first " + std::to_string(unseen.front()) + ", last " +
+               std::to_string(last) + "); their angles follow from the frames around them");
+  }
+  // what no view fixes must not pull towards the straight rope
+  for (const int f : unseen) {
+    solutions[f].information *= 1e-6;
+    solutions[f].gradient *= 1e-6;
+  }
+  if (options.smooth_in_time) {
+    out.states.theta = smoothed(frames.times, solutions);
+  } else {
+    for (const FrameFit& fit : out.frames) out.states.theta.push_back(fit.theta);
+  }
+  out.states.thetadot = derivative(frames.times, out.states.theta);
+  return out;
+}
+
+BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::Capture& capture, const SequenceFit& fit) {
+  constexpr double kSmall = 1e-3;       // m
+  constexpr double kDeviations = 3.0;
+  constexpr int kPoints = 97;           // along the centerline
+  BendingChoice choice;
+  if (capture.tabletop) {
+    choice.bending = chain::Bending::planar;
+    return choice;
+  }
+  const std::vector<double> arclengths = chain::equal_arclengths(spatial_chain, kPoints);
+  double square = 0.0, variance = 0.0;
+  int count = 0;
+  for (std::size_t f = 0; f < fit.states.theta.size(); ++f) {
+    if (fit.frames[f].residual_pixels <= 0.0) continue;  // nothing was seen
+    const VectorX& theta = fit.states.theta[f];
+    const MatrixX points = chain::centerline(spatial_chain, chain::link_motions(spatial_chain, theta, Pose{}), arclengths);
+    const MatrixX axes = chain::world_axes(spatial_chain, theta, Pose{});
+    for (int i = 0; i < kPoints; ++i) {
+      const double out_of_plane = spatial_chain.bending_axis.dot(points.col(i));
+      const MatrixX jacobian =
+          chain::point_jacobian(spatial_chain, axes, chain::link_at(spatial_chain, arclengths[i]), points.col(i));
+      const Eigen::RowVectorXd row = spatial_chain.bending_axis.transpose() * jacobian;
+      square += out_of_plane * out_of_plane;
+      variance += row * fit.frames[f].covariance * row.transpose();
+      ++count;
+    }
+  }
+  if (count == 0) return choice;
+  choice.out_of_plane_rms = std::sqrt(square / count);
+  choice.deviation = std::sqrt(variance / count);
+  if (choice.out_of_plane_rms < std::max(kSmall, kDeviations * choice.deviation)) choice.bending = chain::Bending::planar;
+  return choice;
+}
+
+}  // namespace chainsplat::silhouette

@@ -1,0 +1,28 @@
+// One frame's fit, with what a sequence needs beside the result: the data's own quadratic about it.
+#pragma once
+#include <vector>
+
+#include "chainsplat/silhouette.h"
+#include "src/silhouette/mask_points.h"
+
+namespace chainsplat::silhouette {
+
+struct FrameView {
+  const MaskPoints* mask = nullptr;
+  const capture::Camera* camera = nullptr;
+  math::Pose base;  // at the view's time
+};
+
+struct FrameSolution {
+  FrameFit fit;
+  // Data and joint priors about fit.theta: the log likelihood is -x^T information x / 2 + gradient^T x, x = theta - fit.theta.
+  math::MatrixX information;  // 1/rad^2, calibrated
+  math::VectorX gradient;
+  double cost = 0.0;          // px^2, mask outside the tube and centerline outside the mask: compares fits of one frame
+  int mask_pixels = 0;        // in all views
+};
+
+FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView>& views, const math::VectorX& start,
+                          bool warm, const Options& options);
+
+}  // namespace chainsplat::silhouette

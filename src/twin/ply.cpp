@@ -1,0 +1,185 @@
+// Gaussians in the PLY layout of 3DGS, with the link logits behind.
+#include <array>
+#include <bit>
+#include <charconv>
+#include <cmath>
+#include <cstring>
+#include <map>
+#include <sstream>
+
+#include "chainsplat/twin.h"
+
+namespace chainsplat::twin {
+
+static_assert(std::endian::native == std::endian::little, "PLY files are written as the numbers lie in memory");
+
+namespace {
+
+constexpr int kMostProperties = 4096;  // a vertex; more is a damaged header
+
+// f_rest_* is channel-major: coefficients 1.. of red, then of green, then of blue.
+std::size_t rest_index(const splat::Gaussians& g, int gaussian, int channel, int coefficient) {
+  return 3u * (static_cast<std::size_t>(g.sh_coefficients()) * gaussian + coefficient) + channel;
+}
+
+std::vector<std::string> property_names(int coefficients, int links) {
+  std::vector<std::string> names{"x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"};
+  for (int k = 0; k < 3 * (coefficients - 1); ++k) names.push_back("f_rest_" + std::to_string(k));
+  for (const char* name : {"opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"})
+    names.push_back(name);
+  for (int j = 0; j < links; ++j) names.push_back("link_" + std::to_string(j));
+  return names;
+}
+
+int scalar_bytes(const std::string& type) {
+  static const std::map<std::string, int> sizes{{"char", 1},    {"uchar", 1},   {"int8", 1},    {"uint8", 1}, {"short", 2},
+                                                {"ushort", 2},  {"int16", 2},   {"uint16", 2},  {"int", 4},   {"uint", 4},
+                                                {"int32", 4},   {"uint32", 4},  {"float", 4},   {"float32", 4},
+                                                {"double", 8},  {"float64", 8}};
+  const auto found = sizes.find(type);
+  return found == sizes.end() ? 0 : found->second;
+}
+
+struct Header {
+  std::size_t count = 0, stride = 0, data = 0;  // vertices; bytes a vertex; where they start
+  std::map<std::string, std::size_t> floats;    // byte offset of every float property
+};
+
+Header read_header(const std::string& bytes, const std::string& file) {
+  const auto fail = [&](const std::string& what) {
+    throw InputError(file, what, "write it again as binary little-endian 3DGS PLY");
+  };
+  Header header;
+  std::size_t at = 0;
+  int properties = 0;
+  bool little = false, in_vertex = false, seen_vertex = false;
+  for (int number = 0;; ++number) {
+    const std::size_t end = bytes.find('\n', at);
+    if (end == std::string::npos) fail(number == 0 ? "is not a PLY file" : "its header has no end");
+    std::string line = bytes.substr(at, end - at);
+    at = end + 1;
+    if (line.ends_with('\r')) line.pop_back();
+    if (number == 0) {
+      if (line != "ply") fail("is not a PLY file");
+      continue;
+    }
+    std::istringstream words(line);
+    std::string word;
+    words >> word;
+    if (word == "end_header") break;
+    if (word == "format") {
+      words >> word;
+      little = word == "binary_little_endian";
+      if (!little) fail("is in the format '" + word.substr(0, 30) + "'");
+    } else if (word == "element") {
+      std::string name;
+      long long count = -1;
+      words >> name >> count;
+      if (seen_vertex) {
+        in_vertex = false;  // what follows the vertices is not read
+        continue;
+      }
+      if (name != "vertex" || !words || count < 0) fail("its first element is not a number of vertices");
+      header.count = static_cast<std::size_t>(count);
+      in_vertex = seen_vertex = true;
+    } else if (word == "property" && in_vertex) {
+      std::string type, name;
+      words >> type >> name;
+      const int size = scalar_bytes(type);
+      if (size == 0 || name.empty() || ++properties > kMostProperties) fail("its property line '" + line.substr(0, 60) + "' is not understood");
+      if (type == "float" || type == "float32") header.floats[name] = header.stride;
+      header.stride += static_cast<std::size_t>(size);
+    }
+  }
+  if (!little || !seen_vertex) fail("its header names no format or no vertices");
+  header.data = at;
+  if (header.stride == 0 || header.count > (bytes.size() - at) / header.stride)
+    fail("ends before its " + std::to_string(header.count) + " Gaussians");
+  return header;
+}
+
+}  // namespace
+
+std::string gaussians_ply(const splat::Gaussians& g) {
+  const int coefficients = g.sh_coefficients();
+  std::string bytes =
+      "ply\nformat binary_little_endian 1.0\n"
+      "comment Gaussians of a chain at home (all angles 0), base frame, meters\n"
+      "comment logit opacity, ln scale, quaternion wxyz; link_*: logits of the link probability\n"
+      "element vertex " +
+      std::to_string(g.count) + "\n";
+  const std::vector<std::string> names = property_names(coefficients, g.links);
+  for (const std::string& name : names) bytes += "property float " + name + "\n";
+  bytes += "end_header\n";
+  std::vector<float> row;
+  bytes.reserve(bytes.size() + sizeof(float) * names.size() * g.count);
+  for (int i = 0; i < g.count; ++i) {
+    row.assign(g.mean.begin() + 3 * i, g.mean.begin() + 3 * (i + 1));
+    row.insert(row.end(), 3, 0.0f);
+    for (int c = 0; c < 3; ++c) row.push_back(g.sh[rest_index(g, i, c, 0)]);
+    for (int c = 0; c < 3; ++c)
+      for (int l = 1; l < coefficients; ++l) row.push_back(g.sh[rest_index(g, i, c, l)]);
+    row.push_back(g.opacity_logit[i]);
+    row.insert(row.end(), g.log_scale.begin() + 3 * i, g.log_scale.begin() + 3 * (i + 1));
+    row.insert(row.end(), g.rotation.begin() + 4 * i, g.rotation.begin() + 4 * (i + 1));
+    const auto links = g.link_logits.begin() + static_cast<std::ptrdiff_t>(g.links) * i;
+    row.insert(row.end(), links, links + g.links);
+    bytes.append(reinterpret_cast<const char*>(row.data()), sizeof(float) * row.size());
+  }
+  return bytes;
+}
+
+splat::Gaussians read_ply(const Path& path) {
+  const std::string file = path.string();
+  const std::string bytes = core::read_file(path);
+  const Header header = read_header(bytes, file);
+
+  int rest = 0, links = 0;
+  while (header.floats.contains("f_rest_" + std::to_string(rest))) ++rest;
+  while (header.floats.contains("link_" + std::to_string(links))) ++links;
+  int degree = 0;
+  while (degree < 3 && 3 * ((degree + 1) * (degree + 1) - 1) < rest) ++degree;
+  const int coefficients = (degree + 1) * (degree + 1);
+  if (3 * (coefficients - 1) != rest)
+    throw InputError(file, "has " + std::to_string(rest) + " properties f_rest_*, which is no whole degree",
+                     "write 0, 9, 24 or 45 of them");
+  const std::vector<std::string> names = property_names(coefficients, links);
+  std::vector<std::size_t> offsets;
+  for (const std::string& name : names) {
+    const bool normal = name == "nx" || name == "ny" || name == "nz";
+    const auto found = header.floats.find(name);
+    if (found == header.floats.end() && !normal)
+      throw InputError(file, "has no float property '" + name + "'", "write it with the properties of 3DGS");
+    offsets.push_back(normal ? 0 : found->second);
+  }
+
+  splat::Gaussians g;
+  g.resize(static_cast<int>(header.count), links, degree);
+  for (int i = 0; i < g.count; ++i) {
+    const char* const vertex = bytes.data() + header.data + header.stride * i;
+    std::size_t next = 0;
+    const auto take = [&]() {
+      float value = 0.0f;
+      std::memcpy(&value, vertex + offsets[next], sizeof value);
+      if (!std::isfinite(value))
+        throw InputError(file, names[next] + " of Gaussian " + std::to_string(i) + " is not finite", "remove the Gaussian");
+      ++next;
+      return value;
+    };
+    for (int c = 0; c < 3; ++c) g.mean[3 * i + c] = take();
+    next += 3;  // normals
+    for (int c = 0; c < 3; ++c) g.sh[rest_index(g, i, c, 0)] = take();
+    for (int c = 0; c < 3; ++c)
+      for (int l = 1; l < coefficients; ++l) g.sh[rest_index(g, i, c, l)] = take();
+    g.opacity_logit[i] = take();
+    for (int c = 0; c < 3; ++c) g.log_scale[3 * i + c] = take();
+    float square = 0.0f;
+    for (int c = 0; c < 4; ++c) square += std::pow(g.rotation[4 * i + c] = take(), 2.0f);
+    if (!(square > 0.0f))
+      throw InputError(file, "rot_* of Gaussian " + std::to_string(i) + " has no length", "write a quaternion w, x, y, z");
+    for (int j = 0; j < links; ++j) g.link_logits[static_cast<std::size_t>(links) * i + j] = take();
+  }
+  return g;
+}
+
+}  // namespace chainsplat::twin

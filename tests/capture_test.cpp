@@ -1,0 +1,734 @@
+// Captures: the demo against its truth, small captures made here with every source of images, and everything that can be
+// wrong with one.
+#include <doctest/doctest.h>
+
+#include <unistd.h>
+
+#include <cmath>
+#include <filesystem>
+#include <fstream>
+#include <functional>
+#include <mutex>
+#include <nlohmann/json.hpp>
+
+#include "chainsplat/capture.h"
+
+using namespace chainsplat;
+using capture::Camera;
+using capture::Capture;
+using capture::Image8;
+using capture::LoadOptions;
+using capture::View;
+using math::Vector2;
+using math::Vector3;
+using Json = nlohmann::ordered_json;
+
+namespace {
+
+const Path kDemo = Path(CHAINSPLAT_SOURCE_DIR) / "assets/demo_free_30";
+
+struct Folder {  // removed at the end
+  Path path = std::filesystem::temp_directory_path() / ("chainsplat_capture_test_" + std::to_string(::getpid()));
+  Folder() {
+    std::filesystem::remove_all(path);
+    std::filesystem::create_directories(path);
+  }
+  ~Folder() { std::filesystem::remove_all(path); }
+};
+
+struct Warnings {  // collects what the library warns of
+  std::vector<std::string> lines;
+  std::mutex mutex;
+  Warnings() {
+    core::set_listener({[this](const std::string& line) {
+                          std::lock_guard lock(mutex);
+                          lines.push_back(line);
+                        },
+                        {}});
+  }
+  ~Warnings() { core::set_listener({}); }
+  bool mention(const std::string& part) const {
+    for (const std::string& line : lines)
+      if (line.find(part) != std::string::npos) return true;
+    return false;
+  }
+};
+
+bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
+
+bool any_contains(const std::vector<std::string>& lines, const std::string& part) {
+  for (const std::string& line : lines)
+    if (contains(line, part)) return true;
+  return false;
+}
+
+std::string error_of(const std::function<void()>& body) {
+  try {
+    body();
+  } catch (const InputError& error) {
+    return error.what();
+  }
+  return "";
+}
+
+constexpr int kWidth = 64, kHeight = 48, kFrames = 4;
+
+Image8 filled(int channels, const std::function<std::array<double, 3>(int, int)>& color, int width = kWidth,
+              int height = kHeight) {
+  Image8 image{width, height, channels, {}};
+  for (int y = 0; y < height; ++y)
+    for (int x = 0; x < width; ++x) {
+      const auto value = color(x, y);
+      for (int c = 0; c < channels; ++c) image.pixels.push_back(static_cast<std::uint8_t>(std::lround(value[std::min(c, 2)])));
+    }
+  return image;
+}
+
+// The object: a disk of radius 8 around (30 + frame, 22).
+bool in_disk(double x, double y, int frame) { return std::hypot(x - 30 - frame, y - 22) <= 8.0; }
+
+Image8 disk_mask(int frame) {
+  return filled(1, [&](int x, int y) {
+    const double value = in_disk(x + 0.5, y + 0.5, frame) ? 255 : 0;
+    return std::array{value, value, value};
+  });
+}
+
+std::string numbered(const std::string& stem, int k) {
+  std::string number = std::to_string(k);
+  return stem + "/" + std::string(6 - number.size(), '0') + number + ".png";
+}
+
+// A capture of two cameras, 4 frames at 10 Hz: image folders, mask images and depth. The base is at (0, 0, 1) in front.
+struct Made {
+  Folder folder;
+  Json json;
+
+  Made() {
+    json = {{"format", "chainsplat-capture/1"},
+            {"name", "made"},
+            {"scenario", "free"},
+            {"gravity", {0, 0, -9.81}},
+            {"object", {{"length", 0.3}, {"diameter", 0.02}, {"mass", 0.06}}},
+            {"grasp", {{"direction", {0, 0, -1}}, {"bending_axis", {0, 1, 0}}}},
+            {"base", "base.tum"},
+            {"cameras", Json::array()}};
+    std::string tum;
+    for (int k = 0; k <= 40; ++k) tum += core::exact(0.01 * k) + " " + core::exact(0.01 * k / 0.1 / 60.0) + " 0 1 0 0 0 1\n";
+    write("base.tum", tum);
+    for (const std::string name : {"cam0", "cam1"}) {
+      for (const std::string& sub : {name, "masks/" + name, "depth/" + name}) std::filesystem::create_directories(path() / sub);
+      json["cameras"].push_back({{"name", name},
+                                 {"width", kWidth},
+                                 {"height", kHeight},
+                                 {"fx", 60.0},
+                                 {"fy", 60.0},
+                                 {"cx", 32.0},
+                                 {"cy", 24.0},
+                                 {"distortion", {0, 0, 0, 0, 0}},
+                                 {"world_from_camera", {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1}},
+                                 {"images", name + "/%06d.png"},
+                                 {"masks", "masks/" + name + "/%06d.png"},
+                                 {"depth", "depth/" + name + "/%06d.png"},
+                                 {"depth_scale", 0.0001},
+                                 {"rate", 10.0},
+                                 {"start", 0.0}});
+      for (int k = 0; k < kFrames; ++k) {
+        capture::write_png(path() / numbered(name, k), filled(3, [&](int x, int y) {
+                             return std::array<double, 3>{4.0 * x, 5.0 * y, 20.0 * k};
+                           }));
+        capture::write_png(path() / numbered("masks/" + name, k), disk_mask(k));
+        std::vector<float> depth(kWidth * kHeight, 0.0f);
+        for (int i = 0; i < kWidth * kHeight; ++i) depth[i] = 0.9f + 0.001f * (i % kWidth);
+        capture::write_depth_png(path() / numbered("depth/" + name, k), kWidth, kHeight, depth, 0.0001);
+      }
+    }
+  }
+  const Path& path() const { return folder.path; }
+  void write(const std::string& name, const std::string& text) const { std::ofstream(path() / name) << text; }
+  Capture load(const LoadOptions& options = {}) const {
+    write("capture.json", json.dump(1));
+    return capture::load(path(), options);
+  }
+  std::string refused(const LoadOptions& options = {}) const {
+    return error_of([&] { load(options); });
+  }
+};
+
+const std::uint8_t* pixel(const View& view, int x, int y) {
+  return &view.rgba[4 * (static_cast<std::size_t>(y - view.y0) * view.width + x - view.x0)];
+}
+
+}  // namespace
+
+TEST_CASE("lens distortion: OpenCV's formula and its inverse") {
+  Camera camera;
+  camera.width = 640, camera.height = 480;
+  camera.fx = 610, camera.fy = 605, camera.cx = 315, camera.cy = 244;
+  camera.distortion = {-0.25, 0.08, 0.001, -0.0007, -0.01};
+  CHECK(camera.distorted());
+  for (const Vector2& u : {Vector2(5, 7), Vector2(315, 244), Vector2(600.5, 30.25), Vector2(200, 470)}) {
+    // written out term by term, as in OpenCV's documentation
+    const double x = (u.x() - 315) / 610, y = (u.y() - 244) / 605, r2 = x * x + y * y;
+    const double factor = 1 - 0.25 * r2 + 0.08 * r2 * r2 - 0.01 * r2 * r2 * r2;
+    const double dx = x * factor + 2 * 0.001 * x * y - 0.0007 * (r2 + 2 * x * x);
+    const double dy = y * factor + 0.001 * (r2 + 2 * y * y) - 2 * 0.0007 * x * y;
+    CHECK((capture::distort(camera, u) - Vector2(610 * dx + 315, 605 * dy + 244)).norm() < 1e-10);
+    CHECK((capture::undistort(camera, capture::distort(camera, u)) - u).norm() < 1e-9);
+  }
+  CHECK((capture::project(camera, {0.1, -0.2, 2.0}) - Vector2(610 * 0.05 + 315, -605 * 0.1 + 244)).norm() < 1e-12);
+}
+
+TEST_CASE("the demo: masks, crops and base agree with the truth of the simulation") {
+  const Capture demo = capture::load(kDemo);
+  CHECK(demo.cameras.size() == 3);
+  CHECK(demo.views.size() == 180);
+  CHECK(demo.length == 0.3);
+  CHECK(*demo.mass == 0.06);
+  CHECK(demo.has_depth);
+  const auto truth = capture::load_true_centerline(kDemo);
+  REQUIRE(truth);
+  REQUIRE(truth->time.size() == 60);
+  REQUIRE(truth->points[0].cols() == 49);
+
+  int points = 0, inside = 0, object = 0;
+  for (const View& view : demo.views) {
+    const Camera& camera = demo.cameras[view.camera];
+    CHECK(view.time == doctest::Approx(truth->time[view.frame]).epsilon(1e-6));
+    CHECK(view.rgba.size() == static_cast<std::size_t>(4) * view.width * view.height);
+    for (std::size_t i = 0; i < view.rgba.size(); i += 4) {
+      object += view.rgba[i + 3] == 255;
+      if (view.rgba[i + 3] == 0) CHECK_FALSE((view.rgba[i] || view.rgba[i + 1] || view.rgba[i + 2]));
+    }
+    // the rope's axis, away from the gripper and the tip, lies inside the mask
+    const math::MatrixX& line = truth->points[view.frame];
+    for (int p = 4; p < 46; ++p) {
+      const Vector2 u = capture::project(camera, camera.world_from_camera.inverse() * Vector3(line.col(p)));
+      const int x = static_cast<int>(std::floor(u.x())), y = static_cast<int>(std::floor(u.y()));
+      REQUIRE((x >= view.x0 && y >= view.y0 && x < view.x0 + view.width && y < view.y0 + view.height));
+      ++points;
+      inside += pixel(view, x, y)[3] == 255;
+    }
+    // the base at the frame's time is the centerline's first point (written with five digits)
+    CHECK((demo.base.pose(view.time).translation - Vector3(line.col(0))).norm() < 2e-5);
+  }
+  CHECK(inside > 0.995 * points);
+  // captures/README.md of the simulation: 693, 606, 881 px in the mean of every 7th frame
+  CHECK(object / 180.0 == doctest::Approx((693 + 606 + 881) / 3.0).epsilon(0.01));
+}
+
+TEST_CASE("videos decode to the pixels of another reader, whatever the number of threads") {
+  // OpenImageIO reads a video's first frame through its own use of libav
+  const Image8 other = capture::read_image8(kDemo / "cam0.mp4");
+  REQUIRE(other.width == 320);
+  for (const int threads : {1, 3}) {
+    capture::VideoReader reader(kDemo / "cam0.mp4", threads);
+    Image8 image;
+    REQUIRE(reader.next(image));
+    CHECK(image.pixels == other.pixels);
+    int count = 1;
+    while (reader.skip()) ++count;
+    CHECK(count == 60);
+  }
+  const capture::VideoFacts facts = capture::video_facts(kDemo / "cam0.mp4");
+  CHECK(facts.frames == 60);
+  CHECK(facts.rate == doctest::Approx(30.0));
+
+  core::set_threads(1);
+  const Capture one = capture::load(kDemo);
+  core::set_threads(5);
+  const Capture five = capture::load(kDemo);
+  core::set_threads(0);
+  REQUIRE(one.views.size() == five.views.size());
+  for (std::size_t i = 0; i < one.views.size(); ++i) CHECK(one.views[i].rgba == five.views[i].rgba);
+  CHECK(one.hash == five.hash);
+}
+
+TEST_CASE("frames asked for, one camera, no images") {
+  const Capture all = capture::load(kDemo);
+  LoadOptions options;
+  options.first = 10;
+  options.last = 13;
+  options.camera = "cam1";
+  const Capture some = capture::load(kDemo, options);
+  REQUIRE(some.cameras.size() == 1);
+  REQUIRE(some.views.size() == 3);
+  CHECK(some.times[0].size() == 60);
+  for (int k = 0; k < 3; ++k) {
+    CHECK(some.views[k].frame == 10 + k);
+    CHECK(some.views[k].rgba == all.views[60 + 10 + k].rgba);
+  }
+  options.images = false;
+  CHECK(capture::load(kDemo / "capture.json", options).views.empty());
+  options.camera = "cam7";
+  CHECK(contains(error_of([&] { capture::load(kDemo, options); }), "choose one of cam0, cam1, cam2"));
+}
+
+TEST_CASE("image folders, depth, crops") {
+  const Made made;
+  LoadOptions options;
+  options.depth = true;
+  options.margin = 3;
+  const Capture loaded = made.load(options);
+  REQUIRE(loaded.views.size() == 2 * kFrames);
+  for (const View& view : loaded.views) {
+    CHECK(view.time == doctest::Approx(0.1 * view.frame));
+    // the disk covers the pixels whose centers are within 8 of its middle: [22, 38) x [14, 30)
+    CHECK(view.x0 == 22 + view.frame - 3);
+    CHECK(view.y0 == 14 - 3);
+    CHECK(view.width == 16 + 6);
+    CHECK(view.height == 16 + 6);
+    for (int y = view.y0; y < view.y0 + view.height; ++y)
+      for (int x = view.x0; x < view.x0 + view.width; ++x) {
+        const std::uint8_t* const p = pixel(view, x, y);
+        const bool inside = in_disk(x + 0.5, y + 0.5, view.frame);
+        CHECK(p[3] == (inside ? 255 : 0));
+        CHECK(p[0] == (inside ? 4 * x : 0));
+        CHECK(p[1] == (inside ? 5 * y : 0));
+        CHECK(p[2] == (inside ? 20 * view.frame : 0));
+        CHECK(view.depth[static_cast<std::size_t>(y - view.y0) * view.width + x - view.x0] ==
+              doctest::Approx(0.9 + 0.001 * x).epsilon(1e-4));
+      }
+  }
+  options.masked = false;
+  const Capture whole = made.load(options);
+  CHECK(whole.views[0].width == kWidth);
+  CHECK(pixel(whole.views[0], 1, 1)[0] == 4);
+  CHECK(pixel(whole.views[0], 1, 1)[3] == 255);
+}
+
+TEST_CASE("undistortion: straight pixels, masks, and edges that are not darkened") {
+  Made made;
+  Json& json = made.json["cameras"][0];
+  json["distortion"] = {-0.2, 0.05, 0.002, -0.001, 0.01};
+  Camera camera;
+  camera.width = kWidth, camera.height = kHeight;
+  camera.fx = camera.fy = 60, camera.cx = 32, camera.cy = 24;
+  camera.distortion = {-0.2, 0.05, 0.002, -0.001, 0.01};
+  // what a lens would record of a scene that is linear in the undistorted image, and of the disk
+  for (int k = 0; k < kFrames; ++k) {
+    const auto scene = [&](int x, int y) { return capture::undistort(camera, {x + 0.5, y + 0.5}); };
+    capture::write_png(made.path() / numbered("cam0", k), filled(3, [&](int x, int y) {
+                         const Vector2 u = scene(x, y);
+                         return std::array<double, 3>{std::clamp(20 + 3 * u.x(), 0.0, 255.0),
+                                                      std::clamp(230 - 4 * u.y(), 0.0, 255.0), 200.0};
+                       }));
+    capture::write_png(made.path() / numbered("masks/cam0", k), filled(1, [&](int x, int y) {
+                         const Vector2 u = scene(x, y);
+                         return std::array<double, 3>{in_disk(u.x(), u.y(), k) ? 255.0 : 0.0, 0, 0};
+                       }));
+  }
+  LoadOptions options;
+  options.camera = "cam0";
+  options.depth = true;
+  for (const View& view : made.load(options).views) {
+    int wrong = 0, object = 0;
+    for (int y = view.y0; y < view.y0 + view.height; ++y)
+      for (int x = view.x0; x < view.x0 + view.width; ++x) {
+        const std::uint8_t* const p = pixel(view, x, y);
+        const bool inside = in_disk(x + 0.5, y + 0.5, view.frame);
+        wrong += inside != (p[3] == 255);
+        object += inside;
+        if (p[3] == 0) continue;
+        CHECK(std::abs(p[0] - (20 + 3 * (x + 0.5))) < 1.6);
+        CHECK(std::abs(p[1] - (230 - 4 * (y + 0.5))) < 1.6);
+        CHECK(p[2] == 200);
+      }
+    CHECK(wrong < 0.06 * object);  // edge pixels only
+  }
+  // recorded pixels stay recorded pixels
+  options.undistort = false;
+  const Capture recorded = made.load(options);
+  const Image8 image = capture::read_image8(made.path() / numbered("cam0", 1));
+  const View& view = recorded.views[1];
+  for (int y = view.y0; y < view.y0 + view.height; ++y)
+    for (int x = view.x0; x < view.x0 + view.width; ++x)
+      if (pixel(view, x, y)[3] == 255) CHECK(pixel(view, x, y)[0] == image.pixels[3 * (y * kWidth + x)]);
+}
+
+TEST_CASE("videos of images and masks, missing masks, timestamps, empty views") {
+  Made made;
+  Warnings warnings;
+  std::vector<Image8> images, masks;
+  for (int k = 0; k < kFrames; ++k) {
+    images.push_back(filled(3, [&](int, int) { return std::array<double, 3>{200, 60, 30}; }));
+    Image8 mask = disk_mask(k), rgb{kWidth, kHeight, 3, {}};
+    for (const std::uint8_t value : mask.pixels) rgb.pixels.insert(rgb.pixels.end(), 3, value);
+    masks.push_back(rgb);
+  }
+  capture::write_video(made.path() / "cam0.mp4", 10.0, images);
+  capture::write_video(made.path() / "mask0.mp4", 10.0, masks);
+  const Capture by_file = made.load();
+
+  SUBCASE("images and masks by video: colors of BT.601, edges of the threshold") {
+    for (const bool video_images : {true, false}) {
+      if (video_images) made.json["cameras"][0]["images"] = "cam0.mp4";
+      else made.json["cameras"][0]["images"] = "cam0/%06d.png";
+      made.json["cameras"][0]["masks"] = "mask0.mp4";
+      const Capture loaded = made.load();
+      for (int k = 0; k < kFrames; ++k) {
+        const View &view = loaded.views[k], &reference = by_file.views[k];
+        int object = 0, different = 0;
+        for (int y = 14; y < 30; ++y)
+          for (int x = 22 + k; x < 38 + k; ++x) {
+            object += pixel(reference, x, y)[3] == 255;
+            different += pixel(reference, x, y)[3] != pixel(view, x, y)[3];
+            if (!video_images || pixel(view, x, y)[3] == 0) continue;
+            CHECK(std::abs(pixel(view, x, y)[0] - 200) <= 3);
+            CHECK(std::abs(pixel(view, x, y)[1] - 60) <= 3);
+            CHECK(std::abs(pixel(view, x, y)[2] - 30) <= 3);
+          }
+        CHECK(different <= 0.03 * object);
+      }
+    }
+  }
+  SUBCASE("masked already: what is not black is the object, with a warning; a background is refused") {
+    made.json["cameras"][0].erase("masks");
+    CHECK(contains(made.refused(), "background of the images is not black"));
+    for (int k = 0; k < kFrames; ++k) {
+      Image8 image = filled(3, [&](int x, int y) {
+        return in_disk(x + 0.5, y + 0.5, k) ? std::array<double, 3>{1, 0, 0} : std::array<double, 3>{0, 0, 0};
+      });
+      capture::write_png(made.path() / numbered("cam0", k), image);
+    }
+    const Capture loaded = made.load();
+    CHECK(warnings.mention("taken as masked already"));
+    for (int k = 0; k < kFrames; ++k) {
+      CHECK(loaded.views[k].x0 == by_file.views[k].x0);
+      CHECK(loaded.views[k].width == by_file.views[k].width);
+    }
+  }
+  SUBCASE("timestamps replace start and rate") {
+    made.write("cam1.txt", "# seconds\n0.01\n0.02\n0.15\n\n0.35\n");
+    made.json["cameras"][1]["timestamps"] = "cam1.txt";
+    CHECK(made.load().times[1] == std::vector<double>{0.01, 0.02, 0.15, 0.35});
+    made.write("cam1.txt", "0.01\n0.02\n0.15\n");
+    CHECK(contains(made.refused(), "3 times for 4 frames"));
+    made.write("cam1.txt", "0.01\n0.02\n0.02\n0.3\n");
+    CHECK(contains(made.refused(), "cam1.txt:3"));
+    made.write("cam1.txt", "0.01\nnan\n0.02\n0.3\n");
+    CHECK(contains(made.refused(), "cam1.txt:2"));
+  }
+  SUBCASE("cameras of different start and rate") {
+    made.json["cameras"][1]["start"] = 0.05;
+    made.json["cameras"][1]["rate"] = 20.0;
+    CHECK(made.load().times[1][3] == doctest::Approx(0.2));
+  }
+  SUBCASE("an empty mask keeps its place; a camera that sees nothing is refused") {
+    const Image8 empty = filled(1, [](int, int) { return std::array<double, 3>{0, 0, 0}; });
+    capture::write_png(made.path() / numbered("masks/cam1", 2), empty);
+    const Capture loaded = made.load();
+    REQUIRE(loaded.views.size() == 2 * kFrames);
+    CHECK(loaded.views[kFrames + 2].width == 0);
+    CHECK(loaded.views[kFrames + 2].height == 0);
+    CHECK(loaded.views[kFrames + 3].width > 0);
+    for (int k = 0; k < kFrames; ++k) capture::write_png(made.path() / numbered("masks/cam1", k), empty);
+    CHECK(contains(made.refused(), "cam1 never sees the object"));
+  }
+}
+
+TEST_CASE("everything that can be wrong with capture.json is refused in one line that names the place") {
+  Made made;
+  const auto with = [&](const std::string& pointer, const Json& value) {
+    const Json before = made.json;
+    made.json[Json::json_pointer(pointer)] = value;
+    const std::string message = made.refused();
+    made.json = before;
+    CHECK(contains(message, made.path().string()));
+    CHECK(message.find('\n') == std::string::npos);
+    return message;
+  };
+  const auto without = [&](const std::string& parent, const std::string& key) {
+    const Json before = made.json;
+    made.json[Json::json_pointer(parent)].erase(key);
+    const std::string message = made.refused();
+    made.json = before;
+    return message;
+  };
+  const double infinity = std::numeric_limits<double>::infinity();  // nlohmann writes it as null
+  CHECK(made.refused() == "");
+  CHECK(contains(with("/format", "chainsplat-capture/2"), "format"));
+  CHECK(contains(with("/scenario", "sea"), "scenario: 'sea' is unknown"));
+  CHECK(contains(with("/gravity", {0, 0, nullptr}), "gravity[2]"));
+  CHECK(contains(with("/gravity", {0, 0}), "gravity: has 2 entries instead of 3"));
+  CHECK(contains(with("/object/length", 0), "object.length: 0 is not positive"));
+  CHECK(contains(with("/object/length", infinity), "object.length: is not a number"));
+  CHECK(contains(with("/object/diameter", 0.5), "object.diameter"));
+  CHECK(contains(with("/object/mass", -1), "object.mass"));
+  CHECK(contains(with("/grasp/direction", {0, 0, 0}), "grasp.direction: has no length"));
+  CHECK(contains(with("/grasp/bending_axis", {0, 0, 0}), "grasp.bending_axis: has no length"));
+  CHECK(contains(with("/grasp/bending_axis", {0, 1, 0.2}), "not perpendicular"));
+  CHECK(contains(with("/scenario", "tabletop"), "table: is missing"));
+  CHECK(contains(with("/cameras", Json::array()), "cameras"));
+  CHECK(contains(with("/cameras/1/name", "cam0"), "used twice"));
+  CHECK(contains(with("/cameras/1/name", "../x"), "cannot name a folder"));
+  CHECK(contains(with("/cameras/0/width", 64.5), "cameras[0].width"));
+  CHECK(contains(with("/cameras/0/width", 65), "000000.png: is 64x48 pixels, the camera has 65x48"));
+  CHECK(contains(with("/cameras/0/fx", 0), "cameras[0].fx"));
+  CHECK(contains(with("/cameras/0/cx", "left"), "cameras[0].cx: is not a number"));
+  CHECK(contains(with("/cameras/0/distortion", {0, 0, 0, 0}), "4 entries instead of 5"));
+  CHECK(contains(with("/cameras/0/distortion", {-30, 0, 0, 0, 0}), "cannot be undone"));
+  CHECK(contains(with("/cameras/0/world_from_camera/0", 1.1), "not a rotation"));
+  CHECK(contains(with("/cameras/0/world_from_camera/0", -1), "reflection"));
+  CHECK(contains(with("/cameras/0/world_from_camera/3", nullptr), "world_from_camera[3]"));
+  CHECK(contains(with("/cameras/0/world_from_camera", {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 0, 0, 1}), "by columns"));
+  CHECK(contains(with("/cameras/0/rate", 0), "cameras[0].rate"));
+  CHECK(contains(with("/cameras/0/depth_scale", 0), "depth_scale"));
+  CHECK(contains(with("/cameras/0/images", "../cam0/%06d.png"), "not a path inside"));
+  CHECK(contains(with("/cameras/0/images", "/etc/%06d.png"), "not a path inside"));
+  CHECK(contains(with("/cameras/0/images", "cam0/../../x.mp4"), "not a path inside"));
+  CHECK(contains(with("/cameras/0/images", "cam0/%s.png"), "not a frame pattern"));
+  CHECK(contains(with("/cameras/0/images", "cam0/%06d%06d.png"), "not a frame pattern"));
+  CHECK(contains(with("/cameras/0/images", "missing.mp4"), "missing.mp4: does not exist"));
+  CHECK(contains(with("/cameras/0/images", "base.tum"), "base.tum"));
+  CHECK(contains(with("/base", "../base.tum"), "not a path inside"));
+  CHECK(contains(with("/base", "missing.tum"), "missing.tum"));
+  CHECK(contains(with("/cameras/0/start", 0.2), "covers 0 to 0.4 s, but the frames of cam0 are at 0.2 to 0.5 s"));
+  CHECK(contains(without("", "format"), "format: is missing"));
+  CHECK(contains(without("", "grasp"), "grasp: is missing"));
+  CHECK(contains(without("/object", "length"), "object.length: is missing"));
+  CHECK(contains(without("/cameras/0", "world_from_camera"), "world_from_camera: is missing"));
+  CHECK(contains(without("/cameras/1", "rate"), "cameras[1].rate: is missing"));
+
+  // half a frame beyond the base is allowed
+  made.json["cameras"][0]["start"] = 0.149;
+  CHECK(made.refused() == "");
+}
+
+TEST_CASE("files that are missing, cut off or of another kind") {
+  Made made;
+  const auto spoil = [&](const std::string& name, std::size_t keep) {
+    const std::string bytes = core::read_file(made.path() / name);
+    std::ofstream(made.path() / name, std::ios::binary) << bytes.substr(0, keep);
+  };
+  SUBCASE("a mask of another size") {
+    capture::write_png(made.path() / numbered("masks/cam1", 3),
+                       filled(1, [](int, int) { return std::array<double, 3>{255, 255, 255}; }, 32, 48));
+    CHECK(contains(made.refused(), "masks/cam1/000003.png: is 32x48 pixels"));
+  }
+  SUBCASE("fewer masks than images") {
+    std::filesystem::remove(made.path() / numbered("masks/cam1", 3));
+    CHECK(contains(made.refused(), "cameras[1].masks: 3 frames, but images has 4"));
+  }
+  SUBCASE("a gap") {
+    std::filesystem::remove(made.path() / numbered("cam0", 1));
+    CHECK(contains(made.refused(), "cam0/000001.png: is missing, though later frames exist"));
+  }
+  SUBCASE("nothing") {
+    std::filesystem::remove_all(made.path() / "cam0");
+    CHECK(contains(made.refused(), "cam0/000000.png: is missing"));
+  }
+  SUBCASE("a cut-off image, an empty one, a text") {
+    spoil(numbered("cam0", 2), 60);
+    CHECK(contains(made.refused(), "cam0/000002.png"));
+    spoil(numbered("cam0", 2), 0);
+    CHECK(contains(made.refused(), "cam0/000002.png"));
+    made.write(numbered("cam0", 2), "not an image");
+    CHECK(contains(made.refused(), "cam0/000002.png: is not a readable image"));
+  }
+  SUBCASE("a depth image of 8 bits") {
+    capture::write_png(made.path() / numbered("depth/cam0", 0), disk_mask(0));
+    LoadOptions options;
+    options.depth = true;
+    CHECK(contains(made.refused(options), "does not have 16 bits"));
+  }
+  SUBCASE("a video that is cut off, of another size, or too short for the masks") {
+    std::vector<Image8> frames(3, filled(3, [](int x, int y) { return std::array<double, 3>{3.0 * x, 4.0 * y, 90}; }));
+    capture::write_video(made.path() / "short.mp4", 10.0, frames);
+    made.json["cameras"][0]["images"] = "short.mp4";
+    Warnings warnings;
+    CHECK(made.refused() == "");
+    CHECK(warnings.mention("cameras[0].masks: 4 frames, but images has 3"));
+    made.json["cameras"][0]["masks"] = "short.mp4";
+    made.json["cameras"][0]["images"] = "cam0/%06d.png";
+    CHECK(contains(made.refused(), "3 frames, but images has 4"));
+    made.json["cameras"][0]["images"] = "short.mp4";
+    made.json["cameras"][0]["width"] = 66;
+    CHECK(contains(made.refused(), "short.mp4: is 64x48 pixels, the camera has 66x48"));
+    made.json["cameras"][0]["width"] = 64;
+    spoil("short.mp4", 900);
+    CHECK(contains(made.refused(), "short.mp4"));
+  }
+  SUBCASE("a base with holes in its numbers") {
+    made.write("base.tum", "0 0 0 0 0 0 0 1\n0.1 0 inf 0 0 0 0 1\n");
+    CHECK(contains(made.refused(), "base.tum:2"));
+  }
+  SUBCASE("no capture at all") {
+    CHECK(contains(error_of([&] { capture::load(made.path() / "nothing"); }), "nothing"));
+  }
+}
+
+TEST_CASE("warnings name unknown keys, missing numbers and single cameras") {
+  Made made;
+  Warnings warnings;
+  made.json["cameras"][0]["distorsion"] = {0, 0, 0, 0, 0};
+  made.json["weather"] = "fine";
+  made.json.erase("gravity");
+  made.load();
+  CHECK(warnings.mention("cameras[0].distorsion: unknown key, ignored; is 'distortion' meant?"));
+  CHECK(warnings.mention("weather: unknown key"));
+  CHECK(warnings.mention("gravity: is missing"));
+  made.json["cameras"].erase(1);
+  made.load();
+  CHECK(warnings.mention("only one"));
+}
+
+TEST_CASE("truncated and garbled capture.json never do worse than an error") {
+  Made made;
+  made.load();
+  const std::string good = core::read_file(made.path() / "capture.json");
+  LoadOptions options;
+  options.images = false;
+  const auto attempt = [&](const std::string& text) {
+    made.write("capture.json", text);
+    try {
+      capture::load(made.path(), options);
+      return std::string();
+    } catch (const InputError& error) {
+      return std::string(error.what());
+    }
+  };
+  const std::string cut = attempt(good.substr(0, good.size() / 2));
+  const std::string line = std::to_string(1 + std::count(good.begin(), good.begin() + good.size() / 2, '\n'));
+  CHECK(contains(cut, "capture.json:" + line + ": is not JSON"));
+  for (std::size_t size = 0; size < good.size() - 2; size += 13) CHECK(attempt(good.substr(0, size)) != "");
+  core::Random random(5);
+  int refused = 0;
+  constexpr int kTries = 400;
+  for (int i = 0; i < kTries; ++i) {
+    std::string text = good;
+    const int changes = 1 + static_cast<int>(random.uniform(0, 4));
+    for (int c = 0; c < changes; ++c) {
+      const auto where = static_cast<std::size_t>(random.uniform() * static_cast<double>(text.size()));
+      switch (static_cast<int>(random.uniform(0, 4))) {
+        case 0: text[where] = static_cast<char>(random.next()); break;
+        case 1: text.erase(where, static_cast<std::size_t>(random.uniform(1, 40))); break;
+        case 2: text.insert(where, text.substr(where / 2, 20)); break;
+        default: text.replace(where, 1, "1e999"); break;
+      }
+    }
+    refused += attempt(text) != "";
+  }
+  CHECK(refused > kTries / 2);
+  for (const char* text : {"", "[]", "null", "1", "{}", "\"x\"", "{\"format\":1}", "[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[",
+                           "{\"format\":\"chainsplat-capture/1\",\"cameras\":[1,null,{}]}"})
+    CHECK(attempt(text) != "");
+}
+
+TEST_CASE("check: nothing to complain about in the demo; wrong poses, clocks and scales are found") {
+  const capture::CheckReport good = capture::check(kDemo);
+  CHECK(good.problems.empty());
+  CHECK(good.doubts.empty());
+  CHECK(any_contains(good.facts, "cam2: 320x240, 60 frames"));
+
+  const Folder folder;
+  const Path copy = folder.path / "demo";
+  std::filesystem::copy(kDemo, copy, std::filesystem::copy_options::recursive);
+  const auto json = nlohmann::ordered_json::parse(core::read_file(kDemo / "capture.json"));
+  const auto checked = [&](const nlohmann::ordered_json& changed) {
+    core::write_file(copy / "capture.json", changed.dump());
+    return capture::check(copy);
+  };
+  SUBCASE("cameras 20 cm off, across the rope and along it; a rope that leaves the other way") {
+    auto changed = json;
+    const auto shift = [&](int camera, int element) {
+      auto& value = changed["cameras"][camera]["world_from_camera"][element];
+      value = value.get<double>() + 0.2;
+    };
+    shift(0, 3);
+    shift(1, 11);
+    const capture::CheckReport report = checked(changed);
+    CHECK(any_contains(report.doubts, "cam0: the grasp projects"));
+    CHECK(any_contains(report.doubts, "of the mask lies behind the grasp"));
+    CHECK_FALSE(any_contains(report.doubts, "cam2"));
+    changed = json;
+    changed["grasp"]["direction"] = {0, 0, 1};
+    CHECK(any_contains(checked(changed).doubts, "cam2: 9"));
+  }
+  SUBCASE("OpenGL axes") {
+    auto changed = json;
+    for (const int i : {1, 2, 5, 6, 9, 10})
+      changed["cameras"][0]["world_from_camera"][i] = -json["cameras"][0]["world_from_camera"][i].get<double>();
+    CHECK(any_contains(checked(changed).doubts, "cam0: the grasp is behind the camera"));
+  }
+  SUBCASE("a clock three frames off") {
+    std::vector<trajectory::Sample> samples = trajectory::read_tum(kDemo / "base.tum");
+    for (trajectory::Sample& sample : samples) sample.time += 0.1;
+    samples.insert(samples.begin(), {0.0, samples.front().pose});
+    core::write_file(copy / "base.tum", trajectory::write_tum(samples));
+    CHECK(any_contains(checked(json).doubts, "fit the base better 3 frames later"));
+  }
+  SUBCASE("depth in millimeters, a rate that is not the video's, a mass left out") {
+    auto changed = json;
+    changed["cameras"][2]["depth_scale"] = 0.001;
+    changed["cameras"][1]["rate"] = 31.0;
+    changed["object"].erase("mass");
+    const capture::CheckReport report = checked(changed);
+    CHECK(any_contains(report.doubts, "cam2: the depth images say"));
+    CHECK(any_contains(report.doubts, "cam1: the video says 30 frames a second, the capture 31"));
+    CHECK(any_contains(report.doubts, "object.mass"));
+    CHECK(report.problems.empty());
+  }
+  SUBCASE("several problems are all named") {
+    auto changed = json;
+    changed["object"]["length"] = -0.3;
+    changed["cameras"][0]["masks"] = "masks/none/%06d.png";
+    changed["cameras"][2]["images"] = "cam9.mp4";
+    const capture::CheckReport report = checked(changed);
+    CHECK(report.problems.size() == 3);
+    CHECK(any_contains(report.problems, "object.length"));
+    CHECK(any_contains(report.problems, "masks/none/000000.png"));
+    CHECK(any_contains(report.problems, "cam9.mp4"));
+    CHECK(any_contains(report.facts, "cam1: 320x240"));  // the sound camera is described all the same
+    CHECK(contains(error_of([&] { capture::load(copy); }), "and 2 more"));
+  }
+}
+
+TEST_CASE("the truth of a capture: refused when it is not one, absent without it") {
+  const Made made;
+  CHECK_FALSE(capture::load_true_centerline(made.path()).has_value());
+  std::filesystem::create_directories(made.path() / "truth");
+  made.write("truth/centreline.csv", "frame,time,x0,y0,z0\n0,0.0,1,2,3\n1,0.1,1,2,oops\n");
+  CHECK(contains(error_of([&] { capture::load_true_centerline(made.path()); }), "centreline.csv:3: column 5"));
+}
+
+TEST_CASE("written images and videos come back") {
+  const Folder folder;
+  core::Random random(1);
+  for (const int channels : {1, 3, 4}) {
+    Image8 image{13, 7, channels, {}};
+    for (int i = 0; i < 13 * 7 * channels; ++i) image.pixels.push_back(static_cast<std::uint8_t>(random.next()));
+    capture::write_png(folder.path / "a.png", image);
+    const Image8 back = capture::read_image8(folder.path / "a.png");
+    CHECK(back.channels == channels);
+    CHECK(back.pixels == image.pixels);
+  }
+  std::vector<float> depth;
+  for (int i = 0; i < 13 * 7; ++i) depth.push_back(static_cast<float>(random.uniform(0, 3)));
+  capture::write_depth_exr(folder.path / "a.depth.exr", 13, 7, depth);
+  CHECK(capture::read_image8(folder.path / "a.depth.exr").width == 13);
+
+  for (const auto& [width, height] : {std::pair{64, 48}, std::pair{33, 21}}) {
+    std::vector<Image8> frames;
+    for (int k = 0; k < 12; ++k)
+      frames.push_back(filled(3, [&](int x, int y) { return std::array<double, 3>{3.0 * x + k, 250.0 - 4 * y, 40.0 + 10 * k}; },
+                              width, height));
+    capture::write_video(folder.path / "a.mp4", 29.97, frames);
+    capture::write_video(folder.path / "b.mp4", 29.97, frames);
+    CHECK(core::read_file(folder.path / "a.mp4") == core::read_file(folder.path / "b.mp4"));
+    CHECK(capture::video_facts(folder.path / "a.mp4").rate == doctest::Approx(29.97).epsilon(1e-3));
+    capture::VideoReader reader(folder.path / "a.mp4");
+    Image8 back;
+    double squares = 0.0, count = 0.0;
+    for (const Image8& frame : frames) {
+      REQUIRE(reader.next(back));
+      REQUIRE(back.width == width);
+      for (std::size_t i = 0; i < back.pixels.size(); ++i, ++count) squares += std::pow(back.pixels[i] - frame.pixels[i], 2);
+    }
+    CHECK_FALSE(reader.next(back));
+    CHECK(std::sqrt(squares / count) < 3.0);
+  }
+  const Image8 small = filled(3, [](int, int) { return std::array<double, 3>{1, 2, 3}; });
+  CHECK_THROWS_AS(capture::write_png(folder.path / "missing" / "a.png", small), WorkError);
+  CHECK_THROWS_AS(capture::write_video(folder.path / "missing" / "a.mp4", 30.0, {small}), WorkError);
+}

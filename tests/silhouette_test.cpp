@@ -1,0 +1,3 @@
+#include <doctest/doctest.h>
+#include "chainsplat/silhouette.h"
+TEST_CASE("empty") {}

@@ -1,0 +1,412 @@
+#include "chainsplat/twin.h"
+
+#include <doctest/doctest.h>
+
+#include <cstring>
+#include <limits>
+#include <nlohmann/json.hpp>
+
+#include "small_twin.h"
+
+using namespace chainsplat;
+using Json = nlohmann::json;
+
+namespace {
+
+std::string message_of(const std::function<void()>& work) {
+  try {
+    work();
+  } catch (const InputError& error) {
+    return error.what();
+  }
+  return "nothing was thrown";
+}
+
+bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
+
+// Bit by bit; NaN equals NaN.
+bool same(double a, double b) { return std::memcmp(&a, &b, sizeof a) == 0 || (std::isnan(a) && std::isnan(b)); }
+
+template <class A>
+bool same_all(const A& a, const A& b) {
+  if (a.size() != b.size()) return false;
+  for (decltype(a.size()) i = 0; i < a.size(); ++i)
+    if (!same(a[i], b[i])) return false;
+  return true;
+}
+
+void check_same_states(const chain::States& a, const chain::States& b) {
+  REQUIRE(a.time.size() == b.time.size());
+  REQUIRE(a.thetadot.size() == b.thetadot.size());
+  CHECK(same_all(a.time, b.time));
+  for (std::size_t i = 0; i < a.theta.size(); ++i) CHECK(same_all(a.theta[i], b.theta[i]));
+  for (std::size_t i = 0; i < a.thetadot.size(); ++i) CHECK(same_all(a.thetadot[i], b.thetadot[i]));
+}
+
+twin::Twin full_twin() {
+  twin::Twin twin = test::small_twin();
+  twin.estimates.names = {"log_stiffness", "rest_angle_3"};
+  twin.estimates.values = {-7.0 / 3.0, 0.1};
+  twin.estimates.standard_errors = {0.01, std::numeric_limits<double>::quiet_NaN()};
+  twin.estimates.covariance = math::MatrixX::Identity(2, 2) / 3.0;
+  twin.estimates.covariance(1, 0) = 1e-300;
+  twin.estimates.held = {{"mass", "given by the capture"}, {"twist", "not observed, \"held\""}};
+  twin.provenance = {"1.2.3", "free \xc3\xa4", "00ff", "llvmpipe", "Mesa", {{"joints", "5"}, {"every", "5"}},
+                     std::numeric_limits<std::uint64_t>::max(), {{"recognize", 61.25}, {"identify", 1.0 / 3.0}}};
+  return twin;
+}
+
+}  // namespace
+
+TEST_CASE("a twin reads back bit by bit") {
+  const test::TemporaryFolder folder("twin");
+  const twin::Twin twin = full_twin();
+  twin::save(twin, folder.path / "run");
+  const twin::Twin read = twin::load(folder.path / "run");
+
+  CHECK(read.tabletop == false);
+  CHECK(same(read.chain.length, twin.chain.length));
+  CHECK(same(read.chain.diameter, twin.chain.diameter));
+  CHECK(same_all(read.chain.direction, twin.chain.direction));
+  CHECK(same_all(read.chain.bending_axis, twin.chain.bending_axis));
+  CHECK(same_all(read.chain.joint_arclength, twin.chain.joint_arclength));
+  CHECK(read.chain.child_link == twin.chain.child_link);
+  REQUIRE(read.chain.axes.size() == twin.chain.axes.size());
+  for (std::size_t k = 0; k < read.chain.axes.size(); ++k) CHECK(read.chain.axes[k] == twin.chain.axes[k]);
+
+  REQUIRE(read.parameters.has_value());
+  const dynamics::Parameters &p = *read.parameters, &q = *twin.parameters;
+  CHECK(same_all(p.link_mass, q.link_mass));
+  CHECK(same_all(p.viscous_friction, q.viscous_friction));
+  CHECK(same_all(p.coulomb_friction, q.coulomb_friction));
+  CHECK(same_all(p.air_linear, q.air_linear));
+  CHECK(same_all(p.air_quadratic, q.air_quadratic));
+  CHECK(same_all(p.stiffness, q.stiffness));
+  CHECK(same_all(p.rest_angle, q.rest_angle));
+  CHECK(same_all(p.damping, q.damping));
+  CHECK(same_all(p.gravity, q.gravity));
+  CHECK(same(p.tip_mass, q.tip_mass));
+  CHECK(same(p.radius, q.radius));
+  CHECK(!p.table_normal);
+  CHECK(same(p.coulomb_speed, q.coulomb_speed));
+  CHECK(same(p.drag_speed, q.drag_speed));
+  CHECK(p.integrator == q.integrator);
+  CHECK(p.substeps == q.substeps);
+
+  REQUIRE(read.initial.has_value());
+  CHECK(same(read.initial->time, twin.initial->time));
+  CHECK(same_all(read.initial->theta, twin.initial->theta));
+  CHECK(same_all(read.initial->thetadot, twin.initial->thetadot));
+  CHECK(read.known_mass);
+  CHECK(read.estimates.names == twin.estimates.names);
+  CHECK(same_all(read.estimates.values, twin.estimates.values));
+  CHECK(same_all(read.estimates.standard_errors, twin.estimates.standard_errors));
+  CHECK(read.estimates.covariance == twin.estimates.covariance);
+  CHECK(read.estimates.held == twin.estimates.held);
+  CHECK(read.provenance.capture == twin.provenance.capture);
+  CHECK(read.provenance.options == twin.provenance.options);
+  CHECK(read.provenance.seed == twin.provenance.seed);
+  CHECK(read.provenance.seconds == twin.provenance.seconds);
+
+  CHECK(read.gaussians.degree == 1);
+  CHECK(read.gaussians.mean == twin.gaussians.mean);
+  CHECK(read.gaussians.rotation == twin.gaussians.rotation);
+  CHECK(read.gaussians.log_scale == twin.gaussians.log_scale);
+  CHECK(read.gaussians.opacity_logit == twin.gaussians.opacity_logit);
+  CHECK(read.gaussians.sh == twin.gaussians.sh);
+  CHECK(read.gaussians.link_logits == twin.gaussians.link_logits);
+  check_same_states(read.states, twin.states);
+  check_same_states(read.rollout, twin.rollout);
+
+  // what was read is written as the same bytes
+  twin::save(read, folder.path / "again");
+  for (const char* name : {"twin.json", "gaussians.ply", "states.csv", "rollout.csv"})
+    CHECK(core::read_file(folder.path / "run" / name) == core::read_file(folder.path / "again" / name));
+}
+
+TEST_CASE("tabletop twins keep their table, thin links and paper's integrator") {
+  const test::TemporaryFolder folder("table");
+  twin::Twin twin = full_twin();
+  twin.tabletop = true;
+  twin.table_point = math::Vector3(0.1, 0.2, 1.0 / 3.0);
+  twin.parameters->table_normal = math::Vector3(0.6, 0, 0.8);
+  twin.parameters->gravity = {0, 0.1, -9.7};
+  twin.parameters->radius = 0.0;
+  twin.parameters->integrator = dynamics::Integrator::implicit_velocity_euler;
+  twin.parameters->substeps = 1;
+  twin.known_mass = false;
+  twin::save(twin, folder.path);
+  const twin::Twin read = twin::load(folder.path);
+  CHECK(read.tabletop);
+  CHECK(*read.table_point == *twin.table_point);
+  CHECK(*read.parameters->table_normal == math::Vector3(0.6, 0, 0.8));
+  CHECK(read.gravity == math::Vector3(0, 0.1, -9.7));
+  CHECK(read.parameters->radius == 0.0);
+  CHECK(read.parameters->integrator == dynamics::Integrator::implicit_velocity_euler);
+  CHECK(read.parameters->substeps == 1);
+  CHECK(!read.known_mass);
+  // a radius that is neither 0 nor half the diameter is found from the inertia
+  twin.parameters->radius = 0.007;
+  twin::save(twin, folder.path);
+  CHECK(twin::load(folder.path).parameters->radius == doctest::Approx(0.007).epsilon(1e-9));
+}
+
+TEST_CASE("a recognized twin without parameters, and an empty one, load") {
+  const test::TemporaryFolder folder("recognized");
+  twin::Twin twin = full_twin();
+  twin.parameters.reset();
+  twin.initial.reset();
+  twin.rollout = {};
+  twin.gravity = {0, 0, -1.6};
+  twin::save(twin, folder.path / "a");
+  CHECK(!std::filesystem::exists(folder.path / "a" / "rollout.csv"));
+  const twin::Twin read = twin::load(folder.path / "a");
+  CHECK(!read.parameters);
+  CHECK(!read.initial);
+  CHECK(read.known_mass);
+  CHECK(read.gravity == math::Vector3(0, 0, -1.6));
+  CHECK(read.rollout.time.empty());
+  check_same_states(read.states, twin.states);
+
+  twin.gaussians = {};
+  twin.states = {};
+  twin::save(twin, folder.path / "b");
+  CHECK(twin::load(folder.path / "b").gaussians.count == 0);
+}
+
+TEST_CASE("twin.json has the keys that other programs read") {
+  const test::TemporaryFolder folder("keys");
+  twin::save(full_twin(), folder.path);
+  const Json json = Json::parse(core::read_file(folder.path / "twin.json"));
+  const auto keys = [](const Json& object) {
+    std::vector<std::string> out;
+    for (const auto& [key, value] : object.items()) out.push_back(key);
+    return out;  // sorted by nlohmann::json
+  };
+  using Keys = std::vector<std::string>;
+  CHECK(keys(json) == Keys{"chain", "format", "gaussians", "grasp", "identification", "provenance", "rollout", "states"});
+  CHECK(keys(json["chain"]) == Keys{"air_drag", "diameter", "gravity", "initial_state", "integrator", "joints", "length",
+                                    "links", "regularization", "scenario", "tip_mass"});
+  CHECK(keys(json["chain"]["joints"][0]) == Keys{"axis", "child_link", "damping", "parent_link", "rest_angle", "stiffness"});
+  CHECK(keys(json["chain"]["links"][0]) ==
+        Keys{"center_of_mass", "coulomb_friction", "inertia", "length", "mass", "viscous_friction"});
+  CHECK(json["chain"]["joints"].size() == 10);
+  CHECK(json["chain"]["links"].size() == 6);
+  // both axes of a joint name the same links
+  CHECK(json["chain"]["joints"][3]["parent_link"] == 1);
+  CHECK(json["chain"]["joints"][3]["child_link"] == 2);
+  // a cylinder along z: SPEC 3.1 by hand
+  const Json& link = json["chain"]["links"][2];
+  const double m = link["mass"], l = link["length"], r = 0.01;
+  CHECK(link["inertia"][0].get<double>() == doctest::Approx(m * (l * l / 12 + r * r / 4)));
+  CHECK(link["inertia"][2].get<double>() == doctest::Approx(m * r * r / 2));
+  CHECK(link["center_of_mass"][2].get<double>() == doctest::Approx(-l / 2));
+  CHECK(json["chain"]["air_drag"]["quadratic"].get<double>() == doctest::Approx(0.0144 / 3));
+}
+
+TEST_CASE("air drag that is not proportional to length becomes its mean per meter") {
+  const test::TemporaryFolder folder("drag");
+  twin::Twin twin = full_twin();
+  double sum = 0.0;
+  for (std::size_t j = 0; j < 5; ++j) sum += twin.parameters->air_quadratic[j] = 1e-3 * static_cast<double>(1 + j);
+  twin::save(twin, folder.path);
+  const auto read = twin::load(folder.path).parameters->air_quadratic;
+  double total = 0.0;
+  for (const double value : read) total += value;
+  CHECK(total == doctest::Approx(sum).epsilon(1e-12));
+}
+
+TEST_CASE("damage to twin.json is named by file and key") {
+  const test::TemporaryFolder folder("damage");
+  twin::save(full_twin(), folder.path);
+  const Path file = folder.path / "twin.json";
+  const Json good = Json::parse(core::read_file(file));
+  const auto error_with = [&](const char* pointer, const Json& value) {
+    Json bad = good;
+    if (value.is_discarded())
+      bad[Json::json_pointer(pointer).parent_pointer()].erase(Json::json_pointer(pointer).back());
+    else
+      bad[Json::json_pointer(pointer)] = value;
+    core::write_file(file, bad.dump());
+    return message_of([&] { twin::load(folder.path); });
+  };
+  const Json removed(Json::value_t::discarded);
+  const std::tuple<const char*, Json, const char*> cases[] = {
+      {"/format", "chainsplat-twin/9", "format"},
+      {"/chain", removed, "chain is missing"},
+      {"/chain/length", "0.3", "chain.length"},
+      {"/chain/length", -0.3, "chain.length"},
+      {"/chain/diameter", nullptr, "chain.diameter"},
+      {"/chain/gravity", Json::array({0, 0}), "chain.gravity"},
+      {"/chain/scenario", "water", "chain.scenario"},
+      {"/chain/scenario", "tabletop", "chain.table is missing"},
+      {"/chain/joints/3/axis", removed, "chain.joints[3].axis is missing"},
+      {"/chain/joints/3/axis/1", "x", "chain.joints[3].axis[1]"},
+      {"/chain/joints/3/axis/4", 0.2, "chain.joints[3].axis"},
+      {"/chain/joints/3/child_link", 4, "chain.joints[3].child_link"},
+      {"/chain/joints/3/parent_link", 0, "chain.joints[3].parent_link"},
+      {"/chain/joints/3/stiffness", -1, "chain.joints[3].stiffness"},
+      {"/chain/joints", Json::array(), "chain.joints"},
+      {"/chain/joints", 5, "chain.joints"},
+      {"/chain/links/2/length", 0.01, "chain."},
+      {"/chain/links/2/mass", true, "chain.links[2].mass"},
+      {"/chain/links/2/inertia/0", 1.0, "inertia"},
+      {"/chain/links/2/center_of_mass/0", 1.0, "chain.links[2].center_of_mass"},
+      {"/chain/links/5", removed, "chain.links"},
+      {"/chain/integrator/name", "euler", "chain.integrator.name"},
+      {"/chain/integrator/substeps", 1.5, "chain.integrator.substeps"},
+      {"/chain/initial_state/theta", Json::array({1, 2}), "chain.initial_state.theta"},
+      {"/grasp/direction/0", 3.0, "grasp.direction"},
+      {"/grasp/bending_axis", Json::array({0, 0, 1}), "grasp.bending_axis"},
+      {"/identification/estimates", Json::array({1}), "identification.estimates"},
+      {"/identification/held/0/reason", removed, "identification.held[0].reason"},
+      {"/provenance/seed", -1, "provenance.seed"},
+      {"/gaussians", "../elsewhere.ply", "gaussians"},
+      {"/states", "absent.csv", "absent.csv"},
+  };
+  for (const auto& [pointer, value, expected] : cases) {
+    const std::string message = error_with(pointer, value);
+    std::string flat = message;  // "file: key: what" and "file: key is missing" alike
+    for (std::size_t at; (at = flat.find(": is missing")) != std::string::npos;) flat.replace(at, 2, " ");
+    INFO(pointer << " -> " << message);
+    CHECK(contains(flat, expected));
+    CHECK(contains(message, folder.path.string()));
+    CHECK(!contains(message, "\n"));
+  }
+  // cut off anywhere: an error, never a crash
+  const std::string text = good.dump();
+  for (std::size_t size = 0; size < text.size(); size += 97) {
+    core::write_file(file, text.substr(0, size));
+    CHECK(contains(message_of([&] { twin::load(folder.path); }), "twin.json"));
+  }
+  CHECK(contains(message_of([&] { twin::load(folder.path / "absent"); }), "twin.json"));
+}
+
+TEST_CASE("states keep their digits, and damage is named by line") {
+  const test::TemporaryFolder folder("states");
+  const Path file = folder.path / "states.csv";
+  const chain::Chain chain = chain::make_chain(0.3, 0.02, {0, 0, -1}, {0, 1, 0}, 3, chain::Bending::planar, false);
+  chain::States states = test::swing(chain, 0.5);
+  states.theta[2][1] = 1e-310;
+  CHECK(twin::states_csv(states).starts_with("time,theta_1,theta_2,theta_3,thetadot_1,thetadot_2,thetadot_3\n0,"));
+  core::write_file(file, twin::states_csv(states));
+  check_same_states(twin::read_states(file, 3), states);
+  states.thetadot.clear();
+  CHECK(twin::states_csv(states).starts_with("time,theta_1,theta_2,theta_3\n"));
+  core::write_file(file, twin::states_csv(states));
+  check_same_states(twin::read_states(file, 3), states);
+  CHECK(contains(message_of([&] { twin::read_states(file, 8); }), "8 angles"));
+
+  const std::string head = "time,theta_1\n";
+  for (const auto& [text, expected] : std::initializer_list<std::pair<std::string, const char*>>{
+           {head + "0,1\r\n0.1,\n", ":3: column 2"},
+           {head + "0,1\n0.1,x\n", ":3: column 2"},
+           {head + "0,1\n0.1,nan\n", ":3: column 2"},
+           {head + "0,1\n0.1,2,3\n", ":3: 3 columns"},
+           {head + "0.1,1\n\n0.1,2\n", ":4: its time"},
+           {"t,theta_1\n0,1\n", ":1: is not the header"},
+           {head, "no state"},
+           {"", "no state"}}) {
+    core::write_file(file, text);
+    const std::string message = message_of([&] { twin::read_states(file, 1); });
+    INFO(message);
+    CHECK(contains(message, expected));
+  }
+  CHECK(contains(message_of([&] { twin::read_states(folder.path / "absent.csv", 1); }), "absent.csv"));
+}
+
+TEST_CASE("centerlines are the nodes in the world") {
+  const chain::Chain chain = chain::make_chain(0.4, 0.02, {0, 0, -1}, {0, 1, 0}, 2, chain::Bending::planar, false);
+  chain::States states;
+  states.time = {0.5};
+  // 90 degrees about y at the grasp turns -z to -x; the second joint turns on to +z
+  states.theta = {math::Vector2(M_PI / 2, M_PI / 2)};
+  const auto base = trajectory::fit({{0.0, {math::Matrix3::Identity(), {1, 2, 3}}}}, "base");
+  const std::string text = twin::centerline_csv(chain, states, base);
+  CHECK(text.starts_with("time,x_0,y_0,z_0,x_1,y_1,z_1,x_2,y_2,z_2,x_3,y_3,z_3\n0.5,"));
+  std::vector<double> numbers;
+  std::string row = text.substr(text.find('\n') + 1);
+  for (char& c : row) c = c == ',' ? ' ' : c;
+  std::istringstream in(row);
+  for (double x; in >> x;) numbers.push_back(x);
+  const std::vector<double> expected{0.5, 1, 2, 3, 1, 2, 3, 0.8, 2, 3, 0.8, 2, 3.2};
+  REQUIRE(numbers.size() == expected.size());
+  for (std::size_t i = 0; i < expected.size(); ++i) CHECK(numbers[i] == doctest::Approx(expected[i]).epsilon(1e-12));
+}
+
+TEST_CASE("gaussians.ply has the layout of 3DGS") {
+  splat::Gaussians g;
+  g.resize(2, 3, 1);
+  for (std::size_t i = 0; i < g.sh.size(); ++i) g.sh[i] = 100.0f + static_cast<float>(i);  // 100 + 12 gaussian + 3 coefficient + channel
+  for (int i = 0; i < 8; ++i) g.rotation[i] = 0.1f * static_cast<float>(i + 1);
+  g.mean = {1, 2, 3, 4, 5, 6};
+  g.log_scale = {-1, -2, -3, -4, -5, -6};
+  g.opacity_logit = {7, 8};
+  g.link_logits = {20, 21, 22, 30, 31, 32};
+  const std::string bytes = twin::gaussians_ply(g);
+  const std::size_t data = bytes.find("end_header\n") + 11;
+  std::string properties;
+  for (std::size_t at = 0; (at = bytes.find("property float ", at)) < data; at += 15)
+    properties += bytes.substr(at + 15, bytes.find('\n', at) - at - 15) + " ";
+  CHECK(properties ==
+        "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 f_rest_0 f_rest_1 f_rest_2 f_rest_3 f_rest_4 f_rest_5 f_rest_6 f_rest_7 f_rest_8 "
+        "opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 link_0 link_1 link_2 ");
+  REQUIRE(bytes.size() - data == 2 * 29 * sizeof(float));
+  float second[29];
+  std::memcpy(second, bytes.data() + data + sizeof second, sizeof second);
+  const float expected[29] = {4,   5,   6,   0,   0,   0,  112, 113, 114,             // coefficient 0
+                              115, 118, 121, 116, 119, 122, 117, 120, 123,            // all red, all green, all blue
+                              8,   -4,  -5,  -6,  0.5f, 0.6f, 0.1f * 7, 0.8f, 30, 31, 32};
+  for (int i = 0; i < 29; ++i) {
+    INFO(i);
+    CHECK(second[i] == expected[i]);
+  }
+}
+
+TEST_CASE("other programs' splats are read; damaged ones are refused") {
+  const test::TemporaryFolder folder("ply");
+  const Path file = folder.path / "g.ply";
+  // another order, a property of another type, no normals, no link_*
+  std::string bytes = "ply\r\nformat binary_little_endian 1.0\nelement vertex 1\nproperty double time\n";
+  const char* const names[] = {"rot_0", "rot_1", "rot_2", "rot_3", "x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2",
+                               "f_dc_0", "f_dc_1", "f_dc_2"};
+  for (const char* name : names) bytes += std::string("property float ") + name + "\n";
+  bytes += "element face 0\nproperty list uchar int vertex_indices\nend_header\n";
+  const double time = 5.0;
+  bytes.append(reinterpret_cast<const char*>(&time), sizeof time);
+  for (int i = 0; i < 14; ++i) {
+    const float value = static_cast<float>(i + 1);
+    bytes.append(reinterpret_cast<const char*>(&value), sizeof value);
+  }
+  core::write_file(file, bytes);
+  const splat::Gaussians g = twin::read_ply(file);
+  CHECK(g.count == 1);
+  CHECK(g.links == 0);
+  CHECK(g.degree == 0);
+  CHECK(g.rotation == std::vector<float>{1, 2, 3, 4});
+  CHECK(g.mean == std::vector<float>{5, 6, 7});
+  CHECK(g.sh == std::vector<float>{12, 13, 14});
+
+  const std::string good = twin::gaussians_ply(test::small_twin(chain::Bending::planar, 20).gaussians);
+  for (std::size_t size = 0; size < good.size(); size += 53) {
+    core::write_file(file, good.substr(0, size));
+    CHECK(contains(message_of([&] { twin::read_ply(file); }), "g.ply"));
+  }
+  const auto replaced = [&](const std::string& from, const std::string& to) {
+    std::string bad = good;
+    bad.replace(bad.find(from), from.size(), to);
+    core::write_file(file, bad);
+    return message_of([&] { twin::read_ply(file); });
+  };
+  CHECK(contains(replaced("binary_little_endian", "ascii"), "format 'ascii'"));
+  CHECK(contains(replaced("vertex 20", "vertex 99999999999999999"), "ends before"));
+  CHECK(contains(replaced("vertex 20", "vertex -1"), "number of vertices"));
+  CHECK(contains(replaced("float opacity", "float opagness"), "'opacity'"));
+  CHECK(contains(replaced("float f_rest_8", "float g_rest_8"), "f_rest"));
+  CHECK(contains(replaced("float f_dc_0", "list uchar"), "is not understood"));
+  std::string bad = good;
+  const float nan = std::numeric_limits<float>::quiet_NaN();
+  std::memcpy(bad.data() + bad.size() - 4, &nan, 4);
+  core::write_file(file, bad);
+  CHECK(contains(message_of([&] { twin::read_ply(file); }), "link_5 of Gaussian 19"));
+}

@@ -1,0 +1,184 @@
+// progress.cpp - what the user sees while work is going on, and the log of it.
+#include <sys/ioctl.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cmath>
+#include <csignal>
+#include <cstdio>
+#include <cstdlib>
+#include <fstream>
+#include <nlohmann/json.hpp>
+#include <vector>
+
+#include "cli.h"
+
+namespace chainsplat::tools {
+
+namespace {
+
+constexpr double kRedrawSeconds = 0.1;  // a faster line flickers
+constexpr double kPlainSeconds = 5.0;   // between lines where standard error is no terminal
+constexpr double kLogSeconds = 1.0;     // between records of one stage
+constexpr int kBarCells = 24;
+constexpr int kDefaultColumns = 80;
+
+// All of the program's one terminal. core calls the listener under a lock; messages come from the main thread.
+struct Screen {
+  bool quiet = false, verbose = false, progress = true, terminal = false, bold = false;
+  bool line_open = false;        // a redrawn line stands on the terminal
+  double origin = 0.0;           // s, start of the program
+  std::string stage;
+  double stage_start = 0.0, last_shown = 0.0, last_logged = 0.0;
+  std::int64_t first_step = 0;   // of this stage in this process: a resumed one does not begin at 0
+  std::vector<std::ofstream> logs;
+};
+Screen screen;
+
+std::string number(const char* format, double value) {
+  char text[64];
+  std::snprintf(text, sizeof text, format, value);
+  return text;
+}
+
+std::string clock_text(double seconds) {
+  const auto whole = static_cast<long long>(std::llround(seconds));
+  char text[64];
+  if (whole >= 3600)
+    std::snprintf(text, sizeof text, "%lld:%02lld:%02lld", whole / 3600, whole / 60 % 60, whole % 60);
+  else
+    std::snprintf(text, sizeof text, "%lld:%02lld", whole / 60, whole % 60);
+  return text;
+}
+
+int columns() {
+  winsize size{};
+  return ioctl(STDERR_FILENO, TIOCGWINSZ, &size) == 0 && size.ws_col > 0 ? size.ws_col : kDefaultColumns;
+}
+
+std::string progress_line(const Progress& progress, double now, bool with_bar) {
+  std::string line;
+  const double share = progress.total > 0 ? std::clamp(double(progress.step) / double(progress.total), 0.0, 1.0) : 0.0;
+  if (with_bar && progress.total > 0) {
+    const int cells = static_cast<int>(share * kBarCells);
+    line += " [" + std::string(cells, '#') + std::string(kBarCells - cells, '-') + "]";
+  }
+  if (progress.total > 0)
+    line += " " + std::to_string(progress.step) + "/" + std::to_string(progress.total) + number(" %3.0f%%", 100 * share);
+  const double elapsed = now - screen.stage_start;
+  const double rate = elapsed > 0 ? double(progress.step - screen.first_step) / elapsed : 0.0;
+  if (rate > 0) {
+    line += number(rate < 10 ? "  %.2f/s" : "  %.0f/s", rate);
+    line += "  ETA " + clock_text(std::max(0.0, double(progress.total - progress.step) / rate));
+  }
+  if (std::isfinite(progress.loss)) line += number("  loss %.4g", progress.loss);
+  if (std::isfinite(progress.psnr)) line += number("  PSNR %.1f dB", progress.psnr);
+  if (!progress.note.empty()) line += "  " + progress.note;
+  return line;
+}
+
+void clear_line() {
+  if (screen.line_open) std::fputs("\r\x1b[K", stderr);
+  screen.line_open = false;
+}
+
+void show(const Progress& progress, double now, bool last) {
+  if (!screen.progress) return;
+  if (now - screen.last_shown < (screen.terminal ? kRedrawSeconds : kPlainSeconds) && !(last && screen.terminal)) return;
+  screen.last_shown = now;
+  std::string line = progress_line(progress, now, screen.terminal);
+  if (!screen.terminal) {
+    std::fprintf(stderr, "%s%s\n", progress.stage.c_str(), line.c_str());
+    return;
+  }
+  const int room = std::max(0, columns() - 1 - static_cast<int>(progress.stage.size()));
+  line.resize(std::min<std::size_t>(line.size(), room));
+  clear_line();
+  std::fprintf(stderr, "%s%s%s%s", screen.bold ? "\x1b[1m" : "", progress.stage.c_str(), screen.bold ? "\x1b[0m" : "",
+               line.c_str());
+  std::fflush(stderr);
+  screen.line_open = true;
+}
+
+void log(const Progress& progress, double now, bool last) {
+  if (screen.logs.empty() || (now - screen.last_logged < kLogSeconds && !last)) return;
+  screen.last_logged = now;
+  nlohmann::ordered_json record;
+  record["stage"] = progress.stage;
+  record["iteration"] = progress.step;
+  record["total"] = progress.total;
+  record["loss"] = progress.loss;  // NaN is written as null
+  record["psnr"] = progress.psnr;
+  record["seconds"] = std::round((now - screen.origin) * 1e3) / 1e3;
+  for (std::ofstream& file : screen.logs) file << record.dump() << std::endl;
+}
+
+void on_progress(const Progress& progress) {
+  const double now = core::seconds_now();
+  const bool fresh = progress.stage != screen.stage;
+  if (fresh) {
+    end_progress();
+    screen.stage = progress.stage;
+    screen.stage_start = now;
+    screen.first_step = progress.step;
+    screen.last_logged = screen.last_shown = 0.0;
+  }
+  const bool last = progress.total > 0 && progress.step >= progress.total;
+  show(progress, now, last);
+  log(progress, now, fresh || last);
+}
+
+extern "C" void on_signal(int signal) {
+  if (signal == SIGINT && core::stop_requested() == SIGINT) _exit(128 + SIGINT);
+  core::request_stop(signal);
+}
+
+}  // namespace
+
+void start_listening(const Globals& globals) {
+  const char* kind = std::getenv("TERM");
+  screen.quiet = globals.quiet;
+  screen.verbose = globals.verbose;
+  screen.progress = !globals.quiet && !globals.no_progress;
+  screen.terminal = isatty(STDERR_FILENO) && !(kind && std::string(kind) == "dumb");
+  screen.bold = screen.terminal && !std::getenv("NO_COLOR");
+  screen.origin = core::seconds_now();
+  core::Listener listener;
+  listener.warning = [](const std::string& line) {
+    clear_line();
+    std::fprintf(stderr, "chainsplat: warning: %s\n", line.c_str());
+  };
+  listener.progress = on_progress;
+  core::set_listener(std::move(listener));
+}
+
+void log_to(const Path& file) {
+  std::ofstream stream(file, std::ios::app);
+  if (!stream) throw InputError(file.string(), "the log cannot be opened for writing", "name a file that can be written");
+  screen.logs.push_back(std::move(stream));
+}
+
+void end_progress() {
+  if (screen.line_open) std::fputc('\n', stderr);
+  screen.line_open = false;
+}
+
+void say(const std::string& line) {
+  if (screen.quiet) return;
+  end_progress();
+  std::fprintf(stderr, "%s\n", line.c_str());
+}
+
+void say_more(const std::string& line) {
+  if (screen.verbose) say(line);
+}
+
+void watch_signals() {
+  struct sigaction action {};
+  action.sa_handler = on_signal;
+  sigemptyset(&action.sa_mask);
+  action.sa_flags = SA_RESTART;
+  for (const int signal : {SIGINT, SIGTERM, SIGUSR1}) sigaction(signal, &action, nullptr);
+}
+
+}  // namespace chainsplat::tools

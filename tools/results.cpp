@@ -1,0 +1,82 @@
+// results.cpp - where results may go, and how they get there.
+#include <unistd.h>
+
+#include <charconv>
+#include <fstream>
+#include <iostream>
+
+#include "cli.h"
+
+namespace chainsplat::tools {
+
+namespace fs = std::filesystem;
+
+Path input_path(const std::string& name) { return name == "-" ? Path("/dev/stdin") : Path(name); }
+
+void write_result(const std::string& name, const std::string& bytes) {
+  std::error_code error;
+  if (name == "-") {
+    std::cout << bytes;
+  } else if (fs::exists(name, error) && !fs::is_regular_file(name, error)) {
+    // a device or a pipe must be written into, not replaced
+    std::ofstream file(name, std::ios::binary);
+    file << bytes;
+    file.flush();
+    if (!file) throw WorkError(name, "writing failed", "make room or name another file");
+  } else {
+    core::write_file(name, bytes);
+  }
+}
+
+void check_output_folder(const Path& folder, bool overwrite, const std::string& mend) {
+  std::error_code error;
+  if (fs::exists(folder, error) && !fs::is_directory(folder, error))
+    throw InputError(folder.string(), "is a file, not a folder", "name another folder");
+  if (fs::is_directory(folder, error) && !fs::is_empty(folder, error) && !overwrite)
+    throw InputError(folder.string(), "is there already and not empty", mend);
+  Path above = fs::absolute(folder).lexically_normal();
+  while (!fs::exists(above, error) && above.has_relative_path()) above = above.parent_path();
+  if (!fs::is_directory(above, error) || ::access(above.c_str(), W_OK | X_OK) != 0)
+    throw InputError(folder.string(), "cannot be made in " + above.string(), "name a folder that can be written");
+}
+
+void check_output_file(const std::string& file) {
+  std::error_code error;
+  if (file == "-") return;
+  if (fs::is_directory(file, error)) throw InputError(file, "is a folder, not a file", "name a file");
+  const Path folder = fs::absolute(file).parent_path();
+  if (!fs::is_directory(folder, error))
+    throw InputError(file, "its folder does not exist", "make the folder or name another file");
+  if (::access(folder.c_str(), W_OK | X_OK) != 0 && !fs::exists(file, error))
+    throw InputError(file, "its folder cannot be written", "name another file");
+}
+
+void make_folder(const Path& folder) {
+  std::error_code error;
+  fs::create_directories(folder, error);
+  if (error)
+    throw WorkError(folder.string(), "cannot be made (" + error.message() + ")",
+                    "make room or choose a folder that can be written");
+}
+
+std::pair<int, int> parse_frames(const std::string& text) {
+  if (text.empty()) return {0, -1};
+  const auto fail = [&] {
+    return InputError("--frames", "'" + text + "' is no range of frames", "give A:B, for example 0:60 for the first 60");
+  };
+  const std::size_t colon = text.find(':');
+  if (colon == std::string::npos) throw fail();
+  const auto parse = [&](std::string_view part, int absent) {
+    if (part.empty()) return absent;
+    int value = 0;
+    const auto [end, error] = std::from_chars(part.data(), part.data() + part.size(), value);
+    if (error != std::errc() || end != part.data() + part.size() || value < 0) throw fail();
+    return value;
+  };
+  const int first = parse(std::string_view(text).substr(0, colon), 0);
+  const int last = parse(std::string_view(text).substr(colon + 1), -1);
+  if (last >= 0 && last <= first) throw fail();
+  return {first, last};
+}
+
+}  // namespace chainsplat::tools

@@ -1,0 +1,126 @@
+#include "run_folder.h"
+
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <sstream>
+
+#include "cli.h"
+
+namespace chainsplat::tools {
+
+twin::Twin load_twin(const Path& run) {
+  twin::Twin twin = twin::load(run);
+  if (twin.states.time.empty())
+    throw InputError(run.string(), "holds no recognized states", "finish 'chainsplat recognize' or 'chainsplat train' first");
+  return twin;
+}
+
+trajectory::Trajectory read_base(const std::string& file) {
+  const Path path = input_path(file);
+  return trajectory::fit(trajectory::read_tum(path), path.string());
+}
+
+trajectory::Trajectory own_base(const Path& run) {
+  const Path file = run / kBaseFile;
+  std::error_code error;
+  if (!std::filesystem::exists(file, error))
+    throw InputError(file.string(), "is missing", "give --base with the base motion, or copy the capture's base file there");
+  return read_base(file.string());
+}
+
+dynamics::Model model_of(const twin::Twin& twin, const Path& run) {
+  if (!twin.parameters)
+    throw InputError((run / "twin.json").string(), "its dynamics are not identified", "run 'chainsplat identify' on it first");
+  return dynamics::make_model(twin.chain, *twin.parameters);
+}
+
+std::string covariance_csv(const chain::States& states, const std::vector<math::MatrixX>& covariances) {
+  std::string text = "time";
+  const Eigen::Index angles = covariances.front().rows();
+  for (Eigen::Index row = 0; row < angles; ++row)
+    for (Eigen::Index column = 0; column <= row; ++column)
+      text += ",c_" + std::to_string(row + 1) + "_" + std::to_string(column + 1);
+  text += "\n";
+  for (std::size_t k = 0; k < covariances.size(); ++k) {
+    text += core::exact(states.time[k]);
+    for (Eigen::Index row = 0; row < angles; ++row)
+      for (Eigen::Index column = 0; column <= row; ++column) text += "," + core::exact(covariances[k](row, column));
+    text += "\n";
+  }
+  return text;
+}
+
+std::vector<math::MatrixX> read_covariances(const Path& file, const chain::States& states) {
+  std::error_code error;
+  if (!std::filesystem::exists(file, error)) return {};
+  std::istringstream lines(core::read_file(file));
+  std::string line;
+  std::getline(lines, line);  // the head
+  const Eigen::Index angles = states.theta.front().size();
+  std::vector<math::MatrixX> covariances;
+  while (std::getline(lines, line)) {
+    math::MatrixX covariance(angles, angles);
+    const char* at = line.c_str();
+    char* end = nullptr;
+    bool good = covariances.size() < states.time.size() && std::strtod(at, &end) == states.time[covariances.size()];
+    for (Eigen::Index row = 0; row < angles && good; ++row)
+      for (Eigen::Index column = 0; column <= row && good; ++column) {
+        good = *end == ',';
+        if (!good) break;
+        at = end + 1;
+        covariance(row, column) = covariance(column, row) = std::strtod(at, &end);
+        good = end != at && std::isfinite(covariance(row, column));
+      }
+    if (!good || *end != '\0')
+      throw InputError(file.string() + ": line " + std::to_string(covariances.size() + 2), "does not fit states.csv",
+                       "remove the file (the weights of the frames are then equal) or recognize again");
+    covariances.push_back(std::move(covariance));
+  }
+  if (covariances.size() != states.time.size())
+    throw InputError(file.string(), "has not as many rows as states.csv",
+                     "remove the file (the weights of the frames are then equal) or recognize again");
+  return covariances;
+}
+
+std::string hash_text(std::uint64_t hash) {
+  char text[32];
+  std::snprintf(text, sizeof text, "%016llx", static_cast<unsigned long long>(hash));
+  return text;
+}
+
+std::string metrics_table(const std::vector<MetricsRow>& rows) {
+  constexpr double kMillimeters = 1e3;
+  std::string text = "                    PSNR dB  object dB    SSIM     IoU  Chamfer mm  centerline mm\n";
+  const auto cell = [&](int width, int digits, double value) {
+    char out[64];
+    if (std::isfinite(value))
+      std::snprintf(out, sizeof out, "%*.*f", width, digits, value);
+    else
+      std::snprintf(out, sizeof out, "%*s", width, "-");
+    text += out;
+  };
+  for (const MetricsRow& row : rows) {
+    char name[64];
+    std::snprintf(name, sizeof name, "%-18.40s", row.name.c_str());
+    text += name;
+    cell(9, 2, row.metrics.psnr);
+    cell(11, 2, row.metrics.psnr_object);
+    cell(8, 4, row.metrics.ssim);
+    cell(8, 3, row.metrics.iou);
+    cell(12, 2, kMillimeters * row.metrics.chamfer);
+    cell(15, 2, kMillimeters * row.metrics.centerline_rms);
+    text += "\n";
+  }
+  return text;
+}
+
+std::string metrics_json(const eval::Metrics* recognized, const eval::Metrics* rollout) {
+  std::string text = "{";
+  if (recognized) text += "\"recognized\": " + eval::to_json(*recognized);
+  if (recognized && rollout) text += ",\n";
+  if (rollout) text += "\"rollout\": " + eval::to_json(*rollout);
+  return text + "}\n";
+}
+
+}  // namespace chainsplat::tools

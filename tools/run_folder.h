@@ -1,0 +1,42 @@
+// run_folder.h - what the program keeps in a run folder beside the twin, and how it tells of the result.
+#pragma once
+#include <string>
+#include <vector>
+
+#include "chainsplat/capture.h"
+#include "chainsplat/eval.h"
+#include "chainsplat/twin.h"
+
+namespace chainsplat::tools {
+
+inline constexpr const char* kBaseFile = "base.tum";              // the capture's own base motion
+inline constexpr const char* kCovarianceFile = "covariance.csv";  // of the recognized angles
+inline constexpr const char* kMetricsFile = "metrics.json";
+inline constexpr const char* kLogFile = "log.jsonl";
+inline constexpr const char* kCheckpointFolder = "checkpoint";
+
+// The twin in `run` with something recognized in it. Throws InputError.
+twin::Twin load_twin(const Path& run);
+// The base motion of `file` ("-": standard input).
+trajectory::Trajectory read_base(const std::string& file);
+// The base motion of the capture that the twin was made from, as kept in its folder. Throws InputError.
+trajectory::Trajectory own_base(const Path& run);
+dynamics::Model model_of(const twin::Twin& twin, const Path& run);  // throws InputError before identification
+
+// 'time,c_1_1,c_2_1,c_2_2,...': the lower triangle of every frame's covariance of theta, rad^2.
+std::string covariance_csv(const chain::States& states, const std::vector<math::MatrixX>& covariances);
+// Empty where the file is missing. Throws InputError where it does not fit the states.
+std::vector<math::MatrixX> read_covariances(const Path& file, const chain::States& states);
+
+std::string hash_text(std::uint64_t hash);
+
+// One named row of metrics a line, with the head line; NaN as '-'.
+struct MetricsRow {
+  std::string name;
+  eval::FrameMetrics metrics;
+};
+std::string metrics_table(const std::vector<MetricsRow>& rows);
+// { "recognized": M, "rollout": M }; null pointers are left out.
+std::string metrics_json(const eval::Metrics* recognized, const eval::Metrics* rollout);
+
+}  // namespace chainsplat::tools
