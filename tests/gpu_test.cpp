@@ -1,5 +1,5 @@
-// Tests of chainsplat/gpu.h. Devices are opened with validation, and most lists run twice: with what the device offers, and
-// as on the least device (descriptor sets, staged transfers). Expected values are computed by the host.
+// Tests of chainsplat/gpu.h. Devices are opened with validation, and most lists run twice: with what the device offers,
+// and as on the least device (descriptor sets, staged transfers). Expected values are computed by the host.
 #include "chainsplat/gpu.h"
 
 #include <doctest/doctest.h>
@@ -260,7 +260,8 @@ TEST_CASE("saxpy, resubmitted and recorded again, on both descriptor paths and b
         commands.wait();
         gpu::download(*device, y, result.data(), kCount * 4);
         std::size_t wrong = 0;
-        for (std::uint32_t i = 0; i < kCount; ++i) wrong += result[i] != a[i] + b[i];  // exact: halves of small integers
+        // exact: halves of small integers
+        for (std::uint32_t i = 0; i < kCount; ++i) wrong += result[i] != a[i] + b[i];
         CHECK(wrong == 0);
         commands.begin();  // nothing refers to the pipeline any more when it goes
       }
@@ -457,7 +458,8 @@ TEST_CASE("broken promises are caught before the driver sees them") {
 
 TEST_CASE("synchronization validation sees a missing barrier") {
   gpu::DevicePtr device = open_validated();
-  Buffer a(*device, 4096, Domain::device, "a"), b(*device, 4096, Domain::device, "b"), c(*device, 4096, Domain::device, "c");
+  Buffer a(*device, 4096, Domain::device, "a"), b(*device, 4096, Domain::device, "b"),
+      c(*device, 4096, Domain::device, "c");
   Pipeline add(*device, "test_add", 2, 0, {64, 1});
   const Buffer* const first[] = {&a, &b};
   const Buffer* const second[] = {&b, &c};
@@ -536,6 +538,18 @@ TEST_CASE("the pipeline cache is kept, and a damaged or unwritable one is no tro
   Environment no_cache("XDG_CACHE_HOME", nullptr);
   CHECK(gpu::examine().pipeline_cache.empty());
   work();
+}
+
+TEST_CASE("any damage to a cache file is seen") {
+  const std::string data = "forty-two bytes of somebody's compiled code";
+  const std::string content = gpu::with_checksum(data);
+  CHECK(gpu::without_checksum(content) == data);
+  for (std::size_t i = 0; i < content.size(); ++i) {
+    std::string damaged = content;
+    damaged[i] ^= 1;
+    CHECK(gpu::without_checksum(damaged).empty());
+    CHECK(gpu::without_checksum(content.substr(0, i)).empty());
+  }
 }
 
 TEST_CASE("what a submit and a dispatch cost") {

@@ -1,3 +1,357 @@
-#include <doctest/doctest.h>
+// The silhouette fit against masks drawn from a known chain (surface points, no code in common with the fit) and against
+// the truth of the demo capture.
 #include "chainsplat/silhouette.h"
-TEST_CASE("empty") {}
+
+#include <doctest/doctest.h>
+
+#include <cmath>
+
+namespace {
+
+using namespace chainsplat;
+using chain::Bending;
+using chain::Chain;
+using math::MatrixX;
+using math::Pose;
+using math::Vector3;
+using math::VectorX;
+
+constexpr double kPi = 3.14159265358979323846;
+constexpr double kLength = 0.30, kDiameter = 0.02;
+
+Chain rope(Bending bending, bool twist = false) {
+  return chain::make_chain(kLength, kDiameter, -Vector3::UnitZ(), Vector3::UnitY(), 8, bending, twist);
+}
+
+// A camera at `eye` that looks at `at`, world z up.
+capture::Camera camera(const Vector3& eye, const Vector3& at) {
+  capture::Camera c;
+  c.name = "cam";
+  c.width = 320;
+  c.height = 240;
+  c.fx = c.fy = 305.0;
+  c.cx = 161.0;
+  c.cy = 119.0;
+  const Vector3 forward = (at - eye).normalized(), right = forward.cross(Vector3::UnitZ()).normalized();
+  c.world_from_camera.rotation << right, forward.cross(right), forward;
+  c.world_from_camera.translation = eye;
+  return c;
+}
+
+std::vector<capture::Camera> three_cameras() {
+  const Vector3 at(0.0, 0.0, 0.40);
+  return {camera({0.05, 0.85, 0.6}, at), camera({-0.75, 0.5, 0.75}, at), camera({0.65, 0.4, 0.65}, at)};
+}
+
+Pose base_pose() {
+  Pose base;
+  base.rotation = math::exp_so3(Vector3(0.1, -0.15, 0.3));
+  base.translation = Vector3(0.03, -0.02, 0.55);
+  return base;
+}
+
+// Mask of the tube about the chain: dense surface points drawn at four times the resolution, half coverage decides.
+capture::View draw(const Chain& chain, const VectorX& theta, const Pose& base, const capture::Camera& c, int index = 0,
+                   int frame = 0, double time = 0.0) {
+  constexpr int kFine = 4, kAround = 240, kAlong = 1200, kRings = 40;
+  const int w = c.width * kFine, h = c.height * kFine;
+  std::vector<std::uint8_t> fine(static_cast<std::size_t>(w) * h, 0);
+  const std::vector<Pose> motions = chain::link_motions(chain, theta, base);
+  const Vector3 a = chain.bending_axis, b = chain.direction.cross(a);
+  const Pose camera_from_world = c.world_from_camera.inverse();
+  const auto plot = [&](double s, double radius) {
+    const Pose motion = camera_from_world * motions[chain::link_at(chain, s)];
+    for (int i = 0; i < kAround; ++i) {
+      const double angle = 2 * kPi * i / kAround;
+      const Vector3 x = motion * (s * chain.direction + radius * (std::cos(angle) * a + std::sin(angle) * b));
+      const int u = static_cast<int>(kFine * (c.fx * x.x() / x.z() + c.cx));
+      const int v = static_cast<int>(kFine * (c.fy * x.y() / x.z() + c.cy));
+      if (u >= 0 && v >= 0 && u < w && v < h) fine[static_cast<std::size_t>(v) * w + u] = 1;
+    }
+  };
+  const double last = std::nextafter(chain.length, 0.0);
+  for (int i = 0; i <= kAlong; ++i) plot(last * i / kAlong, 0.5 * chain.diameter);
+  for (int i = 0; i <= kRings; ++i) plot(last, 0.5 * chain.diameter * i / kRings);
+  // fill between surface points: a row's inside is what lies between hits less than a tube's width apart
+  for (int y = 0; y < h; ++y) {
+    int before = -1;
+    for (int x = 0; x < w; ++x) {
+      std::uint8_t& pixel = fine[static_cast<std::size_t>(y) * w + x];
+      if (pixel == 0) continue;
+      if (before >= 0 && x - before < 4) std::fill(&pixel - (x - before), &pixel, std::uint8_t{1});
+      before = x;
+    }
+  }
+  capture::View view;
+  view.camera = index;
+  view.frame = frame;
+  view.time = time;
+  view.width = c.width;
+  view.height = c.height;
+  view.rgba.assign(4 * static_cast<std::size_t>(c.width) * c.height, 0);
+  for (int y = 0; y < c.height; ++y) {
+    for (int x = 0; x < c.width; ++x) {
+      int sum = 0;
+      for (int dy = 0; dy < kFine; ++dy)
+        for (int dx = 0; dx < kFine; ++dx) sum += fine[static_cast<std::size_t>(y * kFine + dy) * w + x * kFine + dx];
+      if (2 * sum >= kFine * kFine) view.rgba[4 * (static_cast<std::size_t>(y) * c.width + x) + 3] = 255;
+    }
+  }
+  return view;
+}
+
+void paint_disk(capture::View& view, double x0, double y0, double radius, std::uint8_t value) {
+  for (int y = 0; y < view.height; ++y)
+    for (int x = 0; x < view.width; ++x)
+      if (std::hypot(x - x0, y - y0) < radius) view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] = value;
+}
+
+// A smooth bend of both kinds.
+VectorX bent(const Chain& chain, double in_plane, double out_of_plane = 0.0) {
+  VectorX theta = VectorX::Zero(chain.angles());
+  const int turns = chain.angles() / (chain.links() - 1);
+  for (int j = 0; j < chain.links() - 1; ++j) {
+    theta[turns * j] = in_plane * (0.12 + 0.1 * std::sin(0.8 * j));
+    if (turns > 1) theta[turns * j + 1] = out_of_plane * (0.1 + 0.08 * std::cos(0.6 * j));
+  }
+  return theta;
+}
+
+double rms(const MatrixX& a, const MatrixX& b) { return std::sqrt((a - b).squaredNorm() / a.cols()); }
+
+MatrixX points(const Chain& chain, const VectorX& theta, const Pose& base) {
+  return chain::centerline(chain, chain::link_motions(chain, theta, base), chain::equal_arclengths(chain, 97));
+}
+
+struct Scene {
+  std::vector<capture::Camera> cameras = three_cameras();
+  std::vector<capture::View> views;
+  Pose base = base_pose();
+  Scene(const Chain& chain, const VectorX& theta) {
+    for (int i = 0; i < 3; ++i) views.push_back(draw(chain, theta, base, cameras[i], i));
+  }
+  silhouette::FrameFit fit(const Chain& chain, const VectorX& start, bool warm, std::vector<int> which = {0, 1, 2},
+                           const silhouette::Options& options = {}) const {
+    std::vector<const capture::View*> seen;
+    for (const int i : which) seen.push_back(&views[i]);
+    return silhouette::fit_frame(chain, base, seen, cameras, start, warm, options);
+  }
+};
+
+// Frames of a chain swinging with `theta_at`, base at rest, as a loaded capture.
+template <typename Function>
+capture::Capture film(const Chain& chain, int frames, const Function& theta_at) {
+  capture::Capture c;
+  c.name = "film";
+  c.length = chain.length;
+  c.diameter = chain.diameter;
+  c.direction = chain.direction;
+  c.bending_axis = chain.bending_axis;
+  c.cameras = three_cameras();
+  c.base = trajectory::fit({{0.0, base_pose()}}, "film");
+  for (int i = 0; i < 3; ++i) {
+    c.times.emplace_back();
+    for (int f = 0; f < frames; ++f) {
+      c.times[i].push_back(f / 30.0);
+      c.views.push_back(draw(chain, theta_at(f / 30.0), base_pose(), c.cameras[i], i, f, f / 30.0));
+    }
+  }
+  return c;
+}
+
+}  // namespace
+
+TEST_CASE("a bent rope is found from the straight one") {
+  for (const Bending bending : {Bending::planar, Bending::spatial}) {
+    const Chain chain = rope(bending);
+    for (const double size : {1.0, -1.0, 2.5}) {
+      CAPTURE(size);
+      const VectorX theta = bent(chain, size, 0.8);
+      const Scene scene(chain, theta);
+      const silhouette::FrameFit fit = scene.fit(chain, VectorX::Zero(chain.angles()), false);
+      CHECK(rms(points(chain, fit.theta, scene.base), points(chain, theta, scene.base)) < 0.3e-3);
+      CHECK(fit.covered > 0.99);
+      CHECK(fit.inside > 0.99);
+      CHECK(fit.residual_pixels < 0.4);
+      CHECK(std::abs(fit.edge_offset) < 0.3);
+      // three deviations hold for every angle
+      for (int k = 0; k < chain.angles(); ++k)
+        CHECK(std::abs(fit.theta[k] - theta[k]) < 3.0 * std::sqrt(fit.covariance(k, k)));
+    }
+  }
+}
+
+TEST_CASE("a warm start follows a fast rope") {
+  const Chain chain = rope(Bending::spatial);
+  const VectorX theta = bent(chain, 1.5, 0.6);
+  const Scene scene(chain, theta);
+  VectorX before = bent(chain, 1.0, 0.9);
+  before[0] += 0.15;  // the free end is some 8 cm away
+  REQUIRE(rms(points(chain, before, scene.base), points(chain, theta, scene.base)) > 0.03);
+  const silhouette::FrameFit fit = scene.fit(chain, before, true);
+  CHECK(rms(points(chain, fit.theta, scene.base), points(chain, theta, scene.base)) < 0.3e-3);
+}
+
+TEST_CASE("one camera: a planar rope is known, a spatial one only as far as its covariance says") {
+  const Chain planar = rope(Bending::planar);
+  const VectorX flat = bent(planar, 1.2);
+  const Scene flat_scene(planar, flat);
+  for (const int view : {0, 1, 2}) {
+    const silhouette::FrameFit fit = flat_scene.fit(planar, VectorX::Zero(planar.angles()), false, {view});
+    CHECK(rms(points(planar, fit.theta, flat_scene.base), points(planar, flat, flat_scene.base)) < 1.5e-3);
+  }
+  const Chain spatial = rope(Bending::spatial);
+  const VectorX theta = bent(spatial, 0.8, 0.5);
+  const Scene scene(spatial, theta);
+  VectorX near = theta;
+  near.array() += 0.02;
+  const silhouette::FrameFit one = scene.fit(spatial, near, true, {0});
+  const silhouette::FrameFit all = scene.fit(spatial, near, true);
+  CHECK(one.covariance.trace() > 5.0 * all.covariance.trace());
+  for (int k = 0; k < spatial.angles(); ++k)
+    CHECK(std::abs(one.theta[k] - theta[k]) < 3.0 * std::sqrt(one.covariance(k, k)));
+  // what is known beforehand decides where the view does not
+  silhouette::Options options;
+  options.prior.mean = theta;
+  options.prior.information = MatrixX::Identity(spatial.angles(), spatial.angles()) * 1e4;
+  const silhouette::FrameFit guided = scene.fit(spatial, near, true, {0}, options);
+  CHECK(rms(points(spatial, guided.theta, scene.base), points(spatial, theta, scene.base)) < 1e-3);
+  CHECK(guided.covariance.trace() < one.covariance.trace());
+}
+
+TEST_CASE("empty masks, false blobs, occluders and wide masks") {
+  const Chain chain = rope(Bending::spatial);
+  const VectorX theta = bent(chain, 1.0, 0.7), zero = VectorX::Zero(chain.angles());
+  const Scene clean(chain, theta);
+  const MatrixX truth = points(chain, theta, clean.base);
+  const auto error = [&](const Scene& scene, bool warm) {
+    return rms(points(chain, scene.fit(chain, warm ? theta : zero, warm).theta, scene.base), truth);
+  };
+  for (const bool warm : {false, true}) {
+    CAPTURE(warm);
+    Scene empty = clean;
+    std::fill(empty.views[1].rgba.begin(), empty.views[1].rgba.end(), std::uint8_t{0});
+    CHECK(error(empty, warm) < 0.5e-3);
+    Scene blobs = clean;
+    paint_disk(blobs.views[0], 25, 25, 14, 255);
+    paint_disk(blobs.views[2], 290, 200, 18, 255);
+    CHECK(error(blobs, warm) < 0.5e-3);
+    Scene hidden = clean;  // a finger across the rope, a different place in each view
+    const auto hide = [&](int view, double s) {
+      const capture::Camera& c = hidden.cameras[view];
+      const Vector3 x = c.world_from_camera.inverse() * Vector3(truth.col(static_cast<int>(96 * s)));
+      paint_disk(hidden.views[view], c.fx * x.x() / x.z() + c.cx, c.fy * x.y() / x.z() + c.cy, 8, 0);
+    };
+    hide(0, 0.5);
+    hide(1, 0.35);
+    CHECK(error(hidden, warm) < 0.6e-3);
+    Scene wide = clean;  // one pixel wider all around
+    for (std::size_t v = 0; v < wide.views.size(); ++v)
+      for (int y = 1; y + 1 < 240; ++y)
+        for (int x = 1; x + 1 < 320; ++x)
+          for (const int step : {-320, -1, 1, 320})
+            if (clean.views[v].rgba[4 * (y * 320 + x + step) + 3]) wide.views[v].rgba[4 * (y * 320 + x) + 3] = 255;
+    CHECK(error(wide, warm) < 0.5e-3);
+    const double offset = wide.fit(chain, theta, true).edge_offset;
+    CHECK(offset > 0.6);
+    CHECK(offset < 1.5);
+  }
+  Scene nothing = clean;
+  for (capture::View& view : nothing.views) std::fill(view.rgba.begin(), view.rgba.end(), std::uint8_t{0});
+  const silhouette::FrameFit blind = nothing.fit(chain, theta, true);
+  CHECK(blind.theta.allFinite());
+  CHECK(blind.covered == 0.0);
+}
+
+TEST_CASE("twist is held") {
+  const Chain chain = rope(Bending::spatial, true);
+  VectorX theta = VectorX::Zero(chain.angles());
+  for (int j = 0; j < 8; ++j) theta[3 * j] = 0.15, theta[3 * j + 1] = 0.05;
+  const Scene scene(chain, theta);
+  const silhouette::FrameFit fit = scene.fit(chain, VectorX::Zero(chain.angles()), false);
+  for (int j = 0; j < 8; ++j) {
+    CHECK(fit.theta[3 * j + 2] == 0.0);
+    CHECK(fit.covariance(3 * j + 2, 3 * j + 2) > 0.01);
+  }
+  CHECK(rms(points(chain, fit.theta, scene.base), points(chain, theta, scene.base)) < 0.4e-3);
+}
+
+TEST_CASE("a sequence: velocity, frames without masks, bending") {
+  const Chain planar = rope(Bending::planar), spatial = rope(Bending::spatial);
+  constexpr int kFrames = 14;
+  constexpr double kRate = 2.5;  // rad/s
+  const auto swing = [&](double t) -> VectorX { return bent(planar, 1.2 * std::sin(kRate * t) + 0.2); };
+  const auto swing_rate = [&](double t) -> VectorX {
+    return 1.2 * kRate * std::cos(kRate * t) * (bent(planar, 1.0) - bent(planar, 0.0));
+  };
+  capture::Capture flat = film(planar, kFrames, swing);
+  for (capture::View& view : flat.views)
+    if (view.frame == 6) std::fill(view.rgba.begin(), view.rgba.end(), std::uint8_t{0});
+  int warnings = 0;
+  core::set_listener({[&](const std::string&) { ++warnings; }, {}});
+  const silhouette::SequenceFit fit = silhouette::fit_sequence(planar, flat);
+  core::set_listener({});
+  CHECK(warnings == 1);
+  REQUIRE(fit.states.theta.size() == kFrames);
+  REQUIRE(fit.states.thetadot.size() == kFrames);
+  for (int f = 0; f < kFrames; ++f) {
+    CAPTURE(f);
+    const double t = f / 30.0;
+    CHECK(rms(points(planar, fit.states.theta[f], base_pose()), points(planar, swing(t), base_pose())) < 0.6e-3);
+    CHECK((fit.states.thetadot[f] - swing_rate(t)).norm() < 0.35 * swing_rate(0).norm());
+  }
+
+  const silhouette::SequenceFit loose = silhouette::fit_sequence(spatial, flat);
+  const silhouette::BendingChoice choice = silhouette::choose_bending(spatial, flat, loose);
+  CHECK(choice.bending == Bending::planar);
+  CHECK(choice.out_of_plane_rms < 1e-3);
+
+  const capture::Capture full = film(spatial, 4, [&](double t) { return bent(spatial, 1.0 + t, 0.4); });
+  const silhouette::BendingChoice other =
+      silhouette::choose_bending(spatial, full, silhouette::fit_sequence(spatial, full));
+  CHECK(other.bending == Bending::spatial);
+  CHECK(other.out_of_plane_rms > 5.0 * other.deviation);
+
+  for (capture::View& view : flat.views) std::fill(view.rgba.begin(), view.rgba.end(), std::uint8_t{0});
+  CHECK_THROWS_AS(silhouette::fit_sequence(planar, flat), InputError);
+}
+
+TEST_CASE("the demo capture is recognized to a fraction of a millimeter, whatever the number of threads") {
+  const Path folder = Path(CHAINSPLAT_SOURCE_DIR) / "assets/demo_free_30";
+  const capture::Capture demo = capture::load(folder);
+  const auto truth = capture::load_true_centerline(folder);
+  REQUIRE(truth);
+  const auto error = [&](const Chain& chain, const chain::States& states) {
+    double square = 0;
+    for (std::size_t f = 0; f < states.time.size(); ++f) {
+      REQUIRE(std::abs(truth->time[f] - states.time[f]) < 1e-3);
+      const MatrixX& given = truth->points[f];
+      MatrixX expected(3, 97);
+      for (int i = 0; i < 97; ++i) {
+        const double at = i / 96.0 * (given.cols() - 1);
+        const int k = std::min(static_cast<int>(at), static_cast<int>(given.cols()) - 2);
+        expected.col(i) = given.col(k) + (at - k) * (given.col(k + 1) - given.col(k));
+      }
+      square += std::pow(rms(points(chain, states.theta[f], demo.base.pose(states.time[f])), expected), 2);
+    }
+    return std::sqrt(square / states.time.size());
+  };
+  const auto chain_of = [&](Bending bending) {
+    return chain::make_chain(demo.length, demo.diameter, demo.direction, demo.bending_axis, 8, bending, false);
+  };
+  // floors of eight joints: 0.26 mm (joints at L/9, captures/README) spatial, 3.27 mm planar
+  const Chain spatial = chain_of(Bending::spatial), planar = chain_of(Bending::planar);
+  const int threads = core::threads();
+  core::set_threads(1);
+  const silhouette::SequenceFit fit = silhouette::fit_sequence(spatial, demo);
+  core::set_threads(3);
+  const silhouette::SequenceFit again = silhouette::fit_sequence(spatial, demo);
+  core::set_threads(threads);
+  REQUIRE(fit.states.theta.size() == 60);
+  for (std::size_t f = 0; f < 60; ++f) CHECK(fit.states.theta[f] == again.states.theta[f]);
+  CHECK(error(spatial, fit.states) < 0.3e-3);
+  const silhouette::BendingChoice choice = silhouette::choose_bending(spatial, demo, fit);
+  CHECK(choice.bending == Bending::spatial);
+  CHECK(choice.out_of_plane_rms == doctest::Approx(3.3e-3).epsilon(0.1));
+  CHECK(error(planar, silhouette::fit_sequence(planar, demo).states) < 3.5e-3);
+}

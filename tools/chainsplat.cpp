@@ -22,14 +22,13 @@ int fail(int code, std::string text) {
   return code;
 }
 
-std::string command_line_error(const CLI::App& app, const CLI::ParseError& error, int argc, char** argv) {
+std::string command_line_error(const CLI::App& app, const CLI::ParseError& error) {
   const auto chosen = app.get_subcommands();
   std::string what = error.what();
   while (!what.empty() && (what.back() == '.' || what.back() == '\n')) what.pop_back();
   if (chosen.empty()) {
-    for (int i = 1; i < argc; ++i)
-      if (argv[i][0] != '-' && dynamic_cast<const CLI::ExtrasError*>(&error))
-        return std::string(argv[i]) + ": is not a command; see 'chainsplat --help' for those there are";
+    for (const std::string& word : app.remaining())
+      if (word[0] != '-') return word + ": is not a command; see 'chainsplat --help' for those there are";
     return "command line: " + what + "; see 'chainsplat --help'";
   }
   const std::string command = chosen.front()->get_name();
@@ -77,7 +76,7 @@ int run(int argc, char** argv) {
   } catch (const CLI::Success& success) {
     return app.exit(success);
   } catch (const CLI::ParseError& error) {
-    return fail(kWrongRequest, command_line_error(app, error, argc, argv));
+    return fail(kWrongRequest, command_line_error(app, error));
   }
   tools::start_listening(globals);
   core::set_threads(globals.threads);

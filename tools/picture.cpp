@@ -68,11 +68,12 @@ Image8 comparison(splat::Engine& engine, const twin::Twin& twin, const capture::
     std::vector<std::vector<render::Frame>> drawn;  // recognized, rollout
     int width = 0;                                  // of its two or three pictures
   };
+  const std::vector<double>& covered = twin.states.time.empty() ? twin.rollout.time : twin.states.time;
   std::vector<Column> columns;
   for (int c = 0; c < static_cast<int>(recorded.cameras.size()); ++c) {
     std::vector<const capture::View*> views;
     for (const capture::View& view : recorded.views)
-      if (view.camera == c && view.time >= twin.states.time.front() && view.time <= twin.states.time.back() && view.width > 0)
+      if (view.camera == c && view.time >= covered.front() && view.time <= covered.back() && view.width > 0)
         views.push_back(&view);
     if (views.empty()) continue;
     Column column;

@@ -56,15 +56,16 @@ int columns() {
   return ioctl(STDERR_FILENO, TIOCGWINSZ, &size) == 0 && size.ws_col > 0 ? size.ws_col : kDefaultColumns;
 }
 
-std::string progress_line(const Progress& progress, double now, bool with_bar) {
+std::string progress_line(const core::Progress& progress, double now, bool with_bar) {
   std::string line;
   const double share = progress.total > 0 ? std::clamp(double(progress.step) / double(progress.total), 0.0, 1.0) : 0.0;
   if (with_bar && progress.total > 0) {
     const int cells = static_cast<int>(share * kBarCells);
-    line += " [" + std::string(cells, '#') + std::string(kBarCells - cells, '-') + "]";
+    line.append(" [").append(cells, '#').append(kBarCells - cells, '-').append("]");
   }
   if (progress.total > 0)
-    line += " " + std::to_string(progress.step) + "/" + std::to_string(progress.total) + number(" %3.0f%%", 100 * share);
+    line.append(" ").append(std::to_string(progress.step)).append("/").append(std::to_string(progress.total))
+        .append(number(" %3.0f%%", 100 * share));
   const double elapsed = now - screen.stage_start;
   const double rate = elapsed > 0 ? double(progress.step - screen.first_step) / elapsed : 0.0;
   if (rate > 0) {
@@ -82,7 +83,7 @@ void clear_line() {
   screen.line_open = false;
 }
 
-void show(const Progress& progress, double now, bool last) {
+void show(const core::Progress& progress, double now, bool last) {
   if (!screen.progress) return;
   if (now - screen.last_shown < (screen.terminal ? kRedrawSeconds : kPlainSeconds) && !(last && screen.terminal)) return;
   screen.last_shown = now;
@@ -100,7 +101,7 @@ void show(const Progress& progress, double now, bool last) {
   screen.line_open = true;
 }
 
-void log(const Progress& progress, double now, bool last) {
+void log(const core::Progress& progress, double now, bool last) {
   if (screen.logs.empty() || (now - screen.last_logged < kLogSeconds && !last)) return;
   screen.last_logged = now;
   nlohmann::ordered_json record;
@@ -113,7 +114,7 @@ void log(const Progress& progress, double now, bool last) {
   for (std::ofstream& file : screen.logs) file << record.dump() << std::endl;
 }
 
-void on_progress(const Progress& progress) {
+void on_progress(const core::Progress& progress) {
   const double now = core::seconds_now();
   const bool fresh = progress.stage != screen.stage;
   if (fresh) {

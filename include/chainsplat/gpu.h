@@ -1,8 +1,8 @@
 // chainsplat/gpu.h - a thin Vulkan 1.3 compute layer: device, buffers, pipelines, one-submission command lists.
 //
-// One queue, host-visible or device buffers, pipelines made from embedded SPIR-V with specialization constants, timeline
-// semaphore, a pipeline cache on disk, debug names, optional validation (with synchronization validation) whose messages
-// are counted. Nothing here knows what is computed.
+// One queue, host-visible or device buffers, pipelines made from embedded SPIR-V with specialization constants, a
+// timeline semaphore, a pipeline cache on disk, debug names, optional validation (with synchronization validation) whose
+// messages are counted. Nothing here knows what is computed.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -19,7 +19,7 @@ struct DeviceInfo {
   int index = 0;
   std::string name, driver, type;        // type: "discrete GPU", "integrated GPU", "CPU", ...
   std::uint32_t api_version = 0, vendor = 0;
-  // Every pipeline runs with subgroup_size lanes; only where a device with several sizes cannot fix it, with that or more.
+  // Every pipeline runs with subgroup_size lanes, or with more where a device with several sizes cannot fix one.
   std::uint32_t subgroup_size = 0, max_workgroup_invocations = 0, shared_memory_bytes = 0;
   std::uint32_t storage_buffers = 0;     // that one kernel may bind
   std::uint64_t max_storage_range = 0;   // bytes of the largest buffer
@@ -119,10 +119,10 @@ struct Timing {
   double milliseconds = 0.0;
 };
 
-// Records work once, submits it any number of times. Dispatches are ordered: every dispatch, fill and copy is preceded by
-// a full compute+transfer memory barrier unless `no_barrier()` was called since the last one; the first one also waits for
-// what was submitted before. One thread at a time may use a Commands; several may share a device. A dispatch without
-// groups, a fill or copy of 0 bytes is skipped. Group counts above 65535 an axis are a broken promise (use y).
+// Records work once, submits it any number of times. Dispatches are ordered: every dispatch, fill and copy is preceded
+// by a full compute+transfer memory barrier unless `no_barrier()` was called since the last one; the first one also
+// waits for what was submitted before. One thread at a time may use a Commands, several threads may share a device.
+// A dispatch without groups, a fill or copy of 0 bytes is skipped. More than 65535 groups an axis are refused (use y).
 class Commands {
  public:
   explicit Commands(Device& device);
@@ -130,8 +130,8 @@ class Commands {
   Commands& operator=(Commands&&) noexcept;
   ~Commands();
   void begin();   // forget what was recorded (waits for the last submit)
-  void dispatch(const Pipeline& pipeline, std::span<const Buffer* const> buffers, const void* push, std::size_t push_bytes,
-                std::uint32_t x, std::uint32_t y = 1, std::uint32_t z = 1);
+  void dispatch(const Pipeline& pipeline, std::span<const Buffer* const> buffers, const void* push,
+                std::size_t push_bytes, std::uint32_t x, std::uint32_t y = 1, std::uint32_t z = 1);
   // Group counts (3 uints) read from `arguments` at `offset` bytes.
   void dispatch_indirect(const Pipeline& pipeline, std::span<const Buffer* const> buffers, const void* push,
                          std::size_t push_bytes, const Buffer& arguments, std::size_t offset);
@@ -139,7 +139,7 @@ class Commands {
   void copy(const Buffer& from, std::size_t from_offset, const Buffer& to, std::size_t to_offset, std::size_t bytes);
   void no_barrier();                    // the next command may overlap the one before
   void stamp(const char* label);        // time since the last stamp is charged to `label`
-  void submit();                        // asynchronous; host writes before it are seen by the device; waits for the last one
+  void submit();                        // waits for the last submit, starts; the device sees host writes before it
   void wait();                          // until the last submit is done; throws WorkError when the device is lost
   std::vector<Timing> timings() const;  // of the last finished submit, summed by label
   struct State;

@@ -25,6 +25,8 @@ struct Options {
   int first_iterations = 30;     // coarse steps of a frame without a warm start, from each of several starts
   double huber_pixels = 8.0;     // px, coarse stage, after the first iterations
   double joint_smoothness = 0.0; // 1/rad^2, weight of (theta_j - theta_{j-1})^2 against edges known to 1 px; 0: default
+  double edge_offset = 0.0;      // px by which the masks are thought wider than the tube on each side, and
+  double edge_offset_deviation = 3.0;  // px, how sure that is (one camera reads depth off the width)
   bool smooth_in_time = true;    // fit_sequence: smooth the angles over time
   Prior prior;                   // fit_frame only
 };
@@ -46,7 +48,7 @@ FrameFit fit_frame(const chain::Chain& chain, const math::Pose& base, std::span<
 
 // Every time of the first camera that has views, in order; other cameras' nearest frame within half an interval joins it
 // (with the base pose of its own time). Frames without any mask pixel keep the prediction from their neighbors (and are
-// named in one warning). Frames whose fit is far worse than the others' are fitted again from the frame after them.
+// named in one warning). Frames whose fit is far worse than the others' are fitted again from the frame after them. Throws InputError when no mask shows anything.
 struct SequenceFit {
   chain::States states;          // theta (smoothed over time) and thetadot
   std::vector<FrameFit> frames;  // each frame's own fit

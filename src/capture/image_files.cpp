@@ -60,6 +60,8 @@ template <class Value>
 std::vector<Value> read_pixels(OIIO::ImageInput& input, const Path& file, OIIO::TypeDesc type, int channels) {
   const OIIO::ImageSpec& spec = input.spec();
   std::vector<Value> pixels(static_cast<std::size_t>(spec.width) * spec.height * channels);
+  // asked for what the file holds, OpenImageIO reads in place; else through a buffer of 64 MB an image
+  if (spec.format == type && spec.nchannels == channels) type = OIIO::TypeDesc::UNKNOWN;
   if (!input.read_image(0, 0, 0, channels, type, pixels.data())) {
     input.geterror();
     throw InputError(file.string(), "is damaged or cut off", "write it again");

@@ -264,6 +264,8 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
   if (x264) {
     av_opt_set(encoder->priv_data, "crf", kX264Quality, 0);
     av_opt_set(encoder->priv_data, "preset", "medium", 0);
+    // its vector code for macroblock trees lets uninitialized memory into the bits; this path does not, on any CPU
+    av_opt_set(encoder->priv_data, "x264-params", "cpu-independent=1", 0);
   } else {
     encoder->flags |= AV_CODEC_FLAG_QSCALE;
     encoder->global_quality = FF_QP2LAMBDA * kMpeg4Quality;
@@ -297,9 +299,6 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
   code = avformat_write_header(raw, nullptr);
   if (code < 0) clean("writing failed", code);
 
-  Owned<AVFrame> picture = padded_frame(width, height, encoder->pix_fmt);
-  picture->color_range = encoder->color_range;
-  picture->colorspace = encoder->colorspace;
   const AVPixelFormat source = frames.front().channels == 3 ? AV_PIX_FMT_RGB24 : AV_PIX_FMT_RGBA;
   Owned<SwsContext> scaler(sws_getContext(width, height, source, width, height, encoder->pix_fmt, SWS_BICUBIC, nullptr,
                                           nullptr, nullptr));
@@ -324,8 +323,10 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
     }
   };
   for (std::size_t k = 0; k < frames.size(); ++k) {
-    code = av_frame_make_writable(picture.get());
-    if (code < 0) clean("no memory", code);
+    // a fresh one each: the encoder keeps what it was given
+    const Owned<AVFrame> picture = padded_frame(width, height, encoder->pix_fmt);
+    picture->color_range = encoder->color_range;
+    picture->colorspace = encoder->colorspace;
     const std::size_t row = static_cast<std::size_t>(frames[k].channels) * width;
     for (int y = 0; y < height; ++y)
       std::memcpy(rgb->data[0] + static_cast<std::ptrdiff_t>(y) * rgb->linesize[0], &frames[k].pixels[y * row], row);

@@ -63,8 +63,8 @@ Buffer::Buffer(Device& device, std::size_t bytes, Domain domain, const char* nam
   handles_->device = &device;
   const std::string where = "device " + device.info.name;
   if (bytes > device.info.max_storage_range) {
-    throw WorkError(where, std::string("buffer '") + name + "' needs " + mebibytes(bytes) + ", the device binds at most " +
-                               mebibytes(device.info.max_storage_range),
+    throw WorkError(where, std::string("buffer '") + name + "' needs " + mebibytes(bytes) +
+                               ", the device binds at most " + mebibytes(device.info.max_storage_range),
                     "use a smaller picture, fewer Gaussians or fewer views at a time");
   }
   auto create = of_type<VkBufferCreateInfo>(VK_STRUCTURE_TYPE_BUFFER_CREATE_INFO);

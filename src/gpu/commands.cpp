@@ -103,7 +103,8 @@ struct Commands::State {
     for (std::size_t i = 0; i < labels.size(); ++i) {
       const std::uint64_t passed = (ticks[i + 1] - ticks[i]) & device.timestamp_mask;  // the counter may wrap
       const double milliseconds = static_cast<double>(passed) * device.timestamp_period * kMillisecondsANanosecond;
-      const auto same = std::find_if(timings.begin(), timings.end(), [&](const Timing& t) { return t.label == labels[i]; });
+      const auto same =
+          std::find_if(timings.begin(), timings.end(), [&](const Timing& t) { return t.label == labels[i]; });
       if (same == timings.end()) {
         timings.push_back({labels[i], milliseconds});
       } else {
@@ -133,10 +134,11 @@ struct Commands::State {
     return set;
   }
 
-  void bind(const Pipeline& pipeline, std::span<const Buffer* const> buffers, const void* push, std::size_t push_bytes) {
+  void bind(const Pipeline& pipeline, std::span<const Buffer* const> buffers, const void* push,
+            std::size_t push_bytes) {
     const Pipeline::Handles& h = pipeline.handles();
-    CHAINSPLAT_CHECK(buffers.size() == h.buffers,
-                     h.name + " takes " + std::to_string(h.buffers) + " buffers, got " + std::to_string(buffers.size()));
+    CHAINSPLAT_CHECK(buffers.size() == h.buffers, h.name + " takes " + std::to_string(h.buffers) + " buffers, got " +
+                                                      std::to_string(buffers.size()));
     CHAINSPLAT_CHECK(push_bytes == h.push_bytes, h.name + " takes " + std::to_string(h.push_bytes) +
                                                      " bytes of push constants, got " + std::to_string(push_bytes));
     vkCmdBindPipeline(commands, VK_PIPELINE_BIND_POINT_COMPUTE, h.pipeline);
@@ -209,7 +211,8 @@ void Commands::dispatch(const Pipeline& pipeline, std::span<const Buffer* const>
 void Commands::dispatch_indirect(const Pipeline& pipeline, std::span<const Buffer* const> buffers, const void* push,
                                  std::size_t push_bytes, const Buffer& arguments, std::size_t offset) {
   CHAINSPLAT_CHECK(offset % 4 == 0 && offset + sizeof(VkDispatchIndirectCommand) <= arguments.bytes(),
-                   pipeline.handles().name + ": " + std::to_string(offset) + " of " + std::to_string(arguments.bytes()));
+                   pipeline.handles().name + ": " + std::to_string(offset) + " of " +
+                       std::to_string(arguments.bytes()));
   state_->before_command();
   state_->bind(pipeline, buffers, push, push_bytes);
   vkCmdDispatchIndirect(state_->commands, arguments.handles().buffer, offset);
@@ -225,8 +228,9 @@ void Commands::fill(const Buffer& buffer, std::uint32_t value, std::size_t offse
 void Commands::copy(const Buffer& from, std::size_t from_offset, const Buffer& to, std::size_t to_offset,
                     std::size_t bytes) {
   CHAINSPLAT_CHECK(from_offset + bytes <= from.bytes() && to_offset + bytes <= to.bytes(),
-                   std::to_string(bytes) + " from " + std::to_string(from_offset) + " of " + std::to_string(from.bytes()) +
-                       " to " + std::to_string(to_offset) + " of " + std::to_string(to.bytes()));
+                   std::to_string(bytes) + " from " + std::to_string(from_offset) + " of " +
+                       std::to_string(from.bytes()) + " to " + std::to_string(to_offset) + " of " +
+                       std::to_string(to.bytes()));
   state_->before_command();
   if (bytes == 0) return;
   const VkBufferCopy region{from_offset, to_offset, bytes};

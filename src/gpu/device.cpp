@@ -265,8 +265,9 @@ Instance make_instance(bool validation, std::string* why) {
   application.apiVersion = VK_API_VERSION_1_3;
 
   std::vector<const char*> extensions;
-  instance.debug_utils = instance_extension_present(nullptr, VK_EXT_DEBUG_UTILS_EXTENSION_NAME) ||
-                         (validation && instance_extension_present(kValidationLayer, VK_EXT_DEBUG_UTILS_EXTENSION_NAME));
+  instance.debug_utils =
+      instance_extension_present(nullptr, VK_EXT_DEBUG_UTILS_EXTENSION_NAME) ||
+      (validation && instance_extension_present(kValidationLayer, VK_EXT_DEBUG_UTILS_EXTENSION_NAME));
   if (instance.debug_utils) extensions.push_back(VK_EXT_DEBUG_UTILS_EXTENSION_NAME);
 
   auto create = of_type<VkInstanceCreateInfo>(VK_STRUCTURE_TYPE_INSTANCE_CREATE_INFO);
@@ -392,7 +393,7 @@ void Device::check(VkResult result, const char* what) const {
   const std::string where = "device " + info.name;
   if (result == VK_ERROR_DEVICE_LOST) {
     throw WorkError(where, std::string("was lost while it should ") + what,
-                    "run again (--resume continues); a driver that stops long work or a driver fault is the usual cause");
+                    "run again (--resume continues); the usual cause is a driver that stops long work, or its fault");
   }
   throw WorkError(where, std::string("could not ") + what + " (" + result_name(result) + ")",
                   result == VK_ERROR_OUT_OF_DEVICE_MEMORY || result == VK_ERROR_OUT_OF_HOST_MEMORY

@@ -64,6 +64,10 @@ std::size_t choose(const std::vector<DeviceInfo>& devices, const std::string& se
 
 // Folder of the pipeline cache, empty without a home folder.
 Path pipeline_cache_folder();
+// Content of a cache file. Drivers check the header of their data but trust the rest: a damaged file must not reach
+// them, so without_checksum gives nothing then.
+std::string with_checksum(std::string_view data);
+std::string_view without_checksum(std::string_view content);
 VkPipelineCache load_pipeline_cache(VkDevice device, const VkPhysicalDeviceProperties& properties, Path* file);
 void save_pipeline_cache(VkDevice device, VkPipelineCache cache, const Path& file);  // failures are ignored
 

@@ -43,7 +43,8 @@ std::string doctor_text(const Doctor& doctor) {
                   "memory %llu MiB%s\n",
                   d.subgroup_size, d.max_workgroup_invocations, d.shared_memory_bytes >> 10, d.storage_buffers,
                   static_cast<unsigned long long>(d.max_storage_range >> 20),
-                  static_cast<unsigned long long>(d.heap_bytes >> 20), d.unified_memory ? " (shared with the host)" : "");
+                  static_cast<unsigned long long>(d.heap_bytes >> 20),
+                  d.unified_memory ? " (shared with the host)" : "");
     text += line;
     for (const std::string& reason : d.refused) text += "    cannot be used: " + reason + "\n";
   }

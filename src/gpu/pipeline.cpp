@@ -31,6 +31,21 @@ Path pipeline_cache_folder() {
   return {};
 }
 
+std::string with_checksum(std::string_view data) {
+  const std::uint64_t checksum = core::fnv1a(data);
+  std::string content(kChecksumBytes, '\0');
+  std::memcpy(content.data(), &checksum, kChecksumBytes);
+  return content.append(data);
+}
+
+std::string_view without_checksum(std::string_view content) {
+  if (content.size() <= kChecksumBytes) return {};
+  std::uint64_t checksum = 0;
+  std::memcpy(&checksum, content.data(), kChecksumBytes);
+  const std::string_view data = content.substr(kChecksumBytes);
+  return core::fnv1a(data) == checksum ? data : std::string_view();
+}
+
 VkPipelineCache load_pipeline_cache(VkDevice device, const VkPhysicalDeviceProperties& properties, Path* file) {
   std::string content;
   const Path folder = pipeline_cache_folder();
@@ -43,14 +58,7 @@ VkPipelineCache load_pipeline_cache(VkDevice device, const VkPhysicalDevicePrope
       content.clear();
     }
   }
-  // drivers check the header but trust the rest: a damaged file must not reach them
-  std::string_view data;
-  if (content.size() > kChecksumBytes) {
-    std::uint64_t checksum = 0;
-    std::memcpy(&checksum, content.data(), kChecksumBytes);
-    const std::string_view rest = std::string_view(content).substr(kChecksumBytes);
-    if (core::fnv1a(rest) == checksum) data = rest;
-  }
+  const std::string_view data = without_checksum(content);
   auto create = of_type<VkPipelineCacheCreateInfo>(VK_STRUCTURE_TYPE_PIPELINE_CACHE_CREATE_INFO);
   create.initialDataSize = data.size();
   create.pInitialData = data.data();
@@ -63,11 +71,10 @@ void save_pipeline_cache(VkDevice device, VkPipelineCache cache, const Path& fil
   std::size_t bytes = 0;
   if (vkGetPipelineCacheData(device, cache, &bytes, nullptr) != VK_SUCCESS) return;
   if (bytes <= sizeof(VkPipelineCacheHeaderVersionOne)) return;  // an empty cache
-  std::string content(kChecksumBytes + bytes, '\0');
-  if (vkGetPipelineCacheData(device, cache, &bytes, content.data() + kChecksumBytes) != VK_SUCCESS) return;
-  content.resize(kChecksumBytes + bytes);
-  const std::uint64_t checksum = core::fnv1a(std::string_view(content).substr(kChecksumBytes));
-  std::memcpy(content.data(), &checksum, kChecksumBytes);
+  std::string data(bytes, '\0');
+  if (vkGetPipelineCacheData(device, cache, &bytes, data.data()) != VK_SUCCESS) return;
+  data.resize(bytes);
+  const std::string content = with_checksum(data);
   try {
     std::error_code error;
     if (std::filesystem::file_size(file, error) == content.size() && !error && core::read_file(file) == content) return;
@@ -90,7 +97,8 @@ Pipeline::Pipeline(Device& device, const std::string& name, int buffers, std::si
   Handles& h = *handles_;
   h.device = &device;
   CHAINSPLAT_CHECK(push_bytes <= kMostPushBytes && push_bytes % 4 == 0, name + ": " + std::to_string(push_bytes));
-  CHAINSPLAT_CHECK(buffers >= 0 && buffers <= static_cast<int>(kLeastStorageBuffers), name + ": " + std::to_string(buffers));
+  CHAINSPLAT_CHECK(buffers >= 0 && buffers <= static_cast<int>(kLeastStorageBuffers),
+                   name + ": " + std::to_string(buffers));
   h.name = name;
   h.buffers = static_cast<std::uint32_t>(buffers);
   h.push_bytes = static_cast<std::uint32_t>(push_bytes);

@@ -5,7 +5,6 @@
 #include "src/recognition/checkpoint.h"
 #include "src/recognition/modes.h"
 #include "src/recognition/place_gaussians.h"
-#include "src/recognition/refine_angles.h"
 
 namespace chainsplat::recognition {
 
@@ -17,8 +16,8 @@ constexpr int kSteps = 80;             // Adam steps a round
 constexpr int kBatch = 9;              // views a step
 constexpr int kFirstGaussians = 700;
 constexpr int kAddedARound = 250;
-constexpr int kAngleIterations = 3;    // Gauss-Newton steps a round and frame
-constexpr int kFinalIterations = 4;    // for the frames that did not train
+constexpr int kAngleIterations = 1;    // Gauss-Newton steps a round and frame
+constexpr int kFinalIterations = 2;    // for every frame, at the end
 constexpr int kFinalSteps = 120;       // Adam steps after the last round, rates falling
 constexpr float kMaskWeight = 0.3f;    // of the mask term: without it black hides transparency (DESIGN)
 constexpr int kShRound = 3;            // from this round on colors depend on the view (SH degree 1): +0.7 dB in the object
@@ -76,6 +75,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   int done_steps = 0, first_round = 0;
   splat::Gaussians gaussians;
   chain::States states;
+  AnglePrior prior;
 
   std::optional<Checkpoint> before;
   if (options.resume && !options.checkpoint.empty()) before = load_checkpoint(options.checkpoint, job);
@@ -103,11 +103,25 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
       }
     }
     states = fit.states;
+    // what the silhouettes know stays known: appearance alone would pull angles to explain rolling and shading
+    prior.mean = fit.states.theta;
+    for (const silhouette::FrameFit& frame : fit.frames) {
+      constexpr double kLeastVariance = 1e-12;  // rad^2
+      prior.information.push_back(
+          (frame.covariance + kLeastVariance * math::MatrixX::Identity(result.chain.angles(), result.chain.angles())).inverse());
+    }
   }
   std::vector<math::VectorX> coarse = states.theta;  // to carry corrections to the frames that do not train
   if (before) {
-    for (std::size_t k = 0; k < coarse.size(); ++k)
-      coarse[k] = Eigen::Map<const math::VectorX>(before->extra.data() + k * result.chain.angles(), result.chain.angles());
+    const Eigen::Index n = result.chain.angles();
+    const double* from = before->extra.data();
+    for (math::VectorX& theta : coarse) {
+      theta = Eigen::Map<const math::VectorX>(from, n);
+      from += n;
+    }
+    for (std::size_t k = 0; k < coarse.size(); ++k, from += n * n)
+      prior.information.push_back(Eigen::Map<const math::MatrixX>(from, n, n));
+    prior.mean = coarse;
   }
   const std::vector<FrameViews> frames = assign_views(capture, states.time);
   const TrainingViews training = training_views(capture, frames, std::max(1, options.every));
@@ -149,6 +163,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     c.states = states;
     c.snapshot.gaussians = gaussians;
     for (const math::VectorX& theta : coarse) c.extra.insert(c.extra.end(), theta.data(), theta.data() + theta.size());
+    for (const math::MatrixX& m : prior.information) c.extra.insert(c.extra.end(), m.data(), m.data() + m.size());
     save_checkpoint(c, options.checkpoint);
   };
   const auto adam = [&](int steps, core::Random& random, const std::string& note) {
@@ -196,7 +211,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     RefineOptions refine;
     refine.iterations = kAngleIterations;
     refine.mask_weight = kAngleMaskWeight;
-    refine_angles(chain, capture, frames, training.frames, draw_training, refine, states);
+    refine_angles(chain, capture, frames, training.frames, draw_training, refine, prior, states);
     pose_views();
     for (std::size_t i = 0; i < specs.size(); ++i) engine.set_motions(static_cast<int>(i), specs[i].motions);
     gaussians = engine.gaussians();
@@ -233,7 +248,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     if (std::find(training.frames.begin(), training.frames.end(), k) == training.frames.end())
       states.theta[k] = coarse[k] + chain::interpolate(correction, states.time[k]);
   }
-  const auto covariances = refine_all(engine, chain, capture, frames, gaussians, all_frames, kFinalIterations, states);
+  const auto covariances = refine_all(engine, chain, capture, frames, gaussians, all_frames, kFinalIterations, prior, states);
   result.covariances.assign(frames.size(), math::MatrixX::Identity(chain.angles(), chain.angles()));
   for (std::size_t i = 0; i < all_frames.size(); ++i) result.covariances[all_frames[i]] = covariances[i];
   differentiate(states);

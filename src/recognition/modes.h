@@ -2,6 +2,7 @@
 #pragma once
 #include "chainsplat/recognition.h"
 #include "src/recognition/frames.h"
+#include "src/recognition/refine_angles.h"
 
 namespace chainsplat::recognition {
 
@@ -22,6 +23,7 @@ void differentiate(chain::States& states);
 // Improves every frame's angles with the Gaussians held. `frames` as assigned to states.time.
 std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain& chain, const capture::Capture& capture,
                                       const std::vector<FrameViews>& frames, const splat::Gaussians& gaussians,
-                                      const std::vector<int>& selected, int iterations, chain::States& states);
+                                      const std::vector<int>& selected, int iterations, const AnglePrior& prior,
+                                      chain::States& states);
 
 }  // namespace chainsplat::recognition

@@ -264,7 +264,7 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
     if (!frames[k].views.empty()) others.push_back(k);
   }
   constexpr int kIterations = 8;  // Gauss-Newton steps from the interpolated angles
-  refine_all(engine, chain, capture, frames, result.gaussians, others, kIterations, states);
+  refine_all(engine, chain, capture, frames, result.gaussians, others, kIterations, {}, states);
   differentiate(states);
   result.states = std::move(states);
   return result;

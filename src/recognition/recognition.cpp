@@ -5,7 +5,6 @@
 #include <sstream>
 
 #include "src/recognition/modes.h"
-#include "src/recognition/refine_angles.h"
 
 namespace chainsplat::recognition {
 
@@ -43,7 +42,8 @@ void differentiate(chain::States& states) {
 
 std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain& chain, const capture::Capture& capture,
                                       const std::vector<FrameViews>& frames, const splat::Gaussians& gaussians,
-                                      const std::vector<int>& selected, int iterations, chain::States& states) {
+                                      const std::vector<int>& selected, int iterations, const AnglePrior& prior,
+                                      chain::States& states) {
   // the targets of one part must fit one buffer on the smallest device
   constexpr std::size_t kPartPixels = 8u << 20;
   std::vector<math::MatrixX> covariances;
@@ -78,7 +78,7 @@ std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain&
     RefineOptions refine;
     refine.iterations = iterations;
     refine.mask_weight = kAngleMaskWeight;
-    RefineSummary summary = refine_angles(chain, capture, frames, part, draw, refine, states);
+    RefineSummary summary = refine_angles(chain, capture, frames, part, draw, refine, prior, states);
     for (auto& covariance : summary.covariances) covariances.push_back(std::move(covariance));
     from += part.size();
   }

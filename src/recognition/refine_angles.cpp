@@ -162,7 +162,7 @@ double smoothness(const chain::Chain& chain, const math::VectorX& theta, double 
 
 RefineSummary refine_angles(const chain::Chain& chain, const capture::Capture& capture,
                             const std::vector<FrameViews>& frames, std::span<const int> selected, const Draw& draw,
-                            const RefineOptions& options, chain::States& states) {
+                            const RefineOptions& options, const AnglePrior& prior, chain::States& states) {
   RefineSummary summary;
   std::vector<FrameState> work(selected.size());
   for (std::size_t f = 0; f < selected.size(); ++f) work[f].trial = work[f].theta = states.theta[selected[f]];
@@ -209,6 +209,13 @@ RefineSummary refine_angles(const chain::Chain& chain, const capture::Capture& c
         ++s;
       }
       cost += smoothness(chain, state.trial, options.smooth_sigma, &normal, &right);
+      if (!prior.mean.empty()) {
+        const math::VectorX away = state.trial - prior.mean[selected[f]];
+        const math::VectorX pull = prior.information[selected[f]] * away;
+        cost += 0.5 * away.dot(pull);
+        normal += prior.information[selected[f]];
+        right += pull;
+      }
       if (iteration == 0) summary.cost_before += cost;
       if (cost < state.cost) {
         if (iteration > 0) ++summary.accepted;

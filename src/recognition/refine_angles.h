@@ -31,6 +31,12 @@ struct RefineOptions {
   double smooth_sigma = 0.15;    // rad, prior on the difference of neighboring joints' same-axis angles
 };
 
+// What is known of a frame's angles before: from the silhouettes. Empty: nothing.
+struct AnglePrior {
+  std::vector<math::VectorX> mean;          // a frame of the sequence
+  std::vector<math::MatrixX> information;   // n x n, inverse covariance
+};
+
 struct RefineSummary {
   double cost_before = 0.0, cost_after = 0.0;
   int accepted = 0, rejected = 0;
@@ -44,6 +50,6 @@ using Draw = std::function<std::vector<splat::Picture>(std::span<const int> view
 // Improves states.theta of the `selected` frames, each on its own (Levenberg-Marquardt, all frames drawn together).
 RefineSummary refine_angles(const chain::Chain& chain, const capture::Capture& capture,
                             const std::vector<FrameViews>& frames, std::span<const int> selected, const Draw& draw,
-                            const RefineOptions& options, chain::States& states);
+                            const RefineOptions& options, const AnglePrior& prior, chain::States& states);
 
 }  // namespace chainsplat::recognition

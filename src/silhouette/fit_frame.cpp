@@ -14,6 +14,8 @@ namespace {
 
 constexpr double kNear = 0.01;  // m, nothing nearer than this is in front of a camera (SPEC 2.5)
 
+constexpr double kSameAxis = 0.5;  // cosine; the axes of a joint are perpendicular, so anything between 0 and 1
+
 // coarse stage
 constexpr double kFarHuber = 50.0;       // px, before `huber_pixels` takes over: everything pulls
 constexpr double kFarShare = 1.0 / 3.0;  // share of the coarse iterations with kFarHuber
@@ -26,12 +28,14 @@ constexpr double kLongestStep = 0.5;     // rad, largest change of an angle in o
 
 // fine stage
 constexpr double kAligned = 0.7;         // least cosine between outline and tube normals
+constexpr double kLeastArm = 1.0;        // px, from a joint, to tell a direction from it
 constexpr double kFirstCut = 8.0;        // px, Tukey's cut-off before residuals are known
 constexpr double kLeastCut = 2.5, kLargestCut = 12.0;  // px
 constexpr double kCutDeviations = 4.685; // Tukey's constant
 constexpr double kDeviationOfMedian = 1.4826;  // standard deviation from a median of absolute values
 constexpr double kFineStep = 1e-5;       // rad
-constexpr double kOffsetDeviation = 1.0; // px, how much wider than the rope a mask may be, each side
+constexpr double kLinkOffsetDeviation = 0.2;  // px, of a link's outline in one view about the common offset
+constexpr double kEndReach = 2.0;        // half widths from the free end within which an outline may be the end's
 
 // priors, rad
 constexpr double kJointDifference = 0.3;  // between neighboring joints, along one axis
@@ -44,11 +48,13 @@ constexpr double kTwist = 0.5;            // unseen by silhouettes, held
 constexpr double kEdgeDeviation = 1.0;  // px
 
 // cold start
-constexpr double kStartBend = 1.5;  // rad, whole bend of the extra starts
+constexpr double kStartBend = 1.5;     // rad, whole bend of the extra starts
+constexpr double kAlike = 1.5, kAlikePixels = 2.0;  // costs under this times the best, plus this (px^2), are alike
 
 // blobs
 constexpr double kReach = 5.0;      // diameters: farther from the prediction (median) a blob is not the rope
 constexpr double kLastReach = 1.0;  // the same after the coarse stage
+constexpr double kGap = 3.0;        // diameters, that an occluder may hide between two blobs of the rope
 constexpr double kLeastArea = 0.05, kLargestArea = 2.0;  // of the straight rope's area: what can be the rope alone
 
 using Vector7 = Eigen::Matrix<double, 7, 1>;
@@ -168,25 +174,44 @@ bool past_end(const ViewWork& work, const Nearest& at) {
 
 // --- blobs ------------------------------------------------------------------------------------------------------------
 
-// The blob that holds the rope when nothing else is known: of those that could be a rope, the one nearest to the grasp.
-int anchor_blob(const ViewWork& work, double straight_length) {
+bool near(const MaskPoints& mask, const Blob& a, const Blob& b, double gap) {
+  for (int i = a.first_pixel; i < a.last_pixel; ++i)
+    for (int j = b.first_pixel; j < b.last_pixel; ++j)
+      if ((mask.pixels[i] - mask.pixels[j]).squaredNorm() <= gap * gap) return true;
+  return false;
+}
+
+// The blobs that hold the rope when nothing else is known: of those that could be a rope, the one nearest to the grasp,
+// and those that follow within an occluder's width.
+void choose_anchor(ViewWork& work, double straight_area) {
   const MaskPoints& mask = *work.view->mask;
+  const int count = static_cast<int>(mask.blobs.size());
   const Vector2 grasp = work.segments.empty() ? Vector2(0, 0) : work.segments[0].from;
-  const double straight_area = straight_length * work.diameter;
-  int best = -1;
+  std::vector<char> possible(count, 0);
+  int first = 0;
   double best_distance2 = 1e300;
-  for (int b = 0; b < static_cast<int>(mask.blobs.size()); ++b) {
+  for (int b = 0; b < count; ++b) {
     const Blob& blob = mask.blobs[b];
-    if (blob.area < kLeastArea * straight_area || blob.area > kLargestArea * straight_area) continue;
+    possible[b] = blob.area >= kLeastArea * straight_area && blob.area <= kLargestArea * straight_area;
+    if (!possible[b]) continue;
     for (int i = blob.first_pixel; i < blob.last_pixel; ++i) {
       const double distance2 = (mask.pixels[i] - grasp).squaredNorm();
       if (distance2 < best_distance2) {
         best_distance2 = distance2;
-        best = b;
+        first = b;
       }
     }
   }
-  return best >= 0 || mask.blobs.empty() ? best : 0;
+  std::vector<int> queue{first};
+  work.active[first] = 1;
+  for (std::size_t done = 0; done < queue.size(); ++done) {
+    for (int b = 0; b < count; ++b) {
+      if (work.active[b] || !possible[b] || !near(mask, mask.blobs[queue[done]], mask.blobs[b], kGap * work.diameter))
+        continue;
+      work.active[b] = 1;
+      queue.push_back(b);
+    }
+  }
 }
 
 // Keeps the blobs whose median pixel is within `reach` diameters of the posed chain; without any, the anchor.
@@ -209,7 +234,7 @@ void choose_blobs(Problem& problem, double reach) {
     }
     if (any || mask.blobs.empty()) continue;
     const double pixels_per_meter = work.diameter / problem.chain->diameter;
-    work.active[anchor_blob(work, problem.chain->length * pixels_per_meter)] = 1;
+    choose_anchor(work, problem.chain->length * pixels_per_meter * work.diameter);
   }
 }
 
@@ -291,6 +316,7 @@ void add_coarse(ViewWork& work, double cut) {
 
 struct FineSums {
   double weighted_square = 0.0, weight = 0.0;  // of the residuals, px^2
+  double capped_square = 0.0, length = 0.0;    // of all outline points, those without a place too, up to kLargestCut
 };
 
 void add_fine(Problem& problem, ViewWork& work, double offset, double cut, FineSums& total) {
@@ -307,6 +333,7 @@ void add_fine(Problem& problem, ViewWork& work, double offset, double cut, FineS
   const auto observe = [&](const Segment& s, const Vector3& x, const Vector3& g, double residual, double length) {
     const double weight = length * tukey_weight(residual, cut);
     problem.sizes.push_back(std::abs(residual));
+    total.capped_square += length * (std::min(residual * residual, kLargestCut * kLargestCut) - kLargestCut * kLargestCut);
     if (weight == 0.0) return;
     add(work.sums, s.link, x, g, 1.0, residual, weight);
     total.weighted_square += weight * residual * residual;
@@ -316,8 +343,10 @@ void add_fine(Problem& problem, ViewWork& work, double offset, double cut, FineS
     if (!work.active[b]) continue;
     for (int i = mask.blobs[b].first_edge; i < mask.blobs[b].last_edge; ++i) {
       const Edge& edge = mask.edges[i];
+      total.length += edge.weight;
+      total.capped_square += edge.weight * kLargestCut * kLargestCut;
       const Vector2 from_end = edge.point - end;
-      if (has_end && from_end.squaredNorm() < 4.0 * end_radius * end_radius &&
+      if (has_end && from_end.norm() < kEndReach * end_radius &&
           edge.outward.dot(last.tangent) > kAligned) {
         const double side = last.normal.dot(from_end) / end_radius;
         const double bulge = end_depth * std::sqrt(std::max(0.0, 1.0 - side * side));
@@ -332,15 +361,27 @@ void add_fine(Problem& problem, ViewWork& work, double offset, double cut, FineS
       // the side of the tube is the one the outline faces; about a bend's outer corner the tube is round
       Vector2 m = s.normal.dot(edge.outward) < 0 ? Vector2(-s.normal) : s.normal;
       const double distance = std::sqrt(at.distance2);
-      if ((at.t <= 0.0 || at.t >= 1.0) && distance > 1.0 && from_center.dot(edge.outward) > 0.0)
+      if ((at.t <= 0.0 || at.t >= 1.0) && distance > kLeastArm && from_center.dot(edge.outward) > 0.0)
         m = from_center / distance;
-      if (m.dot(edge.outward) < kAligned) continue;  // an occluder's outline, or a corner
+        // an occluder's outline, or a corner
       const Vector3 x = point_at(s, at.t);
       Vector3 g = projected_gradient(camera, x, m);
       const double half_width = radius * g.norm();
       g.z() -= half_width / x.z();  // farther is thinner
       observe(s, x, g, m.dot(from_center) - half_width - offset, edge.weight);
     }
+  }
+}
+
+// Masks are not equally much wider than the rope everywhere: each link has an unknown offset of its own in each view, about
+// the common one, eliminated here. Otherwise one camera would take small errors of the width for depth.
+void eliminate_link_offsets(LinkSums& sums) {
+  constexpr double kPrior = 1.0 / (kLinkOffsetDeviation * kLinkOffsetDeviation);
+  for (std::size_t link = 0; link < sums.normal.size(); ++link) {
+    Matrix7& normal = sums.normal[link];
+    const Vector7 coupling = normal.col(6) / std::sqrt(normal(6, 6) + kPrior);
+    sums.right[link] -= coupling * (sums.right[link][6] / std::sqrt(normal(6, 6) + kPrior));
+    normal -= coupling * coupling.transpose();
   }
 }
 
@@ -379,7 +420,7 @@ void assemble(Problem& problem) {
 // Index of the angle before k about the same axis, -1 for the first.
 int neighbor(const chain::Chain& chain, int k) {
   for (int l = k - 1; l >= 0; --l)
-    if (std::abs(chain.axes[l].head<3>().dot(chain.axes[k].head<3>())) > 0.5) return l;
+    if (std::abs(chain.axes[l].head<3>().dot(chain.axes[k].head<3>())) > kSameAxis) return l;
   return -1;
 }
 
@@ -399,17 +440,16 @@ MatrixX joint_prior(const chain::Chain& chain, const Options& options) {
   return information;
 }
 
-// One step from `theta` (and `offset`, when it is free) for the assembled equations and priors. Returns the largest change.
-double step(Problem& problem, const MatrixX& prior, const VectorX& prior_pull, double variance, bool free_offset,
-            VectorX& theta, double& offset) {
+// One step from `theta` (and `offset`, when it has a weight) for the assembled equations and priors. Returns the largest change.
+double step(Problem& problem, const MatrixX& prior, const VectorX& prior_pull, double variance, double offset_weight,
+            double offset_pull, VectorX& theta, double& offset) {
   const int n = static_cast<int>(theta.size());
   problem.normal.topLeftCorner(n, n) += variance * prior;
   problem.right.head(n) += variance * prior_pull;
-  const double offset_weight = free_offset ? 1.0 / (kOffsetDeviation * kOffsetDeviation) : 0.0;
   problem.normal(n, n) += offset_weight;
-  problem.right[n] -= offset_weight * offset;
+  problem.right[n] += offset_pull;
   for (int k = 0; k <= n; ++k) {
-    if (k < n ? !problem.held[k] : free_offset) continue;
+    if (k < n ? !problem.held[k] : offset_weight > 0.0) continue;
     problem.normal.row(k).setZero();
     problem.normal.col(k).setZero();
     problem.normal(k, k) = 1.0;
@@ -424,11 +464,12 @@ double step(Problem& problem, const MatrixX& prior, const VectorX& prior_pull, d
   return largest;
 }
 
-// Information and pull (information times the way to its mean) of what is believed before looking.
+// What is believed before looking, as information.
 struct Belief {
-  MatrixX joints, all;  // all: with the frame before or the caller's prior
-  VectorX all_mean_pull;  // all = sum of informations; pull = sum of information_i mean_i
-  VectorX pull(const VectorX& theta) const { return all_mean_pull - all * theta; }
+  MatrixX joints;        // between neighbors, and that angles are small
+  MatrixX all;           // with the frame before or the caller's prior
+  VectorX weighted_mean; // sum of each part's information times its mean
+  VectorX pull(const VectorX& theta) const { return weighted_mean - all * theta; }
 };
 
 void coarse_stage(Problem& problem, const Belief& belief, int iterations, bool choose, const Options& options,
@@ -443,7 +484,7 @@ void coarse_stage(Problem& problem, const Belief& belief, int iterations, bool c
       add_coarse(work, cut);
     }
     assemble(problem);
-    if (step(problem, belief.all, belief.pull(theta), kCoarseVariance, false, theta, offset) < kCoarseStep &&
+    if (step(problem, belief.all, belief.pull(theta), kCoarseVariance, 0.0, 0.0, theta, offset) < kCoarseStep &&
         cut == options.huber_pixels)
       break;
   }
@@ -464,6 +505,7 @@ FineSums fine_equations(Problem& problem, const VectorX& theta, double offset, d
   for (ViewWork& work : problem.views) {
     clear(work.sums);
     add_fine(problem, work, offset, cut, total);
+    eliminate_link_offsets(work.sums);
   }
   assemble(problem);
   if (!problem.sizes.empty())
@@ -526,11 +568,11 @@ std::vector<VectorX> cold_starts(const chain::Chain& chain, const VectorX& start
   const int joints = chain.links() - 1;
   for (const int axis : first) {
     const Vector3 about = chain.axes[axis].head<3>();
-    if (std::abs(about.dot(chain.direction)) > 0.5) continue;
+    if (std::abs(about.dot(chain.direction)) > kSameAxis) continue;
     for (const double sign : {1.0, -1.0}) {
       VectorX bent = VectorX::Zero(chain.angles());
       for (int k = 0; k < chain.angles(); ++k)
-        if (std::abs(chain.axes[k].head<3>().dot(about)) > 0.5) bent[k] = sign * kStartBend / joints;
+        if (std::abs(chain.axes[k].head<3>().dot(about)) > kSameAxis) bent[k] = sign * kStartBend / joints;
       starts.push_back(bent);
     }
   }
@@ -545,7 +587,7 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
   Problem problem;
   problem.chain = &chain;
   problem.held.assign(n, 0);
-  for (int k = 0; k < n; ++k) problem.held[k] = std::abs(chain.axes[k].head<3>().dot(chain.direction)) > 0.5;
+  for (int k = 0; k < n; ++k) problem.held[k] = std::abs(chain.axes[k].head<3>().dot(chain.direction)) > kSameAxis;
   for (const FrameView& view : views) {
     ViewWork work;
     work.view = &view;
@@ -561,52 +603,71 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
   Belief belief;
   belief.joints = joint_prior(chain, options);
   belief.all = belief.joints;
-  belief.all_mean_pull = VectorX::Zero(n);
-  if (options.prior.mean.size() == n && options.prior.information.rows() == n) {
+  belief.weighted_mean = VectorX::Zero(n);
+  const bool given_prior = options.prior.mean.size() == n && options.prior.information.rows() == n;
+  if (given_prior) {
     belief.all += options.prior.information;
-    belief.all_mean_pull += options.prior.information * options.prior.mean;
+    belief.weighted_mean += options.prior.information * options.prior.mean;
   } else if (warm) {
     const double weight = 1.0 / (kWarmChange * kWarmChange);
     belief.all.diagonal().array() += weight;
-    belief.all_mean_pull += weight * start;
+    belief.weighted_mean += weight * start;
   }
+
+  const double offset_weight = 1.0 / (options.edge_offset_deviation * options.edge_offset_deviation);
+  const double variance = kEdgeDeviation * kEdgeDeviation;
+  double offset = 0.0, cut = kFirstCut;
+  FineSums total;
+  const auto fine_stage = [&](VectorX& theta) {  // leaves the equations at its result in `problem`
+    pose(problem, theta);
+    choose_blobs(problem, kLastReach);
+    offset = options.edge_offset;
+    cut = kFirstCut;
+    for (int i = 0; i < std::max(1, options.iterations - options.iterations / 2); ++i) {
+      fine_equations(problem, theta, offset, cut);
+      if (step(problem, belief.all, belief.pull(theta), variance, offset_weight,
+               offset_weight * (options.edge_offset - offset), theta, offset) < kFineStep)
+        break;
+    }
+    total = fine_equations(problem, theta, offset, cut);
+  };
+  // tells apart fits that cover the masks alike
+  const auto edge_cost = [&] { return total.length > 0 ? total.capped_square / total.length : 0.0; };
 
   FrameSolution out;
   VectorX theta = start;
   if (warm) {
     coarse_stage(problem, belief, std::max(1, options.iterations / 2), true, options, theta);
   } else {
-    double best = 1e300;
-    for (const VectorX& candidate : cold_starts(chain, start)) {
-      VectorX tried = candidate;
-      // the anchor's blob first, whatever its distance; then what lies near the rope found
+    std::vector<VectorX> found;
+    std::vector<double> costs;
+    for (VectorX& tried : cold_starts(chain, start)) {
+      // first what hangs together with the grasp, whatever its distance; then what lies near the rope found
       pose(problem, tried);
       choose_blobs(problem, 0.0);
       coarse_stage(problem, belief, options.first_iterations, false, options, tried);
       coarse_stage(problem, belief, std::max(1, options.iterations / 2), true, options, tried);
       pose(problem, tried);
       judge(problem, out);
-      if (out.cost < best) {
-        best = out.cost;
+      found.push_back(tried);
+      costs.push_back(out.cost);
+    }
+    const double best = *std::min_element(costs.begin(), costs.end());
+    double best_edge_cost = 1e300;
+    for (std::size_t i = 0; i < found.size(); ++i) {
+      if (costs[i] > kAlike * best + kAlikePixels) continue;
+      VectorX tried = found[i];
+      fine_stage(tried);
+      if (edge_cost() < best_edge_cost) {
+        best_edge_cost = edge_cost();
         theta = tried;
       }
     }
   }
-  pose(problem, theta);
-  choose_blobs(problem, kLastReach);
+  fine_stage(theta);
 
-  double offset = 0.0, cut = kFirstCut;
-  const double variance = kEdgeDeviation * kEdgeDeviation;
-  for (int i = 0; i < std::max(1, options.iterations - options.iterations / 2); ++i) {
-    fine_equations(problem, theta, offset, cut);
-    if (step(problem, belief.all, belief.pull(theta), variance, true, theta, offset) < kFineStep) break;
-  }
-
-  // once more at the result: what the data say about it
-  const FineSums total = fine_equations(problem, theta, offset, cut);
-  const double offset_weight = 1.0 / (kOffsetDeviation * kOffsetDeviation);
   const double offset_normal = problem.normal(n, n) + offset_weight;
-  const double offset_right = problem.right[n] - offset_weight * offset;
+  const double offset_right = problem.right[n] + offset_weight * (options.edge_offset - offset);
   const VectorX coupling = problem.normal.col(n).head(n);
   out.information = (problem.normal.topLeftCorner(n, n) - coupling * coupling.transpose() / offset_normal) / variance;
   out.gradient = (problem.right.head(n) - coupling * (offset_right / offset_normal)) / variance;
@@ -618,11 +679,10 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
   }
   out.information += belief.joints;
   out.gradient -= belief.joints * theta;
-  MatrixX held = MatrixX::Zero(n, n);
+  MatrixX posterior = out.information;
   for (int k = 0; k < n; ++k)
-    if (problem.held[k]) held(k, k) = 1.0 / (kTwist * kTwist);
-  MatrixX posterior = out.information + held;
-  if (options.prior.mean.size() == n) posterior += options.prior.information;
+    if (problem.held[k]) posterior(k, k) += 1.0 / (kTwist * kTwist);
+  if (given_prior) posterior += options.prior.information;
   out.fit.theta = theta;
   out.fit.covariance = posterior.ldlt().solve(MatrixX::Identity(n, n));
   out.fit.edge_offset = offset;

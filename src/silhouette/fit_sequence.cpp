@@ -19,7 +19,11 @@ constexpr double kLessCovered = 0.1;     // share of the mask
 constexpr double kLessInside = 0.15;     // share of the centerline
 constexpr double kMoreResidual = 2.0;    // times the median, and
 constexpr double kMoreResidualPixels = 0.5;  // px more
+constexpr double kLost = 0.6;            // share covered or inside under which a frame is looked for from scratch at once
 constexpr double kBetter = 0.9;          // share of the old cost that a new fit must stay under
+
+constexpr double kFewViews = 1.5;               // views a frame, in the mean, that count as one camera
+constexpr double kCommonOffsetDeviation = 0.1;  // px, of the masks' offset learned from all frames
 
 // Smoothing over time: random angular accelerations of this size (measured on moving ropes: 3.5 to 5.2 rad/s^2 RMS over
 // all joints), with heavy tails for contacts (up to 107).
@@ -27,9 +31,11 @@ constexpr double kAcceleration = 5.0;     // rad/s^2
 // Share of a fit's variance that is new in every frame; the rest (a bend that straight links cannot follow, the masks'
 // width) stays and would be taken for motion if the smoothing trusted the frames less.
 constexpr double kIndependent = 0.4;
+constexpr double kLinear = 0.3;          // rad, about a fit, that its quadratic is trusted
+constexpr double kUnseenWeight = 1e-6;   // of the joint priors of a frame that nothing was seen of
 constexpr double kTailDeviations = 2.0;  // beyond this many of them the penalty grows linearly
 constexpr int kSmoothingRounds = 4;      // of reweighting
-constexpr int kDerivativeReach = 2;      // frames on each side of a local cubic fit
+constexpr int kDerivativeReach = 3;      // frames on each side of a local cubic fit
 
 // Times of the frames and, for each, the views (by index) that belong to it.
 struct Frames {
@@ -89,8 +95,10 @@ std::array<double, 3> acceleration_weights(double t0, double t1, double t2) {
   return {2.0 / (a * (a + b)), -2.0 / (a * b), 2.0 / (b * (a + b))};
 }
 
-// Most likely angles for every frame's quadratic and random accelerations.
-std::vector<VectorX> smoothed(const std::vector<double>& times, const std::vector<FrameSolution>& solutions) {
+// Most likely angles for every frame's quadratic and random accelerations. Frames not `seen` follow from the others.
+std::vector<VectorX> smoothed(const std::vector<double>& times, const std::vector<FrameSolution>& solutions,
+                              const std::vector<char>& seen) {
+  constexpr double kStay = 1.0 / (kLinear * kLinear);
   const int count = static_cast<int>(times.size()), n = static_cast<int>(solutions[0].fit.theta.size());
   std::vector<VectorX> theta(count);
   for (int f = 0; f < count; ++f) theta[f] = solutions[f].fit.theta;
@@ -100,9 +108,11 @@ std::vector<VectorX> smoothed(const std::vector<double>& times, const std::vecto
   std::vector<Eigen::Triplet<double>> data;
   for (int f = 0; f < count; ++f) {
     const FrameSolution& s = solutions[f];
-    right.segment(f * n, n) = (s.information * s.fit.theta + s.gradient) / kIndependent;
+    const double share = seen[f] ? 1.0 / kIndependent : kUnseenWeight, stay = seen[f] ? kStay : 0.0;
+    right.segment(f * n, n) = share * (s.information * s.fit.theta + s.gradient) + stay * s.fit.theta;
     for (int k = 0; k < n; ++k)
-      for (int l = 0; l <= k; ++l) data.emplace_back(f * n + k, f * n + l, s.information(k, l) / kIndependent);
+      for (int l = 0; l <= k; ++l)
+        data.emplace_back(f * n + k, f * n + l, share * s.information(k, l) + (k == l ? stay : 0.0));
   }
   Eigen::SimplicialLDLT<Eigen::SparseMatrix<double>, Eigen::Lower, Eigen::NaturalOrdering<int>> solver;
   for (int round = 0; round < kSmoothingRounds; ++round) {
@@ -155,7 +165,7 @@ SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capt
   SequenceFit out;
   const Frames frames = frames_of(capture);
   const int count = static_cast<int>(frames.times.size()), n = chain.angles();
-  if (count == 0) return out;
+  if (count == 0) throw InputError(capture.name, "no images are loaded", "check the frames asked for");
 
   std::vector<MaskPoints> masks(capture.views.size());
   core::parallel_for(static_cast<std::int64_t>(masks.size()), [&](std::int64_t v) {
@@ -171,6 +181,8 @@ SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capt
       seen[f] = seen[f] || masks[v].area > 0;
     }
   }
+  if (std::find(seen.begin(), seen.end(), 1) == seen.end())
+    throw InputError(capture.name, "no mask shows the object in any frame", "check the masks, or make them: chainsplat mask");
   const int first = static_cast<int>(std::find(seen.begin(), seen.end(), 1) - seen.begin());
   Options each = options;
   each.prior = {};
@@ -178,10 +190,16 @@ SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capt
   // forward
   std::vector<FrameSolution> solutions(count);
   std::vector<int> unseen;
+  const auto try_again = [&](int f, const VectorX& from, bool warm) {
+    FrameSolution again = solve_frame(chain, views[f], from, warm, each);
+    if (again.cost < kBetter * solutions[f].cost) solutions[f] = std::move(again);
+  };
   VectorX start = VectorX::Zero(n);
   for (int f = 0; f < count; ++f) {
     if (!seen[f]) unseen.push_back(f);
-    solutions[f] = solve_frame(chain, views[f], start, f != first && f > 0, each);
+    solutions[f] = solve_frame(chain, views[f], start, f > first, each);
+    if (f > first && seen[f] && (solutions[f].fit.covered < kLost || solutions[f].fit.inside < kLost))
+      try_again(f, VectorX::Zero(n), false);
     if (seen[f]) start = solutions[f].fit.theta;
   }
 
@@ -199,10 +217,6 @@ SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capt
     return seen[f] && (fit.covered < usual_covered - kLessCovered || fit.inside < usual_inside - kLessInside ||
                        fit.residual_pixels > kMoreResidual * usual_residual + kMoreResidualPixels);
   };
-  const auto try_again = [&](int f, const VectorX& from, bool warm) {
-    FrameSolution again = solve_frame(chain, views[f], from, warm, each);
-    if (again.cost < kBetter * solutions[f].cost) solutions[f] = std::move(again);
-  };
   for (int f = count - 1; f >= 0; --f) {
     if (!bad(f)) continue;
     if (f + 1 < count) try_again(f, solutions[f + 1].fit.theta, true);
@@ -211,21 +225,32 @@ SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capt
   for (int f = 1; f < count; ++f)
     if (bad(f)) try_again(f, solutions[f - 1].fit.theta, true);
 
+  // One camera tells depth by the width of the mask: how much wider than the rope masks are is learned from all frames.
+  std::vector<double> offsets;
+  double views_a_frame = 0.0;
+  for (int f = 0; f < count; ++f) {
+    if (!seen[f]) continue;
+    offsets.push_back(solutions[f].fit.edge_offset);
+    views_a_frame += views[f].size();
+  }
+  if (offsets.size() > 1 && views_a_frame < kFewViews * offsets.size()) {
+    each.edge_offset = median(offsets);
+    each.edge_offset_deviation = kCommonOffsetDeviation;
+    const std::vector<VectorX> near = smoothed(frames.times, solutions, seen);
+    for (int f = 0; f < count; ++f)
+      if (seen[f]) solutions[f] = solve_frame(chain, views[f], near[f], true, each);
+  }
+
   out.states.time = frames.times;
   for (FrameSolution& s : solutions) out.frames.push_back(s.fit);
-  if (!unseen.empty() && unseen.size() < solutions.size()) {
+  if (!unseen.empty()) {
     const int last = unseen.back();
     core::warn(capture.name + ": " + std::to_string(unseen.size()) + " of " + std::to_string(count) +
                " frames have no mask pixel in any camera (first " + std::to_string(unseen.front()) + ", last " +
                std::to_string(last) + "); their angles follow from the frames around them");
   }
-  // what no view fixes must not pull towards the straight rope
-  for (const int f : unseen) {
-    solutions[f].information *= 1e-6;
-    solutions[f].gradient *= 1e-6;
-  }
   if (options.smooth_in_time) {
-    out.states.theta = smoothed(frames.times, solutions);
+    out.states.theta = smoothed(frames.times, solutions, seen);
   } else {
     for (const FrameFit& fit : out.frames) out.states.theta.push_back(fit.theta);
   }
@@ -243,26 +268,29 @@ BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::C
     return choice;
   }
   const std::vector<double> arclengths = chain::equal_arclengths(spatial_chain, kPoints);
-  double square = 0.0, variance = 0.0;
-  int count = 0;
+  double square = 0.0, variance = 0.0, weights = 0.0;  // frames that see little of the third dimension count little
   for (std::size_t f = 0; f < fit.states.theta.size(); ++f) {
     if (fit.frames[f].residual_pixels <= 0.0) continue;  // nothing was seen
     const VectorX& theta = fit.states.theta[f];
     const MatrixX points = chain::centerline(spatial_chain, chain::link_motions(spatial_chain, theta, Pose{}), arclengths);
     const MatrixX axes = chain::world_axes(spatial_chain, theta, Pose{});
+    double frame_square = 0.0, frame_variance = 0.0;
     for (int i = 0; i < kPoints; ++i) {
       const double out_of_plane = spatial_chain.bending_axis.dot(points.col(i));
       const MatrixX jacobian =
           chain::point_jacobian(spatial_chain, axes, chain::link_at(spatial_chain, arclengths[i]), points.col(i));
       const Eigen::RowVectorXd row = spatial_chain.bending_axis.transpose() * jacobian;
-      square += out_of_plane * out_of_plane;
-      variance += row * fit.frames[f].covariance * row.transpose();
-      ++count;
+      frame_square += out_of_plane * out_of_plane / kPoints;
+      frame_variance += row.dot(fit.frames[f].covariance * row.transpose()) / kPoints;
     }
+    const double weight = 1.0 / (frame_variance + kSmall * kSmall);
+    weights += weight;
+    square += weight * frame_square;
+    variance += weight * frame_variance;
   }
-  if (count == 0) return choice;
-  choice.out_of_plane_rms = std::sqrt(square / count);
-  choice.deviation = std::sqrt(variance / count);
+  if (weights == 0.0) return choice;
+  choice.out_of_plane_rms = std::sqrt(square / weights);
+  choice.deviation = std::sqrt(variance / weights);
   if (choice.out_of_plane_rms < std::max(kSmall, kDeviations * choice.deviation)) choice.bending = chain::Bending::planar;
   return choice;
 }

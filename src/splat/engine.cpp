@@ -375,6 +375,11 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
     live_capacity = static_cast<std::uint32_t>(std::max<std::size_t>(1, std::min<std::size_t>(replicas, 2 * count + 256)));
   constexpr std::uint32_t kFirstInstances = 8;  // tiles a splat touches, first guess
   const std::size_t pairs = static_cast<std::size_t>(live_capacity) * view_count;
+  const std::size_t pair_bytes = (options.backward ? shared::kGradientRows : shared::kSplatRows) * sizeof(glm::vec4);
+  if (pairs * pair_bytes > range_limit && view_count > 1) {
+    most_views = static_cast<int>(std::max<std::size_t>(1, range_limit / (pair_bytes * live_capacity)));
+    return false;
+  }
   if (instance_capacity == 0) instance_capacity = static_cast<std::uint32_t>(std::max<std::size_t>(1024, kFirstInstances * pairs / 2));
   const auto words = [](std::size_t n) { return n * sizeof(std::uint32_t); };
   const auto vectors = [](std::size_t n) { return n * sizeof(glm::vec4); };
@@ -534,9 +539,8 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   if (read[shared::kCounterWantLive] > live_capacity)
     live_capacity = static_cast<std::uint32_t>(std::min<std::size_t>(want_live, replicas));
   if (read[shared::kCounterWantInstances] > instance_capacity) instance_capacity = static_cast<std::uint32_t>(want_instances);
-  const std::size_t record_bytes = vectors(shared::kGradientRows * static_cast<std::size_t>(live_capacity) * view_count);
   const std::size_t partial_bytes = vectors(static_cast<std::size_t>(shared::kPartialRows) * slots * instance_capacity);
-  if (std::max(record_bytes, partial_bytes) > range_limit) {
+  if (partial_bytes > range_limit) {
     if (view_count == 1)
       throw WorkError("splat", "one view needs " + std::to_string(instance_capacity) + " tile entries, more than this device's buffers hold",
                       "use fewer or smaller Gaussians");

@@ -1,5 +1,6 @@
 // twin.json in and out; the run folder as a whole. The keys are documented in twin.h.
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 #include <nlohmann/json.hpp>

@@ -1,0 +1,243 @@
+#include "chainsplat/eval.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <nlohmann/json.hpp>
+
+namespace chainsplat::eval {
+
+using math::MatrixX;
+using math::Vector2;
+using math::Vector3;
+
+namespace {
+
+constexpr double kNone = std::numeric_limits<double>::quiet_NaN();
+constexpr int kWindow = 5;              // px around the content that SSIM's window reaches
+constexpr std::uint8_t kInMask = 128;   // mask values from here on are object
+constexpr float kSolid = 0.5f;          // 1 - T_end from here on is object
+constexpr int kCenterlinePoints = 97;   // SPEC 9
+constexpr double kSameTime = 1e-6;      // s
+
+struct Rectangle {
+  int x0 = 0, y0 = 0, x1 = 0, y1 = 0;
+  bool empty() const { return x1 <= x0 || y1 <= y0; }
+};
+
+// Holds both, grown by what SSIM sees, inside the image.
+Rectangle compared(const Rectangle& a, const Rectangle& b, const capture::Camera& camera) {
+  if (a.empty() && b.empty()) return {};
+  Rectangle all = a.empty() ? b : a;
+  if (!a.empty() && !b.empty())
+    all = {std::min(a.x0, b.x0), std::min(a.y0, b.y0), std::max(a.x1, b.x1), std::max(a.y1, b.y1)};
+  return {std::max(0, all.x0 - kWindow), std::max(0, all.y0 - kWindow), std::min(camera.width, all.x1 + kWindow),
+          std::min(camera.height, all.y1 + kWindow)};
+}
+
+double psnr(double squared_sum, double count) {
+  return std::min(kMostPsnr, -10.0 * std::log10(std::max(squared_sum / count, std::numeric_limits<double>::min())));
+}
+
+// World point of a recorded pixel's center at depth z.
+Vector3 back_projected(const capture::Camera& camera, int x, int y, double z) {
+  Vector2 pixel(x + 0.5, y + 0.5);
+  if (camera.distorted()) pixel = capture::undistort(camera, pixel);
+  return camera.world_from_camera *
+         Vector3((pixel.x() - camera.cx) / camera.fx * z, (pixel.y() - camera.cy) / camera.fy * z, z);
+}
+
+MatrixX columns(const std::vector<Vector3>& points) {
+  MatrixX out(3, points.size());
+  for (std::size_t i = 0; i < points.size(); ++i) out.col(static_cast<Eigen::Index>(i)) = points[i];
+  return out;
+}
+
+// True points at a time: a row of the file, else cubic between its rows; none outside.
+std::optional<MatrixX> true_points(const capture::TrueCenterline& truth, double time) {
+  const int count = static_cast<int>(truth.time.size());
+  const auto above = std::lower_bound(truth.time.begin(), truth.time.end(), time - kSameTime);
+  const int i = static_cast<int>(above - truth.time.begin());
+  if (i == count) return std::nullopt;
+  if (std::abs(truth.time[i] - time) <= kSameTime) return truth.points[i];
+  if (i == 0) return std::nullopt;
+  const int a = i - 1, b = i;
+  const double h = truth.time[b] - truth.time[a], u = (time - truth.time[a]) / h, u2 = u * u, u3 = u2 * u;
+  const auto slope = [&](int k) -> MatrixX {  // m an interval h
+    const int before = std::max(k - 1, 0), after = std::min(k + 1, count - 1);
+    return (truth.points[after] - truth.points[before]) * (h / (truth.time[after] - truth.time[before]));
+  };
+  return (2 * u3 - 3 * u2 + 1) * truth.points[a] + (u3 - 2 * u2 + u) * slope(a) + (3 * u2 - 2 * u3) * truth.points[b] +
+         (u3 - u2) * slope(b);
+}
+
+// `count` points along a polyline whose points (at least 2) are equally spaced in arclength.
+MatrixX resampled(const MatrixX& points, int count) {
+  MatrixX out(3, count);
+  for (int i = 0; i < count; ++i) {
+    const double s = static_cast<double>(points.cols() - 1) * i / (count - 1);
+    const Eigen::Index k = std::min<Eigen::Index>(static_cast<Eigen::Index>(s), points.cols() - 2);
+    const double u = s - static_cast<double>(k);
+    out.col(i) = (1.0 - u) * points.col(k) + u * points.col(k + 1);
+  }
+  return out;
+}
+
+void compare_centerlines(FrameMetrics& metrics, const chain::Chain& chain, const chain::States& states,
+                         const trajectory::Trajectory& base, const capture::TrueCenterline& truth) {
+  const auto points = true_points(truth, metrics.time);
+  if (!points || points->cols() < 2) return;
+  const auto motions = chain::link_motions(chain, chain::interpolate(states, metrics.time), base.pose(metrics.time));
+  const MatrixX ours = chain::centerline(chain, motions, chain::equal_arclengths(chain, kCenterlinePoints));
+  const MatrixX offset = ours - resampled(*points, kCenterlinePoints);
+  metrics.centerline_rms = std::sqrt(offset.colwise().squaredNorm().mean());
+  metrics.tip_rms = offset.col(kCenterlinePoints - 1).norm();
+}
+
+struct Metric {
+  const char* name;
+  double FrameMetrics::*value;
+  bool squared;  // averaged as root mean square
+};
+constexpr std::array kMetrics{
+    Metric{"psnr", &FrameMetrics::psnr, false},       Metric{"psnr_object", &FrameMetrics::psnr_object, false},
+    Metric{"ssim", &FrameMetrics::ssim, false},       Metric{"iou", &FrameMetrics::iou, false},
+    Metric{"chamfer", &FrameMetrics::chamfer, false}, Metric{"centerline_rms", &FrameMetrics::centerline_rms, true},
+    Metric{"tip_rms", &FrameMetrics::tip_rms, true},
+};
+
+// camera < 0: all.
+FrameMetrics mean_of(const std::vector<FrameMetrics>& frames, int camera) {
+  FrameMetrics mean;
+  mean.camera = camera;
+  for (const Metric& metric : kMetrics) {
+    double sum = 0.0;
+    int count = 0;
+    for (const FrameMetrics& frame : frames) {
+      const double value = frame.*metric.value;
+      if ((camera >= 0 && frame.camera != camera) || std::isnan(value)) continue;
+      sum += metric.squared ? value * value : value;
+      ++count;
+    }
+    mean.*metric.value = count == 0 ? kNone : metric.squared ? std::sqrt(sum / count) : sum / count;
+  }
+  return mean;
+}
+
+}  // namespace
+
+FrameMetrics compare(const render::Frame& drawn, const capture::View& view, const capture::Camera& camera) {
+  FrameMetrics metrics;
+  metrics.camera = view.camera;
+  metrics.frame = view.frame;
+  metrics.time = view.time;
+  metrics.chamfer = metrics.centerline_rms = metrics.tip_rms = kNone;
+  const splat::Picture& picture = drawn.picture;
+  const Rectangle area = compared({view.x0, view.y0, view.x0 + view.width, view.y0 + view.height},
+                                  {drawn.x0, drawn.y0, drawn.x0 + picture.width, drawn.y0 + picture.height}, camera);
+  const int width = area.x1 - area.x0, height = area.y1 - area.y0;
+  std::vector<float> recorded(3u * width * height, 0.0f), rendered(3u * width * height, 0.0f);
+  double squared = 0.0, object_squared = 0.0;
+  std::int64_t object = 0, both = 0, either = 0;
+  std::vector<Vector3> true_cloud, cloud;
+  for (int y = area.y0; y < area.y1; ++y) {
+    for (int x = area.x0; x < area.x1; ++x) {
+      const int vx = x - view.x0, vy = y - view.y0, px = x - drawn.x0, py = y - drawn.y0;
+      const bool in_view = vx >= 0 && vy >= 0 && vx < view.width && vy < view.height;
+      const bool in_picture = px >= 0 && py >= 0 && px < picture.width && py < picture.height;
+      if (!in_view && !in_picture) continue;
+      const std::size_t out = 3 * (static_cast<std::size_t>(width) * (y - area.y0) + x - area.x0);
+      const std::size_t v = static_cast<std::size_t>(view.width) * vy + vx, p = static_cast<std::size_t>(picture.width) * py + px;
+      const bool in_mask = in_view && view.rgba[4 * v + 3] >= kInMask;
+      const bool solid = in_picture && picture.rgba[4 * p + 3] >= kSolid;
+      double difference = 0.0;
+      for (int c = 0; c < 3; ++c) {
+        const double a = in_view ? view.rgba[4 * v + c] / 255.0 : 0.0;
+        const double b = in_picture ? std::clamp(static_cast<double>(picture.rgba[4 * p + c]), 0.0, 1.0) : 0.0;
+        recorded[out + c] = static_cast<float>(a);
+        rendered[out + c] = static_cast<float>(b);
+        difference += (a - b) * (a - b);
+      }
+      squared += difference;
+      if (in_mask) object_squared += difference;
+      object += in_mask;
+      both += in_mask && solid;
+      either += in_mask || solid;
+      if (in_mask && !view.depth.empty() && view.depth[v] > 0.0f)
+        true_cloud.push_back(back_projected(camera, x, y, view.depth[v]));
+      if (in_picture && !view.depth.empty() && !picture.depth.empty() && picture.depth[p] > 0.0f)
+        cloud.push_back(back_projected(camera, x, y, picture.depth[p]));
+    }
+  }
+  const double full = static_cast<double>(camera.width) * camera.height;
+  metrics.psnr = psnr(squared, 3.0 * full);
+  metrics.psnr_object = object > 0 ? psnr(object_squared, 3.0 * static_cast<double>(object)) : kNone;
+  metrics.ssim = ssim(rendered, recorded, width, height, full);
+  metrics.iou = either > 0 ? static_cast<double>(both) / static_cast<double>(either) : 1.0;
+  metrics.chamfer = chamfer(columns(cloud), columns(true_cloud));
+  return metrics;
+}
+
+Metrics evaluate(splat::Engine& engine, const splat::Gaussians& gaussians, const chain::Chain& chain,
+                 const chain::States& states, const capture::Capture& recorded) {
+  const auto truth = capture::load_true_centerline(recorded.folder);
+  Metrics metrics;
+  for (int c = 0; c < static_cast<int>(recorded.cameras.size()); ++c) {
+    const capture::Camera& camera = recorded.cameras[c];
+    metrics.camera_names.push_back(camera.name);
+    std::vector<const capture::View*> views;
+    std::vector<double> times;
+    render::Options options;
+    for (const capture::View& view : recorded.views) {
+      if (view.camera != c) continue;
+      views.push_back(&view);
+      times.push_back(view.time);
+      options.depth |= !view.depth.empty();
+    }
+    options.interval = render::median_interval(recorded.times[c]);
+    const std::size_t before = metrics.frames.size();
+    render::for_batches(
+        engine, gaussians, chain, states, recorded.base, camera, c, times, options, [&](std::vector<render::Frame>& batch) {
+          const std::size_t first = metrics.frames.size();
+          metrics.frames.resize(first + batch.size());
+          core::parallel_for(static_cast<std::int64_t>(batch.size()), [&](std::int64_t k) {
+            FrameMetrics& frame = metrics.frames[first + k];
+            frame = compare(batch[k], *views[batch[k].frame], camera);
+            if (truth) compare_centerlines(frame, chain, states, recorded.base, *truth);
+          });
+          for (std::size_t k = 0; k < batch.size(); ++k)
+            metrics.empty_clouds += !views[batch[k].frame]->depth.empty() && std::isnan(metrics.frames[first + k].chamfer);
+        });
+    const std::size_t used = metrics.frames.size() - before;
+    if (used < views.size())
+      core::warn(camera.name + ": " + std::to_string(views.size() - used) + " of " + std::to_string(views.size()) +
+                 " frames lie outside the states' times and are not evaluated");
+  }
+  if (metrics.frames.empty())
+    throw InputError(recorded.folder.string(), "no frame lies within the states' times", "give states of this capture");
+  if (metrics.empty_clouds > 0)
+    core::warn("chamfer leaves out " + std::to_string(metrics.empty_clouds) + " frames without rendered or true depth");
+  metrics.mean = mean_of(metrics.frames, -1);
+  for (int c = 0; c < static_cast<int>(recorded.cameras.size()); ++c) metrics.cameras.push_back(mean_of(metrics.frames, c));
+  return metrics;
+}
+
+std::string to_json(const Metrics& metrics) {
+  using Json = nlohmann::ordered_json;
+  const auto values = [](Json out, const FrameMetrics& frame) {
+    for (const Metric& metric : kMetrics)
+      if (!std::isnan(frame.*metric.value)) out[metric.name] = frame.*metric.value;
+    return out;
+  };
+  Json out{{"mean", values(Json::object(), metrics.mean)}, {"cameras", Json::object()}, {"frames", Json::array()}};
+  for (std::size_t c = 0; c < metrics.cameras.size(); ++c)
+    out["cameras"][metrics.camera_names[c]] = values(Json::object(), metrics.cameras[c]);
+  for (const FrameMetrics& frame : metrics.frames)
+    out["frames"].push_back(
+        values({{"camera", metrics.camera_names[frame.camera]}, {"frame", frame.frame}, {"time", frame.time}}, frame));
+  if (metrics.empty_clouds > 0) out["empty_clouds"] = metrics.empty_clouds;
+  return out.dump(1);
+}
+
+}  // namespace chainsplat::eval

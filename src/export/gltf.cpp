@@ -1,0 +1,232 @@
+// glTF 2.0 with KHR_gaussian_splatting (Khronos' extension registry): splats ride on the nodes of the chain.
+#include <tiny_gltf.h>
+
+#include <array>
+#include <cmath>
+#include <cstring>
+#include <sstream>
+
+#include "chainsplat/export.h"
+
+namespace chainsplat::exports {
+
+using math::Vector3;
+
+namespace {
+
+constexpr const char* kExtension = "KHR_gaussian_splatting";
+constexpr double kSh0 = 0.28209479177387814;  // degree-0 basis function: color = 0.5 + kSh0 * coefficient
+const double kHalfRoot = std::sqrt(0.5);
+
+double sigmoid(double x) { return 1.0 / (1.0 + std::exp(-x)); }
+
+double linear_from_srgb(double value) {
+  return value <= 0.04045 ? value / 12.92 : std::pow((value + 0.055) / 1.055, 2.4);
+}
+
+// Unit quaternion x, y, z, w of the sign nearest to `previous`: viewers differ in how they treat a flip.
+std::array<double, 4> quaternion(const math::Matrix3& rotation, const std::array<double, 4>& previous) {
+  const Eigen::Quaterniond q = Eigen::Quaterniond(rotation).normalized();
+  std::array<double, 4> out{q.x(), q.y(), q.z(), q.w()};
+  double dot = 0.0;
+  for (int c = 0; c < 4; ++c) dot += out[c] * previous[c];
+  if (dot < 0.0)
+    for (double& c : out) c = -c;
+  return out;
+}
+
+// Appends float columns to the one buffer and describes them. glTF wants min and max of positions and key times.
+class Builder {
+ public:
+  explicit Builder(tinygltf::Model& model) : model_(model) { model_.buffers.emplace_back(); }
+
+  int accessor(const std::vector<float>& values, int components, int target, bool with_bounds) {
+    std::vector<unsigned char>& data = model_.buffers[0].data;
+    tinygltf::BufferView view;
+    view.buffer = 0;
+    view.byteOffset = data.size();
+    view.byteLength = values.size() * sizeof(float);
+    view.target = target;
+    const auto* const bytes = reinterpret_cast<const unsigned char*>(values.data());
+    data.insert(data.end(), bytes, bytes + view.byteLength);
+    model_.bufferViews.push_back(view);
+
+    tinygltf::Accessor accessor;
+    accessor.bufferView = static_cast<int>(model_.bufferViews.size()) - 1;
+    accessor.componentType = TINYGLTF_COMPONENT_TYPE_FLOAT;
+    accessor.count = values.size() / components;
+    constexpr int kTypes[] = {0, TINYGLTF_TYPE_SCALAR, TINYGLTF_TYPE_VEC2, TINYGLTF_TYPE_VEC3, TINYGLTF_TYPE_VEC4};
+    accessor.type = kTypes[components];
+    for (int c = 0; with_bounds && c < components; ++c) {
+      float low = values[c], high = values[c];
+      for (std::size_t i = c; i < values.size(); i += components) {
+        low = std::min(low, values[i]);
+        high = std::max(high, values[i]);
+      }
+      accessor.minValues.push_back(low);
+      accessor.maxValues.push_back(high);
+    }
+    model_.accessors.push_back(accessor);
+    return static_cast<int>(model_.accessors.size()) - 1;
+  }
+
+  int vertices(const std::vector<float>& values, int components, bool with_bounds = false) {
+    return accessor(values, components, TINYGLTF_TARGET_ARRAY_BUFFER, with_bounds);
+  }
+  int keys(const std::vector<float>& values, int components, bool with_bounds = false) {
+    return accessor(values, components, 0, with_bounds);
+  }
+
+ private:
+  tinygltf::Model& model_;
+};
+
+tinygltf::Primitive primitive(Builder& builder, const splat::Gaussians& g, const std::vector<int>& members,
+                              const Vector3& link_origin) {
+  const int coefficients = g.sh_coefficients();
+  std::vector<float> position, rotation, scale, opacity, color;
+  std::vector<std::vector<float>> sh(coefficients);
+  for (const int i : members) {
+    double norm = 0.0;
+    for (int c = 0; c < 4; ++c) norm += static_cast<double>(g.rotation[4 * i + c]) * g.rotation[4 * i + c];
+    norm = std::sqrt(norm);
+    for (int c = 0; c < 3; ++c) position.push_back(static_cast<float>(g.mean[3 * i + c] - link_origin[c]));
+    for (const int c : {1, 2, 3, 0}) rotation.push_back(static_cast<float>(g.rotation[4 * i + c] / norm));  // wxyz to xyzw
+    for (int c = 0; c < 3; ++c) scale.push_back(std::exp(g.log_scale[3 * i + c]));
+    opacity.push_back(static_cast<float>(sigmoid(g.opacity_logit[i])));
+    for (int l = 0; l < coefficients; ++l)
+      for (int c = 0; c < 3; ++c) sh[l].push_back(g.sh[3 * (static_cast<std::size_t>(coefficients) * i + l) + c]);
+    for (int c = 0; c < 3; ++c) {
+      const double srgb = 0.5 + kSh0 * g.sh[3 * static_cast<std::size_t>(coefficients) * i + c];
+      color.push_back(static_cast<float>(linear_from_srgb(std::clamp(srgb, 0.0, 1.0))));
+    }
+    color.push_back(opacity.back());
+  }
+  const std::string prefix = std::string(kExtension) + ":";
+  tinygltf::Primitive out;
+  out.mode = TINYGLTF_MODE_POINTS;
+  out.attributes["POSITION"] = builder.vertices(position, 3, true);
+  out.attributes["COLOR_0"] = builder.vertices(color, 4);  // for viewers that only know points
+  out.attributes[prefix + "ROTATION"] = builder.vertices(rotation, 4);
+  out.attributes[prefix + "SCALE"] = builder.vertices(scale, 3);
+  out.attributes[prefix + "OPACITY"] = builder.vertices(opacity, 1);
+  for (int degree = 0, l = 0; degree <= g.degree; ++degree)
+    for (int n = 0; n < 2 * degree + 1; ++n, ++l)
+      out.attributes[prefix + "SH_DEGREE_" + std::to_string(degree) + "_COEF_" + std::to_string(n)] =
+          builder.vertices(sh[l], 3);
+  tinygltf::Value::Object extension;
+  for (const auto& [key, value] : {std::pair{"kernel", "ellipse"}, {"colorSpace", "srgb_rec709_display"},
+                                   {"projection", "perspective"}, {"sortingMethod", "cameraDistance"}})
+    extension[key] = tinygltf::Value(std::string(value));
+  out.extensions[kExtension] = tinygltf::Value(extension);
+  return out;
+}
+
+int surest_link(const splat::Gaussians& g, int i) {
+  const auto first = g.link_logits.begin() + static_cast<std::ptrdiff_t>(g.links) * i;
+  return static_cast<int>(std::max_element(first, first + g.links) - first);
+}
+
+// Poses of all link frames in their parents' (link 0: in the world) at one time.
+std::vector<math::Pose> local_poses(const chain::Chain& chain, const math::VectorX& theta, const math::Pose& base) {
+  const std::vector<math::Pose> motions = chain::link_motions(chain, theta, base);
+  std::vector<math::Pose> world, local;
+  for (int j = 0; j < chain.links(); ++j) {
+    const math::Pose home{math::Matrix3::Identity(), chain.link_start(j) * chain.direction};
+    world.push_back(motions[j] * home);
+    local.push_back(j == 0 ? world[0] : world[j - 1].inverse() * world[j]);
+  }
+  return local;
+}
+
+}  // namespace
+
+std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, const chain::States& motion,
+                 const trajectory::Trajectory& base, bool binary) {
+  CHAINSPLAT_CHECK(gaussians.links == chain.links(), std::to_string(gaussians.links));
+  const int links = chain.links();
+  tinygltf::Model model;
+  model.asset.version = "2.0";
+  model.asset.generator = std::string("chainsplat ") + CHAINSPLAT_VERSION;
+  model.extensionsUsed = {kExtension};
+  Builder builder(model);
+
+  const bool moving = !motion.time.empty();
+  const auto base_pose = [&](double time) { return base.samples().empty() ? math::Pose() : base.pose(time); };
+  const math::VectorX home = math::VectorX::Zero(chain.angles());
+  const double start = moving ? motion.time[0] : base.start();
+
+  // node 0 turns z up to y up; node 1 + j is link j, a child of the node before
+  tinygltf::Node root;
+  root.name = "z_up";
+  root.rotation = {-kHalfRoot, 0.0, 0.0, kHalfRoot};
+  root.children = {1};
+  model.nodes.push_back(root);
+  std::vector<std::vector<int>> members(links);
+  for (int i = 0; i < gaussians.count; ++i) members[surest_link(gaussians, i)].push_back(i);
+  const std::vector<math::Pose> first = local_poses(chain, moving ? motion.theta[0] : home, base_pose(start));
+  constexpr std::array<double, 4> kIdentity{0, 0, 0, 1};
+  std::vector<std::array<double, 4>> turns;
+  for (int j = 0; j < links; ++j) {
+    turns.push_back(quaternion(first[j].rotation, kIdentity));
+    tinygltf::Node node;
+    node.name = "link_" + std::to_string(j);
+    node.rotation.assign(turns[j].begin(), turns[j].end());
+    node.translation.assign(first[j].translation.begin(), first[j].translation.end());
+    if (j + 1 < links) node.children = {j + 2};
+    if (!members[j].empty()) {  // an accessor may not be empty: a link without Gaussians has no mesh
+      tinygltf::Mesh mesh;
+      mesh.name = node.name;
+      mesh.primitives.push_back(primitive(builder, gaussians, members[j], chain.link_start(j) * chain.direction));
+      node.mesh = static_cast<int>(model.meshes.size());
+      model.meshes.push_back(mesh);
+    }
+    model.nodes.push_back(node);
+  }
+  tinygltf::Scene scene;
+  scene.nodes = {0};
+  model.scenes.push_back(scene);
+  model.defaultScene = 0;
+
+  if (moving) {
+    std::vector<float> times, base_translation;
+    std::vector<std::vector<float>> rotation(links);
+    for (std::size_t k = 0; k < motion.time.size(); ++k) {
+      const auto time = static_cast<float>(motion.time[k] - start);
+      if (!times.empty() && !(time > times.back())) continue;  // closer than a float can tell
+      times.push_back(time);
+      const std::vector<math::Pose> local = local_poses(chain, motion.theta[k], base_pose(motion.time[k]));
+      for (const double x : local[0].translation) base_translation.push_back(static_cast<float>(x));
+      for (int j = 0; j < links; ++j) {
+        turns[j] = quaternion(local[j].rotation, turns[j]);
+        for (const double x : turns[j]) rotation[j].push_back(static_cast<float>(x));
+      }
+    }
+    tinygltf::Animation animation;
+    animation.name = "motion";
+    const int input = builder.keys(times, 1, true);
+    const auto channel = [&](int node, const char* path, int output) {
+      tinygltf::AnimationSampler sampler;
+      sampler.input = input;
+      sampler.output = output;
+      sampler.interpolation = "LINEAR";
+      tinygltf::AnimationChannel target;
+      target.sampler = static_cast<int>(animation.samplers.size());
+      target.target_node = node;
+      target.target_path = path;
+      animation.samplers.push_back(sampler);
+      animation.channels.push_back(target);
+    };
+    channel(1, "translation", builder.keys(base_translation, 3));
+    for (int j = 0; j < links; ++j) channel(1 + j, "rotation", builder.keys(rotation[j], 4));
+    model.animations.push_back(animation);
+  }
+
+  std::ostringstream stream;
+  tinygltf::TinyGLTF writer;
+  const bool written = writer.WriteGltfSceneToStream(&model, stream, !binary, binary);
+  CHAINSPLAT_CHECK(written, "tinygltf could not write the model");
+  return std::move(stream).str();
+}
+
+}  // namespace chainsplat::exports

@@ -1,0 +1,71 @@
+// The pixels that Gaussians can touch: EWA projection of SPEC 2.5, reach where alpha falls to 1/255 (SPEC 2.6).
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "chainsplat/render.h"
+
+namespace chainsplat::render {
+
+using math::Matrix3;
+using math::Vector2;
+using math::Vector3;
+
+namespace {
+
+constexpr double kNear = 0.01;             // m, replicas nearer than this are not drawn
+constexpr double kLowPass = 0.3;           // px^2, added to the projected covariance
+constexpr double kClamp = 1.3;             // of the half image, for the projection's Jacobian
+constexpr double kLeastAlpha = 1.0 / 255;  // below it nothing is drawn
+constexpr double kFar = 1e6;               // px, keeps whole numbers in range for splats seen edge-on
+
+}  // namespace
+
+Bounds reach(const splat::Gaussians& g, const std::vector<math::Pose>& motions, const capture::Camera& camera) {
+  CHAINSPLAT_CHECK(static_cast<int>(motions.size()) == g.links, std::to_string(motions.size()));
+  const math::Pose camera_from_world = camera.world_from_camera.inverse();
+  std::vector<math::Pose> camera_from_home;
+  for (const math::Pose& motion : motions) camera_from_home.push_back(camera_from_world * motion);
+  const double limit_x = kClamp * 0.5 * camera.width / camera.fx, limit_y = kClamp * 0.5 * camera.height / camera.fy;
+  constexpr double kInfinity = std::numeric_limits<double>::infinity();
+  Vector2 low(kInfinity, kInfinity), high(-kInfinity, -kInfinity);
+  std::vector<double> rho(g.links);
+  for (int i = 0; i < g.count; ++i) {
+    const float* const logits = &g.link_logits[static_cast<std::size_t>(g.links) * i];
+    const float largest = *std::max_element(logits, logits + g.links);
+    double sum = 0.0;
+    for (int j = 0; j < g.links; ++j) sum += rho[j] = std::exp(static_cast<double>(logits[j] - largest));
+    const double opacity = 1.0 / (1.0 + std::exp(-static_cast<double>(g.opacity_logit[i])));
+    Matrix3 half_axes;  // R(q) diag(s)
+    bool have_axes = false;
+    for (int j = 0; j < g.links; ++j) {
+      const double alpha = opacity * rho[j] / sum;
+      constexpr double kSlack = 0.999;  // the device decides in float
+      if (alpha < kSlack * kLeastAlpha) continue;
+      if (!have_axes) {
+        const float* const q = &g.rotation[4 * i];
+        half_axes = Eigen::Quaterniond(q[0], q[1], q[2], q[3]).normalized().toRotationMatrix();
+        for (int c = 0; c < 3; ++c) half_axes.col(c) *= std::exp(static_cast<double>(g.log_scale[3 * i + c]));
+        have_axes = true;
+      }
+      const Vector3 x = camera_from_home[j] * Vector3(g.mean[3 * i], g.mean[3 * i + 1], g.mean[3 * i + 2]);
+      if (!(x.z() >= kNear)) continue;
+      const Matrix3 axes = camera_from_home[j].rotation * half_axes;
+      const double reach_in_sigma = std::sqrt(std::max(0.0, 2.0 * std::log(alpha / (kSlack * kLeastAlpha))));
+      const double slope[2] = {std::clamp(x.x() / x.z(), -limit_x, limit_x), std::clamp(x.y() / x.z(), -limit_y, limit_y)};
+      const double focal[2] = {camera.fx, camera.fy}, center[2] = {camera.cx, camera.cy};
+      for (int c = 0; c < 2; ++c) {
+        const double variance = (focal[c] / x.z() * (axes.row(c) - slope[c] * axes.row(2))).squaredNorm() + kLowPass;
+        const double middle = focal[c] * x[c] / x.z() + center[c], half = reach_in_sigma * std::sqrt(variance);
+        low[c] = std::min(low[c], middle - half);
+        high[c] = std::max(high[c], middle + half);
+      }
+    }
+  }
+  if (!(low.x() <= high.x())) return {};
+  const auto pixel = [](double value) { return static_cast<int>(std::clamp(value, -kFar, kFar)); };
+  // a pixel is drawn where its center is inside
+  return {pixel(std::floor(low.x())), pixel(std::floor(low.y())), pixel(std::ceil(high.x())), pixel(std::ceil(high.y()))};
+}
+
+}  // namespace chainsplat::render

@@ -1,0 +1,43 @@
+# What the scripts share. Each is called with the program, in a folder that may be written.
+program=$1
+source_dir=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
+work=$(mktemp -d "$PWD/cli.XXXXXX")
+trap 'rm -rf "$work"' EXIT
+failures=0
+
+fail() {  # text
+  echo "FAILED: $1"
+  [ -s "$work/stderr" ] && sed 's/^/  stderr: /' "$work/stderr"
+  failures=$((failures + 1))
+}
+
+run() {  # arguments of the program; leaves $code, $work/stdout, $work/stderr
+  "$program" "$@" >"$work/stdout" 2>"$work/stderr" </dev/null
+  code=$?
+}
+
+expect_code() {  # code name
+  [ "$code" -eq "$1" ] || fail "$2: exit code $code instead of $1"
+}
+
+# The program must end with `code` and exactly one error line of the right form that matches `pattern`.
+expect_error() {  # code pattern arguments...
+  local wanted=$1 pattern=$2
+  shift 2
+  run "$@"
+  expect_code "$wanted" "$*"
+  [ "$(grep -c '^chainsplat: error: ' "$work/stderr")" -eq 1 ] || fail "$*: not exactly one error line"
+  grep -Eq '^chainsplat: error: .+: .+; .+$' "$work/stderr" || fail "$*: the line is not WHERE: WHAT; HOW TO MEND"
+  grep '^chainsplat: error: ' "$work/stderr" | grep -Eq -- "$pattern" || fail "$*: the line does not match '$pattern'"
+  grep -Evq '^chainsplat: (error|warning): ' "$work/stderr" && fail "$*: more than errors and warnings on standard error"
+  [ -s "$work/stdout" ] && fail "$*: an error, but standard output is not empty"
+}
+
+expect_output() {  # pattern name
+  grep -Eq -- "$1" "$work/stdout" || fail "$2: standard output does not match '$1'"
+}
+
+finish() {
+  [ "$failures" -eq 0 ] && echo "all passed" || echo "$failures failed"
+  exit $((failures > 0))
+}

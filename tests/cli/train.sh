@@ -1,0 +1,78 @@
+#!/bin/bash
+# A small training from end to end on whatever Vulkan device there is: results, interruption, resumption, a full disk.
+. "$(dirname "$0")/lib.sh"
+demo=$source_dir/assets/demo_free_30
+small=(--joints 3 --bending planar --frames 0:12)
+
+train() {  # folder, further options
+  local folder=$1
+  shift
+  run train "$demo" -o "$folder" "${small[@]}" "$@"
+}
+
+train "$work/whole" --picture "$work/picture.png" --log "$work/log.jsonl"
+expect_code 0 train
+expect_output '^recognized +[0-9]' train
+expect_output '^rollout +[0-9]' train
+for file in twin.json gaussians.ply states.csv rollout.csv metrics.json log.jsonl; do
+  [ -s "$work/whole/$file" ] || fail "train: no $file"
+done
+[ -e "$work/whole/checkpoint" ] && fail 'train: checkpoint/ is left'
+[ "$(wc -l <"$work/whole/states.csv")" -eq 13 ] || fail 'train: states.csv has not a row for every frame'
+grep -q '"stage":"recognize"' "$work/log.jsonl" || fail 'train: no record of recognize in --log'
+[ "$(head -c 4 "$work/picture.png" | tail -c 3)" = PNG ] || fail 'train: no picture'
+
+# stopped by Ctrl-C as soon as it is at work, then continued: the same result
+"$program" train "$demo" -o "$work/stopped" "${small[@]}" >"$work/stdout" 2>"$work/stderr" </dev/null &
+pid=$!
+for _ in $(seq 600); do
+  grep -q recognize "$work/stopped/log.jsonl" 2>/dev/null && break
+  kill -0 $pid 2>/dev/null || break
+  sleep 0.05
+done
+kill -INT $pid
+wait $pid
+code=$?
+expect_code 130 'interrupted train'
+[ -d "$work/stopped/checkpoint" ] || fail 'interrupted train: no checkpoint'
+expect_error 2 'not empty' train "$demo" -o "$work/stopped" "${small[@]}"
+expect_error 2 'bending' train "$demo" -o "$work/whole" --resume --joints 3 --frames 0:12
+train "$work/stopped" --resume
+expect_code 0 'train --resume'
+for file in gaussians.ply states.csv rollout.csv; do
+  cmp -s "$work/whole/$file" "$work/stopped/$file" || fail "train --resume: $file is not that of an uninterrupted run"
+done
+
+# what was made can be used
+run rollout "$work/whole" -o - --rate 60
+expect_code 0 rollout
+[ "$(wc -l <"$work/stdout")" -eq 122 ] || fail "rollout: $(wc -l <"$work/stdout") lines instead of 122 (2 s at 60 Hz)"
+run rollout "$work/whole" --base "$demo/base.tum" -o "$work/states.csv" --centerline "$work/centerline.csv" --json
+expect_code 0 'rollout --base'
+expect_output '"rows": 61' 'rollout --base'
+expect_error 1 '/dev/full' rollout "$work/whole" -o /dev/full
+run render "$work/whole" --states "$work/whole/rollout.csv" --camera "$demo:cam1" -o "$work/frames" --mask --depth
+expect_code 0 render
+for ending in png mask.png depth.exr; do
+  [ "$(ls "$work/frames/cam1" | grep -c "^[0-9]*\.$ending\$")" -eq 12 ] || fail "render: not 12 files *.$ending"
+done
+run render "$work/whole" --camera "$demo:cam0" -o "$work/video.mp4"
+expect_code 0 'render video'
+[ -s "$work/video.mp4" ] || fail 'render: no video'
+run eval "$work/whole" "$demo" --frames 0:12 --json
+expect_code 0 eval
+[ "$(head -c 1 "$work/stdout")" = '{' ] || fail 'eval --json: does not begin with {'
+run export "$work/whole" -o "$work/twin.glb"
+expect_code 0 export
+[ "$(head -c 4 "$work/twin.glb")" = glTF ] || fail 'export: no glTF'
+run identify "$work/whole"
+expect_code 0 identify
+cmp -s "$work/whole/rollout.csv" "$work/stopped/rollout.csv" || fail 'identify alone: not the rollout of train'
+
+# no room on the disk: a file size limit stands for it
+( ulimit -f 8; exec "$program" train "$demo" -o "$work/full" "${small[@]}" ) >"$work/stdout" 2>"$work/stderr" </dev/null
+code=$?
+expect_code 1 'full disk'
+[ "$(grep -c '^chainsplat: error: ' "$work/stderr")" -eq 1 ] || fail 'full disk: not exactly one error line'
+find "$work/full" -name '*.tmp*' | grep -q . && fail 'full disk: a half-written file is left'
+finish

@@ -1,0 +1,48 @@
+#!/bin/bash
+# Help, version, doctor and wrong command lines; nothing here needs a Vulkan device.
+. "$(dirname "$0")/lib.sh"
+export VK_DRIVER_FILES=/nonexistent VK_ICD_FILENAMES=/nonexistent
+
+run --version
+expect_code 0 --version
+expect_output '^chainsplat [0-9]+\.[0-9]+\.[0-9]+$' --version
+run --help
+expect_code 0 --help
+for command in train recognize identify check rollout render eval export synth doctor; do
+  expect_output "^ +$command " --help
+  run "$command" --help
+  expect_code 0 "$command --help"
+  expect_output "$command" "$command --help"
+  run --help
+done
+
+run doctor
+expect_code 0 doctor
+expect_output 'none' doctor
+run doctor --json
+expect_code 0 'doctor --json'
+expect_output '^ "chosen": null' 'doctor --json'
+[ "$(head -c 1 "$work/stdout")" = '{' ] || fail 'doctor --json: does not begin with {'
+
+expect_error 2 'subcommand'
+expect_error 2 'dance: is not a command' dance
+expect_error 2 'CAPTURE' train
+expect_error 2 '--output' train capture
+expect_error 2 'nonsense' train capture -o run --nonsense
+expect_error 2 'joints' train capture -o run --joints none
+expect_error 2 'joints' train capture -o run --joints 0
+expect_error 2 'bending' train capture -o run --bending sideways
+expect_error 2 'polish' train capture -o run --stages recognize,polish
+expect_error 2 '--frames' train capture -o run --frames 5:5
+expect_error 2 '--frames' train capture -o run --frames some
+expect_error 2 'twin.json' rollout "$work/none" -o "$work/states.csv"
+expect_error 2 'ending' export "$work/none" -o "$work/twin.obj"
+expect_error 2 'folder does not exist' rollout "$work/none" -o "$work/none/states.csv"
+[ "$(ls "$work")" = "$(printf 'stderr\nstdout')" ] || fail 'something was written'
+
+# a full disk under standard output
+"$program" doctor >/dev/full 2>"$work/stderr"
+code=$?
+expect_code 1 'doctor >/dev/full'
+[ "$(grep -c '^chainsplat: error: standard output: ' "$work/stderr")" -eq 1 ] || fail 'doctor >/dev/full: no error line'
+finish

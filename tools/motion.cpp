@@ -1,0 +1,236 @@
+// motion.cpp - rollout and render: a twin set in motion, and drawn.
+#include <CLI/CLI.hpp>
+#include <cmath>
+#include <cstdio>
+#include <iostream>
+#include <memory>
+#include <nlohmann/json.hpp>
+
+#include "chainsplat/capture.h"
+#include "chainsplat/dynamics.h"
+#include "chainsplat/render.h"
+#include "chainsplat/twin.h"
+#include "cli.h"
+#include "picture.h"
+#include "run_folder.h"
+
+namespace chainsplat::tools {
+
+namespace {
+
+namespace fs = std::filesystem;
+using Json = nlohmann::ordered_json;
+
+constexpr double kTimeSlack = 1e-6;  // s: times in text files are rounded
+
+struct RolloutRequest {
+  std::string run, base, out, centerline, initial;
+  double rate = 30.0;
+};
+
+// Where the rollout starts (INTERFACE 1, rollout).
+dynamics::InitialState start_of(const RolloutRequest& request, const twin::Twin& twin, const dynamics::Model& model,
+                                const trajectory::Trajectory& base) {
+  const int angles = twin.chain.angles();
+  dynamics::InitialState initial;
+  initial.time = base.start();
+  initial.thetadot = math::VectorX::Zero(angles);
+  if (!request.initial.empty()) {
+    const chain::States given = twin::read_states(input_path(request.initial), angles);
+    if (given.time.empty()) throw InputError(request.initial, "has no rows", "give at least one");
+    // the states of the twin's own motion keep their time
+    if (request.base.empty() && given.time[0] >= base.start() && given.time[0] < base.end()) initial.time = given.time[0];
+    initial.theta = given.theta[0];
+    if (!given.thetadot.empty())
+      initial.thetadot = given.thetadot[0];
+    else
+      core::warn(request.initial + ": no thetadot columns; the rope is assumed to start at rest");
+  } else if (request.base.empty()) {
+    if (!twin.initial)
+      throw InputError(request.run + "/twin.json", "has no initial state", "run 'chainsplat identify' or give --initial");
+    initial = *twin.initial;
+  } else if (twin.tabletop) {
+    initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
+  } else {
+    initial.theta = dynamics::static_equilibrium(model, base.pose(base.start()));
+  }
+  return initial;
+}
+
+void rollout(const Globals& globals, const RolloutRequest& request) {
+  if (!(request.rate > 0.0) || !std::isfinite(request.rate))
+    throw InputError("--rate", "must be above 0", "give frames a second, for example 30");
+  if (globals.json && (request.out == "-" || request.centerline == "-"))
+    throw InputError("--json", "standard output is wanted by '-' too", "name a file");
+  check_output_file(request.out);
+  if (!request.centerline.empty()) check_output_file(request.centerline);
+  const twin::Twin twin = load_twin(request.run);
+  const dynamics::Model model = model_of(twin, request.run);
+  const trajectory::Trajectory base = request.base.empty() ? own_base(request.run) : read_base(request.base);
+  const dynamics::InitialState initial = start_of(request, twin, model, base);
+  std::vector<double> times;
+  for (int k = 0; initial.time + k / request.rate <= base.end() + kTimeSlack; ++k)
+    times.push_back(initial.time + k / request.rate);
+  if (times.empty())
+    throw InputError(request.base.empty() ? request.run : request.base, "the base motion ends before the start",
+                     "give a base motion that goes on after it");
+  const chain::States states = dynamics::rollout(model, base, initial, times);
+  write_result(request.out, twin::states_csv(states));
+  if (!request.centerline.empty()) write_result(request.centerline, twin::centerline_csv(twin.chain, states, base));
+  if (!globals.json) {
+    say(std::to_string(states.time.size()) + " rows: " + request.out);
+    return;
+  }
+  Json document;
+  document["states"] = request.out;
+  if (!request.centerline.empty()) document["centerline"] = request.centerline;
+  document["rows"] = states.time.size();
+  document["start"] = states.time.front();
+  document["end"] = states.time.back();
+  std::cout << document.dump(1) << "\n";
+}
+
+struct RenderRequest {
+  std::string run, states, base, camera, out;
+  bool mask = false, depth = false, undistorted = false, force = false;
+};
+
+// CAPTURE[:camera]. A folder whose own name has a colon is taken as it is.
+std::pair<std::string, std::string> split_camera(const std::string& text) {
+  std::error_code error;
+  const std::size_t colon = text.rfind(':');
+  if (colon == std::string::npos || fs::exists(text, error)) return {text, ""};
+  return {text.substr(0, colon), text.substr(colon + 1)};
+}
+
+std::vector<float> whole_depth(const render::Frame& frame, const capture::Camera& camera) {
+  std::vector<float> meters(static_cast<std::size_t>(camera.width) * camera.height, 0.0f);
+  const splat::Picture& p = frame.picture;
+  for (int y = std::max(0, -frame.y0); y < p.height && frame.y0 + y < camera.height; ++y)
+    for (int x = std::max(0, -frame.x0); x < p.width && frame.x0 + x < camera.width; ++x)
+      meters[static_cast<std::size_t>(frame.y0 + y) * camera.width + frame.x0 + x] =
+          p.depth[static_cast<std::size_t>(y) * p.width + x];
+  return meters;
+}
+
+capture::Image8 whole_mask(const render::Frame& frame, const capture::Camera& camera) {
+  capture::Image8 mask{camera.width, camera.height, 1, {}};
+  mask.pixels.assign(static_cast<std::size_t>(camera.width) * camera.height, 0);
+  const splat::Picture& p = frame.picture;
+  for (int y = std::max(0, -frame.y0); y < p.height && frame.y0 + y < camera.height; ++y)
+    for (int x = std::max(0, -frame.x0); x < p.width && frame.x0 + x < camera.width; ++x)
+      if (p.rgba[4 * (static_cast<std::size_t>(y) * p.width + x) + 3] >= 0.5f)
+        mask.pixels[static_cast<std::size_t>(frame.y0 + y) * camera.width + frame.x0 + x] = 255;
+  return mask;
+}
+
+std::string frame_name(int frame, const char* ending) {
+  char text[64];
+  std::snprintf(text, sizeof text, "%06d%s", frame, ending);
+  return text;
+}
+
+void render(const Globals& globals, const RenderRequest& request) {
+  const Path out = request.out;
+  const bool video = out.extension() == ".mp4";
+  const auto [folder, camera_name] = split_camera(request.camera);
+  if (video) {
+    check_output_file(request.out);
+    if (request.mask || request.depth)
+      throw InputError("--mask, --depth", "go with a folder of frames, not with a video", "let -o end in another way than .mp4");
+  }
+  const twin::Twin twin = load_twin(request.run);
+  const chain::States states =
+      request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
+  capture::LoadOptions load;
+  load.images = false;
+  load.camera = camera_name;
+  const capture::Capture capture = capture::load(folder, load);
+  const trajectory::Trajectory base = request.base.empty() ? capture.base : read_base(request.base);
+  if (video && capture.cameras.size() != 1)
+    throw InputError(request.camera, "has " + std::to_string(capture.cameras.size()) + " cameras and a video shows one",
+                     "name it, for example " + folder + ":" + capture.cameras.front().name);
+  if (!video)
+    for (const capture::Camera& camera : capture.cameras)
+      check_output_folder(out / camera.name, request.force, "name another folder or give --force to write into it");
+  const gpu::DevicePtr device = gpu::open_device({.selector = globals.device});
+  splat::Engine engine(*device);
+  render::Options options;
+  options.depth = request.depth;
+  options.undistorted = request.undistorted;
+
+  Json document;
+  document["output"] = request.out;
+  std::size_t total = 0;
+  for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
+    const capture::Camera& camera = capture.cameras[c];
+    const std::vector<double>& times = capture.times[c];
+    const std::vector<render::Frame> frames =
+        render::frames(engine, twin.gaussians, twin.chain, states, base, camera, static_cast<int>(c), times, options);
+    if (frames.empty())
+      throw InputError(request.states.empty() ? request.run : request.states,
+                       "covers none of the times of " + camera.name, "give states at the camera's times");
+    if (video) {
+      std::vector<capture::Image8> images;
+      for (const render::Frame& frame : frames) images.push_back(whole_image(frame, camera));
+      const double rate = times.size() > 1 ? double(times.size() - 1) / (times.back() - times.front()) : 30.0;
+      capture::write_video(out, rate, images);
+    } else {
+      make_folder(out / camera.name);
+      for (std::size_t f = 0; f < frames.size(); ++f) {
+        const render::Frame& frame = frames[f];
+        const Path stem = out / camera.name;
+        capture::write_png(stem / frame_name(frame.frame, ".png"), whole_image(frame, camera));
+        if (request.mask) capture::write_png(stem / frame_name(frame.frame, ".mask.png"), whole_mask(frame, camera));
+        if (request.depth)
+          capture::write_depth_exr(stem / frame_name(frame.frame, ".depth.exr"), camera.width, camera.height,
+                                   whole_depth(frame, camera));
+        core::report({"write " + camera.name, static_cast<std::int64_t>(f + 1), static_cast<std::int64_t>(frames.size()), NAN,
+                      NAN, ""});
+      }
+    }
+    total += frames.size();
+    document["cameras"][camera.name] = frames.size();
+  }
+  if (globals.json)
+    std::cout << document.dump(1) << "\n";
+  else
+    say(std::to_string(total) + " frames: " + request.out);
+}
+
+}  // namespace
+
+void add_motion_commands(CLI::App& app, const Globals& globals, Job& job) {
+  CLI::App* roller = app.add_subcommand("rollout", "Set the twin in motion under a base trajectory");
+  auto request = std::make_shared<RolloutRequest>();
+  roller->add_option("RUN", request->run, "Run folder of an identified twin")->required();
+  roller->add_option("--base", request->base, "Base motion, 'timestamp tx ty tz qx qy qz qw' a line (default: the capture's own)")
+      ->type_name("FILE.tum");
+  roller->add_option("-o,--output", request->out, "States to write; - is standard output")->required()->type_name("STATES.csv");
+  roller->add_option("--rate", request->rate, "Rows a second (default 30)")->type_name("HZ");
+  roller->add_option("--centerline", request->centerline, "Also write the world points of the grasp, joints and free end")
+      ->type_name("FILE.csv");
+  roller->add_option("--initial", request->initial,
+                     "Start from its first row (default: the identified state; with --base at rest)")
+      ->type_name("STATES.csv");
+  roller->callback([&globals, &job, request] { job = [&globals, request] { rollout(globals, *request); }; });
+
+  CLI::App* renderer = app.add_subcommand("render", "Draw the twin through the cameras of a capture");
+  auto drawing = std::make_shared<RenderRequest>();
+  renderer->add_option("RUN", drawing->run, "Run folder of a twin")->required();
+  renderer->add_option("--states", drawing->states, "Motion to draw (default: the recognized states)")->type_name("STATES.csv");
+  renderer->add_option("--camera", drawing->camera, "Whose cameras; with :NAME only that one")
+      ->required()
+      ->type_name("CAPTURE[:NAME]");
+  renderer->add_option("-o,--output", drawing->out, "Folder for CAMERA/000000.png ..., or a video that ends in .mp4")
+      ->required()
+      ->type_name("OUT");
+  renderer->add_option("--base", drawing->base, "Base motion (default: that of --camera's capture)")->type_name("FILE.tum");
+  renderer->add_flag("--mask", drawing->mask, "Also 000000.mask.png: 255 where the rope covers half or more");
+  renderer->add_flag("--depth", drawing->depth, "Also 000000.depth.exr: meters along the optical axis, 0 = none");
+  renderer->add_flag("--undistorted", drawing->undistorted, "Leave the lens distortion out");
+  renderer->add_flag("--force", drawing->force, "Write into a folder that is not empty");
+  renderer->callback([&globals, &job, drawing] { job = [&globals, drawing] { render(globals, *drawing); }; });
+}
+
+}  // namespace chainsplat::tools

@@ -1,0 +1,432 @@
+// train.cpp - train, recognize, identify: load -> recognize -> identify -> roll out -> evaluate -> save.
+#include <CLI/CLI.hpp>
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <iostream>
+#include <limits>
+#include <memory>
+#include <nlohmann/json.hpp>
+#include <sstream>
+
+#include "chainsplat/capture.h"
+#include "chainsplat/eval.h"
+#include "chainsplat/identification.h"
+#include "chainsplat/recognition.h"
+#include "chainsplat/twin.h"
+#include "cli.h"
+#include "picture.h"
+#include "run_folder.h"
+
+namespace chainsplat::tools {
+
+namespace {
+
+namespace fs = std::filesystem;
+using Json = nlohmann::ordered_json;
+
+constexpr std::array<const char*, 4> kStages = {"recognize", "identify", "rollout", "evaluate"};
+constexpr int kMostJoints = 64;
+
+struct Request {
+  std::string capture, out, picture;
+  std::string stages;  // empty: all
+  std::string bending = "auto", mode = "fast", frames;
+  int joints = 8, every = 5;
+  bool twist = false, resume = false, force = false;
+};
+
+struct Stages {
+  bool named = false;  // by the user: what is done already is done again (all but recognition)
+  bool recognize = true, identify = true, rollout = true, evaluate = true;
+};
+
+Stages parse_stages(const std::string& text) {
+  Stages stages;
+  if (text.empty()) return stages;
+  stages = {true, false, false, false, false};
+  const std::array<bool*, 4> wanted = {&stages.recognize, &stages.identify, &stages.rollout, &stages.evaluate};
+  std::string word;
+  std::istringstream words(text);
+  while (std::getline(words, word, ',')) {
+    const auto at = std::find(kStages.begin(), kStages.end(), word);
+    if (at == kStages.end())
+      throw InputError("--stages", "'" + word + "' is not a stage", "name some of recognize,identify,rollout,evaluate");
+    *wanted[at - kStages.begin()] = true;
+  }
+  return stages;
+}
+
+// What recognition depends on; also written as provenance.
+std::map<std::string, std::string> recognition_options(const Request& request) {
+  return {{"joints", std::to_string(request.joints)}, {"bending", request.bending},
+          {"twist", request.twist ? "yes" : "no"},    {"every", std::to_string(request.every)},
+          {"frames", request.frames},                 {"mode", request.mode}};
+}
+
+// Measures its own life and adds it to the stage's seconds.
+class Stopwatch {
+ public:
+  Stopwatch(twin::Twin& twin, std::string stage) : twin_(twin), stage_(std::move(stage)), start_(core::seconds_now()) {}
+  ~Stopwatch() {
+    const double seconds = core::seconds_now() - start_;
+    twin_.provenance.seconds[stage_] += seconds;
+    char text[64];
+    std::snprintf(text, sizeof text, ": %.1f s", seconds);
+    say_more(stage_ + text);
+  }
+  Stopwatch(const Stopwatch&) = delete;
+  Stopwatch& operator=(const Stopwatch&) = delete;
+
+ private:
+  twin::Twin& twin_;
+  std::string stage_;
+  double start_;
+};
+
+void stop_if_asked() {
+  if (const int signal = core::stop_requested()) throw Interrupted(signal);
+}
+
+// All that a training writes.
+void remove_results(const Path& out) {
+  std::error_code ignored;
+  for (const char* name : {"twin.json", "gaussians.ply", "states.csv", "rollout.csv", kMetricsFile, kLogFile, kBaseFile,
+                           kCovarianceFile})
+    fs::remove(out / name, ignored);
+  fs::remove_all(out / kCheckpointFolder, ignored);
+}
+
+// The same failure, with what is kept named in its last part.
+WorkError with_kept(const WorkError& error, const Path& out) {
+  const std::string text = error.what();
+  const std::size_t colon = text.find(": "), semicolon = text.rfind("; ");
+  if (colon == std::string::npos || semicolon == std::string::npos || semicolon < colon) return error;
+  return {text.substr(0, colon), text.substr(colon + 2, semicolon - colon - 2),
+          text.substr(semicolon + 2) + ", then --resume: what exists so far is kept in " + out.string()};
+}
+
+identification::Options identification_options(const twin::Twin& twin, bool paper, std::uint64_t seed) {
+  identification::Options options;
+  options.tabletop = twin.tabletop;
+  options.gravity = twin.gravity;
+  if (twin.table_normal) options.table_normal = *twin.table_normal;
+  const auto mass = twin.provenance.options.find("mass");
+  if (mass != twin.provenance.options.end()) options.mass = std::stod(mass->second);
+  options.paper = paper;
+  if (paper) {
+    options.fit_stiffness = false;
+    options.per_joint = true;
+    options.integrator = dynamics::Integrator::implicit_velocity_euler;
+    options.substeps = 1;
+  }
+  options.seed = seed;
+  return options;
+}
+
+// `twin`: recognized. Fills in parameters, initial state, estimates and rollout.
+void identify_stage(twin::Twin& twin, const trajectory::Trajectory& base, const std::vector<math::MatrixX>& covariances,
+                    bool paper, std::uint64_t seed) {
+  const Stopwatch watch(twin, "identify");
+  identification::Result found =
+      identification::identify(twin.chain, base, twin.states, covariances, identification_options(twin, paper, seed));
+  twin.parameters = std::move(found.parameters);
+  twin.initial = std::move(found.initial);
+  twin.estimates = std::move(found.estimates);
+  twin.rollout = std::move(found.rollout);
+}
+
+void rollout_stage(twin::Twin& twin, const trajectory::Trajectory& base, const Path& out) {
+  const Stopwatch watch(twin, "rollout");
+  if (!twin.initial) throw InputError((out / "twin.json").string(), "has no initial state", "add identify to --stages");
+  twin.rollout = dynamics::rollout(model_of(twin, out), base, *twin.initial, twin.states.time);
+}
+
+void recognize_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, gpu::Device& device,
+                     const capture::Capture& capture, const Request& request, const Globals& globals) {
+  const Stopwatch watch(twin, "recognize");
+  recognition::Options options;
+  options.joints = request.joints;
+  if (request.bending != "auto")
+    options.bending = request.bending == "planar" ? chain::Bending::planar : chain::Bending::spatial;
+  options.twist = request.twist;
+  options.every = request.every;
+  options.mode = request.mode == "paper" ? recognition::Mode::paper : recognition::Mode::fast;
+  options.seed = globals.seed;
+  options.checkpoint = Path(request.out) / kCheckpointFolder;
+  options.resume = request.resume;
+  recognition::Result found = recognition::recognize(device, capture, options);
+  twin.chain = std::move(found.chain);
+  twin.gaussians = std::move(found.gaussians);
+  twin.states = std::move(found.states);
+  covariances = std::move(found.covariances);
+  if (request.bending == "auto" && request.mode == "fast") {
+    char text[96];
+    std::snprintf(text, sizeof text, " bending (out of plane: %.2f mm)", 1e3 * found.bending.out_of_plane_rms);
+    say((found.bending.bending == chain::Bending::planar ? "planar" : "spatial") + std::string(text));
+  }
+}
+
+// What the capture and the command line say of a new twin.
+twin::Twin new_twin(const capture::Capture& capture, const Request& request, const Globals& globals) {
+  twin::Twin twin;
+  twin.tabletop = capture.tabletop;
+  twin.gravity = capture.gravity;
+  if (capture.table) {
+    twin.table_point = capture.table->point;
+    twin.table_normal = capture.table->normal;
+  }
+  twin.known_mass = capture.mass.has_value();
+  twin.provenance.version = CHAINSPLAT_VERSION;
+  twin.provenance.capture = capture.name;
+  twin.provenance.capture_hash = hash_text(capture.hash);
+  twin.provenance.seed = globals.seed;
+  twin.provenance.options = recognition_options(request);
+  if (capture.mass) twin.provenance.options["mass"] = core::exact(*capture.mass);
+  return twin;
+}
+
+// Throws InputError where the run folder's twin is not what is asked for now.
+void check_same_work(const twin::Twin& twin, const capture::Capture& capture, const Request& request, const Stages& stages) {
+  if (twin.provenance.capture_hash != hash_text(capture.hash))
+    throw InputError(request.out, "was made from another capture (" + twin.provenance.capture + ") or it has changed since",
+                     "name that one, or begin again with --force");
+  if (!stages.recognize) return;
+  for (const auto& [name, value] : recognition_options(request)) {
+    const auto had = twin.provenance.options.find(name);
+    if (had != twin.provenance.options.end() && had->second != value)
+      throw InputError(request.out, "was begun with --" + name + " '" + had->second + "', not '" + value + "'",
+                       "give the same options, or begin again with --force");
+  }
+}
+
+Json summary_json(const twin::Twin& twin, const Path& out, const eval::Metrics* recognized, const eval::Metrics* rollout) {
+  Json document;
+  document["run"] = out.string();
+  document["capture"] = twin.provenance.capture;
+  document["frames"] = twin.states.time.size();
+  document["joints"] = twin.chain.links() - 1;
+  document["angles"] = twin.chain.angles();
+  document["gaussians"] = twin.gaussians.count;
+  for (const auto& [name, metrics] : {std::pair("recognized", recognized), std::pair("rollout", rollout)})
+    if (metrics) document[name] = Json::parse(eval::to_json(*metrics))["mean"];
+  document["seconds"] = twin.provenance.seconds;
+  return document;
+}
+
+// Throws InputError where the frames asked for do not exist, or a camera shows nothing of the object in them.
+void check_views(const capture::Capture& capture, const Request& request) {
+  if (capture.views.empty())
+    throw InputError("--frames", "'" + request.frames + "' holds none of the capture's frames",
+                     capture.cameras.front().name + " has " + std::to_string(capture.times.front().size()));
+  for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
+    const auto sees = [&](const capture::View& view) {
+      if (view.camera != static_cast<int>(c)) return false;
+      for (std::size_t i = 3; i < view.rgba.size(); i += 4)
+        if (view.rgba[i] != 0) return true;
+      return false;
+    };
+    if (std::none_of(capture.views.begin(), capture.views.end(), sees))
+      throw InputError(request.capture, capture.cameras[c].name + " never sees the object in these frames",
+                       "correct its masks, or take the camera out of capture.json");
+  }
+}
+
+void train(const Globals& globals, const Request& request) {
+  const Stages stages = parse_stages(request.stages);
+  const Path out = request.out;
+  const auto [first, last] = parse_frames(request.frames);
+  check_output_folder(out, request.force || request.resume,
+                      "name another folder, or give --force to begin again or --resume to continue");
+  if (!request.picture.empty()) check_output_file(request.picture);
+  if (request.force && request.resume) throw InputError("--force, --resume", "contradict each other", "give one of them");
+  watch_signals();
+
+  // everything that can be wrong with the request is found before anything is written
+  const double load_start = core::seconds_now();
+  capture::LoadOptions load_options;
+  load_options.first = first;
+  load_options.last = last;
+  load_options.images = stages.recognize;
+  const capture::Capture capture = capture::load(request.capture, load_options);
+  if (stages.recognize) check_views(capture, request);
+  const bool continued = request.resume && fs::exists(out / "twin.json");
+  twin::Twin twin = continued ? load_twin(out) : new_twin(capture, request, globals);
+  if (continued) check_same_work(twin, capture, request, stages);
+  if (!continued && !stages.recognize)
+    throw InputError(out.string(), "holds no recognized twin to go on from", "add recognize to --stages, or give --resume");
+  twin.provenance.seconds["load"] += core::seconds_now() - load_start;
+  const bool recognize = stages.recognize && !continued;
+  const bool identify = stages.identify && (stages.named || recognize || !twin.parameters);
+  const bool roll_out = stages.rollout && (stages.named || identify || twin.rollout.time.empty());
+  if (roll_out && !identify && !twin.parameters)
+    throw InputError("--stages", "nothing is identified that could be rolled out", "add identify");
+  std::vector<math::MatrixX> covariances;
+  if (continued && identify) covariances = read_covariances(out / kCovarianceFile, twin.states);
+  gpu::DevicePtr device;
+  if (recognize || stages.evaluate) {
+    device = gpu::open_device({.selector = globals.device});
+    const gpu::DeviceInfo& info = gpu::info(*device);
+    twin.provenance.device = info.name;
+    twin.provenance.driver = info.driver;
+    say_more("device " + std::to_string(info.index) + ": " + info.name + " (" + info.type + ", " + info.driver + ")");
+  }
+  stop_if_asked();
+
+  const bool was_there = fs::exists(out);
+  if (request.force) remove_results(out);
+  try {
+    make_folder(out / kCheckpointFolder);
+    log_to(out / kLogFile);
+    core::write_file(out / kBaseFile, trajectory::write_tum(capture.base.samples()));
+    if (recognize) {
+      recognize_stage(twin, covariances, *device, capture, request, globals);
+      if (!covariances.empty()) core::write_file(out / kCovarianceFile, covariance_csv(twin.states, covariances));
+      twin::save(twin, out);  // what comes later can fail without losing this
+      stop_if_asked();
+    }
+    if (identify) {
+      identify_stage(twin, capture.base, covariances, request.mode == "paper", globals.seed);
+      twin::save(twin, out);
+      stop_if_asked();
+    }
+    if (roll_out) {
+      rollout_stage(twin, capture.base, out);
+      twin::save(twin, out);
+      stop_if_asked();
+    }
+    eval::Metrics recognized, rolled_out;
+    const bool has_rollout = !twin.rollout.time.empty();
+    if (stages.evaluate) {
+      const Stopwatch watch(twin, "evaluate");
+      load_options.images = load_options.depth = true;
+      load_options.undistort = false;
+      const capture::Capture recorded = capture::load(request.capture, load_options);
+      splat::Engine engine(*device);
+      recognized = eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, recorded);
+      if (has_rollout) rolled_out = eval::evaluate(engine, twin.gaussians, twin.chain, twin.rollout, recorded);
+      core::write_file(out / kMetricsFile, metrics_json(&recognized, has_rollout ? &rolled_out : nullptr));
+      if (!request.picture.empty()) capture::write_png(request.picture, comparison(engine, twin, recorded));
+    }
+    twin::save(twin, out);  // with all durations
+    fs::remove_all(out / kCheckpointFolder);
+
+    end_progress();
+    const eval::Metrics* const shown[] = {stages.evaluate ? &recognized : nullptr,
+                                          stages.evaluate && has_rollout ? &rolled_out : nullptr};
+    if (globals.json) {
+      std::cout << summary_json(twin, out, shown[0], shown[1]).dump(1) << "\n";
+    } else {
+      std::vector<MetricsRow> rows;
+      if (shown[0]) rows.push_back({"recognized", shown[0]->mean});
+      if (shown[1]) rows.push_back({"rollout", shown[1]->mean});
+      if (!rows.empty()) std::cout << metrics_table(rows);
+      std::cout << "twin: " << out.string() << "\n";
+      if (!request.picture.empty() && stages.evaluate) std::cout << "picture: " << request.picture << "\n";
+    }
+  } catch (const InputError&) {
+    // nothing is left where nothing was
+    if (!continued && !request.resume) {
+      remove_results(out);
+      std::error_code ignored;
+      if (!was_there) fs::remove(out, ignored);
+    }
+    throw;
+  } catch (const WorkError& error) {
+    throw with_kept(error, out);
+  } catch (const Interrupted&) {
+    end_progress();
+    say("stopped; a checkpoint is in " + out.string() + ": the same command with --resume continues");
+    throw;
+  }
+}
+
+void identify(const Globals& globals, const std::string& run) {
+  watch_signals();
+  twin::Twin twin = load_twin(run);
+  const trajectory::Trajectory base = own_base(run);
+  const std::vector<math::MatrixX> covariances = read_covariances(Path(run) / kCovarianceFile, twin.states);
+  const auto mode = twin.provenance.options.find("mode");
+  identify_stage(twin, base, covariances, mode != twin.provenance.options.end() && mode->second == "paper", globals.seed);
+  rollout_stage(twin, base, run);
+  std::error_code ignored;
+  // what was measured on the old parameters is not true any more
+  if (fs::remove(Path(run) / kMetricsFile, ignored))
+    say("metrics.json was of the old parameters and is removed: 'chainsplat eval " + run + " CAPTURE -o " + run +
+        "/metrics.json' makes it again");
+  twin::save(twin, run);
+  end_progress();
+  const dynamics::Estimates& found = twin.estimates;
+  if (globals.json) {
+    Json document;
+    document["run"] = run;
+    document["known_mass"] = twin.known_mass;
+    document["names"] = found.names;
+    document["estimates"] = found.values;
+    document["standard_errors"] = found.standard_errors;
+    document["held"] = Json::array();
+    for (const auto& [name, reason] : found.held) document["held"].push_back({{"name", name}, {"reason", reason}});
+    std::cout << document.dump(1) << "\n";
+    return;
+  }
+  std::cout << "parameter                        estimate   standard error\n";
+  for (std::size_t i = 0; i < found.names.size(); ++i) {
+    char line[160];
+    std::snprintf(line, sizeof line, "%-28.60s %12.5g %16.3g\n", found.names[i].c_str(), found.values[i],
+                  i < found.standard_errors.size() ? found.standard_errors[i] : std::numeric_limits<double>::quiet_NaN());
+    std::cout << line;
+  }
+  for (const auto& [name, reason] : found.held) std::cout << name << ": held, " << reason << "\n";
+  std::cout << "twin: " << run << "\n";
+}
+
+void add_recognition_options(CLI::App& command, Request& request) {
+  command.add_option("CAPTURE", request.capture, "The capture's folder or its capture.json")->required();
+  command.add_option("-o,--output", request.out, "Run folder to make: the twin")->required()->type_name("RUN");
+  command.add_flag("--force", request.force, "Begin again in a run folder that is not empty");
+  command.add_flag("--resume", request.resume, "Continue in a run folder that was left unfinished");
+  command.add_option("--joints", request.joints, "Joints along the rope (default 8)")
+      ->check(CLI::Range(1, kMostJoints))
+      ->type_name("N");
+  command.add_option("--bending", request.bending,
+                     "Axes a joint: planar (one), spatial (two) or auto (default: planar on a table; in free space spatial\n"
+                     "unless the rope hardly leaves its plane)")
+      ->check(CLI::IsMember({"auto", "planar", "spatial"}))
+      ->type_name("KIND");
+  command.add_flag("--twist", request.twist, "Also a twist axis a joint");
+  command.add_option("--every", request.every, "Train the Gaussians on every N-th frame (default 5)")
+      ->check(CLI::PositiveNumber)
+      ->type_name("N");
+  command.add_option("--frames", request.frames, "Only these frames: from A up to, not including, B")->type_name("A:B");
+  command.add_option("--mode", request.mode, "fast (default) or paper: the paper's own procedure, slow")
+      ->check(CLI::IsMember({"fast", "paper"}))
+      ->type_name("MODE");
+}
+
+}  // namespace
+
+void add_training_commands(CLI::App& app, const Globals& globals, Job& job) {
+  CLI::App* trainer = app.add_subcommand("train", "Make a twin from a capture: recognize, identify, roll out, evaluate");
+  auto request = std::make_shared<Request>();
+  add_recognition_options(*trainer, *request);
+  trainer->add_option("--stages", request->stages, "Only these, by comma: recognize,identify,rollout,evaluate")
+      ->type_name("LIST");
+  trainer->add_option("--picture", request->picture, "Also make a picture: observed beside rendered frames")
+      ->type_name("FILE.png");
+  trainer->callback([&globals, &job, request] { job = [&globals, request] { train(globals, *request); }; });
+
+  CLI::App* recognizer = app.add_subcommand("recognize", "The first stage of train alone: Gaussians and angles from images");
+  auto recognition = std::make_shared<Request>();
+  add_recognition_options(*recognizer, *recognition);
+  recognizer->callback([&globals, &job, recognition] {
+    recognition->stages = "recognize";
+    job = [&globals, recognition] { train(globals, *recognition); };
+  });
+
+  CLI::App* identifier = app.add_subcommand("identify", "The second stage alone: masses, stiffness, damping, friction of a twin");
+  auto run = std::make_shared<std::string>();
+  identifier->add_option("RUN", *run, "Run folder with recognized states; it is updated")->required();
+  identifier->callback([&globals, &job, run] { job = [&globals, run] { identify(globals, *run); }; });
+}
+
+}  // namespace chainsplat::tools
