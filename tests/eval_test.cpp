@@ -2,6 +2,7 @@
 
 #include <doctest/doctest.h>
 
+#include <algorithm>
 #include <fstream>
 #include <nlohmann/json.hpp>
 
@@ -192,6 +193,125 @@ TEST_CASE("distorted pixels are straightened before they are projected back") {
   const math::Vector2 a = capture::undistort(camera, {33.5, 25.5}), b = capture::undistort(camera, {34.5, 25.5});
   CHECK((b - a).norm() > 1.05);
   CHECK(next.chamfer == doctest::Approx((b - a).norm() / 50.0).epsilon(1e-9));
+}
+
+TEST_CASE("a twin explains pictures of itself, and the metrics know by how much another does not") {
+  const gpu::DevicePtr device = gpu::open_device();
+  splat::Engine engine(*device);
+  const test::TemporaryFolder folder("eval");
+  const twin::Twin twin = test::small_twin(chain::Bending::spatial, 400);
+  capture::Capture recorded;
+  recorded.folder = folder.path;
+  recorded.base = test::moving_base(1.0);
+  recorded.has_depth = true;
+  capture::Camera camera = small_camera();
+  camera.width = 160;
+  camera.height = 121;
+  camera.fx = camera.fy = 150;
+  camera.cx = 80;
+  camera.cy = 60;
+  camera.world_from_camera.rotation << 1, 0, 0, 0, 0, 1, 0, -1, 0;
+  camera.world_from_camera.translation = {0.02, -0.6, 0.4};
+  recorded.cameras.push_back(camera);
+  camera.name = "cam1";
+  camera.distortion = {-0.2, 0.05, 0.001, -0.002, 0.0};
+  camera.world_from_camera = math::Pose{math::exp_so3({0, 0, -0.9}), Vector3::Zero()} * camera.world_from_camera;
+  recorded.cameras.push_back(camera);
+  recorded.times.resize(2);
+  render::Options options;
+  options.depth = true;
+  for (int c = 0; c < 2; ++c) {
+    for (int k = 0; k < 40; ++k) recorded.times[c].push_back(k / 30.0 + 0.01 * c);  // the states end at 1 s
+    for (render::Frame& frame : render::frames(engine, twin.gaussians, twin.chain, twin.states, recorded.base,
+                                               recorded.cameras[c], c, recorded.times[c], options)) {
+      capture::View view;
+      view.camera = c;
+      view.frame = frame.frame;
+      view.time = frame.time;
+      view.x0 = frame.x0;
+      view.y0 = frame.y0;
+      view.width = frame.picture.width;
+      view.height = frame.picture.height;
+      for (std::size_t k = 0; k < frame.picture.rgba.size(); k += 4) {
+        const bool in_mask = frame.picture.rgba[k + 3] >= 0.5f;
+        for (int i = 0; i < 3; ++i)
+          view.rgba.push_back(in_mask ? static_cast<std::uint8_t>(std::lround(255 * std::min(1.0f, frame.picture.rgba[k + i]))) : 0);
+        view.rgba.push_back(in_mask ? 255 : 0);
+      }
+      view.depth = frame.picture.depth;
+      recorded.views.push_back(std::move(view));
+    }
+  }
+  // and two views that no state covers
+  capture::View late = recorded.views.back();
+  late.frame = 39;
+  late.time = recorded.times[1][39];
+  recorded.views.push_back(late);
+  late.frame = 38;
+  late.time = recorded.times[1][38];
+  recorded.views.insert(recorded.views.end() - 1, late);
+
+  // truth by nodes of the chain: the chain has points at 0, 13 mm and every 57.4 mm; 301 points are 1 mm apart
+  std::filesystem::create_directories(folder.path / "truth");
+  std::string text = "frame,time";
+  for (int i = 0; i <= 300; ++i)
+    for (const char* axis : {",x", ",y", ",z"}) text += axis + std::to_string(i);
+  text += "\n";
+  for (int k = 0; k <= 30; ++k) {
+    const auto motions = chain::link_motions(twin.chain, twin.states.theta[k], recorded.base.pose(k / 30.0));
+    const math::MatrixX points = chain::centerline(twin.chain, motions, chain::equal_arclengths(twin.chain, 301));
+    text.append(std::to_string(k)).append(",").append(core::exact(k / 30.0));
+    for (const double x : points.reshaped()) text.append(",").append(core::exact(x));
+    text += "\n";
+  }
+  core::write_file(folder.path / "truth" / "centreline.csv", text);
+
+  std::vector<std::string> warnings;
+  core::set_listener({[&](const std::string& line) { warnings.push_back(line); }, {}});
+  const eval::Metrics metrics = eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, recorded);
+  core::set_listener({});
+  REQUIRE(warnings.size() == 1);
+  CHECK(warnings[0].find("cam1: 2 of 33") != std::string::npos);
+  REQUIRE(metrics.frames.size() == 62);
+  CHECK(metrics.camera_names == std::vector<std::string>{"cam0", "cam1"});
+  CHECK(metrics.mean.iou == 1.0);
+  CHECK(metrics.mean.psnr_object > 52.0);  // 8 bits: 20 log10(255 sqrt(12)) = 58.9
+  CHECK(metrics.mean.psnr > 35.0);         // less: the faint rim outside the mask is black in the recording
+  CHECK(metrics.mean.ssim > 0.98);
+  CHECK(metrics.mean.chamfer < 1e-7);
+  CHECK(metrics.empty_clouds == 0);
+  CHECK(metrics.cameras[0].centerline_rms < 1e-4);
+  CHECK(metrics.cameras[0].tip_rms < 1e-12);
+  CHECK(metrics.cameras[1].tip_rms < 1e-3);  // between the truth's times: cubic
+  CHECK(metrics.cameras[1].tip_rms > 1e-9);
+
+  // a base that is 5 mm away moves the centerline by exactly that, and the picture by enough to see
+  capture::Capture shifted = recorded;
+  std::vector<trajectory::Sample> samples = recorded.base.samples();
+  for (trajectory::Sample& sample : samples) sample.pose.translation += Vector3(0.003, 0, 0.004);
+  shifted.base = trajectory::fit(samples, "shifted");
+  const eval::Metrics off = eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, shifted);
+  CHECK(off.cameras[0].centerline_rms == doctest::Approx(0.005).epsilon(0.002));
+  CHECK(off.cameras[0].tip_rms == doctest::Approx(0.005).epsilon(0.001));
+  CHECK(off.mean.iou < 0.95);
+  CHECK(off.mean.psnr_object < metrics.mean.psnr_object - 15.0);
+  CHECK(off.mean.ssim < metrics.mean.ssim);
+  CHECK(off.mean.chamfer > 2e-4);
+  CHECK(off.mean.chamfer < 5e-3);
+  // cam1's last frame is after the truth's last time
+  const auto with_truth = std::count_if(off.frames.begin(), off.frames.end(), [](const auto& f) { return !std::isnan(f.tip_rms); });
+  CHECK(with_truth == 61);
+  double squares = 0.0;
+  for (const eval::FrameMetrics& frame : off.frames)
+    if (!std::isnan(frame.tip_rms)) squares += frame.tip_rms * frame.tip_rms;
+  CHECK(off.mean.tip_rms == doctest::Approx(std::sqrt(squares / 61)));
+
+  // the same on one thread
+  const int threads = core::threads();
+  core::set_threads(1);
+  CHECK(eval::to_json(eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, shifted)) == eval::to_json(off));
+  core::set_threads(threads);
+  CHECK_THROWS_AS(eval::evaluate(engine, twin.gaussians, twin.chain, test::swing(twin.chain, 0.1, 5.0), recorded), InputError);
 }
 
 TEST_CASE("metrics.json has the keys of its documentation") {

@@ -1,5 +1,5 @@
-// The silhouette fit against masks drawn from a known chain (surface points, no code in common with the fit) and against
-// the truth of the demo capture.
+// The silhouette fit against masks drawn from a known chain (surface points, no code in common with the fit) and
+// against the truth of the demo capture.
 #include "chainsplat/silhouette.h"
 
 #include <doctest/doctest.h>
@@ -103,7 +103,7 @@ capture::View draw(const Chain& chain, const VectorX& theta, const Pose& base, c
 void paint_disk(capture::View& view, double x0, double y0, double radius, std::uint8_t value) {
   for (int y = 0; y < view.height; ++y)
     for (int x = 0; x < view.width; ++x)
-      if (std::hypot(x - x0, y - y0) < radius) view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] = value;
+      if (std::hypot(x - x0, y - y0) < radius) view.rgba[4 * (y * view.width + x) + 3] = value;
 }
 
 // A smooth bend of both kinds.

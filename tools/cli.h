@@ -51,6 +51,8 @@ void check_output_folder(const Path& folder, bool overwrite, const std::string& 
 void check_output_file(const std::string& file);
 // Makes a folder and those above it. Throws WorkError.
 void make_folder(const Path& folder);
+// CAPTURE[:camera] as the two; the second is empty for all cameras. A folder whose own name has a colon is taken as it is.
+std::pair<std::string, std::string> split_camera(const std::string& text);
 // "A:B", "A:" or ":B" as [first, last); last = -1: to the end. Throws InputError.
 std::pair<int, int> parse_frames(const std::string& text);
 

@@ -95,14 +95,6 @@ struct RenderRequest {
   bool mask = false, depth = false, undistorted = false, force = false;
 };
 
-// CAPTURE[:camera]. A folder whose own name has a colon is taken as it is.
-std::pair<std::string, std::string> split_camera(const std::string& text) {
-  std::error_code error;
-  const std::size_t colon = text.rfind(':');
-  if (colon == std::string::npos || fs::exists(text, error)) return {text, ""};
-  return {text.substr(0, colon), text.substr(colon + 1)};
-}
-
 std::vector<float> whole_depth(const render::Frame& frame, const capture::Camera& camera) {
   std::vector<float> meters(static_cast<std::size_t>(camera.width) * camera.height, 0.0f);
   const splat::Picture& p = frame.picture;

@@ -1,7 +1,6 @@
 #include "picture.h"
 
 #include <algorithm>
-#include <climits>
 #include <cmath>
 
 namespace chainsplat::tools {
@@ -13,11 +12,12 @@ namespace {
 constexpr int kMoments = 4;       // rows of the comparison
 constexpr int kGap = 2;           // px between two pictures
 constexpr int kWideGap = 8;       // px between two cameras
-constexpr int kMargin = 8;        // px around what was seen
+constexpr int kSheetWidth = 1800; // px, about, of the enlarged comparison
+constexpr int kMostZoom = 3;
 constexpr std::uint8_t kGapLevel = 96;  // gray
 
 struct Bounds {
-  int x0 = INT_MAX, y0 = INT_MAX, x1 = INT_MIN, y1 = INT_MIN;
+  int x0 = 0, y0 = 0, x1 = 0, y1 = 0;
   int width() const { return x1 - x0; }
   int height() const { return y1 - y0; }
 };
@@ -52,6 +52,17 @@ void blacken(int left, int top, const Bounds& bounds, Image8& sheet) {
                 std::uint8_t{0});
 }
 
+Image8 enlarged(const Image8& image, int zoom) {
+  Image8 out{zoom * image.width, zoom * image.height, image.channels, {}};
+  out.pixels.reserve(image.pixels.size() * zoom * zoom);
+  for (int y = 0; y < out.height; ++y)
+    for (int x = 0; x < out.width; ++x) {
+      const auto from = image.pixels.begin() + image.channels * (static_cast<std::ptrdiff_t>(y / zoom) * image.width + x / zoom);
+      out.pixels.insert(out.pixels.end(), from, from + image.channels);
+    }
+  return out;
+}
+
 }  // namespace
 
 Image8 whole_image(const render::Frame& frame, const capture::Camera& camera) {
@@ -62,14 +73,14 @@ Image8 whole_image(const render::Frame& frame, const capture::Camera& camera) {
 }
 
 Image8 comparison(splat::Engine& engine, const twin::Twin& twin, const capture::Capture& recorded) {
-  struct Column {
-    Bounds bounds;
-    std::vector<const capture::View*> views;
-    std::vector<std::vector<render::Frame>> drawn;  // recognized, rollout
-    int width = 0;                                  // of its two or three pictures
-  };
   const std::vector<double>& covered = twin.states.time.empty() ? twin.rollout.time : twin.states.time;
+  struct Column {
+    std::vector<const capture::View*> views;        // one a moment
+    std::vector<std::vector<render::Frame>> drawn;  // recognized, rollout
+  };
   std::vector<Column> columns;
+  int width = 0, height = 0, pictures = 0;  // of every window, px; windows beside each other
+  std::size_t rows = 0;
   for (int c = 0; c < static_cast<int>(recorded.cameras.size()); ++c) {
     std::vector<const capture::View*> views;
     for (const capture::View& view : recorded.views)
@@ -79,57 +90,48 @@ Image8 comparison(splat::Engine& engine, const twin::Twin& twin, const capture::
     Column column;
     std::vector<double> times;
     for (int m = 0; m < kMoments; ++m) {
-      const std::size_t index = (2 * m + 1) * views.size() / (2 * kMoments);
-      if (!column.views.empty() && column.views.back() == views[index]) continue;  // fewer frames than moments
-      column.views.push_back(views[index]);
-      times.push_back(views[index]->time);
+      const capture::View* view = views[(2 * m + 1) * views.size() / (2 * kMoments)];
+      if (!column.views.empty() && column.views.back() == view) continue;  // fewer frames than moments
+      column.views.push_back(view);
+      times.push_back(view->time);
+      width = std::max(width, view->width);
+      height = std::max(height, view->height);
     }
-    const auto grow = [&](int x0, int y0, int width, int height) {
-      const capture::Camera& camera = recorded.cameras[c];
-      column.bounds.x0 = std::max(0, std::min(column.bounds.x0, x0 - kMargin));
-      column.bounds.y0 = std::max(0, std::min(column.bounds.y0, y0 - kMargin));
-      column.bounds.x1 = std::min(camera.width, std::max(column.bounds.x1, x0 + width + kMargin));
-      column.bounds.y1 = std::min(camera.height, std::max(column.bounds.y1, y0 + height + kMargin));
-    };
-    for (const capture::View* view : column.views) grow(view->x0, view->y0, view->width, view->height);
     for (const chain::States* states : {&twin.states, &twin.rollout})
       if (!states->time.empty())
         column.drawn.push_back(
             render::frames(engine, twin.gaussians, twin.chain, *states, recorded.base, recorded.cameras[c], c, times));
-    const int pictures = 1 + static_cast<int>(column.drawn.size());
-    column.width = pictures * column.bounds.width() + (pictures - 1) * kGap;
+    pictures += 1 + static_cast<int>(column.drawn.size());
+    rows = std::max(rows, column.views.size());
     columns.push_back(std::move(column));
   }
   if (columns.empty()) throw InputError(recorded.folder.string(), "no frame of it has the rope in it", "name another capture");
 
   Image8 sheet;
   sheet.channels = 3;
-  std::size_t rows = 0;
-  int row_height = 0;
-  for (const Column& column : columns) {
-    sheet.width += column.width + (sheet.width > 0 ? kWideGap : 0);
-    rows = std::max(rows, column.views.size());
-    row_height = std::max(row_height, column.bounds.height());
-  }
-  sheet.height = static_cast<int>(rows) * (row_height + kGap) - kGap;
+  sheet.width = pictures * (width + kGap) - kGap + (static_cast<int>(columns.size()) - 1) * (kWideGap - kGap);
+  sheet.height = static_cast<int>(rows) * (height + kGap) - kGap;
   sheet.pixels.assign(3 * static_cast<std::size_t>(sheet.width) * sheet.height, kGapLevel);
   int left = 0;
   for (const Column& column : columns) {
     for (std::size_t row = 0; row < column.views.size(); ++row) {
-      const int top = static_cast<int>(row) * (row_height + kGap);
+      const capture::View& view = *column.views[row];
+      const int top = static_cast<int>(row) * (height + kGap);
+      const int x0 = view.x0 + (view.width - width) / 2, y0 = view.y0 + (view.height - height) / 2;
+      const Bounds window{x0, y0, x0 + width, y0 + height};
       int x = left;
-      blacken(x, top, column.bounds, sheet);
-      paste(*column.views[row], column.bounds, x, top, sheet);
+      blacken(x, top, window, sheet);
+      paste(view, window, x, top, sheet);
       for (const std::vector<render::Frame>& drawn : column.drawn) {
-        x += column.bounds.width() + kGap;
-        blacken(x, top, column.bounds, sheet);
+        x += width + kGap;
+        blacken(x, top, window, sheet);
         for (const render::Frame& frame : drawn)
-          if (frame.time == column.views[row]->time) paste(frame, column.bounds, x, top, sheet);
+          if (frame.time == view.time) paste(frame, window, x, top, sheet);
       }
     }
-    left += column.width + kWideGap;
+    left += (1 + static_cast<int>(column.drawn.size())) * (width + kGap) - kGap + kWideGap;
   }
-  return sheet;
+  return enlarged(sheet, std::clamp(kSheetWidth / sheet.width, 1, kMostZoom));
 }
 
 }  // namespace chainsplat::tools

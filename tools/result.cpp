@@ -9,6 +9,7 @@
 #include "chainsplat/dynamics.h"
 #include "chainsplat/eval.h"
 #include "chainsplat/export.h"
+#include "chainsplat/synth.h"
 #include "cli.h"
 #include "picture.h"
 #include "run_folder.h"
@@ -16,6 +17,8 @@
 namespace chainsplat::tools {
 
 namespace {
+
+namespace fs = std::filesystem;
 
 struct EvalRequest {
   std::string run, capture, out, picture, frames;
@@ -105,6 +108,43 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
     say("written: " + request.out);
 }
 
+struct SynthRequest {
+  std::string run, states, base, camera, out;
+  bool images = false, force = false;
+};
+
+void synthesize(const Globals& globals, const SynthRequest& request) {
+  const Path out = request.out;
+  check_output_folder(out, request.force, "name another folder or give --force to write into it");
+  const twin::Twin twin = load_twin(request.run);
+  auto [folder, camera] = split_camera(request.camera);
+  if (folder.empty()) {
+    const auto path = twin.provenance.options.find("path");
+    if (path == twin.provenance.options.end())
+      throw InputError(request.run, "does not say which capture it was made from", "give --camera with a capture");
+    folder = (Path(request.run) / path->second).lexically_normal().string();
+  }
+  capture::LoadOptions load;
+  load.images = false;
+  load.camera = camera;
+  capture::Capture scene = capture::load(folder, load);
+  if (!request.base.empty()) scene.base = read_base(request.base);
+  const chain::States states = !request.states.empty()      ? twin::read_states(input_path(request.states), twin.chain.angles())
+                               : twin.rollout.time.empty() ? twin.states
+                                                            : twin.rollout;
+  const gpu::DevicePtr device = gpu::open_device({.selector = globals.device});
+  splat::Engine engine(*device);
+  synth::Options options;
+  options.name = fs::absolute(out).lexically_normal().filename().string();
+  if (options.name.empty()) options.name = "synth";
+  options.video = !request.images;
+  synth::write(engine, twin, states, scene, out, options);
+  if (globals.json)
+    std::cout << nlohmann::ordered_json{{"capture", request.out}}.dump() << "\n";
+  else
+    say("capture: " + request.out);
+}
+
 }  // namespace
 
 void add_result_commands(CLI::App& app, const Globals& globals, Job& job) {
@@ -130,6 +170,19 @@ void add_result_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("STATES.csv");
   exporter->add_option("--base", exporting->base, "Its base motion (default: the capture's own)")->type_name("FILE.tum");
   exporter->callback([&globals, &job, exporting] { job = [&globals, exporting] { export_twin(globals, *exporting); }; });
+
+  CLI::App* synthesizer = app.add_subcommand("synth", "Draw a capture from a twin: videos, masks, depth, truth");
+  auto scene = std::make_shared<SynthRequest>();
+  synthesizer->add_option("RUN", scene->run, "Run folder of a twin")->required();
+  synthesizer->add_option("-o,--output", scene->out, "Capture folder to make")->required()->type_name("CAPTURE");
+  synthesizer->add_option("--states", scene->states, "Motion to draw (default: the rollout, else the recognized states)")
+      ->type_name("STATES.csv");
+  synthesizer->add_option("--camera", scene->camera, "Whose cameras, base motion and table (default: the twin's own capture)")
+      ->type_name("CAPTURE[:NAME]");
+  synthesizer->add_option("--base", scene->base, "Base motion (default: that of the capture)")->type_name("FILE.tum");
+  synthesizer->add_flag("--images", scene->images, "Images without loss instead of videos");
+  synthesizer->add_flag("--force", scene->force, "Write into a folder that is not empty");
+  synthesizer->callback([&globals, &job, scene] { job = [&globals, scene] { synthesize(globals, *scene); }; });
 }
 
 }  // namespace chainsplat::tools

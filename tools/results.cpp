@@ -59,6 +59,13 @@ void make_folder(const Path& folder) {
                     "make room or choose a folder that can be written");
 }
 
+std::pair<std::string, std::string> split_camera(const std::string& text) {
+  std::error_code error;
+  const std::size_t colon = text.rfind(':');
+  if (colon == std::string::npos || fs::exists(text, error)) return {text, ""};
+  return {text.substr(0, colon), text.substr(colon + 1)};
+}
+
 std::pair<int, int> parse_frames(const std::string& text) {
   if (text.empty()) return {0, -1};
   const auto fail = [&] {

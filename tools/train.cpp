@@ -182,6 +182,9 @@ twin::Twin new_twin(const capture::Capture& capture, const Request& request, con
   twin.provenance.capture_hash = hash_text(capture.hash);
   twin.provenance.seed = globals.seed;
   twin.provenance.options = recognition_options(request);
+  // from the run folder, so that the two can be moved together
+  twin.provenance.options["path"] =
+      fs::proximate(fs::absolute(request.capture), fs::absolute(request.out)).lexically_normal().generic_string();
   if (capture.mass) twin.provenance.options["mass"] = core::exact(*capture.mass);
   return twin;
 }

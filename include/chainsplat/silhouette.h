@@ -1,10 +1,10 @@
 // chainsplat/silhouette.h - masks and a chain -> joint angles: the coarse step of recognition and estimation (SPEC 6).
 //
-// A frame in two stages, Gauss-Newton over all its views at once. Coarse: sampled mask pixels are drawn to the projected
-// centerline along its normal (those past the free end with the whole vector) and centerline samples into the mask: this
-// finds the rope from afar. Fine: the mask's outline, to a fraction of a pixel, is put at the tube's radius from the
-// centerline on either side, and its end at the free end. A sequence is warm-started frame by frame, repaired where that
-// failed, and smoothed over time with each frame's own normal equations as weights. DESIGN, 'Recognition'.
+// A frame in two stages, Gauss-Newton over all its views at once. Coarse: sampled mask pixels are drawn to the
+// projected centerline along its normal (those past the free end with the whole vector) and centerline samples into the
+// mask: this finds the rope from afar. Fine: the mask's outline, to a fraction of a pixel, is put at the tube's radius
+// from the centerline on either side, and its end at the free end. A sequence is warm-started frame by frame, repaired
+// where that failed, and smoothed over time with each frame's own normal equations as weights. DESIGN, 'Recognition'.
 #pragma once
 #include <span>
 #include <vector>
@@ -20,15 +20,15 @@ struct Prior {
 };
 
 struct Options {
-  int max_pixels = 500;          // mask pixels used a view (coarse stage)
-  int iterations = 8;            // Gauss-Newton steps of a warm-started frame, half of them coarse
-  int first_iterations = 30;     // coarse steps of a frame without a warm start, from each of several starts
-  double huber_pixels = 8.0;     // px, coarse stage, after the first iterations
-  double joint_smoothness = 0.0; // 1/rad^2, weight of (theta_j - theta_{j-1})^2 against edges known to 1 px; 0: default
-  double edge_offset = 0.0;      // px by which the masks are thought wider than the tube on each side, and
+  int max_pixels = 500;                // mask pixels used a view (coarse stage)
+  int iterations = 8;                  // Gauss-Newton steps of a warm-started frame, half of them coarse
+  int first_iterations = 30;           // coarse steps of a frame without a warm start, from each of several starts
+  double huber_pixels = 8.0;           // px, coarse stage, after the first iterations
+  double joint_smoothness = 0.0;       // 1/rad^2, weight of (theta_j - theta_{j-1})^2, edges known to 1 px; 0: default
+  double edge_offset = 0.0;            // px by which the masks are thought wider than the tube on each side, and
   double edge_offset_deviation = 3.0;  // px, how sure that is (one camera reads depth off the width)
-  bool smooth_in_time = true;    // fit_sequence: smooth the angles over time
-  Prior prior;                   // fit_frame only
+  bool smooth_in_time = true;          // fit_sequence: smooth the angles over time
+  Prior prior;                         // fit_frame only
 };
 
 struct FrameFit {
@@ -40,15 +40,16 @@ struct FrameFit {
   math::MatrixX covariance;      // n x n of theta, rad^2; directions that the views do not fix have their prior's
 };
 
-// One frame: all views taken at (nearly) one time. `views` must be undistorted crops with masks; empty masks are allowed.
+// One frame: all views taken at (nearly) one time. `views` must be undistorted crops with masks, which may be empty.
 // `warm`: `start` is near (the frame before); otherwise several starts are tried and the best is kept.
 FrameFit fit_frame(const chain::Chain& chain, const math::Pose& base, std::span<const capture::View* const> views,
                    const std::vector<capture::Camera>& cameras, const math::VectorX& start, bool warm,
                    const Options& options = {});
 
-// Every time of the first camera that has views, in order; other cameras' nearest frame within half an interval joins it
-// (with the base pose of its own time). Frames without any mask pixel keep the prediction from their neighbors (and are
-// named in one warning). Frames whose fit is far worse than the others' are fitted again from the frame after them. Throws InputError when no mask shows anything.
+// Every time of the first camera that has views, in order; other cameras' nearest frame within half an interval joins
+// it (with the base pose of its own time). Frames without any mask pixel keep the prediction from their neighbors (and
+// are named in one warning). Frames whose fit is far worse than the others' are fitted again from the frame after them.
+// Throws InputError when no mask shows anything.
 struct SequenceFit {
   chain::States states;          // theta (smoothed over time) and thetadot
   std::vector<FrameFit> frames;  // each frame's own fit
@@ -62,6 +63,7 @@ struct BendingChoice {
   double out_of_plane_rms = 0.0;  // m; 0 when not measured
   double deviation = 0.0;         // its standard deviation, m
 };
-BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::Capture& capture, const SequenceFit& fit);
+BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::Capture& capture,
+                             const SequenceFit& fit);
 
 }  // namespace chainsplat::silhouette

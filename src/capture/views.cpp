@@ -1,6 +1,8 @@
 // Decoding, masking, undistorting and cropping: from the files of a capture to its views.
 #include <algorithm>
 #include <cmath>
+#include <exception>
+#include <functional>
 
 #include "image_files.h"
 #include "manifest.h"
@@ -215,6 +217,20 @@ void load_mask_video(const CameraSource& source, const LoadOptions& options, int
   }
 }
 
+// core::parallel_for that throws the exception of the lowest number, so that messages do not depend on the threads.
+void for_each_in_parallel(std::int64_t count, const std::function<void(std::int64_t)>& body) {
+  std::vector<std::exception_ptr> failures(static_cast<std::size_t>(count));
+  core::parallel_for(count, [&](std::int64_t i) {
+    try {
+      body(i);
+    } catch (...) {
+      failures[i] = std::current_exception();
+    }
+  });
+  for (const std::exception_ptr& failure : failures)
+    if (failure) std::rethrow_exception(failure);
+}
+
 bool lossless(const ImageSource& images) {
   return images.suffix.ends_with(".png") || images.suffix.ends_with(".PNG") || images.suffix.ends_with(".bmp") ||
          images.suffix.ends_with(".tif") || images.suffix.ends_with(".tiff");
@@ -262,7 +278,7 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
   const auto view_of = [&](const Frame& f) -> View& { return views[ranges[f.camera].offset + f.frame - ranges[f.camera].first]; };
 
   // masks by file first: they say which part of an image is kept
-  core::parallel_for(total, [&](std::int64_t i) {
+  for_each_in_parallel(total, [&](std::int64_t i) {
     const CameraSource& source = manifest.cameras[frames[i].camera];
     if (!options.masked || !source.masks || source.masks->video) return;
     const Pixels mask = read_mask(source.masks->frame_file(frames[i].frame), source.camera.width, source.camera.height);
@@ -271,7 +287,7 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
   // videos: one camera a task. Fewer cameras than threads: the decoders use the rest (their output does not depend on it)
   const int cameras = static_cast<int>(manifest.cameras.size());
   const int decoder_threads = std::max(1, (core::threads() + cameras - 1) / std::max(1, cameras));
-  core::parallel_for(cameras, [&](std::int64_t c) {
+  for_each_in_parallel(cameras, [&](std::int64_t c) {
     const CameraSource& source = manifest.cameras[c];
     const Range& range = ranges[c];
     if (range.first == range.last) return;
@@ -282,7 +298,7 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
       load_mask_video(source, options, range.first, range.last, range.undistorting, decoder_threads, mine);
   });
   // images and depth by file
-  core::parallel_for(total, [&](std::int64_t i) {
+  for_each_in_parallel(total, [&](std::int64_t i) {
     const CameraSource& source = manifest.cameras[frames[i].camera];
     const bool undistorting = ranges[frames[i].camera].undistorting;
     View& view = view_of(frames[i]);

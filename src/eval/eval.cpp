@@ -166,7 +166,7 @@ FrameMetrics compare(const render::Frame& drawn, const capture::View& view, cons
       either += in_mask || solid;
       if (in_mask && !view.depth.empty() && view.depth[v] > 0.0f)
         true_cloud.push_back(back_projected(camera, x, y, view.depth[v]));
-      if (in_picture && !view.depth.empty() && !picture.depth.empty() && picture.depth[p] > 0.0f)
+      if (solid && !view.depth.empty() && !picture.depth.empty() && picture.depth[p] > 0.0f)
         cloud.push_back(back_projected(camera, x, y, picture.depth[p]));
     }
   }

@@ -1,7 +1,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "src/silhouette/frame.h"
+#include "src/silhouette/observations.h"
 
 namespace chainsplat::silhouette {
 
@@ -12,30 +12,24 @@ using math::VectorX;
 
 namespace {
 
-constexpr double kNear = 0.01;  // m, nothing nearer than this is in front of a camera (SPEC 2.5)
-
 constexpr double kSameAxis = 0.5;  // cosine; the axes of a joint are perpendicular, so anything between 0 and 1
 
 // coarse stage
 constexpr double kFarHuber = 50.0;       // px, before `huber_pixels` takes over: everything pulls
 constexpr double kFarShare = 1.0 / 3.0;  // share of the coarse iterations with kFarHuber
-constexpr int kReverseSamples = 4;       // centerline samples a link that must lie in the mask
-constexpr double kReverseWeight = 0.5;   // of all of them together, against all mask pixels of the view
 constexpr double kCoarseVariance = 100;  // px^2, what a mask pixel's distance says about the centerline: half widths,
                                          // strongly correlated; scales the priors
 constexpr double kCoarseStep = 1e-3;     // rad, smaller steps end the stage
 constexpr double kLongestStep = 0.5;     // rad, largest change of an angle in one step
+constexpr double kReach = 5.0;           // diameters: farther from the prediction (median) a blob is not the rope
+constexpr double kLastReach = 1.0;       // the same after the coarse stage
 
 // fine stage
-constexpr double kAligned = 0.7;         // least cosine between outline and tube normals
-constexpr double kLeastArm = 1.0;        // px, from a joint, to tell a direction from it
-constexpr double kFirstCut = 8.0;        // px, Tukey's cut-off before residuals are known
-constexpr double kLeastCut = 2.5, kLargestCut = 12.0;  // px
-constexpr double kCutDeviations = 4.685; // Tukey's constant
+constexpr double kFirstCut = 8.0;              // px, Tukey's cut-off before residuals are known
+constexpr double kLeastCut = 2.5;              // px, smallest cut-off
+constexpr double kCutDeviations = 4.685;       // Tukey's constant
 constexpr double kDeviationOfMedian = 1.4826;  // standard deviation from a median of absolute values
-constexpr double kFineStep = 1e-5;       // rad
-constexpr double kLinkOffsetDeviation = 0.2;  // px, of a link's outline in one view about the common offset
-constexpr double kEndReach = 2.0;        // half widths from the free end within which an outline may be the end's
+constexpr double kFineStep = 1e-5;             // rad
 
 // priors, rad
 constexpr double kJointDifference = 0.3;  // between neighboring joints, along one axis
@@ -48,374 +42,8 @@ constexpr double kTwist = 0.5;            // unseen by silhouettes, held
 constexpr double kEdgeDeviation = 1.0;  // px
 
 // cold start
-constexpr double kStartBend = 1.5;     // rad, whole bend of the extra starts
+constexpr double kStartBend = 1.5;                  // rad, whole bend of the extra starts
 constexpr double kAlike = 1.5, kAlikePixels = 2.0;  // costs under this times the best, plus this (px^2), are alike
-
-// blobs
-constexpr double kReach = 5.0;      // diameters: farther from the prediction (median) a blob is not the rope
-constexpr double kLastReach = 1.0;  // the same after the coarse stage
-constexpr double kGap = 3.0;        // diameters, that an occluder may hide between two blobs of the rope
-constexpr double kLeastArea = 0.05, kLargestArea = 2.0;  // of the straight rope's area: what can be the rope alone
-
-using Vector7 = Eigen::Matrix<double, 7, 1>;
-using Matrix7 = Eigen::Matrix<double, 7, 7>;
-
-// One link's segment seen by one camera.
-struct Segment {
-  int link;
-  Vector3 a, b;            // camera frame, m
-  Vector2 from, step;      // px: image of a, and from there to the image of b
-  Vector2 tangent, normal; // unit
-  double per_length2;      // 1 / |step|^2
-};
-
-struct Nearest {
-  int segment = -1;
-  double t = 0.0;         // along the segment in the image, 0 to 1
-  double distance2 = 1e300;
-};
-
-// Normal equations of one view by link, in camera coordinates: a row is (x cross g, g, offset derivative), SPEC 2.3.
-struct LinkSums {
-  std::vector<Matrix7> normal;
-  std::vector<Vector7> right;
-};
-
-struct ViewWork {
-  const FrameView* view;
-  Pose camera_from_base;
-  std::vector<Segment> segments;
-  LinkSums sums;
-  std::vector<char> active;  // by blob
-  double diameter = 0.0;     // px, at the base or the first visible node
-};
-
-struct Problem {
-  const chain::Chain* chain;
-  std::vector<ViewWork> views;
-  std::vector<char> held;      // by angle: twist, which silhouettes do not show
-  MatrixX axes;                // 6 x n in the base frame, at the angles of the last pose()
-  MatrixX normal;              // (n + 1) x (n + 1), the last row is the edge offset's
-  VectorX right;
-  std::vector<double> sizes;   // residuals' absolute values, px
-};
-
-Vector2 image_of(const capture::Camera& camera, const Vector3& x) {
-  return {camera.fx * x.x() / x.z() + camera.cx, camera.fy * x.y() / x.z() + camera.cy};
-}
-
-// d(m . u)/dx of a camera-frame point.
-Vector3 projected_gradient(const capture::Camera& camera, const Vector3& x, const Vector2& m) {
-  const double gx = camera.fx * m.x() / x.z(), gy = camera.fy * m.y() / x.z();
-  return {gx, gy, -(gx * x.x() + gy * x.y()) / x.z()};
-}
-
-// Puts the chain at theta into every view.
-void pose(Problem& problem, const VectorX& theta) {
-  const chain::Chain& chain = *problem.chain;
-  const std::vector<Pose> motions = chain::link_motions(chain, theta, Pose{});
-  const MatrixX nodes = chain::nodes(chain, motions);
-  problem.axes = chain::world_axes(chain, theta, Pose{});
-  for (ViewWork& work : problem.views) {
-    const capture::Camera& camera = *work.view->camera;
-    work.segments.clear();
-    for (int link = 0; link < chain.links(); ++link) {
-      Segment s;
-      s.link = link;
-      s.a = work.camera_from_base * Vector3(nodes.col(link));
-      s.b = work.camera_from_base * Vector3(nodes.col(link + 1));
-      if (!(chain.link_end(link) > chain.link_start(link)) || s.a.z() < kNear || s.b.z() < kNear) continue;
-      s.from = image_of(camera, s.a);
-      s.step = image_of(camera, s.b) - s.from;
-      const double length2 = std::max(s.step.squaredNorm(), 1e-12);
-      s.per_length2 = 1.0 / length2;
-      s.tangent = s.step / std::sqrt(length2);
-      s.normal = Vector2(-s.tangent.y(), s.tangent.x());
-      work.segments.push_back(s);
-    }
-  }
-}
-
-Nearest nearest(const std::vector<Segment>& segments, const Vector2& pixel) {
-  Nearest best;
-  for (int i = 0; i < static_cast<int>(segments.size()); ++i) {
-    const Segment& s = segments[i];
-    const Vector2 offset = pixel - s.from;
-    const double t = std::clamp(offset.dot(s.step) * s.per_length2, 0.0, 1.0);
-    const double distance2 = (offset - t * s.step).squaredNorm();
-    if (distance2 < best.distance2) best = {i, t, distance2};
-  }
-  return best;
-}
-
-// Camera-frame point of image position t along a segment.
-Vector3 point_at(const Segment& s, double t) {
-  const double from = t * s.a.z(), to = (1.0 - t) * s.b.z();
-  return s.a + from / (from + to) * (s.b - s.a);
-}
-
-void add(LinkSums& sums, int link, const Vector3& x, const Vector3& g, double offset, double residual, double weight) {
-  Vector7 row;
-  row << x.cross(g), g, offset;
-  sums.normal[link].noalias() += (weight * row) * row.transpose();
-  sums.right[link] += (weight * residual) * row;
-}
-
-double huber_weight(double residual, double cut) { return residual <= cut ? 1.0 : cut / residual; }
-
-double tukey_weight(double residual, double cut) {
-  const double u = residual / cut;
-  return std::abs(u) >= 1.0 ? 0.0 : (1.0 - u * u) * (1.0 - u * u);
-}
-
-bool past_end(const ViewWork& work, const Nearest& at) {
-  return at.segment + 1 == static_cast<int>(work.segments.size()) && at.t >= 1.0;
-}
-
-// --- blobs ------------------------------------------------------------------------------------------------------------
-
-bool near(const MaskPoints& mask, const Blob& a, const Blob& b, double gap) {
-  for (int i = a.first_pixel; i < a.last_pixel; ++i)
-    for (int j = b.first_pixel; j < b.last_pixel; ++j)
-      if ((mask.pixels[i] - mask.pixels[j]).squaredNorm() <= gap * gap) return true;
-  return false;
-}
-
-// The blobs that hold the rope when nothing else is known: of those that could be a rope, the one nearest to the grasp,
-// and those that follow within an occluder's width.
-void choose_anchor(ViewWork& work, double straight_area) {
-  const MaskPoints& mask = *work.view->mask;
-  const int count = static_cast<int>(mask.blobs.size());
-  const Vector2 grasp = work.segments.empty() ? Vector2(0, 0) : work.segments[0].from;
-  std::vector<char> possible(count, 0);
-  int first = 0;
-  double best_distance2 = 1e300;
-  for (int b = 0; b < count; ++b) {
-    const Blob& blob = mask.blobs[b];
-    possible[b] = blob.area >= kLeastArea * straight_area && blob.area <= kLargestArea * straight_area;
-    if (!possible[b]) continue;
-    for (int i = blob.first_pixel; i < blob.last_pixel; ++i) {
-      const double distance2 = (mask.pixels[i] - grasp).squaredNorm();
-      if (distance2 < best_distance2) {
-        best_distance2 = distance2;
-        first = b;
-      }
-    }
-  }
-  std::vector<int> queue{first};
-  work.active[first] = 1;
-  for (std::size_t done = 0; done < queue.size(); ++done) {
-    for (int b = 0; b < count; ++b) {
-      if (work.active[b] || !possible[b] || !near(mask, mask.blobs[queue[done]], mask.blobs[b], kGap * work.diameter))
-        continue;
-      work.active[b] = 1;
-      queue.push_back(b);
-    }
-  }
-}
-
-// Keeps the blobs whose median pixel is within `reach` diameters of the posed chain; without any, the anchor.
-void choose_blobs(Problem& problem, double reach) {
-  for (ViewWork& work : problem.views) {
-    const MaskPoints& mask = *work.view->mask;
-    work.active.assign(mask.blobs.size(), 0);
-    bool any = false;
-    for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
-      const Blob& blob = mask.blobs[b];
-      problem.sizes.clear();
-      for (int i = blob.first_pixel; i < blob.last_pixel; ++i)
-        problem.sizes.push_back(nearest(work.segments, mask.pixels[i]).distance2);
-      if (problem.sizes.empty()) continue;
-      const auto middle = problem.sizes.begin() + problem.sizes.size() / 2;
-      std::nth_element(problem.sizes.begin(), middle, problem.sizes.end());
-      const double limit = reach * work.diameter;
-      work.active[b] = *middle <= limit * limit;
-      any = any || work.active[b];
-    }
-    if (any || mask.blobs.empty()) continue;
-    const double pixels_per_meter = work.diameter / problem.chain->diameter;
-    choose_anchor(work, problem.chain->length * pixels_per_meter * work.diameter);
-  }
-}
-
-// --- the two stages' observations ---------------------------------------------------------------------------------------
-
-void clear(LinkSums& sums) {
-  std::fill(sums.normal.begin(), sums.normal.end(), Matrix7::Zero());
-  std::fill(sums.right.begin(), sums.right.end(), Vector7::Zero());
-}
-
-// Nearest sampled pixel of the active blobs.
-Vector2 nearest_pixel(const ViewWork& work, const Vector2& to) {
-  const MaskPoints& mask = *work.view->mask;
-  Vector2 best = to;
-  double best_distance2 = 1e300;
-  for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
-    if (!work.active[b]) continue;
-    for (int i = mask.blobs[b].first_pixel; i < mask.blobs[b].last_pixel; ++i) {
-      const double distance2 = (mask.pixels[i] - to).squaredNorm();
-      if (distance2 < best_distance2) {
-        best_distance2 = distance2;
-        best = mask.pixels[i];
-      }
-    }
-  }
-  return best;
-}
-
-// Calls body(segment, image t, pixel) for the centerline samples that should be seen: in the image.
-template <typename Body>
-void for_each_sample(const ViewWork& work, const Body& body) {
-  const capture::Camera& camera = *work.view->camera;
-  for (const Segment& s : work.segments) {
-    for (int i = 0; i < kReverseSamples; ++i) {
-      const double t = (i + 1.0) / kReverseSamples;
-      const Vector2 pixel = s.from + t * s.step;
-      if (pixel.x() < 0 || pixel.y() < 0 || pixel.x() >= camera.width || pixel.y() >= camera.height) continue;
-      body(s, t, pixel);
-    }
-  }
-}
-
-bool in_mask(const ViewWork& work, const Vector2& pixel) {
-  const int blob = work.view->mask->blob_at(pixel);
-  return blob >= 0 && work.active[blob];
-}
-
-void add_coarse(ViewWork& work, double cut) {
-  const capture::Camera& camera = *work.view->camera;
-  const MaskPoints& mask = *work.view->mask;
-  int count = 0;
-  for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
-    if (!work.active[b]) continue;
-    count += mask.blobs[b].last_pixel - mask.blobs[b].first_pixel;
-    for (int i = mask.blobs[b].first_pixel; i < mask.blobs[b].last_pixel; ++i) {
-      const Nearest at = nearest(work.segments, mask.pixels[i]);
-      if (at.segment < 0) return;
-      const Segment& s = work.segments[at.segment];
-      const Vector2 offset = mask.pixels[i] - (s.from + at.t * s.step);
-      const Vector3 x = point_at(s, at.t);
-      const double weight = huber_weight(std::sqrt(at.distance2), cut);
-      add(work.sums, s.link, x, projected_gradient(camera, x, s.normal), 0.0, s.normal.dot(offset), weight);
-      if (past_end(work, at))
-        add(work.sums, s.link, x, projected_gradient(camera, x, s.tangent), 0.0, s.tangent.dot(offset), weight);
-    }
-  }
-  if (count == 0) return;
-  const double share = kReverseWeight * count / (kReverseSamples * static_cast<double>(work.segments.size()));
-  for_each_sample(work, [&](const Segment& s, double t, const Vector2& pixel) {
-    if (in_mask(work, pixel)) return;
-    const Vector2 offset = nearest_pixel(work, pixel) - pixel;
-    const double size = offset.norm();
-    const double weight = share * huber_weight(size, cut);
-    const Vector3 x = point_at(s, t);
-    for (const Vector2& m : {s.normal, s.tangent})
-      add(work.sums, s.link, x, projected_gradient(camera, x, m), 0.0, m.dot(offset), weight);
-  });
-}
-
-struct FineSums {
-  double weighted_square = 0.0, weight = 0.0;  // of the residuals, px^2
-  double capped_square = 0.0, length = 0.0;    // of all outline points, those without a place too, up to kLargestCut
-};
-
-void add_fine(Problem& problem, ViewWork& work, double offset, double cut, FineSums& total) {
-  const capture::Camera& camera = *work.view->camera;
-  const MaskPoints& mask = *work.view->mask;
-  const double radius = 0.5 * problem.chain->diameter;
-  if (work.segments.empty()) return;
-  const Segment& last = work.segments.back();
-  const bool has_end = last.link + 1 == problem.chain->links();
-  const Vector2 end = last.from + last.step;
-  const double end_radius = radius * projected_gradient(camera, last.b, last.normal).norm();
-  // the end is a flat disk, seen as an ellipse: this is its half axis along the rope
-  const double end_depth = end_radius * std::abs((last.b - last.a).normalized().dot(last.b.normalized()));
-  const auto observe = [&](const Segment& s, const Vector3& x, const Vector3& g, double residual, double length) {
-    const double weight = length * tukey_weight(residual, cut);
-    problem.sizes.push_back(std::abs(residual));
-    total.capped_square += length * (std::min(residual * residual, kLargestCut * kLargestCut) - kLargestCut * kLargestCut);
-    if (weight == 0.0) return;
-    add(work.sums, s.link, x, g, 1.0, residual, weight);
-    total.weighted_square += weight * residual * residual;
-    total.weight += weight;
-  };
-  for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
-    if (!work.active[b]) continue;
-    for (int i = mask.blobs[b].first_edge; i < mask.blobs[b].last_edge; ++i) {
-      const Edge& edge = mask.edges[i];
-      total.length += edge.weight;
-      total.capped_square += edge.weight * kLargestCut * kLargestCut;
-      const Vector2 from_end = edge.point - end;
-      if (has_end && from_end.norm() < kEndReach * end_radius &&
-          edge.outward.dot(last.tangent) > kAligned) {
-        const double side = last.normal.dot(from_end) / end_radius;
-        const double bulge = end_depth * std::sqrt(std::max(0.0, 1.0 - side * side));
-        observe(last, last.b, projected_gradient(camera, last.b, last.tangent),
-                last.tangent.dot(from_end) - bulge - offset, edge.weight);
-        continue;
-      }
-      const Nearest at = nearest(work.segments, edge.point);
-      if (past_end(work, at)) continue;
-      const Segment& s = work.segments[at.segment];
-      const Vector2 from_center = edge.point - (s.from + at.t * s.step);
-      // the side of the tube is the one the outline faces; about a bend's outer corner the tube is round
-      Vector2 m = s.normal.dot(edge.outward) < 0 ? Vector2(-s.normal) : s.normal;
-      const double distance = std::sqrt(at.distance2);
-      if ((at.t <= 0.0 || at.t >= 1.0) && distance > kLeastArm && from_center.dot(edge.outward) > 0.0)
-        m = from_center / distance;
-        // an occluder's outline, or a corner
-      const Vector3 x = point_at(s, at.t);
-      Vector3 g = projected_gradient(camera, x, m);
-      const double half_width = radius * g.norm();
-      g.z() -= half_width / x.z();  // farther is thinner
-      observe(s, x, g, m.dot(from_center) - half_width - offset, edge.weight);
-    }
-  }
-}
-
-// Masks are not equally much wider than the rope everywhere: each link has an unknown offset of its own in each view, about
-// the common one, eliminated here. Otherwise one camera would take small errors of the width for depth.
-void eliminate_link_offsets(LinkSums& sums) {
-  constexpr double kPrior = 1.0 / (kLinkOffsetDeviation * kLinkOffsetDeviation);
-  for (std::size_t link = 0; link < sums.normal.size(); ++link) {
-    Matrix7& normal = sums.normal[link];
-    const Vector7 coupling = normal.col(6) / std::sqrt(normal(6, 6) + kPrior);
-    sums.right[link] -= coupling * (sums.right[link][6] / std::sqrt(normal(6, 6) + kPrior));
-    normal -= coupling * coupling.transpose();
-  }
-}
-
-// H and b of all views: link sums to angles by suffix sums (SPEC 2.3), for squares of the angles' joint effect.
-void assemble(Problem& problem) {
-  const chain::Chain& chain = *problem.chain;
-  const int n = chain.angles();
-  problem.normal.setZero(n + 1, n + 1);
-  problem.right.setZero(n + 1);
-  MatrixX columns(7, n);  // of one view: the axes in camera coordinates, and 0 for the offset
-  for (ViewWork& work : problem.views) {
-    for (int k = 0; k < n; ++k) {
-      columns.col(k).head<6>() = math::transform_twist(work.camera_from_base, problem.axes.col(k));
-      columns(6, k) = 0.0;
-    }
-    LinkSums& sums = work.sums;
-    for (int link = chain.links() - 2; link >= 0; --link) {
-      sums.normal[link] += sums.normal[link + 1];
-      sums.right[link] += sums.right[link + 1];
-    }
-    for (int k = 0; k < n; ++k) {
-      const int link = chain.child_link[k];
-      const Vector7 moved = sums.normal[link] * columns.col(k);
-      for (int l = 0; l <= k; ++l) problem.normal(l, k) += moved.dot(columns.col(l));
-      problem.normal(k, n) += moved[6];
-      problem.right[k] += sums.right[link].dot(columns.col(k));
-    }
-    problem.normal(n, n) += sums.normal[0](6, 6);
-    problem.right[n] += sums.right[0][6];
-  }
-  problem.normal.triangularView<Eigen::StrictlyLower>() = problem.normal.transpose();
-}
-
-// --- priors and steps -------------------------------------------------------------------------------------------------
 
 // Index of the angle before k about the same axis, -1 for the first.
 int neighbor(const chain::Chain& chain, int k) {
@@ -440,7 +68,7 @@ MatrixX joint_prior(const chain::Chain& chain, const Options& options) {
   return information;
 }
 
-// One step from `theta` (and `offset`, when it has a weight) for the assembled equations and priors. Returns the largest change.
+// One step from `theta` (and `offset`, when it has a weight) for the equations and priors. Returns the largest change.
 double step(Problem& problem, const MatrixX& prior, const VectorX& prior_pull, double variance, double offset_weight,
             double offset_pull, VectorX& theta, double& offset) {
   const int n = static_cast<int>(theta.size());
@@ -466,9 +94,9 @@ double step(Problem& problem, const MatrixX& prior, const VectorX& prior_pull, d
 
 // What is believed before looking, as information.
 struct Belief {
-  MatrixX joints;        // between neighbors, and that angles are small
-  MatrixX all;           // with the frame before or the caller's prior
-  VectorX weighted_mean; // sum of each part's information times its mean
+  MatrixX joints;         // between neighbors, and that angles are small
+  MatrixX all;            // with the frame before or the caller's prior
+  VectorX weighted_mean;  // sum of each part's information times its mean
   VectorX pull(const VectorX& theta) const { return weighted_mean - all * theta; }
 };
 
@@ -479,11 +107,7 @@ void coarse_stage(Problem& problem, const Belief& belief, int iterations, bool c
     pose(problem, theta);
     if (choose) choose_blobs(problem, i == 0 ? kReach : kReach + (kLastReach - kReach) * i / iterations);
     const double cut = i < kFarShare * iterations ? kFarHuber : options.huber_pixels;
-    for (ViewWork& work : problem.views) {
-      clear(work.sums);
-      add_coarse(work, cut);
-    }
-    assemble(problem);
+    coarse_equations(problem, cut);
     if (step(problem, belief.all, belief.pull(theta), kCoarseVariance, 0.0, 0.0, theta, offset) < kCoarseStep &&
         cut == options.huber_pixels)
       break;
@@ -497,67 +121,10 @@ double median(std::vector<double>& values) {
   return *middle;
 }
 
-// Edge observations at theta; returns their sums and sets the next cut-off.
-FineSums fine_equations(Problem& problem, const VectorX& theta, double offset, double& cut) {
-  pose(problem, theta);
-  problem.sizes.clear();
-  FineSums total;
-  for (ViewWork& work : problem.views) {
-    clear(work.sums);
-    add_fine(problem, work, offset, cut, total);
-    eliminate_link_offsets(work.sums);
-  }
-  assemble(problem);
-  if (!problem.sizes.empty())
-    cut = std::clamp(kCutDeviations * kDeviationOfMedian * median(problem.sizes), kLeastCut, kLargestCut);
-  return total;
-}
-
-// Mask pixels away from the tube and centerline samples away from the mask, mean squares, capped; and the two shares.
-void judge(const Problem& problem, FrameSolution& out) {
-  constexpr double kMargin = 2.0;  // px, of `covered`
-  constexpr double kCap = 3.0;     // diameters
-  const double radius = 0.5 * problem.chain->diameter;
-  double pixels = 0, covered = 0, samples = 0, inside = 0, cost = 0;
-  int seen = 0;
-  out.mask_pixels = 0;
-  for (const ViewWork& work : problem.views) {
-    const MaskPoints& mask = *work.view->mask;
-    out.mask_pixels += mask.area;
-    if (mask.pixels.empty() || work.segments.empty()) continue;
-    ++seen;
-    const double cap = kCap * work.diameter;
-    double view_cost = 0;
-    const double area = static_cast<double>(mask.area) / mask.pixels.size();  // px a sample stands for
-    for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
-      for (int i = mask.blobs[b].first_pixel; i < mask.blobs[b].last_pixel; ++i) {
-        const Nearest at = nearest(work.segments, mask.pixels[i]);
-        const Segment& s = work.segments[at.segment];
-        const Vector3 x = point_at(s, at.t);
-        const double away = std::sqrt(at.distance2) - radius * projected_gradient(*work.view->camera, x, s.normal).norm();
-        pixels += area;
-        if (away <= kMargin) covered += area;
-        const double size = std::clamp(away, 0.0, cap);
-        view_cost += size * size / mask.pixels.size();
-      }
-    }
-    double reverse = 0;
-    int count = 0;
-    for_each_sample(work, [&](const Segment&, double, const Vector2& pixel) {
-      ++samples;
-      ++count;
-      if (mask.blob_at(pixel) >= 0) {
-        ++inside;
-        return;
-      }
-      const double size = std::min(cap, (nearest_pixel(work, pixel) - pixel).norm());
-      reverse += size * size;
-    });
-    cost += view_cost + (count > 0 ? reverse / count : cap * cap);
-  }
-  out.fit.covered = pixels > 0 ? covered / pixels : 0.0;
-  out.fit.inside = samples > 0 ? inside / samples : 0.0;
-  out.cost = seen > 0 ? cost / seen : 0.0;
+// Tukey's cut-off that the last residuals call for.
+double next_cut(Problem& problem, double cut) {
+  if (problem.sizes.empty()) return cut;
+  return std::clamp(kCutDeviations * kDeviationOfMedian * median(problem.sizes), kLeastCut, kLargestCut);
 }
 
 // `start`, and bends to every side, of one size.
@@ -581,8 +148,8 @@ std::vector<VectorX> cold_starts(const chain::Chain& chain, const VectorX& start
 
 }  // namespace
 
-FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView>& views, const VectorX& start, bool warm,
-                          const Options& options) {
+FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView>& views, const VectorX& start,
+                          bool warm, const Options& options) {
   const int n = chain.angles();
   Problem problem;
   problem.chain = &chain;
@@ -624,12 +191,15 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
     offset = options.edge_offset;
     cut = kFirstCut;
     for (int i = 0; i < std::max(1, options.iterations - options.iterations / 2); ++i) {
-      fine_equations(problem, theta, offset, cut);
+      pose(problem, theta);
+      fine_equations(problem, offset, cut);
+      cut = next_cut(problem, cut);
       if (step(problem, belief.all, belief.pull(theta), variance, offset_weight,
                offset_weight * (options.edge_offset - offset), theta, offset) < kFineStep)
         break;
     }
-    total = fine_equations(problem, theta, offset, cut);
+    pose(problem, theta);
+    total = fine_equations(problem, offset, cut);
   };
   // tells apart fits that cover the masks alike
   const auto edge_cost = [&] { return total.length > 0 ? total.capped_square / total.length : 0.0; };
@@ -692,7 +262,8 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
 }
 
 FrameFit fit_frame(const chain::Chain& chain, const Pose& base, std::span<const capture::View* const> views,
-                   const std::vector<capture::Camera>& cameras, const VectorX& start, bool warm, const Options& options) {
+                   const std::vector<capture::Camera>& cameras, const VectorX& start, bool warm,
+                   const Options& options) {
   std::vector<MaskPoints> masks;
   masks.reserve(views.size());
   std::vector<FrameView> frame_views;

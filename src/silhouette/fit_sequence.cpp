@@ -15,19 +15,19 @@ using math::VectorX;
 namespace {
 
 // A frame is fitted again when it is worse than most by more than this.
-constexpr double kLessCovered = 0.1;     // share of the mask
-constexpr double kLessInside = 0.15;     // share of the centerline
-constexpr double kMoreResidual = 2.0;    // times the median, and
+constexpr double kLessCovered = 0.1;         // share of the mask
+constexpr double kLessInside = 0.15;         // share of the centerline
+constexpr double kMoreResidual = 2.0;        // times the median, and
 constexpr double kMoreResidualPixels = 0.5;  // px more
-constexpr double kLost = 0.6;            // share covered or inside under which a frame is looked for from scratch at once
-constexpr double kBetter = 0.9;          // share of the old cost that a new fit must stay under
+constexpr double kLost = 0.6;                // share covered or inside under which a frame is sought from scratch
+constexpr double kBetter = 0.9;              // share of the old cost that a new fit must stay under
 
 constexpr double kFewViews = 1.5;               // views a frame, in the mean, that count as one camera
 constexpr double kCommonOffsetDeviation = 0.1;  // px, of the masks' offset learned from all frames
 
 // Smoothing over time: random angular accelerations of this size (measured on moving ropes: 3.5 to 5.2 rad/s^2 RMS over
 // all joints), with heavy tails for contacts (up to 107).
-constexpr double kAcceleration = 5.0;     // rad/s^2
+constexpr double kAcceleration = 5.0;  // rad/s^2
 // Share of a fit's variance that is new in every frame; the rest (a bend that straight links cannot follow, the masks'
 // width) stays and would be taken for motion if the smoothing trusted the frames less.
 constexpr double kIndependent = 0.4;
@@ -55,8 +55,8 @@ Frames frames_of(const capture::Capture& capture) {
     low = std::min(low, view.frame);
     high = std::max(high, view.frame);
   }
-  const bool listed = camera < static_cast<int>(capture.times.size()) &&
-                      high < static_cast<int>(capture.times[camera].size());
+  const bool listed =
+      camera < static_cast<int>(capture.times.size()) && high < static_cast<int>(capture.times[camera].size());
   if (listed) {
     frames.times.assign(capture.times[camera].begin() + low, capture.times[camera].begin() + high + 1);
   } else {
@@ -182,7 +182,8 @@ SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capt
     }
   }
   if (std::find(seen.begin(), seen.end(), 1) == seen.end())
-    throw InputError(capture.name, "no mask shows the object in any frame", "check the masks, or make them: chainsplat mask");
+    throw InputError(capture.name, "no mask shows the object in any frame",
+                     "check the masks, or make them with `chainsplat mask`");
   const int first = static_cast<int>(std::find(seen.begin(), seen.end(), 1) - seen.begin());
   Options each = options;
   each.prior = {};
@@ -258,10 +259,11 @@ SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capt
   return out;
 }
 
-BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::Capture& capture, const SequenceFit& fit) {
-  constexpr double kSmall = 1e-3;       // m
+BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::Capture& capture,
+                             const SequenceFit& fit) {
+  constexpr double kSmall = 1e-3;  // m
   constexpr double kDeviations = 3.0;
-  constexpr int kPoints = 97;           // along the centerline
+  constexpr int kPoints = 97;  // along the centerline
   BendingChoice choice;
   if (capture.tabletop) {
     choice.bending = chain::Bending::planar;
@@ -272,7 +274,8 @@ BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::C
   for (std::size_t f = 0; f < fit.states.theta.size(); ++f) {
     if (fit.frames[f].residual_pixels <= 0.0) continue;  // nothing was seen
     const VectorX& theta = fit.states.theta[f];
-    const MatrixX points = chain::centerline(spatial_chain, chain::link_motions(spatial_chain, theta, Pose{}), arclengths);
+    const auto motions = chain::link_motions(spatial_chain, theta, Pose{});
+    const MatrixX points = chain::centerline(spatial_chain, motions, arclengths);
     const MatrixX axes = chain::world_axes(spatial_chain, theta, Pose{});
     double frame_square = 0.0, frame_variance = 0.0;
     for (int i = 0; i < kPoints; ++i) {
@@ -291,7 +294,8 @@ BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::C
   if (weights == 0.0) return choice;
   choice.out_of_plane_rms = std::sqrt(square / weights);
   choice.deviation = std::sqrt(variance / weights);
-  if (choice.out_of_plane_rms < std::max(kSmall, kDeviations * choice.deviation)) choice.bending = chain::Bending::planar;
+  if (choice.out_of_plane_rms < std::max(kSmall, kDeviations * choice.deviation))
+    choice.bending = chain::Bending::planar;
   return choice;
 }
 

@@ -15,11 +15,11 @@ struct FrameView {
 
 struct FrameSolution {
   FrameFit fit;
-  // Data and joint priors about fit.theta: the log likelihood is -x^T information x / 2 + gradient^T x, x = theta - fit.theta.
+  // Data and joint priors: with x = theta - fit.theta the log likelihood is -x^T information x / 2 + gradient^T x.
   math::MatrixX information;  // 1/rad^2, calibrated
   math::VectorX gradient;
-  double cost = 0.0;          // px^2, mask outside the tube and centerline outside the mask: compares fits of one frame
-  int mask_pixels = 0;        // in all views
+  double cost = 0.0;    // px^2, mask outside the tube and centerline outside the mask: compares fits of one frame
+  int mask_pixels = 0;  // in all views
 };
 
 FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView>& views, const math::VectorX& start,

@@ -27,7 +27,7 @@ struct MaskPoints {
   std::vector<Blob> blobs;      // by area, largest first; specks are left out
   std::vector<Vector2> pixels;  // px, centers of evenly chosen mask pixels
   std::vector<Edge> edges;
-  int area = 0;                 // px, all blobs
+  int area = 0;  // px, all blobs
   // The crop, to look up single pixels: blob number + 1, 0 outside.
   int x0 = 0, y0 = 0, width = 0, height = 0;
   std::vector<std::int16_t> labels;

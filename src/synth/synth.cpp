@@ -25,13 +25,6 @@ std::string number(int frame) {
   return text;
 }
 
-// File and folder name of a camera.
-std::string file_name(const capture::Camera& camera, int index) {
-  const bool plain = !camera.name.empty() && camera.name != "." && camera.name != ".." &&
-                     camera.name.find_first_of("/%") == std::string::npos;
-  return plain ? camera.name : "cam" + std::to_string(index);
-}
-
 void make_folder(const Path& folder) {
   std::error_code error;
   std::filesystem::create_directories(folder, error);
@@ -39,9 +32,10 @@ void make_folder(const Path& folder) {
     throw WorkError(folder.string(), "cannot be made (" + error.message() + ")", "choose a folder that can be written");
 }
 
-Json camera_json(const capture::Camera& camera, const std::string& name, const std::vector<double>& times,
-                 const Options& options, const Path& folder) {
-  Json out{{"name", camera.name}, {"width", camera.width}, {"height", camera.height}, {"fx", camera.fx},
+Json camera_json(const capture::Camera& camera, const std::vector<double>& times, const Options& options,
+                 const Path& folder) {
+  const std::string& name = camera.name;
+  Json out{{"name", name}, {"width", camera.width}, {"height", camera.height}, {"fx", camera.fx},
            {"fy", camera.fy},     {"cx", camera.cx},       {"cy", camera.cy},         {"distortion", camera.distortion}};
   const math::Pose& pose = camera.world_from_camera;
   Json matrix = Json::array();
@@ -138,11 +132,11 @@ void write(splat::Engine& engine, const twin::Twin& twin, const chain::States& s
   std::size_t done = 0;
   for (std::size_t c = 0; c < scene.cameras.size(); ++c) {
     const capture::Camera& camera = scene.cameras[c];
-    const std::string name = file_name(camera, static_cast<int>(c));
+    const std::string& name = camera.name;  // a capture's camera names can name files
     make_folder(folder / "masks" / name);
     if (options.depth) make_folder(folder / "depth" / name);
     if (!options.video) make_folder(folder / name);
-    json["cameras"].push_back(camera_json(camera, name, times[c], options, folder));
+    json["cameras"].push_back(camera_json(camera, times[c], options, folder));
     render::Options drawing;
     drawing.depth = options.depth;
     drawing.interval = render::median_interval(scene.times[c]);

@@ -1,5 +1,6 @@
 # What the scripts share. Each is called with the program, in a folder that may be written.
 program=$1
+[ -x "$program" ] || { echo "FAILED: there is no program '$program'"; exit 1; }
 source_dir=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 work=$(mktemp -d "$PWD/cli.XXXXXX")
 trap 'rm -rf "$work"' EXIT

@@ -65,6 +65,14 @@ expect_code 0 eval
 run export "$work/whole" -o "$work/twin.glb"
 expect_code 0 export
 [ "$(head -c 4 "$work/twin.glb")" = glTF ] || fail 'export: no glTF'
+run synth "$work/whole" -o "$work/drawn"
+expect_code 0 synth
+run check "$work/drawn"
+expect_code 0 'check of what synth made'
+run eval "$work/whole" "$work/drawn"
+expect_code 0 'eval on another capture'
+grep -q 'only the rollout' "$work/stderr" || fail 'eval on another capture: does not say so'
+grep -q '^recognized' "$work/stdout" && fail 'eval on another capture: recognized states of the wrong capture'
 run identify "$work/whole"
 expect_code 0 identify
 cmp -s "$work/whole/rollout.csv" "$work/stopped/rollout.csv" || fail 'identify alone: not the rollout of train'

@@ -1,0 +1,68 @@
+// The views of a frame as normal equations: the projected chain, which mask pixels and outline points see it, sums.
+#pragma once
+#include <vector>
+
+#include "src/silhouette/frame.h"
+
+namespace chainsplat::silhouette {
+
+constexpr double kNear = 0.01;        // m, nothing nearer than this is in front of a camera (SPEC 2.5)
+constexpr double kLargestCut = 12.0;  // px, no outline point farther from the tube counts
+
+using Vector7 = Eigen::Matrix<double, 7, 1>;
+using Matrix7 = Eigen::Matrix<double, 7, 7>;
+
+// One link's segment seen by one camera.
+struct Segment {
+  int link;
+  math::Vector3 a, b;       // camera frame, m
+  Vector2 from, step;       // px: image of a, and from there to the image of b
+  Vector2 tangent, normal;  // unit
+  double per_length2;       // 1 / |step|^2
+};
+
+// Normal equations of one view by link, in camera coordinates: a row is (x cross g, g, offset derivative), SPEC 2.3.
+struct LinkSums {
+  std::vector<Matrix7> normal;
+  std::vector<Vector7> right;
+};
+
+struct ViewWork {
+  const FrameView* view;
+  math::Pose camera_from_base;
+  std::vector<Segment> segments;
+  LinkSums sums;
+  std::vector<char> active;  // by blob
+  double diameter = 0.0;     // px, at the depth of the base
+};
+
+struct Problem {
+  const chain::Chain* chain;
+  std::vector<ViewWork> views;
+  std::vector<char> held;  // by angle: twist, which silhouettes do not show
+  math::MatrixX axes;      // 6 x n in the base frame, at the angles of the last pose()
+  math::MatrixX normal;    // (n + 1) x (n + 1), the last row is the edge offset's
+  math::VectorX right;
+  std::vector<double> sizes;  // work space; after fine_equations the residuals' absolute values, px
+};
+
+struct FineSums {
+  double weighted_square = 0.0, weight = 0.0;  // of the residuals, px^2
+  double capped_square = 0.0, length = 0.0;    // of all outline points, those without a place too, up to kLargestCut
+};
+
+// Puts the chain at theta into every view.
+void pose(Problem& problem, const math::VectorX& theta);
+
+// Keeps the blobs whose median pixel is within `reach` diameters of the posed chain; without any, those at the grasp.
+void choose_blobs(Problem& problem, double reach);
+
+// Equations of the posed chain in `problem.normal` and `.right`. Coarse: mask pixels and centerline samples, Huber cut.
+void coarse_equations(Problem& problem, double cut);
+// Fine: outline points about masks wider by `offset` than the tube, Tukey's cut; residuals' sizes in `problem.sizes`.
+FineSums fine_equations(Problem& problem, double offset, double cut);
+
+// Cost and shares of the posed chain (FrameSolution::cost, mask_pixels; FrameFit::covered, inside).
+void judge(const Problem& problem, FrameSolution& out);
+
+}  // namespace chainsplat::silhouette
