@@ -1,5 +1,5 @@
-// Captures: the demo against its truth, small captures made here with every source of images, and everything that can be
-// wrong with one.
+// Captures: the demo against its truth, small captures made here with every source of images, and everything that can
+// be wrong with one.
 #include <doctest/doctest.h>
 
 #include <unistd.h>
@@ -79,7 +79,8 @@ Image8 filled(int channels, const std::function<std::array<double, 3>(int, int)>
   for (int y = 0; y < height; ++y)
     for (int x = 0; x < width; ++x) {
       const auto value = color(x, y);
-      for (int c = 0; c < channels; ++c) image.pixels.push_back(static_cast<std::uint8_t>(std::lround(value[std::min(c, 2)])));
+      for (int c = 0; c < channels; ++c)
+        image.pixels.push_back(static_cast<std::uint8_t>(std::lround(value[std::min(c, 2)])));
     }
   return image;
 }
@@ -114,10 +115,12 @@ struct Made {
             {"base", "base.tum"},
             {"cameras", Json::array()}};
     std::string tum;
-    for (int k = 0; k <= 40; ++k) tum += core::exact(0.01 * k) + " " + core::exact(0.01 * k / 0.1 / 60.0) + " 0 1 0 0 0 1\n";
+    for (int k = 0; k <= 40; ++k)
+      tum += core::exact(0.01 * k) + " " + core::exact(0.01 * k / 0.1 / 60.0) + " 0 1 0 0 0 1\n";
     write("base.tum", tum);
     for (const std::string name : {"cam0", "cam1"}) {
-      for (const std::string& sub : {name, "masks/" + name, "depth/" + name}) std::filesystem::create_directories(path() / sub);
+      for (const std::string& sub : {name, "masks/" + name, "depth/" + name})
+        std::filesystem::create_directories(path() / sub);
       json["cameras"].push_back({{"name", name},
                                  {"width", kWidth},
                                  {"height", kHeight},
@@ -363,8 +366,10 @@ TEST_CASE("videos of images and masks, missing masks, timestamps, empty views") 
 
   SUBCASE("images and masks by video: colors of BT.601, edges of the threshold") {
     for (const bool video_images : {true, false}) {
-      if (video_images) made.json["cameras"][0]["images"] = "cam0.mp4";
-      else made.json["cameras"][0]["images"] = "cam0/%06d.png";
+      if (video_images)
+        made.json["cameras"][0]["images"] = "cam0.mp4";
+      else
+        made.json["cameras"][0]["images"] = "cam0/%06d.png";
       made.json["cameras"][0]["masks"] = "mask0.mp4";
       const Capture loaded = made.load();
       for (int k = 0; k < kFrames; ++k) {
@@ -503,8 +508,12 @@ TEST_CASE("files that are missing, cut off or of another kind") {
     std::ofstream(made.path() / name, std::ios::binary) << bytes.substr(0, keep);
   };
   SUBCASE("a mask of another size") {
-    capture::write_png(made.path() / numbered("masks/cam1", 3),
-                       filled(1, [](int, int) { return std::array<double, 3>{255, 255, 255}; }, 32, 48));
+    capture::write_png(made.path() / numbered("masks/cam1", 3), filled(
+                                                                    1,
+                                                                    [](int, int) {
+                                                                      return std::array<double, 3>{255, 255, 255};
+                                                                    },
+                                                                    32, 48));
     CHECK(contains(made.refused(), "masks/cam1/000003.png: is 32x48 pixels"));
   }
   SUBCASE("fewer masks than images") {
@@ -602,10 +611,18 @@ TEST_CASE("truncated and garbled capture.json never do worse than an error") {
     for (int c = 0; c < changes; ++c) {
       const auto where = static_cast<std::size_t>(random.uniform() * static_cast<double>(text.size()));
       switch (static_cast<int>(random.uniform(0, 4))) {
-        case 0: text[where] = static_cast<char>(random.next()); break;
-        case 1: text.erase(where, static_cast<std::size_t>(random.uniform(1, 40))); break;
-        case 2: text.insert(where, text.substr(where / 2, 20)); break;
-        default: text.replace(where, 1, "1e999"); break;
+        case 0:
+          text[where] = static_cast<char>(random.next());
+          break;
+        case 1:
+          text.erase(where, static_cast<std::size_t>(random.uniform(1, 40)));
+          break;
+        case 2:
+          text.insert(where, text.substr(where / 2, 20));
+          break;
+        default:
+          text.replace(where, 1, "1e999");
+          break;
       }
     }
     refused += attempt(text) != "";
@@ -712,8 +729,12 @@ TEST_CASE("written images and videos come back") {
   for (const auto& [width, height] : {std::pair{64, 48}, std::pair{33, 21}}) {
     std::vector<Image8> frames;
     for (int k = 0; k < 12; ++k)
-      frames.push_back(filled(3, [&](int x, int y) { return std::array<double, 3>{3.0 * x + k, 250.0 - 4 * y, 40.0 + 10 * k}; },
-                              width, height));
+      frames.push_back(filled(
+          3,
+          [&](int x, int y) {
+            return std::array<double, 3>{3.0 * x + k, 250.0 - 4 * y, 40.0 + 10 * k};
+          },
+          width, height));
     capture::write_video(folder.path / "a.mp4", 29.97, frames);
     capture::write_video(folder.path / "b.mp4", 29.97, frames);
     CHECK(core::read_file(folder.path / "a.mp4") == core::read_file(folder.path / "b.mp4"));
@@ -724,7 +745,8 @@ TEST_CASE("written images and videos come back") {
     for (const Image8& frame : frames) {
       REQUIRE(reader.next(back));
       REQUIRE(back.width == width);
-      for (std::size_t i = 0; i < back.pixels.size(); ++i, ++count) squares += std::pow(back.pixels[i] - frame.pixels[i], 2);
+      for (std::size_t i = 0; i < back.pixels.size(); ++i, ++count)
+        squares += std::pow(back.pixels[i] - frame.pixels[i], 2);
     }
     CHECK_FALSE(reader.next(back));
     CHECK(std::sqrt(squares / count) < 3.0);

@@ -21,7 +21,8 @@ namespace {
 constexpr double kTurn = 2.0 * std::numbers::pi;
 
 struct Folder {  // removed at the end
-  Path path = std::filesystem::temp_directory_path() / ("chainsplat_trajectory_" + std::to_string(core::fnv1a(__FILE__)));
+  Path path =
+      std::filesystem::temp_directory_path() / ("chainsplat_trajectory_" + std::to_string(core::fnv1a(__FILE__)));
   Folder() { std::filesystem::create_directories(path); }
   ~Folder() { std::filesystem::remove_all(path); }
 };
@@ -111,7 +112,8 @@ TEST_CASE("an analytic motion comes back: pose, twist, acceleration") {
     CHECK((world_acceleration(motion) - analytic_acceleration(t)).norm() < 1e-3);
     const double h = 1e-3;
     const Vector3 angular =
-        (twist_by_differences(analytic_pose, t + h, h) - twist_by_differences(analytic_pose, t - h, h)).head<3>() / (2 * h);
+        (twist_by_differences(analytic_pose, t + h, h) - twist_by_differences(analytic_pose, t - h, h)).head<3>() /
+        (2 * h);
     CHECK((motion.acceleration.head<3>() - angular).norm() < 1e-3);
   }
 }
@@ -166,7 +168,8 @@ TEST_CASE("rotations beyond half a turn go on continuously") {
   std::vector<Sample> samples;
   const Vector3 axis = Vector3(1, 2, -2) / 3.0;
   for (int k = 0; k <= 200; ++k)
-    samples.push_back({k * 0.02, {math::exp_so3(2.5 * k * 0.02 * axis) * math::exp_so3(Vector3(0.1, 0.2, 0.3)), Vector3::Zero()}});
+    samples.push_back(
+        {k * 0.02, {math::exp_so3(2.5 * k * 0.02 * axis) * math::exp_so3(Vector3(0.1, 0.2, 0.3)), Vector3::Zero()}});
   // the axis is fixed in the world, so the rotation vector from the first sample is along a fixed line: ten radians
   const Trajectory fitted = trajectory::fit(samples, "test");
   for (double t = 0.0; t <= 4.0; t += 0.013) {
@@ -207,7 +210,8 @@ TEST_CASE("uneven and doubled sampling, few samples, the ends") {
   }
   SUBCASE("outside it rests; times that were rounded by the file's digits still count as inside") {
     std::vector<Sample> samples;
-    for (int k = 0; k <= 100; ++k) samples.push_back({0.01 * k, {math::Matrix3::Identity(), Vector3(0.3 * 0.01 * k, 0, 0)}});
+    for (int k = 0; k <= 100; ++k)
+      samples.push_back({0.01 * k, {math::Matrix3::Identity(), Vector3(0.3 * 0.01 * k, 0, 0)}});
     const Trajectory fitted = trajectory::fit(samples, "test");
     CHECK(fitted.at(1.0 + 1e-6).velocity.tail<3>().x() == doctest::Approx(0.3));
     CHECK(fitted.at(1.02).velocity.norm() == 0.0);

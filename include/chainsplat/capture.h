@@ -19,8 +19,8 @@ namespace chainsplat::capture {
 struct Camera {
   std::string name;
   int width = 0, height = 0;
-  double fx = 0, fy = 0, cx = 0, cy = 0;      // px
-  std::array<double, 5> distortion{};         // OpenCV k1 k2 p1 p2 k3
+  double fx = 0, fy = 0, cx = 0, cy = 0;  // px
+  std::array<double, 5> distortion{};     // OpenCV k1 k2 p1 p2 k3
   math::Pose world_from_camera;
   bool distorted() const;
 };
@@ -33,12 +33,12 @@ math::Vector2 undistort(const Camera& camera, const math::Vector2& recorded_pixe
 
 // One image of one camera, cropped: pixel (0,0) of the crop is pixel (x0, y0) of the image.
 struct View {
-  int camera = 0;                     // index into Capture::cameras
-  int frame = 0;                      // the camera's frame number
-  double time = 0.0;                  // s
+  int camera = 0;     // index into Capture::cameras
+  int frame = 0;      // the camera's frame number
+  double time = 0.0;  // s
   int x0 = 0, y0 = 0, width = 0, height = 0;
-  std::vector<std::uint8_t> rgba;     // 4 * width * height, row-major; RGB is 0 where A is 0; A = mask coverage, 0..255
-  std::vector<float> depth;           // width * height, m along z, 0 = none; empty when not loaded
+  std::vector<std::uint8_t> rgba;  // 4 * width * height, row-major; RGB is 0 where A is 0; A = mask coverage, 0..255
+  std::vector<float> depth;        // width * height, m along z, 0 = none; empty when not loaded
 };
 
 struct Table {
@@ -50,22 +50,22 @@ struct Capture {
   Path folder;
   std::string name;
   bool tabletop = false;
-  math::Vector3 gravity{0, 0, -9.81};         // world
-  double length = 0, diameter = 0;            // m
-  std::optional<double> mass;                 // kg
-  math::Vector3 direction, bending_axis;      // unit, base frame
+  math::Vector3 gravity{0, 0, -9.81};     // world
+  double length = 0, diameter = 0;        // m
+  std::optional<double> mass;             // kg
+  math::Vector3 direction, bending_axis;  // unit, base frame
   std::optional<Table> table;
   std::vector<Camera> cameras;
-  std::vector<std::vector<double>> times;     // frame times of each camera, s (all frames, loaded or not)
-  std::vector<View> views;                    // sorted by camera, then frame; only the frames asked for
+  std::vector<std::vector<double>> times;  // frame times of each camera, s (all frames, loaded or not)
+  std::vector<View> views;                 // sorted by camera, then frame; only the frames asked for
   trajectory::Trajectory base;
-  std::uint64_t hash = 0;                     // of capture.json, base file and the image files' sizes
+  std::uint64_t hash = 0;  // of capture.json, base file and the image files' sizes
   bool has_depth = false;
 };
 
 struct LoadOptions {
-  bool images = true;        // false: capture.json and base only
-  bool undistort = true;     // false: recorded pixels (evaluation)
+  bool images = true;     // false: capture.json and base only
+  bool undistort = true;  // false: recorded pixels (evaluation)
   bool depth = false;
   bool masked = true;        // false: whole frames, RGB as recorded, A = 255; masks are not looked for (to make them)
   int margin = 24;           // px around the mask's bounds
@@ -104,8 +104,8 @@ void write_depth_png(const Path& file, int width, int height, const std::vector<
 // tagged. Frames RGB or RGBA of one size. The same frames give the same bytes.
 void write_video(const Path& file, double rate, const std::vector<Image8>& frames);
 
-// Decodes a video frame by frame, in display order. Colors: swscale's default bicubic, matrix and range from the stream's
-// tags, else BT.601 limited. Throws InputError (missing, not a video, a frame that cannot be decoded).
+// Decodes a video frame by frame, in display order. Colors: swscale's default bicubic, matrix and range from the
+// stream's tags, else BT.601 limited. Throws InputError (missing, not a video, a frame that cannot be decoded).
 class VideoReader {
  public:
   explicit VideoReader(const Path& file, int threads = 1);

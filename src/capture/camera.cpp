@@ -9,7 +9,7 @@ using math::Vector3;
 
 namespace {
 
-constexpr int kMostIterations = 200;   // of the fixed-point inverse; mild lenses need about ten
+constexpr int kMostIterations = 200;  // of the fixed-point inverse; mild lenses need about ten
 constexpr double kConverged = 1e-13;  // normalized coordinates: under 1e-9 px for any image size
 
 Vector2 normalized(const Camera& camera, const Vector2& pixel) {

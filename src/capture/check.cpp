@@ -16,24 +16,24 @@ using math::Vector3;
 namespace {
 
 // What we doubt. Lengths are compared in the image through the distance of the grasp.
-constexpr double kGripperReach = 0.015;    // m of rope that fingers may hide beyond the grasp
-constexpr double kPoseSlack = 3.0;         // px of reprojection error that a calibrated camera may have
-constexpr double kThinRope = 5.0;          // px across; thinner ropes leave too few pixels
-constexpr double kSaturated = 250;         // of 255, any channel
-constexpr double kMostSaturated = 0.05;    // share of the object's pixels
-constexpr double kDark = 20;               // of 255, mean of the object
-constexpr double kFlicker = 0.15;          // relative spread of a camera's object brightness between frames
-constexpr double kRateTolerance = 0.01;    // between `rate` and the container's
-constexpr double kStill = 1e-3;            // m of base travel below which it counts as at rest
-constexpr double kNoisyBase = 2e-3;        // m
-constexpr double kAlong = 0.1;             // rad between the bending axis and the table's normal
-constexpr double kBehind = 0.2;            // share of the mask on the wrong side of the grasp
-constexpr double kForeshortened = 0.3;     // a rope seen shorter than this, relative to its length, has no side to judge
-constexpr int kMostLag = 4;                // frames of delay between base and images that are tried
-constexpr double kLagGain = 0.7;           // a delay is believed when it leaves less than this share of the error
-constexpr double kLagPixels = 1.0;         // px and when the error shrinks by at least this
-constexpr int kLagFrames = 50;             // frames of a camera that the search for a delay looks at
-constexpr int kFarPixels = 100000;         // px, "no mask"
+constexpr double kGripperReach = 0.015;  // m of rope that fingers may hide beyond the grasp
+constexpr double kPoseSlack = 3.0;       // px of reprojection error that a calibrated camera may have
+constexpr double kThinRope = 5.0;        // px across; thinner ropes leave too few pixels
+constexpr double kSaturated = 250;       // of 255, any channel
+constexpr double kMostSaturated = 0.05;  // share of the object's pixels
+constexpr double kDark = 20;             // of 255, mean of the object
+constexpr double kFlicker = 0.15;        // relative spread of a camera's object brightness between frames
+constexpr double kRateTolerance = 0.01;  // between `rate` and the container's
+constexpr double kStill = 1e-3;          // m of base travel below which it counts as at rest
+constexpr double kNoisyBase = 2e-3;      // m
+constexpr double kAlong = 0.1;           // rad between the bending axis and the table's normal
+constexpr double kBehind = 0.2;          // share of the mask on the wrong side of the grasp
+constexpr double kForeshortened = 0.3;   // a rope seen shorter than this, relative to its length, has no side to judge
+constexpr int kMostLag = 4;              // frames of delay between base and images that are tried
+constexpr double kLagGain = 0.7;         // a delay is believed when it leaves less than this share of the error
+constexpr double kLagPixels = 1.0;       // px and when the error shrinks by at least this
+constexpr int kLagFrames = 50;           // frames of a camera that the search for a delay looks at
+constexpr int kFarPixels = 100000;       // px, "no mask"
 constexpr double kDegrees = 180.0 / std::numbers::pi;
 
 std::string text(const char* format, auto... values) {
@@ -61,7 +61,8 @@ double mask_distance(const View& view, const Vector2& position) {
 
 // Share of the mask that lies against the direction in which the rope leaves the gripper, beyond the gripper's reach.
 // NaN when the rope points at the camera.
-double share_behind(const View& view, const Camera& camera, const Vector3& grasp, const Vector3& direction, double length) {
+double share_behind(const View& view, const Camera& camera, const Vector3& grasp, const Vector3& direction,
+                    double length) {
   const Vector3 along = grasp + length * direction;
   if (along.z() <= 0) return std::numeric_limits<double>::quiet_NaN();
   const Vector2 start = project(camera, grasp), step = project(camera, along) - start;
@@ -73,7 +74,8 @@ double share_behind(const View& view, const Camera& camera, const Vector3& grasp
     for (int x = 0; x < view.width; ++x) {
       if (view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] == 0) continue;
       ++all;
-      behind += forward.dot(Vector2(view.x0 + x + 0.5, view.y0 + y + 0.5) - start) < -kGripperReach * scale - kPoseSlack;
+      behind +=
+          forward.dot(Vector2(view.x0 + x + 0.5, view.y0 + y + 0.5) - start) < -kGripperReach * scale - kPoseSlack;
     }
   return all ? static_cast<double>(behind) / all : 0.0;
 }
@@ -128,18 +130,22 @@ void check_base(const Manifest& manifest, CheckReport& report) {
     acceleration = std::max(acceleration, (motion.acceleration.tail<3>() + w.cross(v)).norm());
   }
   const double rate = seconds > 0 ? (static_cast<double>(samples.size()) - 1.0) / seconds : 0.0;
-  report.facts.push_back(text("base: %zu poses, %.3f to %.3f s, %.4g Hz; travels %.3f, %.3f, %.3f m along x, y, z; at most %.2f m/s, "
-                              "%.2f m/s^2, %.2f rad/s; position noise %.2g m",
-                              samples.size(), capture.base.start(), capture.base.end(), rate, travel.x(), travel.y(), travel.z(),
-                              speed, acceleration, turning, capture.base.noise()));
+  report.facts.push_back(
+      text("base: %zu poses, %.3f to %.3f s, %.4g Hz; travels %.3f, %.3f, %.3f m along x, y, z; at most %.2f m/s, "
+           "%.2f m/s^2, %.2f rad/s; position noise %.2g m",
+           samples.size(), capture.base.start(), capture.base.end(), rate, travel.x(), travel.y(), travel.z(), speed,
+           acceleration, turning, capture.base.noise()));
   if (travel.norm() < kStill && turning * seconds < kStill)
-    report.doubts.push_back("base: it stays at rest; masses, damping and friction are hardly observable from such a capture");
+    report.doubts.push_back(
+        "base: it stays at rest; masses, damping and friction are hardly observable from such a capture");
   if (capture.base.noise() > kNoisyBase)
-    report.doubts.push_back(text("base: position noise of %.1f mm; accelerations from it are uncertain", 1e3 * capture.base.noise()));
+    report.doubts.push_back(
+        text("base: position noise of %.1f mm; accelerations from it are uncertain", 1e3 * capture.base.noise()));
   for (const CameraSource& source : manifest.cameras)
     if (rate > 0 && source.interval > 0 && rate < (1.0 - kRateTolerance) / source.interval) {
-      report.doubts.push_back(text("base: %.4g Hz is less than the %.4g Hz of %s; fast motion between the poses is lost", rate,
-                                   1.0 / source.interval, source.camera.name.c_str()));
+      report.doubts.push_back(
+          text("base: %.4g Hz is less than the %.4g Hz of %s; fast motion between the poses is lost", rate,
+               1.0 / source.interval, source.camera.name.c_str()));
       break;
     }
   if (capture.table) {
@@ -147,7 +153,8 @@ void check_base(const Manifest& manifest, CheckReport& report) {
     const Vector3 axis = first.rotation * capture.bending_axis;
     const double angle = std::acos(std::min(1.0, std::abs(axis.dot(capture.table->normal))));
     if (angle > kAlong)
-      report.doubts.push_back(text("grasp.bending_axis: is %.0f degrees off the table's normal at the first pose", angle * kDegrees));
+      report.doubts.push_back(
+          text("grasp.bending_axis: is %.0f degrees off the table's normal at the first pose", angle * kDegrees));
     const double height = capture.table->normal.dot(first.translation - capture.table->point);
     if (height < -kStill || height > capture.length)
       report.doubts.push_back(text("base: the grasp is %.3f m above the table at the first pose", height));
@@ -155,7 +162,8 @@ void check_base(const Manifest& manifest, CheckReport& report) {
 }
 
 // Reprojection of the grasp, exposure, borders, depth of one camera. `views` are all of it, undistorted.
-void check_camera(const Manifest& manifest, const CameraSource& source, const View* views, int count, CheckReport& report) {
+void check_camera(const Manifest& manifest, const CameraSource& source, const View* views, int count,
+                  CheckReport& report) {
   const Camera& camera = source.camera;
   const trajectory::Trajectory& base = manifest.capture.base;
   const Pose camera_from_world = camera.world_from_camera.inverse();
@@ -182,9 +190,9 @@ void check_camera(const Manifest& manifest, const CameraSource& source, const Vi
     }
     grasp_depth.push_back(grasp.z());
     distance.push_back(mask_distance(view, project(camera, grasp)));
-    const double side = share_behind(view, camera, grasp,
-                                     camera_from_world.rotation * pose.rotation * manifest.capture.direction,
-                                     manifest.capture.length);
+    const double side =
+        share_behind(view, camera, grasp, camera_from_world.rotation * pose.rotation * manifest.capture.direction,
+                     manifest.capture.length);
     if (std::isfinite(side)) wrong_side.push_back(side);
     if (k % std::max(1, count / kLagFrames) != 0) continue;
     for (int lag = -kMostLag; lag <= kMostLag; ++lag) {
@@ -194,46 +202,59 @@ void check_camera(const Manifest& manifest, const CameraSource& source, const Vi
   }
   const double z = median(grasp_depth), miss = median(distance), bright = median(brightness);
   const double across = manifest.capture.diameter * camera.fx / z;
-  std::string line = text("%s: %dx%d, %d frames, %.3f to %.3f s, %s; sees the object in %d, %.0f px in the mean (%.2f %%)", name.c_str(),
-                          camera.width, camera.height, count, source.times.front(), source.times.back(),
-                          camera.distorted() ? "lens distortion is taken out" : "no lens distortion", seen, seen ? pixels / seen : 0.0,
-                          seen ? 100.0 * pixels / seen / camera.width / camera.height : 0.0);
+  std::string line =
+      text("%s: %dx%d, %d frames, %.3f to %.3f s, %s; sees the object in %d, %.0f px in the mean (%.2f %%)",
+           name.c_str(), camera.width, camera.height, count, source.times.front(), source.times.back(),
+           camera.distorted() ? "lens distortion is taken out" : "no lens distortion", seen, seen ? pixels / seen : 0.0,
+           seen ? 100.0 * pixels / seen / camera.width / camera.height : 0.0);
   if (seen > 0) line += text("; brightness %.0f of 255", bright);
-  if (std::isfinite(z)) line += text("; grasp %.2f m away, the rope about %.1f px across, the grasp %.1f px from the mask", z, across, miss);
+  if (std::isfinite(z))
+    line +=
+        text("; grasp %.2f m away, the rope about %.1f px across, the grasp %.1f px from the mask", z, across, miss);
   report.facts.push_back(line);
 
-  if (source.video_rate > 0 && source.interval > 0 && std::abs(source.video_rate * source.interval - 1.0) > kRateTolerance)
-    report.doubts.push_back(text("%s: the video says %.4g frames a second, the capture %.4g", name.c_str(), source.video_rate,
-                                 1.0 / source.interval));
+  if (source.video_rate > 0 && source.interval > 0 &&
+      std::abs(source.video_rate * source.interval - 1.0) > kRateTolerance)
+    report.doubts.push_back(text("%s: the video says %.4g frames a second, the capture %.4g", name.c_str(),
+                                 source.video_rate, 1.0 / source.interval));
   if (seen == 0) return;  // a problem already
-  if (seen < count) report.doubts.push_back(text("%s: the mask is empty in %d of %d frames", name.c_str(), count - seen, count));
+  if (seen < count)
+    report.doubts.push_back(text("%s: the mask is empty in %d of %d frames", name.c_str(), count - seen, count));
   if (border > 0)
-    report.doubts.push_back(text("%s: the mask touches the image's border in %d of %d frames: part of the rope may be out of sight",
-                                 name.c_str(), border, count));
+    report.doubts.push_back(
+        text("%s: the mask touches the image's border in %d of %d frames: part of the rope may be out of sight",
+             name.c_str(), border, count));
   if (saturated > kMostSaturated * pixels)
-    report.doubts.push_back(text("%s: %.0f %% of the object's pixels are overexposed", name.c_str(), 100.0 * saturated / pixels));
-  if (bright < kDark) report.doubts.push_back(text("%s: the object is very dark (%.0f of 255 in the mean)", name.c_str(), bright));
+    report.doubts.push_back(
+        text("%s: %.0f %% of the object's pixels are overexposed", name.c_str(), 100.0 * saturated / pixels));
+  if (bright < kDark)
+    report.doubts.push_back(text("%s: the object is very dark (%.0f of 255 in the mean)", name.c_str(), bright));
   const auto [darkest, brightest] = std::minmax_element(brightness.begin(), brightness.end());
   std::vector<double> jumps;
   for (std::size_t k = 1; k < brightness.size(); ++k) jumps.push_back(std::abs(brightness[k] - brightness[k - 1]));
   if (!jumps.empty() && bright > 0 && *std::max_element(jumps.begin(), jumps.end()) > kFlicker * bright)
-    report.doubts.push_back(text("%s: the object's brightness jumps between frames (%.0f to %.0f of 255): is the exposure fixed?",
-                                 name.c_str(), *darkest, *brightest));
+    report.doubts.push_back(
+        text("%s: the object's brightness jumps between frames (%.0f to %.0f of 255): is the exposure fixed?",
+             name.c_str(), *darkest, *brightest));
   if (behind > 0)
-    report.doubts.push_back(text("%s: the grasp is behind the camera in %d frames: does world_from_camera use OpenCV's axes (z forward)?",
-                                 name.c_str(), behind));
+    report.doubts.push_back(
+        text("%s: the grasp is behind the camera in %d frames: does world_from_camera use OpenCV's axes (z forward)?",
+             name.c_str(), behind));
   if (std::isfinite(across) && across < kThinRope)
     report.doubts.push_back(text("%s: the rope is only %.1f px across", name.c_str(), across));
   const double allowed = kGripperReach * camera.fx / z + kPoseSlack;
   if (miss > allowed)
-    report.doubts.push_back(text("%s: the grasp projects %.0f px from the mask (at most %.0f expected): check the camera's pose, the base "
-                                 "trajectory and their times",
-                                 name.c_str(), miss, allowed));
+    report.doubts.push_back(
+        text("%s: the grasp projects %.0f px from the mask (at most %.0f expected): check the camera's pose, the base "
+             "trajectory and their times",
+             name.c_str(), miss, allowed));
   else if (median(wrong_side) > kBehind)
-    report.doubts.push_back(text("%s: %.0f %% of the mask lies behind the grasp, against grasp.direction: check the camera's pose, the base "
-                                 "trajectory and the direction",
-                                 name.c_str(), 100.0 * median(wrong_side)));
-  // a wrong clock shows as a distance that shrinks when the base is moved in time; rests tell nothing, so all frames count
+    report.doubts.push_back(text(
+        "%s: %.0f %% of the mask lies behind the grasp, against grasp.direction: check the camera's pose, the base "
+        "trajectory and the direction",
+        name.c_str(), 100.0 * median(wrong_side)));
+  // a wrong clock shows as a distance that shrinks when the base is moved in time; rests tell nothing, so all frames
+  // count
   const auto rms = [](const std::vector<double>& values) {
     double sum = 0.0;
     for (const double v : values) sum += v * v;
@@ -244,15 +265,17 @@ void check_camera(const Manifest& manifest, const CameraSource& source, const Vi
     if (!shifted[lag + kMostLag].empty() && rms(shifted[lag + kMostLag]) < rms(shifted[best + kMostLag])) best = lag;
   const double now = rms(shifted[kMostLag]), then = rms(shifted[best + kMostLag]);
   if (best != 0 && then < kLagGain * now && now - then > kLagPixels)
-    report.doubts.push_back(text("%s: the images fit the base better %d frames %s (%.1f px instead of %.1f): are start and the base's times "
-                                 "on one clock?",
-                                 name.c_str(), std::abs(best), best > 0 ? "later" : "earlier", then, now));
+    report.doubts.push_back(text(
+        "%s: the images fit the base better %d frames %s (%.1f px instead of %.1f): are start and the base's times "
+        "on one clock?",
+        name.c_str(), std::abs(best), best > 0 ? "later" : "earlier", then, now));
   if (source.depth) {
     const double depth = median(object_depth);
     if (!std::isfinite(depth))
       report.doubts.push_back(name + ": no depth inside the masks");
     else if (std::isfinite(z) && std::abs(depth - z) > manifest.capture.length + kGripperReach)
-      report.doubts.push_back(text("%s: the depth images say %.2f m, the grasp is %.2f m away: check depth_scale", name.c_str(), depth, z));
+      report.doubts.push_back(
+          text("%s: the depth images say %.2f m, the grasp is %.2f m away: check depth_scale", name.c_str(), depth, z));
   }
 }
 
@@ -275,11 +298,12 @@ CheckReport check(const Path& path) {
     return finish();
   }
   const Capture& capture = manifest.capture;
-  report.facts.push_back(text("capture '%.100s': %s, %zu cameras", capture.name.c_str(), capture.tabletop ? "on a table" : "free space",
-                              manifest.cameras.size()));
+  report.facts.push_back(text("capture '%.100s': %s, %zu cameras", capture.name.c_str(),
+                              capture.tabletop ? "on a table" : "free space", manifest.cameras.size()));
   report.facts.push_back(text("rope: %.4g m long, %.4g m thick, ", capture.length, capture.diameter) +
                          (capture.mass ? text("%.4g kg", *capture.mass) : std::string("mass not given")));
-  if (!capture.mass) report.doubts.push_back("object.mass: is missing; masses and forces will be relative to a total mass of 1");
+  if (!capture.mass)
+    report.doubts.push_back("object.mass: is missing; masses and forces will be relative to a total mass of 1");
   if (manifest.cameras.size() == 1) report.doubts.push_back("cameras: only one; depth along its rays is hardly seen");
   if (!capture.base.samples().empty()) check_base(manifest, report);
 

@@ -51,8 +51,8 @@ std::string size_text(int width, int height) { return std::to_string(width) + "x
 
 void require_size(const Path& file, const OIIO::ImageSpec& spec, int width, int height) {
   if (spec.width != width || spec.height != height)
-    throw InputError(file.string(), "is " + size_text(spec.width, spec.height) + " pixels, the camera has " +
-                                        size_text(width, height),
+    throw InputError(file.string(),
+                     "is " + size_text(spec.width, spec.height) + " pixels, the camera has " + size_text(width, height),
                      "correct width and height in capture.json or the image");
 }
 
@@ -75,8 +75,7 @@ void write_image(const Path& file, const std::string& format, const OIIO::ImageS
   const Path temporary = file.string() + ".tmp" + std::to_string(::getpid());
   auto output = OIIO::ImageOutput::create(format);
   CHAINSPLAT_CHECK(output != nullptr, "OpenImageIO lacks " + format);
-  const bool written =
-      output->open(temporary.string(), spec) && output->write_image(type, pixels) && output->close();
+  const bool written = output->open(temporary.string(), spec) && output->write_image(type, pixels) && output->close();
   std::error_code error;
   if (written) std::filesystem::rename(temporary, file, error);
   if (!written || error) {
@@ -109,7 +108,8 @@ std::vector<float> read_depth(const Path& file, int width, int height, double sc
   const auto input = open_image(file);
   require_size(file, input->spec(), width, height);
   if (input->spec().format != OIIO::TypeDesc::UINT16)
-    throw InputError(file.string(), "does not have 16 bits a pixel", "write depth as 16-bit PNG, value x depth_scale = m");
+    throw InputError(file.string(), "does not have 16 bits a pixel",
+                     "write depth as 16-bit PNG, value x depth_scale = m");
   const std::vector<std::uint16_t> raw = read_pixels<std::uint16_t>(*input, file, OIIO::TypeDesc::UINT16, 1);
   std::vector<float> depth(raw.size());
   for (std::size_t i = 0; i < raw.size(); ++i) depth[i] = static_cast<float>(raw[i] * scale);
@@ -139,7 +139,8 @@ void write_depth_png(const Path& file, int width, int height, const std::vector<
     const double value = std::round(meters[i] / scale);
     raw[i] = value > 0.0 && value <= kLargest ? static_cast<std::uint16_t>(value) : 0;
   }
-  write_image(file, "png", OIIO::ImageSpec(width, height, 1, OIIO::TypeDesc::UINT16), OIIO::TypeDesc::UINT16, raw.data());
+  write_image(file, "png", OIIO::ImageSpec(width, height, 1, OIIO::TypeDesc::UINT16), OIIO::TypeDesc::UINT16,
+              raw.data());
 }
 
 void write_depth_exr(const Path& file, int width, int height, const std::vector<float>& meters) {

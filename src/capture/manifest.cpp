@@ -21,12 +21,12 @@ Path ImageSource::frame_file(int frame) const {
 
 namespace {
 
-constexpr int kLargestSide = 1 << 15;           // px, of an image
-constexpr double kRotationTolerance = 1e-3;     // |R R^T - I|: three digits pass
-constexpr double kUnitTolerance = 1e-3;         // of a direction's length before we doubt it
-constexpr double kPerpendicular = 1e-3;         // rad
-constexpr double kInversePixels = 1e-3;         // px, largest error of undistort(distort(.)) at the corners
-constexpr double kTopMeters = 5.0;              // a longer rope is doubted (millimeters?)
+constexpr int kLargestSide = 1 << 15;        // px, of an image
+constexpr double kRotationTolerance = 1e-3;  // |R R^T - I|: three digits pass
+constexpr double kUnitTolerance = 1e-3;      // of a direction's length before we doubt it
+constexpr double kPerpendicular = 1e-3;      // rad
+constexpr double kInversePixels = 1e-3;      // px, largest error of undistort(distort(.)) at the corners
+constexpr double kTopMeters = 5.0;           // a longer rope is doubted (millimeters?)
 
 // In quotes, cut to what fits on a line.
 std::string in_quotes(const std::string& text) {
@@ -62,7 +62,9 @@ class Reader {
   void problem(const std::string& key, const std::string& what, const std::string& mend) const {
     findings_.problems.push_back({at(key), what, mend});
   }
-  void doubt(const std::string& key, const std::string& what) const { findings_.doubts.push_back(at(key) + ": " + what); }
+  void doubt(const std::string& key, const std::string& what) const {
+    findings_.doubts.push_back(at(key) + ": " + what);
+  }
 
   // Unknown keys are doubts that name the nearest known key.
   void know(std::initializer_list<const char*> known) const {
@@ -116,15 +118,17 @@ class Reader {
     if (!value) return std::nullopt;
     if (!value->is_array() || value->size() != count) {
       problem(key,
-              value->is_array() ? "has " + std::to_string(value->size()) + " entries instead of " + std::to_string(count)
-                                : "is not a list",
+              value->is_array()
+                  ? "has " + std::to_string(value->size()) + " entries instead of " + std::to_string(count)
+                  : "is not a list",
               std::string("write ") + expected);
       return std::nullopt;
     }
     std::vector<double> out;
     for (const Json& entry : *value) {
       if (!entry.is_number() || !std::isfinite(entry.get<double>())) {
-        problem(key + "[" + std::to_string(out.size()) + "]", "is not a finite number", std::string("write ") + expected);
+        problem(key + "[" + std::to_string(out.size()) + "]", "is not a finite number",
+                std::string("write ") + expected);
         return std::nullopt;
       }
       out.push_back(entry.get<double>());
@@ -147,7 +151,8 @@ class Reader {
       problem(key, "has no length", std::string("write ") + expected);
       return std::nullopt;
     }
-    if (std::abs(length - 1.0) > kUnitTolerance) doubt(key, "has length " + core::exact(length) + ", taken as a direction");
+    if (std::abs(length - 1.0) > kUnitTolerance)
+      doubt(key, "has length " + core::exact(length) + ", taken as a direction");
     return *value / length;
   }
 
@@ -190,7 +195,8 @@ class Reader {
 };
 
 // 'cam0.mp4' or 'cam0/%06d.png'.
-std::optional<ImageSource> image_source(const Reader& reader, const std::string& key, const Path& folder, bool required) {
+std::optional<ImageSource> image_source(const Reader& reader, const std::string& key, const Path& folder,
+                                        bool required) {
   const auto text = reader.path(key, required, "a video like cam0.mp4 or a pattern like cam0/%06d.png");
   if (!text) return std::nullopt;
   ImageSource source;
@@ -203,8 +209,8 @@ std::optional<ImageSource> image_source(const Reader& reader, const std::string&
   std::size_t end = percent + 1;
   while (end < text->size() && std::isdigit(static_cast<unsigned char>((*text)[end]))) ++end;
   const std::string width = text->substr(percent + 1, end - percent - 1);
-  const bool valid = end < text->size() && (*text)[end] == 'd' && width.size() <= 3 && (width.empty() || width[0] == '0') &&
-                     text->find('%', end) == std::string::npos;
+  const bool valid = end < text->size() && (*text)[end] == 'd' && width.size() <= 3 &&
+                     (width.empty() || width[0] == '0') && text->find('%', end) == std::string::npos;
   if (!valid) {
     reader.problem(key, in_quotes(*text) + " is not a frame pattern", "write the number once, as %d or %06d");
     return std::nullopt;
@@ -221,7 +227,8 @@ bool is_file(const Path& file) {
 }
 
 // Sets source.frames; false and a problem when there are none or a number is left out.
-bool count_frames(ImageSource& source, const std::string& where, double* rate, const Camera* camera, Findings& findings) {
+bool count_frames(ImageSource& source, const std::string& where, double* rate, const Camera* camera,
+                  Findings& findings) {
   if (source.video) {
     try {
       const VideoFacts facts = video_facts(source.file);
@@ -252,7 +259,8 @@ bool count_frames(ImageSource& source, const std::string& where, double* rate, c
       return false;
     }
   if (source.frames > 0) return true;
-  findings.problems.push_back({source.frame_file(0).string(), "is missing", "number the frames from 0, or correct the pattern"});
+  findings.problems.push_back(
+      {source.frame_file(0).string(), "is missing", "number the frames from 0, or correct the pattern"});
   return false;
 }
 
@@ -346,12 +354,13 @@ void read_pose(const Reader& reader, Camera& camera) {
 void check_lens(const Reader& reader, const Camera& camera) {
   if (!camera.distorted()) return;
   const double w = camera.width, h = camera.height;
-  for (const math::Vector2& recorded : {math::Vector2(0, 0), math::Vector2(w, 0), math::Vector2(0, h), math::Vector2(w, h),
-                                        math::Vector2(0, h / 2), math::Vector2(w / 2, 0)}) {
+  for (const math::Vector2& recorded : {math::Vector2(0, 0), math::Vector2(w, 0), math::Vector2(0, h),
+                                        math::Vector2(w, h), math::Vector2(0, h / 2), math::Vector2(w / 2, 0)}) {
     const math::Vector2 back = distort(camera, undistort(camera, recorded));
     if (!((back - recorded).norm() < kInversePixels)) {
-      reader.problem("distortion", "cannot be undone at pixel (" + core::exact(recorded.x()) + ", " +
-                                       core::exact(recorded.y()) + "): the model folds the image",
+      reader.problem("distortion",
+                     "cannot be undone at pixel (" + core::exact(recorded.x()) + ", " + core::exact(recorded.y()) +
+                         "): the model folds the image",
                      "write OpenCV's k1, k2, p1, p2, k3 of this image size");
       return;
     }
@@ -359,17 +368,17 @@ void check_lens(const Reader& reader, const Camera& camera) {
 }
 
 bool good_name(const std::string& name) {
-  return !name.empty() && name.size() <= 64 && name[0] != '.' && std::all_of(name.begin(), name.end(), [](unsigned char c) {
-    return std::isalnum(c) || c == '_' || c == '-' || c == '.';
-  });
+  return !name.empty() && name.size() <= 64 && name[0] != '.' &&
+         std::all_of(name.begin(), name.end(),
+                     [](unsigned char c) { return std::isalnum(c) || c == '_' || c == '-' || c == '.'; });
 }
 
 CameraSource read_camera(const Reader& reader, const std::string& where, const Path& folder) {
   CameraSource source;
   source.where = where;
   Camera& camera = source.camera;
-  reader.know({"name", "width", "height", "fx", "fy", "cx", "cy", "distortion", "world_from_camera", "images", "masks", "depth",
-               "depth_scale", "rate", "start", "timestamps"});
+  reader.know({"name", "width", "height", "fx", "fy", "cx", "cy", "distortion", "world_from_camera", "images", "masks",
+               "depth", "depth_scale", "rate", "start", "timestamps"});
   camera.name = reader.text("name", true, "a short name like cam0").value_or("");
   if (reader.has("name") && !good_name(camera.name))
     reader.problem("name", in_quotes(camera.name) + " cannot name a folder", "use letters, digits, - and _");
@@ -379,7 +388,8 @@ CameraSource read_camera(const Reader& reader, const std::string& where, const P
   camera.fy = reader.positive("fy", "the focal length in pixels");
   camera.cx = reader.number("cx", true, "the principal point in pixels").value_or(0.0);
   camera.cy = reader.number("cy", true, "the principal point in pixels").value_or(0.0);
-  if (camera.width > 0 && camera.height > 0 && (camera.cx < 0 || camera.cx > camera.width || camera.cy < 0 || camera.cy > camera.height))
+  if (camera.width > 0 && camera.height > 0 &&
+      (camera.cx < 0 || camera.cx > camera.width || camera.cy < 0 || camera.cy > camera.height))
     reader.doubt("cx", "the principal point lies outside the image");
   if (const auto values = reader.numbers("distortion", 5, false, "OpenCV's [k1, k2, p1, p2, k3]"))
     std::copy(values->begin(), values->end(), camera.distortion.begin());
@@ -394,7 +404,8 @@ CameraSource read_camera(const Reader& reader, const std::string& where, const P
     source.depth.reset();
   }
   if (source.depth) source.depth_scale = reader.positive("depth_scale", "meters a unit, like 0.0001");
-  if (const auto file = reader.path("timestamps", false, "a text file with a time a line")) source.timestamps = folder / *file;
+  if (const auto file = reader.path("timestamps", false, "a text file with a time a line"))
+    source.timestamps = folder / *file;
   if (!reader.has("timestamps")) {
     source.rate = reader.positive("rate", "frames a second");
     source.start = reader.number("start", false, "the first frame's time in seconds").value_or(0.0);
@@ -422,8 +433,8 @@ void survey(Manifest& manifest, bool masked, Findings& findings) {
                                  std::to_string(other->frames) + " frames, but images has " + std::to_string(frames),
                                  "write one for every frame"});
       else if (other->frames > frames)
-        mine.doubts.push_back(source.where + "." + key + ": " + std::to_string(other->frames) + " frames, but images has " +
-                              std::to_string(frames) + "; the last ones are ignored");
+        mine.doubts.push_back(source.where + "." + key + ": " + std::to_string(other->frames) +
+                              " frames, but images has " + std::to_string(frames) + "; the last ones are ignored");
     };
     if (masked) compare(source.masks, "masks");
     compare(source.depth, "depth");
@@ -448,9 +459,10 @@ void read_base(Manifest& manifest, const Path& file, Findings& findings) {
     const double slack = 0.5 * source.interval;
     if (source.times.front() < capture.base.start() - slack || source.times.back() > capture.base.end() + slack)
       findings.problems.push_back({file.string(),
-                                   "covers " + core::exact(capture.base.start()) + " to " + core::exact(capture.base.end()) +
-                                       " s, but the frames of " + source.camera.name + " are at " +
-                                       core::exact(source.times.front()) + " to " + core::exact(source.times.back()) + " s",
+                                   "covers " + core::exact(capture.base.start()) + " to " +
+                                       core::exact(capture.base.end()) + " s, but the frames of " + source.camera.name +
+                                       " are at " + core::exact(source.times.front()) + " to " +
+                                       core::exact(source.times.back()) + " s",
                                    "record the base during all frames or correct start, rate or timestamps"});
   }
 }
@@ -484,12 +496,14 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
   try {
     json = Json::parse(text);
   } catch (const Json::parse_error& failure) {
-    throw InputError(file + ":" + line_of(text, failure.byte), "is not JSON (a comma, bracket or quote is missing, or the file is cut off)",
+    throw InputError(file + ":" + line_of(text, failure.byte),
+                     "is not JSON (a comma, bracket or quote is missing, or the file is cut off)",
                      "correct this line or the one before");
   } catch (const Json::exception&) {  // a number beyond double
     throw InputError(file, "has a number that is too large", "write finite numbers");
   }
-  if (!json.is_object()) throw InputError(file, "is not a JSON object", "write { \"format\": \"chainsplat-capture/1\", ... }");
+  if (!json.is_object())
+    throw InputError(file, "is not a JSON object", "write { \"format\": \"chainsplat-capture/1\", ... }");
 
   const Reader top(&json, file + ": ", findings);
   const auto format = top.text("format", true, "\"chainsplat-capture/1\"");
@@ -569,7 +583,8 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
     const std::string given = name != value.end() && name->is_string() ? name->get<std::string>() : "";
     all_names.append(c ? ", " : "").append(given);
     if (!given.empty() && !names.insert(given).second)
-      findings.problems.push_back({where + ".name", in_quotes(given) + " is used twice", "give every camera its own name"});
+      findings.problems.push_back(
+          {where + ".name", in_quotes(given) + " is used twice", "give every camera its own name"});
     if (!camera.empty() && given != camera) continue;
     manifest.cameras.push_back(read_camera(Reader(&value, where, findings), where, capture.folder));
   }

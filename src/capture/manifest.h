@@ -20,9 +20,9 @@ struct Findings {
 // A video, or one image file a frame by a printf pattern.
 struct ImageSource {
   bool video = false;
-  Path file;                        // the video
-  std::string prefix, suffix;       // of an image's path
-  int digits = 0;                   // at least so many, with zeros in front
+  Path file;                   // the video
+  std::string prefix, suffix;  // of an image's path
+  int digits = 0;              // at least so many, with zeros in front
   int frames = 0;
   Path frame_file(int frame) const;  // of a pattern
 };
@@ -36,8 +36,8 @@ struct CameraSource {
   double rate = 0.0;         // frames a second; 0 with timestamps
   double start = 0.0;        // s
   std::optional<Path> timestamps;
-  double interval = 0.0;     // s, median between frames
-  double video_rate = 0.0;   // frames a second as the container says, 0 = unknown
+  double interval = 0.0;    // s, median between frames
+  double video_rate = 0.0;  // frames a second as the container says, 0 = unknown
   std::vector<double> times;
 };
 

@@ -24,7 +24,8 @@ std::optional<TrueCenterline> load_true_centerline(const Path& capture_folder) {
     if (line.ends_with('\r')) line.remove_suffix(1);
     if (line.empty()) continue;
     const auto fail = [&](const std::string& what) {
-      throw InputError(file.string() + ":" + std::to_string(line_number), what, "take the file as the simulation wrote it");
+      throw InputError(file.string() + ":" + std::to_string(line_number), what,
+                       "take the file as the simulation wrote it");
     };
     if (columns == 0) {
       constexpr std::string_view kHeader = "frame,time,x0,y0,z0";
@@ -42,7 +43,8 @@ std::optional<TrueCenterline> load_true_centerline(const Path& capture_folder) {
       numbers.push_back(number);
       c = after;
     }
-    if (numbers.size() != columns) fail(std::to_string(numbers.size()) + " columns instead of " + std::to_string(columns));
+    if (numbers.size() != columns)
+      fail(std::to_string(numbers.size()) + " columns instead of " + std::to_string(columns));
     truth.time.push_back(numbers[1]);
     truth.points.push_back(
         Eigen::Map<const math::MatrixX>(numbers.data() + 2, 3, static_cast<Eigen::Index>((columns - 2) / 3)));

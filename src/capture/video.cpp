@@ -82,8 +82,10 @@ bool full_range(const AVFrame& frame) {
     case AV_PIX_FMT_YUVJ420P:
     case AV_PIX_FMT_YUVJ422P:
     case AV_PIX_FMT_YUVJ444P:
-    case AV_PIX_FMT_YUVJ440P: return true;
-    default: return frame.color_range == AVCOL_RANGE_JPEG;
+    case AV_PIX_FMT_YUVJ440P:
+      return true;
+    default:
+      return frame.color_range == AVCOL_RANGE_JPEG;
   }
 }
 
@@ -94,8 +96,10 @@ int matrix(AVColorSpace space) {
     case AVCOL_SPC_FCC:
     case AVCOL_SPC_SMPTE240M:
     case AVCOL_SPC_BT2020_NCL:
-    case AVCOL_SPC_BT2020_CL: return space;
-    default: return SWS_CS_ITU601;
+    case AVCOL_SPC_BT2020_CL:
+      return space;
+    default:
+      return SWS_CS_ITU601;
   }
 }
 
@@ -157,15 +161,16 @@ bool VideoReader::Implementation::decode() {
       }
     }
     if (code < 0)
-      throw InputError(file.string() + ": frame " + std::to_string(frames), "cannot be decoded (" + error_text(code) + ")",
-                       "write the video again");
+      throw InputError(file.string() + ": frame " + std::to_string(frames),
+                       "cannot be decoded (" + error_text(code) + ")", "write the video again");
   }
 }
 
 void VideoReader::Implementation::convert(Image8& rgb) {
   const int width = frame->width, height = frame->height;
   if (width <= 0 || height <= 0 || static_cast<std::int64_t>(width) * height > kMostPixels)
-    throw InputError(file.string(), "claims frames of " + std::to_string(width) + "x" + std::to_string(height) + " pixels",
+    throw InputError(file.string(),
+                     "claims frames of " + std::to_string(width) + "x" + std::to_string(height) + " pixels",
                      "write the video again");
   const int coefficients = matrix(frame->colorspace);
   const bool full = full_range(*frame);
@@ -177,13 +182,13 @@ void VideoReader::Implementation::convert(Image8& rgb) {
     scaler_matrix = coefficients;
     scaler_full = full;
     // flags: exactly the default. Others move colors at chroma edges by up to 200 levels
-    scaler.reset(sws_getContext(width, height, static_cast<AVPixelFormat>(frame->format), width, height, AV_PIX_FMT_RGB24,
-                                SWS_BICUBIC, nullptr, nullptr, nullptr));
+    scaler.reset(sws_getContext(width, height, static_cast<AVPixelFormat>(frame->format), width, height,
+                                AV_PIX_FMT_RGB24, SWS_BICUBIC, nullptr, nullptr, nullptr));
     if (!scaler) throw InputError(file.string(), "has a pixel format without a way to RGB", "write it as yuv420p");
     converted = padded_frame(width, height, AV_PIX_FMT_RGB24);
     constexpr int kOne = 1 << 16;  // libswscale's fixed point
-    sws_setColorspaceDetails(scaler.get(), sws_getCoefficients(coefficients), full, sws_getCoefficients(SWS_CS_DEFAULT), 1, 0,
-                             kOne, kOne);
+    sws_setColorspaceDetails(scaler.get(), sws_getCoefficients(coefficients), full, sws_getCoefficients(SWS_CS_DEFAULT),
+                             1, 0, kOne, kOne);
   }
   rgb.width = width;
   rgb.height = height;
@@ -192,7 +197,8 @@ void VideoReader::Implementation::convert(Image8& rgb) {
   sws_scale(scaler.get(), frame->data, frame->linesize, 0, height, converted->data, converted->linesize);
   const std::size_t row = static_cast<std::size_t>(3) * width;
   for (int y = 0; y < height; ++y)
-    std::memcpy(&rgb.pixels[y * row], converted->data[0] + static_cast<std::ptrdiff_t>(y) * converted->linesize[0], row);
+    std::memcpy(&rgb.pixels[y * row], converted->data[0] + static_cast<std::ptrdiff_t>(y) * converted->linesize[0],
+                row);
 }
 
 bool VideoReader::next(Image8& rgb) {
@@ -300,13 +306,13 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
   if (code < 0) clean("writing failed", code);
 
   const AVPixelFormat source = frames.front().channels == 3 ? AV_PIX_FMT_RGB24 : AV_PIX_FMT_RGBA;
-  Owned<SwsContext> scaler(sws_getContext(width, height, source, width, height, encoder->pix_fmt, SWS_BICUBIC, nullptr,
-                                          nullptr, nullptr));
+  Owned<SwsContext> scaler(
+      sws_getContext(width, height, source, width, height, encoder->pix_fmt, SWS_BICUBIC, nullptr, nullptr, nullptr));
   const Owned<AVFrame> rgb = padded_frame(width, height, source);
   if (!scaler) clean("no way from RGB to the encoder's format", 0);
   constexpr int kOne = 1 << 16;
-  sws_setColorspaceDetails(scaler.get(), sws_getCoefficients(SWS_CS_DEFAULT), 1, sws_getCoefficients(SWS_CS_ITU601), 0, 0, kOne,
-                           kOne);
+  sws_setColorspaceDetails(scaler.get(), sws_getCoefficients(SWS_CS_DEFAULT), 1, sws_getCoefficients(SWS_CS_ITU601), 0,
+                           0, kOne, kOne);
 
   Owned<AVPacket> packet(av_packet_alloc());
   const auto drain = [&] {

@@ -13,10 +13,10 @@ using math::Vector2;
 
 namespace {
 
-constexpr std::uint8_t kInside = 128;   // mask values from here on are object (INTERFACE 2)
+constexpr std::uint8_t kInside = 128;  // mask values from here on are object (INTERFACE 2)
 // Without masks, what is brighter than this in any channel is object. Lossy coding does not keep black black.
 constexpr std::uint8_t kBlackLossless = 0, kBlackLossy = 16;
-constexpr double kMostCovered = 0.5;    // of an image: more means that nothing was masked
+constexpr double kMostCovered = 0.5;  // of an image: more means that nothing was masked
 
 using Pixels = std::vector<std::uint8_t>;
 
@@ -50,7 +50,8 @@ Bounds bounds_of(const std::uint8_t* mask, int width, int height) {
 
 // Bilinear sample at a pixel position (centers at +0.5) of channel `channel`. Outside: the nearest pixel's value.
 double sample(const std::uint8_t* image, int width, int height, int channels, int channel, const Vector2& position) {
-  const double x = std::clamp(position.x() - 0.5, 0.0, width - 1.0), y = std::clamp(position.y() - 0.5, 0.0, height - 1.0);
+  const double x = std::clamp(position.x() - 0.5, 0.0, width - 1.0),
+               y = std::clamp(position.y() - 0.5, 0.0, height - 1.0);
   const int x0 = static_cast<int>(x), y0 = static_cast<int>(y);
   const int x1 = std::min(x0 + 1, width - 1), y1 = std::min(y0 + 1, height - 1);
   const double fx = x - x0, fy = y - y0;
@@ -80,7 +81,9 @@ Bounds undistorted_bounds(const Camera& camera, const Bounds& bounds) {
     for (const int y : {bounds.y0, bounds.y1}) include(std::min(x, bounds.x1), y);
   for (int y = bounds.y0; y < bounds.y1 + kStep; y += kStep)
     for (const int x : {bounds.x0, bounds.x1}) include(x, std::min(y, bounds.y1));
-  const auto whole = [](double value, int size) { return static_cast<int>(std::clamp(value, 0.0, static_cast<double>(size))); };
+  const auto whole = [](double value, int size) {
+    return static_cast<int>(std::clamp(value, 0.0, static_cast<double>(size)));
+  };
   return {whole(std::floor(low.x()) - kSlack, camera.width), whole(std::floor(low.y()) - kSlack, camera.height),
           whole(std::ceil(high.x()) + kSlack, camera.width), whole(std::ceil(high.y()) + kSlack, camera.height)};
 }
@@ -115,8 +118,9 @@ void cut_mask(View& view, const Camera& camera, const Pixels& mask, bool undisto
   for (int y = bounds.y0; y < bounds.y1; ++y)
     for (int x = bounds.x0; x < bounds.x1; ++x) {
       const bool inside =
-          undistorting ? straight[static_cast<std::size_t>(y - region.y0) * (region.x1 - region.x0) + x - region.x0] != 0
-                       : mask[static_cast<std::size_t>(y) * camera.width + x] >= kInside;
+          undistorting
+              ? straight[static_cast<std::size_t>(y - region.y0) * (region.x1 - region.x0) + x - region.x0] != 0
+              : mask[static_cast<std::size_t>(y) * camera.width + x] >= kInside;
       if (inside) view.rgba[4 * (static_cast<std::size_t>(y - crop.y0) * view.width + x - crop.x0) + 3] = 255;
     }
 }
@@ -130,7 +134,8 @@ void fill_color(View& view, const Camera& camera, const Pixels& rgb, bool undist
       if (undistorting) {
         const Vector2 position = distort(camera, center(view.x0 + x, view.y0 + y));
         for (int c = 0; c < 3; ++c)
-          out[c] = static_cast<std::uint8_t>(std::lround(sample(rgb.data(), camera.width, camera.height, 3, c, position)));
+          out[c] =
+              static_cast<std::uint8_t>(std::lround(sample(rgb.data(), camera.width, camera.height, 3, c, position)));
       } else {
         std::copy_n(&rgb[3 * (static_cast<std::size_t>(view.y0 + y) * camera.width + view.x0 + x)], 3, out);
       }
@@ -146,21 +151,24 @@ void fill_depth(View& view, const Camera& camera, const std::vector<float>& dept
       if (undistorting) position = distort(camera, position);
       const int column = static_cast<int>(std::floor(position.x())), row = static_cast<int>(std::floor(position.y()));
       if (column < 0 || row < 0 || column >= camera.width || row >= camera.height) continue;
-      view.depth[static_cast<std::size_t>(y) * view.width + x] = depth[static_cast<std::size_t>(row) * camera.width + column];
+      view.depth[static_cast<std::size_t>(y) * view.width + x] =
+          depth[static_cast<std::size_t>(row) * camera.width + column];
     }
 }
 
 void require_size(const CameraSource& source, const ImageSource& video, const Image8& image) {
   if (image.width != source.camera.width || image.height != source.camera.height)
     throw InputError(video.file.string(),
-                     "is " + std::to_string(image.width) + "x" + std::to_string(image.height) + " pixels, the camera has " +
-                         std::to_string(source.camera.width) + "x" + std::to_string(source.camera.height),
+                     "is " + std::to_string(image.width) + "x" + std::to_string(image.height) +
+                         " pixels, the camera has " + std::to_string(source.camera.width) + "x" +
+                         std::to_string(source.camera.height),
                      "correct width and height in capture.json or the video");
 }
 
 void require_frame(const ImageSource& video, bool got, int frame) {
   if (!got)
-    throw InputError(video.file.string(), "ends before frame " + std::to_string(frame) + " of " + std::to_string(video.frames),
+    throw InputError(video.file.string(),
+                     "ends before frame " + std::to_string(frame) + " of " + std::to_string(video.frames),
                      "write the video again");
 }
 
@@ -205,8 +213,8 @@ void load_video_frames(const CameraSource& source, const LoadOptions& options, i
   }
 }
 
-void load_mask_video(const CameraSource& source, const LoadOptions& options, int first, int last, bool undistorting, int threads,
-                     View* views) {
+void load_mask_video(const CameraSource& source, const LoadOptions& options, int first, int last, bool undistorting,
+                     int threads, View* views) {
   VideoReader masks(source.masks->file, threads);
   for (int k = 0; k < first; ++k) require_frame(*source.masks, masks.skip(), k);
   Image8 mask;
@@ -272,10 +280,13 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
       views.push_back(std::move(view));
     }
     if (options.masked && !source.masks)
-      findings.doubts.push_back(source.where + ".masks: is missing; the images are taken as masked already (black background)");
+      findings.doubts.push_back(source.where +
+                                ".masks: is missing; the images are taken as masked already (black background)");
   }
   const auto total = static_cast<std::int64_t>(frames.size());
-  const auto view_of = [&](const Frame& f) -> View& { return views[ranges[f.camera].offset + f.frame - ranges[f.camera].first]; };
+  const auto view_of = [&](const Frame& f) -> View& {
+    return views[ranges[f.camera].offset + f.frame - ranges[f.camera].first];
+  };
 
   // masks by file first: they say which part of an image is kept
   for_each_in_parallel(total, [&](std::int64_t i) {
@@ -284,7 +295,8 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
     const Pixels mask = read_mask(source.masks->frame_file(frames[i].frame), source.camera.width, source.camera.height);
     cut_mask(view_of(frames[i]), source.camera, mask, ranges[frames[i].camera].undistorting, options.margin);
   });
-  // videos: one camera a task. Fewer cameras than threads: the decoders use the rest (their output does not depend on it)
+  // videos: one camera a task. Fewer cameras than threads: the decoders use the rest (their output does not depend on
+  // it)
   const int cameras = static_cast<int>(manifest.cameras.size());
   const int decoder_threads = std::max(1, (core::threads() + cameras - 1) / std::max(1, cameras));
   for_each_in_parallel(cameras, [&](std::int64_t c) {
@@ -331,8 +343,9 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
     covered /= static_cast<double>(range.last - range.first) * source.camera.width * source.camera.height;
     if (covered > kMostCovered)
       findings.problems.push_back(
-          {source.where + ".masks", source.masks ? "the masks cover more than half of the image"
-                                                 : "is missing and the background of the images is not black",
+          {source.where + ".masks",
+           source.masks ? "the masks cover more than half of the image"
+                        : "is missing and the background of the images is not black",
            source.masks ? "the object must be 255 and the rest 0" : "make masks (chainsplat mask) and name them"});
     if (seen == 0) {
       const std::string what = source.camera.name + " never sees the object: every mask is empty";

@@ -28,8 +28,8 @@ int find_interval(const std::vector<double>& knots, double time) {
   return static_cast<int>(std::upper_bound(first, last, time) - knots.begin()) - 1;
 }
 
-// Values (row vectors) of a spline of degree `degree` at `time` from the degree + 1 control rows of its interval: de Boor.
-// `knots` points at the interval's left knot.
+// Values (row vectors) of a spline of degree `degree` at `time` from the degree + 1 control rows of its interval: de
+// Boor. `knots` points at the interval's left knot.
 template <class Rows>
 Eigen::RowVectorXd de_boor(Rows rows, int degree, const double* knots, double time) {
   for (int level = 1; level <= degree; ++level)
@@ -157,7 +157,8 @@ SplineFit fit_spline(const std::vector<double>& times, const Points& values) {
   for (int i = kDegree; i < count; ++i) {
     const double half = 0.5 * (knots[i + 1] - knots[i]), middle = 0.5 * (knots[i + 1] + knots[i]);
     for (int g = 0; g < 3; ++g)
-      add_outer(penalty, i - kDegree, basis(knots, i, middle + half * kGaussPoint[g], kPenalized), half * kGaussWeight[g]);
+      add_outer(penalty, i - kDegree, basis(knots, i, middle + half * kGaussPoint[g], kPenalized),
+                half * kGaussWeight[g]);
   }
 
   SplineFit best;
@@ -169,12 +170,13 @@ SplineFit fit_spline(const std::vector<double>& times, const Points& values) {
     solve(normal, coefficients);
     double squares = 0.0;
     for (int k = 0; k < samples; ++k)
-      squares += (rows[k] * coefficients.middleRows<kOrder>(first[k]) - (values.row(k) - offset.transpose())).squaredNorm();
+      squares +=
+          (rows[k] * coefficients.middleRows<kOrder>(first[k]) - (values.row(k) - offset.transpose())).squaredNorm();
     const double freedom = trace_of_inverse_times(normal, data);
     const double left_over = samples - freedom;
     // with as many degrees of freedom as samples there is nothing to judge by; the first strength is the fallback
-    const double score = left_over > 1e-9 * samples ? squares / (left_over * left_over)
-                                                    : std::numeric_limits<double>::infinity();
+    const double score =
+        left_over > 1e-9 * samples ? squares / (left_over * left_over) : std::numeric_limits<double>::infinity();
     if (!(score < best_score) && exponent > kLeastExponent) continue;
     best_score = score;
     best.spline.coefficients = coefficients;

@@ -1,8 +1,8 @@
 // src/trajectory/smoothing_spline.h - quintic B-spline curves in R^3, fitted with a penalty on the third derivative.
 //
-// The minimizer of  sum_k |f(t_k) - y_k|^2 + lambda integral |f'''|^2 dt  over all functions is a quintic spline with its
-// knots at the samples: C^4, so acceleration and jerk are continuous. lambda is chosen by generalized cross validation
-// (Craven & Wahba 1979), from the data alone.
+// The minimizer of  sum_k |f(t_k) - y_k|^2 + lambda integral |f'''|^2 dt  over all functions is a quintic spline with
+// its knots at the samples: C^4, so acceleration and jerk are continuous. lambda is chosen by generalized cross
+// validation (Craven & Wahba 1979), from the data alone.
 #pragma once
 #include <vector>
 #include "chainsplat/math.h"

@@ -73,10 +73,10 @@ Trajectory fit(std::vector<Sample> samples, const std::string& where) {
     if (!std::isfinite(sample.time) || !sample.pose.rotation.allFinite() || !sample.pose.translation.allFinite())
       throw InputError(which, "a number is not finite", "remove the pose or fill it from its neighbors");
     if (k > 0 && !(sample.time > samples[k - 1].time))
-      throw InputError(which,
-                       "its time " + core::exact(sample.time) + " s does not come after " +
-                           core::exact(samples[k - 1].time) + " s",
-                       "sort the poses by time and remove doubles");
+      throw InputError(
+          which,
+          "its time " + core::exact(sample.time) + " s does not come after " + core::exact(samples[k - 1].time) + " s",
+          "sort the poses by time and remove doubles");
   }
 
   auto data = std::make_shared<Trajectory::Data>();
