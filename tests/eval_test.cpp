@@ -109,7 +109,8 @@ TEST_CASE("SSIM of a crop is that of the image around it") {
   const Pair corner = pair_of(example, 0, 0, 12, 12), corner_crop = pair_of(example, 0, 0, 5, 5);
   const double corner_pixels = static_cast<double>(corner.width) * corner.height;
   CHECK(std::abs(eval::ssim(corner.x, corner.y, corner.width, corner.height, corner_pixels) -
-                 eval::ssim(corner_crop.x, corner_crop.y, corner_crop.width, corner_crop.height, corner_pixels)) < 1e-14);
+                 eval::ssim(corner_crop.x, corner_crop.y, corner_crop.width, corner_crop.height, corner_pixels)) <
+        1e-14);
 }
 
 TEST_CASE("chamfer equals the double loop") {
@@ -120,8 +121,10 @@ TEST_CASE("chamfer equals the double loop") {
     for (double& x : q.reshaped()) x = random.normal();
     q.row(2) *= 0.01;  // thin, as the surface of a rope
     double forward = 0.0, backward = 0.0;
-    for (const auto& a : p.colwise()) forward += (q.colwise() - a).colwise().norm().minCoeff() / static_cast<double>(p.cols());
-    for (const auto& b : q.colwise()) backward += (p.colwise() - b).colwise().norm().minCoeff() / static_cast<double>(q.cols());
+    for (const auto& a : p.colwise())
+      forward += (q.colwise() - a).colwise().norm().minCoeff() / static_cast<double>(p.cols());
+    for (const auto& b : q.colwise())
+      backward += (p.colwise() - b).colwise().norm().minCoeff() / static_cast<double>(q.cols());
     CHECK(eval::chamfer(p, q) == doctest::Approx(0.5 * (forward + backward)).epsilon(1e-12));
   }
   // equal points many times over
@@ -148,7 +151,8 @@ TEST_CASE("metrics of a frame, by hand") {
   CHECK(std::isnan(m.tip_rms));
 
   // the same picture: everything perfect
-  const eval::FrameMetrics same = eval::compare(rectangle_frame(10, 8, 20, 14, static_cast<float>(0.4), 2.0f), view, camera);
+  const eval::FrameMetrics same =
+      eval::compare(rectangle_frame(10, 8, 20, 14, static_cast<float>(0.4), 2.0f), view, camera);
   CHECK(same.psnr == eval::kMostPsnr);
   CHECK(same.iou == 1.0);
   CHECK(same.ssim == doctest::Approx(1.0).epsilon(1e-12));
@@ -185,11 +189,13 @@ TEST_CASE("alpha and colors are clamped and thresholded as SPEC 9 says") {
 TEST_CASE("distorted pixels are straightened before they are projected back") {
   capture::Camera camera = small_camera();
   camera.distortion = {-0.3, 0.1, 0.003, -0.002, 0.0};
-  // recorded depth of one pixel; the drawn cloud is that pixel as well, so both are the same point wherever it is. Move the
-  // camera's principal point by a pixel for the expected distance: depth * 1 px / f
-  const eval::FrameMetrics same = eval::compare(rectangle_frame(33, 25, 34, 26, 0.4f, 1.0f), rectangle_view(33, 25, 34, 26, 102, 1.0f), camera);
+  // recorded depth of one pixel; the drawn cloud is that pixel as well, so both are the same point wherever it is. Move
+  // the camera's principal point by a pixel for the expected distance: depth * 1 px / f
+  const eval::FrameMetrics same =
+      eval::compare(rectangle_frame(33, 25, 34, 26, 0.4f, 1.0f), rectangle_view(33, 25, 34, 26, 102, 1.0f), camera);
   CHECK(same.chamfer == 0.0);
-  const eval::FrameMetrics next = eval::compare(rectangle_frame(34, 25, 35, 26, 0.4f, 1.0f), rectangle_view(33, 25, 34, 26, 102, 1.0f), camera);
+  const eval::FrameMetrics next =
+      eval::compare(rectangle_frame(34, 25, 35, 26, 0.4f, 1.0f), rectangle_view(33, 25, 34, 26, 102, 1.0f), camera);
   const math::Vector2 a = capture::undistort(camera, {33.5, 25.5}), b = capture::undistort(camera, {34.5, 25.5});
   CHECK((b - a).norm() > 1.05);
   CHECK(next.chamfer == doctest::Approx((b - a).norm() / 50.0).epsilon(1e-9));
@@ -235,7 +241,8 @@ TEST_CASE("a twin explains pictures of itself, and the metrics know by how much 
       for (std::size_t k = 0; k < frame.picture.rgba.size(); k += 4) {
         const bool in_mask = frame.picture.rgba[k + 3] >= 0.5f;
         for (int i = 0; i < 3; ++i)
-          view.rgba.push_back(in_mask ? static_cast<std::uint8_t>(std::lround(255 * std::min(1.0f, frame.picture.rgba[k + i]))) : 0);
+          view.rgba.push_back(
+              in_mask ? static_cast<std::uint8_t>(std::lround(255 * std::min(1.0f, frame.picture.rgba[k + i]))) : 0);
         view.rgba.push_back(in_mask ? 255 : 0);
       }
       view.depth = frame.picture.depth;
@@ -299,7 +306,8 @@ TEST_CASE("a twin explains pictures of itself, and the metrics know by how much 
   CHECK(off.mean.chamfer > 2e-4);
   CHECK(off.mean.chamfer < 5e-3);
   // cam1's last frame is after the truth's last time
-  const auto with_truth = std::count_if(off.frames.begin(), off.frames.end(), [](const auto& f) { return !std::isnan(f.tip_rms); });
+  const auto with_truth =
+      std::count_if(off.frames.begin(), off.frames.end(), [](const auto& f) { return !std::isnan(f.tip_rms); });
   CHECK(with_truth == 61);
   double squares = 0.0;
   for (const eval::FrameMetrics& frame : off.frames)
@@ -311,7 +319,8 @@ TEST_CASE("a twin explains pictures of itself, and the metrics know by how much 
   core::set_threads(1);
   CHECK(eval::to_json(eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, shifted)) == eval::to_json(off));
   core::set_threads(threads);
-  CHECK_THROWS_AS(eval::evaluate(engine, twin.gaussians, twin.chain, test::swing(twin.chain, 0.1, 5.0), recorded), InputError);
+  CHECK_THROWS_AS(eval::evaluate(engine, twin.gaussians, twin.chain, test::swing(twin.chain, 0.1, 5.0), recorded),
+                  InputError);
 }
 
 TEST_CASE("metrics.json has the keys of its documentation") {

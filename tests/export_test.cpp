@@ -16,11 +16,11 @@ tinygltf::Model loaded(const std::string& bytes, bool binary) {
   tinygltf::Model model;
   tinygltf::TinyGLTF loader;
   std::string error, warning;
-  const bool good = binary ? loader.LoadBinaryFromMemory(&model, &error, &warning,
-                                                         reinterpret_cast<const unsigned char*>(bytes.data()),
-                                                         static_cast<unsigned>(bytes.size()))
-                           : loader.LoadASCIIFromString(&model, &error, &warning, bytes.data(),
-                                                        static_cast<unsigned>(bytes.size()), "");
+  const bool good =
+      binary
+          ? loader.LoadBinaryFromMemory(&model, &error, &warning, reinterpret_cast<const unsigned char*>(bytes.data()),
+                                        static_cast<unsigned>(bytes.size()))
+          : loader.LoadASCIIFromString(&model, &error, &warning, bytes.data(), static_cast<unsigned>(bytes.size()), "");
   INFO(error << warning);
   REQUIRE(good);
   CHECK(error.empty());
@@ -36,7 +36,8 @@ std::vector<float> floats(const tinygltf::Model& model, int accessor, int compon
   REQUIRE(view.byteLength == a.count * components * sizeof(float));
   REQUIRE((view.byteOffset + a.byteOffset) % 4 == 0);
   std::vector<float> out(a.count * components);
-  std::memcpy(out.data(), model.buffers[view.buffer].data.data() + view.byteOffset + a.byteOffset, out.size() * sizeof(float));
+  std::memcpy(out.data(), model.buffers[view.buffer].data.data() + view.byteOffset + a.byteOffset,
+              out.size() * sizeof(float));
   return out;
 }
 
@@ -85,7 +86,8 @@ int link_node(const tinygltf::Model& model, int link) {
 }
 
 double apart(const math::Pose& a, const math::Pose& b) {
-  return std::max((a.rotation - b.rotation).cwiseAbs().maxCoeff(), (a.translation - b.translation).cwiseAbs().maxCoeff());
+  return std::max((a.rotation - b.rotation).cwiseAbs().maxCoeff(),
+                  (a.translation - b.translation).cwiseAbs().maxCoeff());
 }
 
 }  // namespace
@@ -120,7 +122,8 @@ TEST_CASE("the animation is what viewers need") {
   chain::States motion = test::swing(twin.chain, 1.0);
   // the base turns by more than half a turn: plain quaternions would flip their sign on the way
   std::vector<trajectory::Sample> samples;
-  for (int k = 0; k <= 60; ++k) samples.push_back({k / 60.0, {math::exp_so3({0, 0, 5.0 * k / 60.0}), math::Vector3::Zero()}});
+  for (int k = 0; k <= 60; ++k)
+    samples.push_back({k / 60.0, {math::exp_so3({0, 0, 5.0 * k / 60.0}), math::Vector3::Zero()}});
   const tinygltf::Model model =
       loaded(exports::gltf(twin.gaussians, twin.chain, motion, trajectory::fit(samples, "turning"), true), true);
   const tinygltf::Animation& animation = model.animations.at(0);
@@ -212,7 +215,8 @@ TEST_CASE("the points' fallback color is linear") {
   twin::Twin twin = test::small_twin(chain::Bending::planar, 12);
   // sRGB 0.5 is 0.21404114 linear; 2 is clamped to 1, -1 to 0
   for (int i = 0; i < 12; ++i)
-    for (int c = 0; c < 3; ++c) twin.gaussians.sh[12 * i + c] = static_cast<float>(c == 0 ? 0.0 : (c == 1 ? 1.5 : -1.5) / 0.28209479177387814);
+    for (int c = 0; c < 3; ++c)
+      twin.gaussians.sh[12 * i + c] = static_cast<float>(c == 0 ? 0.0 : (c == 1 ? 1.5 : -1.5) / 0.28209479177387814);
   const tinygltf::Model model = loaded(exports::gltf(twin.gaussians, twin.chain, {}, {}, false), false);
   const std::vector<float> color = floats(model, model.meshes[0].primitives[0].attributes.at("COLOR_0"), 4);
   CHECK(color[0] == doctest::Approx(0.21404114));

@@ -75,16 +75,19 @@ TEST_CASE("a ball appears in the recorded pixel where its center projects") {
       if (distorted && place.x() != 0.02) CHECK((expected - straight).norm() > 1.5);  // the lens matters here
       render::Options options;
       options.depth = true;
-      const auto frames = render::frames(engine(), ball.gaussians, ball.chain, ball.states, ball.base, camera, 3, {0.0}, options);
+      const auto frames =
+          render::frames(engine(), ball.gaussians, ball.chain, ball.states, ball.base, camera, 3, {0.0}, options);
       REQUIRE(frames.size() == 1);
       CHECK(frames[0].camera == 3);
       CHECK((centroid(frames[0]) - expected).norm() < 0.1);
       options.undistorted = true;
-      const auto plain = render::frames(engine(), ball.gaussians, ball.chain, ball.states, ball.base, camera, 0, {0.0}, options);
+      const auto plain =
+          render::frames(engine(), ball.gaussians, ball.chain, ball.states, ball.base, camera, 0, {0.0}, options);
       CHECK((centroid(plain.at(0)) - straight).norm() < 0.1);
 
       // whole images: the mask is a disk there, its depth that of the ball's center
-      const capture::Image8 mask = render::mask_image(frames[0], camera), color = render::color_image(frames[0], camera);
+      const capture::Image8 mask = render::mask_image(frames[0], camera),
+                            color = render::color_image(frames[0], camera);
       const std::vector<float> depth = render::depth_image(frames[0], camera);
       const double z = (camera.world_from_camera.inverse() * place).z();
       const auto at = [&](const Vector2& p) {
@@ -115,8 +118,13 @@ TEST_CASE("the crop holds all of the full image") {
       render::frames(engine(), twin.gaussians, twin.chain, twin.states, base, camera, 0, times, options);
   REQUIRE(frames.size() == 3);
   for (std::size_t k = 0; k < 3; ++k) {
-    const splat::ViewSpec whole{&camera, 0, 0, camera.width, camera.height,
-                                chain::link_motions(twin.chain, chain::interpolate(twin.states, times[k]), base.pose(times[k]))};
+    const splat::ViewSpec whole{
+        &camera,
+        0,
+        0,
+        camera.width,
+        camera.height,
+        chain::link_motions(twin.chain, chain::interpolate(twin.states, times[k]), base.pose(times[k]))};
     const splat::Picture picture = engine().draw(twin.gaussians, {&whole, 1})[0];
     const render::Frame& frame = frames[k];
     CHECK(frame.picture.width < camera.width / 2);
@@ -143,11 +151,13 @@ TEST_CASE("the recorded crop of a distorting camera holds what the lens brings i
   const Vector2 recorded(camera.width - 4.0, camera.height - 10.0), straight = capture::undistort(camera, recorded);
   REQUIRE(straight.x() > camera.width + 3);
   const double z = 0.6;
-  const Vector3 place = camera.world_from_camera * Vector3((straight.x() - camera.cx) / camera.fx * z, (straight.y() - camera.cy) / camera.fy * z, z);
+  const Vector3 place = camera.world_from_camera * Vector3((straight.x() - camera.cx) / camera.fx * z,
+                                                           (straight.y() - camera.cy) / camera.fy * z, z);
   const Ball ball(place, 0.004);
   const auto frames = render::frames(engine(), ball.gaussians, ball.chain, ball.states, ball.base, camera, 0, {0.0});
   const capture::Image8 mask = render::mask_image(frames.at(0), camera);
-  CHECK(mask.pixels[static_cast<std::size_t>(recorded.y()) * camera.width + static_cast<std::size_t>(recorded.x())] == 255);
+  CHECK(mask.pixels[static_cast<std::size_t>(recorded.y()) * camera.width + static_cast<std::size_t>(recorded.x())] ==
+        255);
 }
 
 TEST_CASE("frames are those that the states cover, at their own times") {
@@ -181,7 +191,6 @@ TEST_CASE("what is not seen is black, not an error") {
   for (const std::uint8_t value : render::color_image(away[0], camera).pixels) CHECK(value == 0);
   splat::Gaussians none;
   none.resize(0, twin.chain.links(), 0);
-  const auto empty = render::frames(engine(), none, twin.chain, twin.states, base,
-                                    front_camera(true), 0, {0.2});
+  const auto empty = render::frames(engine(), none, twin.chain, twin.states, base, front_camera(true), 0, {0.2});
   CHECK(empty.at(0).picture.width == 0);
 }

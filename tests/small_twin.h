@@ -25,7 +25,8 @@ inline splat::Gaussians spiral_gaussians(const chain::Chain& chain, int count) {
       g.sh[12 * i + c] = static_cast<float>(1.2 * std::sin(9.0 * i / count + 2.0 * c));
       for (int l = 1; l < 4; ++l) g.sh[12 * i + 3 * l + c] = static_cast<float>(random.uniform(-0.1, 0.1));
     }
-    for (int c = 0; c < 4; ++c) g.rotation[4 * i + c] = static_cast<float>(1.3 * wxyz[c]);  // files need not be normalized
+    for (int c = 0; c < 4; ++c)
+      g.rotation[4 * i + c] = static_cast<float>(1.3 * wxyz[c]);  // files need not be normalized
     g.opacity_logit[i] = 2.0f;
     for (int j = 0; j < g.links; ++j)
       g.link_logits[g.links * i + j] = j == chain::link_at(chain, arclength) ? 12.0f : 0.1f * static_cast<float>(j);
@@ -98,7 +99,8 @@ inline twin::Twin small_twin(chain::Bending bending = chain::Bending::spatial, i
 struct TemporaryFolder {
   Path path;
   explicit TemporaryFolder(const std::string& name)
-      : path(std::filesystem::temp_directory_path() / ("chainsplat_" + name + "_" + std::to_string(std::random_device()()))) {
+      : path(std::filesystem::temp_directory_path() /
+             ("chainsplat_" + name + "_" + std::to_string(std::random_device()()))) {
     std::filesystem::create_directories(path);
   }
   ~TemporaryFolder() { std::filesystem::remove_all(path); }

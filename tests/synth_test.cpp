@@ -84,9 +84,10 @@ TEST_CASE("a synthesized capture loads and holds what was drawn") {
     const capture::Camera& camera = read.cameras[view.camera];
     render::Options drawing;
     drawing.depth = true;
-    const auto frames = render::frames(engine(), twin.gaussians, twin.chain, twin.states, given.base, camera, view.camera,
-                                       {view.time}, drawing);
-    const capture::Image8 color = render::color_image(frames.at(0), camera), mask = render::mask_image(frames[0], camera);
+    const auto frames = render::frames(engine(), twin.gaussians, twin.chain, twin.states, given.base, camera,
+                                       view.camera, {view.time}, drawing);
+    const capture::Image8 color = render::color_image(frames.at(0), camera),
+                          mask = render::mask_image(frames[0], camera);
     const std::vector<float> depth = render::depth_image(frames[0], camera);
     int in_mask = 0, wrong = 0;
     for (int y = 0; y < view.height; ++y)
@@ -141,6 +142,7 @@ TEST_CASE("only frames that the states cover are written, numbered from 0; video
   REQUIRE(read.times[0].size() == 4);
   CHECK(read.times[0][0] == doctest::Approx(0.3));
   for (const capture::View& view : read.views) CHECK(view.width > 20);
-  CHECK_THROWS_AS(synth::write(engine(), twin, test::swing(twin.chain, 0.1, 5.0), given, folder.path / "none"), InputError);
+  CHECK_THROWS_AS(synth::write(engine(), twin, test::swing(twin.chain, 0.1, 5.0), given, folder.path / "none"),
+                  InputError);
   CHECK(!std::filesystem::exists(folder.path / "none"));
 }

@@ -51,8 +51,14 @@ twin::Twin full_twin() {
   twin.estimates.covariance = math::MatrixX::Identity(2, 2) / 3.0;
   twin.estimates.covariance(1, 0) = 1e-300;
   twin.estimates.held = {{"mass", "given by the capture"}, {"twist", "not observed, \"held\""}};
-  twin.provenance = {"1.2.3", "free \xc3\xa4", "00ff", "llvmpipe", "Mesa", {{"joints", "5"}, {"every", "5"}},
-                     std::numeric_limits<std::uint64_t>::max(), {{"recognize", 61.25}, {"identify", 1.0 / 3.0}}};
+  twin.provenance = {"1.2.3",
+                     "free \xc3\xa4",
+                     "00ff",
+                     "llvmpipe",
+                     "Mesa",
+                     {{"joints", "5"}, {"every", "5"}},
+                     std::numeric_limits<std::uint64_t>::max(),
+                     {{"recognize", 61.25}, {"identify", 1.0 / 3.0}}};
   return twin;
 }
 
@@ -184,10 +190,12 @@ TEST_CASE("twin.json has the keys that other programs read") {
     return out;  // sorted by nlohmann::json
   };
   using Keys = std::vector<std::string>;
-  CHECK(keys(json) == Keys{"chain", "format", "gaussians", "grasp", "identification", "provenance", "rollout", "states"});
-  CHECK(keys(json["chain"]) == Keys{"air_drag", "diameter", "gravity", "initial_state", "integrator", "joints", "length",
-                                    "links", "regularization", "scenario", "tip_mass"});
-  CHECK(keys(json["chain"]["joints"][0]) == Keys{"axis", "child_link", "damping", "parent_link", "rest_angle", "stiffness"});
+  CHECK(keys(json) ==
+        Keys{"chain", "format", "gaussians", "grasp", "identification", "provenance", "rollout", "states"});
+  CHECK(keys(json["chain"]) == Keys{"air_drag", "diameter", "gravity", "initial_state", "integrator", "joints",
+                                    "length", "links", "regularization", "scenario", "tip_mass"});
+  CHECK(keys(json["chain"]["joints"][0]) ==
+        Keys{"axis", "child_link", "damping", "parent_link", "rest_angle", "stiffness"});
   CHECK(keys(json["chain"]["links"][0]) ==
         Keys{"center_of_mass", "coulomb_friction", "inertia", "length", "mass", "viscous_friction"});
   CHECK(json["chain"]["joints"].size() == 10);
@@ -302,15 +310,15 @@ TEST_CASE("states keep their digits, and damage is named by line") {
   CHECK(contains(message_of([&] { twin::read_states(file, 8); }), "8 angles"));
 
   const std::string head = "time,theta_1\n";
-  for (const auto& [text, expected] : std::initializer_list<std::pair<std::string, const char*>>{
-           {head + "0,1\r\n0.1,\n", ":3: column 2"},
-           {head + "0,1\n0.1,x\n", ":3: column 2"},
-           {head + "0,1\n0.1,nan\n", ":3: column 2"},
-           {head + "0,1\n0.1,2,3\n", ":3: 3 columns"},
-           {head + "0.1,1\n\n0.1,2\n", ":4: its time"},
-           {"t,theta_1\n0,1\n", ":1: is not the header"},
-           {head, "no state"},
-           {"", "no state"}}) {
+  for (const auto& [text, expected] :
+       std::initializer_list<std::pair<std::string, const char*>>{{head + "0,1\r\n0.1,\n", ":3: column 2"},
+                                                                  {head + "0,1\n0.1,x\n", ":3: column 2"},
+                                                                  {head + "0,1\n0.1,nan\n", ":3: column 2"},
+                                                                  {head + "0,1\n0.1,2,3\n", ":3: 3 columns"},
+                                                                  {head + "0.1,1\n\n0.1,2\n", ":4: its time"},
+                                                                  {"t,theta_1\n0,1\n", ":1: is not the header"},
+                                                                  {head, "no state"},
+                                                                  {"", "no state"}}) {
     core::write_file(file, text);
     const std::string message = message_of([&] { twin::read_states(file, 1); });
     INFO(message);
@@ -341,7 +349,8 @@ TEST_CASE("centerlines are the nodes in the world") {
 TEST_CASE("gaussians.ply has the layout of 3DGS") {
   splat::Gaussians g;
   g.resize(2, 3, 1);
-  for (std::size_t i = 0; i < g.sh.size(); ++i) g.sh[i] = 100.0f + static_cast<float>(i);  // 100 + 12 gaussian + 3 coefficient + channel
+  for (std::size_t i = 0; i < g.sh.size(); ++i)
+    g.sh[i] = 100.0f + static_cast<float>(i);  // 100 + 12 gaussian + 3 coefficient + channel
   for (int i = 0; i < 8; ++i) g.rotation[i] = 0.1f * static_cast<float>(i + 1);
   g.mean = {1, 2, 3, 4, 5, 6};
   g.log_scale = {-1, -2, -3, -4, -5, -6};
@@ -353,14 +362,15 @@ TEST_CASE("gaussians.ply has the layout of 3DGS") {
   for (std::size_t at = 0; (at = bytes.find("property float ", at)) < data; at += 15)
     properties += bytes.substr(at + 15, bytes.find('\n', at) - at - 15) + " ";
   CHECK(properties ==
-        "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 f_rest_0 f_rest_1 f_rest_2 f_rest_3 f_rest_4 f_rest_5 f_rest_6 f_rest_7 f_rest_8 "
+        "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 f_rest_0 f_rest_1 f_rest_2 f_rest_3 f_rest_4 f_rest_5 f_rest_6 f_rest_7 "
+        "f_rest_8 "
         "opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 link_0 link_1 link_2 ");
   REQUIRE(bytes.size() - data == 2 * 29 * sizeof(float));
   float second[29];
   std::memcpy(second, bytes.data() + data + sizeof second, sizeof second);
-  const float expected[29] = {4,   5,   6,   0,   0,   0,  112, 113, 114,             // coefficient 0
-                              115, 118, 121, 116, 119, 122, 117, 120, 123,            // all red, all green, all blue
-                              8,   -4,  -5,  -6,  0.5f, 0.6f, 0.1f * 7, 0.8f, 30, 31, 32};
+  const float expected[29] = {4,   5,   6,   0,   0,    0,    112,      113,  114,  // coefficient 0
+                              115, 118, 121, 116, 119,  122,  117,      120,  123,  // all red, all green, all blue
+                              8,   -4,  -5,  -6,  0.5f, 0.6f, 0.1f * 7, 0.8f, 30,  31, 32};
   for (int i = 0; i < 29; ++i) {
     INFO(i);
     CHECK(second[i] == expected[i]);
@@ -372,8 +382,8 @@ TEST_CASE("other programs' splats are read; damaged ones are refused") {
   const Path file = folder.path / "g.ply";
   // another order, a property of another type, no normals, no link_*
   std::string bytes = "ply\r\nformat binary_little_endian 1.0\nelement vertex 1\nproperty double time\n";
-  const char* const names[] = {"rot_0", "rot_1", "rot_2", "rot_3", "x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2",
-                               "f_dc_0", "f_dc_1", "f_dc_2"};
+  const char* const names[] = {"rot_0",   "rot_1",   "rot_2",   "rot_3",   "x",      "y",      "z",
+                               "opacity", "scale_0", "scale_1", "scale_2", "f_dc_0", "f_dc_1", "f_dc_2"};
   for (const char* name : names) bytes += std::string("property float ") + name + "\n";
   bytes += "element face 0\nproperty list uchar int vertex_indices\nend_header\n";
   const double time = 5.0;

@@ -160,6 +160,8 @@ void recognize_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, 
   twin.gaussians = std::move(found.gaussians);
   twin.states = std::move(found.states);
   covariances = std::move(found.covariances);
+  // exactly symmetric, as they are read back
+  for (math::MatrixX& covariance : covariances) covariance = math::MatrixX(covariance.selfadjointView<Eigen::Lower>());
   if (request.bending == "auto" && request.mode == "fast") {
     char text[96];
     std::snprintf(text, sizeof text, " bending (out of plane: %.2f mm)", 1e3 * found.bending.out_of_plane_rms);

@@ -2,12 +2,13 @@
 //
 // twin.json ("format": "chainsplat-twin/1"); SI units, radians. Keys marked * are absent before identification.
 //   grasp           direction, bending_axis: unit vectors, base frame
-//   chain           scenario ("free", "tabletop"); length, diameter; gravity (world); table { point, normal } on a table
+//   chain           scenario ("free", "tabletop"); length, diameter; gravity (world); on a table
+//                   table { point, normal }
 //     joints        one an angle, base to tip: axis [w, v] (base frame, home, space form), parent_link, child_link,
 //                   stiffness*, rest_angle*, damping*
-//     links         n_l + 1, number 0 is the base link: length; mass*, inertia* [Ixx Iyy Izz Ixy Ixz Iyz] about the center of
-//                   mass, axes of the base frame at home, without the tip mass; center_of_mass* from the link's joint;
-//                   viscous_friction* (N s/m), coulomb_friction*. Link 0 is held: its mass and friction are written as 0
+//     links         n_l + 1, number 0 is the base link: length; mass*, inertia* [Ixx Iyy Izz Ixy Ixz Iyz] about the
+//                   center of mass, axes of the base frame at home, without the tip mass; center_of_mass* from the link's joint;
+//                   viscous_friction* (N s/m), coulomb_friction*. Link 0 is held: mass and friction are written as 0
 //     air_drag*     linear (N s/m^2), quadratic (N s^2/m^3): per meter of rope, one number for the whole rope
 //     tip_mass*, regularization* { coulomb_speed, drag_speed }, integrator* { name, substeps a 1/30 s }
 //     initial_state* time, theta, thetadot
@@ -31,22 +32,22 @@ struct Provenance {
   std::string version, capture, capture_hash, device, driver;
   std::map<std::string, std::string> options;
   std::uint64_t seed = 0;
-  std::map<std::string, double> seconds;                 // by stage
+  std::map<std::string, double> seconds;  // by stage
 };
 
 struct Twin {
   bool tabletop = false;
   chain::Chain chain;
   // Of the scene. With `parameters`, theirs count and are what is saved; load() sets both.
-  math::Vector3 gravity{0, 0, -9.81};                    // m/s^2, world
+  math::Vector3 gravity{0, 0, -9.81};                      // m/s^2, world
   std::optional<math::Vector3> table_point, table_normal;  // m and unit, world
-  std::optional<dynamics::Parameters> parameters;        // none before identification
+  std::optional<dynamics::Parameters> parameters;          // none before identification
   std::optional<dynamics::InitialState> initial;
   dynamics::Estimates estimates;
   Provenance provenance;
   bool known_mass = false;
-  splat::Gaussians gaussians;                            // count 0 before recognition
-  chain::States states;                                  // recognized, every frame
+  splat::Gaussians gaussians;  // count 0 before recognition
+  chain::States states;        // recognized, every frame
   chain::States rollout;
 };
 

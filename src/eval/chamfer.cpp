@@ -21,8 +21,8 @@ class Tree {
     build(0, static_cast<int>(points_.size()));
   }
 
-  // Squared distance from x to the nearest point. `near` is any point's index before, the nearest one's after: neighbors in
-  // an image have neighbors in the cloud, and a good first guess prunes most of the tree.
+  // Squared distance from x to the nearest point. `near` is any point's index before, the nearest one's after:
+  // neighbors in an image have neighbors in the cloud, and a good first guess prunes most of the tree.
   double nearest(const Vector3& x, int& near) const {
     double best = (points_[near] - x).squaredNorm();
     search(x, 0, static_cast<int>(points_.size()), best, near);

@@ -15,11 +15,11 @@ using math::Vector3;
 namespace {
 
 constexpr double kNone = std::numeric_limits<double>::quiet_NaN();
-constexpr int kWindow = 5;              // px around the content that SSIM's window reaches
-constexpr std::uint8_t kInMask = 128;   // mask values from here on are object
-constexpr float kSolid = 0.5f;          // 1 - T_end from here on is object
-constexpr int kCenterlinePoints = 97;   // SPEC 9
-constexpr double kSameTime = 1e-6;      // s
+constexpr int kWindow = 5;             // px around the content that SSIM's window reaches
+constexpr std::uint8_t kInMask = 128;  // mask values from here on are object
+constexpr float kSolid = 0.5f;         // 1 - T_end from here on is object
+constexpr int kCenterlinePoints = 97;  // SPEC 9
+constexpr double kSameTime = 1e-6;     // s
 
 struct Rectangle {
   int x0 = 0, y0 = 0, x1 = 0, y1 = 0;
@@ -148,7 +148,8 @@ FrameMetrics compare(const render::Frame& drawn, const capture::View& view, cons
       const bool in_picture = px >= 0 && py >= 0 && px < picture.width && py < picture.height;
       if (!in_view && !in_picture) continue;
       const std::size_t out = 3 * (static_cast<std::size_t>(width) * (y - area.y0) + x - area.x0);
-      const std::size_t v = static_cast<std::size_t>(view.width) * vy + vx, p = static_cast<std::size_t>(picture.width) * py + px;
+      const std::size_t v = static_cast<std::size_t>(view.width) * vy + vx,
+                        p = static_cast<std::size_t>(picture.width) * py + px;
       const bool in_mask = in_view && view.rgba[4 * v + 3] >= kInMask;
       const bool solid = in_picture && picture.rgba[4 * p + 3] >= kSolid;
       double difference = 0.0;
@@ -197,18 +198,19 @@ Metrics evaluate(splat::Engine& engine, const splat::Gaussians& gaussians, const
     }
     options.interval = render::median_interval(recorded.times[c]);
     const std::size_t before = metrics.frames.size();
-    render::for_batches(
-        engine, gaussians, chain, states, recorded.base, camera, c, times, options, [&](std::vector<render::Frame>& batch) {
-          const std::size_t first = metrics.frames.size();
-          metrics.frames.resize(first + batch.size());
-          core::parallel_for(static_cast<std::int64_t>(batch.size()), [&](std::int64_t k) {
-            FrameMetrics& frame = metrics.frames[first + k];
-            frame = compare(batch[k], *views[batch[k].frame], camera);
-            if (truth) compare_centerlines(frame, chain, states, recorded.base, *truth);
-          });
-          for (std::size_t k = 0; k < batch.size(); ++k)
-            metrics.empty_clouds += !views[batch[k].frame]->depth.empty() && std::isnan(metrics.frames[first + k].chamfer);
-        });
+    render::for_batches(engine, gaussians, chain, states, recorded.base, camera, c, times, options,
+                        [&](std::vector<render::Frame>& batch) {
+                          const std::size_t first = metrics.frames.size();
+                          metrics.frames.resize(first + batch.size());
+                          core::parallel_for(static_cast<std::int64_t>(batch.size()), [&](std::int64_t k) {
+                            FrameMetrics& frame = metrics.frames[first + k];
+                            frame = compare(batch[k], *views[batch[k].frame], camera);
+                            if (truth) compare_centerlines(frame, chain, states, recorded.base, *truth);
+                          });
+                          for (std::size_t k = 0; k < batch.size(); ++k)
+                            metrics.empty_clouds +=
+                                !views[batch[k].frame]->depth.empty() && std::isnan(metrics.frames[first + k].chamfer);
+                        });
     const std::size_t used = metrics.frames.size() - before;
     if (used < views.size())
       core::warn(camera.name + ": " + std::to_string(views.size() - used) + " of " + std::to_string(views.size()) +
@@ -219,7 +221,8 @@ Metrics evaluate(splat::Engine& engine, const splat::Gaussians& gaussians, const
   if (metrics.empty_clouds > 0)
     core::warn("chamfer leaves out " + std::to_string(metrics.empty_clouds) + " frames without rendered or true depth");
   metrics.mean = mean_of(metrics.frames, -1);
-  for (int c = 0; c < static_cast<int>(recorded.cameras.size()); ++c) metrics.cameras.push_back(mean_of(metrics.frames, c));
+  for (int c = 0; c < static_cast<int>(recorded.cameras.size()); ++c)
+    metrics.cameras.push_back(mean_of(metrics.frames, c));
   return metrics;
 }
 

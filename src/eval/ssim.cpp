@@ -8,10 +8,10 @@ namespace chainsplat::eval {
 
 namespace {
 
-constexpr int kReach = 5;                              // px, half of the window of 11
-constexpr double kSigma = 1.5;                         // px
+constexpr int kReach = 5;       // px, half of the window of 11
+constexpr double kSigma = 1.5;  // px
 constexpr double kC1 = 0.01 * 0.01, kC2 = 0.03 * 0.03;
-constexpr int kMoments = 5;                            // filtered: x, y, x^2, y^2, x y
+constexpr int kMoments = 5;  // filtered: x, y, x^2, y^2, x y
 
 std::array<double, 2 * kReach + 1> window() {
   std::array<double, 2 * kReach + 1> weights;
@@ -33,7 +33,8 @@ Span joined(const Span& a, const Span& b) {
 
 }  // namespace
 
-double ssim(const std::vector<float>& a_rgb, const std::vector<float>& b_rgb, int width, int height, double full_pixels) {
+double ssim(const std::vector<float>& a_rgb, const std::vector<float>& b_rgb, int width, int height,
+            double full_pixels) {
   const std::size_t pixels = static_cast<std::size_t>(width) * height;
   CHAINSPLAT_CHECK(a_rgb.size() == 3 * pixels && b_rgb.size() == 3 * pixels, std::to_string(a_rgb.size()));
   static const auto weights = window();
@@ -53,9 +54,10 @@ double ssim(const std::vector<float>& a_rgb, const std::vector<float>& b_rgb, in
     if (first < last) row_span[y] = {std::max(0, first - kReach), std::min(width, last + kReach)};
   }
   for (int y = 0; y < height; ++y)
-    for (int t = std::max(0, y - kReach); t < std::min(height, y + kReach + 1); ++t) span[y] = joined(span[y], row_span[t]);
+    for (int t = std::max(0, y - kReach); t < std::min(height, y + kReach + 1); ++t)
+      span[y] = joined(span[y], row_span[t]);
 
-  std::vector<double> filtered(kMoments * pixels, 0.0);        // along rows; 0 outside the spans in every channel
+  std::vector<double> filtered(kMoments * pixels, 0.0);  // along rows; 0 outside the spans in every channel
   std::vector<double> line(kMoments * (width + 2u * kReach)), sum(kMoments * static_cast<std::size_t>(width));
   const std::size_t padded = width + 2u * kReach;
   double deficit = 0.0;  // sum of 1 - S over pixels and channels
@@ -97,7 +99,8 @@ double ssim(const std::vector<float>& a_rgb, const std::vector<float>& b_rgb, in
       }
       for (int x = s.first; x < s.last; ++x) {
         const double mx = sum[x], my = sum[width + x];
-        const double xx = sum[2 * width + x] - mx * mx, yy = sum[3 * width + x] - my * my, xy = sum[4 * width + x] - mx * my;
+        const double xx = sum[2 * width + x] - mx * mx, yy = sum[3 * width + x] - my * my,
+                     xy = sum[4 * width + x] - mx * my;
         deficit += 1.0 - (2 * mx * my + kC1) * (2 * xy + kC2) / ((mx * mx + my * my + kC1) * (xx + yy + kC2));
       }
     }

@@ -91,7 +91,8 @@ tinygltf::Primitive primitive(Builder& builder, const splat::Gaussians& g, const
     for (int c = 0; c < 4; ++c) norm += static_cast<double>(g.rotation[4 * i + c]) * g.rotation[4 * i + c];
     norm = std::sqrt(norm);
     for (int c = 0; c < 3; ++c) position.push_back(static_cast<float>(g.mean[3 * i + c] - link_origin[c]));
-    for (const int c : {1, 2, 3, 0}) rotation.push_back(static_cast<float>(g.rotation[4 * i + c] / norm));  // wxyz to xyzw
+    for (const int c : {1, 2, 3, 0})
+      rotation.push_back(static_cast<float>(g.rotation[4 * i + c] / norm));  // wxyz to xyzw
     for (int c = 0; c < 3; ++c) scale.push_back(std::exp(g.log_scale[3 * i + c]));
     opacity.push_back(static_cast<float>(sigmoid(g.opacity_logit[i])));
     for (int l = 0; l < coefficients; ++l)
@@ -115,8 +116,10 @@ tinygltf::Primitive primitive(Builder& builder, const splat::Gaussians& g, const
       out.attributes[prefix + "SH_DEGREE_" + std::to_string(degree) + "_COEF_" + std::to_string(n)] =
           builder.vertices(sh[l], 3);
   tinygltf::Value::Object extension;
-  for (const auto& [key, value] : {std::pair{"kernel", "ellipse"}, {"colorSpace", "srgb_rec709_display"},
-                                   {"projection", "perspective"}, {"sortingMethod", "cameraDistance"}})
+  for (const auto& [key, value] : {std::pair{"kernel", "ellipse"},
+                                   {"colorSpace", "srgb_rec709_display"},
+                                   {"projection", "perspective"},
+                                   {"sortingMethod", "cameraDistance"}})
     extension[key] = tinygltf::Value(std::string(value));
   out.extensions[kExtension] = tinygltf::Value(extension);
   return out;

@@ -52,7 +52,8 @@ Bounds reach(const splat::Gaussians& g, const std::vector<math::Pose>& motions, 
       if (!(x.z() >= kNear)) continue;
       const Matrix3 axes = camera_from_home[j].rotation * half_axes;
       const double reach_in_sigma = std::sqrt(std::max(0.0, 2.0 * std::log(alpha / (kSlack * kLeastAlpha))));
-      const double slope[2] = {std::clamp(x.x() / x.z(), -limit_x, limit_x), std::clamp(x.y() / x.z(), -limit_y, limit_y)};
+      const double slope[2] = {std::clamp(x.x() / x.z(), -limit_x, limit_x),
+                               std::clamp(x.y() / x.z(), -limit_y, limit_y)};
       const double focal[2] = {camera.fx, camera.fy}, center[2] = {camera.cx, camera.cy};
       for (int c = 0; c < 2; ++c) {
         const double variance = (focal[c] / x.z() * (axes.row(c) - slope[c] * axes.row(2))).squaredNorm() + kLowPass;
@@ -65,7 +66,8 @@ Bounds reach(const splat::Gaussians& g, const std::vector<math::Pose>& motions, 
   if (!(low.x() <= high.x())) return {};
   const auto pixel = [](double value) { return static_cast<int>(std::clamp(value, -kFar, kFar)); };
   // a pixel is drawn where its center is inside
-  return {pixel(std::floor(low.x())), pixel(std::floor(low.y())), pixel(std::ceil(high.x())), pixel(std::ceil(high.y()))};
+  return {pixel(std::floor(low.x())), pixel(std::floor(low.y())), pixel(std::ceil(high.x())),
+          pixel(std::ceil(high.y()))};
 }
 
 }  // namespace chainsplat::render

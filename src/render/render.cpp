@@ -44,8 +44,8 @@ Bounds mapped(const Bounds& bounds, Map map) {
 // Where every recorded pixel's center lies in the undistorted image; made once a camera.
 struct Lens {
   bool active = false;
-  Bounds seen;                   // undistorted rectangle that holds the whole recorded image
-  std::vector<Vector2> straight; // width x height
+  Bounds seen;                    // undistorted rectangle that holds the whole recorded image
+  std::vector<Vector2> straight;  // width x height
 };
 
 Lens make_lens(const capture::Camera& camera, bool undistorted) {
@@ -63,9 +63,10 @@ Lens make_lens(const capture::Camera& camera, bool undistorted) {
   return lens;
 }
 
-// The drawn rectangle (undistorted, at `drawn`) as recorded pixels of `frame`'s crop. Colors bilinear, black outside; depth
-// of the nearest pixel, because a mean across an edge is nowhere.
-splat::Picture warp(const splat::Picture& from, const Bounds& drawn, const Bounds& crop, const Lens& lens, int image_width) {
+// The drawn rectangle (undistorted, at `drawn`) as recorded pixels of `frame`'s crop. Colors bilinear, black outside;
+// depth of the nearest pixel, because a mean across an edge is nowhere.
+splat::Picture warp(const splat::Picture& from, const Bounds& drawn, const Bounds& crop, const Lens& lens,
+                    int image_width) {
   splat::Picture to;
   to.width = crop.x1 - crop.x0;
   to.height = crop.y1 - crop.y0;
@@ -184,8 +185,9 @@ void for_batches(splat::Engine& engine, const splat::Gaussians& gaussians, const
 }
 
 std::vector<Frame> frames(splat::Engine& engine, const splat::Gaussians& gaussians, const chain::Chain& chain,
-                          const chain::States& states, const trajectory::Trajectory& base, const capture::Camera& camera,
-                          int camera_index, const std::vector<double>& times, const Options& options) {
+                          const chain::States& states, const trajectory::Trajectory& base,
+                          const capture::Camera& camera, int camera_index, const std::vector<double>& times,
+                          const Options& options) {
   std::vector<Frame> out;
   for_batches(engine, gaussians, chain, states, base, camera, camera_index, times, options,
               [&](std::vector<Frame>& batch) { std::move(batch.begin(), batch.end(), std::back_inserter(out)); });

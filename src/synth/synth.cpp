@@ -12,10 +12,10 @@ using Json = nlohmann::ordered_json;
 
 namespace {
 
-constexpr double kDepthScale = 1e-4;   // m a unit: 16 bits reach 6.5 m
-constexpr int kTruePoints = 49;        // of a centerline
-constexpr double kEvenTimes = 1e-9;    // s, around start + k / rate
-constexpr double kUsualRate = 30.0;    // frames a second, where a single frame has none
+constexpr double kDepthScale = 1e-4;  // m a unit: 16 bits reach 6.5 m
+constexpr int kTruePoints = 49;       // of a centerline
+constexpr double kEvenTimes = 1e-9;   // s, around start + k / rate
+constexpr double kUsualRate = 30.0;   // frames a second, where a single frame has none
 
 Json list(const math::Vector3& v) { return {v.x(), v.y(), v.z()}; }
 
@@ -35,8 +35,8 @@ void make_folder(const Path& folder) {
 Json camera_json(const capture::Camera& camera, const std::vector<double>& times, const Options& options,
                  const Path& folder) {
   const std::string& name = camera.name;
-  Json out{{"name", name}, {"width", camera.width}, {"height", camera.height}, {"fx", camera.fx},
-           {"fy", camera.fy},     {"cx", camera.cx},       {"cy", camera.cy},         {"distortion", camera.distortion}};
+  Json out{{"name", name},    {"width", camera.width}, {"height", camera.height}, {"fx", camera.fx},
+           {"fy", camera.fy}, {"cx", camera.cx},       {"cy", camera.cy},         {"distortion", camera.distortion}};
   const math::Pose& pose = camera.world_from_camera;
   Json matrix = Json::array();
   for (int row = 0; row < 3; ++row) {
@@ -141,25 +141,25 @@ void write(splat::Engine& engine, const twin::Twin& twin, const chain::States& s
     drawing.depth = options.depth;
     drawing.interval = render::median_interval(scene.times[c]);
     std::vector<capture::Image8> movie;
-    render::for_batches(
-        engine, twin.gaussians, twin.chain, states, scene.base, camera, static_cast<int>(c), times[c], drawing,
-        [&](std::vector<render::Frame>& batch) {
-          std::vector<capture::Image8> images(batch.size());
-          core::parallel_for(static_cast<std::int64_t>(batch.size()), [&](std::int64_t k) {
-            const render::Frame& frame = batch[k];
-            const std::string file = number(frame.frame) + ".png";
-            images[k] = render::color_image(frame, camera);
-            if (!options.video) capture::write_png(folder / name / file, images[k]);
-            capture::write_png(folder / "masks" / name / file, render::mask_image(frame, camera));
-            if (options.depth)
-              capture::write_depth_png(folder / "depth" / name / file, camera.width, camera.height,
-                                       render::depth_image(frame, camera), kDepthScale);
-          });
-          if (options.video) std::move(images.begin(), images.end(), std::back_inserter(movie));
-          done += batch.size();
-          constexpr double kNone = std::numeric_limits<double>::quiet_NaN();
-          core::report({"synth", static_cast<std::int64_t>(done), static_cast<std::int64_t>(total), kNone, kNone, camera.name});
-        });
+    render::for_batches(engine, twin.gaussians, twin.chain, states, scene.base, camera, static_cast<int>(c), times[c],
+                        drawing, [&](std::vector<render::Frame>& batch) {
+                          std::vector<capture::Image8> images(batch.size());
+                          core::parallel_for(static_cast<std::int64_t>(batch.size()), [&](std::int64_t k) {
+                            const render::Frame& frame = batch[k];
+                            const std::string file = number(frame.frame) + ".png";
+                            images[k] = render::color_image(frame, camera);
+                            if (!options.video) capture::write_png(folder / name / file, images[k]);
+                            capture::write_png(folder / "masks" / name / file, render::mask_image(frame, camera));
+                            if (options.depth)
+                              capture::write_depth_png(folder / "depth" / name / file, camera.width, camera.height,
+                                                       render::depth_image(frame, camera), kDepthScale);
+                          });
+                          if (options.video) std::move(images.begin(), images.end(), std::back_inserter(movie));
+                          done += batch.size();
+                          constexpr double kNone = std::numeric_limits<double>::quiet_NaN();
+                          core::report({"synth", static_cast<std::int64_t>(done), static_cast<std::int64_t>(total),
+                                        kNone, kNone, camera.name});
+                        });
     if (options.video) {
       const double interval = render::median_interval(times[c]);
       capture::write_video(folder / (name + ".mp4"), interval > 0.0 ? 1.0 / interval : kUsualRate, movie);

@@ -32,10 +32,10 @@ std::vector<std::string> property_names(int coefficients, int links) {
 }
 
 int scalar_bytes(const std::string& type) {
-  static const std::map<std::string, int> sizes{{"char", 1},    {"uchar", 1},   {"int8", 1},    {"uint8", 1}, {"short", 2},
-                                                {"ushort", 2},  {"int16", 2},   {"uint16", 2},  {"int", 4},   {"uint", 4},
-                                                {"int32", 4},   {"uint32", 4},  {"float", 4},   {"float32", 4},
-                                                {"double", 8},  {"float64", 8}};
+  static const std::map<std::string, int> sizes{{"char", 1},  {"uchar", 1},   {"int8", 1},   {"uint8", 1},
+                                                {"short", 2}, {"ushort", 2},  {"int16", 2},  {"uint16", 2},
+                                                {"int", 4},   {"uint", 4},    {"int32", 4},  {"uint32", 4},
+                                                {"float", 4}, {"float32", 4}, {"double", 8}, {"float64", 8}};
   const auto found = sizes.find(type);
   return found == sizes.end() ? 0 : found->second;
 }
@@ -86,7 +86,8 @@ Header read_header(const std::string& bytes, const std::string& file) {
       std::string type, name;
       words >> type >> name;
       const int size = scalar_bytes(type);
-      if (size == 0 || name.empty() || ++properties > kMostProperties) fail("its property line '" + line.substr(0, 60) + "' is not understood");
+      if (size == 0 || name.empty() || ++properties > kMostProperties)
+        fail("its property line '" + line.substr(0, 60) + "' is not understood");
       if (type == "float" || type == "float32") header.floats[name] = header.stride;
       header.stride += static_cast<std::size_t>(size);
     }
@@ -162,7 +163,8 @@ splat::Gaussians read_ply(const Path& path) {
       float value = 0.0f;
       std::memcpy(&value, vertex + offsets[next], sizeof value);
       if (!std::isfinite(value))
-        throw InputError(file, names[next] + " of Gaussian " + std::to_string(i) + " is not finite", "remove the Gaussian");
+        throw InputError(file, names[next] + " of Gaussian " + std::to_string(i) + " is not finite",
+                         "remove the Gaussian");
       ++next;
       return value;
     };
@@ -176,7 +178,8 @@ splat::Gaussians read_ply(const Path& path) {
     float square = 0.0f;
     for (int c = 0; c < 4; ++c) square += std::pow(g.rotation[4 * i + c] = take(), 2.0f);
     if (!(square > 0.0f))
-      throw InputError(file, "rot_* of Gaussian " + std::to_string(i) + " has no length", "write a quaternion w, x, y, z");
+      throw InputError(file, "rot_* of Gaussian " + std::to_string(i) + " has no length",
+                       "write a quaternion w, x, y, z");
     for (int j = 0; j < links; ++j) g.link_logits[static_cast<std::size_t>(links) * i + j] = take();
   }
   return g;

@@ -57,7 +57,8 @@ chain::States read_states(const Path& file, int angles) {
         const bool other = line == header(static_cast<int>(columns) - 1, false) ||
                            (columns % 2 == 1 && line == header(static_cast<int>(columns) / 2, true));
         if (other)
-          fail("is not of this chain, which has " + std::to_string(angles) + " angles", "take the states of the same twin");
+          fail("is not of this chain, which has " + std::to_string(angles) + " angles",
+               "take the states of the same twin");
         fail("is not the header of states", form);
       }
       continue;
@@ -73,7 +74,8 @@ chain::States read_states(const Path& file, int angles) {
       c = after;
     }
     if (numbers.size() != columns)
-      fail(std::to_string(numbers.size()) + " columns instead of " + std::to_string(columns), "mend the line or remove it");
+      fail(std::to_string(numbers.size()) + " columns instead of " + std::to_string(columns),
+           "mend the line or remove it");
     if (!states.time.empty() && !(numbers[0] > states.time.back()))
       fail("its time does not come after the one before it", "sort the rows by time");
     states.time.push_back(numbers[0]);

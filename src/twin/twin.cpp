@@ -24,8 +24,8 @@ const std::pair<dynamics::Integrator, const char*> kIntegrators[] = {
     {dynamics::Integrator::implicit_velocity_euler, "implicit_velocity_euler"},
 };
 
-// The double at or next to `guess` for which `holds` is true, else `guess`: undoes the rounding of a number that was stored
-// as a difference or a quotient.
+// The double at or next to `guess` for which `holds` is true, else `guess`: undoes the rounding of a number that was
+// stored as a difference or a quotient.
 template <class Predicate>
 double exact_near(double guess, Predicate holds) {
   constexpr int kReach = 4;  // units in the last place
@@ -47,7 +47,8 @@ std::array<double, 6> cylinder_inertia(double mass, double length, double radius
   return {i(0, 0), i(1, 1), i(2, 2), i(0, 1), i(0, 2), i(1, 2)};
 }
 
-// --- writing -------------------------------------------------------------------------------------------------------------
+// --- writing
+// -------------------------------------------------------------------------------------------------------------
 
 template <class Vector>
 Json list(const Vector& values) {
@@ -107,7 +108,8 @@ Json chain_json(const Twin& twin) {
                     {"normal", list(normal.value_or(Vector3::UnitZ()))}};
   out["joints"] = Json::array();
   for (int k = 0; k < chain.angles(); ++k) {
-    Json joint{{"axis", list(chain.axes[k])}, {"parent_link", chain.child_link[k] - 1}, {"child_link", chain.child_link[k]}};
+    Json joint{
+        {"axis", list(chain.axes[k])}, {"parent_link", chain.child_link[k] - 1}, {"child_link", chain.child_link[k]}};
     if (p) {
       joint["stiffness"] = p->stiffness[k];
       joint["rest_angle"] = p->rest_angle[k];
@@ -139,9 +141,8 @@ Json chain_json(const Twin& twin) {
       if (integrator == p->integrator) out["integrator"] = {{"name", name}, {"substeps", p->substeps}};
   }
   if (twin.initial)
-    out["initial_state"] = {{"time", twin.initial->time},
-                            {"theta", list(twin.initial->theta)},
-                            {"thetadot", list(twin.initial->thetadot)}};
+    out["initial_state"] = {
+        {"time", twin.initial->time}, {"theta", list(twin.initial->theta)}, {"thetadot", list(twin.initial->thetadot)}};
   return out;
 }
 
@@ -160,7 +161,8 @@ Json identification_json(const Twin& twin) {
   return out;
 }
 
-// --- reading -------------------------------------------------------------------------------------------------------------
+// --- reading
+// -------------------------------------------------------------------------------------------------------------
 
 // A value of the file and where it is; every access checks and throws InputError.
 class Node {
@@ -292,7 +294,8 @@ chain::Chain read_chain(const Node& node, const Node& grasp) {
       if (std::abs(chain.axes[a].head<3>().norm() - 1.0) > kLengthTolerance)
         axis.fail("its first three numbers are no unit vector", "divide them by their length");
       if ((space_axis(chain.axes[a].head<3>(), end * chain.direction) - chain.axes[a]).norm() > kLengthTolerance)
-        axis.fail("does not pass through its joint, " + core::exact(end) + " m along the rope", "write v = -w x (s direction)");
+        axis.fail("does not pass through its joint, " + core::exact(end) + " m along the rope",
+                  "write v = -w x (s direction)");
     }
     chain.joint_arclength.push_back(end);
   }
@@ -306,7 +309,8 @@ double cylinder_radius(const chain::Chain& chain, const std::vector<double>& mas
   const auto fits = [&](double radius, double tolerance) {
     for (int j = 1; j < chain.links(); ++j) {
       const std::vector<double> given = links[j]["inertia"].numbers(6);
-      const std::array<double, 6> ours = cylinder_inertia(masses[j - 1], chain.link_end(j) - chain.link_start(j), radius, chain.direction);
+      const std::array<double, 6> ours =
+          cylinder_inertia(masses[j - 1], chain.link_end(j) - chain.link_start(j), radius, chain.direction);
       const double size = std::max({ours[0], ours[1], ours[2]});
       for (int i = 0; i < 6; ++i)
         if (!(std::abs(given[i] - ours[i]) <= tolerance * size)) return false;
@@ -338,7 +342,8 @@ dynamics::Parameters read_parameters(const Node& node, const Twin& twin) {
     p.rest_angle.push_back(joint["rest_angle"].number());
     p.damping.push_back(joint["damping"].not_negative());
   }
-  const double linear = node["air_drag"]["linear"].not_negative(), quadratic = node["air_drag"]["quadratic"].not_negative();
+  const double linear = node["air_drag"]["linear"].not_negative(),
+               quadratic = node["air_drag"]["quadratic"].not_negative();
   for (int j = 1; j < twin.chain.links(); ++j) {
     const double length = twin.chain.link_end(j) - twin.chain.link_start(j);
     p.link_mass.push_back(links[j]["mass"].not_negative());
@@ -348,7 +353,8 @@ dynamics::Parameters read_parameters(const Node& node, const Twin& twin) {
     p.air_quadratic.push_back(quadratic * length);
     const Vector3 center = links[j]["center_of_mass"].vector(3);
     if ((center - 0.5 * length * twin.chain.direction).norm() > kLengthTolerance)
-      links[j]["center_of_mass"].fail("is not the middle of the link", "only uniform links are known; use tip_mass for the rest");
+      links[j]["center_of_mass"].fail("is not the middle of the link",
+                                      "only uniform links are known; use tip_mass for the rest");
   }
   p.radius = cylinder_radius(twin.chain, p.link_mass, links);
   p.tip_mass = node["tip_mass"].not_negative();
@@ -375,11 +381,13 @@ dynamics::Estimates read_estimates(const Node& node) {
   e.standard_errors = node["standard_errors"].numbers(count, true);
   const std::vector<Node> rows = node["covariance"].entries();
   if (!rows.empty() && static_cast<int>(rows.size()) != count)
-    node["covariance"].fail("has " + std::to_string(rows.size()) + " rows for " + std::to_string(count) + " names", "correct it");
+    node["covariance"].fail("has " + std::to_string(rows.size()) + " rows for " + std::to_string(count) + " names",
+                            "correct it");
   e.covariance.resize(static_cast<Eigen::Index>(rows.size()), static_cast<Eigen::Index>(rows.size()));
   for (std::size_t row = 0; row < rows.size(); ++row) {
     const std::vector<double> values = rows[row].numbers(count, true);
-    for (int column = 0; column < count; ++column) e.covariance(static_cast<Eigen::Index>(row), column) = values[column];
+    for (int column = 0; column < count; ++column)
+      e.covariance(static_cast<Eigen::Index>(row), column) = values[column];
   }
   for (const Node& held : node["held"].entries()) e.held.emplace_back(held["name"].text(), held["reason"].text());
   return e;
@@ -412,7 +420,8 @@ Path named_file(const Node& top, const char* key, const Path& run) {
 void save(const Twin& twin, const Path& run) {
   std::error_code error;
   std::filesystem::create_directories(run, error);
-  if (error) throw WorkError(run.string(), "cannot be made (" + error.message() + ")", "choose a folder that can be written");
+  if (error)
+    throw WorkError(run.string(), "cannot be made (" + error.message() + ")", "choose a folder that can be written");
   Json out{{"format", kFormat},
            {"grasp", {{"direction", list(twin.chain.direction)}, {"bending_axis", list(twin.chain.bending_axis)}}},
            {"chain", chain_json(twin)},
@@ -426,10 +435,14 @@ void save(const Twin& twin, const Path& run) {
   part(!twin.states.time.empty(), "states", kStates, [&] { return states_csv(twin.states); });
   part(!twin.rollout.time.empty(), "rollout", kRollout, [&] { return states_csv(twin.rollout); });
   const Provenance& p = twin.provenance;
-  out["provenance"] = {{"version", p.version}, {"capture", p.capture},
-                       {"capture_hash", p.capture_hash}, {"options", Json(p.options)},
-                       {"seed", p.seed},       {"device", p.device},
-                       {"driver", p.driver},   {"durations", Json(p.seconds)}};
+  out["provenance"] = {{"version", p.version},
+                       {"capture", p.capture},
+                       {"capture_hash", p.capture_hash},
+                       {"options", Json(p.options)},
+                       {"seed", p.seed},
+                       {"device", p.device},
+                       {"driver", p.driver},
+                       {"durations", Json(p.seconds)}};
   std::string text;
   print(out, "", text);
   core::write_file(run / "twin.json", text + "\n");
@@ -444,7 +457,8 @@ Twin load(const Path& run) {
   const Json document = Json::parse(core::read_file(path), nullptr, false);
   if (document.is_discarded()) throw InputError(file, "is not JSON or is cut off", "restore it or train again");
   const Node top(document, file, "");
-  if (top["format"].text() != kFormat) top["format"].fail("is not '" + std::string(kFormat) + "'", "use the program that wrote it");
+  if (top["format"].text() != kFormat)
+    top["format"].fail("is not '" + std::string(kFormat) + "'", "use the program that wrote it");
 
   Twin twin;
   const Node node = top["chain"];
@@ -466,18 +480,21 @@ Twin load(const Path& run) {
   const int angles = twin.chain.angles();
   if (node.has("initial_state")) {
     const Node initial = node["initial_state"];
-    twin.initial = dynamics::InitialState{initial["time"].number(), initial["theta"].vector(angles), initial["thetadot"].vector(angles)};
+    twin.initial = dynamics::InitialState{initial["time"].number(), initial["theta"].vector(angles),
+                                          initial["thetadot"].vector(angles)};
   }
   twin.provenance = read_provenance(top["provenance"]);
   if (const Path ply = named_file(top, "gaussians", run); !ply.empty()) {
     twin.gaussians = read_ply(ply);
     if (twin.gaussians.links != twin.chain.links())
-      throw InputError(ply.string(), "has " + std::to_string(twin.gaussians.links) + " properties link_*, the chain has " +
-                                         std::to_string(twin.chain.links()) + " links",
+      throw InputError(ply.string(),
+                       "has " + std::to_string(twin.gaussians.links) + " properties link_*, the chain has " +
+                           std::to_string(twin.chain.links()) + " links",
                        "take the file of the same run");
   }
   if (const Path states = named_file(top, "states", run); !states.empty()) twin.states = read_states(states, angles);
-  if (const Path rollout = named_file(top, "rollout", run); !rollout.empty()) twin.rollout = read_states(rollout, angles);
+  if (const Path rollout = named_file(top, "rollout", run); !rollout.empty())
+    twin.rollout = read_states(rollout, angles);
   return twin;
 }
 

@@ -1,5 +1,5 @@
-// Judges .glb files with Khronos' validator. Fails on every error but one kind: the validator refuses attribute names with
-// a colon, which KHR_gaussian_splatting prescribes. Prints one line a file and the messages that count.
+// Judges .glb files with Khronos' validator. Fails on every error but one kind: the validator refuses attribute names
+// with a colon, which KHR_gaussian_splatting prescribes. Prints one line a file and the messages that count.
 import { createRequire } from 'node:module';
 import { readFileSync } from 'node:fs';
 
@@ -17,7 +17,8 @@ for (const file of files) {
   const info = report.info;
   console.log(`${file}: ${counted.length} problems, ${messages.filter(allowed).length} colon names; ` +
               `${info.drawCallCount} meshes, ${info.totalVertexCount} points, ${info.animationCount} animations`);
-  for (const m of counted) console.log(`  ${m.severity === 0 ? 'error' : 'warning'} ${m.code} ${m.pointer ?? ''}: ${m.message}`);
+  for (const m of counted)
+    console.log(`  ${m.severity === 0 ? 'error' : 'warning'} ${m.code} ${m.pointer ?? ''}: ${m.message}`);
   failed ||= counted.some((m) => m.severity === 0) || !(info.totalVertexCount > 0) || !(info.animationCount > 0);
 }
 process.exit(failed || files.length === 0 ? 1 : 0);
