@@ -33,6 +33,9 @@ constexpr double kGradientTolerance = 1e-3;
 // Of the largest entry of one Gaussian's row, so that a wrong weak Gaussian does not hide behind a strong one; with a floor
 // of kRowFloor of the kind's largest entry, below which cancellation leaves no digits.
 constexpr double kRowTolerance = 1e-2, kRowFloor = 1e-4;
+// Gradients of at most this size come from alphas that vanish beside 1 in float (the sign of alpha - mask is then lost);
+// losses are of order 1, lengths of order 0.1 m.
+constexpr double kNothing = 1e-8;
 // Sums of some thousand floats.
 constexpr double kLossTolerance = 1e-5;
 
@@ -197,8 +200,8 @@ void check_kind(const std::string& name, const Got& got, const std::vector<doubl
     worst_row = std::max(worst_row, row_error - kRowTolerance * row_largest);
   }
   INFO(name, ": error ", worst, " of ", largest);
-  CHECK(worst <= tolerance * largest);
-  CHECK(worst_row <= kRowFloor * largest);
+  CHECK(worst <= tolerance * largest + kNothing);
+  CHECK(worst_row <= kRowFloor * largest + kNothing);
 }
 
 void check_gradients(const splat::Gradients& got, const reference::Evaluation& wanted,
@@ -509,7 +512,7 @@ TEST_CASE("odd Gaussians: behind, at the border, beyond the clamp, tiny, huge, s
 }
 
 TEST_CASE("lists longer than any fast path: 700, 1500 and 5000 entries in one tile") {
-  for (const int count : {5000}) {
+  for (const int count : {700, 1500, 5000}) {
     CAPTURE(count);
     core::Random random(count);
     Scene scene;
@@ -528,9 +531,7 @@ TEST_CASE("lists longer than any fast path: 700, 1500 and 5000 entries in one ti
       g.mean[3 * i + 1] = static_cast<float>(0.04 * z * random.normal());
       g.mean[3 * i + 2] = static_cast<float>(z);
       for (int k = 0; k < 3; ++k) g.log_scale[3 * i + k] = static_cast<float>(std::log(0.15 * z) + 0.1 * random.normal());
-      // thin enough that the last one still shows: 1/255 is 0.0039
-      const double opacity = random.uniform(0.0045, 0.0045 + 8.0 / count);
-      g.opacity_logit[i] = static_cast<float>(std::log(opacity / (1.0 - opacity)));
+      g.opacity_logit[i] = static_cast<float>(std::log(random.uniform(1.0, 3.0) / count));  // the last one still shows
     }
     for (float& c : g.sh) c = static_cast<float>(random.normal());
     const auto plain = reference::parameters(g);
@@ -538,14 +539,14 @@ TEST_CASE("lists longer than any fast path: 700, 1500 and 5000 entries in one ti
     splat::Gradients gradients;
     std::vector<splat::Picture> pictures;
     engine(false).loss(g, scene.views, scene.target_pointers(), kAllTerms, 0.0, &gradients, &pictures);
-    if (std::getenv("DBG")) { int n=0; for (int i=0;i<count;++i) if (!(std::abs(gradients.gaussians.opacity_logit[i])<1) || i<40) {if(n++<40) printf("%d slot %d op %g mean %g sh %g w %g\n",i,slot[i],gradients.gaussians.opacity_logit[i],gradients.gaussians.mean[3*i],gradients.gaussians.sh[3*i], wanted.gradient.opacity_logit[i]);} printf("bad %d\n",n);}
     // thousands of roundings of the transmittance and of the sums, in place of dozens
     constexpr double kLongImage = 5e-5;
     check_picture(pictures[0], wanted.pictures[0], kLongImage);
     check_gradients(gradients, wanted);
-    // with the rules nearly every pixel is in doubt somewhere, by 1/255 of a thin rest
+    // with the rules, each just above 1/255 (0.0039): nearly every pixel is in doubt somewhere, by 1/255 of a thin rest
+    for (float& logit : g.opacity_logit) logit = static_cast<float>(std::log(random.uniform(0.0045, 0.012)));
     constexpr double kLongWithRules = 1e-3;
-    check_picture(engine().draw(g, scene.views)[0], reference::draw(plain, scene.views[0]), kLongWithRules);
+    check_picture(engine().draw(g, scene.views)[0], reference::draw(reference::parameters(g), scene.views[0]), kLongWithRules);
   }
   check_silent();
 }
