@@ -11,7 +11,10 @@ layout(std430, binding = 1) readonly buffer TileBlock { uint tile_block[]; };
 layout(std430, binding = 2) readonly buffer TileCount { uint tile_count[]; };
 layout(std430, binding = 3) coherent buffer Entries { uvec4 entries[]; };
 layout(std430, binding = 4) writeonly buffer Sorted { uvec2 sorted[]; };  // splat, instance
-layout(std430, binding = 5) readonly buffer Counters { uint counters[]; };
+layout(std430, binding = 5) buffer Counters { uint counters[]; };
+
+// lavapipe ends all loops of an invocation after 65535 iterations in sum: fewer, longer ones
+const uint kUnrolled = 8u;
 
 shared uvec2 key[kRankLimit];
 
@@ -21,6 +24,10 @@ void main() {
   uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x, lanes = gl_WorkGroupSize.x;
   uint start = tile_prefix[tile] + tile_block[tile / kScanBlock];
   uint n = counters[kCounterOverflow] != 0u ? 0u : tile_count[tile];
+  if (n > kLongestList) {
+    if (lane == 0u) counters[kCounterTooLong] = 1u;
+    n = 0u;
+  }
   if (n <= kRankLimit) {
     for (uint k = lane; k < n; k += lanes) key[k] = entries[start + k].xy;
     barrier();
@@ -36,13 +43,16 @@ void main() {
     while (width < 2u * n) {
       for (uint stride = width; stride > 1u; stride /= 2u) {
         bool mirror = stride == width;
-        for (uint k = lane; k < n; k += lanes) {
-          uint partner = mirror ? k ^ (width - 1u) : k ^ (stride / 2u);
-          if (partner > k && partner < n) {
-            uvec4 a = entries[start + k], b = entries[start + partner];
-            if (before(b.xy, a.xy)) {
-              entries[start + k] = b;
-              entries[start + partner] = a;
+        for (uint first = lane; first < n; first += kUnrolled * lanes) {
+          for (uint m = 0u; m < kUnrolled; ++m) {
+            uint k = first + m * lanes;
+            uint partner = mirror ? k ^ (width - 1u) : k ^ (stride / 2u);
+            if (partner > k && partner < n) {
+              uvec4 a = entries[start + k], b = entries[start + partner];
+              if (before(b.xy, a.xy)) {
+                entries[start + k] = b;
+                entries[start + partner] = a;
+              }
             }
           }
         }

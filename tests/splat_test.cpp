@@ -458,9 +458,9 @@ TEST_CASE("odd Gaussians: behind, at the border, beyond the clamp, tiny, huge, s
       {"a hundredth of a millimeter", 0.03, 0.02, 0.5, 1e-5, 3.0},
       {"larger than the image", 0.0, 0.0, 0.6, 0.5, -1.0},
       {"a needle", -0.05, 0.03, 0.5, 1e-5, 2.0},
-      {"saturated", -0.06, -0.03, 0.4, 0.02, 8.0},
-      {"saturated, before it", -0.05, -0.035, 0.35, 0.015, 8.0},
-      {"saturated, behind both", -0.055, -0.03, 0.45, 0.02, 8.0},
+      {"saturated", -0.06, -0.03, 0.4, 0.05, 8.0},
+      {"saturated, before it", -0.05, -0.035, 0.35, 0.04, 8.0},
+      {"saturated, behind both", -0.055, -0.03, 0.45, 0.06, 8.0},
       {"hardly visible", 0.05, -0.05, 0.5, 0.02, -4.6},
       {"invisible", 0.05, -0.05, 0.4, 0.02, -8.0},
   };
@@ -478,7 +478,7 @@ TEST_CASE("odd Gaussians: behind, at the border, beyond the clamp, tiny, huge, s
     const double size = i % 3 == 0 ? 1e-2 : i % 3 == 1 ? 1.0 : 30.0;  // normalized before use
     for (int k = 0; k < 4; ++k) g.rotation[4 * i + k] = static_cast<float>(size * random.normal());
     g.opacity_logit[i] = static_cast<float>(o.opacity);
-    g.link_logits[2 * i] = static_cast<float>(i % 2 == 0 ? 6.0 : 0.5);
+    g.link_logits[2 * i] = static_cast<float>(o.opacity == 8.0 ? 12.0 : i % 2 == 0 ? 6.0 : 0.5);
   }
   const auto plain = reference::parameters(g);
   for (const bool cutoffs : {true, false}) {
@@ -501,10 +501,44 @@ TEST_CASE("odd Gaussians: behind, at the border, beyond the clamp, tiny, huge, s
       std::copy_n(g.link_logits.begin() + 2 * i, 2, one.link_logits.begin());
       const auto wanted = reference::evaluate(reference::parameters(one), scene.views, scene.reference_targets(), kAllTerms,
                                               0.0, rules);
+      CHECK(doubtful(wanted) == 0);
       splat::Gradients gradients;
       std::vector<splat::Picture> alone;
       engine(cutoffs).loss(one, scene.views, scene.target_pointers(), kAllTerms, 0.0, &gradients, &alone);
       for (std::size_t v = 0; v < alone.size(); ++v) check_picture(alone[v], wanted.pictures[v]);
+      check_gradients(gradients, wanted);
+    }
+  }
+  check_silent();
+}
+
+TEST_CASE("spherical harmonics turn with the link and reach the position: Gaussians so large that only color varies") {
+  for (const int degree : {1, 2, 3}) {
+    CAPTURE(degree);
+    for (std::uint64_t seed = 1; seed <= 4; ++seed) {
+      core::Random random(seed);
+      Scene scene;
+      scene.cameras = {make_camera(24, 18, 30.0, pose(0.0, 0.0, 0.4, 0.02, 0.01, 0.0)), make_camera(18, 22, 30.0, {})};
+      const auto turned = [&] {
+        return math::Pose{math::exp_so3({2.0 * random.normal(), 2.0 * random.normal(), 2.0 * random.normal()}),
+                          {0.05 * random.normal(), 0.05 * random.normal(), 0.4}};
+      };
+      scene.views = {{&scene.cameras[0], 0, 0, 24, 18, {turned(), turned()}}, {&scene.cameras[1], 2, 1, 13, 20, {turned(), turned()}}};
+      for (const ViewSpec& view : scene.views) scene.targets.push_back(random_target(random, view.width, view.height));
+      Gaussians& g = scene.gaussians;
+      g.resize(1, 2, degree);
+      for (float& x : g.mean) x = static_cast<float>(0.05 * random.normal());
+      for (float& s : g.log_scale) s = std::log(2.0f);
+      for (float& c : g.sh) c = static_cast<float>(random.normal());
+      for (int c = 0; c < 3; ++c) g.sh[c] = 9.0f;  // away from the max(0, .)
+      g.opacity_logit[0] = 0.3f;
+      g.link_logits[0] = 0.4f;
+      // the pull of the color on the picture, without L1's signs
+      const LossWeights weights{0.0f, 1.0f, 0.0f};
+      const auto wanted = reference::evaluate(reference::parameters(g), scene.views, scene.reference_targets(), weights, 0.0);
+      CHECK(doubtful(wanted) == 0);
+      splat::Gradients gradients;
+      engine().loss(g, scene.views, scene.target_pointers(), weights, 0.0, &gradients);
       check_gradients(gradients, wanted);
     }
   }

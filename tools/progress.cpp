@@ -20,7 +20,7 @@ namespace {
 constexpr double kRedrawSeconds = 0.1;  // a faster line flickers
 constexpr double kPlainSeconds = 5.0;   // between lines where standard error is no terminal
 constexpr double kLogSeconds = 1.0;     // between records of one stage
-constexpr int kBarCells = 24;
+constexpr int kBarCells = 12;
 constexpr int kDefaultColumns = 80;
 
 // All of the program's one terminal. core calls the listener under a lock; messages come from the main thread.

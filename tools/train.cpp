@@ -252,7 +252,6 @@ void train(const Globals& globals, const Request& request) {
   capture::LoadOptions load_options;
   load_options.first = first;
   load_options.last = last;
-  load_options.images = stages.recognize;
   const capture::Capture capture = capture::load(request.capture, load_options);
   if (stages.recognize) check_views(capture, request);
   const bool continued = request.resume && fs::exists(out / "twin.json");
@@ -304,7 +303,7 @@ void train(const Globals& globals, const Request& request) {
     const bool has_rollout = !twin.rollout.time.empty();
     if (stages.evaluate) {
       const Stopwatch watch(twin, "evaluate");
-      load_options.images = load_options.depth = true;
+      load_options.depth = true;
       load_options.undistort = false;
       const capture::Capture recorded = capture::load(request.capture, load_options);
       splat::Engine engine(*device);

@@ -7,8 +7,8 @@
 //     joints        one an angle, base to tip: axis [w, v] (base frame, home, space form), parent_link, child_link,
 //                   stiffness*, rest_angle*, damping*
 //     links         n_l + 1, number 0 is the base link: length; mass*, inertia* [Ixx Iyy Izz Ixy Ixz Iyz] about the
-//                   center of mass, axes of the base frame at home, without the tip mass; center_of_mass* from the link's joint;
-//                   viscous_friction* (N s/m), coulomb_friction*. Link 0 is held: mass and friction are written as 0
+//                   center of mass, axes of the base frame at home, without the tip mass; center_of_mass* from the
+//                   link's joint; viscous_friction* (N s/m), coulomb_friction*. Link 0 is held: its are written as 0
 //     air_drag*     linear (N s/m^2), quadratic (N s^2/m^3): per meter of rope, one number for the whole rope
 //     tip_mass*, regularization* { coulomb_speed, drag_speed }, integrator* { name, substeps a 1/30 s }
 //     initial_state* time, theta, thetadot

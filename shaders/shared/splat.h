@@ -44,7 +44,9 @@ const uint kCounterOverflow = 3u;   // not 0: a capacity was exceeded; nothing o
 const uint kCounterDispatch = 4u;   // 3 uints: groups of the passes over (replica, view)
 const uint kCounterWantLive = 7u;   // what the capacities would have to be
 const uint kCounterWantInstances = 8u;
+const uint kCounterTooLong = 9u;    // not 0: a tile's list is longer than kLongestList
 const uint kCounters = 16u;
+const uint kLongestList = 32768u;   // entries of a tile that sorting and blending get through on every device
 
 const uint kFlagAccumulate = 1u;    // gradients of this chunk of views are added to those before
 

@@ -186,7 +186,8 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   blend = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 0});
   blend_depth = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 1});
   blend_backward =
-      gpu::Pipeline(d, "splat_blend_backward", 12, push, {lanes, tile_width, tile_height, pixels_per_lane, cut});
+      gpu::Pipeline(d, "splat_blend_backward", 12, push, {lanes, tile_width, tile_height, pixels_per_lane, cut,
+                                 std::min(lanes, std::max(1u, device_info.subgroup_size))});
   project_backward = gpu::Pipeline(d, "splat_project_backward", 11, push, {});
   gather = gpu::Pipeline(d, "splat_gather", 11, push, {});
   link_twist = gpu::Pipeline(d, "splat_link_twist", 5, push, {});
@@ -532,6 +533,8 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
 
   std::array<std::uint32_t, shared::kCounters> read{};
   gpu::download(device, counters, read.data(), words(shared::kCounters));
+  if (read[shared::kCounterTooLong] != 0)
+    throw WorkError("splat", "more than " + std::to_string(shared::kLongestList) + " Gaussians cover one tile", "use fewer or smaller Gaussians");
   if (read[shared::kCounterOverflow] == 0) return true;
   // raise what was too small, as far as one buffer may reach
   const std::size_t want_live = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantLive]) + 64;

@@ -47,8 +47,7 @@ std::array<double, 6> cylinder_inertia(double mass, double length, double radius
   return {i(0, 0), i(1, 1), i(2, 2), i(0, 1), i(0, 2), i(1, 2)};
 }
 
-// --- writing
-// -------------------------------------------------------------------------------------------------------------
+// --- writing --------------------------------------------------------------------------------
 
 template <class Vector>
 Json list(const Vector& values) {
@@ -161,8 +160,7 @@ Json identification_json(const Twin& twin) {
   return out;
 }
 
-// --- reading
-// -------------------------------------------------------------------------------------------------------------
+// --- reading --------------------------------------------------------------------------------
 
 // A value of the file and where it is; every access checks and throws InputError.
 class Node {

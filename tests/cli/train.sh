@@ -22,19 +22,26 @@ done
 grep -q '"stage":"recognize"' "$work/log.jsonl" || fail 'train: no record of recognize in --log'
 [ "$(head -c 4 "$work/picture.png" | tail -c 3)" = PNG ] || fail 'train: no picture'
 
-# stopped by Ctrl-C as soon as it is at work, then continued: the same result
-"$program" train "$demo" -o "$work/stopped" "${small[@]}" >"$work/stdout" 2>"$work/stderr" </dev/null &
-pid=$!
-for _ in $(seq 600); do
-  grep -q recognize "$work/stopped/log.jsonl" 2>/dev/null && break
-  kill -0 $pid 2>/dev/null || break
-  sleep 0.05
-done
-kill -INT $pid
-wait $pid
-code=$?
-expect_code 130 'interrupted train'
-[ -d "$work/stopped/checkpoint" ] || fail 'interrupted train: no checkpoint'
+# stopped as soon as it is at work, by SIGUSR1 and by Ctrl-C, then continued to the end: the same result
+stop() {  # signal, exit code, further options
+  local signal=$1 wanted=$2 before
+  shift 2
+  before=$(cat "$work/stopped/log.jsonl" 2>/dev/null | wc -l)
+  "$program" train "$demo" -o "$work/stopped" "${small[@]}" "$@" >"$work/stdout" 2>"$work/stderr" </dev/null &
+  local pid=$!
+  for _ in $(seq 1200); do
+    [ "$(cat "$work/stopped/log.jsonl" 2>/dev/null | wc -l)" -gt $((before + 1)) ] && break
+    kill -0 $pid 2>/dev/null || break
+    sleep 0.05
+  done
+  kill -s "$signal" $pid
+  wait $pid
+  code=$?
+  expect_code "$wanted" "train, stopped by $signal"
+  [ -d "$work/stopped/checkpoint" ] || fail "train, stopped by $signal: no checkpoint"
+}
+stop USR1 0
+stop INT 130 --resume
 expect_error 2 'not empty' train "$demo" -o "$work/stopped" "${small[@]}"
 expect_error 2 'bending' train "$demo" -o "$work/whole" --resume --joints 3 --frames 0:12
 train "$work/stopped" --resume
@@ -73,6 +80,8 @@ run eval "$work/whole" "$work/drawn"
 expect_code 0 'eval on another capture'
 grep -q 'only the rollout' "$work/stderr" || fail 'eval on another capture: does not say so'
 grep -q '^recognized' "$work/stdout" && fail 'eval on another capture: recognized states of the wrong capture'
+run train "$demo" -o "$work/stopped" "${small[@]}" --resume --stages identify,rollout
+expect_code 0 'train --resume --stages'
 run identify "$work/whole"
 expect_code 0 identify
 cmp -s "$work/whole/rollout.csv" "$work/stopped/rollout.csv" || fail 'identify alone: not the rollout of train'
