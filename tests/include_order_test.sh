@@ -6,7 +6,8 @@ declare -A may=(
   [core]="" [math]="core" [gpu]="core" [chain]="math" [trajectory]="math"
   [capture]="chain trajectory" [silhouette]="capture" [splat]="capture gpu" [dynamics]="chain trajectory"
   [recognition]="silhouette splat" [identification]="dynamics" [twin]="splat dynamics" [render]="twin"
-  [eval]="render capture" [export]="render capture" [synth]="render capture"
+  [refinement]="recognition identification" [eval]="render capture" [export]="render capture" [synth]="render capture"
+  [estimation]="render silhouette" [force]="twin" [planning]="twin"
 )
 declare -A all  # module -> everything it may include
 reach() {  # module

@@ -1,6 +1,6 @@
-// reference_renderer.h - SPEC 2.4-2.8 in double on the host, pixel by pixel over all replicas: what the device is measured
-// against. Only the forward formulas are written down; gradients come from reverse-mode differentiation on a tape, so that
-// no backward formula can share a mistake with the device's. Header only; for tests.
+// reference_renderer.h - SPEC 2.4-2.8 in double on the host, pixel by pixel over all replicas: what the device is
+// measured against. Only the forward formulas are written down; gradients come from reverse-mode differentiation on a
+// tape, so that no backward formula can share a mistake with the device's. Header only; for tests.
 #pragma once
 #include <algorithm>
 #include <array>
@@ -79,7 +79,9 @@ inline Variable made(double value, const Variable& a, double da) { return made(v
 inline Variable operator+(const Variable& a, const Variable& b) { return made(a.value + b.value, a, 1, b, 1); }
 inline Variable operator-(const Variable& a, const Variable& b) { return made(a.value - b.value, a, 1, b, -1); }
 inline Variable operator-(const Variable& a) { return made(-a.value, a, -1); }
-inline Variable operator*(const Variable& a, const Variable& b) { return made(a.value * b.value, a, b.value, b, a.value); }
+inline Variable operator*(const Variable& a, const Variable& b) {
+  return made(a.value * b.value, a, b.value, b, a.value);
+}
 inline Variable operator/(const Variable& a, const Variable& b) {
   return made(a.value / b.value, a, 1 / b.value, b, -a.value / (b.value * b.value));
 }
@@ -89,7 +91,9 @@ inline Variable sqrt(const Variable& a) { return made(std::sqrt(a.value), a, 0.5
 inline Variable sin(const Variable& a) { return made(std::sin(a.value), a, std::cos(a.value)); }
 inline Variable cos(const Variable& a) { return made(std::cos(a.value), a, -std::sin(a.value)); }
 // derivative 0 at 0, as sign() of the device
-inline Variable abs(const Variable& a) { return made(std::abs(a.value), a, a.value > 0 ? 1.0 : a.value < 0 ? -1.0 : 0.0); }
+inline Variable abs(const Variable& a) {
+  return made(std::abs(a.value), a, a.value > 0 ? 1.0 : a.value < 0 ? -1.0 : 0.0);
+}
 
 inline double value(double a) { return a; }
 inline double value(const Variable& a) { return a.value; }
@@ -102,8 +106,10 @@ inline Variable plus_weighted(const Variable& sum, double weight, const Variable
 
 // --- scene -----------------------------------------------------------------------------------------------------------
 
-template <class S> using Vec3 = std::array<S, 3>;
-template <class S> using Mat3 = std::array<Vec3<S>, 3>;  // rows
+template <class S>
+using Vec3 = std::array<S, 3>;
+template <class S>
+using Mat3 = std::array<Vec3<S>, 3>;  // rows
 
 template <class S>
 Vec3<S> operator*(const Mat3<S>& a, const Vec3<S>& x) {
@@ -162,7 +168,14 @@ constexpr std::array<const char*, 6> kKindNames{"mean", "rotation", "log_scale",
 
 inline Parameters<double> parameters(const splat::Gaussians& g) {
   const auto wide = [](const std::vector<float>& x) { return std::vector<double>(x.begin(), x.end()); };
-  return {g.count, g.links, g.degree, wide(g.mean), wide(g.rotation), wide(g.log_scale), wide(g.opacity_logit), wide(g.sh),
+  return {g.count,
+          g.links,
+          g.degree,
+          wide(g.mean),
+          wide(g.rotation),
+          wide(g.log_scale),
+          wide(g.opacity_logit),
+          wide(g.sh),
           wide(g.link_logits)};
 }
 
@@ -207,10 +220,12 @@ std::vector<S> sh_basis(int degree, const Vec3<S>& r) {
   const double pi = 3.14159265358979323846;
   const double c0 = std::sqrt(1 / (4 * pi)), c1 = std::sqrt(3 / (4 * pi));
   std::vector<S> b{S(c0)};
-  if (degree >= 1) for (const S& e : {-c1 * y, c1 * z, -c1 * x}) b.push_back(e);
+  if (degree >= 1)
+    for (const S& e : {-c1 * y, c1 * z, -c1 * x}) b.push_back(e);
   if (degree >= 2) {
     const double a = std::sqrt(15 / (4 * pi)), d = std::sqrt(5 / (16 * pi)), e = std::sqrt(15 / (16 * pi));
-    for (const S& term : {a * x * y, -a * y * z, d * (2.0 * zz - xx - yy), -a * x * z, e * (xx - yy)}) b.push_back(term);
+    for (const S& term : {a * x * y, -a * y * z, d * (2.0 * zz - xx - yy), -a * x * z, e * (xx - yy)})
+      b.push_back(term);
   }
   if (degree >= 3) {
     const double a = std::sqrt(35 / (32 * pi)), d = std::sqrt(105 / (4 * pi)), e = std::sqrt(21 / (32 * pi));
@@ -226,18 +241,18 @@ std::vector<S> sh_basis(int degree, const Vec3<S>& r) {
 // A replica as one view sees it. `center` in crop pixels.
 template <class S>
 struct Splat {
-  int replica = 0;               // gaussian * links + link
+  int replica = 0;  // gaussian * links + link
   std::array<S, 2> center;
-  std::array<S, 3> covariance;   // xx, xy, yy with the low pass, px^2
-  std::array<S, 3> conic;        // inverse of it
+  std::array<S, 3> covariance;  // xx, xy, yy with the low pass, px^2
+  std::array<S, 3> conic;       // inverse of it
   Vec3<S> color;
   S opacity, depth;
 };
 
 // All replicas that are in front of the camera, in blending order.
 template <class S>
-std::vector<Splat<S>> project(const Parameters<S>& g, const splat::ViewSpec& view, const std::vector<Motion<S>>& motions,
-                              const Rules& rules) {
+std::vector<Splat<S>> project(const Parameters<S>& g, const splat::ViewSpec& view,
+                              const std::vector<Motion<S>>& motions, const Rules& rules) {
   using std::exp;
   using std::sqrt;
   constexpr double kNear = 0.01, kLowPass = 0.3, kClamp = 1.3;  // m, px^2, half images (SPEC 2.5)
@@ -287,7 +302,8 @@ std::vector<Splat<S>> project(const Parameters<S>& g, const splat::ViewSpec& vie
       s.conic = {s.covariance[2] / determinant, -s.covariance[1] / determinant, s.covariance[0] / determinant};
       // the direction from the camera center, turned into the home frame
       const S distance = sqrt(dot(p, p));
-      const Vec3<S> direction = transposed(from_home.rotation) * Vec3<S>{p[0] / distance, p[1] / distance, p[2] / distance};
+      const Vec3<S> direction =
+          transposed(from_home.rotation) * Vec3<S>{p[0] / distance, p[1] / distance, p[2] / distance};
       const std::vector<S> basis = sh_basis(g.degree, direction);
       for (int c = 0; c < 3; ++c) {
         S color(0.5);
@@ -306,7 +322,7 @@ std::vector<Splat<S>> project(const Parameters<S>& g, const splat::ViewSpec& vie
 struct Doubt {
   // bands, relative: alpha at the skip, alpha at the cap, transmittance at the stop, depths of two neighbors
   double skip = 2e-4, cap = 2e-4, stop = 5e-3, order = 6e-7;
-  double change = 0.0;   // bound on the change of a channel (color or alpha)
+  double change = 0.0;  // bound on the change of a channel (color or alpha)
   bool doubtful = false;
 };
 
@@ -362,8 +378,9 @@ Pixel<S> blend(const std::vector<Splat<S>>& splats, double px, double py, const 
       blended.push_back({&s, free_alpha, T});
     }
     const S dx = px - s.center[0], dy = py - s.center[1];
-    const S alpha = capped ? S(kMostAlpha)
-                           : s.opacity * exp(-0.5 * (s.conic[0] * dx * dx + s.conic[2] * dy * dy) - s.conic[1] * dx * dy);
+    const S alpha = capped
+                        ? S(kMostAlpha)
+                        : s.opacity * exp(-0.5 * (s.conic[0] * dx * dx + s.conic[2] * dy * dy) - s.conic[1] * dx * dy);
     const S weight = alpha * transmittance;
     for (int c = 0; c < 3; ++c) pixel.color[c] += weight * s.color[c];
     pixel.depth_sum += weight * s.depth;
@@ -417,7 +434,8 @@ std::vector<S> ssim_map(const std::vector<S>& x, const std::vector<double>& y, i
     xy[k] = x[k] * y[k];
     yy[k] = y[k] * y[k];
   }
-  const std::vector<S> mx = filtered(x, width, height), sxx = filtered(xx, width, height), sxy = filtered(xy, width, height);
+  const std::vector<S> mx = filtered(x, width, height), sxx = filtered(xx, width, height),
+                       sxy = filtered(xy, width, height);
   const std::vector<double> my = filtered(y, width, height), syy = filtered(yy, width, height);
   for (std::size_t k = 0; k < x.size(); ++k) {
     const S a1 = 2.0 * mx[k] * my[k] + c1, a2 = 2.0 * (sxy[k] - mx[k] * my[k]) + c2;
@@ -427,7 +445,7 @@ std::vector<S> ssim_map(const std::vector<S>& x, const std::vector<double>& y, i
   return map;
 }
 
-struct Target {  // of one crop
+struct Target {              // of one crop
   std::vector<double> rgb;   // 3 x pixels, 0..1
   std::vector<double> mask;  // pixels, 0..1
 };
@@ -462,12 +480,13 @@ ViewLoss<S> view_loss(const std::vector<S>& rgba, const Target& wanted, int widt
   return {l1 / (3.0 * normalizer), S(1.0) - dissimilarity / (3.0 * normalizer), mask / normalizer};
 }
 
-// --- pictures, losses and gradients of some views ----------------------------------------------------------------------
+// --- pictures, losses and gradients of some views
+// ----------------------------------------------------------------------
 
 struct Picture {
   int width = 0, height = 0;
-  std::vector<double> rgba, depth;   // as splat::Picture
-  std::vector<double> change;        // a pixel: Doubt::change
+  std::vector<double> rgba, depth;  // as splat::Picture
+  std::vector<double> change;       // a pixel: Doubt::change
   std::vector<std::uint8_t> doubtful;
   int doubtful_count() const { return std::accumulate(doubtful.begin(), doubtful.end(), 0); }
 };
@@ -513,15 +532,17 @@ struct Evaluation {
   double total = 0.0;  // summed over views
   std::vector<ViewLoss<double>> losses;
   std::vector<Picture> pictures;
-  Parameters<double> gradient;               // summed over views
-  std::vector<math::MatrixX> link_twists;    // a view: 6 x links
+  Parameters<double> gradient;                      // summed over views
+  std::vector<math::MatrixX> link_twists;           // a view: 6 x links
   std::vector<std::vector<double>> image_gradient;  // a view: 4 x pixels
 };
 
-// `own_motions`, when given, makes the link motions of every view (in place of ViewSpec::motions) from numbers on the tape.
+// `own_motions`, when given, makes the link motions of every view (in place of ViewSpec::motions) from numbers on the
+// tape.
 template <class MakeMotions>
-Evaluation evaluate(const Parameters<double>& g, std::span<const splat::ViewSpec> views, std::span<const Target> targets,
-                    const splat::LossWeights& weights, double normalizer, const Rules& rules, MakeMotions own_motions) {
+Evaluation evaluate(const Parameters<double>& g, std::span<const splat::ViewSpec> views,
+                    std::span<const Target> targets, const splat::LossWeights& weights, double normalizer,
+                    const Rules& rules, MakeMotions own_motions) {
   Tape& t = tape();
   const std::size_t bottom = t.size();
   Parameters<Variable> v{g.count, g.links, g.degree, {}, {}, {}, {}, {}, {}};
@@ -552,7 +573,8 @@ Evaluation evaluate(const Parameters<double>& g, std::span<const splat::ViewSpec
     for (const double x : out.pictures.back().rgba) image.push_back(independent(x));
     const std::size_t image_end = t.size();
     const ViewLoss<Variable> loss = view_loss(image, targets[k], view.width, view.height, normalizer);
-    const Variable total = static_cast<double>(weights.l1) * loss.l1 + static_cast<double>(weights.dssim) * (1.0 - loss.ssim) +
+    const Variable total = static_cast<double>(weights.l1) * loss.l1 +
+                           static_cast<double>(weights.dssim) * (1.0 - loss.ssim) +
                            static_cast<double>(weights.mask) * loss.mask;
     out.total += total.value;
     out.losses.push_back({loss.l1.value, loss.ssim.value, loss.mask.value});

@@ -59,8 +59,15 @@ TEST_CASE("the reference equals the splat vectors: replicas, image, loss and eve
   camera.world_from_camera = camera_from_world.inverse();
 
   const auto& rows = file["gaussians"];
-  reference::Parameters<double> g{12, 4, file["sh_degree"], flat(rows["mean"]), flat(rows["quat"]), flat(rows["log_scale"]),
-                                  flat(rows["opacity_logit"]), flat(rows["sh"]), flat(rows["link_logits"])};
+  reference::Parameters<double> g{12,
+                                  4,
+                                  file["sh_degree"],
+                                  flat(rows["mean"]),
+                                  flat(rows["quat"]),
+                                  flat(rows["log_scale"]),
+                                  flat(rows["opacity_logit"]),
+                                  flat(rows["sh"]),
+                                  flat(rows["link_logits"])};
   std::vector<math::Vector6> axes;
   for (const auto& s : file["chain"]["S"]) axes.push_back(math::Vector6(flat(s).data()));
   const std::vector<double> theta = flat(file["chain"]["theta"]), base_rows = flat(file["chain"]["T_b"]);
@@ -90,8 +97,8 @@ TEST_CASE("the reference equals the splat vectors: replicas, image, loss and eve
     const auto& s = splats[k];
     CHECK(s.replica == file["order"][k].get<int>());
     const auto& wanted = file["replicas"][s.replica];
-    const std::vector<double> got{s.center[0], s.center[1], s.covariance[0], s.covariance[1], s.covariance[1], s.covariance[2],
-                                  s.depth, s.opacity};
+    const std::vector<double> got{s.center[0],     s.center[1],     s.covariance[0], s.covariance[1],
+                                  s.covariance[1], s.covariance[2], s.depth,         s.opacity};
     std::vector<double> numbers = flat(wanted["mean2d"]);
     for (const char* key : {"cov2d", "depth", "opacity"})
       for (const double x : flat(wanted[key])) numbers.push_back(x);
@@ -100,7 +107,8 @@ TEST_CASE("the reference equals the splat vectors: replicas, image, loss and eve
   }
 
   reference::Target target{flat(file["target"]), std::vector<double>(24 * 16, 0.0)};
-  // 0.8 and 0.2 are not floats, as LossWeights has them: one evaluation with weights (1, 0), one with (0, 1), mixed in double
+  // 0.8 and 0.2 are not floats, as LossWeights has them: one evaluation with weights (1, 0), one with (0, 1), mixed in
+  // double
   splat::LossWeights weights;
   std::vector<reference::Variable> angles;
   for (const double x : theta) angles.push_back(reference::independent(x));
@@ -145,14 +153,15 @@ TEST_CASE("the reference equals the splat vectors: replicas, image, loss and eve
   const std::array<const char*, 6> keys{"mean", "quat", "log_scale", "opacity_logit", "sh", "link_logits"};
   for (int kind = 0; kind < 6; ++kind) {
     INFO(keys[kind]);
-    CHECK(relative_error(mixed(*l1.gradient.kinds()[kind], *dssim.gradient.kinds()[kind]), flat(gradients[keys[kind]])) <=
-          kVectorTolerance);
+    CHECK(relative_error(mixed(*l1.gradient.kinds()[kind], *dssim.gradient.kinds()[kind]),
+                         flat(gradients[keys[kind]])) <= kVectorTolerance);
   }
   CHECK(relative_error(mixed(theta_l1, theta_dssim), flat(gradients["theta"])) <= kVectorTolerance);
   const math::MatrixX twists = 0.8 * l1.link_twists[0] + 0.2 * dssim.link_twists[0];
   CHECK(relative_error({twists.data(), twists.data() + 24}, flat(gradients["link_twists_world"])) <= kVectorTolerance);
   const math::Vector6 base_twist = twists.rowwise().sum();
-  CHECK(relative_error({base_twist.data(), base_twist.data() + 6}, flat(gradients["base_twist_world"])) <= kVectorTolerance);
+  CHECK(relative_error({base_twist.data(), base_twist.data() + 6}, flat(gradients["base_twist_world"])) <=
+        kVectorTolerance);
   reference::tape().forget(0);
 }
 
@@ -209,8 +218,10 @@ TEST_CASE("the reference's SSIM, L1 and PSNR equal the vectors") {
     const auto loss = reference::view_loss(picture.rgba, target, width, height, 0.0);
     CHECK(loss.l1 == doctest::Approx(c["l1"].get<double>()).epsilon(kVectorTolerance));
     CHECK(loss.ssim == doctest::Approx(c["ssim"].get<double>()).epsilon(kVectorTolerance));
-    CHECK(0.8 * loss.l1 + 0.2 * (1.0 - loss.ssim) == doctest::Approx(c["loss"].get<double>()).epsilon(kVectorTolerance));
-    CHECK(reference::psnr_object(picture, target) == doctest::Approx(c["psnr"].get<double>()).epsilon(kVectorTolerance));
+    CHECK(0.8 * loss.l1 + 0.2 * (1.0 - loss.ssim) ==
+          doctest::Approx(c["loss"].get<double>()).epsilon(kVectorTolerance));
+    CHECK(reference::psnr_object(picture, target) ==
+          doctest::Approx(c["psnr"].get<double>()).epsilon(kVectorTolerance));
   }
 }
 
@@ -251,11 +262,11 @@ TEST_CASE("the tape's gradients are those of central differences: degree 3, mask
     views.push_back(view);
     targets.push_back(target);
   }
-  const auto center = reference::project(g, views[0], {reference::motion<double>(views[0].motions[0]),
-                                                      reference::motion<double>(views[0].motions[1])}, {});
-  REQUIRE(std::any_of(center.begin(), center.end(), [&](const auto& s) {
-    return std::abs(s.center[0] - camera.cx) > 1.3 * 0.5 * camera.width;
-  }));
+  const auto center = reference::project(
+      g, views[0], {reference::motion<double>(views[0].motions[0]), reference::motion<double>(views[0].motions[1])},
+      {});
+  REQUIRE(std::any_of(center.begin(), center.end(),
+                      [&](const auto& s) { return std::abs(s.center[0] - camera.cx) > 1.3 * 0.5 * camera.width; }));
   const splat::LossWeights weights{0.5f, 0.25f, 0.25f};
   const auto at = [&](const reference::Parameters<double>& p, std::span<const splat::ViewSpec> v) {
     return reference::loss(p, v, targets, weights, 0.0, reference::kNoCutoffs);

@@ -1,9 +1,9 @@
 // The device's splatting engine (chainsplat/splat.h) against the double-precision renderer of reference_renderer.h.
 //
-// A float device and a double host decide the discrete rules (1/255 skip, 1e-4 stop, order of two depths) differently where
-// a number lies within rounding of its threshold. The reference says for each pixel whether that can happen and bounds the
-// change (reference::Doubt): pixels beyond doubt are compared strictly, the others within the bound, and their share is
-// capped. Gradients are compared where no pixel is in doubt, or without the rules.
+// A float device and a double host decide the discrete rules (1/255 skip, 1e-4 stop, order of two depths) differently
+// where a number lies within rounding of its threshold. The reference says for each pixel whether that can happen and
+// bounds the change (reference::Doubt): pixels beyond doubt are compared strictly, the others within the bound, and
+// their share is capped. Gradients are compared where no pixel is in doubt, or without the rules.
 #include "chainsplat/splat.h"
 
 #include <doctest/doctest.h>
@@ -16,6 +16,7 @@
 #include <string>
 
 #include "reference_renderer.h"
+#include "shaders/shared/splat.h"
 
 using namespace chainsplat;
 using splat::Engine;
@@ -30,11 +31,11 @@ namespace {
 constexpr double kImageTolerance = 2e-5;
 // Of the largest entry of a kind (vectors/README.md): the same, through quotients and sums with cancellation.
 constexpr double kGradientTolerance = 1e-3;
-// Of the largest entry of one Gaussian's row, so that a wrong weak Gaussian does not hide behind a strong one; with a floor
-// of kRowFloor of the kind's largest entry, below which cancellation leaves no digits.
+// Of the largest entry of one Gaussian's row, so that a wrong weak Gaussian does not hide behind a strong one; with a
+// floor of kRowFloor of the kind's largest entry, below which cancellation leaves no digits.
 constexpr double kRowTolerance = 1e-2, kRowFloor = 1e-4;
-// Gradients of at most this size come from alphas that vanish beside 1 in float (the sign of alpha - mask is then lost);
-// losses are of order 1, lengths of order 0.1 m.
+// Gradients of at most this size come from alphas that vanish beside 1 in float (the sign of alpha - mask is then
+// lost); losses are of order 1, lengths of order 0.1 m.
 constexpr double kNothing = 1e-8;
 // Sums of some thousand floats.
 constexpr double kLossTolerance = 1e-5;
@@ -66,12 +67,13 @@ void check_silent() {
   CHECK_MESSAGE(texts.empty(), (texts.empty() ? std::string() : texts.front()));
 }
 
-// --- scenes ------------------------------------------------------------------------------------------------------------
+// --- scenes
+// ------------------------------------------------------------------------------------------------------------
 
 struct Scene {
   Gaussians gaussians;
   std::vector<capture::Camera> cameras;
-  std::vector<ViewSpec> views;                    // point into `cameras`
+  std::vector<ViewSpec> views;  // point into `cameras`
   std::vector<std::vector<std::uint8_t>> targets;
 
   std::vector<const std::vector<std::uint8_t>*> target_pointers() const {
@@ -132,7 +134,8 @@ std::vector<math::Pose> random_motions(core::Random& random, int links) {
                                        0.01 * random.normal(), 0.01 * random.normal(), 0.35)};
   for (int j = 1; j < links; ++j) {
     const math::Vector3 joint(0.2 * j / links - 0.1, 0.0, 0.0);
-    const math::Matrix3 bend = math::exp_so3(0.25 * math::Vector3(0.3 * random.normal(), random.normal(), random.normal()));
+    const math::Matrix3 bend =
+        math::exp_so3(0.25 * math::Vector3(0.3 * random.normal(), random.normal(), random.normal()));
     motions.push_back(motions.back() * math::Pose{bend, joint - bend * joint});
   }
   return motions;
@@ -160,12 +163,15 @@ Scene random_scene(std::uint64_t seed, int count, int links, int degree, Logits 
   s.cameras = {make_camera(52, 36, 70.0, {}), make_camera(60, 41, 66.0, pose(0.05, -0.2, 0.3, 0.06, 0.01, -0.02)),
                make_camera(21, 45, 60.0, pose(0.0, 0.1, 1.4, -0.02, 0.0, 0.03))};
   const std::vector<math::Pose> first = random_motions(random, links), second = random_motions(random, links);
-  s.views = {{&s.cameras[0], 0, 0, 52, 36, first}, {&s.cameras[1], 9, 5, 37, 23, second}, {&s.cameras[2], 0, 0, 21, 45, first}};
+  s.views = {{&s.cameras[0], 0, 0, 52, 36, first},
+             {&s.cameras[1], 9, 5, 37, 23, second},
+             {&s.cameras[2], 0, 0, 21, 45, first}};
   for (const ViewSpec& view : s.views) s.targets.push_back(random_target(random, view.width, view.height));
   return s;
 }
 
-// --- comparisons -------------------------------------------------------------------------------------------------------
+// --- comparisons
+// -------------------------------------------------------------------------------------------------------
 
 // Share of pixels where rounding may decide a rule.
 double check_picture(const splat::Picture& got, const reference::Picture& wanted, double tolerance = kImageTolerance) {
@@ -186,7 +192,8 @@ double check_picture(const splat::Picture& got, const reference::Picture& wanted
 }
 
 template <class Got>
-void check_kind(const std::string& name, const Got& got, const std::vector<double>& wanted, std::size_t row, double tolerance) {
+void check_kind(const std::string& name, const Got& got, const std::vector<double>& wanted, std::size_t row,
+                double tolerance) {
   REQUIRE(got.size() == wanted.size());
   double largest = 0.0, worst = 0.0, worst_row = 0.0;
   for (const double x : wanted) largest = std::max(largest, std::abs(x));
@@ -214,7 +221,8 @@ void check_gradients(const splat::Gradients& got, const reference::Evaluation& w
   for (std::size_t v = 0; v < wanted.link_twists.size(); ++v) {
     // moments (N m) and forces (N) are two kinds
     for (const int half : {0, 1}) {
-      const math::MatrixX a = got.link_twists[v].middleRows(3 * half, 3), b = wanted.link_twists[v].middleRows(3 * half, 3);
+      const math::MatrixX a = got.link_twists[v].middleRows(3 * half, 3),
+                          b = wanted.link_twists[v].middleRows(3 * half, 3);
       REQUIRE(a.cols() == b.cols());
       check_kind(half == 0 ? "link moment" : "link force", std::vector<double>(a.data(), a.data() + a.size()),
                  {b.data(), b.data() + b.size()}, 3, tolerance);
@@ -229,8 +237,8 @@ void check_losses(const splat::LossValues& got, const Scene& scene, const refere
     CHECK(std::abs(got.ssim[v] - wanted.losses[v].ssim) <= kLossTolerance);
     CHECK(std::abs(got.mask[v] - wanted.losses[v].mask) <= kLossTolerance);
     constexpr double kDecibels = 1e-3;  // relative error 2e-4 of the squared error
-    CHECK(std::abs(got.psnr_object[v] - reference::psnr_object(wanted.pictures[v], reference::target(scene.targets[v]))) <=
-          kDecibels);
+    CHECK(std::abs(got.psnr_object[v] -
+                   reference::psnr_object(wanted.pictures[v], reference::target(scene.targets[v]))) <= kDecibels);
   }
   CHECK(std::abs(got.total - wanted.total) <= kLossTolerance * static_cast<double>(wanted.losses.size()));
 }
@@ -251,8 +259,8 @@ std::pair<Scene, reference::Evaluation> clear_scene(Make make, const LossWeights
     for (const ViewSpec& view : scene.views)
       doubts += reference::draw(reference::parameters(scene.gaussians), view).doubtful_count();
     if (doubts > 0) continue;
-    auto wanted = reference::evaluate(reference::parameters(scene.gaussians), scene.views, scene.reference_targets(), weights,
-                                      normalizer);
+    auto wanted = reference::evaluate(reference::parameters(scene.gaussians), scene.views, scene.reference_targets(),
+                                      weights, normalizer);
     return {std::move(scene), std::move(wanted)};
   }
   FAIL("no scene of the family keeps away from the thresholds");
@@ -264,7 +272,8 @@ bool same_bits(const std::vector<float>& a, const std::vector<float>& b) {
 }
 bool same_bits(const Gaussians& a, const Gaussians& b) {
   return same_bits(a.mean, b.mean) && same_bits(a.rotation, b.rotation) && same_bits(a.log_scale, b.log_scale) &&
-         same_bits(a.opacity_logit, b.opacity_logit) && same_bits(a.sh, b.sh) && same_bits(a.link_logits, b.link_logits);
+         same_bits(a.opacity_logit, b.opacity_logit) && same_bits(a.sh, b.sh) &&
+         same_bits(a.link_logits, b.link_logits);
 }
 
 constexpr LossWeights kAllTerms{0.8f, 0.2f, 0.3f};
@@ -339,8 +348,8 @@ TEST_CASE("the device equals the splat vectors") {
   }
   CHECK(worst <= kImageTolerance);
 
-  // Targets on the device have 8 bits, the vectors' do not: the wanted gradient is the reference's for the rounded target
-  // (it equals the vectors for theirs: splat_reference_test.cpp).
+  // Targets on the device have 8 bits, the vectors' do not: the wanted gradient is the reference's for the rounded
+  // target (it equals the vectors for theirs: splat_reference_test.cpp).
   std::vector<std::uint8_t> target;
   for (int y = 0; y < camera.height; ++y) {
     for (int x = 0; x < camera.width; ++x) {
@@ -351,7 +360,8 @@ TEST_CASE("the device equals the splat vectors") {
   }
   scene.targets = {target};
   const LossWeights weights;
-  const auto wanted = reference::evaluate(reference::parameters(g), scene.views, scene.reference_targets(), weights, 0.0, rules);
+  const auto wanted =
+      reference::evaluate(reference::parameters(g), scene.views, scene.reference_targets(), weights, 0.0, rules);
   CHECK(doubtful(wanted) == 0);
   splat::Gradients gradients;
   const auto losses = unclamped.loss(g, scene.views, scene.target_pointers(), weights, 0.0, &gradients);
@@ -367,9 +377,9 @@ TEST_CASE("pictures of random scenes equal the reference's with all rules on") {
     double size;  // m
   };
   int number = 0;
-  for (const Case& c : {Case{60, 4, 0, Logits::soft, 0.006}, Case{150, 9, 0, Logits::sharp, 0.004},
-                        Case{40, 2, 1, Logits::soft, 0.012}, Case{30, 3, 2, Logits::sharp, 0.008},
-                        Case{80, 1, 3, Logits::soft, 0.005}}) {
+  for (const Case& c :
+       {Case{60, 4, 0, Logits::soft, 0.006}, Case{150, 9, 0, Logits::sharp, 0.004}, Case{40, 2, 1, Logits::soft, 0.012},
+        Case{30, 3, 2, Logits::sharp, 0.008}, Case{80, 1, 3, Logits::soft, 0.005}}) {
     CAPTURE(number);
     const Scene scene = random_scene(100 + number++, c.count, c.links, c.degree, c.logits, c.size);
     const auto pictures = engine().draw(scene.gaussians, scene.views, true);
@@ -407,8 +417,8 @@ TEST_CASE("gradients equal the reference's, all rules on, in scenes away from th
         kAllTerms, kNormalizer);
     splat::Gradients gradients;
     std::vector<splat::Picture> pictures;
-    const auto losses =
-        engine().loss(scene.gaussians, scene.views, scene.target_pointers(), kAllTerms, kNormalizer, &gradients, &pictures);
+    const auto losses = engine().loss(scene.gaussians, scene.views, scene.target_pointers(), kAllTerms, kNormalizer,
+                                      &gradients, &pictures);
     check_losses(losses, scene, wanted);
     REQUIRE(pictures.size() == wanted.pictures.size());
     for (std::size_t v = 0; v < pictures.size(); ++v) check_picture(pictures[v], wanted.pictures[v]);
@@ -423,12 +433,12 @@ TEST_CASE("gradients and pictures equal the reference's without the rules") {
     const Scene scene = random_scene(50 + degree, 40, 3, degree, Logits::soft);
     for (const LossWeights& weights : {LossWeights{1, 0, 0}, LossWeights{0, 1, 0}, LossWeights{0, 0, 1}, kAllTerms}) {
       if (degree != 0 && weights.l1 != kAllTerms.l1) continue;  // one term at a time: once is enough
-      const auto wanted = reference::evaluate(reference::parameters(scene.gaussians), scene.views, scene.reference_targets(),
-                                              weights, 0.0, reference::kNoCutoffs);
+      const auto wanted = reference::evaluate(reference::parameters(scene.gaussians), scene.views,
+                                              scene.reference_targets(), weights, 0.0, reference::kNoCutoffs);
       splat::Gradients gradients;
       std::vector<splat::Picture> pictures;
-      const auto losses = engine(false).loss(scene.gaussians, scene.views, scene.target_pointers(), weights, 0.0, &gradients,
-                                             &pictures);
+      const auto losses = engine(false).loss(scene.gaussians, scene.views, scene.target_pointers(), weights, 0.0,
+                                             &gradients, &pictures);
       if (weights.dssim > 0.0f) check_losses(losses, scene, wanted);
       for (std::size_t v = 0; v < pictures.size(); ++v) check_picture(pictures[v], wanted.pictures[v]);
       check_gradients(gradients, wanted);
@@ -437,7 +447,8 @@ TEST_CASE("gradients and pictures equal the reference's without the rules") {
   check_silent();
 }
 
-TEST_CASE("odd Gaussians: behind, at the border, beyond the clamp, tiny, huge, saturated, degenerate quaternion sizes") {
+TEST_CASE(
+    "odd Gaussians: behind, at the border, beyond the clamp, tiny, huge, saturated, degenerate quaternion sizes") {
   core::Random random(5);
   Scene scene;
   scene.cameras = {make_camera(52, 36, 60.0, {})};
@@ -499,8 +510,8 @@ TEST_CASE("odd Gaussians: behind, at the border, beyond the clamp, tiny, huge, s
       one.opacity_logit[0] = g.opacity_logit[i];
       std::copy_n(g.sh.begin() + 12 * i, 12, one.sh.begin());
       std::copy_n(g.link_logits.begin() + 2 * i, 2, one.link_logits.begin());
-      const auto wanted = reference::evaluate(reference::parameters(one), scene.views, scene.reference_targets(), kAllTerms,
-                                              0.0, rules);
+      const auto wanted = reference::evaluate(reference::parameters(one), scene.views, scene.reference_targets(),
+                                              kAllTerms, 0.0, rules);
       CHECK(doubtful(wanted) == 0);
       splat::Gradients gradients;
       std::vector<splat::Picture> alone;
@@ -523,7 +534,8 @@ TEST_CASE("spherical harmonics turn with the link and reach the position: Gaussi
         return math::Pose{math::exp_so3({2.0 * random.normal(), 2.0 * random.normal(), 2.0 * random.normal()}),
                           {0.05 * random.normal(), 0.05 * random.normal(), 0.4}};
       };
-      scene.views = {{&scene.cameras[0], 0, 0, 24, 18, {turned(), turned()}}, {&scene.cameras[1], 2, 1, 13, 20, {turned(), turned()}}};
+      scene.views = {{&scene.cameras[0], 0, 0, 24, 18, {turned(), turned()}},
+                     {&scene.cameras[1], 2, 1, 13, 20, {turned(), turned()}}};
       for (const ViewSpec& view : scene.views) scene.targets.push_back(random_target(random, view.width, view.height));
       Gaussians& g = scene.gaussians;
       g.resize(1, 2, degree);
@@ -535,7 +547,8 @@ TEST_CASE("spherical harmonics turn with the link and reach the position: Gaussi
       g.link_logits[0] = 0.4f;
       // the pull of the color on the picture, without L1's signs
       const LossWeights weights{0.0f, 1.0f, 0.0f};
-      const auto wanted = reference::evaluate(reference::parameters(g), scene.views, scene.reference_targets(), weights, 0.0);
+      const auto wanted =
+          reference::evaluate(reference::parameters(g), scene.views, scene.reference_targets(), weights, 0.0);
       CHECK(doubtful(wanted) == 0);
       splat::Gradients gradients;
       engine().loss(g, scene.views, scene.target_pointers(), weights, 0.0, &gradients);
@@ -545,8 +558,8 @@ TEST_CASE("spherical harmonics turn with the link and reach the position: Gaussi
   check_silent();
 }
 
-TEST_CASE("lists longer than any fast path: 700, 1500, 5000 and 20000 entries in one tile") {
-  for (const int count : {700, 1500, 5000, 20000}) {
+TEST_CASE("lists longer than any fast path: 700, 1500, 5000 entries in one tile, and the longest that is let through") {
+  for (const int count : {700, 1500, 5000, static_cast<int>(shared::kLongestList)}) {
     CAPTURE(count);
     core::Random random(count);
     Scene scene;
@@ -564,12 +577,14 @@ TEST_CASE("lists longer than any fast path: 700, 1500, 5000 and 20000 entries in
       g.mean[3 * i] = static_cast<float>(0.04 * z * random.normal());
       g.mean[3 * i + 1] = static_cast<float>(0.04 * z * random.normal());
       g.mean[3 * i + 2] = static_cast<float>(z);
-      for (int k = 0; k < 3; ++k) g.log_scale[3 * i + k] = static_cast<float>(std::log(0.15 * z) + 0.1 * random.normal());
+      for (int k = 0; k < 3; ++k)
+        g.log_scale[3 * i + k] = static_cast<float>(std::log(0.15 * z) + 0.1 * random.normal());
       g.opacity_logit[i] = static_cast<float>(std::log(random.uniform(1.0, 3.0) / count));  // the last one still shows
     }
     for (float& c : g.sh) c = static_cast<float>(random.normal());
     const auto plain = reference::parameters(g);
-    const auto wanted = reference::evaluate(plain, scene.views, scene.reference_targets(), kAllTerms, 0.0, reference::kNoCutoffs);
+    const auto wanted =
+        reference::evaluate(plain, scene.views, scene.reference_targets(), kAllTerms, 0.0, reference::kNoCutoffs);
     splat::Gradients gradients;
     std::vector<splat::Picture> pictures;
     engine(false).loss(g, scene.views, scene.target_pointers(), kAllTerms, 0.0, &gradients, &pictures);
@@ -580,8 +595,23 @@ TEST_CASE("lists longer than any fast path: 700, 1500, 5000 and 20000 entries in
     // with the rules, each just above 1/255 (0.0039): nearly every pixel is in doubt somewhere, by 1/255 of a thin rest
     for (float& logit : g.opacity_logit) logit = static_cast<float>(std::log(random.uniform(0.0045, 0.012)));
     constexpr double kLongWithRules = 1e-3;
-    check_picture(engine().draw(g, scene.views)[0], reference::draw(reference::parameters(g), scene.views[0]), kLongWithRules);
+    check_picture(engine().draw(g, scene.views)[0], reference::draw(reference::parameters(g), scene.views[0]),
+                  kLongWithRules);
   }
+  check_silent();
+}
+
+TEST_CASE("a tile's list beyond the limit is an error, and the engine goes on afterwards") {
+  Scene scene;
+  scene.cameras = {make_camera(8, 8, 30.0, {})};
+  scene.views = {{&scene.cameras[0], 0, 0, 8, 8, {math::Pose{}}}};
+  Gaussians& g = scene.gaussians;
+  g.resize(static_cast<int>(shared::kLongestList) + 1, 1, 0);
+  for (int i = 0; i < g.count; ++i) g.mean[3 * i + 2] = 0.5f;
+  std::fill(g.log_scale.begin(), g.log_scale.end(), std::log(0.1f));
+  CHECK_THROWS_AS(engine().draw(g, scene.views), WorkError);
+  g.resize(40, 1, 0);
+  check_picture(engine().draw(g, scene.views)[0], reference::draw(reference::parameters(g), scene.views[0]));
   check_silent();
 }
 
@@ -606,7 +636,8 @@ TEST_CASE("equal depths are blended in the order of the replica index") {
   for (int i = 0; i < 8; ++i) std::copy_n(g.sh.begin() + 3 * (7 - i), 3, reversed.sh.begin() + 3 * i);
   const auto other = reference::draw(reference::parameters(reversed), scene.views[0]);
   double difference = 0.0;
-  for (std::size_t k = 0; k < other.rgba.size(); ++k) difference = std::max(difference, std::abs(other.rgba[k] - wanted.rgba[k]));
+  for (std::size_t k = 0; k < other.rgba.size(); ++k)
+    difference = std::max(difference, std::abs(other.rgba[k] - wanted.rgba[k]));
   CHECK(difference > 0.05);
   check_silent();
 }
@@ -626,7 +657,8 @@ TEST_CASE("600 Gaussians in one tile among others") {
   }
   const auto plain = reference::parameters(g);
   CHECK(check_picture(engine().draw(g, scene.views)[0], reference::draw(plain, scene.views[0])) <= 0.2);
-  const auto wanted = reference::evaluate(plain, scene.views, scene.reference_targets(), kAllTerms, 0.0, reference::kNoCutoffs);
+  const auto wanted =
+      reference::evaluate(plain, scene.views, scene.reference_targets(), kAllTerms, 0.0, reference::kNoCutoffs);
   splat::Gradients gradients;
   std::vector<splat::Picture> pictures;
   engine(false).loss(g, scene.views, scene.target_pointers(), kAllTerms, 0.0, &gradients, &pictures);
@@ -670,12 +702,15 @@ TEST_CASE("a crop is the cut-out of the whole image, and its loss is the whole i
     ViewSpec view{&scene.cameras[0], left, top, right - left, bottom - top, motions};
     std::vector<std::uint8_t> target;
     for (int y = top; y < bottom; ++y)
-      target.insert(target.end(), full_target.begin() + 4 * (75 * y + left), full_target.begin() + 4 * (75 * y + right));
+      target.insert(target.end(), full_target.begin() + 4 * (75 * y + left),
+                    full_target.begin() + 4 * (75 * y + right));
     return std::pair{view, target};
   };
   // odd corners, inside and at the border of what is drawn
-  for (const auto& [left, top, right, bottom] : {std::array{x0 - 5, y0 - 5, x1 + 5, y1 + 5}, {x0 + 3, y0 + 1, x1 - 2, y1 - 4},
-                                                 {0, 0, 9, 58}, {37, 29, 38, 30}}) {
+  for (const auto& [left, top, right, bottom] : {std::array{x0 - 5, y0 - 5, x1 + 5, y1 + 5},
+                                                 {x0 + 3, y0 + 1, x1 - 2, y1 - 4},
+                                                 {0, 0, 9, 58},
+                                                 {37, 29, 38, 30}}) {
     const ViewSpec view = cut(left, top, right, bottom).first;
     const splat::Picture part = engine().draw(scene.gaussians, std::span(&view, 1))[0];
     double worst = 0.0;
@@ -683,15 +718,18 @@ TEST_CASE("a crop is the cut-out of the whole image, and its loss is the whole i
       for (int x = left; x < right; ++x) {
         if (wanted.doubtful[75 * y + x]) continue;
         for (int c = 0; c < 4; ++c)
-          worst = std::max(worst, std::abs(static_cast<double>(part.rgba[4 * ((y - top) * (right - left) + x - left) + c]) -
-                                           full.rgba[4 * (75 * y + x) + c]));
+          worst =
+              std::max(worst, std::abs(static_cast<double>(part.rgba[4 * ((y - top) * (right - left) + x - left) + c]) -
+                                       full.rgba[4 * (75 * y + x) + c]));
       }
     }
     CHECK(worst <= kImageTolerance);  // the crop's center coordinates are rounded anew
   }
-  const auto evaluate = [&](const ViewSpec& view, const std::vector<std::uint8_t>& target, splat::Gradients& gradients) {
+  const auto evaluate = [&](const ViewSpec& view, const std::vector<std::uint8_t>& target,
+                            splat::Gradients& gradients) {
     const std::vector<std::uint8_t>* pointer = &target;
-    return engine().loss(scene.gaussians, std::span(&view, 1), std::span(&pointer, 1), kAllTerms, 75.0 * 58.0, &gradients);
+    return engine().loss(scene.gaussians, std::span(&view, 1), std::span(&pointer, 1), kAllTerms, 75.0 * 58.0,
+                         &gradients);
   };
   splat::Gradients of_whole, of_crop, of_tight;
   const auto [crop, crop_target] = cut(x0 - kMargin, y0 - kMargin, x1 + kMargin, y1 + kMargin);
@@ -715,7 +753,8 @@ TEST_CASE("a batch of views is the sum of its views") {
   const Scene scene = random_scene(31, 50, 4, 1, Logits::soft);
   constexpr double kNormalizer = 1500.0;
   splat::Gradients together;
-  const auto all = engine().loss(scene.gaussians, scene.views, scene.target_pointers(), kAllTerms, kNormalizer, &together);
+  const auto all =
+      engine().loss(scene.gaussians, scene.views, scene.target_pointers(), kAllTerms, kNormalizer, &together);
   std::array<std::vector<double>, 6> sums;
   double total = 0.0;
   for (std::size_t v = 0; v < scene.views.size(); ++v) {
@@ -737,11 +776,13 @@ TEST_CASE("a batch of views is the sum of its views") {
   CHECK(all.total == doctest::Approx(total).epsilon(1e-12));
   const auto g = reference::parameters(together.gaussians);
   constexpr double kRounding = 1e-6;  // of sums of three floats
-  for (int kind = 0; kind < 6; ++kind) check_kind(reference::kKindNames[kind], *g.kinds()[kind], sums[kind], 1, kRounding);
+  for (int kind = 0; kind < 6; ++kind)
+    check_kind(reference::kKindNames[kind], *g.kinds()[kind], sums[kind], 1, kRounding);
   // a normalizer of 0 stands for each crop's own pixels
   const auto own = engine().loss(scene.gaussians, scene.views, scene.target_pointers(), kAllTerms, 0.0, nullptr);
   for (std::size_t v = 0; v < scene.views.size(); ++v)
-    CHECK(own.l1[v] == doctest::Approx(all.l1[v] * kNormalizer / (scene.views[v].width * scene.views[v].height)).epsilon(1e-9));
+    CHECK(own.l1[v] ==
+          doctest::Approx(all.l1[v] * kNormalizer / (scene.views[v].width * scene.views[v].height)).epsilon(1e-9));
   check_silent();
 }
 
@@ -787,13 +828,15 @@ TEST_CASE("the same input gives the same bits: loss, gradients, 20 steps, and on
 TEST_CASE("step is Adam on the mean loss of the batch") {
   // targets whose mask reaches within 16 px of everything, so that all of every crop is charged
   Scene scene = random_scene(61, 16, 3, 1, Logits::soft);
-  scene.views = {{&scene.cameras[0], 11, 9, 30, 19, scene.views[0].motions}, {&scene.cameras[1], 13, 8, 27, 22, scene.views[1].motions}};
+  scene.views = {{&scene.cameras[0], 11, 9, 30, 19, scene.views[0].motions},
+                 {&scene.cameras[1], 13, 8, 27, 22, scene.views[1].motions}};
   scene.targets.clear();
   core::Random random(62);
   double object_pixels = 0.0;
   for (const ViewSpec& view : scene.views) {
     scene.targets.push_back(random_target(random, view.width, view.height));
-    for (std::size_t k = 3; k < scene.targets.back().size(); k += 4) object_pixels += scene.targets.back()[k] >= 128 ? 1 : 0;
+    for (std::size_t k = 3; k < scene.targets.back().size(); k += 4)
+      object_pixels += scene.targets.back()[k] >= 128 ? 1 : 0;
   }
   const double normalizer = object_pixels / 2.0;  // training's means are over the views' mean number of object pixels
   const std::array<float, 7> rate{3e-4f, 2e-3f, 4e-3f, 1e-2f, 5e-3f, 1e-3f, 3e-2f};
@@ -818,8 +861,8 @@ TEST_CASE("step is Adam on the mean loss of the batch") {
       views.push_back(scene.views[v]);
       wanted_targets.push_back(targets[v]);
     }
-    const auto wanted = reference::evaluate(g, views, wanted_targets, kAllTerms, normalizer * static_cast<double>(batch.size()),
-                                            reference::kNoCutoffs);
+    const auto wanted = reference::evaluate(g, views, wanted_targets, kAllTerms,
+                                            normalizer * static_cast<double>(batch.size()), reference::kNoCutoffs);
     std::vector<math::MatrixX> twists;
     const auto losses = engine(false).step(batch, kAllTerms, rates, true, &twists);
     // losses are those before the step, means over the normalizer's pixels
@@ -879,7 +922,8 @@ TEST_CASE("resets cap the opacity, even the links out, and forget their moments 
   const Engine::Snapshot after = engine().snapshot();
   const float least_logit = std::log(0.01f / 0.99f);
   for (int i = 0; i < 20; ++i)
-    CHECK(after.gaussians.opacity_logit[i] == doctest::Approx(std::min(before.gaussians.opacity_logit[i], least_logit)));
+    CHECK(after.gaussians.opacity_logit[i] ==
+          doctest::Approx(std::min(before.gaussians.opacity_logit[i], least_logit)));
   // uniform probabilities: equal logits
   for (int i = 0; i < 20; ++i)
     for (int j = 1; j < 3; ++j) CHECK(after.gaussians.link_logits[3 * i + j] == after.gaussians.link_logits[3 * i]);
@@ -889,8 +933,8 @@ TEST_CASE("resets cap the opacity, even the links out, and forget their moments 
   // as many moments are forgotten as the two sections have entries that had any
   const auto zeros = [](const std::vector<float>& x) { return std::count(x.begin(), x.end(), 0.0f); };
   REQUIRE(before.first_moment.size() == 20u * (3 + 4 + 3 + 1 + 3 + 3));
-  for (const auto& [now, then] : {std::pair{&after.first_moment, &before.first_moment},
-                                  std::pair{&after.second_moment, &before.second_moment}}) {
+  for (const auto& [now, then] :
+       {std::pair{&after.first_moment, &before.first_moment}, std::pair{&after.second_moment, &before.second_moment}}) {
     CHECK(zeros(*now) >= 20 * 4);
     CHECK(zeros(*now) - zeros(*then) <= 20 * 4);
     for (std::size_t k = 0; k < now->size(); ++k) CHECK(((*now)[k] == (*then)[k] || (*now)[k] == 0.0f));
@@ -907,7 +951,8 @@ TEST_CASE("training draws and charges near the mask, or everywhere when asked") 
   std::vector<std::uint8_t> target(4 * 96 * 40, 0);
   for (int y = 14; y < 26; ++y)
     for (int x = 6; x < 18; ++x)
-      for (int c = 0; c < 4; ++c) target[4 * (96 * y + x) + c] = c == 3 ? 255 : static_cast<std::uint8_t>(random.next() % 256);
+      for (int c = 0; c < 4; ++c)
+        target[4 * (96 * y + x) + c] = c == 3 ? 255 : static_cast<std::uint8_t>(random.next() % 256);
   scene.targets = {target};
   Gaussians& g = scene.gaussians;
   g.resize(2, 1, 0);
@@ -1004,11 +1049,11 @@ TEST_CASE("nothing to draw: no views, no Gaussians, views of size 0, everything 
   Gaussians empty;
   empty.resize(0, 2, 0);
   const auto black = engine().loss(empty, scene.views, scene.target_pointers(), kAllTerms, 0.0, &gradients, &pictures);
-  const auto wanted = reference::evaluate(reference::parameters(empty), scene.views, scene.reference_targets(), kAllTerms, 0.0);
+  const auto wanted =
+      reference::evaluate(reference::parameters(empty), scene.views, scene.reference_targets(), kAllTerms, 0.0);
   check_losses(black, scene, wanted);
   REQUIRE(pictures.size() == 3);
-  for (const auto& p : pictures)
-    CHECK(std::all_of(p.rgba.begin(), p.rgba.end(), [](float x) { return x == 0.0f; }));
+  for (const auto& p : pictures) CHECK(std::all_of(p.rgba.begin(), p.rgba.end(), [](float x) { return x == 0.0f; }));
   CHECK(gradients.gaussians.count == 0);
   REQUIRE(gradients.link_twists.size() == 3);
   CHECK(gradients.link_twists[0].isZero(0.0));
@@ -1017,7 +1062,8 @@ TEST_CASE("nothing to draw: no views, no Gaussians, views of size 0, everything 
   Scene gap = scene;
   gap.views[1].width = 0;
   gap.targets[1].clear();
-  const auto with_gap = engine().loss(gap.gaussians, gap.views, gap.target_pointers(), kAllTerms, 1000.0, &gradients, &pictures);
+  const auto with_gap =
+      engine().loss(gap.gaussians, gap.views, gap.target_pointers(), kAllTerms, 1000.0, &gradients, &pictures);
   const auto plain = engine().loss(scene.gaussians, scene.views, scene.target_pointers(), kAllTerms, 1000.0, nullptr);
   CHECK(with_gap.l1[0] == plain.l1[0]);
   CHECK(with_gap.l1[1] == 0.0);
@@ -1037,14 +1083,14 @@ TEST_CASE("nothing to draw: no views, no Gaussians, views of size 0, everything 
   for (ViewSpec& view : behind.views)
     for (math::Pose& motion : view.motions) motion.translation.z() -= 5.0;
   for (const bool cutoffs : {true, false}) {
-    const auto lost = engine(cutoffs).loss(behind.gaussians, behind.views, behind.target_pointers(), kAllTerms, 0.0, &gradients,
-                                           &pictures);
+    const auto lost = engine(cutoffs).loss(behind.gaussians, behind.views, behind.target_pointers(), kAllTerms, 0.0,
+                                           &gradients, &pictures);
     CHECK(lost.total == doctest::Approx(black.total).epsilon(1e-6));
-    for (const auto* kind : {&gradients.gaussians.mean, &gradients.gaussians.rotation, &gradients.gaussians.log_scale,
-                             &gradients.gaussians.opacity_logit, &gradients.gaussians.sh, &gradients.gaussians.link_logits})
+    for (const auto* kind :
+         {&gradients.gaussians.mean, &gradients.gaussians.rotation, &gradients.gaussians.log_scale,
+          &gradients.gaussians.opacity_logit, &gradients.gaussians.sh, &gradients.gaussians.link_logits})
       CHECK(std::all_of(kind->begin(), kind->end(), [](float x) { return x == 0.0f; }));
-    for (const auto& p : pictures)
-      CHECK(std::all_of(p.rgba.begin(), p.rgba.end(), [](float x) { return x == 0.0f; }));
+    for (const auto& p : pictures) CHECK(std::all_of(p.rgba.begin(), p.rgba.end(), [](float x) { return x == 0.0f; }));
   }
 
   // a step on black moves nothing

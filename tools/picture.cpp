@@ -12,7 +12,7 @@ namespace {
 constexpr int kMoments = 4;       // rows of the comparison
 constexpr int kGap = 2;           // px between two pictures
 constexpr int kWideGap = 8;       // px between two cameras
-constexpr int kSheetWidth = 1800; // px, about, of the enlarged comparison
+constexpr int kSheetWidth = 2000;  // px, about, of the enlarged comparison
 constexpr int kMostZoom = 3;
 constexpr std::uint8_t kGapLevel = 96;  // gray
 

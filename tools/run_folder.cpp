@@ -40,12 +40,12 @@ std::string covariance_csv(const chain::States& states, const std::vector<math::
   const Eigen::Index angles = covariances.front().rows();
   for (Eigen::Index row = 0; row < angles; ++row)
     for (Eigen::Index column = 0; column <= row; ++column)
-      text += ",c_" + std::to_string(row + 1) + "_" + std::to_string(column + 1);
+      text.append(",c_").append(std::to_string(row + 1)).append("_").append(std::to_string(column + 1));
   text += "\n";
   for (std::size_t k = 0; k < covariances.size(); ++k) {
     text += core::exact(states.time[k]);
     for (Eigen::Index row = 0; row < angles; ++row)
-      for (Eigen::Index column = 0; column <= row; ++column) text += "," + core::exact(covariances[k](row, column));
+      for (Eigen::Index column = 0; column <= row; ++column) text.append(",").append(core::exact(covariances[k](row, column)));
     text += "\n";
   }
   return text;

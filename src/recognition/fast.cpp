@@ -11,16 +11,16 @@ namespace chainsplat::recognition {
 namespace {
 
 // The schedule: rounds of Adam on the Gaussians, additions where the images ask, and Gauss-Newton on the angles.
-constexpr int kRounds = 5;
-constexpr int kSteps = 80;             // Adam steps a round
-constexpr int kBatch = 9;              // views a step
-constexpr int kFirstGaussians = 700;
-constexpr int kAddedARound = 250;
+constexpr int kRounds = 4;
+constexpr int kSteps = 100;             // Adam steps a round
+constexpr int kBatch = 3;              // views a step
+constexpr int kFirstGaussians = 1200;
+constexpr int kAddedARound = 150;
 constexpr int kAngleIterations = 1;    // Gauss-Newton steps a round and frame
 constexpr int kFinalIterations = 2;    // for every frame, at the end
 constexpr int kFinalSteps = 120;       // Adam steps after the last round, rates falling
 constexpr float kMaskWeight = 0.3f;    // of the mask term: without it black hides transparency (DESIGN)
-constexpr int kShRound = 3;            // from this round on colors depend on the view (SH degree 1): +0.7 dB in the object
+constexpr int kShRound = 1;            // from this round on colors depend on the view (SH degree 1): +0.7 dB in the object
 
 splat::AdamRates rates(double fraction) {
   // fraction: 0 at the start, 1 at the end of all steps; rates fall by ten

@@ -1,0 +1,82 @@
+// chainsplat/estimation.h - a rope followed live from one camera: joint angles, rates and how sure they are (SPEC 6).
+//
+// An iterated extended Kalman filter. Its motion model is the twin's own dynamics under the base's motion; what the
+// model does not know (a hand, a finger, its own errors) is a force on the rope that wanders slowly and is estimated
+// too, as a shift of the joints' rest angles. Its measurement is the silhouette fit of one mask, with the prediction as
+// the fit's prior (silhouette.h). Depth along the camera's rays is hardly seen; the dynamics supply it, and the
+// covariance says how well.
+#pragma once
+#include <optional>
+#include <string>
+
+#include "chainsplat/capture.h"
+#include "chainsplat/dynamics.h"
+#include "chainsplat/silhouette.h"
+#include "chainsplat/twin.h"
+
+namespace chainsplat::estimation {
+
+struct Options {
+  double model_force = 0.06;         // N/sqrt(s) a kilogram of rope, random walk of the unknown force without contact
+  double contact_force = 20.0;       // N/sqrt(s) a kilogram, the same while the motion does not follow the model
+  double force_memory = 0.5;         // s, in which an unknown force that nothing confirms is forgotten
+  double acceleration = 2.0;         // rad/s^2, of every angle, independent from frame to frame
+  double blind_acceleration = 30.0;  // rad/s^2, the same where the twin has no identified dynamics
+  double new_share = 0.4;            // of a silhouette's variance that is new in every frame (the rest stays)
+  silhouette::Options silhouette;    // the prior is set by the filter
+};
+
+// Gaussian belief about (theta, thetadot, shift of the rest angles): 3 n, rad and rad/s.
+struct Belief {
+  double time = 0.0;
+  math::VectorX mean;
+  math::MatrixX covariance;
+};
+
+struct Estimate {
+  int frame = 0;
+  double time = 0.0;              // s
+  math::VectorX theta, thetadot;  // rad, rad/s; n
+  math::MatrixX covariance;       // of (theta, thetadot), 2 n x 2 n
+  double iou = 0.0;               // of the chain's tube and the mask
+  double residual = 0.0;          // px, RMS of the mask's outline about the tube's, robust
+  double surprise = 0.0;          // squared innovation over its expectation; about 1 as long as the model holds
+  bool seen = false;              // the mask showed something
+  bool lost = false;              // the estimate does not explain the mask, or nothing was seen for long
+};
+
+// The filter between two frames.
+struct Filter {
+  dynamics::Model model;
+  bool identified = false;  // the twin has dynamics; else angles go on at constant rate
+  bool shifts = false;      // the unknown force is a part of the state
+  capture::Camera camera;
+  dynamics::BaseFunction base;
+  Options options;
+  std::optional<Belief> belief;  // none before the first frame
+  double base_start = 0.0;       // s, from here on the base's motion is known: the rope is thought at rest there
+  math::VectorX rest;            // rad, how the rope rests (or lies) at that time
+  double contact_until = 0.0;    // s, until then the motion is thought not to follow the model
+  double last_seen = 0.0;        // s
+  double edge_offset = 0.0, edge_offset_variance = 0.0;  // px, px^2: how much wider the masks are than the tube
+};
+
+// `base_start`: the first time that `base` is good for. Throws InputError where the twin's chain or parameters are no
+// good.
+Filter start(const twin::Twin& twin, const capture::Camera& camera, dynamics::BaseFunction base, double base_start,
+             const Options& options = {});
+
+// One frame: an undistorted crop with its mask, which may be empty. Times must increase. `view.camera` is ignored.
+Estimate update(Filter& filter, const capture::View& view);
+
+// The belief at a later time, without looking. `contact`: the unknown force may change as under a hand.
+Belief predict(const Filter& filter, const Belief& belief, double time, bool contact);
+
+// Share of pixels in both the mask and the tube about the chain among those in either.
+double tube_iou(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta, const capture::View& view,
+                const capture::Camera& camera);
+
+// The line of INTERFACE 5, without line feed. `latency`: s.
+std::string to_json(const Estimate& estimate, double latency);
+
+}  // namespace chainsplat::estimation

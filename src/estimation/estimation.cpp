@@ -1,0 +1,401 @@
+#include "chainsplat/estimation.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdlib>
+
+namespace chainsplat::estimation {
+
+using math::MatrixX;
+using math::Pose;
+using math::Vector2;
+using math::Vector3;
+using math::VectorX;
+
+namespace {
+
+constexpr double kFrame = 1.0 / 30.0;  // s, what a frame's random acceleration counts in
+
+// before the first frame: about the motion that the twin expects from rest
+constexpr double kFirstAngle = 0.15;  // rad
+constexpr double kFirstRate = 1.0;    // rad/s
+constexpr double kFirstForce = 0.3;   // N a kilogram of rope, standing (a wrong rest shape, for example)
+
+// A frame whose innovation is so many times what the model expects is met again with the force free to change, and
+// the frames of the next while too.
+static double G2(const char*k,double d){const char*e=getenv(k);return e?atof(e):d;}
+static const double kSurprise = G2("SUR",3.0);
+static const double kContactMemory = G2("CM",0.3);  // s
+
+constexpr double kLostShare = 0.5;    // of the mask explained, under which the rope is lost (SPEC 6)
+constexpr double kLongUnseen = 0.5;   // s without a mask after which the rope counts as lost
+constexpr double kLostAngle = 0.5;    // rad, and
+constexpr double kLostRate = 5.0;     // rad/s: standard deviations from which a lost rope is sought
+constexpr double kNoSmoothness = 1e-9;  // 1/rad^2: the filter's prior replaces the fit's own
+
+// of the masks' edge offset: how sure it is at first, at best, and after how many frames
+static double G(const char*k,double d){const char*e=getenv(k);return e?atof(e):d;}
+static const double kOffsetDeviation = G("OD",0.5), kLeastOffsetDeviation = G("LOD",0.1);  // px
+static const double kOffsetFrames = G("OF",30.0);
+
+constexpr double kLeastVariance = 1e-12;  // rad^2, keeps covariances invertible
+
+bool identified_shifts(const dynamics::Parameters& parameters) {
+  return parameters.integrator == dynamics::Integrator::rodas3 &&
+         std::all_of(parameters.stiffness.begin(), parameters.stiffness.end(), [](double k) { return k > 0.0; });
+}
+
+double total_mass(const dynamics::Parameters& parameters) {
+  double mass = parameters.tip_mass;
+  for (const double m : parameters.link_mass) mass += m;
+  return mass;
+}
+
+// Covariance of the rest angles' shifts for a random force of `deviation` N, alike in all directions, somewhere on the
+// rope: mean over the joints and the free end of J^T J.
+MatrixX force_covariance(const Filter& filter, const Pose& base, const VectorX& theta, double deviation) {
+  const chain::Chain& chain = filter.model.chain;
+  const int n = chain.angles();
+  const MatrixX axes = chain::world_axes(chain, theta, base);
+  const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, base));
+  MatrixX sum = MatrixX::Zero(n, n);
+  for (int link = 1; link < chain.links(); ++link) {
+    const MatrixX jacobian = chain::point_jacobian(chain, axes, link, nodes.col(link + 1));
+    sum.noalias() += jacobian.transpose() * jacobian;
+  }
+  sum *= deviation * deviation / (chain.links() - 1);
+  for (int k = 0; k < n; ++k) {
+    sum.row(k) /= filter.model.parameters.stiffness[k];
+    sum.col(k) /= filter.model.parameters.stiffness[k];
+  }
+  return sum;
+}
+
+void symmetrize(MatrixX& matrix) { matrix = (0.5 * (matrix + matrix.transpose())).eval(); }
+
+// The mean of a belief moved in time, and the derivative of that with respect to it (empty where it is constant rate).
+struct Motion {
+  VectorX theta, thetadot;
+  MatrixX theta_by_state, thetadot_by_state;  // n x 3 n
+};
+
+Motion move(const Filter& filter, const Belief& belief, double time) {
+  const int n = filter.model.chain.angles();
+  const double h = time - belief.time;
+  Motion out;
+  if (filter.identified) {
+    dynamics::Model model = filter.model;
+    for (int k = 0; k < n; ++k) model.parameters.rest_angle[k] += belief.mean[2 * n + k];
+    std::vector<dynamics::Tangent> unknowns(filter.shifts ? 3 * n : 2 * n);
+    for (int k = 0; k < n; ++k) {
+      unknowns[k].theta = VectorX::Unit(n, k);
+      unknowns[n + k].thetadot = VectorX::Unit(n, k);
+      if (!filter.shifts) continue;
+      unknowns[2 * n + k].rest_angle.assign(n, 0.0);
+      unknowns[2 * n + k].rest_angle[k] = 1.0;
+    }
+    const dynamics::BaseGrid grid =
+        dynamics::sample_base(filter.base, belief.time, {time}, model.parameters.substeps);
+    chain::States states;
+    dynamics::Sensitivities sensitivities;
+    if (dynamics::simulate(model, grid, belief.mean.head(n), belief.mean.segment(n, n), states, unknowns,
+                           &sensitivities)) {
+      out.theta = states.theta.back();
+      out.thetadot = states.thetadot.back();
+      out.theta_by_state = MatrixX::Zero(n, 3 * n);
+      out.thetadot_by_state = MatrixX::Zero(n, 3 * n);
+      out.theta_by_state.leftCols(unknowns.size()) = sensitivities.theta.back();
+      out.thetadot_by_state.leftCols(unknowns.size()) = sensitivities.thetadot.back();
+      return out;
+    }
+  }
+  out.theta = belief.mean.head(n) + h * belief.mean.segment(n, n);
+  out.thetadot = belief.mean.segment(n, n);
+  out.theta_by_state = MatrixX::Zero(n, 3 * n);
+  out.theta_by_state.leftCols(n).setIdentity();
+  out.theta_by_state.middleCols(n, n) = h * MatrixX::Identity(n, n);
+  out.thetadot_by_state = MatrixX::Zero(n, 3 * n);
+  out.thetadot_by_state.middleCols(n, n).setIdentity();
+  return out;
+}
+
+// What is believed before the first frame: the motion from rest that the twin expects, roughly.
+Belief first_belief(const Filter& filter, double time) {
+  const int n = filter.model.chain.angles();
+  Belief belief;
+  belief.time = time;
+  belief.mean = VectorX::Zero(3 * n);
+  belief.mean.head(n) = filter.rest;
+  if (filter.identified && filter.base_start < time) {
+    const dynamics::BaseGrid grid =
+        dynamics::sample_base(filter.base, filter.base_start, {time}, filter.model.parameters.substeps);
+    chain::States states;
+    if (dynamics::simulate(filter.model, grid, filter.rest, VectorX::Zero(n), states)) {
+      belief.mean.head(n) = states.theta.back();
+      belief.mean.segment(n, n) = states.thetadot.back();
+    }
+  }
+  belief.covariance = MatrixX::Zero(3 * n, 3 * n);
+  belief.covariance.diagonal().head(n).setConstant(kFirstAngle * kFirstAngle);
+  belief.covariance.diagonal().segment(n, n).setConstant(kFirstRate * kFirstRate);
+  if (filter.shifts)
+    belief.covariance.bottomRightCorner(n, n) =
+        force_covariance(filter, filter.base(time).pose, belief.mean.head(n),
+                         kFirstForce * total_mass(filter.model.parameters));
+  belief.covariance.diagonal().array() += kLeastVariance;
+  return belief;
+}
+
+struct Measured {
+  silhouette::FrameFit fit;
+  Belief belief;          // with what was seen
+  double surprise = 0.0;  // squared innovation over its expectation
+};
+
+// The view brought to `predicted`. The fit's variance is partly old news: the prior is tightened in proportion, which
+// gives the same angles as weakening the data, and the covariance is widened again.
+Measured measure(const Filter& filter, const Belief& predicted, const capture::View& view, bool warm) {
+  const int n = filter.model.chain.angles();
+  const double share = filter.options.new_share;
+  const MatrixX prior = predicted.covariance.topLeftCorner(n, n);
+  const MatrixX information = prior.llt().solve(MatrixX::Identity(n, n));
+  silhouette::Options options = filter.options.silhouette;
+  options.joint_smoothness = kNoSmoothness;
+  options.prior.mean = predicted.mean.head(n);
+  options.prior.information = information / share;
+  options.edge_offset = filter.edge_offset;
+  options.edge_offset_deviation = std::sqrt(filter.edge_offset_variance);
+  capture::View alone = view;
+  alone.camera = 0;
+  const capture::View* const views[] = {&alone};
+
+  Measured out;
+  out.fit = silhouette::fit_frame(filter.model.chain, filter.base(view.time).pose, views, {filter.camera},
+                                  predicted.mean.head(n), warm, options);
+  MatrixX posterior = out.fit.covariance / share;
+  symmetrize(posterior);
+  const VectorX change = out.fit.theta - predicted.mean.head(n);
+  const double expected = n - (information * posterior).trace();
+  out.surprise = change.dot(information * change) / std::max(1.0, expected);
+
+  // rates and shifts follow by what ties them to the angles
+  const MatrixX gain = predicted.covariance.leftCols(n) * information;  // 3 n x n, identity on top
+  out.belief.time = view.time;
+  out.belief.mean = predicted.mean + gain * change;
+  out.belief.mean.head(n) = out.fit.theta;
+  out.belief.covariance = predicted.covariance - gain * (prior - posterior) * gain.transpose();
+  symmetrize(out.belief.covariance);
+  out.belief.covariance.diagonal().array() += kLeastVariance;
+  return out;
+}
+
+bool has_mask(const capture::View& view) {
+  for (std::size_t i = 3; i < view.rgba.size(); i += 4)
+    if (view.rgba[i] >= 128) return true;
+  return false;
+}
+
+bool explains(const silhouette::FrameFit& fit) { return fit.covered >= kLostShare && fit.theta.allFinite(); }
+
+}  // namespace
+
+Filter start(const twin::Twin& twin, const capture::Camera& camera, dynamics::BaseFunction base, double base_start,
+             const Options& options) {
+  Filter filter;
+  filter.identified = twin.parameters.has_value();
+  if (filter.identified) {
+    filter.model = dynamics::make_model(twin.chain, *twin.parameters);
+    filter.shifts = identified_shifts(*twin.parameters);
+    // the variational equation needs it
+    filter.model.parameters.integrator = dynamics::Integrator::rodas3;
+  } else {
+    filter.model.chain = twin.chain;
+  }
+  filter.camera = camera;
+  filter.base = std::move(base);
+  filter.base_start = base_start;
+  filter.options = options;
+  filter.edge_offset_variance = kOffsetDeviation * kOffsetDeviation;
+  if (twin.tabletop || !filter.identified) {
+    filter.rest = twin.initial                 ? twin.initial->theta
+                  : twin.states.theta.empty() ? VectorX::Zero(twin.chain.angles())
+                                              : twin.states.theta.front();
+  } else {
+    filter.rest = dynamics::static_equilibrium(filter.model, filter.base(base_start).pose);
+  }
+  return filter;
+}
+
+Belief predict(const Filter& filter, const Belief& belief, double time, bool contact) {
+  const int n = filter.model.chain.angles();
+  const double h = time - belief.time;
+  CHAINSPLAT_CHECK(h > 0.0, std::to_string(h));
+  const Motion motion = move(filter, belief, time);
+  const double keep = std::exp(-h / filter.options.force_memory);
+
+  MatrixX transition = MatrixX::Zero(3 * n, 3 * n);
+  transition.topRows(n) = motion.theta_by_state;
+  transition.middleRows(n, n) = motion.thetadot_by_state;
+  transition.bottomRightCorner(n, n) = keep * MatrixX::Identity(n, n);
+  Belief out;
+  out.time = time;
+  out.mean.resize(3 * n);
+  out.mean << motion.theta, motion.thetadot, keep * belief.mean.tail(n);
+  out.covariance = transition * belief.covariance * transition.transpose();
+  if (filter.shifts) {
+    const double force = (contact ? filter.options.contact_force : filter.options.model_force) *
+                         total_mass(filter.model.parameters) * std::sqrt(h);
+    const MatrixX shift = force_covariance(filter, filter.base(time).pose, motion.theta, force);
+    // the force changes during the step: a third of the change acts all along in the mean square
+    MatrixX noise = transition.rightCols(n);
+    noise.topRows(2 * n) *= std::sqrt(1.0 / 3.0);
+    noise.bottomRows(n).setIdentity();
+    out.covariance += noise * shift * noise.transpose();
+  }
+  // an acceleration that is new every frame
+  const double a = filter.identified ? filter.options.acceleration : filter.options.blind_acceleration;
+  const double rate = a * a * h * kFrame;
+  for (int k = 0; k < n; ++k) {
+    out.covariance(k, k) += rate * h * h / 3.0;
+    out.covariance(k, n + k) += rate * h / 2.0;
+    out.covariance(n + k, k) += rate * h / 2.0;
+    out.covariance(n + k, n + k) += rate;
+  }
+  symmetrize(out.covariance);
+  out.covariance.diagonal().array() += kLeastVariance;
+  return out;
+}
+
+Estimate update(Filter& filter, const capture::View& view) {
+  const int n = filter.model.chain.angles();
+  const bool first = !filter.belief;
+  const auto believed = [&](bool contact) {
+    return first ? first_belief(filter, view.time) : predict(filter, *filter.belief, view.time, contact);
+  };
+  const bool in_contact = view.time <= filter.contact_until;
+  Belief predicted = believed(in_contact);
+  if (first) filter.last_seen = view.time;
+
+  Estimate out;
+  out.frame = view.frame;
+  out.time = view.time;
+  out.seen = has_mask(view);
+  if (out.seen) {
+    Measured measured = measure(filter, predicted, view, !first);
+    if (!first && (measured.surprise > kSurprise || !explains(measured.fit))) {
+      filter.contact_until = view.time + kContactMemory;
+      if (!in_contact) {
+        predicted = believed(true);
+        measured = measure(filter, predicted, view, true);
+      }
+    }
+    if (!explains(measured.fit)) {  // sought again from afar
+      Belief wide = first_belief(filter, view.time);
+      wide.covariance.diagonal().head(n).array() += kLostAngle * kLostAngle;
+      wide.covariance.diagonal().segment(n, n).array() += kLostRate * kLostRate;
+      const Measured again = measure(filter, wide, view, false);
+      if (explains(again.fit)) measured = again;
+    }
+    out.lost = !explains(measured.fit);
+    out.residual = measured.fit.residual_pixels;
+    out.surprise = measured.surprise;
+    if (!out.lost) {
+      filter.last_seen = view.time;
+      filter.belief = measured.belief;
+      const double gain = 1.0 / kOffsetFrames;
+      filter.edge_offset += gain * (measured.fit.edge_offset - filter.edge_offset);
+      filter.edge_offset_variance =
+          std::max(kLeastOffsetDeviation * kLeastOffsetDeviation, filter.edge_offset_variance * (1.0 - gain));
+    }
+  }
+  if (!out.seen || out.lost) {
+    filter.belief = predicted;
+    out.lost = out.lost || view.time - filter.last_seen > kLongUnseen;
+  }
+  out.theta = filter.belief->mean.head(n);
+  out.thetadot = filter.belief->mean.segment(n, n);
+  out.covariance = filter.belief->covariance.topLeftCorner(2 * n, 2 * n);
+  out.iou = tube_iou(filter.model.chain, filter.base(view.time).pose, out.theta, view, filter.camera);
+  return out;
+}
+
+double tube_iou(const chain::Chain& chain, const Pose& base, const VectorX& theta, const capture::View& view,
+                const capture::Camera& camera) {
+  constexpr double kNear = 0.01;  // m, SPEC 2.5
+  const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, base));
+  const Pose camera_from_world = camera.world_from_camera.inverse();
+  const double focal = 0.5 * (camera.fx + camera.fy);
+  struct Point {
+    Vector2 pixel;
+    double radius;  // px
+  };
+  std::vector<Point> points;
+  double x0 = view.x0, y0 = view.y0, x1 = view.x0 + view.width, y1 = view.y0 + view.height;
+  for (int i = 0; i < nodes.cols(); ++i) {
+    const Vector3 x = camera_from_world * Vector3(nodes.col(i));
+    if (x.z() < kNear) return 0.0;
+    points.push_back({capture::project(camera, x), 0.5 * chain.diameter * focal / x.z()});
+    x0 = std::min(x0, points.back().pixel.x() - points.back().radius);
+    y0 = std::min(y0, points.back().pixel.y() - points.back().radius);
+    x1 = std::max(x1, points.back().pixel.x() + points.back().radius);
+    y1 = std::max(y1, points.back().pixel.y() + points.back().radius);
+  }
+  const int left = std::max(0, static_cast<int>(std::floor(x0))), top = std::max(0, static_cast<int>(std::floor(y0)));
+  const int right = std::min(camera.width, static_cast<int>(std::ceil(x1)));
+  const int bottom = std::min(camera.height, static_cast<int>(std::ceil(y1)));
+  if (right <= left || bottom <= top) return 0.0;
+  const int width = right - left, height = bottom - top;
+  std::vector<char> tube(static_cast<std::size_t>(width) * height, 0);
+  for (std::size_t i = 0; i + 1 < points.size(); ++i) {
+    const Point &a = points[i], &b = points[i + 1];
+    const Vector2 step = b.pixel - a.pixel;
+    const double length2 = step.squaredNorm();
+    if (length2 <= 0.0) continue;
+    const bool last = i + 2 == points.size();  // the free end is flat
+    const double reach = std::max(a.radius, b.radius);
+    const int ax = std::max(left, static_cast<int>(std::min(a.pixel.x(), b.pixel.x()) - reach));
+    const int bx = std::min(right - 1, static_cast<int>(std::max(a.pixel.x(), b.pixel.x()) + reach));
+    const int ay = std::max(top, static_cast<int>(std::min(a.pixel.y(), b.pixel.y()) - reach));
+    const int by = std::min(bottom - 1, static_cast<int>(std::max(a.pixel.y(), b.pixel.y()) + reach));
+    for (int y = ay; y <= by; ++y)
+      for (int x = ax; x <= bx; ++x) {
+        const Vector2 p(x + 0.5, y + 0.5);
+        double t = (p - a.pixel).dot(step) / length2;
+        if ((last && t > 1.0) || (i == 0 && t < 0.0)) continue;
+        t = std::clamp(t, 0.0, 1.0);
+        const double radius = a.radius + t * (b.radius - a.radius);
+        if ((p - a.pixel - t * step).squaredNorm() <= radius * radius)
+          tube[static_cast<std::size_t>(y - top) * width + x - left] = 1;
+      }
+  }
+  long both = 0, either = 0;
+  for (int y = top; y < bottom; ++y)
+    for (int x = left; x < right; ++x) {
+      const int u = x - view.x0, v = y - view.y0;
+      const bool in_mask = u >= 0 && v >= 0 && u < view.width && v < view.height &&
+                           view.rgba[4 * (static_cast<std::size_t>(v) * view.width + u) + 3] >= 128;
+      const bool in_tube = tube[static_cast<std::size_t>(y - top) * width + x - left] != 0;
+      both += in_mask && in_tube;
+      either += in_mask || in_tube;
+    }
+  return either > 0 ? static_cast<double>(both) / either : 0.0;
+}
+
+std::string to_json(const Estimate& estimate, double latency) {
+  const auto list = [](const VectorX& values) {
+    std::string text = "[";
+    for (Eigen::Index k = 0; k < values.size(); ++k) text += (k ? "," : "") + core::exact(values[k]);
+    return text + "]";
+  };
+  const int n = static_cast<int>(estimate.theta.size());
+  char milliseconds[32];
+  std::snprintf(milliseconds, sizeof milliseconds, "%.3f", 1e3 * latency);
+  return "{\"frame\":" + std::to_string(estimate.frame) + ",\"time\":" + core::exact(estimate.time) +
+         ",\"theta\":" + list(estimate.theta) + ",\"thetadot\":" + list(estimate.thetadot) +
+         ",\"sigma\":" + list(estimate.covariance.diagonal().head(n).cwiseSqrt()) +
+         ",\"iou\":" + core::exact(estimate.iou) + ",\"residual\":" + core::exact(estimate.residual) +
+         ",\"lost\":" + (estimate.lost ? "true" : "false") + ",\"latency_ms\":" + milliseconds + "}";
+}
+
+}  // namespace chainsplat::estimation
