@@ -14,7 +14,7 @@ layout(std430, binding = 4) writeonly buffer Sorted { uvec2 sorted[]; };  // spl
 layout(std430, binding = 5) buffer Counters { uint counters[]; };
 
 // lavapipe ends all loops of an invocation after 65535 iterations in sum: fewer, longer ones
-const uint kUnrolled = 8u;
+const uint kUnrolled = 16u;
 
 shared uvec2 key[kRankLimit];
 

@@ -65,11 +65,13 @@ int run(int argc, char** argv) {
   tools::add_inspection_commands(app, globals, job);
   for (CLI::App* command : app.get_subcommands({})) {
     command->get_formatter()->column_width(34);
-    command->footer("Global options (--device, --threads, --seed, -q, -v, --log, --no-progress, --json): chainsplat --help");
+    command->footer(
+        "Global options (--device, --threads, --seed, -q, -v, --log, --no-progress, --json): chainsplat --help");
   }
   app.footer(
       "Lengths in meters, angles in radians, time in seconds, mass in kilograms, forces in newtons.\n"
-      "Exit codes: 0 done; 1 the work failed, what exists is kept; 2 the request or its input is wrong, nothing written;\n"
+      "Exit codes: 0 done; 1 the work failed, what exists is kept; 2 the request or its input is wrong, nothing "
+      "written;\n"
       "130, 143 interrupted, a checkpoint was left (SIGUSR1: the same and 0).");
   try {
     app.parse(argc, argv);
@@ -109,6 +111,7 @@ int main(int argc, char** argv) {
   } catch (const std::bad_alloc&) {
     return fail(kWorkFailed, "memory: there is not enough of it; use fewer --frames or a machine with more");
   } catch (const std::exception& error) {
-    return fail(kWorkFailed, std::string("internal: ") + error.what() + "; this is a defect, please report the command");
+    return fail(kWorkFailed,
+                std::string("internal: ") + error.what() + "; this is a defect, please report the command");
   }
 }

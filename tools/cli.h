@@ -14,33 +14,33 @@ namespace chainsplat::tools {
 
 // Options that stand before or after any command.
 struct Globals {
-  std::string device;      // number or part of a name; empty: chosen
-  int threads = 0;         // 0: all cores
+  std::string device;  // number or part of a name; empty: chosen
+  int threads = 0;     // 0: all cores
   std::uint64_t seed = 0;
   bool quiet = false, verbose = false, no_progress = false, json = false;
-  std::string log;         // file for one JSON record an interval
+  std::string log;  // file for one JSON record an interval
 };
 
 using Job = std::function<void()>;
 
 // Each adds its commands to `app`; the one that was named sets `job`.
-void add_training_commands(CLI::App& app, const Globals& globals, Job& job);  // train, recognize, identify
-void add_motion_commands(CLI::App& app, const Globals& globals, Job& job);    // rollout, render
-void add_result_commands(CLI::App& app, const Globals& globals, Job& job);    // eval, export, synth
+void add_training_commands(CLI::App& app, const Globals& globals, Job& job);    // train, recognize, identify
+void add_motion_commands(CLI::App& app, const Globals& globals, Job& job);      // rollout, render
+void add_result_commands(CLI::App& app, const Globals& globals, Job& job);      // eval, export, synth
 void add_inspection_commands(CLI::App& app, const Globals& globals, Job& job);  // check, doctor
 
-// --- progress.cpp ------------------------------------------------------------------------------------------------------
+// --- progress.cpp --------------------------------------------------------------------------------
 // Warnings and progress go to standard error from now on: a redrawn line on a terminal, else a plain line every 5 s.
 void start_listening(const Globals& globals);
 // One JSON record an interval is added to `file` from now on. Throws InputError when it cannot be opened.
 void log_to(const Path& file);
-void end_progress();                      // leaves the redrawn line
-void say(const std::string& line);        // a message on standard error, unless -q
-void say_more(const std::string& line);   // only with -v
+void end_progress();                     // leaves the redrawn line
+void say(const std::string& line);       // a message on standard error, unless -q
+void say_more(const std::string& line);  // only with -v
 // SIGINT, SIGTERM and SIGUSR1 ask long work to stop; a second SIGINT quits at once.
 void watch_signals();
 
-// --- results.cpp -------------------------------------------------------------------------------------------------------
+// --- results.cpp --------------------------------------------------------------------------------
 // "-" is standard input.
 Path input_path(const std::string& name);
 // Writes `bytes` to standard output ("-"), into a device or pipe that exists, else as a file in one step.
@@ -51,7 +51,8 @@ void check_output_folder(const Path& folder, bool overwrite, const std::string& 
 void check_output_file(const std::string& file);
 // Makes a folder and those above it. Throws WorkError.
 void make_folder(const Path& folder);
-// CAPTURE[:camera] as the two; the second is empty for all cameras. A folder whose own name has a colon is taken as it is.
+// CAPTURE[:camera] as the two; the second is empty for all cameras. A folder whose own name has a colon is taken as it
+// is.
 std::pair<std::string, std::string> split_camera(const std::string& text);
 // "A:B", "A:" or ":B" as [first, last); last = -1: to the end. Throws InputError.
 std::pair<int, int> parse_frames(const std::string& text);

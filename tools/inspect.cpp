@@ -33,7 +33,8 @@ void check(const Globals& globals, const std::string& path) {
   }
   if (report.problems.empty()) return;
   std::cout.flush();
-  throw InputError(path, std::to_string(report.problems.size()) + (report.problems.size() == 1 ? " problem" : " problems"),
+  throw InputError(path,
+                   std::to_string(report.problems.size()) + (report.problems.size() == 1 ? " problem" : " problems"),
                    "mend what is listed as a problem");
 }
 
@@ -80,7 +81,8 @@ void add_inspection_commands(CLI::App& app, const Globals& globals, Job& job) {
   checker->add_option("CAPTURE", *path, "The capture's folder or its capture.json")->required();
   checker->callback([&globals, &job, path] { job = [&globals, path] { check(globals, *path); }; });
 
-  CLI::App* examiner = app.add_subcommand("doctor", "List the Vulkan devices, which is chosen and why, what is missing");
+  CLI::App* examiner =
+      app.add_subcommand("doctor", "List the Vulkan devices, which is chosen and why, what is missing");
   examiner->callback([&globals, &job] { job = [&globals] { doctor(globals); }; });
 }
 

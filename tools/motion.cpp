@@ -39,7 +39,8 @@ dynamics::InitialState start_of(const RolloutRequest& request, const twin::Twin&
     const chain::States given = twin::read_states(input_path(request.initial), angles);
     if (given.time.empty()) throw InputError(request.initial, "has no rows", "give at least one");
     // the states of the twin's own motion keep their time
-    if (request.base.empty() && given.time[0] >= base.start() && given.time[0] < base.end()) initial.time = given.time[0];
+    if (request.base.empty() && given.time[0] >= base.start() && given.time[0] < base.end())
+      initial.time = given.time[0];
     initial.theta = given.theta[0];
     if (!given.thetadot.empty())
       initial.thetadot = given.thetadot[0];
@@ -47,7 +48,8 @@ dynamics::InitialState start_of(const RolloutRequest& request, const twin::Twin&
       core::warn(request.initial + ": no thetadot columns; the rope is assumed to start at rest");
   } else if (request.base.empty()) {
     if (!twin.initial)
-      throw InputError(request.run + "/twin.json", "has no initial state", "run 'chainsplat identify' or give --initial");
+      throw InputError(request.run + "/twin.json", "has no initial state",
+                       "run 'chainsplat identify' or give --initial");
     initial = *twin.initial;
   } else if (twin.tabletop) {
     initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
@@ -78,7 +80,7 @@ void rollout(const Globals& globals, const RolloutRequest& request) {
   write_result(request.out, twin::states_csv(states));
   if (!request.centerline.empty()) write_result(request.centerline, twin::centerline_csv(twin.chain, states, base));
   if (!globals.json) {
-    say(std::to_string(states.time.size()) + " rows: " + request.out);
+    say(std::to_string(states.time.size()) + " rows" + (request.out == "-" ? "" : ": " + request.out));
     return;
   }
   Json document;
@@ -129,7 +131,8 @@ void render(const Globals& globals, const RenderRequest& request) {
   if (video) {
     check_output_file(request.out);
     if (request.mask || request.depth)
-      throw InputError("--mask, --depth", "go with a folder of frames, not with a video", "let -o end in another way than .mp4");
+      throw InputError("--mask, --depth", "go with a folder of frames, not with a video",
+                       "let -o end in another way than .mp4");
   }
   const twin::Twin twin = load_twin(request.run);
   const chain::States states =
@@ -177,8 +180,8 @@ void render(const Globals& globals, const RenderRequest& request) {
         if (request.depth)
           capture::write_depth_exr(stem / frame_name(frame.frame, ".depth.exr"), camera.width, camera.height,
                                    whole_depth(frame, camera));
-        core::report({"write " + camera.name, static_cast<std::int64_t>(f + 1), static_cast<std::int64_t>(frames.size()), NAN,
-                      NAN, ""});
+        core::report({"write " + camera.name, static_cast<std::int64_t>(f + 1),
+                      static_cast<std::int64_t>(frames.size()), NAN, NAN, ""});
       }
     }
     total += frames.size();
@@ -196,28 +199,36 @@ void add_motion_commands(CLI::App& app, const Globals& globals, Job& job) {
   CLI::App* roller = app.add_subcommand("rollout", "Set the twin in motion under a base trajectory");
   auto request = std::make_shared<RolloutRequest>();
   roller->add_option("RUN", request->run, "Run folder of an identified twin")->required();
-  roller->add_option("--base", request->base, "Base motion, 'timestamp tx ty tz qx qy qz qw' a line (default: the capture's own)")
+  roller
+      ->add_option("--base", request->base,
+                   "Base motion, 'timestamp tx ty tz qx qy qz qw' a line (default: the capture's own)")
       ->type_name("FILE.tum");
-  roller->add_option("-o,--output", request->out, "States to write; - is standard output")->required()->type_name("STATES.csv");
+  roller->add_option("-o,--output", request->out, "States to write; - is standard output")
+      ->required()
+      ->type_name("STATES.csv");
   roller->add_option("--rate", request->rate, "Rows a second (default 30)")->type_name("HZ");
-  roller->add_option("--centerline", request->centerline, "Also write the world points of the grasp, joints and free end")
+  roller
+      ->add_option("--centerline", request->centerline, "Also write the world points of the grasp, joints and free end")
       ->type_name("FILE.csv");
-  roller->add_option("--initial", request->initial,
-                     "Start from its first row (default: the identified state; with --base at rest)")
+  roller
+      ->add_option("--initial", request->initial,
+                   "Start from its first row (default: the identified state; with --base at rest)")
       ->type_name("STATES.csv");
   roller->callback([&globals, &job, request] { job = [&globals, request] { rollout(globals, *request); }; });
 
   CLI::App* renderer = app.add_subcommand("render", "Draw the twin through the cameras of a capture");
   auto drawing = std::make_shared<RenderRequest>();
   renderer->add_option("RUN", drawing->run, "Run folder of a twin")->required();
-  renderer->add_option("--states", drawing->states, "Motion to draw (default: the recognized states)")->type_name("STATES.csv");
+  renderer->add_option("--states", drawing->states, "Motion to draw (default: the recognized states)")
+      ->type_name("STATES.csv");
   renderer->add_option("--camera", drawing->camera, "Whose cameras; with :NAME only that one")
       ->required()
       ->type_name("CAPTURE[:NAME]");
   renderer->add_option("-o,--output", drawing->out, "Folder for CAMERA/000000.png ..., or a video that ends in .mp4")
       ->required()
       ->type_name("OUT");
-  renderer->add_option("--base", drawing->base, "Base motion (default: that of --camera's capture)")->type_name("FILE.tum");
+  renderer->add_option("--base", drawing->base, "Base motion (default: that of --camera's capture)")
+      ->type_name("FILE.tum");
   renderer->add_flag("--mask", drawing->mask, "Also 000000.mask.png: 255 where the rope covers half or more");
   renderer->add_flag("--depth", drawing->depth, "Also 000000.depth.exr: meters along the optical axis, 0 = none");
   renderer->add_flag("--undistorted", drawing->undistorted, "Leave the lens distortion out");

@@ -9,9 +9,9 @@ using capture::Image8;
 
 namespace {
 
-constexpr int kMoments = 4;       // rows of the comparison
-constexpr int kGap = 2;           // px between two pictures
-constexpr int kWideGap = 8;       // px between two cameras
+constexpr int kMoments = 4;        // rows of the comparison
+constexpr int kGap = 2;            // px between two pictures
+constexpr int kWideGap = 8;        // px between two cameras
 constexpr int kSheetWidth = 2000;  // px, about, of the enlarged comparison
 constexpr int kMostZoom = 3;
 constexpr std::uint8_t kGapLevel = 96;  // gray
@@ -28,7 +28,8 @@ std::uint8_t level(float value) {
 
 // Copies the part of an RGB picture at (x0, y0) of its image that lies in `bounds` to (left, top) of `sheet`.
 template <class Pixel>  // Pixel(index, channel) -> level
-void paste(int x0, int y0, int width, int height, const Pixel& pixel, const Bounds& bounds, int left, int top, Image8& sheet) {
+void paste(int x0, int y0, int width, int height, const Pixel& pixel, const Bounds& bounds, int left, int top,
+           Image8& sheet) {
   for (int y = std::max(y0, bounds.y0); y < std::min(y0 + height, bounds.y1); ++y)
     for (int x = std::max(x0, bounds.x0); x < std::min(x0 + width, bounds.x1); ++x)
       for (int c = 0; c < 3; ++c)
@@ -37,19 +38,21 @@ void paste(int x0, int y0, int width, int height, const Pixel& pixel, const Boun
 }
 
 void paste(const capture::View& view, const Bounds& bounds, int left, int top, Image8& sheet) {
-  paste(view.x0, view.y0, view.width, view.height, [&](std::size_t i, int c) { return view.rgba[4 * i + c]; }, bounds, left,
-        top, sheet);
+  paste(
+      view.x0, view.y0, view.width, view.height, [&](std::size_t i, int c) { return view.rgba[4 * i + c]; }, bounds,
+      left, top, sheet);
 }
 
 void paste(const render::Frame& frame, const Bounds& bounds, int left, int top, Image8& sheet) {
-  paste(frame.x0, frame.y0, frame.picture.width, frame.picture.height,
-        [&](std::size_t i, int c) { return level(frame.picture.rgba[4 * i + c]); }, bounds, left, top, sheet);
+  paste(
+      frame.x0, frame.y0, frame.picture.width, frame.picture.height,
+      [&](std::size_t i, int c) { return level(frame.picture.rgba[4 * i + c]); }, bounds, left, top, sheet);
 }
 
 void blacken(int left, int top, const Bounds& bounds, Image8& sheet) {
   for (int y = 0; y < bounds.height(); ++y)
-    std::fill_n(sheet.pixels.begin() + 3 * (static_cast<std::ptrdiff_t>(top + y) * sheet.width + left), 3 * bounds.width(),
-                std::uint8_t{0});
+    std::fill_n(sheet.pixels.begin() + 3 * (static_cast<std::ptrdiff_t>(top + y) * sheet.width + left),
+                3 * bounds.width(), std::uint8_t{0});
 }
 
 Image8 enlarged(const Image8& image, int zoom) {
@@ -57,7 +60,8 @@ Image8 enlarged(const Image8& image, int zoom) {
   out.pixels.reserve(image.pixels.size() * zoom * zoom);
   for (int y = 0; y < out.height; ++y)
     for (int x = 0; x < out.width; ++x) {
-      const auto from = image.pixels.begin() + image.channels * (static_cast<std::ptrdiff_t>(y / zoom) * image.width + x / zoom);
+      const auto from =
+          image.pixels.begin() + image.channels * (static_cast<std::ptrdiff_t>(y / zoom) * image.width + x / zoom);
       out.pixels.insert(out.pixels.end(), from, from + image.channels);
     }
   return out;
@@ -105,7 +109,8 @@ Image8 comparison(splat::Engine& engine, const twin::Twin& twin, const capture::
     rows = std::max(rows, column.views.size());
     columns.push_back(std::move(column));
   }
-  if (columns.empty()) throw InputError(recorded.folder.string(), "no frame of it has the rope in it", "name another capture");
+  if (columns.empty())
+    throw InputError(recorded.folder.string(), "no frame of it has the rope in it", "name another capture");
 
   Image8 sheet;
   sheet.channels = 3;

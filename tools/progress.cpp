@@ -26,11 +26,11 @@ constexpr int kDefaultColumns = 80;
 // All of the program's one terminal. core calls the listener under a lock; messages come from the main thread.
 struct Screen {
   bool quiet = false, verbose = false, progress = true, terminal = false, bold = false;
-  bool line_open = false;        // a redrawn line stands on the terminal
-  double origin = 0.0;           // s, start of the program
+  bool line_open = false;  // a redrawn line stands on the terminal
+  double origin = 0.0;     // s, start of the program
   std::string stage;
   double stage_start = 0.0, last_shown = 0.0, last_logged = 0.0;
-  std::int64_t first_step = 0;   // of this stage in this process: a resumed one does not begin at 0
+  std::int64_t first_step = 0;  // of this stage in this process: a resumed one does not begin at 0
   std::vector<std::ofstream> logs;
 };
 Screen screen;
@@ -64,7 +64,10 @@ std::string progress_line(const core::Progress& progress, double now, bool with_
     line.append(" [").append(cells, '#').append(kBarCells - cells, '-').append("]");
   }
   if (progress.total > 0)
-    line.append(" ").append(std::to_string(progress.step)).append("/").append(std::to_string(progress.total))
+    line.append(" ")
+        .append(std::to_string(progress.step))
+        .append("/")
+        .append(std::to_string(progress.total))
         .append(number(" %3.0f%%", 100 * share));
   const double elapsed = now - screen.stage_start;
   const double rate = elapsed > 0 ? double(progress.step - screen.first_step) / elapsed : 0.0;
@@ -85,7 +88,8 @@ void clear_line() {
 
 void show(const core::Progress& progress, double now, bool last) {
   if (!screen.progress) return;
-  if (now - screen.last_shown < (screen.terminal ? kRedrawSeconds : kPlainSeconds) && !(last && screen.terminal)) return;
+  if (now - screen.last_shown < (screen.terminal ? kRedrawSeconds : kPlainSeconds) && !(last && screen.terminal))
+    return;
   screen.last_shown = now;
   std::string line = progress_line(progress, now, screen.terminal);
   if (!screen.terminal) {
@@ -155,7 +159,8 @@ void start_listening(const Globals& globals) {
 
 void log_to(const Path& file) {
   std::ofstream stream(file, std::ios::app);
-  if (!stream) throw InputError(file.string(), "the log cannot be opened for writing", "name a file that can be written");
+  if (!stream)
+    throw InputError(file.string(), "the log cannot be opened for writing", "name a file that can be written");
   screen.logs.push_back(std::move(stream));
 }
 

@@ -129,9 +129,10 @@ void synthesize(const Globals& globals, const SynthRequest& request) {
   load.camera = camera;
   capture::Capture scene = capture::load(folder, load);
   if (!request.base.empty()) scene.base = read_base(request.base);
-  const chain::States states = !request.states.empty()      ? twin::read_states(input_path(request.states), twin.chain.angles())
+  const chain::States states = !request.states.empty()
+                                   ? twin::read_states(input_path(request.states), twin.chain.angles())
                                : twin.rollout.time.empty() ? twin.states
-                                                            : twin.rollout;
+                                                           : twin.rollout;
   const gpu::DevicePtr device = gpu::open_device({.selector = globals.device});
   splat::Engine engine(*device);
   synth::Options options;
@@ -151,9 +152,11 @@ void add_result_commands(CLI::App& app, const Globals& globals, Job& job) {
   CLI::App* evaluator = app.add_subcommand("eval", "Measure how well a twin explains a capture");
   auto request = std::make_shared<EvalRequest>();
   evaluator->add_option("RUN", request->run, "Run folder of a twin")->required();
-  evaluator->add_option("CAPTURE", request->capture, "Its own capture, or another one of the same rope (rollout only)")->required();
+  evaluator->add_option("CAPTURE", request->capture, "Its own capture, or another one of the same rope (rollout only)")
+      ->required();
   evaluator->add_option("-o,--output", request->out, "Also write the metrics as JSON")->type_name("FILE.json");
-  evaluator->add_option("--frames", request->frames, "Only these frames: from A up to, not including, B")->type_name("A:B");
+  evaluator->add_option("--frames", request->frames, "Only these frames: from A up to, not including, B")
+      ->type_name("A:B");
   evaluator->add_option("--picture", request->picture, "Also make a picture: observed beside rendered frames")
       ->type_name("FILE.png");
   evaluator->callback([&globals, &job, request] { job = [&globals, request] { evaluate(globals, *request); }; });
@@ -168,16 +171,20 @@ void add_result_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("FILE");
   exporter->add_option("--states", exporting->states, "Motion to write (default: the recognized states)")
       ->type_name("STATES.csv");
-  exporter->add_option("--base", exporting->base, "Its base motion (default: the capture's own)")->type_name("FILE.tum");
-  exporter->callback([&globals, &job, exporting] { job = [&globals, exporting] { export_twin(globals, *exporting); }; });
+  exporter->add_option("--base", exporting->base, "Its base motion (default: the capture's own)")
+      ->type_name("FILE.tum");
+  exporter->callback(
+      [&globals, &job, exporting] { job = [&globals, exporting] { export_twin(globals, *exporting); }; });
 
   CLI::App* synthesizer = app.add_subcommand("synth", "Draw a capture from a twin: videos, masks, depth, truth");
   auto scene = std::make_shared<SynthRequest>();
   synthesizer->add_option("RUN", scene->run, "Run folder of a twin")->required();
   synthesizer->add_option("-o,--output", scene->out, "Capture folder to make")->required()->type_name("CAPTURE");
-  synthesizer->add_option("--states", scene->states, "Motion to draw (default: the rollout, else the recognized states)")
+  synthesizer
+      ->add_option("--states", scene->states, "Motion to draw (default: the rollout, else the recognized states)")
       ->type_name("STATES.csv");
-  synthesizer->add_option("--camera", scene->camera, "Whose cameras, base motion and table (default: the twin's own capture)")
+  synthesizer
+      ->add_option("--camera", scene->camera, "Whose cameras, base motion and table (default: the twin's own capture)")
       ->type_name("CAPTURE[:NAME]");
   synthesizer->add_option("--base", scene->base, "Base motion (default: that of the capture)")->type_name("FILE.tum");
   synthesizer->add_flag("--images", scene->images, "Images without loss instead of videos");

@@ -69,7 +69,8 @@ std::pair<std::string, std::string> split_camera(const std::string& text) {
 std::pair<int, int> parse_frames(const std::string& text) {
   if (text.empty()) return {0, -1};
   const auto fail = [&] {
-    return InputError("--frames", "'" + text + "' is no range of frames", "give A:B, for example 0:60 for the first 60");
+    return InputError("--frames", "'" + text + "' is no range of frames",
+                      "give A:B, for example 0:60 for the first 60");
   };
   const std::size_t colon = text.find(':');
   if (colon == std::string::npos) throw fail();

@@ -12,7 +12,8 @@ namespace chainsplat::tools {
 twin::Twin load_twin(const Path& run) {
   twin::Twin twin = twin::load(run);
   if (twin.states.time.empty())
-    throw InputError(run.string(), "holds no recognized states", "finish 'chainsplat recognize' or 'chainsplat train' first");
+    throw InputError(run.string(), "holds no recognized states",
+                     "finish 'chainsplat recognize' or 'chainsplat train' first");
   return twin;
 }
 
@@ -25,13 +26,15 @@ trajectory::Trajectory own_base(const Path& run) {
   const Path file = run / kBaseFile;
   std::error_code error;
   if (!std::filesystem::exists(file, error))
-    throw InputError(file.string(), "is missing", "give --base with the base motion, or copy the capture's base file there");
+    throw InputError(file.string(), "is missing",
+                     "give --base with the base motion, or copy the capture's base file there");
   return read_base(file.string());
 }
 
 dynamics::Model model_of(const twin::Twin& twin, const Path& run) {
   if (!twin.parameters)
-    throw InputError((run / "twin.json").string(), "its dynamics are not identified", "run 'chainsplat identify' on it first");
+    throw InputError((run / "twin.json").string(), "its dynamics are not identified",
+                     "run 'chainsplat identify' on it first");
   return dynamics::make_model(twin.chain, *twin.parameters);
 }
 
@@ -45,7 +48,8 @@ std::string covariance_csv(const chain::States& states, const std::vector<math::
   for (std::size_t k = 0; k < covariances.size(); ++k) {
     text += core::exact(states.time[k]);
     for (Eigen::Index row = 0; row < angles; ++row)
-      for (Eigen::Index column = 0; column <= row; ++column) text.append(",").append(core::exact(covariances[k](row, column)));
+      for (Eigen::Index column = 0; column <= row; ++column)
+        text.append(",").append(core::exact(covariances[k](row, column)));
     text += "\n";
   }
   return text;

@@ -59,9 +59,9 @@ Stages parse_stages(const std::string& text) {
 
 // What recognition depends on; also written as provenance.
 std::map<std::string, std::string> recognition_options(const Request& request) {
-  return {{"joints", std::to_string(request.joints)}, {"bending", request.bending},
-          {"twist", request.twist ? "yes" : "no"},    {"every", std::to_string(request.every)},
-          {"frames", request.frames},                 {"mode", request.mode}};
+  return {
+      {"joints", std::to_string(request.joints)}, {"bending", request.bending}, {"twist", request.twist ? "yes" : "no"},
+      {"every", std::to_string(request.every)},   {"frames", request.frames},   {"mode", request.mode}};
 }
 
 // Measures its own life and adds it to the stage's seconds.
@@ -91,8 +91,8 @@ void stop_if_asked() {
 // All that a training writes.
 void remove_results(const Path& out) {
   std::error_code ignored;
-  for (const char* name : {"twin.json", "gaussians.ply", "states.csv", "rollout.csv", kMetricsFile, kLogFile, kBaseFile,
-                           kCovarianceFile})
+  for (const char* name :
+       {"twin.json", "gaussians.ply", "states.csv", "rollout.csv", kMetricsFile, kLogFile, kBaseFile, kCovarianceFile})
     fs::remove(out / name, ignored);
   fs::remove_all(out / kCheckpointFolder, ignored);
 }
@@ -192,9 +192,11 @@ twin::Twin new_twin(const capture::Capture& capture, const Request& request, con
 }
 
 // Throws InputError where the run folder's twin is not what is asked for now.
-void check_same_work(const twin::Twin& twin, const capture::Capture& capture, const Request& request, const Stages& stages) {
+void check_same_work(const twin::Twin& twin, const capture::Capture& capture, const Request& request,
+                     const Stages& stages) {
   if (twin.provenance.capture_hash != hash_text(capture.hash))
-    throw InputError(request.out, "was made from another capture (" + twin.provenance.capture + ") or it has changed since",
+    throw InputError(request.out,
+                     "was made from another capture (" + twin.provenance.capture + ") or it has changed since",
                      "name that one, or begin again with --force");
   if (!stages.recognize) return;
   for (const auto& [name, value] : recognition_options(request)) {
@@ -205,7 +207,8 @@ void check_same_work(const twin::Twin& twin, const capture::Capture& capture, co
   }
 }
 
-Json summary_json(const twin::Twin& twin, const Path& out, const eval::Metrics* recognized, const eval::Metrics* rollout) {
+Json summary_json(const twin::Twin& twin, const Path& out, const eval::Metrics* recognized,
+                  const eval::Metrics* rollout) {
   Json document;
   document["run"] = out.string();
   document["capture"] = twin.provenance.capture;
@@ -244,7 +247,8 @@ void train(const Globals& globals, const Request& request) {
   check_output_folder(out, request.force || request.resume,
                       "name another folder, or give --force to begin again or --resume to continue");
   if (!request.picture.empty()) check_output_file(request.picture);
-  if (request.force && request.resume) throw InputError("--force, --resume", "contradict each other", "give one of them");
+  if (request.force && request.resume)
+    throw InputError("--force, --resume", "contradict each other", "give one of them");
   watch_signals();
 
   // everything that can be wrong with the request is found before anything is written
@@ -258,7 +262,8 @@ void train(const Globals& globals, const Request& request) {
   twin::Twin twin = continued ? load_twin(out) : new_twin(capture, request, globals);
   if (continued) check_same_work(twin, capture, request, stages);
   if (!continued && !stages.recognize)
-    throw InputError(out.string(), "holds no recognized twin to go on from", "add recognize to --stages, or give --resume");
+    throw InputError(out.string(), "holds no recognized twin to go on from",
+                     "add recognize to --stages, or give --resume");
   twin.provenance.seconds["load"] += core::seconds_now() - load_start;
   const bool recognize = stages.recognize && !continued;
   const bool identify = stages.identify && (stages.named || recognize || !twin.parameters);
@@ -303,6 +308,7 @@ void train(const Globals& globals, const Request& request) {
     const bool has_rollout = !twin.rollout.time.empty();
     if (stages.evaluate) {
       const Stopwatch watch(twin, "evaluate");
+      core::report({"evaluate", 0, 0, NAN, NAN, "drawing every frame and comparing"});
       load_options.depth = true;
       load_options.undistort = false;
       const capture::Capture recorded = capture::load(request.capture, load_options);
@@ -351,7 +357,8 @@ void identify(const Globals& globals, const std::string& run) {
   const trajectory::Trajectory base = own_base(run);
   const std::vector<math::MatrixX> covariances = read_covariances(Path(run) / kCovarianceFile, twin.states);
   const auto mode = twin.provenance.options.find("mode");
-  identify_stage(twin, base, covariances, mode != twin.provenance.options.end() && mode->second == "paper", globals.seed);
+  identify_stage(twin, base, covariances, mode != twin.provenance.options.end() && mode->second == "paper",
+                 globals.seed);
   rollout_stage(twin, base, run);
   std::error_code ignored;
   // what was measured on the old parameters is not true any more
@@ -376,8 +383,9 @@ void identify(const Globals& globals, const std::string& run) {
   std::cout << "parameter                        estimate   standard error\n";
   for (std::size_t i = 0; i < found.names.size(); ++i) {
     char line[160];
-    std::snprintf(line, sizeof line, "%-28.60s %12.5g %16.3g\n", found.names[i].c_str(), found.values[i],
-                  i < found.standard_errors.size() ? found.standard_errors[i] : std::numeric_limits<double>::quiet_NaN());
+    std::snprintf(
+        line, sizeof line, "%-28.60s %12.5g %16.3g\n", found.names[i].c_str(), found.values[i],
+        i < found.standard_errors.size() ? found.standard_errors[i] : std::numeric_limits<double>::quiet_NaN());
     std::cout << line;
   }
   for (const auto& [name, reason] : found.held) std::cout << name << ": held, " << reason << "\n";
@@ -392,9 +400,11 @@ void add_recognition_options(CLI::App& command, Request& request) {
   command.add_option("--joints", request.joints, "Joints along the rope (default 8)")
       ->check(CLI::Range(1, kMostJoints))
       ->type_name("N");
-  command.add_option("--bending", request.bending,
-                     "Axes a joint: planar (one), spatial (two) or auto (default: planar on a table; in free space spatial\n"
-                     "unless the rope hardly leaves its plane)")
+  command
+      .add_option(
+          "--bending", request.bending,
+          "Axes a joint: planar (one), spatial (two) or auto (default: planar on a table; in free space spatial\n"
+          "unless the rope hardly leaves its plane)")
       ->check(CLI::IsMember({"auto", "planar", "spatial"}))
       ->type_name("KIND");
   command.add_flag("--twist", request.twist, "Also a twist axis a joint");
@@ -410,7 +420,8 @@ void add_recognition_options(CLI::App& command, Request& request) {
 }  // namespace
 
 void add_training_commands(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* trainer = app.add_subcommand("train", "Make a twin from a capture: recognize, identify, roll out, evaluate");
+  CLI::App* trainer =
+      app.add_subcommand("train", "Make a twin from a capture: recognize, identify, roll out, evaluate");
   auto request = std::make_shared<Request>();
   add_recognition_options(*trainer, *request);
   trainer->add_option("--stages", request->stages, "Only these, by comma: recognize,identify,rollout,evaluate")
@@ -419,7 +430,8 @@ void add_training_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("FILE.png");
   trainer->callback([&globals, &job, request] { job = [&globals, request] { train(globals, *request); }; });
 
-  CLI::App* recognizer = app.add_subcommand("recognize", "The first stage of train alone: Gaussians and angles from images");
+  CLI::App* recognizer =
+      app.add_subcommand("recognize", "The first stage of train alone: Gaussians and angles from images");
   auto recognition = std::make_shared<Request>();
   add_recognition_options(*recognizer, *recognition);
   recognizer->callback([&globals, &job, recognition] {
@@ -427,7 +439,8 @@ void add_training_commands(CLI::App& app, const Globals& globals, Job& job) {
     job = [&globals, recognition] { train(globals, *recognition); };
   });
 
-  CLI::App* identifier = app.add_subcommand("identify", "The second stage alone: masses, stiffness, damping, friction of a twin");
+  CLI::App* identifier =
+      app.add_subcommand("identify", "The second stage alone: masses, stiffness, damping, friction of a twin");
   auto run = std::make_shared<std::string>();
   identifier->add_option("RUN", *run, "Run folder with recognized states; it is updated")->required();
   identifier->callback([&globals, &job, run] { job = [&globals, run] { identify(globals, *run); }; });

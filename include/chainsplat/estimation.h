@@ -57,6 +57,7 @@ struct Filter {
   double base_start = 0.0;       // s, from here on the base's motion is known: the rope is thought at rest there
   math::VectorX rest;            // rad, how the rope rests (or lies) at that time
   double contact_until = 0.0;    // s, until then the motion is thought not to follow the model
+  math::VectorX everywhere, place;  // shares of the links' ends in the unknown force: evenly, and as learned in contact
   double last_seen = 0.0;        // s
   double edge_offset = 0.0, edge_offset_variance = 0.0;  // px, px^2: how much wider the masks are than the tube
 };

@@ -53,8 +53,9 @@ double total_mass(const dynamics::Parameters& parameters) {
 }
 
 // Covariance of the rest angles' shifts for a random force of `deviation` N, alike in all directions, somewhere on the
-// rope: mean over the joints and the free end of J^T J.
-MatrixX force_covariance(const Filter& filter, const Pose& base, const VectorX& theta, double deviation) {
+// rope: mean over the joints and the free end of J^T J, weighted by `place`.
+MatrixX force_covariance(const Filter& filter, const Pose& base, const VectorX& theta, double deviation,
+                         const VectorX& place) {
   const chain::Chain& chain = filter.model.chain;
   const int n = chain.angles();
   const MatrixX axes = chain::world_axes(chain, theta, base);
@@ -62,14 +63,45 @@ MatrixX force_covariance(const Filter& filter, const Pose& base, const VectorX& 
   MatrixX sum = MatrixX::Zero(n, n);
   for (int link = 1; link < chain.links(); ++link) {
     const MatrixX jacobian = chain::point_jacobian(chain, axes, link, nodes.col(link + 1));
-    sum.noalias() += jacobian.transpose() * jacobian;
+    sum.noalias() += place[link - 1] * jacobian.transpose() * jacobian;
   }
-  sum *= deviation * deviation / (chain.links() - 1);
+  sum *= deviation * deviation;
   for (int k = 0; k < n; ++k) {
     sum.row(k) /= filter.model.parameters.stiffness[k];
     sum.col(k) /= filter.model.parameters.stiffness[k];
   }
   return sum;
+}
+
+// Where the believed force acts: the share of each link's end in it, when it is spread as `place` allows.
+VectorX place_of_force(const Filter& filter, const Belief& belief, const VectorX& place, double& size) {
+  const chain::Chain& chain = filter.model.chain;
+  const int n = chain.angles();
+  const VectorX theta = belief.mean.head(n);
+  const Pose base = filter.base(belief.time).pose;
+  const MatrixX axes = chain::world_axes(chain, theta, base);
+  const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, base));
+  VectorX torque = belief.mean.tail(n);
+  for (int k = 0; k < n; ++k) torque[k] *= filter.model.parameters.stiffness[k];
+  std::vector<MatrixX> jacobians;
+  MatrixX sum = MatrixX::Zero(n, n);
+  for (int link = 1; link < chain.links(); ++link) {
+    jacobians.push_back(chain::point_jacobian(chain, axes, link, nodes.col(link + 1)));
+    sum.noalias() += place[link - 1] * jacobians.back().transpose() * jacobians.back();
+  }
+  sum.diagonal().array() += 1e-3 * sum.trace() / n;
+  const VectorX spread = sum.ldlt().solve(torque);
+  VectorX out(place.size());
+  Vector3 force = Vector3::Zero();
+  for (int i = 0; i < place.size(); ++i) {
+    const Vector3 part = place[i] * (jacobians[i] * spread);
+    out[i] = part.norm();
+    force += part;
+  }
+  size = force.norm();
+  out = out.array().square().eval();
+  const double total = out.sum();
+  return total > 0.0 ? VectorX(out / total) : place;
 }
 
 void symmetrize(MatrixX& matrix) { matrix = (0.5 * (matrix + matrix.transpose())).eval(); }
@@ -142,7 +174,7 @@ Belief first_belief(const Filter& filter, double time) {
   if (filter.shifts)
     belief.covariance.bottomRightCorner(n, n) =
         force_covariance(filter, filter.base(time).pose, belief.mean.head(n),
-                         kFirstForce * total_mass(filter.model.parameters));
+                         kFirstForce * total_mass(filter.model.parameters), filter.everywhere);
   belief.covariance.diagonal().array() += kLeastVariance;
   return belief;
 }
@@ -212,6 +244,8 @@ Filter start(const twin::Twin& twin, const capture::Camera& camera, dynamics::Ba
   } else {
     filter.model.chain = twin.chain;
   }
+  filter.everywhere = VectorX::Constant(twin.chain.links() - 1, 1.0 / (twin.chain.links() - 1));
+  filter.place = filter.everywhere;
   filter.camera = camera;
   filter.base = std::move(base);
   filter.base_start = base_start;
@@ -232,7 +266,7 @@ Belief predict(const Filter& filter, const Belief& belief, double time, bool con
   const double h = time - belief.time;
   CHAINSPLAT_CHECK(h > 0.0, std::to_string(h));
   const Motion motion = move(filter, belief, time);
-  const double keep = std::exp(-h / filter.options.force_memory);
+  const double keep = std::exp(-h / (contact ? G2("CFM", 1e9) : filter.options.force_memory));
 
   MatrixX transition = MatrixX::Zero(3 * n, 3 * n);
   transition.topRows(n) = motion.theta_by_state;
@@ -246,7 +280,7 @@ Belief predict(const Filter& filter, const Belief& belief, double time, bool con
   if (filter.shifts) {
     const double force = (contact ? filter.options.contact_force : filter.options.model_force) *
                          total_mass(filter.model.parameters) * std::sqrt(h);
-    const MatrixX shift = force_covariance(filter, filter.base(time).pose, motion.theta, force);
+    const MatrixX shift = force_covariance(filter, filter.base(time).pose, motion.theta, force, contact ? filter.place : filter.everywhere);
     // the force changes during the step: a third of the change acts all along in the mean square
     MatrixX noise = transition.rightCols(n);
     noise.topRows(2 * n) *= std::sqrt(1.0 / 3.0);
@@ -303,6 +337,19 @@ Estimate update(Filter& filter, const capture::View& view) {
     if (!out.lost) {
       filter.last_seen = view.time;
       filter.belief = measured.belief;
+      if (filter.shifts) {
+        if (view.time > filter.contact_until) {
+          filter.place = filter.everywhere;
+        } else {
+          const double rate = G2("PR", 0.3), floor = G2("PF", 0.02);
+          double size = 0.0;
+          filter.place += rate * (place_of_force(filter, *filter.belief, filter.place, size) - filter.place);
+          if (size > G2("TH", 0.05) * 9.81 * total_mass(filter.model.parameters))
+            filter.contact_until = std::max(filter.contact_until, view.time + kContactMemory);
+          filter.place.array() += floor;
+          filter.place /= filter.place.sum();
+        }
+      }
       const double gain = 1.0 / kOffsetFrames;
       filter.edge_offset += gain * (measured.fit.edge_offset - filter.edge_offset);
       filter.edge_offset_variance =

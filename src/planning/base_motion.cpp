@@ -14,7 +14,7 @@ constexpr double kRounding = 1e-9;  // relative, of a limit that is met exactly
 Basis basis(Window window, double start, double duration, double time) {
   Basis out = Basis::Zero();
   const double s = (time - start) / duration;
-  if (s <= 0.0) return out;
+  if (s < 0.0) return out;  // at the start itself the values from the right: the jerk jumps there
   if (s >= 1.0) {
     out(kBasisCount, 0) = 1.0;
     return out;

@@ -1,0 +1,340 @@
+#include "objective.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+namespace chainsplat::planning {
+namespace {
+
+constexpr double kLimitWeight = 1.0;     // m^2: 1 % too fast costs as much as 10 mm
+constexpr double kLimitMargin = 0.97;    // of a limit, where its cost begins: verified on a finer grid afterwards
+constexpr double kClearanceWeight = 30.0;
+constexpr double kClearanceMargin = 0.004;  // m
+constexpr double kRestTime = 0.01;       // s: 10 cm/s left on the table cost as much as 1 mm
+constexpr double kNegligible = 1e-7;     // weight in the soft minimum
+constexpr int kHermiteSteps = 16;        // between two nodes, for the hard minimum
+constexpr double kLimitInterval = 0.02;  // s, between tests of limits and obstacles
+
+// 3 x unknowns: a world point fixed to link `link`.
+MatrixX point_slope(const Task& task, const chain::Chain& chain, const Rollout& rollout, const MatrixX& axes, int node,
+                    int link, const Vector3& point) {
+  MatrixX slope = chain::point_jacobian(chain, axes, link, point) * rollout.theta_slope[node];
+  const Vector3 base = rollout.base[node].col(0).head<3>();
+  for (std::size_t a = 0; a < task.motion.axes.size(); ++a) {
+    const Axis axis = task.motion.axes[a];
+    const Vector3 direction =
+        axis == Axis::yaw ? task.motion.up.cross(point - base) : Vector3::Unit(static_cast<int>(axis)).eval();
+    slope.middleCols(static_cast<Eigen::Index>(a) * kPerAxis, kPerAxis) +=
+        direction * task.grid.basis[node].col(0).transpose();
+  }
+  return slope;
+}
+
+math::Pose pose_at(const Task& task, const Rollout& rollout, int node) {
+  return {math::exp_so3(rollout.base[node](3, 0) * task.motion.up) * task.motion.origin.rotation,
+          rollout.base[node].col(0).head<3>()};
+}
+
+// Adds weight * residual^2 with the residual's slope.
+void add(Evaluation& sum, double weight, double residual, const VectorX& slope) {
+  sum.value += weight * residual * residual;
+  sum.gradient += 2.0 * weight * residual * slope;
+  sum.curvature.selfadjointView<Eigen::Lower>().rankUpdate(slope, 2.0 * weight);
+}
+
+double box_distance(const Box& box, const Vector3& p, Vector3& outward) {
+  const Vector3 center = 0.5 * (box.low + box.high), half = 0.5 * (box.high - box.low);
+  const Vector3 q = (p - center).cwiseAbs() - half;
+  Vector3 sign;
+  for (int i = 0; i < 3; ++i) sign[i] = p[i] < center[i] ? -1.0 : 1.0;
+  const Vector3 outside = q.cwiseMax(0.0);
+  if (const double d = outside.norm(); d > 0.0) {
+    outward = outside.cwiseProduct(sign) / d;
+    return d;
+  }
+  int face = 0;
+  const double d = q.maxCoeff(&face);
+  outward = sign[face] * Vector3::Unit(face);
+  return d;
+}
+
+// Calls use(link, world point, surface distance, outward normal) for all points that are watched at a node.
+template <class Use>
+void watch(const Task& task, const chain::Chain& chain, const std::vector<math::Pose>& motions, const Use& use) {
+  const Options& options = *task.options;
+  const auto test = [&](int link, const Vector3& point, double radius) {
+    for (const Sphere& sphere : options.spheres) {
+      const Vector3 away = point - sphere.center;
+      const double distance = away.norm();
+      use(link, point, distance - sphere.radius - radius, distance > 0.0 ? Vector3(away / distance) : Vector3::UnitZ());
+    }
+    for (const Box& box : options.boxes) {
+      Vector3 outward;
+      const double distance = box_distance(box, point, outward);
+      use(link, point, distance - radius, outward);
+    }
+  };
+  test(0, motions[0].translation, options.gripper_radius);
+  for (int link = 1; link < chain.links(); ++link)
+    for (const double part : {0.5, 1.0}) {
+      const double s = chain.link_start(link) + part * (chain.link_end(link) - chain.link_start(link));
+      test(link, motions[link] * (s * chain.direction), 0.5 * chain.diameter);
+    }
+}
+
+struct Candidate {
+  int node;
+  Nearest nearest;
+};
+
+// The soft minimum of one model's squared distances; its derivatives are added with `scale` where `sum` is given.
+struct Soft {
+  double value = 0.0, miss = 0.0;
+  std::vector<Candidate> candidates;
+  std::vector<double> weights;
+};
+
+Soft soft_minimum(const Task& task, const dynamics::Model& model, const Rollout& rollout, double sharpness) {
+  const chain::Chain& chain = model.chain;
+  Soft soft;
+  const int nodes = task.grid.nodes();
+  for (int node = task.tabletop ? nodes - 1 : 0; node < nodes; ++node) {
+    const auto motions = chain::link_motions(chain, rollout.theta[node], pose_at(task, rollout, node));
+    const Vector3 target = task.target_at(task.grid.time(node));
+    if (!task.tabletop) {
+      soft.candidates.push_back({node, nearest(chain, motions, false, target)});
+      continue;
+    }
+    for (int link = 1; link < chain.links(); ++link) {
+      const Vector3 a = motions[link] * (chain.link_start(link) * chain.direction);
+      const Vector3 b = motions[link] * (chain.link_end(link) * chain.direction);
+      const double part = std::clamp((target - a).dot(b - a) / (b - a).squaredNorm(), 0.0, 1.0);
+      const Vector3 point = a + part * (b - a);
+      soft.candidates.push_back({node, {link, point, (point - target).squaredNorm()}});
+    }
+  }
+  double least = std::numeric_limits<double>::infinity(), total = 0.0;
+  for (const Candidate& c : soft.candidates) least = std::min(least, c.nearest.squared);
+  for (const Candidate& c : soft.candidates) {
+    soft.weights.push_back(std::exp(-sharpness * (c.nearest.squared - least)));
+    total += soft.weights.back();
+  }
+  for (double& w : soft.weights) w /= total;
+  soft.value = least - std::log(total) / sharpness;
+  soft.miss = std::sqrt(least);
+  return soft;
+}
+
+}  // namespace
+
+Nearest nearest(const chain::Chain& chain, const std::vector<math::Pose>& motions, bool tabletop,
+                const Vector3& target) {
+  Nearest best;
+  best.squared = std::numeric_limits<double>::infinity();
+  for (int link = tabletop ? 1 : chain.links() - 1; link < chain.links(); ++link) {
+    const Vector3 a = motions[link] * (chain.link_start(link) * chain.direction);
+    const Vector3 b = motions[link] * (chain.link_end(link) * chain.direction);
+    const double part = std::clamp((target - a).dot(b - a) / (b - a).squaredNorm(), 0.0, 1.0);
+    const Vector3 point = a + part * (b - a);
+    if (const double squared = (point - target).squaredNorm(); squared < best.squared) best = {link, point, squared};
+  }
+  return best;
+}
+
+Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& sharpness, bool derivatives) {
+  const Eigen::Index size = unknowns.size();
+  const int samples = static_cast<int>(task.models.size()), nodes = task.grid.nodes();
+  const Options& options = *task.options;
+  Evaluation sum;
+  sum.gradient.setZero(size);
+  sum.curvature.setZero(size, size);
+  const int stride = std::max(1, static_cast<int>(std::lround(kLimitInterval / task.grid.step)));
+
+  std::vector<Rollout> rollouts(samples);
+  std::vector<char> finite(samples);
+  core::parallel_for(samples, [&](std::int64_t m) {
+    finite[m] = roll_out(*task.models[m], task.motion, task.grid, unknowns, task.initial, derivatives, rollouts[m]);
+  });
+  if (std::find(finite.begin(), finite.end(), 0) != finite.end()) return sum;
+  sum.good = true;
+
+  // the samples' soft minima, averaged, or their soft maximum
+  std::vector<Soft> soft;
+  std::vector<double> share(samples, 1.0 / samples);
+  for (int m = 0; m < samples; ++m)
+    soft.push_back(soft_minimum(task, *task.models[m], rollouts[m], sharpness.soft_minimum));
+  if (options.worst_case && samples > 1) {
+    double largest = -std::numeric_limits<double>::infinity(), total = 0.0;
+    for (const Soft& s : soft) largest = std::max(largest, s.value);
+    for (int m = 0; m < samples; ++m) total += share[m] = std::exp(sharpness.soft_minimum * (soft[m].value - largest));
+    for (double& s : share) s /= total;
+    sum.value = largest + std::log(total) / sharpness.soft_minimum;
+    for (const Soft& s : soft) sum.miss = std::max(sum.miss, s.miss);
+  } else {
+    for (const Soft& s : soft) sum.value += s.value / samples, sum.miss += s.miss / samples;
+  }
+
+  for (int m = 0; m < samples; ++m) {
+    const dynamics::Model& model = *task.models[m];
+    const chain::Chain& chain = model.chain;
+    const Rollout& rollout = rollouts[m];
+    for (std::size_t i = 0; derivatives && i < soft[m].candidates.size(); ++i) {
+      const double weight = share[m] * soft[m].weights[i];
+      if (weight < kNegligible) continue;
+      const auto& [node, best] = soft[m].candidates[i];
+      const MatrixX axes = chain::world_axes(chain, rollout.theta[node], pose_at(task, rollout, node));
+      const MatrixX slope = point_slope(task, chain, rollout, axes, node, best.link, best.point);
+      const Vector3 apart = best.point - task.target_at(task.grid.time(node));
+      sum.gradient += 2.0 * weight * slope.transpose() * apart;
+      sum.curvature.selfadjointView<Eigen::Lower>().rankUpdate(slope.transpose(), 2.0 * weight);
+    }
+    // at rest in the end: speed that each joint gives to the free end
+    if (task.tabletop)
+      for (int k = 0; k < chain.angles(); ++k) {
+        const double arm = kRestTime * (chain.length - chain.link_start(chain.child_link[k]));
+        const double residual = arm * rollout.thetadot.back()[k];
+        const double weight = 1.0 / (samples * chain.angles());
+        if (derivatives)
+          add(sum, weight, residual, arm * rollout.thetadot_slope.back().row(k).transpose());
+        else
+          sum.value += weight * residual * residual;
+      }
+    if (!options.spheres.empty() || !options.boxes.empty())
+      for (int node = 0; node < nodes; node += stride) {
+        const math::Pose base = pose_at(task, rollout, node);
+        const auto motions = chain::link_motions(chain, rollout.theta[node], base);
+        MatrixX axes;
+        watch(task, chain, motions, [&](int link, const Vector3& point, double distance, const Vector3& outward) {
+          const double residual = kClearanceMargin - distance;
+          if (residual <= 0.0) return;
+          const double weight = kClearanceWeight / samples;
+          if (!derivatives) {
+            sum.value += weight * residual * residual;
+            return;
+          }
+          if (axes.size() == 0) axes = chain::world_axes(chain, rollout.theta[node], base);
+          const MatrixX slope = point_slope(task, chain, rollout, axes, node, link, point);
+          add(sum, weight, residual, -(slope.transpose() * outward));
+        });
+      }
+  }
+
+  // smoothness and limits of the base, the same for all samples
+  const auto& base = rollouts.front().base;
+  const double length = task.models.front()->chain.length;
+  const auto limit = [&](int node, int derivative, double most, bool yaw) {
+    const Basis& b = task.grid.basis[node];
+    const auto vector = base[node].col(derivative).head<3>();
+    const double value = yaw ? std::abs(base[node](3, derivative)) : vector.norm();
+    const double residual = value / most - kLimitMargin;
+    if (residual <= 0.0) return;
+    if (!derivatives) {
+      sum.value += kLimitWeight * residual * residual;
+      return;
+    }
+    VectorX slope = VectorX::Zero(size);
+    for (std::size_t a = 0; a < task.motion.axes.size(); ++a) {
+      const Axis axis = task.motion.axes[a];
+      if ((axis == Axis::yaw) != yaw) continue;
+      const double direction = base[node](static_cast<int>(axis), derivative) / value;
+      slope.segment(static_cast<Eigen::Index>(a) * kPerAxis, kPerAxis) = direction / most * b.col(derivative);
+    }
+    add(sum, kLimitWeight, residual, slope);
+  };
+  const Limits& limits = options.limits;
+  const bool smooth = task.motion.window == Window::smooth;
+  for (int node = 0; node < nodes; node += stride) {
+    limit(node, 1, limits.velocity, false);
+    limit(node, 2, limits.acceleration, false);
+    if (smooth) limit(node, 3, limits.jerk, false);
+    limit(node, 1, limits.yaw_velocity, true);
+    limit(node, 2, limits.yaw_acceleration, true);
+    if (smooth) limit(node, 3, limits.yaw_jerk, true);
+  }
+  for (std::size_t a = 0; a < task.motion.axes.size(); ++a) {
+    const int row = static_cast<int>(task.motion.axes[a]);
+    const bool yaw = task.motion.axes[a] == Axis::yaw;
+    const double scale = yaw ? length : 1.0;  // an angular acceleration counts by what it does at the rope's length
+    const double weight = sharpness.smoothness * scale * scale / nodes;
+    const auto first = static_cast<Eigen::Index>(a) * kPerAxis;
+    const double origin = yaw ? 0.0 : task.motion.origin.translation[row];
+    const double most = yaw ? limits.turn : limits.stroke;
+    for (int node = 0; node < nodes; ++node) {
+      const Basis& b = task.grid.basis[node];
+      sum.value += weight * base[node](row, 2) * base[node](row, 2);
+      if (derivatives) {
+        sum.gradient.segment(first, kPerAxis) += 2.0 * weight * base[node](row, 2) * b.col(2);
+        sum.curvature.block(first, first, kPerAxis, kPerAxis) += 2.0 * weight * b.col(2) * b.col(2).transpose();
+      }
+      if (node % stride != 0) continue;
+      const double offset = base[node](row, 0) - origin;
+      const double residual = std::abs(offset) / most - kLimitMargin;
+      if (residual <= 0.0) continue;
+      VectorX slope = VectorX::Zero(size);
+      slope.segment(first, kPerAxis) = (offset < 0.0 ? -1.0 : 1.0) / most * b.col(0);
+      add(sum, kLimitWeight, residual, slope);
+    }
+  }
+  if (derivatives) {
+    sum.curvature.triangularView<Eigen::StrictlyUpper>() = sum.curvature.transpose();
+    for (Eigen::Index i = 0; i < size; ++i)
+      if (task.held[i]) {
+        sum.gradient[i] = 0.0;
+        sum.curvature.row(i).setZero(), sum.curvature.col(i).setZero();
+      }
+  }
+  return sum;
+}
+
+Hit measure(const Task& task, const dynamics::Model& model, const Rollout& rollout) {
+  const chain::Chain& chain = model.chain;
+  Hit hit;
+  double least = std::numeric_limits<double>::infinity();
+  const auto consider = [&](double time, const VectorX& theta, const math::Pose& base) {
+    const Nearest best =
+        nearest(chain, chain::link_motions(chain, theta, base), task.tabletop, task.target_at(time));
+    if (best.squared < least) least = best.squared, hit.time = time, hit.point = best.point;
+    return best.squared;
+  };
+  const int last = task.grid.nodes() - 1;
+  if (task.tabletop) {
+    consider(task.grid.time(last), rollout.theta[last], pose_at(task, rollout, last));
+  } else {
+    // every interval whose ends could hide a smaller distance than the best node's
+    std::vector<double> distance(last + 1);
+    double best = std::numeric_limits<double>::infinity();
+    for (int k = 0; k <= last; ++k) {
+      distance[k] = std::sqrt(consider(task.grid.time(k), rollout.theta[k], pose_at(task, rollout, k)));
+      best = std::min(best, distance[k]);
+    }
+    Motion motion = task.motion;
+    const double h = task.grid.step;
+    for (int k = 0; k < last; ++k) {
+      const double travel = std::abs(distance[k + 1] - distance[k]);
+      if (std::min(distance[k], distance[k + 1]) > best + std::max(travel, 0.02)) continue;
+      for (int i = 1; i < kHermiteSteps; ++i) {
+        const double s = double(i) / kHermiteSteps;
+        const double a = (1 + 2 * s) * (1 - s) * (1 - s), b = s * (1 - s) * (1 - s), c = s * s * (3 - 2 * s),
+                     d = s * s * (s - 1);
+        const VectorX theta = a * rollout.theta[k] + b * h * rollout.thetadot[k] + c * rollout.theta[k + 1] +
+                              d * h * rollout.thetadot[k + 1];
+        Coordinates base = a * rollout.base[k] + c * rollout.base[k + 1];
+        base.col(0) += h * (b * rollout.base[k].col(1) + d * rollout.base[k + 1].col(1));
+        consider(task.grid.time(k) + s * h, theta, base_from(motion, base).pose);
+      }
+    }
+  }
+  hit.miss = hit.mean_miss = hit.worst_miss = std::sqrt(least);
+  return hit;
+}
+
+double clearance(const Task& task, const dynamics::Model& model, const Rollout& rollout) {
+  double least = std::numeric_limits<double>::infinity();
+  for (int node = 0; node < task.grid.nodes(); ++node)
+    watch(task, model.chain, chain::link_motions(model.chain, rollout.theta[node], pose_at(task, rollout, node)),
+          [&](int, const Vector3&, double distance, const Vector3&) { least = std::min(least, distance); });
+  return least;
+}
+
+}  // namespace chainsplat::planning

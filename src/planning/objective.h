@@ -1,0 +1,52 @@
+// Private to planning: what a stretch of base motion is worth, with gradient and Gauss-Newton matrix.
+#pragma once
+#include "sensitivities.h"
+
+namespace chainsplat::planning {
+
+// One stretch whose last piece is being planned.
+struct Task {
+  std::vector<const dynamics::Model*> models;  // one, or the samples
+  bool tabletop = false;
+  Motion motion;                               // the last piece's numbers do not count
+  Grid grid;
+  dynamics::InitialState initial;
+  Vector3 target = Vector3::Zero();            // at `target_time`, at the rope's height
+  Vector3 target_velocity = Vector3::Zero();   // m/s
+  double target_time = 0.0;
+  const Options* options = nullptr;
+  std::vector<bool> held;                      // unknowns that keep their value
+
+  Vector3 target_at(double time) const { return target + (time - target_time) * target_velocity; }
+};
+
+struct Sharpness {
+  double soft_minimum = 1e5;  // nu, m^-2
+  double smoothness = 1e-7;   // alpha, beta of SPEC 8, of the mean squared acceleration, s^4
+};
+
+struct Evaluation {
+  bool good = false;  // the motion stayed finite
+  double value = 0.0;   // m^2
+  double miss = 0.0;    // m, hard minimum over the nodes, mean (or worst) of the samples
+  VectorX gradient;
+  MatrixX curvature;  // Gauss-Newton, positive semidefinite
+};
+Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& sharpness, bool derivatives);
+
+// Point of the rope nearest to `target` among the candidates of SPEC 8.
+struct Nearest {
+  int link = 0;
+  Vector3 point = Vector3::Zero();
+  double squared = 0.0;
+};
+Nearest nearest(const chain::Chain& chain, const std::vector<math::Pose>& motions, bool tabletop,
+                const Vector3& target);
+
+// Hard minimum over a rollout, between its nodes too.
+Hit measure(const Task& task, const dynamics::Model& model, const Rollout& rollout);
+
+// Smallest distance of rope and gripper to what must be kept clear, along a rollout, m; infinity without obstacles.
+double clearance(const Task& task, const dynamics::Model& model, const Rollout& rollout);
+
+}  // namespace chainsplat::planning
