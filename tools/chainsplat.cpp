@@ -62,7 +62,9 @@ int run(int argc, char** argv) {
   tools::add_training_commands(app, globals, job);
   tools::add_motion_commands(app, globals, job);
   tools::add_result_commands(app, globals, job);
+  tools::add_planning_commands(app, globals, job);
   tools::add_inspection_commands(app, globals, job);
+  tools::add_bench_command(app, globals, job);
   for (CLI::App* command : app.get_subcommands({})) {
     command->get_formatter()->column_width(34);
     command->footer(

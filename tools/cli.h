@@ -28,6 +28,8 @@ void add_training_commands(CLI::App& app, const Globals& globals, Job& job);    
 void add_motion_commands(CLI::App& app, const Globals& globals, Job& job);      // rollout, render
 void add_result_commands(CLI::App& app, const Globals& globals, Job& job);      // eval, export, synth
 void add_inspection_commands(CLI::App& app, const Globals& globals, Job& job);  // check, doctor
+void add_planning_commands(CLI::App& app, const Globals& globals, Job& job);    // plan
+void add_bench_command(CLI::App& app, const Globals& globals, Job& job);
 
 // --- progress.cpp --------------------------------------------------------------------------------
 // Warnings and progress go to standard error from now on: a redrawn line on a terminal, else a plain line every 5 s.

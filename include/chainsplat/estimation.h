@@ -18,7 +18,7 @@ namespace chainsplat::estimation {
 
 struct Options {
   double model_force = 0.06;         // N/sqrt(s) a kilogram of rope, random walk of the unknown force without contact
-  double contact_force = 20.0;       // N/sqrt(s) a kilogram, the same while the motion does not follow the model
+  double contact_force = 4.0;        // N/sqrt(s) a kilogram, the same while the motion does not follow the model
   double force_memory = 0.5;         // s, in which an unknown force that nothing confirms is forgotten
   double acceleration = 2.0;         // rad/s^2, of every angle, independent from frame to frame
   double blind_acceleration = 30.0;  // rad/s^2, the same where the twin has no identified dynamics

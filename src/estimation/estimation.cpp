@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <cstdlib>
 
 namespace chainsplat::estimation {
 
@@ -22,11 +21,22 @@ constexpr double kFirstAngle = 0.15;  // rad
 constexpr double kFirstRate = 1.0;    // rad/s
 constexpr double kFirstForce = 0.3;   // N a kilogram of rope, standing (a wrong rest shape, for example)
 
-// A frame whose innovation is so many times what the model expects is met again with the force free to change, and
-// the frames of the next while too.
-static double G2(const char*k,double d){const char*e=getenv(k);return e?atof(e):d;}
-static const double kSurprise = G2("SUR",3.0);
-static const double kContactMemory = G2("CM",0.3);  // s
+// A frame whose innovation is so many times what the model expects is met again with the force free to change, and so
+// are the frames after it, for a while and as long as the force that was found is a share of the rope's weight.
+constexpr double kSurprise = 1.5;
+constexpr double kContactMemory = 0.5;  // s
+constexpr double kContactForce = 0.05;  // of the rope's weight
+
+// A hand touches a rope at one place. Where, is learned from the force found so far: each frame by this share, and every
+// link keeps a little.
+constexpr double kPlaceRate = 0.5;
+constexpr double kPlaceFloor = 0.005;
+constexpr double kPlaceRidge = 1e-3;  // of the mean variance of the torques, which a force at few places cannot give
+
+// What straight links and a tube of constant width cannot follow, a coordinate of every joint's position: of the
+// diameter. Not in the filter, only in what is reported.
+constexpr double kLinkDeviation = 0.02;
+constexpr double kUnseenAngle = 0.5;  // rad, of angles that move no joint (twist)
 
 constexpr double kLostShare = 0.5;    // of the mask explained, under which the rope is lost (SPEC 6)
 constexpr double kLongUnseen = 0.5;   // s without a mask after which the rope counts as lost
@@ -35,9 +45,8 @@ constexpr double kLostRate = 5.0;     // rad/s: standard deviations from which a
 constexpr double kNoSmoothness = 1e-9;  // 1/rad^2: the filter's prior replaces the fit's own
 
 // of the masks' edge offset: how sure it is at first, at best, and after how many frames
-static double G(const char*k,double d){const char*e=getenv(k);return e?atof(e):d;}
-static const double kOffsetDeviation = G("OD",0.5), kLeastOffsetDeviation = G("LOD",0.1);  // px
-static const double kOffsetFrames = G("OF",30.0);
+constexpr double kOffsetDeviation = 0.5, kLeastOffsetDeviation = 0.05;  // px
+constexpr double kOffsetFrames = 30.0;
 
 constexpr double kLeastVariance = 1e-12;  // rad^2, keeps covariances invertible
 
@@ -52,56 +61,87 @@ double total_mass(const dynamics::Parameters& parameters) {
   return mass;
 }
 
-// Covariance of the rest angles' shifts for a random force of `deviation` N, alike in all directions, somewhere on the
-// rope: mean over the joints and the free end of J^T J, weighted by `place`.
-MatrixX force_covariance(const Filter& filter, const Pose& base, const VectorX& theta, double deviation,
-                         const VectorX& place) {
-  const chain::Chain& chain = filter.model.chain;
-  const int n = chain.angles();
+// Of the joints after the first and the free end: the ends of the links 1.. .
+std::vector<MatrixX> link_end_jacobians(const chain::Chain& chain, const Pose& base, const VectorX& theta) {
   const MatrixX axes = chain::world_axes(chain, theta, base);
   const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, base));
-  MatrixX sum = MatrixX::Zero(n, n);
-  for (int link = 1; link < chain.links(); ++link) {
-    const MatrixX jacobian = chain::point_jacobian(chain, axes, link, nodes.col(link + 1));
-    sum.noalias() += place[link - 1] * jacobian.transpose() * jacobian;
-  }
-  sum *= deviation * deviation;
-  for (int k = 0; k < n; ++k) {
-    sum.row(k) /= filter.model.parameters.stiffness[k];
-    sum.col(k) /= filter.model.parameters.stiffness[k];
-  }
+  std::vector<MatrixX> jacobians;
+  for (int link = 1; link < chain.links(); ++link)
+    jacobians.push_back(chain::point_jacobian(chain, axes, link, nodes.col(link + 1)));
+  return jacobians;
+}
+
+// Sum of weight J^T J: covariance of the torques that a random unit force, alike in all directions, causes.
+MatrixX torque_covariance(const std::vector<MatrixX>& jacobians, const VectorX& weights) {
+  MatrixX sum = MatrixX::Zero(jacobians[0].cols(), jacobians[0].cols());
+  for (std::size_t i = 0; i < jacobians.size(); ++i)
+    sum.noalias() += weights[i] * jacobians[i].transpose() * jacobians[i];
   return sum;
 }
 
-// Where the believed force acts: the share of each link's end in it, when it is spread as `place` allows.
-VectorX place_of_force(const Filter& filter, const Belief& belief, const VectorX& place, double& size) {
-  const chain::Chain& chain = filter.model.chain;
-  const int n = chain.angles();
-  const VectorX theta = belief.mean.head(n);
-  const Pose base = filter.base(belief.time).pose;
-  const MatrixX axes = chain::world_axes(chain, theta, base);
-  const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, base));
+// Covariance of the rest angles' shifts that stand for a random force of `deviation` N somewhere on the rope.
+MatrixX shift_covariance(const Filter& filter, const Pose& base, const VectorX& theta, double deviation,
+                         const VectorX& place) {
+  MatrixX out = torque_covariance(link_end_jacobians(filter.model.chain, base, theta), place);
+  out *= deviation * deviation;
+  for (int k = 0; k < out.rows(); ++k) {
+    out.row(k) /= filter.model.parameters.stiffness[k];
+    out.col(k) /= filter.model.parameters.stiffness[k];
+  }
+  return out;
+}
+
+// The believed force, if it is spread as filter.place allows, and each link end's share in it.
+struct FoundForce {
+  Vector3 sum = Vector3::Zero();  // N
+  VectorX shares;
+};
+
+FoundForce found_force(const Filter& filter, const Belief& belief) {
+  const int n = filter.model.chain.angles();
+  const std::vector<MatrixX> jacobians =
+      link_end_jacobians(filter.model.chain, filter.base(belief.time).pose, belief.mean.head(n));
   VectorX torque = belief.mean.tail(n);
   for (int k = 0; k < n; ++k) torque[k] *= filter.model.parameters.stiffness[k];
-  std::vector<MatrixX> jacobians;
-  MatrixX sum = MatrixX::Zero(n, n);
-  for (int link = 1; link < chain.links(); ++link) {
-    jacobians.push_back(chain::point_jacobian(chain, axes, link, nodes.col(link + 1)));
-    sum.noalias() += place[link - 1] * jacobians.back().transpose() * jacobians.back();
+  MatrixX covariance = torque_covariance(jacobians, filter.place);
+  covariance.diagonal().array() += kPlaceRidge * covariance.trace() / n;
+  const VectorX weighted = covariance.ldlt().solve(torque);
+  FoundForce out;
+  out.shares.resize(filter.place.size());
+  for (int i = 0; i < filter.place.size(); ++i) {
+    const Vector3 part = filter.place[i] * (jacobians[i] * weighted);
+    out.sum += part;
+    out.shares[i] = part.squaredNorm();
   }
-  sum.diagonal().array() += 1e-3 * sum.trace() / n;
-  const VectorX spread = sum.ldlt().solve(torque);
-  VectorX out(place.size());
-  Vector3 force = Vector3::Zero();
-  for (int i = 0; i < place.size(); ++i) {
-    const Vector3 part = place[i] * (jacobians[i] * spread);
-    out[i] = part.norm();
-    force += part;
+  const double total = out.shares.sum();
+  out.shares = total > 0.0 ? VectorX(out.shares / total) : filter.everywhere;
+  return out;
+}
+
+// Variance of the angles that the model's own shape leaves open.
+MatrixX shape_covariance(const chain::Chain& chain, const Pose& base, const VectorX& theta) {
+  const int n = chain.angles();
+  const double deviation = kLinkDeviation * chain.diameter;
+  const std::vector<MatrixX> jacobians = link_end_jacobians(chain, base, theta);
+  MatrixX information = torque_covariance(jacobians, VectorX::Constant(jacobians.size(), 1.0 / (deviation * deviation)));
+  information.diagonal().array() += 1.0 / (kUnseenAngle * kUnseenAngle);
+  return information.llt().solve(MatrixX::Identity(n, n));
+}
+
+// After a frame: where the force acts and whether it still does.
+void learn_force(Filter& filter, double time) {
+  if (!filter.shifts) return;
+  if (time > filter.contact_until) {
+    filter.place = filter.everywhere;
+    return;
   }
-  size = force.norm();
-  out = out.array().square().eval();
-  const double total = out.sum();
-  return total > 0.0 ? VectorX(out / total) : place;
+  const FoundForce found = found_force(filter, *filter.belief);
+  filter.place += kPlaceRate * (found.shares - filter.place);
+  filter.place.array() += kPlaceFloor;
+  filter.place /= filter.place.sum();
+  const double weight = filter.model.parameters.gravity.norm() * total_mass(filter.model.parameters);
+  if (found.sum.norm() > kContactForce * weight)
+    filter.contact_until = std::max(filter.contact_until, time + kContactMemory);
 }
 
 void symmetrize(MatrixX& matrix) { matrix = (0.5 * (matrix + matrix.transpose())).eval(); }
@@ -173,7 +213,7 @@ Belief first_belief(const Filter& filter, double time) {
   belief.covariance.diagonal().segment(n, n).setConstant(kFirstRate * kFirstRate);
   if (filter.shifts)
     belief.covariance.bottomRightCorner(n, n) =
-        force_covariance(filter, filter.base(time).pose, belief.mean.head(n),
+        shift_covariance(filter, filter.base(time).pose, belief.mean.head(n),
                          kFirstForce * total_mass(filter.model.parameters), filter.everywhere);
   belief.covariance.diagonal().array() += kLeastVariance;
   return belief;
@@ -266,7 +306,7 @@ Belief predict(const Filter& filter, const Belief& belief, double time, bool con
   const double h = time - belief.time;
   CHAINSPLAT_CHECK(h > 0.0, std::to_string(h));
   const Motion motion = move(filter, belief, time);
-  const double keep = std::exp(-h / (contact ? G2("CFM", 1e9) : filter.options.force_memory));
+  const double keep = std::exp(-h / filter.options.force_memory);
 
   MatrixX transition = MatrixX::Zero(3 * n, 3 * n);
   transition.topRows(n) = motion.theta_by_state;
@@ -280,7 +320,7 @@ Belief predict(const Filter& filter, const Belief& belief, double time, bool con
   if (filter.shifts) {
     const double force = (contact ? filter.options.contact_force : filter.options.model_force) *
                          total_mass(filter.model.parameters) * std::sqrt(h);
-    const MatrixX shift = force_covariance(filter, filter.base(time).pose, motion.theta, force, contact ? filter.place : filter.everywhere);
+    const MatrixX shift = shift_covariance(filter, filter.base(time).pose, motion.theta, force, contact ? filter.place : filter.everywhere);
     // the force changes during the step: a third of the change acts all along in the mean square
     MatrixX noise = transition.rightCols(n);
     noise.topRows(2 * n) *= std::sqrt(1.0 / 3.0);
@@ -337,19 +377,7 @@ Estimate update(Filter& filter, const capture::View& view) {
     if (!out.lost) {
       filter.last_seen = view.time;
       filter.belief = measured.belief;
-      if (filter.shifts) {
-        if (view.time > filter.contact_until) {
-          filter.place = filter.everywhere;
-        } else {
-          const double rate = G2("PR", 0.3), floor = G2("PF", 0.02);
-          double size = 0.0;
-          filter.place += rate * (place_of_force(filter, *filter.belief, filter.place, size) - filter.place);
-          if (size > G2("TH", 0.05) * 9.81 * total_mass(filter.model.parameters))
-            filter.contact_until = std::max(filter.contact_until, view.time + kContactMemory);
-          filter.place.array() += floor;
-          filter.place /= filter.place.sum();
-        }
-      }
+      learn_force(filter, view.time);
       const double gain = 1.0 / kOffsetFrames;
       filter.edge_offset += gain * (measured.fit.edge_offset - filter.edge_offset);
       filter.edge_offset_variance =
@@ -363,6 +391,7 @@ Estimate update(Filter& filter, const capture::View& view) {
   out.theta = filter.belief->mean.head(n);
   out.thetadot = filter.belief->mean.segment(n, n);
   out.covariance = filter.belief->covariance.topLeftCorner(2 * n, 2 * n);
+  out.covariance.topLeftCorner(n, n) += shape_covariance(filter.model.chain, filter.base(view.time).pose, out.theta);
   out.iou = tube_iou(filter.model.chain, filter.base(view.time).pose, out.theta, view, filter.camera);
   return out;
 }

@@ -1,0 +1,352 @@
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <limits>
+#include <numeric>
+
+#include "search.h"
+
+namespace chainsplat::planning {
+namespace {
+
+// Annealing of the soft minimum (SPEC 8), with the iterations for each.
+constexpr struct {
+  double sharpness, smoothness;
+  int iterations;
+} kCoarse[] = {{1e3, 1e-6, 5}, {1e4, 1e-7, 6}};
+constexpr double kFinalSharpness = 1e5;
+constexpr double kFinalSmoothness = 2e-8;
+constexpr int kFinalIterations = 10;
+constexpr double kGoodMiss = 1e-4;    // m: no further start is tried
+constexpr int kGroups[] = {1, 3, 4, 4};  // starts optimized side by side; the next group only where the last failed
+constexpr double kLeastLoad = 0.25, kMostLoad = 0.95;  // of the limits, of random motions
+constexpr std::uint64_t kTargetStream = 0x7461726765740001ull;  // random numbers of random_target
+constexpr double kHorizons[] = {0.25, 0.35, 0.5, 0.7, 1.0};     // of the longest, for a free one
+constexpr double kTableSlack = 1e-6;  // m, a target may lie in the table's plane
+
+std::string millimeters(double meters) {
+  char text[32];
+  std::snprintf(text, sizeof text, "%.1f mm", 1e3 * meters);
+  return text;
+}
+
+void validate(const Problem& problem, const Options& options) {
+  const auto positive = [](double value, const char* name) {
+    if (!(value > 0.0) || !std::isfinite(value))
+      throw InputError(name, "is " + core::exact(value), "give a number above 0");
+  };
+  const Limits& limits = options.limits;
+  positive(options.horizon, "--horizon");
+  positive(limits.velocity, "velocity limit");
+  positive(limits.acceleration, "acceleration limit");
+  positive(limits.jerk, "jerk limit");
+  positive(limits.stroke, "stroke limit");
+  positive(limits.yaw_velocity, "yaw velocity limit");
+  positive(limits.yaw_acceleration, "yaw acceleration limit");
+  positive(limits.yaw_jerk, "yaw jerk limit");
+  positive(limits.turn, "turn limit");
+  positive(options.tolerance, "--tolerance");
+  if (problem.targets.empty()) throw InputError("--target", "no target is given", "give X,Y,Z");
+  const std::vector<Axis> axes = options.axes.empty() ? default_axes(problem.model.chain) : options.axes;
+  for (std::size_t i = 0; i < axes.size(); ++i)
+    if (std::find(axes.begin() + i + 1, axes.end(), axes[i]) != axes.end())
+      throw InputError("--axes", "an axis is named twice", "name each of x, y, z, yaw once at most");
+  if (problem.tabletop && problem.model.parameters.table_normal)
+    for (Axis axis : axes)
+      if (axis != Axis::yaw && std::abs(problem.model.parameters.table_normal->operator[](static_cast<int>(axis))) > 0.1)
+        throw InputError("--axes", "one leaves the table and the rope is known on the table only", "leave it out");
+  for (const Vector3& target : problem.targets) {
+    if (!target.allFinite())
+      throw InputError("--target", "a coordinate is not a finite number", "give X,Y,Z in meters");
+    if (problem.tabletop && problem.table_point && problem.model.parameters.table_normal &&
+        problem.model.parameters.table_normal->dot(target - *problem.table_point) < -kTableSlack)
+      throw InputError("--target", "lies under the table", "give a point on the table or above it");
+  }
+  if (options.terminal) {
+    if (options.terminal->size() != static_cast<Eigen::Index>(axes.size()) || !options.terminal->allFinite())
+      throw InputError("--terminal", "has " + std::to_string(options.terminal->size()) + " numbers",
+                       "give an offset for each of the " + std::to_string(axes.size()) + " axes");
+    for (std::size_t a = 0; a < axes.size(); ++a)
+      if (std::abs((*options.terminal)[static_cast<Eigen::Index>(a)]) >
+          (axes[a] == Axis::yaw ? limits.turn : limits.stroke))
+        throw InputError("--terminal", "is outside the stroke", "raise the stroke limit or end nearer to the start");
+    // the fastest way from rest to rest: the blend's own peaks
+    Motion motion = empty_motion(problem, options);
+    append_piece(motion, 0.0, options.horizon * static_cast<double>(problem.targets.size()));
+    motion.pieces.back().terminal = *options.terminal;
+    if (const Peaks p = peaks(motion, 0.0, motion.end(), limits);
+        p.over == "velocity" && options.terminal->head(1).size() > 0 &&
+        p.velocity > 1.9 * limits.velocity)  // 1.9: mean to peak speed of the blend; no motion in time is slower
+      throw InputError("--terminal", "cannot be reached in time within the velocity limit",
+                       "give a longer horizon or a nearer end");
+  }
+  for (const Sphere& s : options.spheres)
+    if (!s.center.allFinite() || !(s.radius > 0.0))
+      throw InputError("--keep-out-sphere", "is no sphere", "give X,Y,Z,RADIUS with a radius above 0");
+  for (const Box& b : options.boxes)
+    if (!b.low.allFinite() || !b.high.allFinite() || !((b.high - b.low).minCoeff() > 0.0))
+      throw InputError("--keep-out-box", "is no box", "give the lower corner, then the upper corner");
+}
+
+struct Found {
+  VectorX unknowns;
+  Hit hit;
+  Peaks peaks;
+  double clearance = 0.0;
+  bool good = false;  // finite, within the limits, clear of the obstacles
+  int iterations = 0;
+};
+
+// Full steps, fine peaks, all samples.
+void judge(const Task& task, Found& found) {
+  found.good = false;
+  std::vector<Rollout> rollouts(task.models.size());
+  std::vector<char> finite(task.models.size());
+  core::parallel_for(static_cast<std::int64_t>(task.models.size()), [&](std::int64_t m) {
+    finite[m] = roll_out(*task.models[m], task.motion, task.grid, found.unknowns, task.initial, false, rollouts[m]);
+  });
+  found.hit = {};
+  found.hit.miss = std::numeric_limits<double>::infinity();
+  if (std::find(finite.begin(), finite.end(), 0) != finite.end()) return;
+  found.clearance = std::numeric_limits<double>::infinity();
+  double mean = 0.0, worst = 0.0;
+  for (std::size_t m = 0; m < task.models.size(); ++m) {
+    const Hit hit = measure(task, *task.models[m], rollouts[m]);
+    if (m == 0) found.hit = hit;
+    mean += hit.miss / static_cast<double>(task.models.size());
+    worst = std::max(worst, hit.miss);
+    found.clearance = std::min(found.clearance, clearance(task, *task.models[m], rollouts[m]));
+  }
+  found.hit.mean_miss = mean, found.hit.worst_miss = worst;
+  Motion motion = task.motion;
+  set_unknowns(motion, found.unknowns);
+  found.peaks = peaks(motion, task.grid.start, task.grid.time(task.grid.nodes() - 1), task.options->limits);
+  found.good = found.peaks.over.empty() && found.clearance >= 0.0;
+}
+
+double merit(const Found& found, const Options& options) {
+  return options.worst_case ? found.hit.worst_miss : found.hit.mean_miss;
+}
+
+bool better(const Found& a, const Found& b, const Options& options) {
+  if (a.good != b.good) return a.good;
+  return merit(a, options) < merit(b, options);
+}
+
+Found optimize(const Task& coarse, const Task& fine, VectorX unknowns) {
+  Found found;
+  found.unknowns = std::move(unknowns);
+  for (const auto& stage : kCoarse)
+    found.iterations += minimize(coarse, found.unknowns, {stage.sharpness, stage.smoothness}, stage.iterations);
+  found.iterations += minimize(fine, found.unknowns, {kFinalSharpness, kFinalSmoothness}, kFinalIterations);
+  judge(fine, found);
+  return found;
+}
+
+// Motions that carry a point of the resting rope to the target, as far as the limits allow.
+std::vector<VectorX> carried(const Task& task) {
+  std::vector<VectorX> out;
+  const chain::Chain& chain = task.models.front()->chain;
+  math::Pose base{task.motion.origin.rotation, task.grid.fixed[0].col(0).head<3>()};
+  const auto motions = chain::link_motions(chain, task.initial.theta, base);
+  for (const double part : task.tabletop ? std::vector<double>{0.35, 0.65, 1.0} : std::vector<double>{1.0}) {
+    const double s = part * chain.length;
+    const Vector3 point = motions[chain::link_at(chain, std::min(s, 0.999 * chain.length))] * (s * chain.direction);
+    VectorX q = VectorX::Zero(static_cast<Eigen::Index>(task.motion.axes.size()) * kPerAxis);
+    for (std::size_t a = 0; a < task.motion.axes.size(); ++a) {
+      const Eigen::Index i = static_cast<Eigen::Index>(a) * kPerAxis + kBasisCount;
+      if (task.motion.axes[a] != Axis::yaw && !task.held[i])
+        q[i] = (task.target - point)[static_cast<int>(task.motion.axes[a])];
+    }
+    const double most = load(task, q);
+    if (most > kMostLoad) q *= kMostLoad / most;
+    out.push_back(q);
+  }
+  return out;
+}
+
+// The best motion of one stretch; `tried` and `iterations` are added to.
+Found solve(const Problem& problem, const Options& options, const std::vector<const dynamics::Model*>& models,
+            const Motion& motion, const dynamics::InitialState& initial, const Vector3& target,
+            const std::optional<VectorX>& terminal, int& tried, int& iterations) {
+  const int substeps = problem.model.parameters.substeps;
+  Task fine = make_task(problem, options, models, motion, initial, target, substeps);
+  Task coarse = make_task(problem, options, models, motion, initial, target, std::max(1, substeps / 2));
+  VectorX rest = VectorX::Zero(static_cast<Eigen::Index>(motion.axes.size()) * kPerAxis);
+  if (terminal)
+    for (Task* task : {&fine, &coarse})
+      for (Eigen::Index a = 0; a < terminal->size(); ++a) {
+        task->held[a * kPerAxis + kBasisCount] = true;
+        rest[a * kPerAxis + kBasisCount] = (*terminal)[a];
+      }
+
+  // diverse motions, rolled out with the identified parameters only
+  std::vector<VectorX> starts = carried(coarse);
+  core::Random random(options.seed + 1);
+  for (int i = 0; i < options.starts; ++i)
+    starts.push_back(random_unknowns(coarse, random, random.uniform(kLeastLoad, kMostLoad)));
+  for (VectorX& q : starts) q += rest;
+  Task screening = coarse;
+  screening.models = {models.front()};
+  std::vector<double> value(starts.size());
+  core::parallel_for(static_cast<std::int64_t>(starts.size()), [&](std::int64_t i) {
+    const Evaluation e = evaluate(screening, starts[i], {kFinalSharpness, kCoarse[0].smoothness}, false);
+    value[i] = e.good ? e.value : std::numeric_limits<double>::infinity();
+  });
+  std::vector<int> order(starts.size());
+  std::iota(order.begin(), order.end(), 0);
+  std::stable_sort(order.begin(), order.end(), [&](int a, int b) { return value[a] < value[b]; });
+  tried += static_cast<int>(starts.size());
+
+  Found best;
+  bool first = true;
+  std::size_t next = 0;
+  for (const int group : kGroups) {
+    const std::size_t count = std::min<std::size_t>(group, order.size() - next);
+    std::vector<Found> found(count);
+    core::parallel_for(static_cast<std::int64_t>(count), [&](std::int64_t i) {
+      found[i] = optimize(coarse, fine, starts[order[next + static_cast<std::size_t>(i)]]);
+    });
+    next += count;
+    for (Found& f : found) {
+      iterations += f.iterations;
+      if (first || better(f, best, options)) best = std::move(f);
+      first = false;
+    }
+    if (core::stop_requested()) throw Interrupted(core::stop_requested());
+    // samples have a spread that no motion removes
+    const double enough = models.size() > 1 ? options.tolerance : kGoodMiss;
+    if (best.good && merit(best, options) <= enough) break;
+    if (best.good && models.size() > 1 && group > 1) break;
+  }
+  return best;
+}
+
+}  // namespace
+
+double unreachable_distance(const Problem& problem, const Options& options, const Vector3& asked) {
+  const chain::Chain& chain = problem.model.chain;
+  const Vector3 target = at_rope_height(problem, asked);
+  const std::vector<Axis> axes = options.axes.empty() ? default_axes(chain) : options.axes;
+  // from rest to rest in the horizon no axis gets further than the velocity limit allows
+  const double time = options.horizon * static_cast<double>(problem.targets.size());
+  const double stroke = std::min(options.limits.stroke, options.limits.velocity * time);
+  Vector3 gap = target - problem.base.translation;
+  bool turns = false;
+  Vector3 moved = Vector3::Zero();  // along which axes the base goes
+  for (Axis axis : axes) {
+    if (axis == Axis::yaw) {
+      turns = true;
+      continue;
+    }
+    const int i = static_cast<int>(axis);
+    moved[i] = 1.0;
+    gap[i] = gap[i] > 0.0 ? std::max(0.0, gap[i] - stroke) : std::min(0.0, gap[i] + stroke);
+  }
+  double bound = std::max(0.0, gap.norm() - chain.length);
+  // a planar chain stays in its plane
+  const Vector3 normal = problem.base.rotation * chain.bending_axis;
+  if (default_axes(chain).size() == 1 && !turns && normal.cwiseAbs().dot(moved) < 1e-9)
+    bound = std::max(bound, std::abs(normal.dot(target - problem.base.translation)));
+  return bound;
+}
+
+Plan plan(const Problem& problem, const Options& options) {
+  validate(problem, options);
+  const double begin = core::seconds_now();
+  std::vector<dynamics::Model> drawn;
+  std::vector<const dynamics::Model*> models{&problem.model};
+  if (options.samples > 0) {
+    for (const dynamics::Parameters& p : draw_parameters(problem.model.chain, problem.model.parameters,
+                                                         problem.estimates, options.samples, options.seed + 2))
+      drawn.push_back(dynamics::make_model(problem.model.chain, p));
+    for (const dynamics::Model& model : drawn) models.push_back(&model);
+  }
+
+  Plan plan;
+  plan.motion = empty_motion(problem, options);
+  plan.reached = true;
+  dynamics::InitialState state = problem.initial;
+  state.time = 0.0;
+  for (std::size_t t = 0; t < problem.targets.size(); ++t) {
+    const bool last = t + 1 == problem.targets.size();
+    std::optional<VectorX> terminal;
+    if (options.terminal && last) {
+      terminal = *options.terminal;
+      for (const Piece& piece : plan.motion.pieces) *terminal -= piece.terminal;
+    }
+    const double start = plan.motion.end();
+    Found best;
+    Motion motion;
+    bool first = true;
+    for (const double part : kHorizons) {
+      if (!options.free_horizon && part != 1.0) continue;
+      Motion trial = plan.motion;
+      append_piece(trial, start, part * options.horizon);
+      Found found = solve(problem, options, models, trial, state, problem.targets[t], terminal, plan.starts,
+                          plan.iterations);
+      if (first || better(found, best, options)) best = std::move(found), motion = std::move(trial);
+      first = false;
+      if (best.good && merit(best, options) <= options.tolerance) break;
+    }
+    if (!std::isfinite(best.hit.miss))
+      throw WorkError("plan", "the rope's motion diverged for every start", "check the twin's parameters");
+    set_unknowns(motion, best.unknowns);
+    plan.motion = std::move(motion);
+    plan.hits.push_back(best.hit);
+    if (!best.good || !(best.hit.miss <= options.tolerance)) {
+      plan.reached = false;
+      const double bound = unreachable_distance(problem, options, problem.targets[t]);
+      const std::string which = problem.targets.size() > 1 ? "target " + std::to_string(t + 1) + ": " : "";
+      if (!plan.reason.empty()) plan.reason += "; ";
+      if (!best.peaks.over.empty())
+        plan.reason += which + "no motion found keeps the " + best.peaks.over + " limit";
+      else if (best.clearance < 0.0)
+        plan.reason += which + "no motion found stays clear of what must be kept out of";
+      else if (bound > options.tolerance)
+        plan.reason += which + "it is at least " + millimeters(bound) + " beyond what rope length, stroke and axes allow";
+      else
+        plan.reason += which + "the nearest of all starts misses by " + millimeters(best.hit.miss) +
+                       " with these axes, limits and horizon";
+    }
+    // the next stretch starts where this one leaves the rope
+    if (!last) {
+      const chain::States end = predict(problem, plan.motion, {plan.motion.end()});
+      state.time = end.time.back(), state.theta = end.theta.back(), state.thetadot = end.thetadot.back();
+    }
+  }
+  plan.peaks = peaks(plan.motion, 0.0, plan.motion.end(), options.limits);
+  plan.seconds = core::seconds_now() - begin;
+  return plan;
+}
+
+chain::States predict(const Problem& problem, const Motion& motion, const std::vector<double>& times) {
+  dynamics::InitialState initial = problem.initial;
+  initial.time = 0.0;
+  return dynamics::rollout(
+      problem.model, [&](double time) { return base_at(motion, time); }, initial, times);
+}
+
+Vector3 random_target(const Problem& problem, const Options& options, std::uint64_t seed) {
+  Motion motion = empty_motion(problem, options);
+  append_piece(motion, 0.0, options.horizon);
+  dynamics::InitialState initial = problem.initial;
+  initial.time = 0.0;
+  const Task task = make_task(problem, options, {&problem.model}, motion, initial, problem.base.translation,
+                              problem.model.parameters.substeps);
+  core::Random random(kTargetStream ^ (seed * 0x9e3779b97f4a7c15ull));
+  for (int attempt = 0; attempt < 100; ++attempt) {
+    const VectorX q = random_unknowns(task, random, random.uniform(0.2, 0.9));
+    Rollout rollout;
+    if (!roll_out(problem.model, task.motion, task.grid, q, task.initial, false, rollout)) continue;
+    const int last = task.grid.nodes() - 1;
+    const int node = problem.tabletop ? last : static_cast<int>(random.uniform(0.2, 1.0) * last);
+    set_unknowns(motion, q);
+    const auto motions =
+        chain::link_motions(problem.model.chain, rollout.theta[node], base_from(motion, rollout.base[node]).pose);
+    return motions.back() * (problem.model.chain.length * problem.model.chain.direction);
+  }
+  throw WorkError("random target", "no random motion stays finite", "check the twin's parameters");
+}
+
+}  // namespace chainsplat::planning

@@ -1,0 +1,148 @@
+#include "search.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace chainsplat::planning {
+namespace {
+
+constexpr double kFirstDamping = 1e-2;  // of the curvature's trace
+constexpr double kLeastDamping = 1e-9, kMostDamping = 1e6;
+constexpr double kLessDamping = 0.15, kMoreDamping = 6.0;
+constexpr double kConverged = 1e-4;  // relative decrease of the objective
+constexpr double kNothing = 1e-11;   // m^2, (3 um)^2: a smaller decrease does not count
+
+}  // namespace
+
+std::vector<Axis> default_axes(const chain::Chain& chain) {
+  for (const math::Vector6& axis : chain.axes)
+    if (std::abs(axis.head<3>().dot(chain.bending_axis)) < 0.5 && std::abs(axis.head<3>().dot(chain.direction)) < 0.5)
+      return {Axis::x, Axis::y};
+  return {Axis::x};
+}
+
+Motion empty_motion(const Problem& problem, const Options& options) {
+  Motion motion;
+  motion.origin = problem.base;
+  const dynamics::Parameters& p = problem.model.parameters;
+  if (p.table_normal)
+    motion.up = *p.table_normal;
+  else if (p.gravity.norm() > 0.0)
+    motion.up = -p.gravity.normalized();
+  motion.axes = options.axes.empty() ? default_axes(problem.model.chain) : options.axes;
+  motion.window = options.window;
+  return motion;
+}
+
+void append_piece(Motion& motion, double start, double duration) {
+  const auto axes = static_cast<Eigen::Index>(motion.axes.size());
+  motion.pieces.push_back({start, duration, MatrixX::Zero(kBasisCount, axes), VectorX::Zero(axes)});
+}
+
+void set_unknowns(Motion& motion, const VectorX& unknowns) {
+  Piece& piece = motion.pieces.back();
+  for (Eigen::Index a = 0; a < piece.terminal.size(); ++a) {
+    piece.weights.col(a) = unknowns.segment(a * kPerAxis, kBasisCount);
+    piece.terminal[a] = unknowns[a * kPerAxis + kBasisCount];
+  }
+}
+
+Vector3 at_rope_height(const Problem& problem, const Vector3& target) {
+  if (!problem.tabletop || !problem.model.parameters.table_normal) return target;
+  const Vector3& normal = *problem.model.parameters.table_normal;
+  return target + normal * normal.dot(problem.base.translation - target);
+}
+
+Task make_task(const Problem& problem, const Options& options, const std::vector<const dynamics::Model*>& models,
+               const Motion& motion, const dynamics::InitialState& initial, const Vector3& target, int substeps) {
+  Task task;
+  task.models = models;
+  task.tabletop = problem.tabletop;
+  task.motion = motion;
+  task.grid = make_grid(motion, substeps);
+  task.initial = initial;
+  task.target = at_rope_height(problem, target);
+  task.options = &options;
+  task.held.assign(motion.axes.size() * kPerAxis, false);
+  return task;
+}
+
+int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, int iterations) {
+  Evaluation now = evaluate(task, unknowns, sharpness, true);
+  if (!now.good) return 1;
+  // unit of the damping: acceleration, so that a step changes the motion as little as it can
+  MatrixX metric = MatrixX::Zero(unknowns.size(), unknowns.size());
+  for (const Basis& b : task.grid.basis)
+    for (std::size_t a = 0; a < task.motion.axes.size(); ++a) {
+      const auto first = static_cast<Eigen::Index>(a) * kPerAxis;
+      metric.block(first, first, kPerAxis, kPerAxis) += b.col(2) * b.col(2).transpose();
+    }
+  for (Eigen::Index i = 0; i < unknowns.size(); ++i)
+    if (task.held[i]) metric.row(i).setZero(), metric.col(i).setZero(), metric(i, i) = 1.0;
+  metric /= metric.trace();
+  double damping = kFirstDamping;
+  int count = 1;
+  while (count < iterations) {
+    const double scale = now.curvature.trace();
+    VectorX step;
+    Evaluation next;
+    for (;;) {
+      MatrixX matrix = now.curvature + damping * scale * metric;
+      // the metric has no part in directions without acceleration; held unknowns have no row
+      matrix.diagonal().array() += 1e-12 * scale;
+      step = -matrix.ldlt().solve(now.gradient);
+      for (Eigen::Index i = 0; i < step.size(); ++i)
+        if (task.held[i]) step[i] = 0.0;
+      next = evaluate(task, unknowns + step, sharpness, true);
+      ++count;
+      if (next.good && next.value < now.value) break;
+      damping *= kMoreDamping;
+      if (damping > kMostDamping || count >= iterations) return count;
+    }
+    const double decrease = now.value - next.value;
+    unknowns += step;
+    now = std::move(next);
+    damping = std::max(kLeastDamping, kLessDamping * damping);
+    if (decrease < kNothing || decrease < kConverged * std::abs(now.value)) break;
+  }
+  return count;
+}
+
+double load(const Task& task, const VectorX& unknowns) {
+  const Limits& limits = task.options->limits;
+  double most = 0.0;
+  for (int node = 0; node < task.grid.nodes(); ++node) {
+    Coordinates c = task.grid.fixed[node];
+    for (std::size_t a = 0; a < task.motion.axes.size(); ++a)
+      c.row(static_cast<int>(task.motion.axes[a])) +=
+          unknowns.segment(static_cast<Eigen::Index>(a) * kPerAxis, kPerAxis).transpose() * task.grid.basis[node];
+    const Vector3 offset = c.col(0).head<3>() - task.motion.origin.translation;
+    most = std::max({most, c.col(1).head<3>().norm() / limits.velocity, c.col(2).head<3>().norm() / limits.acceleration,
+                     offset.cwiseAbs().maxCoeff() / limits.stroke, std::abs(c(3, 1)) / limits.yaw_velocity,
+                     std::abs(c(3, 2)) / limits.yaw_acceleration, std::abs(c(3, 0)) / limits.turn});
+    if (task.motion.window == Window::smooth)
+      most = std::max({most, c.col(3).head<3>().norm() / limits.jerk, std::abs(c(3, 3)) / limits.yaw_jerk});
+  }
+  return most;
+}
+
+VectorX random_unknowns(const Task& task, core::Random& random, double fraction) {
+  VectorX q(static_cast<Eigen::Index>(task.motion.axes.size()) * kPerAxis);
+  // weights that follow one another give slow wide motions, independent ones shake
+  const double memory = random.uniform(-0.5, 0.9);
+  for (std::size_t a = 0; a < task.motion.axes.size(); ++a) {
+    double weight = 0.0;
+    for (int i = 0; i < kBasisCount; ++i) {
+      weight = memory * weight + random.normal();
+      q[static_cast<Eigen::Index>(a) * kPerAxis + i] = weight;
+    }
+    q[static_cast<Eigen::Index>(a) * kPerAxis + kBasisCount] = 2.0 * random.normal();
+  }
+  for (Eigen::Index i = 0; i < q.size(); ++i)
+    if (task.held[i]) q[i] = 0.0;
+  // where other pieces move too, the load is not proportional: a few rounds
+  for (int round = 0; round < 3; ++round) q *= std::min(10.0, fraction / std::max(load(task, q), 1e-6));
+  return q;
+}
+
+}  // namespace chainsplat::planning

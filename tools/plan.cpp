@@ -1,0 +1,345 @@
+// plan.cpp - a base motion that makes the rope hit a target.
+#include <CLI/CLI.hpp>
+#include <cmath>
+#include <cstdlib>
+#include <iostream>
+#include <memory>
+#include <nlohmann/json.hpp>
+#include <sstream>
+
+#include "chainsplat/planning.h"
+#include "chainsplat/twin.h"
+#include "cli.h"
+#include "run_folder.h"
+
+namespace chainsplat::tools {
+
+namespace {
+
+using Json = nlohmann::ordered_json;
+using planning::Axis;
+
+struct PlanRequest {
+  std::string run, out, axes, initial, terminal, horizon = "3", window = "smooth";
+  std::vector<std::string> targets, spheres, boxes;
+  double rate = 100.0;
+  bool force = false;
+  planning::Options options;
+};
+
+std::vector<double> numbers(const std::string& text, const std::string& where, std::size_t count) {
+  std::vector<double> out;
+  const char* at = text.c_str();
+  for (;;) {
+    char* end = nullptr;
+    const double value = std::strtod(at, &end);
+    if (end == at) break;
+    out.push_back(value);
+    if (*end == '\0') at = end;
+    if (*end != ',') break;
+    at = end + 1;
+  }
+  if (*at != '\0' || (count && out.size() != count) || out.empty())
+    throw InputError(where, "'" + text + "' is not " + (count ? std::to_string(count) + " numbers" : "numbers"),
+                     "give them with commas between, for example 0.1,0,0.3");
+  return out;
+}
+
+std::vector<Axis> parse_axes(const std::string& text) {
+  std::vector<Axis> out;
+  std::istringstream words(text);
+  std::string word;
+  while (std::getline(words, word, ','))
+    if (word == "x")
+      out.push_back(Axis::x);
+    else if (word == "y")
+      out.push_back(Axis::y);
+    else if (word == "z")
+      out.push_back(Axis::z);
+    else if (word == "yaw")
+      out.push_back(Axis::yaw);
+    else
+      throw InputError("--axes", "'" + word + "' is no axis", "give some of x,y,z,yaw");
+  return out;
+}
+
+// Planning needs numbers for everything: what identification starts from, for a 60 g/m rope where the mass is unknown.
+dynamics::Parameters assumed_parameters(const twin::Twin& twin) {
+  constexpr double kMass = 0.2;         // kg/m
+  constexpr double kStiffness = 0.1;    // of weight times length, N m/rad at a joint
+  constexpr double kRetardation = 0.07;  // s, damping over stiffness
+  constexpr double kCoulomb = 0.3, kDrag = 0.72;  // -, N s^2/m^3 per meter of diameter
+  const chain::Chain& chain = twin.chain;
+  dynamics::Parameters p;
+  const double torque = kStiffness * kMass * chain.length * twin.gravity.norm() * chain.length;
+  for (int link = 1; link < chain.links(); ++link) {
+    const double length = chain.link_end(link) - chain.link_start(link);
+    p.link_mass.push_back(kMass * length);
+    p.viscous_friction.push_back(0.0);
+    p.coulomb_friction.push_back(twin.tabletop ? kCoulomb : 0.0);
+    p.air_linear.push_back(0.0);
+    p.air_quadratic.push_back(twin.tabletop ? 0.0 : kDrag * chain.diameter * length);
+  }
+  p.stiffness.assign(chain.angles(), torque);
+  p.rest_angle.assign(chain.angles(), 0.0);
+  p.damping.assign(chain.angles(), kRetardation * torque);
+  p.radius = 0.5 * chain.diameter;
+  p.gravity = twin.gravity;
+  if (twin.tabletop) p.table_normal = twin.table_normal.value_or(math::Vector3::UnitZ());
+  p.substeps = twin.tabletop ? 8 : 4;
+  return p;
+}
+
+planning::Problem make_problem(const PlanRequest& request, const twin::Twin& twin) {
+  planning::Problem problem;
+  dynamics::Parameters parameters;
+  if (twin.parameters) {
+    parameters = *twin.parameters;
+  } else {
+    core::warn(request.run + ": its dynamics are not identified; mass, stiffness, damping and friction are assumed");
+    parameters = assumed_parameters(twin);
+  }
+  problem.model = dynamics::make_model(twin.chain, parameters);
+  problem.tabletop = twin.tabletop;
+  problem.table_point = twin.table_point;
+  const trajectory::Trajectory base = own_base(request.run);
+  problem.base = base.pose(base.start());
+  problem.estimates = twin.estimates;
+  const int angles = twin.chain.angles();
+  problem.initial.thetadot = math::VectorX::Zero(angles);
+  if (!request.initial.empty()) {
+    const chain::States given = twin::read_states(input_path(request.initial), angles);
+    if (given.time.empty()) throw InputError(request.initial, "has no rows", "give at least one");
+    problem.initial.theta = given.theta[0];
+    if (!given.thetadot.empty()) problem.initial.thetadot = given.thetadot[0];
+  } else if (twin.tabletop) {
+    problem.initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
+  } else {
+    problem.initial.theta = dynamics::static_equilibrium(problem.model, problem.base);
+  }
+  return problem;
+}
+
+Json json_of(const math::Vector3& v) { return {v.x(), v.y(), v.z()}; }
+
+Json plan_json(const planning::Problem& problem, const planning::Options& options, const planning::Plan& plan,
+               const std::string& horizon) {
+  Json out;
+  out["targets"] = Json::array();
+  for (const math::Vector3& target : problem.targets) out["targets"].push_back(json_of(target));
+  // of several targets the worst
+  const planning::Hit* worst = &plan.hits.front();
+  for (const planning::Hit& hit : plan.hits)
+    if (hit.miss > worst->miss) worst = &hit;
+  out["miss"] = worst->miss;
+  out["miss_time"] = worst->time;
+  out["miss_point"] = json_of(worst->point);
+  out["reached"] = plan.reached;
+  if (!plan.reached) out["reason"] = plan.reason;
+  out["tolerance"] = options.tolerance;
+  if (plan.hits.size() > 1) {
+    out["hits"] = Json::array();
+    for (const planning::Hit& hit : plan.hits)
+      out["hits"].push_back({{"miss", hit.miss}, {"miss_time", hit.time}, {"miss_point", json_of(hit.point)}});
+  }
+  if (options.samples > 0) {
+    out["samples"] = options.samples;
+    out["expected_miss"] = worst->mean_miss;
+    out["worst_miss"] = worst->worst_miss;
+  }
+  const bool yaw = std::find(plan.motion.axes.begin(), plan.motion.axes.end(), Axis::yaw) != plan.motion.axes.end();
+  out["peak_velocity"] = plan.peaks.velocity;
+  out["peak_acceleration"] = plan.peaks.acceleration;
+  out["peak_jerk"] = plan.peaks.jerk;
+  out["peak_stroke"] = plan.peaks.stroke;
+  if (yaw) {
+    out["peak_yaw_velocity"] = plan.peaks.yaw_velocity;
+    out["peak_yaw_acceleration"] = plan.peaks.yaw_acceleration;
+    out["peak_yaw_jerk"] = plan.peaks.yaw_jerk;
+    out["peak_turn"] = plan.peaks.turn;
+  }
+  const planning::Limits& l = options.limits;
+  out["limits"] = {{"velocity", l.velocity}, {"acceleration", l.acceleration}, {"jerk", l.jerk}, {"stroke", l.stroke}};
+  if (yaw) {
+    out["limits"]["yaw_velocity"] = l.yaw_velocity;
+    out["limits"]["yaw_acceleration"] = l.yaw_acceleration;
+    out["limits"]["yaw_jerk"] = l.yaw_jerk;
+    out["limits"]["turn"] = l.turn;
+  }
+  constexpr const char* kNames[] = {"x", "y", "z", "yaw"};
+  out["axes"] = Json::array();
+  for (Axis axis : plan.motion.axes) out["axes"].push_back(kNames[static_cast<int>(axis)]);
+  out["horizon"] = horizon;
+  out["window"] = options.window == planning::Window::smooth ? "smooth" : "paper";
+  // a stretch for each target: rows of weights by axis
+  out["weights"] = Json::array();
+  out["terminal"] = Json::array();
+  out["stretches"] = Json::array();
+  for (const planning::Piece& piece : plan.motion.pieces) {
+    Json weights = Json::array(), terminal = Json::array();
+    for (Eigen::Index a = 0; a < piece.terminal.size(); ++a) {
+      Json row = Json::array();
+      for (int i = 0; i < planning::kBasisCount; ++i) row.push_back(piece.weights(i, a));
+      weights.push_back(row);
+      terminal.push_back(piece.terminal[a]);
+    }
+    out["weights"].push_back(weights);
+    out["terminal"].push_back(terminal);
+    out["stretches"].push_back({{"start", piece.start}, {"duration", piece.duration}});
+  }
+  out["starts"] = plan.starts;
+  out["iterations"] = plan.iterations;
+  out["seconds"] = plan.seconds;
+  return out;
+}
+
+std::vector<double> row_times(double end, double rate) {
+  constexpr double kSlack = 1e-6;  // s
+  std::vector<double> times;
+  for (int k = 0; k / rate < end - kSlack; ++k) times.push_back(k / rate);
+  times.push_back(end);
+  return times;
+}
+
+void write_motion(const Path& out, const planning::Motion& motion, const std::vector<double>& times) {
+  std::vector<trajectory::Sample> samples;
+  std::string csv = "time,x,y,z,vx,vy,vz,ax,ay,az,yaw,yaw_velocity,yaw_acceleration\n";
+  for (double time : times) {
+    const planning::Coordinates c = planning::coordinates(motion, time);
+    samples.push_back({time, planning::base_at(motion, time).pose});
+    csv += core::exact(time);
+    for (int d = 0; d < 3; ++d)
+      for (int i = 0; i < 3; ++i) csv += "," + core::exact(c(i, d));
+    for (int d = 0; d < 3; ++d) csv += "," + core::exact(c(3, d));
+    csv += "\n";
+  }
+  core::write_file(out / "base.tum", trajectory::write_tum(samples));
+  core::write_file(out / "base.csv", csv);
+}
+
+void plan(const Globals& globals, PlanRequest& request) {
+  if (!(request.rate > 0.0) || !std::isfinite(request.rate))
+    throw InputError("--rate", "must be above 0", "give rows a second, for example 100");
+  planning::Options& options = request.options;
+  options.seed = globals.seed;
+  if (!request.axes.empty()) options.axes = parse_axes(request.axes);
+  options.window = request.window == "paper" ? planning::Window::paper : planning::Window::smooth;
+  constexpr double kLongestFree = 4.0;  // s, of a free horizon
+  if (request.horizon == "free") {
+    options.free_horizon = true;
+    options.horizon = kLongestFree;
+  } else {
+    options.horizon = numbers(request.horizon, "--horizon", 1)[0];
+  }
+  if (!request.terminal.empty()) {
+    const std::vector<double> values = numbers(request.terminal, "--terminal", 0);
+    options.terminal = Eigen::Map<const math::VectorX>(values.data(), static_cast<Eigen::Index>(values.size()));
+  }
+  for (const std::string& text : request.spheres) {
+    const auto v = numbers(text, "--keep-out-sphere", 4);
+    options.spheres.push_back({{v[0], v[1], v[2]}, v[3]});
+  }
+  for (const std::string& text : request.boxes) {
+    const auto v = numbers(text, "--keep-out-box", 6);
+    options.boxes.push_back({{v[0], v[1], v[2]}, {v[3], v[4], v[5]}});
+  }
+  const std::string mend = "name another folder or give --force to write into it";
+  check_output_folder(request.out, request.force, mend);
+  const twin::Twin twin = load_twin(request.run);
+  planning::Problem problem = make_problem(request, twin);
+  for (const std::string& text : request.targets) {
+    const std::string random = "random:";
+    if (text.rfind(random, 0) == 0) {
+      char* end = nullptr;
+      const std::uint64_t seed = std::strtoull(text.c_str() + random.size(), &end, 10);
+      if (*end != '\0' || end == text.c_str() + random.size())
+        throw InputError("--target", "'" + text + "' has no seed", "give for example random:1");
+      problem.targets.push_back(planning::random_target(problem, options, seed));
+    } else {
+      const auto v = numbers(text, "--target", 3);
+      problem.targets.push_back({v[0], v[1], v[2]});
+    }
+  }
+  for (const math::Vector3& target : problem.targets)
+    if (target.allFinite()) {
+      const double bound = planning::unreachable_distance(problem, options, target);
+      if (bound > options.tolerance) {
+        char text[160];
+        std::snprintf(text, sizeof text,
+                      "--target: at least %.1f mm beyond what rope length, stroke and axes allow; looking for the nearest motion",
+                      1e3 * bound);
+        core::warn(text);
+      }
+    }
+  const planning::Plan plan = planning::plan(problem, options);
+  const Path out = request.out;
+  make_folder(out);
+  const std::vector<double> times = row_times(plan.motion.end(), request.rate);
+  write_motion(out, plan.motion, times);
+  core::write_file(out / "states.csv", twin::states_csv(planning::predict(problem, plan.motion, times)));
+  core::write_file(out / "picture.svg", planning::picture_svg(problem, options, plan));
+  const Json document = plan_json(problem, options, plan, request.horizon);
+  core::write_file(out / "plan.json", document.dump(1) + "\n");
+  if (globals.json) {
+    std::cout << document.dump(1) << "\n";
+    return;
+  }
+  char text[256];
+  std::snprintf(text, sizeof text, "%s: miss %.2f mm at %.2f s, peak %.2f m/s and %.1f m/s^2, %.2f s: %s",
+                plan.reached ? "reached" : "cannot reach", 1e3 * document["miss"].get<double>(),
+                document["miss_time"].get<double>(), plan.peaks.velocity, plan.peaks.acceleration, plan.seconds,
+                request.out.c_str());
+  say(text);
+  if (!plan.reached) say(plan.reason);
+}
+
+}  // namespace
+
+void add_planning_commands(CLI::App& app, const Globals& globals, Job& job) {
+  CLI::App* planner = app.add_subcommand("plan", "Find a base motion that makes the rope hit a target");
+  auto request = std::make_shared<PlanRequest>();
+  planning::Limits& limits = request->options.limits;
+  planner->add_option("RUN", request->run, "Run folder of an identified twin")->required();
+  planner
+      ->add_option("--target", request->targets,
+                   "Point to hit, m, world: with the tip at any time, on a table with any point of the rope at the end.\n"
+                   "Several are hit one after the other. random:SEED: a point that a random motion passes")
+      ->required()
+      ->type_name("X,Y,Z");
+  planner->add_option("-o,--output", request->out, "Folder for base.tum, base.csv, states.csv, plan.json, picture.svg")
+      ->required()
+      ->type_name("PLAN");
+  planner->add_option("--axes", request->axes, "What moves (default: x, for a chain with two bending axes x,y)")
+      ->type_name("x,y,z,yaw");
+  planner->add_option("--horizon", request->horizon, "Seconds for each target (default 3), or free: the shortest that does")
+      ->type_name("S|free");
+  planner->add_option("--initial", request->initial, "Start from its first row (default: at rest)")->type_name("STATES.csv");
+  planner->add_option("--terminal", request->terminal, "Where the base ends, from its start, one number an axis (default: free)")
+      ->type_name("OFFSETS");
+  planner->add_option("--window", request->window, "smooth: no acceleration at the ends; paper: s^2(1-s)^2")
+      ->check(CLI::IsMember({"smooth", "paper"}));
+  planner->add_option("--velocity", limits.velocity, "Limit of the base, m/s (default 1.5)");
+  planner->add_option("--acceleration", limits.acceleration, "Limit of the base, m/s^2 (default 10)");
+  planner->add_option("--jerk", limits.jerk, "Limit of the base, m/s^3 (default 200)");
+  planner->add_option("--stroke", limits.stroke, "Farthest from the start along an axis, m (default 0.6)");
+  planner->add_option("--yaw-velocity", limits.yaw_velocity, "Limit, rad/s (default 3.1)");
+  planner->add_option("--yaw-acceleration", limits.yaw_acceleration, "Limit, rad/s^2 (default 20)");
+  planner->add_option("--yaw-jerk", limits.yaw_jerk, "Limit, rad/s^3 (default 400)");
+  planner->add_option("--turn", limits.turn, "Farthest yaw from the start, rad (default 1.6)");
+  planner->add_option("--keep-out-sphere", request->spheres, "Rope and gripper stay out of it")->type_name("X,Y,Z,R");
+  planner->add_option("--keep-out-box", request->boxes, "Rope and gripper stay out of it")->type_name("X,Y,Z,X,Y,Z");
+  planner->add_option("--gripper-radius", request->options.gripper_radius, "Of a sphere about the base, m (default 0.04)");
+  planner->add_option("--tolerance", request->options.tolerance, "A smaller miss counts as reached, m (default 0.001)");
+  planner->add_option("--starts", request->options.starts, "Random motions to begin from (default 24)")
+      ->check(CLI::Range(0, 100000));
+  planner->add_option("--samples", request->options.samples,
+                      "Also plan for N parameter sets drawn from the identification's covariance")
+      ->check(CLI::Range(0, 1000))
+      ->type_name("N");
+  planner->add_flag("--worst-case", request->options.worst_case, "Minimize the samples' worst miss, not the mean");
+  planner->add_option("--rate", request->rate, "Rows a second of the files (default 100)")->type_name("HZ");
+  planner->add_flag("--force", request->force, "Write into a folder that is not empty");
+  planner->callback([&globals, &job, request] { job = [&globals, request] { plan(globals, *request); }; });
+}
+
+}  // namespace chainsplat::tools
