@@ -1,4 +1,5 @@
-// bench.cpp - fixed benchmarks of drawing and training, defined here and seeded, so that two machines measure the same work.
+// bench.cpp - fixed benchmarks of drawing and training, defined here and seeded, so that two machines measure the same
+// work.
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cmath>
@@ -24,8 +25,8 @@ struct Request {
   int repeats = 7;
 };
 
-// A bent rope of 30 cm, 2 cm thick, seen by cameras on a half circle: `far`, 1 m away, fills about 1 % of 640x480; `close`
-// fills about 8 %.
+// A bent rope of 30 cm, 2 cm thick, seen by cameras on a half circle: `far`, 1 m away, fills about 1 % of 640x480;
+// `close` fills about 8 %.
 struct Scene {
   std::vector<capture::Camera> cameras;
   std::vector<splat::ViewSpec> views;
@@ -52,8 +53,8 @@ Scene make_scene(bool close, int count, int views, std::uint64_t seed) {
   constexpr int kJoints = 8;
   constexpr double kLength = 0.3, kDiameter = 0.02, kFocal = 615.0;  // m, m, px
   Scene scene;
-  const chain::Chain chain = chain::make_chain(kLength, kDiameter, -math::Vector3::UnitZ(), math::Vector3::UnitY(), kJoints,
-                                               chain::Bending::planar, false);
+  const chain::Chain chain = chain::make_chain(kLength, kDiameter, -math::Vector3::UnitZ(), math::Vector3::UnitY(),
+                                               kJoints, chain::Bending::planar, false);
   core::Random random(seed);
   splat::Gaussians& g = scene.gaussians;
   g.resize(count, chain.links(), 0);
@@ -68,14 +69,16 @@ Scene make_scene(bool close, int count, int views, std::uint64_t seed) {
     }
     for (int c = 0; c < 4; ++c) g.rotation[4 * i + c] = static_cast<float>(random.normal());
     g.opacity_logit[i] = static_cast<float>(random.uniform(0.0, 3.0));
-    g.link_logits[g.links * i + chain::link_at(chain, std::min(s, kLength * (1 - 1e-9)))] = 12.0f;  // one live replica each
+    g.link_logits[g.links * i + chain::link_at(chain, std::min(s, kLength * (1 - 1e-9)))] =
+        12.0f;  // one live replica each
   }
   const double distance = close ? 0.36 : 1.0;
   scene.cameras.reserve(views);
   std::vector<math::VectorX> theta;
   for (int v = 0; v < views; ++v) {
     const double around = std::numbers::pi * (v + 0.5) / views;
-    scene.cameras.push_back(camera_at({distance * std::cos(around), distance * std::sin(around), -0.15}, {0, 0, -0.15}, kFocal));
+    scene.cameras.push_back(
+        camera_at({distance * std::cos(around), distance * std::sin(around), -0.15}, {0, 0, -0.15}, kFocal));
     const math::VectorX bent = math::VectorX::Constant(chain.angles(), 0.1 * std::sin(1.0 + v));
     // the crop: the rope's projection and 24 px
     const auto motions = chain::link_motions(chain, bent, math::Pose{});
@@ -88,8 +91,10 @@ Scene make_scene(bool close, int count, int views, std::uint64_t seed) {
       high = high.cwiseMax(u);
     }
     const double margin = 24.0 + 0.5 * kDiameter * kFocal / distance;
-    const int x0 = std::max(0, static_cast<int>(low.x() - margin)), y0 = std::max(0, static_cast<int>(low.y() - margin));
-    const int x1 = std::min(640, static_cast<int>(high.x() + margin)), y1 = std::min(480, static_cast<int>(high.y() + margin));
+    const int x0 = std::max(0, static_cast<int>(low.x() - margin)),
+              y0 = std::max(0, static_cast<int>(low.y() - margin));
+    const int x1 = std::min(640, static_cast<int>(high.x() + margin)),
+              y1 = std::min(480, static_cast<int>(high.y() + margin));
     scene.views.push_back({&scene.cameras[v], x0, y0, x1 - x0, y1 - y0, motions});
   }
   return scene;
@@ -110,7 +115,8 @@ std::vector<int> numbers(const std::string& text, const char* option) {
     } catch (const std::exception&) {
       out.push_back(0);
     }
-    if (out.back() < 1) throw InputError(option, "'" + word + "' is not a positive number", "give numbers with commas between");
+    if (out.back() < 1)
+      throw InputError(option, "'" + word + "' is not a positive number", "give numbers with commas between");
   }
   return out;
 }
@@ -142,7 +148,8 @@ void bench(const Globals& globals, const Request& request) {
         for (const splat::Picture& picture : engine.draw(other.gaussians, scene.views)) {
           targets.emplace_back(picture.rgba.size());
           for (std::size_t k = 0; k < picture.rgba.size(); ++k)
-            targets.back()[k] = static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(picture.rgba[k], 0.0f, 1.0f)));
+            targets.back()[k] =
+                static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(picture.rgba[k], 0.0f, 1.0f)));
           for (std::size_t k = 3; k < targets.back().size(); k += 4) {
             const bool object = targets.back()[k] >= 128;
             targets.back()[k] = object ? 255 : 0;
@@ -185,9 +192,9 @@ void bench(const Globals& globals, const Request& request) {
         document["results"].push_back(entry);
         if (globals.json) continue;
         std::ostringstream line;
-        line << std::fixed << std::setprecision(1) << std::left << std::setw(7) << (close ? "close" : "far") << std::right
-             << std::setw(9) << count << std::setw(7) << views << std::setw(7) << draw << std::setw(6) << step
-             << std::setw(18) << dssim << "   ";
+        line << std::fixed << std::setprecision(1) << std::left << std::setw(7) << (close ? "close" : "far")
+             << std::right << std::setw(9) << count << std::setw(7) << views << std::setw(7) << draw << std::setw(6)
+             << step << std::setw(18) << dssim << "   ";
         std::vector<std::pair<double, std::string>> order;
         for (const auto& [label, values] : passes) order.emplace_back(-median(values), label);
         std::sort(order.begin(), order.end());
@@ -205,7 +212,8 @@ void bench(const Globals& globals, const Request& request) {
 void add_bench_command(CLI::App& app, const Globals& globals, Job& job) {
   CLI::App* command = app.add_subcommand("bench", "Measure drawing and training steps on fixed synthetic scenes");
   auto request = std::make_shared<Request>();
-  command->add_option("--gaussians", request->gaussians, "Numbers of Gaussians, with commas between")->capture_default_str();
+  command->add_option("--gaussians", request->gaussians, "Numbers of Gaussians, with commas between")
+      ->capture_default_str();
   command->add_option("--views", request->views, "Views a submission, with commas between")->capture_default_str();
   command->add_option("--scene", request->scene, "far (1 % of the image), close (8 %) or both")->capture_default_str();
   command->add_option("--repeats", request->repeats, "Measurements of each")->capture_default_str();

@@ -20,20 +20,20 @@ using math::VectorX;
 enum class Bending { planar, spatial };
 
 struct Chain {
-  double length = 0.0;                       // m, grasp to free end
-  double diameter = 0.0;                     // m
-  Vector3 direction = -Vector3::UnitZ();     // d, unit, base frame
-  Vector3 bending_axis = Vector3::UnitY();   // a, unit, base frame, perpendicular to d
-  std::vector<Vector6> axes;                 // S_k, one an angle, base frame at home (space form)
-  std::vector<int> child_link;               // link moved by angle k, 1..links-1; its parent is child_link - 1
-  std::vector<double> joint_arclength;       // s_j of joint j = link j, m; size links() - 1, increasing, s_1 >= 0
+  double length = 0.0;                      // m, grasp to free end
+  double diameter = 0.0;                    // m
+  Vector3 direction = -Vector3::UnitZ();    // d, unit, base frame
+  Vector3 bending_axis = Vector3::UnitY();  // a, unit, base frame, perpendicular to d
+  std::vector<Vector6> axes;                // S_k, one an angle, base frame at home (space form)
+  std::vector<int> child_link;              // link moved by angle k, 1..links-1; its parent is child_link - 1
+  std::vector<double> joint_arclength;      // s_j of joint j = link j, m; size links() - 1, increasing, s_1 >= 0
 
-  int angles() const { return static_cast<int>(axes.size()); }              // n
+  int angles() const { return static_cast<int>(axes.size()); }                // n
   int links() const { return static_cast<int>(joint_arclength.size()) + 1; }  // n_l + 1, with the base link
   // Arclength range of link j: [start, end]. Link 0 is [0, s_1].
   double link_start(int link) const { return link == 0 ? 0.0 : joint_arclength[link - 1]; }
   double link_end(int link) const { return link + 1 == links() ? length : joint_arclength[link]; }
-  int last_angle(int link) const;            // k(j): index of the last angle that moves `link`, -1 for link 0
+  int last_angle(int link) const;  // k(j): index of the last angle that moves `link`, -1 for link 0
 };
 
 // `joints` joints at s_j = (j - 1) L / joints (SPEC 2.1 [D]). Axes a joint: a; a, b = d x a; with twist also d.
@@ -41,7 +41,8 @@ struct Chain {
 Chain make_chain(double length, double diameter, const Vector3& direction, const Vector3& bending_axis, int joints,
                  Bending bending, bool twist, double first_joint = 0.0);
 
-// E_j for j = 0..n_l: world pose that carries home coordinates (base frame) of link j to the world. E_0 = base. SPEC 2.2.
+// E_j for j = 0..n_l: world pose that carries home coordinates (base frame) of link j to the world. E_0 = base.
+// SPEC 2.2.
 std::vector<Pose> link_motions(const Chain& chain, const VectorX& theta, const Pose& base);
 
 // s_k, world-frame screw axes at theta, 6 x n (columns). SPEC 2.3.
@@ -70,7 +71,8 @@ struct States {
   std::vector<VectorX> theta;     // rad, n each
   std::vector<VectorX> thetadot;  // rad/s
 };
-// theta at any time: cubic (Catmull-Rom on the given times), clamped outside by linear extrapolation of at most one interval.
+// theta at any time: cubic (Catmull-Rom on the given times), clamped outside by linear extrapolation of at most one
+// interval.
 VectorX interpolate(const States& states, double time);
 
 }  // namespace chainsplat::chain

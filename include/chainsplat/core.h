@@ -1,8 +1,9 @@
-// chainsplat/core.h - what every module needs and no module is about: errors, warnings, progress, files, threads, random.
+// chainsplat/core.h - what every module needs and no module is about: errors, warnings, progress, files, threads,
+// random.
 //
-// Errors are two exceptions, because they decide the exit code: InputError (2: the request or its input is wrong, nothing
-// was written) and WorkError (1: the work failed, what exists is kept). The library never prints and never aborts; the
-// tools catch both and print one line.
+// Errors are two exceptions, because they decide the exit code: InputError (2: the request or its input is wrong,
+// nothing was written) and WorkError (1: the work failed, what exists is kept). The library never prints and never
+// aborts; the tools catch both and print one line.
 #pragma once
 #include <cstdint>
 #include <filesystem>
@@ -38,8 +39,8 @@ namespace core {
 
 // A broken promise between our own functions: throws std::logic_error with file, line and the condition.
 [[noreturn]] void check_failed(const char* condition, const char* file, int line, const std::string& values);
-#define CHAINSPLAT_CHECK(condition, values)                                                      \
-  do {                                                                                           \
+#define CHAINSPLAT_CHECK(condition, values)                                                       \
+  do {                                                                                            \
     if (!(condition)) ::chainsplat::core::check_failed(#condition, __FILE__, __LINE__, (values)); \
   } while (false)
 
@@ -49,8 +50,8 @@ struct Progress {
   std::int64_t step = 0;  // of `total`
   std::int64_t total = 0;
   double loss = 0.0;
-  double psnr = 0.0;      // dB inside the object
-  std::string note;       // what is being done, a few words
+  double psnr = 0.0;  // dB inside the object
+  std::string note;   // what is being done, a few words
 };
 
 // Where warnings and progress go. Set once by the tool; the default swallows both. Thread-safe to call.
@@ -73,7 +74,8 @@ int threads();
 // Calls body(i) for i in [0, count), each exactly once, on threads() threads. The first exception is rethrown.
 void parallel_for(std::int64_t count, const std::function<void(std::int64_t)>& body);
 
-// Writes `bytes` as `path` in one step (temporary file in the same folder, fsync, rename). Throws WorkError (disk full, ...).
+// Writes `bytes` as `path` in one step (temporary file in the same folder, fsync, rename). Throws WorkError (disk full,
+// ...).
 void write_file(const Path& path, std::string_view bytes);
 // The whole file. Throws InputError naming `path` when it is missing or unreadable.
 std::string read_file(const Path& path);
@@ -89,9 +91,9 @@ class Random {
  public:
   explicit Random(std::uint64_t seed) : state_(seed) {}
   std::uint64_t next();
-  double uniform();                       // [0, 1)
+  double uniform();  // [0, 1)
   double uniform(double low, double high);
-  double normal();                        // mean 0, sd 1
+  double normal();  // mean 0, sd 1
  private:
   std::uint64_t state_;
 };

@@ -1,8 +1,8 @@
 // chainsplat/gpu.h - a thin Vulkan 1.3 compute layer: device, buffers, pipelines, one-submission command lists.
 //
 // One queue, host-visible or device buffers, pipelines made from embedded SPIR-V with specialization constants, a
-// timeline semaphore, a pipeline cache on disk, debug names, optional validation (with synchronization validation) whose
-// messages are counted. Nothing here knows what is computed.
+// timeline semaphore, a pipeline cache on disk, debug names, optional validation (with synchronization validation)
+// whose messages are counted. Nothing here knows what is computed.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -17,18 +17,18 @@ namespace chainsplat::gpu {
 
 struct DeviceInfo {
   int index = 0;
-  std::string name, driver, type;        // type: "discrete GPU", "integrated GPU", "CPU", ...
+  std::string name, driver, type;  // type: "discrete GPU", "integrated GPU", "CPU", ...
   std::uint32_t api_version = 0, vendor = 0;
   // Every pipeline runs with subgroup_size lanes, or with more where a device with several sizes cannot fix one.
   std::uint32_t subgroup_size = 0, max_workgroup_invocations = 0, shared_memory_bytes = 0;
-  std::uint32_t storage_buffers = 0;     // that one kernel may bind
-  std::uint64_t max_storage_range = 0;   // bytes of the largest buffer
-  std::uint64_t heap_bytes = 0;          // of the largest device-local heap
-  bool software = false;                 // a CPU device such as lavapipe
-  bool unified_memory = false;           // the host reads and writes Domain::device at full speed: it is mapped
-  bool timestamps = false;               // false: Commands::timings() is empty
-  bool push_descriptors = false;         // false: Commands uses descriptor sets
-  std::vector<std::string> refused;      // why it cannot be used; empty: it can
+  std::uint32_t storage_buffers = 0;    // that one kernel may bind
+  std::uint64_t max_storage_range = 0;  // bytes of the largest buffer
+  std::uint64_t heap_bytes = 0;         // of the largest device-local heap
+  bool software = false;                // a CPU device such as lavapipe
+  bool unified_memory = false;          // the host reads and writes Domain::device at full speed: it is mapped
+  bool timestamps = false;              // false: Commands::timings() is empty
+  bool push_descriptors = false;        // false: Commands uses descriptor sets
+  std::vector<std::string> refused;     // why it cannot be used; empty: it can
 };
 
 // All Vulkan devices, without opening one. Empty (never an exception) without loader, driver or device; `why` says why.
@@ -51,12 +51,14 @@ std::string doctor_text(const Doctor& doctor);  // several lines, for a terminal
 
 struct DeviceOptions {
   std::string selector;
-  bool validation = false;        // needs the layer; throws InputError when it is missing
-  bool least = false;             // as on the least device: descriptor sets, staged transfers (for tests)
+  bool validation = false;  // needs the layer; throws InputError when it is missing
+  bool least = false;       // as on the least device: descriptor sets, staged transfers (for tests)
 };
 
-class Device;   // opened device; keep it alive longer than what was made from it
-struct DeviceDeleter { void operator()(Device*) const; };
+class Device;  // opened device; keep it alive longer than what was made from it
+struct DeviceDeleter {
+  void operator()(Device*) const;
+};
 using DevicePtr = std::unique_ptr<Device, DeviceDeleter>;
 DevicePtr open_device(const DeviceOptions& options = {});
 const DeviceInfo& info(const Device& device);
@@ -78,8 +80,11 @@ class Buffer {
   Buffer& operator=(Buffer&&) noexcept;
   ~Buffer();
   std::size_t bytes() const { return bytes_; }
-  void* mapped() const { return mapped_; }      // null unless Domain::host or unified_memory
-  template <class T> std::span<T> as() const { return {static_cast<T*>(mapped_), bytes_ / sizeof(T)}; }
+  void* mapped() const { return mapped_; }  // null unless Domain::host or unified_memory
+  template <class T>
+  std::span<T> as() const {
+    return {static_cast<T*>(mapped_), bytes_ / sizeof(T)};
+  }
   struct Handles;
   const Handles& handles() const { return *handles_; }
 
@@ -129,7 +134,7 @@ class Commands {
   Commands(Commands&&) noexcept;
   Commands& operator=(Commands&&) noexcept;
   ~Commands();
-  void begin();   // forget what was recorded (waits for the last submit)
+  void begin();  // forget what was recorded (waits for the last submit)
   void dispatch(const Pipeline& pipeline, std::span<const Buffer* const> buffers, const void* push,
                 std::size_t push_bytes, std::uint32_t x, std::uint32_t y = 1, std::uint32_t z = 1);
   // Group counts (3 uints) read from `arguments` at `offset` bytes.

@@ -26,14 +26,14 @@ struct Pose {
   Pose inverse() const { return {rotation.transpose(), -(rotation.transpose() * translation)}; }
 };
 
-Matrix3 hat(const Vector3& w);                  // [w]: hat(w) x = w cross x
-Pose exp_se3(const Vector6& twist);             // SPEC 1, series below |omega| = 1e-2
-Vector6 log_se3(const Pose& pose);              // inverse of exp_se3, accurate to |omega| = pi
+Matrix3 hat(const Vector3& w);       // [w]: hat(w) x = w cross x
+Pose exp_se3(const Vector6& twist);  // SPEC 1, series below |omega| = 1e-2
+Vector6 log_se3(const Pose& pose);   // inverse of exp_se3, accurate to |omega| = pi
 Matrix3 exp_so3(const Vector3& w);
 Vector3 log_so3(const Matrix3& rotation);
-Matrix6 adjoint(const Pose& pose);              // Ad_T = [R 0; [p]R R]: V_x = Ad_{T_xy} V_y, F_y = Ad_{T_xy}^T F_x
-Matrix6 ad(const Vector6& twist);               // ad_V = [[w] 0; [v] [w]]
-Matrix6 coadjoint(const Vector6& wrench);       // ad*_F with ad_X^T F = ad*_F X
+Matrix6 adjoint(const Pose& pose);         // Ad_T = [R 0; [p]R R]: V_x = Ad_{T_xy} V_y, F_y = Ad_{T_xy}^T F_x
+Matrix6 ad(const Vector6& twist);          // ad_V = [[w] 0; [v] [w]]
+Matrix6 coadjoint(const Vector6& wrench);  // ad*_F with ad_X^T F = ad*_F X
 Vector6 transform_twist(const Pose& pose, const Vector6& twist);  // Ad_T V without forming Ad_T
 
 // Nearest rotation to a 3x3 matrix that is almost one (read from a file with few digits).

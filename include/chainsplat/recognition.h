@@ -1,8 +1,8 @@
 // chainsplat/recognition.h - masked frames -> link-aware Gaussians and joint angles (paper, "Recognition"; SPEC 2.9).
 //
 // `fast`: silhouettes give every frame's angles; Gaussians are placed along the links and then refined in turn with the
-// angles (Adam on the Gaussians with angles held, Gauss-Newton on each frame's angles with Gaussians held). `paper`: the
-// paper's initialization, Adam on everything, both asynchronous resets.
+// angles (Adam on the Gaussians with angles held, Gauss-Newton on each frame's angles with Gaussians held). `paper`:
+// the paper's initialization, Adam on everything, both asynchronous resets.
 #pragma once
 #include <optional>
 #include <string>
@@ -17,16 +17,16 @@ enum class Mode { fast, paper };
 
 struct Options {
   int joints = 8;
-  std::optional<chain::Bending> bending;   // none: auto (INTERFACE 1)
+  std::optional<chain::Bending> bending;  // none: auto (INTERFACE 1)
   bool twist = false;
-  int every = 5;                           // frames that train the Gaussians
+  int every = 5;  // frames that train the Gaussians
   Mode mode = Mode::fast;
   std::uint64_t seed = 0;
-  int budget = 1500;                       // most Gaussians (fast)
+  int budget = 1500;  // most Gaussians (fast)
   int paper_gaussians = 5000;
   int paper_iterations = 30000;
-  Path checkpoint;                         // folder for checkpoints; empty: none
-  bool resume = false;                     // continue from the checkpoint when one is there
+  Path checkpoint;      // folder for checkpoints; empty: none
+  bool resume = false;  // continue from the checkpoint when one is there
 };
 
 struct Result {
@@ -37,7 +37,8 @@ struct Result {
   silhouette::BendingChoice bending;
 };
 
-// Throws WorkError (device lost, diverged), Interrupted after leaving a checkpoint. Reports progress in stage "recognize".
+// Throws WorkError (device lost, diverged), Interrupted after leaving a checkpoint. Reports progress in stage
+// "recognize".
 Result recognize(gpu::Device& device, const capture::Capture& capture, const Options& options);
 
 }  // namespace chainsplat::recognition

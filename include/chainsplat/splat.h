@@ -1,8 +1,8 @@
-// chainsplat/splat.h - link-aware 3-D Gaussians on the device: replicate, project, bin, sort, blend, loss, backward, Adam
-// (SPEC 2.4-2.8; paper, "Link-aware Gaussian splatting").
+// chainsplat/splat.h - link-aware 3-D Gaussians on the device: replicate, project, bin, sort, blend, loss, backward,
+// Adam (SPEC 2.4-2.8; paper, "Link-aware Gaussian splatting").
 //
-// The unit of work is a batch of views (crops of different sizes, each with its camera and the link poses of its time) in
-// one submission. Float on the device, no atomics on floats: the same input gives the same bits on one device.
+// The unit of work is a batch of views (crops of different sizes, each with its camera and the link poses of its time)
+// in one submission. Float on the device, no atomics on floats: the same input gives the same bits on one device.
 #pragma once
 #include <cstdint>
 #include <memory>
@@ -17,8 +17,8 @@ namespace chainsplat::splat {
 // Gaussians in the home configuration (base frame). Arrays of structures-of-rows, row i is Gaussian i.
 struct Gaussians {
   int count = 0;
-  int links = 0;       // n_l + 1
-  int degree = 0;      // of the spherical harmonics, 0..3
+  int links = 0;                     // n_l + 1
+  int degree = 0;                    // of the spherical harmonics, 0..3
   std::vector<float> mean;           // count x 3, m
   std::vector<float> rotation;       // count x 4, quaternion wxyz (normalized before use)
   std::vector<float> log_scale;      // count x 3, ln m
@@ -33,7 +33,7 @@ struct Gaussians {
 struct ViewSpec {
   const capture::Camera* camera = nullptr;  // distortion is ignored here (images are undistorted)
   int x0 = 0, y0 = 0, width = 0, height = 0;
-  std::vector<math::Pose> motions;          // links()
+  std::vector<math::Pose> motions;  // links()
 };
 
 // Row-major pictures of one view. Color is premultiplied over a black background.
@@ -45,30 +45,30 @@ struct Picture {
 
 // Gradients of one loss (summed over views) and per view, as SPEC 2.8.
 struct Gradients {
-  Gaussians gaussians;                        // same layout; rotation holds d/dq of the unnormalized quaternion
-  std::vector<math::MatrixX> link_twists;     // one 6 x links a view: world twist about the world origin
+  Gaussians gaussians;                     // same layout; rotation holds d/dq of the unnormalized quaternion
+  std::vector<math::MatrixX> link_twists;  // one 6 x links a view: world twist about the world origin
 };
 
 struct LossWeights {
-  float l1 = 0.8f;       // weight of mean |I^ - I|
-  float dssim = 0.2f;    // weight of 1 - mean SSIM
-  float mask = 0.0f;     // weight of mean |alpha - mask|
+  float l1 = 0.8f;     // weight of mean |I^ - I|
+  float dssim = 0.2f;  // weight of 1 - mean SSIM
+  float mask = 0.0f;   // weight of mean |alpha - mask|
 };
 
 struct LossValues {
   double total = 0.0;
-  std::vector<double> l1, ssim, mask;   // one a view: means over the view's `normalizer` pixels
-  std::vector<double> psnr_object;      // dB over pixels with mask >= 128
+  std::vector<double> l1, ssim, mask;  // one a view: means over the view's `normalizer` pixels
+  std::vector<double> psnr_object;     // dB over pixels with mask >= 128
 };
 
 struct Settings {
-  int tile = 0;             // px, 8 or 16; 0: chosen for the device
-  int pixels_per_lane = 0;  // 0: chosen for the device
+  int tile = 0;                  // px, 8 or 16; 0: chosen for the device
+  int pixels_per_lane = 0;       // 0: chosen for the device
   bool projection_clamp = true;  // of SPEC 2.5; false where a reference has none
-  bool exact_cutoffs = true;  // 1/255 cut, 0.99 cap, 1e-4 stop; false: none of them (for finite-difference tests)
+  bool exact_cutoffs = true;     // 1/255 cut, 0.99 cap, 1e-4 stop; false: none of them (for finite-difference tests)
 };
 
-struct AdamRates {   // step sizes, units of the parameter (mean: m)
+struct AdamRates {  // step sizes, units of the parameter (mean: m)
   float mean = 0, rotation = 0, log_scale = 0, opacity = 0, sh0 = 0, sh_rest = 0, link_logits = 0;
 };
 
@@ -86,16 +86,17 @@ class Engine {
   // targets[v]: RGBA8 of the crop, A = mask. `normalizer` is the number of pixels that means are taken over (the full
   // image's for SPEC 2.7; 0: the crop's).
   LossValues loss(const Gaussians& gaussians, std::span<const ViewSpec> views,
-                  std::span<const std::vector<std::uint8_t>* const> targets, const LossWeights& weights, double normalizer,
-                  Gradients* gradients, std::vector<Picture>* pictures = nullptr);
+                  std::span<const std::vector<std::uint8_t>* const> targets, const LossWeights& weights,
+                  double normalizer, Gradients* gradients, std::vector<Picture>* pictures = nullptr);
 
-  // --- training: parameters, moments and targets stay on the device ----------------------------------------------------
-  // Targets of all views that will be used; `views` keep their indices. Poses can be changed later. Only tiles near the mask
-  // are drawn and charged; with `everywhere` the whole crop is (D-SSIM still near the mask only: elsewhere L1 says enough).
+  // --- training: parameters, moments and targets stay on the device
+  // ---------------------------------------------------- Targets of all views that will be used; `views` keep their
+  // indices. Poses can be changed later. Only tiles near the mask are drawn and charged; with `everywhere` the whole
+  // crop is (D-SSIM still near the mask only: elsewhere L1 says enough).
   void set_views(std::span<const ViewSpec> views, std::span<const std::vector<std::uint8_t>* const> targets,
                  bool everywhere = false);
   void set_motions(int view, const std::vector<math::Pose>& motions);
-  void set_gaussians(const Gaussians& gaussians);   // resets Adam's moments and step count
+  void set_gaussians(const Gaussians& gaussians);  // resets Adam's moments and step count
   Gaussians gaussians() const;
   // One Adam step on the mean loss of the views in `batch`.
   // `twists`: also the gradient of the mean loss with respect to each view's link motions (world twists, SPEC 2.3).
@@ -103,7 +104,8 @@ class Engine {
                   std::vector<math::MatrixX>* twists = nullptr);
   std::vector<Picture> draw_views(std::span<const int> batch, bool depth = false);
 
-  // The paper's resets: opacity to at most `largest`, link probabilities to uniform; Adam's moments of that section to zero.
+  // The paper's resets: opacity to at most `largest`, link probabilities to uniform; Adam's moments of that section to
+  // zero.
   void reset_opacity(float largest);
   void reset_links();
   // Everything that a later step depends on, for checkpoints.
@@ -115,7 +117,7 @@ class Engine {
   Snapshot snapshot() const;
   void restore(const Snapshot& snapshot);
 
-  std::vector<gpu::Timing> timings() const;   // of the last call, by pass
+  std::vector<gpu::Timing> timings() const;  // of the last call, by pass
   struct State;
 
  private:

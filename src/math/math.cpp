@@ -15,8 +15,7 @@ struct ExpCoefficients {
 ExpCoefficients exp_coefficients(double angle) {
   const double x2 = angle * angle;
   if (angle < kSmallAngle) {
-    return {1 + x2 * (-1.0 / 6 + x2 * (1.0 / 120 - x2 / 5040)),
-            0.5 + x2 * (-1.0 / 24 + x2 * (1.0 / 720 - x2 / 40320)),
+    return {1 + x2 * (-1.0 / 6 + x2 * (1.0 / 120 - x2 / 5040)), 0.5 + x2 * (-1.0 / 24 + x2 * (1.0 / 720 - x2 / 40320)),
             1.0 / 6 + x2 * (-1.0 / 120 + x2 * (1.0 / 5040 - x2 / 362880))};
   }
   // 1 - cos through the half angle keeps all digits for moderate angles
@@ -43,8 +42,7 @@ Pose exp_se3(const Vector6& twist) {
   const Vector3 w = twist.head<3>();
   const auto [a, b, c] = exp_coefficients(w.norm());
   const Matrix3 skew = hat(w), square = skew * skew;
-  return {Matrix3::Identity() + a * skew + b * square,
-          (Matrix3::Identity() + b * skew + c * square) * twist.tail<3>()};
+  return {Matrix3::Identity() + a * skew + b * square, (Matrix3::Identity() + b * skew + c * square) * twist.tail<3>()};
 }
 
 Vector3 log_so3(const Matrix3& rotation) {
@@ -69,8 +67,8 @@ Vector3 log_so3(const Matrix3& rotation) {
 Vector6 log_se3(const Pose& pose) {
   const Vector3 w = log_so3(pose.rotation);
   const double angle = w.norm(), x2 = angle * angle;
-  const double d = angle < kSmallAngle ? 1.0 / 12 + x2 / 720 + x2 * x2 / 30240
-                                       : (1.0 - 0.5 * angle / std::tan(0.5 * angle)) / x2;
+  const double d =
+      angle < kSmallAngle ? 1.0 / 12 + x2 / 720 + x2 * x2 / 30240 : (1.0 - 0.5 * angle / std::tan(0.5 * angle)) / x2;
   const Matrix3 skew = hat(w);
   Vector6 twist;
   twist << w, (Matrix3::Identity() - 0.5 * skew + d * skew * skew) * pose.translation;

@@ -18,7 +18,7 @@ constexpr double kFinalSharpness = 1e5;
 constexpr double kFinalSmoothness = 2e-8;
 constexpr int kFinalIterations = 10;
 constexpr double kGoodMiss = 1e-4;    // m: no further start is tried
-constexpr int kGroups[] = {1, 3, 4, 4};  // starts optimized side by side; the next group only where the last failed
+constexpr int kGroups[] = {1, 1, 2, 4, 4};  // starts optimized side by side; the next group only where the last failed
 constexpr double kLeastLoad = 0.25, kMostLoad = 0.95;  // of the limits, of random motions
 constexpr std::uint64_t kTargetStream = 0x7461726765740001ull;  // random numbers of random_target
 constexpr double kHorizons[] = {0.25, 0.35, 0.5, 0.7, 1.0};     // of the longest, for a free one

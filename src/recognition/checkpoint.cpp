@@ -73,7 +73,8 @@ void save_checkpoint(const Checkpoint& c, const Path& folder) {
   w.put(g.count);
   w.put(g.links);
   w.put(g.degree);
-  for (const auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits}) w.put_all(*part);
+  for (const auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
+    w.put_all(*part);
   w.put_all(c.snapshot.first_moment);
   w.put_all(c.snapshot.second_moment);
   w.put(c.snapshot.step);
@@ -89,7 +90,9 @@ std::optional<Checkpoint> load_checkpoint(const Path& folder, const std::string&
   if (!std::filesystem::exists(file)) return std::nullopt;
   const std::string bytes = core::read_file(file);
   const std::size_t head = sizeof kMagic - 1 + sizeof(std::uint64_t);
-  const auto damaged = [&] { return InputError(file.string(), "the checkpoint is damaged", "remove it and train anew"); };
+  const auto damaged = [&] {
+    return InputError(file.string(), "the checkpoint is damaged", "remove it and train anew");
+  };
   if (bytes.size() < head || bytes.compare(0, sizeof kMagic - 1, kMagic) != 0) throw damaged();
   Reader sum{std::string_view(bytes).substr(sizeof kMagic - 1)};
   if (sum.get<std::uint64_t>() != core::fnv1a(std::string_view(bytes).substr(head))) throw damaged();

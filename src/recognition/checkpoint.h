@@ -10,13 +10,13 @@
 namespace chainsplat::recognition {
 
 struct Checkpoint {
-  std::string job;                 // options that the result depends on; another job's checkpoint is refused
-  int stage = 0;                   // rounds (fast) or iterations (paper) done
-  bool spatial = false;            // the bending that was chosen
+  std::string job;       // options that the result depends on; another job's checkpoint is refused
+  int stage = 0;         // rounds (fast) or iterations (paper) done
+  bool spatial = false;  // the bending that was chosen
   double out_of_plane_rms = 0.0, deviation = 0.0;
   chain::States states;
   splat::Engine::Snapshot snapshot;
-  std::vector<double> extra;       // what a mode adds: angles' Adam moments (paper)
+  std::vector<double> extra;  // what a mode adds: angles' Adam moments (paper)
 };
 
 void save_checkpoint(const Checkpoint& checkpoint, const Path& folder);

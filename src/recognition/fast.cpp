@@ -12,35 +12,35 @@ namespace {
 
 // The schedule: rounds of Adam on the Gaussians, additions where the images ask, and Gauss-Newton on the angles.
 constexpr int kRounds = 4;
-constexpr int kSteps = 100;             // Adam steps a round
-constexpr int kBatch = 3;              // views a step
+constexpr int kSteps = 100;  // Adam steps a round
+constexpr int kBatch = 3;    // views a step
 constexpr int kFirstGaussians = 1200;
 constexpr int kAddedARound = 150;
-constexpr int kAngleIterations = 1;    // Gauss-Newton steps a round and frame
-constexpr int kFinalIterations = 2;    // for every frame, at the end
-constexpr int kFinalSteps = 120;       // Adam steps after the last round, rates falling
-constexpr float kMaskWeight = 0.3f;    // of the mask term: without it black hides transparency (DESIGN)
-constexpr int kShRound = 1;            // from this round on colors depend on the view (SH degree 1): +0.7 dB in the object
+constexpr int kAngleIterations = 1;  // Gauss-Newton steps a round and frame
+constexpr int kFinalIterations = 2;  // for every frame, at the end
+constexpr int kFinalSteps = 120;     // Adam steps after the last round, rates falling
+constexpr float kMaskWeight = 0.3f;  // of the mask term: without it black hides transparency (DESIGN)
+constexpr int kShRound = 1;  // from this round on colors depend on the view (SH degree 1): +0.7 dB in the object
 
 splat::AdamRates rates(double fraction) {
   // fraction: 0 at the start, 1 at the end of all steps; rates fall by ten
   const auto fall = static_cast<float>(std::pow(0.1, fraction));
   splat::AdamRates r;
-  r.mean = 2.5e-4f * fall;      // m: a tenth of a Gaussian's spacing on the rope
+  r.mean = 2.5e-4f * fall;  // m: a tenth of a Gaussian's spacing on the rope
   r.rotation = 0.02f * fall;
   r.log_scale = 0.03f * fall;
   r.opacity = 0.08f * fall;
-  r.sh0 = 0.06f * fall;         // 0.017 in color
+  r.sh0 = 0.06f * fall;  // 0.017 in color
   r.sh_rest = 0.01f * fall;
-  r.link_logits = 0.0f;         // hard on their link: soft gained nothing (DESIGN, 'Recognition')
+  r.link_logits = 0.0f;  // hard on their link: soft gained nothing (DESIGN, 'Recognition')
   return r;
 }
 
 struct TrainingViews {
-  std::vector<int> frames;                            // that train
-  std::vector<int> views;                             // capture view of every training view
-  std::vector<int> frame_of;                          // its frame
-  std::vector<int> index_of;                          // capture view -> training view or -1
+  std::vector<int> frames;    // that train
+  std::vector<int> views;     // capture view of every training view
+  std::vector<int> frame_of;  // its frame
+  std::vector<int> index_of;  // capture view -> training view or -1
 };
 
 TrainingViews training_views(const capture::Capture& capture, const std::vector<FrameViews>& frames, int every) {
@@ -91,7 +91,8 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     // coarse: silhouettes
     core::report({"recognize", 0, total_steps, NAN, NAN, "silhouettes"});
     const bool decide = !options.bending && !capture.tabletop;
-    const chain::Bending first = options.bending.value_or(capture.tabletop ? chain::Bending::planar : chain::Bending::spatial);
+    const chain::Bending first =
+        options.bending.value_or(capture.tabletop ? chain::Bending::planar : chain::Bending::spatial);
     result.bending.bending = first;
     result.chain = make(first);
     silhouette::SequenceFit fit = silhouette::fit_sequence(result.chain, capture);
@@ -108,7 +109,8 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     for (const silhouette::FrameFit& frame : fit.frames) {
       constexpr double kLeastVariance = 1e-12;  // rad^2
       prior.information.push_back(
-          (frame.covariance + kLeastVariance * math::MatrixX::Identity(result.chain.angles(), result.chain.angles())).inverse());
+          (frame.covariance + kLeastVariance * math::MatrixX::Identity(result.chain.angles(), result.chain.angles()))
+              .inverse());
     }
   }
   std::vector<math::VectorX> coarse = states.theta;  // to carry corrections to the frames that do not train
@@ -137,7 +139,8 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     for (std::size_t i = 0; i < training.views.size(); ++i) {
       const int k = training.frame_of[i];
       const capture::View& view = capture.views[training.views[i]];
-      specs.push_back(view_spec(capture, view, view_motions(chain, capture, states, frames[k], k, states.theta[k], view)));
+      specs.push_back(
+          view_spec(capture, view, view_motions(chain, capture, states, frames[k], k, states.theta[k], view)));
     }
   };
   pose_views();
@@ -189,7 +192,8 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
         loss = values.total / static_cast<double>(batch.size());
         psnr = mean(values.psnr_object);
         if (!std::isfinite(loss))
-          throw WorkError("recognize", "the loss is not finite at step " + std::to_string(done_steps), "report the capture; try another --seed");
+          throw WorkError("recognize", "the loss is not finite at step " + std::to_string(done_steps),
+                          "report the capture; try another --seed");
         core::report({"recognize", done_steps, total_steps, loss, psnr, note});
       }
     }
@@ -248,7 +252,8 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     if (std::find(training.frames.begin(), training.frames.end(), k) == training.frames.end())
       states.theta[k] = coarse[k] + chain::interpolate(correction, states.time[k]);
   }
-  const auto covariances = refine_all(engine, chain, capture, frames, gaussians, all_frames, kFinalIterations, prior, states);
+  const auto covariances =
+      refine_all(engine, chain, capture, frames, gaussians, all_frames, kFinalIterations, prior, states);
   result.covariances.assign(frames.size(), math::MatrixX::Identity(chain.angles(), chain.angles()));
   for (std::size_t i = 0; i < all_frames.size(); ++i) result.covariances[all_frames[i]] = covariances[i];
   differentiate(states);

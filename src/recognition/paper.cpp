@@ -1,6 +1,6 @@
 // The paper's procedure, so that it can be compared with the fast one in one table: random Gaussians with uniform link
-// probabilities, all angles zero, Adam on one random view an iteration, two asynchronous resets. What the paper does not
-// print is 3DGS' and ScrewSplat's (INTERFACE 1, `--mode paper`). SH degree 0.
+// probabilities, all angles zero, Adam on one random view an iteration, two asynchronous resets. What the paper does
+// not print is 3DGS' and ScrewSplat's (INTERFACE 1, `--mode paper`). SH degree 0.
 #include <algorithm>
 #include <cmath>
 #include <numeric>
@@ -13,7 +13,7 @@ namespace chainsplat::recognition {
 namespace {
 
 constexpr double kSh0 = 0.28209479177387814;
-constexpr int kOpacityReset = 3000, kLastOpacityReset = 12000;   // iterations
+constexpr int kOpacityReset = 3000, kLastOpacityReset = 12000;  // iterations
 constexpr float kResetOpacity = 0.01f;
 constexpr int kLinkResets[] = {1500, 4500, 7500, 10500};
 constexpr float kMeanRateFirst = 1.6e-4f, kMeanRateLast = 1.6e-6f;  // of the scene's extent
@@ -25,7 +25,6 @@ struct AngleMoments {
   math::VectorX first, second;
   int visits = 0;
 };
-
 
 capture::View padded(const capture::View& view, int x0, int y0, int width, int height) {
   capture::View out = view;
@@ -43,15 +42,17 @@ capture::View padded(const capture::View& view, int x0, int y0, int width, int h
 
 // Bounds of the visual hull in the base frame, over all training times: the cells of a grid around the grasp that every
 // camera of one time sees inside its mask.
-void hull_bounds(const capture::Capture& capture, const std::vector<FrameViews>& frames, const std::vector<int>& training,
-                 math::Vector3& low, math::Vector3& high) {
+void hull_bounds(const capture::Capture& capture, const std::vector<FrameViews>& frames,
+                 const std::vector<int>& training, math::Vector3& low, math::Vector3& high) {
   constexpr int kCells = 48;  // along the edge of a cube of twice the rope's length
   low = math::Vector3::Constant(1e9);
   high = -low;
   const double cell = 2.0 * capture.length / kCells;
   for (const int k : training) {
     for (int n = 0; n < kCells * kCells * kCells; ++n) {
-      const math::Vector3 home = cell * (math::Vector3(n % kCells, n / kCells % kCells, n / kCells / kCells).array() + 0.5 - 0.5 * kCells).matrix();
+      const math::Vector3 home =
+          cell *
+          (math::Vector3(n % kCells, n / kCells % kCells, n / kCells / kCells).array() + 0.5 - 0.5 * kCells).matrix();
       bool inside = !frames[k].views.empty();
       for (const int v : frames[k].views) {
         const capture::View& view = capture.views[v];
@@ -88,9 +89,11 @@ void hull_bounds(const capture::Capture& capture, const std::vector<FrameViews>&
 double scene_extent(const capture::Capture& capture) {
   // as 3DGS: 1.1 times the largest distance of a camera from the cameras' mean
   math::Vector3 mean = math::Vector3::Zero();
-  for (const auto& camera : capture.cameras) mean += camera.world_from_camera.translation / static_cast<double>(capture.cameras.size());
+  for (const auto& camera : capture.cameras)
+    mean += camera.world_from_camera.translation / static_cast<double>(capture.cameras.size());
   double extent = 0.0;
-  for (const auto& camera : capture.cameras) extent = std::max(extent, (camera.world_from_camera.translation - mean).norm());
+  for (const auto& camera : capture.cameras)
+    extent = std::max(extent, (camera.world_from_camera.translation - mean).norm());
   return 1.1 * std::max(extent, capture.length);
 }
 
@@ -100,8 +103,8 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
   Result result;
   const std::string job = job_text(capture, options);
   result.bending.bending = options.bending.value_or(chain::Bending::planar);
-  result.chain = chain::make_chain(capture.length, capture.diameter, capture.direction, capture.bending_axis, options.joints,
-                                   result.bending.bending, options.twist);
+  result.chain = chain::make_chain(capture.length, capture.diameter, capture.direction, capture.bending_axis,
+                                   options.joints, result.bending.bending, options.twist);
   const chain::Chain& chain = result.chain;
   chain::States states;
   std::vector<double> times;
@@ -113,7 +116,8 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
   std::vector<int> training;
   for (int k = 0; k < static_cast<int>(frames.size()); k += std::max(1, options.every))
     if (!frames[k].views.empty()) training.push_back(k);
-  if (training.empty()) throw WorkError(capture.name, "no training frame shows the object", "use --every 1 or check the masks");
+  if (training.empty())
+    throw WorkError(capture.name, "no training frame shows the object", "use --every 1 or check the masks");
 
   // views on the union of their camera's crops
   std::vector<int> x0(capture.cameras.size(), 1 << 30), y0 = x0, x1(capture.cameras.size(), 0), y1 = x1;
@@ -166,7 +170,8 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
     math::Vector3 low, high;
     hull_bounds(capture, frames, training, low, high);
     if ((high - low).minCoeff() <= 0)
-      throw WorkError(capture.name, "the cameras' masks have no common volume", "check the calibration with 'chainsplat check'");
+      throw WorkError(capture.name, "the cameras' masks have no common volume",
+                      "check the calibration with 'chainsplat check'");
     splat::Gaussians g;
     g.resize(options.paper_gaussians, chain.links(), 0);
     const double spacing = std::cbrt((high - low).prod() / options.paper_gaussians);
@@ -229,12 +234,14 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
     const int batch[] = {static_cast<int>(v)};
     std::vector<math::MatrixX> twists;
     const splat::LossValues values = engine.step(batch, weights, rates, read, &twists);
-    if (read) core::report({"recognize", iteration, options.paper_iterations, values.total, values.psnr_object[0], "paper mode"});
+    if (read)
+      core::report(
+          {"recognize", iteration, options.paper_iterations, values.total, values.psnr_object[0], "paper mode"});
     // Adam on this time step's angles
     const int k = frame_of[v];
     AngleMoments& m = moments[k];
-    const math::VectorX gradient =
-        chain::theta_gradient(chain, chain::world_axes(chain, states.theta[k], capture.base.pose(views[v].time)), twists[0]);
+    const math::VectorX gradient = chain::theta_gradient(
+        chain, chain::world_axes(chain, states.theta[k], capture.base.pose(views[v].time)), twists[0]);
     if (gradient.allFinite()) {
       ++m.visits;
       m.first = kBeta1 * m.first + (1 - kBeta1) * gradient;

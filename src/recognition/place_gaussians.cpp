@@ -8,14 +8,14 @@ namespace chainsplat::recognition {
 
 namespace {
 
-constexpr double kSh0 = 0.28209479177387814;   // degree-0 basis: color = 0.5 + kSh0 * coefficient
-constexpr float kOwnLinkLogit = 12.0f;         // softmax of 12 against zeros: other links below 1/255 by far
-constexpr double kShell = 0.75;                // of the radius, where Gaussians start: most of what is seen is the surface
-constexpr double kCoverage = 0.55;             // sigma in units of the spacing on the shell: neighbors overlap
-constexpr float kStartOpacity = 2.0f;          // logit, 0.88: ropes are opaque
-constexpr double kFacing = 0.35;               // least cosine between surface normal and view ray for a color sample
-constexpr float kLeastOpacity = -3.9f;         // logit, 0.02
-constexpr double kLargest = 1.5;               // of the rope's diameter: a larger Gaussian explains something else
+constexpr double kSh0 = 0.28209479177387814;  // degree-0 basis: color = 0.5 + kSh0 * coefficient
+constexpr float kOwnLinkLogit = 12.0f;        // softmax of 12 against zeros: other links below 1/255 by far
+constexpr double kShell = 0.75;         // of the radius, where Gaussians start: most of what is seen is the surface
+constexpr double kCoverage = 0.55;      // sigma in units of the spacing on the shell: neighbors overlap
+constexpr float kStartOpacity = 2.0f;   // logit, 0.88: ropes are opaque
+constexpr double kFacing = 0.35;        // least cosine between surface normal and view ray for a color sample
+constexpr float kLeastOpacity = -3.9f;  // logit, 0.02
+constexpr double kLargest = 1.5;        // of the rope's diameter: a larger Gaussian explains something else
 
 void set_gaussian(splat::Gaussians& g, int i, const math::Vector3& mean, double sigma, float opacity,
                   const math::Vector3& color, int link) {
@@ -110,8 +110,10 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
   std::vector<int> kept;
   const float largest = static_cast<float>(std::log(kLargest * chain.diameter));
   for (int i = 0; i < gaussians.count; ++i) {
-    const float scale = std::max({gaussians.log_scale[3 * i], gaussians.log_scale[3 * i + 1], gaussians.log_scale[3 * i + 2]});
-    if (gaussians.opacity_logit[i] >= kLeastOpacity && scale <= largest && std::isfinite(gaussians.mean[3 * i])) kept.push_back(i);
+    const float scale =
+        std::max({gaussians.log_scale[3 * i], gaussians.log_scale[3 * i + 1], gaussians.log_scale[3 * i + 2]});
+    if (gaussians.opacity_logit[i] >= kLeastOpacity && scale <= largest && std::isfinite(gaussians.mean[3 * i]))
+      kept.push_back(i);
   }
   changed.removed = gaussians.count - static_cast<int>(kept.size());
   splat::Gaussians old = gaussians;
@@ -132,7 +134,8 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
       if (view.rgba[4 * k + 3] < 128) continue;
       double error = std::pow(1.0 - picture.rgba[4 * k + 3], 2);
       for (int c = 0; c < 3; ++c) error += std::pow(picture.rgba[4 * k + c] - view.rgba[4 * k + c] / 255.0, 2);
-      constexpr double kNoise = 0.03 * 0.03 * 3;  // codec and sensor noise, squared, three channels: not worth a Gaussian
+      constexpr double kNoise =
+          0.03 * 0.03 * 3;  // codec and sensor noise, squared, three channels: not worth a Gaussian
       if (error < kNoise) continue;
       total += error;
       candidates.push_back({d, k});
@@ -143,7 +146,8 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
   gaussians = splat::Gaussians{};
   gaussians.resize(static_cast<int>(kept.size()) + added, old.links, old.degree);
   const auto copy_row = [&](const std::vector<float>& from, std::vector<float>& to, int width, int i, int k) {
-    std::copy_n(from.begin() + static_cast<std::ptrdiff_t>(width) * k, width, to.begin() + static_cast<std::ptrdiff_t>(width) * i);
+    std::copy_n(from.begin() + static_cast<std::ptrdiff_t>(width) * k, width,
+                to.begin() + static_cast<std::ptrdiff_t>(width) * i);
   };
   for (int i = 0; i < static_cast<int>(kept.size()); ++i) {
     copy_row(old.mean, gaussians.mean, 3, i, kept[i]);

@@ -11,8 +11,8 @@
 
 namespace chainsplat::recognition {
 
-// `count` Gaussians in the shell of the rope's tube (home configuration), hard on their own link, colored by the views that
-// see their side. Deterministic for one `random`.
+// `count` Gaussians in the shell of the rope's tube (home configuration), hard on their own link, colored by the views
+// that see their side. Deterministic for one `random`.
 splat::Gaussians place_along_chain(const chain::Chain& chain, const capture::Capture& capture,
                                    const chain::States& states, const std::vector<FrameViews>& frames,
                                    std::span<const int> training, int count, core::Random& random);
@@ -24,9 +24,9 @@ struct Drawn {
   const splat::Picture* picture = nullptr;
 };
 
-// Removes Gaussians whose opacity is below `least_opacity` or that are larger than the rope, then adds up to `budget` where
-// color or mask error is largest (drawn in proportion to the squared error), carried back to the home configuration by the
-// nearest link. Returns how many were removed and added.
+// Removes Gaussians whose opacity is below `least_opacity` or that are larger than the rope, then adds up to `budget`
+// where color or mask error is largest (drawn in proportion to the squared error), carried back to the home
+// configuration by the nearest link. Returns how many were removed and added.
 struct Changed {
   int removed = 0, added = 0;
 };

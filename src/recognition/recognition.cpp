@@ -9,7 +9,8 @@
 namespace chainsplat::recognition {
 
 Result recognize(gpu::Device& device, const capture::Capture& capture, const Options& options) {
-  return options.mode == Mode::paper ? recognize_paper(device, capture, options) : recognize_fast(device, capture, options);
+  return options.mode == Mode::paper ? recognize_paper(device, capture, options)
+                                     : recognize_fast(device, capture, options);
 }
 
 std::string job_text(const capture::Capture& capture, const Options& options) {
@@ -36,7 +37,8 @@ void differentiate(chain::States& states) {
       values.row(r) = states.theta[first + r].transpose();
     }
     const math::MatrixX fit = design.colPivHouseholderQr().solve(values);
-    states.thetadot[k] = order >= 1 ? math::VectorX(fit.row(1).transpose()) : math::VectorX::Zero(states.theta[k].size());
+    states.thetadot[k] =
+        order >= 1 ? math::VectorX(fit.row(1).transpose()) : math::VectorX::Zero(states.theta[k].size());
   }
 }
 
@@ -60,7 +62,8 @@ std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain&
       for (const int v : frames[k].views) {
         const capture::View& view = capture.views[v];
         index_of[v] = static_cast<int>(specs.size());
-        specs.push_back(view_spec(capture, view, view_motions(chain, capture, states, frames[k], k, states.theta[k], view)));
+        specs.push_back(
+            view_spec(capture, view, view_motions(chain, capture, states, frames[k], k, states.theta[k], view)));
         targets.push_back(&view.rgba);
         pixels += static_cast<std::size_t>(view.width) * view.height;
       }

@@ -8,7 +8,7 @@ namespace chainsplat::recognition {
 
 namespace {
 
-constexpr double kNoise = 0.04;        // intensity below which a residual counts as noise (quadratic), above: absolute
+constexpr double kNoise = 0.04;  // intensity below which a residual counts as noise (quadratic), above: absolute
 constexpr double kGradientFloor = 1e-4;  // squared image gradient below which a pixel says nothing
 
 // Depth of the drawn surface, spread a few pixels over the silhouette's edge, where there is gradient but no depth.
@@ -55,7 +55,8 @@ double robust(double residual, double& cost) {
 }  // namespace
 
 LinkEquations link_equations(const chain::Chain& chain, const capture::Camera& camera, const capture::View& view,
-                             const std::vector<math::Pose>& motions, const splat::Picture& picture, double mask_weight) {
+                             const std::vector<math::Pose>& motions, const splat::Picture& picture,
+                             double mask_weight) {
   LinkEquations out;
   out.normal.assign(chain.links(), math::Matrix6::Zero());
   out.right.assign(chain.links(), math::Vector6::Zero());
@@ -74,7 +75,8 @@ LinkEquations link_equations(const chain::Chain& chain, const capture::Camera& c
     for (int x = 0; x < w; ++x) {
       const int k = y * w + x;
       if (shown[4 * k + 3] < 1e-4f && wanted[4 * k + 3] == 0) continue;
-      // residuals and weights of the four channels; gradient: mean of drawn and seen picture (second-order accurate step)
+      // residuals and weights of the four channels; gradient: mean of drawn and seen picture (second-order accurate
+      // step)
       math::Vector2 right = math::Vector2::Zero();
       double gxx = 0, gxy = 0, gyy = 0;
       const bool border = x == 0 || y == 0 || x == w - 1 || y == h - 1;
@@ -97,7 +99,8 @@ LinkEquations link_equations(const chain::Chain& chain, const capture::Camera& c
       if (border || gxx + gyy < kGradientFloor || depth[k] <= 0) continue;
       // surface point and its link
       const double z = depth[k];
-      const math::Vector3 xc((view.x0 + x + 0.5 - camera.cx) / camera.fx * z, (view.y0 + y + 0.5 - camera.cy) / camera.fy * z, z);
+      const math::Vector3 xc((view.x0 + x + 0.5 - camera.cx) / camera.fx * z,
+                             (view.y0 + y + 0.5 - camera.cy) / camera.fy * z, z);
       const math::Vector3 xw = camera.world_from_camera * xc;
       int link = 1;
       double nearest = std::numeric_limits<double>::infinity();
@@ -175,8 +178,8 @@ RefineSummary refine_angles(const chain::Chain& chain, const capture::Capture& c
       if (work[f].done) continue;
       for (const int v : frames[selected[f]].views) {
         views.push_back(v);
-        motions.push_back(view_motions(chain, capture, states, frames[selected[f]], selected[f], work[f].trial,
-                                       capture.views[v]));
+        motions.push_back(
+            view_motions(chain, capture, states, frames[selected[f]], selected[f], work[f].trial, capture.views[v]));
       }
     }
     if (views.empty()) break;
@@ -242,9 +245,10 @@ RefineSummary refine_angles(const chain::Chain& chain, const capture::Capture& c
   for (std::size_t f = 0; f < selected.size(); ++f) {
     states.theta[selected[f]] = work[f].theta;
     summary.cost_after += work[f].cost;
-    summary.covariances.push_back(work[f].normal.size() > 0
-                                      ? math::MatrixX((work[f].normal + 1e-6 * math::MatrixX::Identity(chain.angles(), chain.angles())).inverse())
-                                      : math::MatrixX::Identity(chain.angles(), chain.angles()));
+    summary.covariances.push_back(
+        work[f].normal.size() > 0
+            ? math::MatrixX((work[f].normal + 1e-6 * math::MatrixX::Identity(chain.angles(), chain.angles())).inverse())
+            : math::MatrixX::Identity(chain.angles(), chain.angles()));
   }
   return summary;
 }

@@ -1,8 +1,9 @@
 // refine_angles.h - Gauss-Newton on each frame's joint angles with the Gaussians held (DESIGN, 'Recognition').
 //
-// A drawn rope moves in the image with its surface: where pixel p shows the surface point x of link j, a twist xi of that
-// link moves the picture by the flow du = dpi/dx (w x x + v), so dI^/dxi = -grad I^ . du. Color and mask residuals of a
-// view become a 6x6 normal matrix and a 6-vector a link in twist space; the space Jacobian takes their sum to theta.
+// A drawn rope moves in the image with its surface: where pixel p shows the surface point x of link j, a twist xi of
+// that link moves the picture by the flow du = dpi/dx (w x x + v), so dI^/dxi = -grad I^ . du. Color and mask residuals
+// of a view become a 6x6 normal matrix and a 6-vector a link in twist space; the space Jacobian takes their sum to
+// theta.
 #pragma once
 #include <functional>
 #include <span>
@@ -15,10 +16,10 @@
 
 namespace chainsplat::recognition {
 
-struct LinkEquations {          // of one view; world twists about the world origin
+struct LinkEquations {                // of one view; world twists about the world origin
   std::vector<math::Matrix6> normal;  // a link: J^T W J
   std::vector<math::Vector6> right;   // a link: J^T W r
-  double cost = 0.0;            // robust cost of color and mask residuals
+  double cost = 0.0;                  // robust cost of color and mask residuals
 };
 
 // `picture` drawn with depth at `motions`. `mask_weight` scales the mask residual against one color channel.
@@ -28,19 +29,19 @@ LinkEquations link_equations(const chain::Chain& chain, const capture::Camera& c
 struct RefineOptions {
   int iterations = 3;
   double mask_weight = 1.0;
-  double smooth_sigma = 0.15;    // rad, prior on the difference of neighboring joints' same-axis angles
+  double smooth_sigma = 0.15;  // rad, prior on the difference of neighboring joints' same-axis angles
 };
 
 // What is known of a frame's angles before: from the silhouettes. Empty: nothing.
 struct AnglePrior {
-  std::vector<math::VectorX> mean;          // a frame of the sequence
-  std::vector<math::MatrixX> information;   // n x n, inverse covariance
+  std::vector<math::VectorX> mean;         // a frame of the sequence
+  std::vector<math::MatrixX> information;  // n x n, inverse covariance
 };
 
 struct RefineSummary {
   double cost_before = 0.0, cost_after = 0.0;
   int accepted = 0, rejected = 0;
-  std::vector<math::MatrixX> covariances;   // of each refined frame
+  std::vector<math::MatrixX> covariances;  // of each refined frame
 };
 
 // Draws the capture's views of these indices with these link motions, with depth, in order.

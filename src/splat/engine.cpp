@@ -20,22 +20,22 @@ using shared::SplatPush;
 using shared::SplatTile;
 using shared::SplatView;
 
-constexpr double kClampMargin = 1.3;        // of the half image, for the projection's Jacobian (SPEC 2.5)
-constexpr int kActiveMargin = 16;           // px around the mask that training draws and charges: SSIM's reach twice, and a bit
+constexpr double kClampMargin = 1.3;  // of the half image, for the projection's Jacobian (SPEC 2.5)
+constexpr int kActiveMargin = 16;  // px around the mask that training draws and charges: SSIM's reach twice, and a bit
 constexpr std::uint32_t kMostTiles = 60000;  // of one submission: below every device's group count limit (65535)
-constexpr std::uint32_t kRankLimit = 256;   // longest tile list sorted by rank; longer ones by the bitonic network
-constexpr double kGrowth = 1.25;            // spare room when a capacity is raised
+constexpr std::uint32_t kRankLimit = 256;    // longest tile list sorted by rank; longer ones by the bitonic network
+constexpr double kGrowth = 1.25;             // spare room when a capacity is raised
 constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;  // Adam, as in 3DGS
 
 struct SceneView {
-  double fx = 0, fy = 0, cx = 0, cy = 0;   // px, of the crop
+  double fx = 0, fy = 0, cx = 0, cy = 0;  // px, of the crop
   double limit_x = 0, limit_y = 0;
   int width = 0, height = 0, tiles_x = 0, tiles_y = 0;
   math::Pose camera_from_world;
   std::vector<math::Pose> motions;
-  std::size_t target = 0;                  // first pixel in the target buffer
-  std::vector<std::uint32_t> active;       // grid cells that are drawn and charged
-  std::size_t near = 0;                    // the first `near` of them get the D-SSIM term too
+  std::size_t target = 0;             // first pixel in the target buffer
+  std::vector<std::uint32_t> active;  // grid cells that are drawn and charged
+  std::size_t near = 0;               // the first `near` of them get the D-SSIM term too
 };
 
 // Parameters and views that belong together: the training's, or those of one call.
@@ -55,7 +55,7 @@ enum class Active { near_mask, everywhere, everywhere_dssim_near_mask };
 
 struct RunOptions {
   LossWeights weights;
-  double color_scale = 0.0;   // what |I^ - I| sums are divided by
+  double color_scale = 0.0;  // what |I^ - I| sums are divided by
   double mask_scale = 0.0;
   bool loss = false, backward = false, twists = false, depth = false, accumulate = false;
 };
@@ -115,8 +115,8 @@ struct Engine::State {
   gpu::Device& device;
   std::uint32_t tile_width, tile_height, pixels_per_lane, slots;
   bool cutoffs;
-  double clamp_margin;                      // of the half image
-  std::size_t range_limit;                  // bytes of one storage buffer
+  double clamp_margin;      // of the half image
+  std::size_t range_limit;  // bytes of one storage buffer
 
   gpu::Pipeline replicate, compact, scan_block, scan_sums, project, bin, sort, blend, blend_depth, blend_backward,
       project_backward, gather, link_twist, adam, loss_pixel, ssim_rows, ssim_columns, ssim_rows_backward,
@@ -131,7 +131,7 @@ struct Engine::State {
   Buffer entries, sorted, partials;
   Buffer image, depth_image, pixel_gradient, ssim_row_sums, ssim_factors;
   std::uint32_t live_capacity = 0, instance_capacity = 0;
-  int most_views = 1 << 20;                 // of one submission, lowered when a buffer would pass the device's limit
+  int most_views = 1 << 20;  // of one submission, lowered when a buffer would pass the device's limit
   std::vector<gpu::Timing> timings;
 
   Scene training, scratch;
@@ -159,8 +159,8 @@ struct Engine::State {
 
 Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), commands(d) {
   const gpu::DeviceInfo& device_info = gpu::info(d);
-  // lavapipe: one subgroup of 8 lanes a tile, a column of 8 pixels each (loads are what costs there: DESIGN, 'The size of
-  // the work'); a GPU: one subgroup of 32 a tile, 2 pixels each
+  // lavapipe: one subgroup of 8 lanes a tile, a column of 8 pixels each (loads are what costs there: DESIGN, 'The size
+  // of the work'); a GPU: one subgroup of 32 a tile, 2 pixels each
   const int tile = settings.tile > 0 ? settings.tile : 8;
   const int pixels = settings.pixels_per_lane > 0 ? settings.pixels_per_lane : device_info.software ? 8 : 2;
   CHAINSPLAT_CHECK(tile % pixels == 0, std::to_string(tile) + " " + std::to_string(pixels));
@@ -185,9 +185,9 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   sort = gpu::Pipeline(d, "splat_sort", 6, push, {tile_lanes, kRankLimit});
   blend = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 0});
   blend_depth = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 1});
-  blend_backward =
-      gpu::Pipeline(d, "splat_blend_backward", 12, push, {lanes, tile_width, tile_height, pixels_per_lane, cut,
-                                 std::min(lanes, std::max(1u, device_info.subgroup_size))});
+  blend_backward = gpu::Pipeline(
+      d, "splat_blend_backward", 12, push,
+      {lanes, tile_width, tile_height, pixels_per_lane, cut, std::min(lanes, std::max(1u, device_info.subgroup_size))});
   project_backward = gpu::Pipeline(d, "splat_project_backward", 11, push, {});
   gather = gpu::Pipeline(d, "splat_gather", 11, push, {});
   link_twist = gpu::Pipeline(d, "splat_link_twist", 5, push, {});
@@ -257,7 +257,8 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
       view.target = all_targets.size() / 4;
       all_targets.insert(all_targets.end(), target.begin(), target.end());
       for (std::size_t k = 3; k < target.size(); k += 4) object_pixels += target[k] >= 128 ? 1.0 : 0.0;
-      if (active != Active::everywhere) view.active = active_cells(view, target, static_cast<int>(tile_width), static_cast<int>(tile_height));
+      if (active != Active::everywhere)
+        view.active = active_cells(view, target, static_cast<int>(tile_width), static_cast<int>(tile_height));
     }
     view.near = view.active.size();
     if (active != Active::near_mask) {
@@ -285,8 +286,10 @@ std::vector<std::vector<int>> Engine::State::chunks(const Scene& scene, std::spa
     const SceneView& view = scene.views[v];
     const std::size_t view_pixels = static_cast<std::size_t>(view.width) * view.height;
     if (view_pixels > most_pixels || view.active.size() > kMostTiles)
-      throw WorkError("splat", "an image of " + std::to_string(view.width) + "x" + std::to_string(view.height) +
-                                   " pixels does not fit this device's buffers", "use smaller images or another device");
+      throw WorkError("splat",
+                      "an image of " + std::to_string(view.width) + "x" + std::to_string(view.height) +
+                          " pixels does not fit this device's buffers",
+                      "use smaller images or another device");
     if (out.empty() || pixels + view_pixels > most_pixels || tile_total + view.active.size() > kMostTiles ||
         static_cast<int>(out.back().size()) >= most_views) {
       out.emplace_back();
@@ -309,7 +312,8 @@ void Engine::State::scan(const Buffer& values, const Buffer& prefix, const Buffe
 }
 
 // Records and runs all passes for one chunk. False: a capacity was too small; it has been raised, run again.
-bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptions& options, const AdamPush* adam_push) {
+bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptions& options,
+                        const AdamPush* adam_push) {
   const auto count = static_cast<std::uint32_t>(scene.count), links = static_cast<std::uint32_t>(scene.links);
   const auto view_count = static_cast<std::uint32_t>(chunk.size());
   const std::size_t replicas = static_cast<std::size_t>(count) * links;
@@ -373,7 +377,8 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
 
   // room
   if (live_capacity == 0 || live_capacity > replicas)
-    live_capacity = static_cast<std::uint32_t>(std::max<std::size_t>(1, std::min<std::size_t>(replicas, 2 * count + 256)));
+    live_capacity =
+        static_cast<std::uint32_t>(std::max<std::size_t>(1, std::min<std::size_t>(replicas, 2 * count + 256)));
   constexpr std::uint32_t kFirstInstances = 8;  // tiles a splat touches, first guess
   const std::size_t pairs = static_cast<std::size_t>(live_capacity) * view_count;
   const std::size_t pair_bytes = (options.backward ? shared::kGradientRows : shared::kSplatRows) * sizeof(glm::vec4);
@@ -381,7 +386,8 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
     most_views = static_cast<int>(std::max<std::size_t>(1, range_limit / (pair_bytes * live_capacity)));
     return false;
   }
-  if (instance_capacity == 0) instance_capacity = static_cast<std::uint32_t>(std::max<std::size_t>(1024, kFirstInstances * pairs / 2));
+  if (instance_capacity == 0)
+    instance_capacity = static_cast<std::uint32_t>(std::max<std::size_t>(1024, kFirstInstances * pairs / 2));
   const auto words = [](std::size_t n) { return n * sizeof(std::uint32_t); };
   const auto vectors = [](std::size_t n) { return n * sizeof(glm::vec4); };
   const auto blocks = [](std::size_t n) { return n / shared::kScanBlock + 1; };
@@ -438,7 +444,9 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
     commands.dispatch_indirect(pipeline, {buffers.begin(), buffers.size()}, &push, sizeof push, counters,
                                words(shared::kCounterDispatch));
   };
-  const auto groups = [](std::size_t n) { return static_cast<std::uint32_t>((n + shared::kGroup - 1) / shared::kGroup); };
+  const auto groups = [](std::size_t n) {
+    return static_cast<std::uint32_t>((n + shared::kGroup - 1) / shared::kGroup);
+  };
 
   commands.begin();
   commands.fill(counters, 0, 0, words(shared::kCounters));
@@ -492,26 +500,30 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
       dispatch(ssim_rows, {&tiles, &views, &image, &scene.target, &ssim_row_sums}, near_total);
       dispatch(ssim_columns, {&tiles, &views, &ssim_row_sums, &ssim_factors, &tile_loss}, near_total);
       dispatch(ssim_rows_backward, {&tiles, &views, &ssim_factors, &ssim_row_sums}, near_total);
-      dispatch(ssim_columns_backward, {&tiles, &views, &ssim_row_sums, &image, &scene.target, &pixel_gradient}, near_total);
+      dispatch(ssim_columns_backward, {&tiles, &views, &ssim_row_sums, &image, &scene.target, &pixel_gradient},
+               near_total);
       commands.stamp("ssim");
     }
   }
   if (options.backward) {
-    dispatch(blend_backward, {&tiles, &views, &tile_prefix, &tile_block, &tile_count, &sorted, &splats, &counters, &image,
-                              &tile_used, &pixel_gradient, &partials},
+    dispatch(blend_backward,
+             {&tiles, &views, &tile_prefix, &tile_block, &tile_count, &sorted, &splats, &counters, &image, &tile_used,
+              &pixel_gradient, &partials},
              tile_total);
     commands.stamp("blend backward");
     dispatch_live(project_backward, {&scene.parameters, &live, &views, &motions, &counters, &splats, &instance_count,
                                      &instance_prefix, &instance_block, &partials, &records});
     commands.stamp("project backward");
-    dispatch(gather, {&scene.parameters, &replica_opacity, &live_flag, &live_prefix, &live_block, &views, &motions,
-                      &counters, &records, &scene.gradient, &replica_gradient},
+    dispatch(gather,
+             {&scene.parameters, &replica_opacity, &live_flag, &live_prefix, &live_block, &views, &motions, &counters,
+              &records, &scene.gradient, &replica_gradient},
              groups(count));
     if (options.twists && count > 0)
       dispatch(link_twist, {&live_prefix, &live_block, &counters, &records, &link_twists}, links, view_count);
     commands.stamp("gather");
     if (adam_push) {
-      const std::array buffers{static_cast<const Buffer*>(&scene.parameters), static_cast<const Buffer*>(&scene.gradient),
+      const std::array buffers{static_cast<const Buffer*>(&scene.parameters),
+                               static_cast<const Buffer*>(&scene.gradient),
                                static_cast<const Buffer*>(&scene.first_moment),
                                static_cast<const Buffer*>(&scene.second_moment), static_cast<const Buffer*>(&counters)};
       const std::uint32_t parameter_groups = groups(scene.parameter_count);
@@ -523,7 +535,8 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   commands.submit();
   commands.wait();
   for (const gpu::Timing& timing : commands.timings()) {
-    const auto same = std::find_if(timings.begin(), timings.end(), [&](const auto& t) { return t.label == timing.label; });
+    const auto same =
+        std::find_if(timings.begin(), timings.end(), [&](const auto& t) { return t.label == timing.label; });
     if (same == timings.end()) {
       timings.push_back(timing);
     } else {
@@ -534,19 +547,23 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   std::array<std::uint32_t, shared::kCounters> read{};
   gpu::download(device, counters, read.data(), words(shared::kCounters));
   if (read[shared::kCounterTooLong] != 0)
-    throw WorkError("splat", "more than " + std::to_string(shared::kLongestList) + " Gaussians cover one tile", "use fewer or smaller Gaussians");
+    throw WorkError("splat", "more than " + std::to_string(shared::kLongestList) + " Gaussians cover one tile",
+                    "use fewer or smaller Gaussians");
   if (read[shared::kCounterOverflow] == 0) return true;
   // raise what was too small, as far as one buffer may reach
   const std::size_t want_live = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantLive]) + 64;
   const std::size_t want_instances = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantInstances]) + 1024;
   if (read[shared::kCounterWantLive] > live_capacity)
     live_capacity = static_cast<std::uint32_t>(std::min<std::size_t>(want_live, replicas));
-  if (read[shared::kCounterWantInstances] > instance_capacity) instance_capacity = static_cast<std::uint32_t>(want_instances);
+  if (read[shared::kCounterWantInstances] > instance_capacity)
+    instance_capacity = static_cast<std::uint32_t>(want_instances);
   const std::size_t partial_bytes = vectors(static_cast<std::size_t>(shared::kPartialRows) * slots * instance_capacity);
   if (partial_bytes > range_limit) {
     if (view_count == 1)
-      throw WorkError("splat", "one view needs " + std::to_string(instance_capacity) + " tile entries, more than this device's buffers hold",
-                      "use fewer or smaller Gaussians");
+      throw WorkError(
+          "splat",
+          "one view needs " + std::to_string(instance_capacity) + " tile entries, more than this device's buffers hold",
+          "use fewer or smaller Gaussians");
     most_views = static_cast<int>(view_count) / 2;
     instance_capacity = 0;
   }
@@ -554,8 +571,8 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
 }
 
 template <class AfterChunk>
-void Engine::State::run_all(Scene& scene, std::span<const int> batch, const RunOptions& options, const AdamPush* adam_push,
-                            AfterChunk after) {
+void Engine::State::run_all(Scene& scene, std::span<const int> batch, const RunOptions& options,
+                            const AdamPush* adam_push, AfterChunk after) {
   const bool dssim = options.loss && options.weights.dssim > 0.0f;
   timings.clear();
   std::size_t done = 0;
@@ -607,7 +624,9 @@ std::vector<Picture> Engine::State::pictures(const Scene& scene, std::span<const
     for (const std::uint32_t cell : view.active) drawn[cell] = true;
     for (int y = 0; y < view.height; ++y) {
       for (int x = 0; x < view.width; ++x) {
-        if (drawn[static_cast<std::size_t>(y / static_cast<int>(tile_height)) * view.tiles_x + x / static_cast<int>(tile_width)]) continue;
+        if (drawn[static_cast<std::size_t>(y / static_cast<int>(tile_height)) * view.tiles_x +
+                  x / static_cast<int>(tile_width)])
+          continue;
         const std::size_t k = static_cast<std::size_t>(y) * view.width + x;
         std::fill_n(picture.rgba.begin() + 4 * k, 4, 0.0f);
         if (depth) picture.depth[k] = 0.0f;
@@ -684,8 +703,8 @@ LossValues Engine::loss(const Gaussians& gaussians, std::span<const ViewSpec> vi
   s.load_views(s.scratch, views, targets, Active::everywhere);
   LossValues values;
   if (gradients) {
-    gradients->gaussians = unpacked(std::vector<float>(s.scratch.parameter_count, 0.0f), gaussians.count, gaussians.links,
-                                    gaussians.degree);
+    gradients->gaussians = unpacked(std::vector<float>(s.scratch.parameter_count, 0.0f), gaussians.count,
+                                    gaussians.links, gaussians.degree);
     std::fill(gradients->gaussians.rotation.begin(), gradients->gaussians.rotation.end(), 0.0f);
     gradients->link_twists.clear();
   }
@@ -725,7 +744,8 @@ LossValues Engine::loss(const Gaussians& gaussians, std::span<const ViewSpec> vi
 
 void Engine::set_views(std::span<const ViewSpec> views, std::span<const std::vector<std::uint8_t>* const> targets,
                        bool everywhere) {
-  state_->load_views(state_->training, views, targets, everywhere ? Active::everywhere_dssim_near_mask : Active::near_mask);
+  state_->load_views(state_->training, views, targets,
+                     everywhere ? Active::everywhere_dssim_near_mask : Active::near_mask);
 }
 
 void Engine::set_motions(int view, const std::vector<math::Pose>& motions) {
@@ -747,8 +767,8 @@ Gaussians Engine::gaussians() const {
   return unpacked(all, scene.count, scene.links, scene.degree);
 }
 
-LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, const AdamRates& rates, bool read_losses,
-                        std::vector<math::MatrixX>* twists) {
+LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, const AdamRates& rates,
+                        bool read_losses, std::vector<math::MatrixX>* twists) {
   State& s = *state_;
   Scene& scene = s.training;
   RunOptions options;
@@ -801,8 +821,8 @@ Engine::Snapshot Engine::snapshot() const {
   Snapshot out;
   out.gaussians = gaussians();
   out.step = scene.step;
-  for (const auto& [buffer, values] : {std::pair{&scene.first_moment, &out.first_moment},
-                                       std::pair{&scene.second_moment, &out.second_moment}}) {
+  for (const auto& [buffer, values] :
+       {std::pair{&scene.first_moment, &out.first_moment}, std::pair{&scene.second_moment, &out.second_moment}}) {
     values->resize(scene.parameter_count);
     if (!values->empty()) gpu::download(state_->device, *buffer, values->data(), values->size() * sizeof(float));
   }
@@ -812,9 +832,12 @@ Engine::Snapshot Engine::snapshot() const {
 void Engine::restore(const Snapshot& snapshot) {
   State& s = *state_;
   s.load_gaussians(s.training, snapshot.gaussians);
-  CHAINSPLAT_CHECK(snapshot.first_moment.size() == s.training.parameter_count, std::to_string(snapshot.first_moment.size()));
-  s.write(s.training.first_moment, snapshot.first_moment.data(), snapshot.first_moment.size() * sizeof(float), "first moment");
-  s.write(s.training.second_moment, snapshot.second_moment.data(), snapshot.second_moment.size() * sizeof(float), "second moment");
+  CHAINSPLAT_CHECK(snapshot.first_moment.size() == s.training.parameter_count,
+                   std::to_string(snapshot.first_moment.size()));
+  s.write(s.training.first_moment, snapshot.first_moment.data(), snapshot.first_moment.size() * sizeof(float),
+          "first moment");
+  s.write(s.training.second_moment, snapshot.second_moment.data(), snapshot.second_moment.size() * sizeof(float),
+          "second moment");
   s.training.step = snapshot.step;
 }
 
@@ -823,7 +846,8 @@ void Engine::reset_opacity(float largest) {
   const float logit = std::log(largest / (1.0f - largest));
   for (float& value : now.gaussians.opacity_logit) value = std::min(value, logit);
   const std::size_t first = 10u * now.gaussians.count;
-  for (auto* moment : {&now.first_moment, &now.second_moment}) std::fill_n(moment->begin() + first, now.gaussians.count, 0.0f);
+  for (auto* moment : {&now.first_moment, &now.second_moment})
+    std::fill_n(moment->begin() + first, now.gaussians.count, 0.0f);
   restore(now);
 }
 

@@ -1,0 +1,90 @@
+// chainsplat/force.h - angles over time and a twin -> the force that the outside exerts on the rope (SPEC 7).
+//
+// At a material point with position Jacobian J the force f solves J^T f = r, with the generalized force that the model
+// does not explain, r = M ddtheta + h + K (theta - theta_0) + D dtheta. Where J sees a direction badly (along a straight
+// rope) or not at all (the bending axis of a planar chain) the prior keeps f small and the standard error says so.
+#pragma once
+#include <optional>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "chainsplat/dynamics.h"
+#include "chainsplat/splat.h"
+#include "chainsplat/twin.h"
+
+namespace chainsplat::force {
+
+using math::Matrix3;
+using math::MatrixX;
+using math::Vector3;
+using math::VectorX;
+
+// Angles with their derivatives and how sure each angle's (theta, thetadot, thetaddot) is.
+struct Motion {
+  std::vector<double> time;                         // s
+  std::vector<VectorX> theta, thetadot, thetaddot;  // n
+  std::vector<std::vector<Matrix3>> covariance;     // a time, an angle
+};
+
+// Kalman filter and, unless `live`, Rauch-Tung-Striebel smoother of every angle under random jerk. How large jerk and
+// noise are is found by maximum likelihood, one ratio for all angles. `sigma`: standard deviations of the angles, n
+// a time, which bound the noise from below, or empty. Throws InputError for fewer than three times.
+Motion smooth(const chain::States& states, std::span<const VectorX> sigma, bool live);
+
+struct Options {
+  double force_scale = 0.5;            // N a 60 g rope is pushed with, in proportion to the mass: the prior's deviation
+  double relative_deviation = 0.1;     // of the joints' stiffness and damping torques: what identification leaves open
+  double gravity_deviation = 0.004;    // of the rope's weight times its length: torque error of any joint
+  double window = 0.15;                // s to either side over which the place of an automatic contact is one
+  int places = 60;                     // arclengths tried for an automatic contact
+};
+
+// The force at one place.
+struct Fit {
+  Vector3 force = Vector3::Zero();            // N, world, on the rope
+  Matrix3 covariance = Matrix3::Identity();   // N^2
+  double cost = 0.0;                          // chi square of what is left, prior included
+};
+
+// (J C^-1 J^T + prior^-2)^-1 J C^-1 r. `jacobian` 3 x n, `residual` n, `covariance` n x n of the residual.
+Fit solve(const MatrixX& jacobian, const VectorX& residual, const MatrixX& covariance, double prior_deviation);
+
+// r of SPEC 7. n, N m.
+VectorX residual_torque(const dynamics::Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
+                        const VectorX& thetadot, const VectorX& thetaddot);
+
+// Where the rope is touched.
+struct Contact {
+  int link = 0;
+  double arclength = 0.0;            // m
+  Vector3 home = Vector3::Zero();    // of the material point, base frame, m
+};
+
+// The Gaussian nearest to any of the `points` (world, columns), on its most probable link; without Gaussians the
+// nearest point of the centerline.
+Contact nearest_contact(const chain::Chain& chain, const splat::Gaussians& gaussians, const math::Pose& base,
+                        const VectorX& theta, const MatrixX& points);
+
+struct Estimate {
+  double time = 0.0;
+  Contact contact;
+  Vector3 point = Vector3::Zero();      // of the contact, world, m
+  Vector3 force = Vector3::Zero();      // N, or N a kilogram of rope
+  Vector3 sigma = Vector3::Zero();      // standard errors
+  Vector3 observed = Vector3::Zero();   // 0 (only the prior speaks) .. 1, by component
+  double explained = 0.0;               // fall of chi square by the force
+  double arclength_sigma = 0.0;         // m, of an automatic contact; else 0
+  bool touching = false;
+  bool moving = true;                   // false: friction at rest hides forces; sigma has what it may hold
+};
+
+// One line a time of `motion`. `contacts`: a time each, empty where nothing is said to touch; an empty span: automatic.
+// `live`: the place of a contact is found from the past alone.
+std::vector<Estimate> estimate(const dynamics::Model& model, const dynamics::BaseFunction& base, const Motion& motion,
+                               std::span<const std::optional<Contact>> contacts, bool live, const Options& options = {});
+
+// The line of INTERFACE 5, without line feed. `known_mass` false: forces are per kilogram of rope, and the line says so.
+std::string to_json(const Estimate& estimate, bool known_mass);
+
+}  // namespace chainsplat::force

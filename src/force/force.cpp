@@ -1,0 +1,245 @@
+#include "chainsplat/force.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+
+namespace chainsplat::force {
+
+using math::Pose;
+
+namespace {
+
+constexpr double kPushedMass = 0.06;  // kg, of the rope that Options::force_scale is for
+
+// A force is said to touch where it explains this much chi square (three components: beyond 99.9 %) and is larger than
+// this share of the rope's weight, which model errors feign.
+constexpr double kTouching = 16.3;
+constexpr double kTouchingWeight = 0.04;
+
+constexpr double kMovingSpeeds = 3.0;  // of the friction's regularization speed, beyond which friction is known (SPEC 7)
+constexpr double kLeastTorque = 1e-6;  // of weight times length, keeps covariances invertible
+
+double total_mass(const dynamics::Parameters& parameters) {
+  double mass = parameters.tip_mass;
+  for (const double m : parameters.link_mass) mass += m;
+  return mass;
+}
+
+// What one frame contributes: the unexplained torque, how sure it is, and where the rope is.
+struct Frame {
+  VectorX residual;
+  MatrixX covariance;
+  MatrixX axes;
+  std::vector<Pose> motions;
+  std::vector<double> friction;  // N a link that may hide at rest
+  std::vector<double> speed;     // m/s a link, of its middle, across the table
+};
+
+Frame frame_of(const dynamics::Model& model, const trajectory::BaseMotion& base, const Motion& motion, std::size_t f,
+               const Options& options) {
+  const chain::Chain& chain = model.chain;
+  const dynamics::Parameters& p = model.parameters;
+  const int n = chain.angles();
+  const VectorX &theta = motion.theta[f], &thetadot = motion.thetadot[f], &thetaddot = motion.thetaddot[f];
+  Frame out;
+  out.residual = residual_torque(model, base, theta, thetadot, thetaddot);
+  out.axes = chain::world_axes(chain, theta, base.pose);
+  out.motions = chain::link_motions(chain, theta, base.pose);
+
+  const dynamics::Linearization at = dynamics::linearize(model, base, math::Vector6::Zero(), theta, thetadot);
+  MatrixX by_angle = MatrixX::Zero(n, n);
+  for (int k = 0; k < n; ++k) {
+    const Matrix3& c = motion.covariance[f][k];
+    MatrixX columns(n, 3);
+    columns << at.stiffness.col(k), at.damping.col(k), at.mass.col(k);
+    by_angle.noalias() += columns * c * columns.transpose();
+  }
+  out.covariance = by_angle;
+  const double moment = total_mass(p) * p.gravity.norm() * chain.length;
+  for (int k = 0; k < n; ++k) {
+    const double spring = options.relative_deviation * p.stiffness[k] * (theta[k] - p.rest_angle[k]);
+    const double damper = options.relative_deviation * p.damping[k] * thetadot[k];
+    out.covariance(k, k) += spring * spring + damper * damper + std::pow(kLeastTorque * moment, 2);
+  }
+  // weight that is somewhere else than thought: an error that grows toward the grasp, as a small force at every joint
+  // and at the free end would make it
+  const double error = options.gravity_deviation * total_mass(p) * p.gravity.norm();
+  const MatrixX nodes = chain::nodes(chain, out.motions);
+  for (int link = 1; link < chain.links(); ++link) {
+    const MatrixX jacobian = chain::point_jacobian(chain, out.axes, link, nodes.col(link + 1));
+    out.covariance.noalias() += error * error * jacobian.transpose() * jacobian;
+  }
+
+  // friction at rest balances anything up to its limit
+  out.friction.assign(chain.links(), 0.0);
+  out.speed.assign(chain.links(), 0.0);
+  if (p.table_normal) {
+    const Vector3& normal = *p.table_normal;
+    const Matrix3 across = Matrix3::Identity() - normal * normal.transpose();
+    const math::Matrix3& rotation = base.pose.rotation;
+    const Vector3 omega = rotation * base.velocity.head<3>(), v0 = rotation * base.velocity.tail<3>();
+    for (int link = 1; link < chain.links(); ++link) {
+      const Vector3 x = 0.5 * (nodes.col(link) + nodes.col(link + 1));
+      const MatrixX jacobian = chain::point_jacobian(chain, out.axes, link, x);
+      const Vector3 v = across * (jacobian * thetadot + v0 + omega.cross(x - base.pose.translation));
+      out.speed[link] = v.norm();
+      const double limit = p.coulomb_friction[link - 1] * p.link_mass[link - 1] * std::abs(p.gravity.dot(normal));
+      out.friction[link] = limit * p.coulomb_speed / std::hypot(v.norm(), p.coulomb_speed);
+      const MatrixX tangential = across * jacobian;
+      out.covariance.noalias() += std::pow(out.friction[link], 2) * tangential.transpose() * tangential;
+    }
+  }
+  return out;
+}
+
+Contact contact_at(const chain::Chain& chain, double arclength) {
+  return {chain::link_at(chain, arclength), arclength, arclength * chain.direction};
+}
+
+MatrixX jacobian_of(const chain::Chain& chain, const Frame& frame, const Contact& contact) {
+  return chain::point_jacobian(chain, frame.axes, contact.link, frame.motions[contact.link] * contact.home);
+}
+
+}  // namespace
+
+VectorX residual_torque(const dynamics::Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
+                        const VectorX& thetadot, const VectorX& thetaddot) {
+  return dynamics::inverse_dynamics(model, base, theta, thetadot, thetaddot) -
+         dynamics::joint_law(model, theta, thetadot);
+}
+
+Fit solve(const MatrixX& jacobian, const VectorX& residual, const MatrixX& covariance, double prior_deviation) {
+  const Eigen::LLT<MatrixX> factor(covariance);
+  const MatrixX weighted = factor.solve(jacobian.transpose());  // n x 3
+  const Matrix3 information =
+      jacobian * weighted + Matrix3::Identity() / (prior_deviation * prior_deviation);
+  Fit out;
+  out.covariance = information.inverse();
+  out.force = out.covariance * (weighted.transpose() * residual);
+  out.cost = residual.dot(factor.solve(residual)) - out.force.dot(information * out.force);
+  return out;
+}
+
+Contact nearest_contact(const chain::Chain& chain, const splat::Gaussians& gaussians, const Pose& base,
+                        const VectorX& theta, const MatrixX& points) {
+  const std::vector<Pose> motions = chain::link_motions(chain, theta, base);
+  Contact best;
+  double least = 1e300;
+  const auto offer = [&](int link, double arclength, const Vector3& home) {
+    const Vector3 x = motions[link] * home;
+    for (Eigen::Index i = 0; i < points.cols(); ++i) {
+      const double distance = (points.col(i) - x).squaredNorm();
+      if (distance >= least) continue;
+      least = distance;
+      best = {link, arclength, home};
+    }
+  };
+  if (gaussians.count > 0 && gaussians.links == chain.links()) {
+    for (int i = 0; i < gaussians.count; ++i) {
+      const float* const logits = &gaussians.link_logits[static_cast<std::size_t>(i) * gaussians.links];
+      const int link = static_cast<int>(std::max_element(logits, logits + gaussians.links) - logits);
+      const Vector3 home(gaussians.mean[3 * i], gaussians.mean[3 * i + 1], gaussians.mean[3 * i + 2]);
+      offer(link, std::clamp(home.dot(chain.direction), chain.link_start(link), chain.link_end(link)), home);
+    }
+    return best;
+  }
+  constexpr int kPoints = 301;
+  for (const double s : chain::equal_arclengths(chain, kPoints)) {
+    const int link = chain::link_at(chain, s);
+    offer(link, s, s * chain.direction);
+  }
+  return best;
+}
+
+std::vector<Estimate> estimate(const dynamics::Model& model, const dynamics::BaseFunction& base, const Motion& motion,
+                               std::span<const std::optional<Contact>> contacts, bool live, const Options& options) {
+  const chain::Chain& chain = model.chain;
+  const std::size_t count = motion.time.size();
+  const bool automatic = contacts.empty();
+  CHAINSPLAT_CHECK(automatic || contacts.size() == count, std::to_string(contacts.size()));
+  const double mass = total_mass(model.parameters);
+  const double prior = options.force_scale * mass / kPushedMass, weight = mass * model.parameters.gravity.norm();
+  std::vector<Frame> frames;
+  for (std::size_t f = 0; f < count; ++f) frames.push_back(frame_of(model, base(motion.time[f]), motion, f, options));
+
+  // chi square of every place at every time
+  std::vector<double> arclengths;
+  MatrixX costs;
+  if (automatic) {
+    for (int i = 1; i <= options.places; ++i) arclengths.push_back(chain.length * i / options.places);
+    costs.resize(options.places, static_cast<Eigen::Index>(count));
+    for (std::size_t f = 0; f < count; ++f)
+      for (int i = 0; i < options.places; ++i)
+        costs(i, f) = solve(jacobian_of(chain, frames[f], contact_at(chain, arclengths[i])), frames[f].residual,
+                            frames[f].covariance, prior)
+                          .cost;
+  }
+
+  std::vector<Estimate> out;
+  for (std::size_t f = 0; f < count; ++f) {
+    const Frame& frame = frames[f];
+    Estimate e;
+    e.time = motion.time[f];
+    bool said = true;
+    if (automatic) {
+      // neighboring frames see nearly the same contact, and their errors are nearly the same too: the mean, not the sum
+      VectorX cost = VectorX::Zero(options.places);
+      double frames_used = 0.0;
+      for (std::size_t g = 0; g < count; ++g) {
+        if (std::abs(motion.time[g] - e.time) > options.window || (live && g > f)) continue;
+        cost += costs.col(g);
+        frames_used += 1.0;
+      }
+      cost /= frames_used;
+      Eigen::Index at = 0;
+      cost.minCoeff(&at);
+      double s = arclengths[at];
+      const double step = chain.length / options.places;
+      if (at > 0 && at + 1 < options.places) {
+        const double curvature = cost[at - 1] - 2.0 * cost[at] + cost[at + 1];
+        if (curvature > 0.0) {
+          s += 0.5 * step * (cost[at - 1] - cost[at + 1]) / curvature;
+          e.arclength_sigma = std::min(chain.length, step * std::sqrt(2.0 / curvature));
+        }
+      }
+      if (e.arclength_sigma == 0.0) e.arclength_sigma = chain.length;
+      e.contact = contact_at(chain, std::clamp(s, 0.0, chain.length));
+    } else if (contacts[f]) {
+      e.contact = *contacts[f];
+    } else {
+      said = false;
+      e.contact = contact_at(chain, chain.length);
+    }
+    e.point = frame.motions[e.contact.link] * e.contact.home;
+    if (said) {
+      const Fit fit = solve(jacobian_of(chain, frame, e.contact), frame.residual, frame.covariance, prior);
+      e.force = fit.force;
+      e.sigma = fit.covariance.diagonal().cwiseSqrt();
+      e.explained = frame.residual.dot(frame.covariance.llt().solve(frame.residual)) - fit.cost;
+      e.observed = (Vector3::Ones() - fit.covariance.diagonal() / (prior * prior)).cwiseMax(0.0);
+      e.touching = e.explained > kTouching && e.force.norm() > kTouchingWeight * weight;
+    }
+    // friction is known where the links about the contact slide
+    for (int link = std::max(1, e.contact.link - 1); link <= std::min(chain.links() - 1, e.contact.link + 1); ++link)
+      if (model.parameters.table_normal && frame.speed[link] < kMovingSpeeds * model.parameters.coulomb_speed &&
+          frame.friction[link] > 0.0)
+        e.moving = false;
+    out.push_back(e);
+  }
+  return out;
+}
+
+std::string to_json(const Estimate& e, bool known_mass) {
+  const auto list = [](const Vector3& v) {
+    return "[" + core::exact(v.x()) + "," + core::exact(v.y()) + "," + core::exact(v.z()) + "]";
+  };
+  const auto truth = [](bool value) { return value ? "true" : "false"; };
+  return "{\"time\":" + core::exact(e.time) + ",\"link\":" + std::to_string(e.contact.link) +
+         ",\"arclength\":" + core::exact(e.contact.arclength) + ",\"point\":" + list(e.point) +
+         ",\"force\":" + list(e.force) + ",\"sigma\":" + list(e.sigma) + ",\"touching\":" + truth(e.touching) +
+         ",\"observed\":" + list(e.observed) + ",\"arclength_sigma\":" + core::exact(e.arclength_sigma) +
+         ",\"moving\":" + truth(e.moving) + ",\"unit\":\"" + (known_mass ? "N" : "N/kg") + "\"}";
+}
+
+}  // namespace chainsplat::force
