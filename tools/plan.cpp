@@ -1,5 +1,8 @@
 // plan.cpp - a base motion that makes the rope hit a target.
+#include <unistd.h>
+
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <cmath>
 #include <cstdlib>
 #include <iostream>
@@ -23,7 +26,9 @@ struct PlanRequest {
   std::string run, out, axes, initial, terminal, horizon = "3", window = "smooth";
   std::vector<std::string> targets, spheres, boxes;
   double rate = 100.0;
-  bool force = false;
+  bool force = false, mpc = false;
+  std::string simulate, target_velocity;
+  planning::LoopOptions loop;
   planning::Options options;
 };
 
@@ -193,6 +198,59 @@ Json plan_json(const planning::Problem& problem, const planning::Options& option
   return out;
 }
 
+// CHAIN.json is the chain object of a twin.json (INTERFACE 3), held as `twin`'s rope is: read as a twin of its own.
+dynamics::Model read_truth(const std::string& file, const Path& run) {
+  Json chain;
+  try {
+    chain = Json::parse(core::read_file(input_path(file)));
+  } catch (const Json::exception&) {
+    throw InputError(file, "is not JSON", "give the 'chain' object of a twin.json");
+  }
+  if (chain.is_object() && chain.contains("chain")) chain = chain["chain"];  // a whole twin.json does too
+  Json document = Json::parse(core::read_file(run / "twin.json"));
+  document["chain"] = std::move(chain);
+  for (const char* key : {"identification", "gaussians", "states", "rollout"}) document.erase(key);
+  const Path folder = std::filesystem::temp_directory_path() / ("chainsplat_simulate_" + std::to_string(::getpid()));
+  make_folder(folder);
+  struct Remove {
+    Path path;
+    ~Remove() {
+      std::error_code error;
+      std::filesystem::remove_all(path, error);
+    }
+  } remove{folder};
+  core::write_file(folder / "twin.json", document.dump());
+  try {
+    const twin::Twin truth = twin::load(folder);
+    if (!truth.parameters) throw InputError(file, "has no masses, stiffness and damping", "give an identified chain");
+    return dynamics::make_model(truth.chain, *truth.parameters);
+  } catch (const InputError& error) {
+    // name the file that the user knows
+    std::string text = error.what();
+    const std::string inner = (folder / "twin.json").string();
+    if (const std::size_t at = text.find(inner); at != std::string::npos) text.replace(at, inner.size(), file);
+    const std::size_t mend = text.rfind("; "), where = text.find(": ");
+    if (mend == std::string::npos || where == std::string::npos || where > mend) throw;
+    throw InputError(text.substr(0, where), text.substr(where + 2, mend - where - 2), text.substr(mend + 2));
+  }
+}
+
+Json loop_json(const planning::LoopResult& loop) {
+  Json out{{"miss", loop.hit.miss},
+           {"miss_time", loop.hit.time},
+           {"miss_point", json_of(loop.hit.point)},
+           {"peak_velocity", loop.peaks.velocity},
+           {"peak_acceleration", loop.peaks.acceleration},
+           {"peak_jerk", loop.peaks.jerk}};
+  if (!loop.peaks.over.empty()) out["over_limit"] = loop.peaks.over;
+  if (loop.replans > 0) {
+    out["replans"] = loop.replans;
+    out["mean_replan_seconds"] = loop.mean_replan;
+    out["longest_replan_seconds"] = loop.longest_replan;
+  }
+  return out;
+}
+
 std::vector<double> row_times(double end, double rate) {
   constexpr double kSlack = 1e-6;  // s
   std::vector<double> times;
@@ -271,14 +329,35 @@ void plan(const Globals& globals, PlanRequest& request) {
         core::warn(text);
       }
     }
+  if (request.simulate.empty() && (request.mpc || !request.target_velocity.empty()))
+    throw InputError("--mpc", "feedback needs a rope to see", "give --simulate CHAIN.json as the true one");
+  std::optional<dynamics::Model> truth;
+  if (!request.simulate.empty()) truth = read_truth(request.simulate, request.run);
+  if (!request.target_velocity.empty()) {
+    const auto v = numbers(request.target_velocity, "--target-velocity", 3);
+    request.loop.target_velocity = {v[0], v[1], v[2]};
+  }
   const planning::Plan plan = planning::plan(problem, options);
+  planning::Motion played = plan.motion;
+  Json simulated;
+  if (truth) {
+    request.loop.feedback = false;
+    simulated["without_feedback"] = loop_json(planning::closed_loop(problem, options, plan, *truth, request.loop));
+    if (request.mpc) {
+      request.loop.feedback = true;
+      const planning::LoopResult loop = planning::closed_loop(problem, options, plan, *truth, request.loop);
+      simulated["with_feedback"] = loop_json(loop);
+      played = loop.motion;
+    }
+  }
   const Path out = request.out;
   make_folder(out);
   const std::vector<double> times = row_times(plan.motion.end(), request.rate);
-  write_motion(out, plan.motion, times);
-  core::write_file(out / "states.csv", twin::states_csv(planning::predict(problem, plan.motion, times)));
+  write_motion(out, played, times);
+  core::write_file(out / "states.csv", twin::states_csv(planning::predict(problem, played, times)));
   core::write_file(out / "picture.svg", planning::picture_svg(problem, options, plan));
-  const Json document = plan_json(problem, options, plan, request.horizon);
+  Json document = plan_json(problem, options, plan, request.horizon);
+  if (truth) document["simulated"] = simulated;
   core::write_file(out / "plan.json", document.dump(1) + "\n");
   if (globals.json) {
     std::cout << document.dump(1) << "\n";
@@ -291,6 +370,10 @@ void plan(const Globals& globals, PlanRequest& request) {
                 request.out.c_str());
   say(text);
   if (!plan.reached) say(plan.reason);
+  for (const auto& [name, loop] : simulated.items()) {
+    std::snprintf(text, sizeof text, "%s: miss %.2f mm", name.c_str(), 1e3 * loop["miss"].get<double>());
+    say(text);
+  }
 }
 
 }  // namespace
@@ -337,6 +420,13 @@ void add_planning_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->check(CLI::Range(0, 1000))
       ->type_name("N");
   planner->add_flag("--worst-case", request->options.worst_case, "Minimize the samples' worst miss, not the mean");
+  planner->add_option("--simulate", request->simulate, "Also play the plan on this true chain (a twin.json's 'chain')")
+      ->type_name("CHAIN.json");
+  planner->add_flag("--mpc", request->mpc, "With --simulate: plan the rest anew from the state that is seen; base.* is\n"
+                                           "then the motion as corrected");
+  planner->add_option("--mpc-rate", request->loop.rate, "Replans a second (default 10)")->type_name("HZ");
+  planner->add_option("--target-velocity", request->target_velocity, "With --mpc: the target moves from the start on, m/s")
+      ->type_name("VX,VY,VZ");
   planner->add_option("--rate", request->rate, "Rows a second of the files (default 100)")->type_name("HZ");
   planner->add_flag("--force", request->force, "Write into a folder that is not empty");
   planner->callback([&globals, &job, request] { job = [&globals, request] { plan(globals, *request); }; });

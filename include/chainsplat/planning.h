@@ -135,23 +135,30 @@ chain::States predict(const Problem& problem, const Motion& motion, const std::v
 std::vector<dynamics::Parameters> draw_parameters(const chain::Chain& chain, const dynamics::Parameters& parameters,
                                                   const dynamics::Estimates& estimates, int count, std::uint64_t seed);
 
-// Replanning from measured states while another chain plays the rope's part.
+// The angles of `chain` whose centerline comes nearest to `points` (3 x count, world) at `arclengths`, from `start`, by
+// Gauss-Newton; and with the points' velocities the rates that go with them.
+dynamics::InitialState fit_state(const chain::Chain& chain, const trajectory::BaseMotion& base,
+                                 const std::vector<double>& arclengths, const MatrixX& points,
+                                 const MatrixX& velocities, const VectorX& start);
+
+// Replanning from the rope's measured state while another chain plays the rope's part.
 struct LoopOptions {
-  bool feedback = true;         // else the plan is played as it is
-  double rate = 10.0;           // replans a second
-  Vector3 target_velocity = Vector3::Zero();  // m/s, of a target that moves; known to the planner only as measured
+  bool feedback = true;                       // else the plan is played as it is
+  double rate = 10.0;                         // replans a second
+  Vector3 target_velocity = Vector3::Zero();  // m/s; seen by the replanning only, the plan knows the first place
 };
 struct LoopResult {
   Motion motion;                // as executed
   chain::States states;         // of the true chain
-  Hit hit;                      // of the true chain, against the target where it was then
+  Hit hit;                      // of the true chain, against the target where it is then
+  Peaks peaks;
   int replans = 0;
-  double longest_replan = 0.0;  // s, one core
-  double mean_replan = 0.0;     // s
+  double longest_replan = 0.0, mean_replan = 0.0;  // s
 };
-// `truth` starts at rest in its own equilibrium. One target.
+// Plays `plan` (of one target) on `truth`, from rest: in free space in its own equilibrium, on a table with the shape of
+// the problem's initial state.
 LoopResult closed_loop(const Problem& problem, const Options& options, const Plan& plan, const dynamics::Model& truth,
-                       const dynamics::InitialState& truth_initial, const LoopOptions& loop);
+                       const LoopOptions& loop);
 
 // Base path, rope at a few times, targets and obstacles: a side view (free space) or the view from above (table).
 std::string picture_svg(const Problem& problem, const Options& options, const Plan& plan);

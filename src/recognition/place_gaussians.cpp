@@ -172,7 +172,7 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
     // the point of the ray nearest to the centerline, moved to the tube's near side
     const std::vector<math::Pose>& motions = *source.motions;
     double best = std::numeric_limits<double>::infinity();
-    math::Vector3 point;
+    math::Vector3 point = origin;
     int link = 1;
     for (int j = 1; j < chain.links(); ++j) {
       const math::Vector3 a0 = motions[j] * (chain.link_start(j) * chain.direction);

@@ -1,0 +1,207 @@
+// Model predictive control: the motion's rest is planned anew at a fixed rate, from the state that is seen.
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "search.h"
+
+namespace chainsplat::planning {
+namespace {
+
+constexpr double kTruthStep = 1.0 / 240.0;   // s, between states of the true chain
+constexpr double kReplanSharpness = 3e4;     // m^-2
+constexpr double kReplanSmoothness = 1e-8;
+constexpr int kReplanIterations = 4;
+constexpr double kShortest = 0.1;            // s before the hit, after which nothing is changed any more
+constexpr double kLeastPiece = 0.35;         // s, of a correction
+constexpr double kPieceMargin = 1.6;         // its length over the time to the hit, in free space
+constexpr int kReplanNodes = 60;             // of its rollout, where the substeps allow
+constexpr int kFitIterations = 20;
+constexpr double kFitStiffness = 1e-5;       // m/rad: angles that the points leave open stay as they are
+constexpr int kSeenPoints = 33;              // of the rope's centerline
+
+// Distance of `target` to a polyline.
+double distance_to(const MatrixX& points, const Vector3& target, Vector3& nearest) {
+  double least = std::numeric_limits<double>::infinity();
+  for (Eigen::Index i = 0; i + 1 < points.cols(); ++i) {
+    const Vector3 a = points.col(i), d = points.col(i + 1) - points.col(i);
+    const Vector3 p = a + std::clamp((target - a).dot(d) / d.squaredNorm(), 0.0, 1.0) * d;
+    if (const double distance = (p - target).norm(); distance < least) least = distance, nearest = p;
+  }
+  return least;
+}
+
+// World velocities of the centerline at `arclengths`.
+MatrixX centerline_velocity(const chain::Chain& chain, const VectorX& theta, const VectorX& thetadot,
+                            const trajectory::BaseMotion& base, const std::vector<double>& arclengths) {
+  const auto motions = chain::link_motions(chain, theta, base.pose);
+  const MatrixX axes = chain::world_axes(chain, theta, base.pose);
+  const Vector3 spin = base.pose.rotation * base.velocity.head<3>();
+  const Vector3 speed = base.pose.rotation * base.velocity.tail<3>();
+  MatrixX out(3, arclengths.size());
+  for (std::size_t i = 0; i < arclengths.size(); ++i) {
+    const int link = chain::link_at(chain, arclengths[i]);
+    const Vector3 point = motions[link] * (arclengths[i] * chain.direction);
+    out.col(static_cast<Eigen::Index>(i)) = speed + spin.cross(point - base.pose.translation) +
+                                            chain::point_jacobian(chain, axes, link, point) * thetadot;
+  }
+  return out;
+}
+
+}  // namespace
+
+dynamics::InitialState fit_state(const chain::Chain& chain, const trajectory::BaseMotion& base,
+                                 const std::vector<double>& arclengths, const MatrixX& points,
+                                 const MatrixX& velocities, const VectorX& start) {
+  const int n = chain.angles();
+  dynamics::InitialState out;
+  out.theta = start, out.thetadot = VectorX::Zero(n);
+  const Eigen::Index rows = 3 * static_cast<Eigen::Index>(arclengths.size());
+  MatrixX jacobian(rows, n);
+  VectorX residual(rows);
+  const auto place = [&] {
+    const auto motions = chain::link_motions(chain, out.theta, base.pose);
+    const MatrixX axes = chain::world_axes(chain, out.theta, base.pose);
+    for (std::size_t i = 0; i < arclengths.size(); ++i) {
+      const int link = chain::link_at(chain, arclengths[i]);
+      const Vector3 point = motions[link] * (arclengths[i] * chain.direction);
+      const auto row = 3 * static_cast<Eigen::Index>(i);
+      jacobian.middleRows<3>(row) = chain::point_jacobian(chain, axes, link, point);
+      residual.segment<3>(row) = points.col(static_cast<Eigen::Index>(i)) - point;
+    }
+  };
+  const double ridge = kFitStiffness * kFitStiffness * static_cast<double>(arclengths.size());
+  const auto solve = [&](const VectorX& right) -> VectorX {
+    MatrixX normal = jacobian.transpose() * jacobian;
+    normal.diagonal().array() += ridge;
+    return normal.ldlt().solve(jacobian.transpose() * right);
+  };
+  for (int i = 0; i < kFitIterations; ++i) {
+    place();
+    const VectorX step = solve(residual);
+    out.theta += step;
+    if (step.norm() < 1e-9) break;
+  }
+  if (velocities.cols() == points.cols()) {
+    place();
+    const MatrixX rest = centerline_velocity(chain, out.theta, VectorX::Zero(n), base, arclengths);
+    const MatrixX relative = velocities - rest;
+    out.thetadot = solve(Eigen::Map<const VectorX>(relative.data(), relative.size()));
+  }
+  return out;
+}
+
+LoopResult closed_loop(const Problem& problem, const Options& options, const Plan& plan, const dynamics::Model& truth,
+                       const LoopOptions& loop) {
+  if (plan.hits.size() != 1) throw InputError("--simulate", "plays one target only", "give one --target");
+  if (!(loop.rate > 0.0) || !std::isfinite(loop.rate))
+    throw InputError("--mpc-rate", "must be above 0", "give replans a second, for example 10");
+  if (!loop.target_velocity.allFinite())
+    throw InputError("--target-velocity", "is not finite", "give VX,VY,VZ in m/s");
+  if (truth.chain.direction != problem.model.chain.direction)
+    throw InputError("--simulate", "the chain leaves the gripper in another direction", "give one of the same grasp");
+  const chain::Chain& chain = problem.model.chain;
+  const std::vector<double> seen = chain::equal_arclengths(chain, kSeenPoints);
+  std::vector<double> true_seen = seen;  // the same parts of a rope of another length
+  for (double& s : true_seen) s *= truth.chain.length / chain.length;
+  LoopResult out;
+  out.motion = plan.motion;
+  const double end = out.motion.end();
+  const auto base = [&](double time) { return base_at(out.motion, time); };
+  const auto target_at = [&](double time) {
+    return Vector3(at_rope_height(problem, problem.targets.front()) + time * loop.target_velocity);
+  };
+
+  dynamics::InitialState state;
+  state.time = 0.0;
+  if (problem.tabletop) {
+    const MatrixX shape =
+        chain::centerline(chain, chain::link_motions(chain, problem.initial.theta, problem.base), seen);
+    state = fit_state(truth.chain, dynamics::at_rest(problem.base), true_seen, shape, {},
+                      VectorX::Zero(truth.chain.angles()));
+  } else {
+    state.theta = dynamics::static_equilibrium(truth, problem.base);
+  }
+  state.thetadot = VectorX::Zero(truth.chain.angles());
+  out.states.time.push_back(0.0), out.states.theta.push_back(state.theta), out.states.thetadot.push_back(state.thetadot);
+
+  double hit_time = plan.hits.front().time;
+  VectorX guess = problem.initial.theta;
+  const int intervals = std::max(1, static_cast<int>(std::ceil(end * loop.rate - 1e-9)));
+  for (int k = 0; k < intervals; ++k) {
+    const double now = k / loop.rate, next = std::min(end, (k + 1) / loop.rate);
+    const double left = (problem.tabletop ? end : hit_time) - now;
+    if (loop.feedback && k > 0 && left > kShortest) {
+      const trajectory::BaseMotion here = base(now);
+      const MatrixX points =
+          chain::centerline(truth.chain, chain::link_motions(truth.chain, state.theta, here.pose), true_seen);
+      const MatrixX speeds = centerline_velocity(truth.chain, state.theta, state.thetadot, here, true_seen);
+      const double begin = core::seconds_now();
+      dynamics::InitialState estimate = fit_state(chain, here, seen, points, speeds, guess);
+      estimate.time = now;
+      guess = estimate.theta;
+      const double rest = end - now;
+      const double length = problem.tabletop ? rest : std::min(rest, std::max(kLeastPiece, kPieceMargin * left));
+      Motion motion = out.motion;
+      append_piece(motion, now, length);
+      const int full = problem.model.parameters.substeps;
+      const int substeps = std::clamp(static_cast<int>(kReplanNodes / (30.0 * length)), full > 4 ? 2 : 1, full);
+      Task task = make_task(problem, options, {&problem.model}, motion, estimate, problem.targets.front(), substeps);
+      task.target = target_at(now);
+      task.target_velocity = loop.target_velocity;
+      task.target_time = now;
+      if (options.terminal)
+        for (std::size_t a = 0; a < motion.axes.size(); ++a) task.held[a * kPerAxis + kBasisCount] = true;
+      VectorX q = VectorX::Zero(static_cast<Eigen::Index>(motion.axes.size()) * kPerAxis);
+      minimize(task, q, {kReplanSharpness, kReplanSmoothness}, kReplanIterations);
+      Rollout rollout;
+      if (roll_out(problem.model, task.motion, task.grid, q, estimate, false, rollout)) {
+        set_unknowns(motion, q);
+        out.motion = std::move(motion);
+        hit_time = measure(task, problem.model, rollout).time;
+      }
+      const double seconds = core::seconds_now() - begin;
+      ++out.replans;
+      out.longest_replan = std::max(out.longest_replan, seconds);
+      out.mean_replan += (seconds - out.mean_replan) / out.replans;
+    }
+    std::vector<double> times;
+    const int steps = std::max(1, static_cast<int>(std::ceil((next - now) / kTruthStep - 1e-9)));
+    for (int i = 1; i <= steps; ++i) times.push_back(i == steps ? next : now + (next - now) * i / steps);
+    state.time = now;
+    const chain::States states = dynamics::rollout(truth, base, state, times);
+    for (std::size_t i = 0; i < states.time.size(); ++i) {
+      out.states.time.push_back(states.time[i]);
+      out.states.theta.push_back(states.theta[i]);
+      out.states.thetadot.push_back(states.thetadot[i]);
+    }
+    state.theta = states.theta.back(), state.thetadot = states.thetadot.back();
+  }
+
+  // the same part of the true rope that counts for the twin
+  std::vector<double> counts;
+  const double first = problem.tabletop ? 0.0 : chain.link_start(chain.links() - 1) / chain.length;
+  constexpr int kCounted = 65;
+  for (int i = 0; i < kCounted; ++i)
+    counts.push_back(truth.chain.length * std::min(1.0, first + (1.0 - first) * i / (kCounted - 1)));
+  out.hit.miss = std::numeric_limits<double>::infinity();
+  constexpr int kBetween = 4;  // parts of a step
+  const std::size_t count = out.states.time.size();
+  for (std::size_t k = problem.tabletop ? count - 1 : 0; k < count; ++k)
+    for (int i = 0; i < (k + 1 < count ? kBetween : 1); ++i) {
+      const double time =
+          i == 0 ? out.states.time[k]
+                 : out.states.time[k] + (out.states.time[k + 1] - out.states.time[k]) * i / double(kBetween);
+      const VectorX theta = i == 0 ? out.states.theta[k] : chain::interpolate(out.states, time);
+      const MatrixX points =
+          chain::centerline(truth.chain, chain::link_motions(truth.chain, theta, base(time).pose), counts);
+      Vector3 nearest;
+      const double miss = distance_to(points, target_at(time), nearest);
+      if (miss < out.hit.miss) out.hit.miss = miss, out.hit.time = time, out.hit.point = nearest;
+    }
+  out.hit.mean_miss = out.hit.worst_miss = out.hit.miss;
+  out.peaks = peaks(out.motion, 0.0, end, options.limits);
+  return out;
+}
+
+}  // namespace chainsplat::planning
