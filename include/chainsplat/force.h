@@ -34,7 +34,8 @@ Motion smooth(const chain::States& states, std::span<const VectorX> sigma, bool 
 
 struct Options {
   double force_scale = 0.5;            // N a 60 g rope is pushed with, in proportion to the mass: the prior's deviation
-  double relative_deviation = 0.1;     // of the joints' stiffness and damping torques: what identification leaves open
+  double along = 0.3;                  // the same along the rope, in proportion: fingers slip
+  double relative_deviation = 0.2;     // of the joints' stiffness and damping torques: what identification leaves open
   double gravity_deviation = 0.004;    // of the rope's weight times its length: torque error of any joint
   double window = 0.15;                // s to either side over which the place of an automatic contact is one
   int places = 60;                     // arclengths tried for an automatic contact
@@ -44,11 +45,13 @@ struct Options {
 struct Fit {
   Vector3 force = Vector3::Zero();            // N, world, on the rope
   Matrix3 covariance = Matrix3::Identity();   // N^2
-  double cost = 0.0;                          // chi square of what is left, prior included
+  double explained = 0.0;                     // fall of chi square by the force, prior included
+  double evidence = 0.0;                      // log likelihood of the residual over that without any force
 };
 
-// (J C^-1 J^T + prior^-2)^-1 J C^-1 r. `jacobian` 3 x n, `residual` n, `covariance` n x n of the residual.
-Fit solve(const MatrixX& jacobian, const VectorX& residual, const MatrixX& covariance, double prior_deviation);
+// (J C^-1 J^T + prior^-1)^-1 J C^-1 r. `jacobian` 3 x n, `residual` n, `covariance` n x n of the residual; `prior`:
+// covariance of the force before it was felt, N^2.
+Fit solve(const MatrixX& jacobian, const VectorX& residual, const MatrixX& covariance, const Matrix3& prior);
 
 // r of SPEC 7. n, N m.
 VectorX residual_torque(const dynamics::Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
@@ -70,7 +73,7 @@ struct Estimate {
   double time = 0.0;
   Contact contact;
   Vector3 point = Vector3::Zero();      // of the contact, world, m
-  Vector3 force = Vector3::Zero();      // N, or N a kilogram of rope
+  Vector3 force = Vector3::Zero();      // N, or N a kilogram of rope; with an automatic contact times its probability
   Vector3 sigma = Vector3::Zero();      // standard errors
   Vector3 observed = Vector3::Zero();   // 0 (only the prior speaks) .. 1, by component
   double explained = 0.0;               // fall of chi square by the force

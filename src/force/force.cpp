@@ -17,6 +17,9 @@ constexpr double kPushedMass = 0.06;  // kg, of the rope that Options::force_sca
 constexpr double kTouching = 16.3;
 constexpr double kTouchingWeight = 0.04;
 
+// Nothing touches a rope most of the time: without evidence an automatic contact is so much less likely than none.
+constexpr double kOddsOfNone = 100.0;
+
 constexpr double kMovingSpeeds = 3.0;  // of the friction's regularization speed, beyond which friction is known (SPEC 7)
 constexpr double kLeastTorque = 1e-6;  // of weight times length, keeps covariances invertible
 
@@ -32,7 +35,7 @@ struct Frame {
   MatrixX covariance;
   MatrixX axes;
   std::vector<Pose> motions;
-  std::vector<double> friction;  // N a link that may hide at rest
+  std::vector<double> hidden;  // N a link, friction that may balance a force unseen
   std::vector<double> speed;     // m/s a link, of its middle, across the table
 };
 
@@ -72,7 +75,7 @@ Frame frame_of(const dynamics::Model& model, const trajectory::BaseMotion& base,
   }
 
   // friction at rest balances anything up to its limit
-  out.friction.assign(chain.links(), 0.0);
+  out.hidden.assign(chain.links(), 0.0);
   out.speed.assign(chain.links(), 0.0);
   if (p.table_normal) {
     const Vector3& normal = *p.table_normal;
@@ -85,9 +88,9 @@ Frame frame_of(const dynamics::Model& model, const trajectory::BaseMotion& base,
       const Vector3 v = across * (jacobian * thetadot + v0 + omega.cross(x - base.pose.translation));
       out.speed[link] = v.norm();
       const double limit = p.coulomb_friction[link - 1] * p.link_mass[link - 1] * std::abs(p.gravity.dot(normal));
-      out.friction[link] = limit * p.coulomb_speed / std::hypot(v.norm(), p.coulomb_speed);
+      out.hidden[link] = limit * p.coulomb_speed / std::hypot(v.norm(), p.coulomb_speed);
       const MatrixX tangential = across * jacobian;
-      out.covariance.noalias() += std::pow(out.friction[link], 2) * tangential.transpose() * tangential;
+      out.covariance.noalias() += std::pow(out.hidden[link], 2) * tangential.transpose() * tangential;
     }
   }
   return out;
@@ -95,10 +98,6 @@ Frame frame_of(const dynamics::Model& model, const trajectory::BaseMotion& base,
 
 Contact contact_at(const chain::Chain& chain, double arclength) {
   return {chain::link_at(chain, arclength), arclength, arclength * chain.direction};
-}
-
-MatrixX jacobian_of(const chain::Chain& chain, const Frame& frame, const Contact& contact) {
-  return chain::point_jacobian(chain, frame.axes, contact.link, frame.motions[contact.link] * contact.home);
 }
 
 }  // namespace
@@ -109,15 +108,15 @@ VectorX residual_torque(const dynamics::Model& model, const trajectory::BaseMoti
          dynamics::joint_law(model, theta, thetadot);
 }
 
-Fit solve(const MatrixX& jacobian, const VectorX& residual, const MatrixX& covariance, double prior_deviation) {
+Fit solve(const MatrixX& jacobian, const VectorX& residual, const MatrixX& covariance, const Matrix3& prior) {
   const Eigen::LLT<MatrixX> factor(covariance);
   const MatrixX weighted = factor.solve(jacobian.transpose());  // n x 3
-  const Matrix3 information =
-      jacobian * weighted + Matrix3::Identity() / (prior_deviation * prior_deviation);
+  const Matrix3 information = jacobian * weighted + prior.inverse();
   Fit out;
   out.covariance = information.inverse();
   out.force = out.covariance * (weighted.transpose() * residual);
-  out.cost = residual.dot(factor.solve(residual)) - out.force.dot(information * out.force);
+  out.explained = out.force.dot(information * out.force);
+  out.evidence = 0.5 * (out.explained - std::log(prior.determinant() * information.determinant()));
   return out;
 }
 
@@ -158,22 +157,28 @@ std::vector<Estimate> estimate(const dynamics::Model& model, const dynamics::Bas
   const std::size_t count = motion.time.size();
   const bool automatic = contacts.empty();
   CHAINSPLAT_CHECK(automatic || contacts.size() == count, std::to_string(contacts.size()));
-  const double mass = total_mass(model.parameters);
-  const double prior = options.force_scale * mass / kPushedMass, weight = mass * model.parameters.gravity.norm();
+  const double mass = total_mass(model.parameters), weight = mass * model.parameters.gravity.norm();
+  const double across = options.force_scale * mass / kPushedMass, along = options.along * across;
+  const auto solve_at = [&](const Frame& frame, const Contact& contact) {
+    const Vector3 tangent = frame.motions[contact.link].rotation * chain.direction;
+    const Matrix3 prior = across * across * Matrix3::Identity() +
+                          (along * along - across * across) * tangent * tangent.transpose();
+    const MatrixX jacobian = chain::point_jacobian(chain, frame.axes, contact.link,
+                                                   frame.motions[contact.link] * contact.home);
+    return std::pair(solve(jacobian, frame.residual, frame.covariance, prior), prior);
+  };
   std::vector<Frame> frames;
   for (std::size_t f = 0; f < count; ++f) frames.push_back(frame_of(model, base(motion.time[f]), motion, f, options));
 
-  // chi square of every place at every time
+  // how much better a force at each place explains each time than none does
   std::vector<double> arclengths;
-  MatrixX costs;
+  MatrixX evidence;
   if (automatic) {
     for (int i = 1; i <= options.places; ++i) arclengths.push_back(chain.length * i / options.places);
-    costs.resize(options.places, static_cast<Eigen::Index>(count));
+    evidence.resize(options.places, static_cast<Eigen::Index>(count));
     for (std::size_t f = 0; f < count; ++f)
       for (int i = 0; i < options.places; ++i)
-        costs(i, f) = solve(jacobian_of(chain, frames[f], contact_at(chain, arclengths[i])), frames[f].residual,
-                            frames[f].covariance, prior)
-                          .cost;
+        evidence(i, f) = solve_at(frames[f], contact_at(chain, arclengths[i])).first.evidence;
   }
 
   std::vector<Estimate> out;
@@ -181,49 +186,50 @@ std::vector<Estimate> estimate(const dynamics::Model& model, const dynamics::Bas
     const Frame& frame = frames[f];
     Estimate e;
     e.time = motion.time[f];
+    e.contact = contact_at(chain, chain.length);
     bool said = true;
+    double probability = 1.0;
     if (automatic) {
-      // neighboring frames see nearly the same contact, and their errors are nearly the same too: the mean, not the sum
-      VectorX cost = VectorX::Zero(options.places);
-      double frames_used = 0.0;
+      // neighboring times see nearly the same contact, and their errors are nearly the same too: the mean, not the sum
+      VectorX mean = VectorX::Zero(options.places);
+      double used = 0.0;
       for (std::size_t g = 0; g < count; ++g) {
         if (std::abs(motion.time[g] - e.time) > options.window || (live && g > f)) continue;
-        cost += costs.col(g);
-        frames_used += 1.0;
+        mean += evidence.col(g);
+        used += 1.0;
       }
-      cost /= frames_used;
+      mean /= used;
       Eigen::Index at = 0;
-      cost.minCoeff(&at);
+      mean.maxCoeff(&at);
       double s = arclengths[at];
       const double step = chain.length / options.places;
+      e.arclength_sigma = chain.length;
       if (at > 0 && at + 1 < options.places) {
-        const double curvature = cost[at - 1] - 2.0 * cost[at] + cost[at + 1];
+        const double curvature = 2.0 * mean[at] - mean[at - 1] - mean[at + 1];
         if (curvature > 0.0) {
-          s += 0.5 * step * (cost[at - 1] - cost[at + 1]) / curvature;
-          e.arclength_sigma = std::min(chain.length, step * std::sqrt(2.0 / curvature));
+          s += 0.5 * step * (mean[at + 1] - mean[at - 1]) / curvature;
+          e.arclength_sigma = std::min(chain.length, step / std::sqrt(curvature));
         }
       }
-      if (e.arclength_sigma == 0.0) e.arclength_sigma = chain.length;
       e.contact = contact_at(chain, std::clamp(s, 0.0, chain.length));
+      probability = 1.0 / (1.0 + kOddsOfNone * std::exp(-evidence(at, f)));
     } else if (contacts[f]) {
       e.contact = *contacts[f];
     } else {
       said = false;
-      e.contact = contact_at(chain, chain.length);
     }
     e.point = frame.motions[e.contact.link] * e.contact.home;
     if (said) {
-      const Fit fit = solve(jacobian_of(chain, frame, e.contact), frame.residual, frame.covariance, prior);
-      e.force = fit.force;
+      const auto [fit, prior] = solve_at(frame, e.contact);
+      e.force = probability * fit.force;
       e.sigma = fit.covariance.diagonal().cwiseSqrt();
-      e.explained = frame.residual.dot(frame.covariance.llt().solve(frame.residual)) - fit.cost;
-      e.observed = (Vector3::Ones() - fit.covariance.diagonal() / (prior * prior)).cwiseMax(0.0);
+      e.explained = fit.explained;
+      e.observed = (Vector3::Ones() - fit.covariance.diagonal().cwiseQuotient(prior.diagonal())).cwiseMax(0.0);
       e.touching = e.explained > kTouching && e.force.norm() > kTouchingWeight * weight;
     }
     // friction is known where the links about the contact slide
     for (int link = std::max(1, e.contact.link - 1); link <= std::min(chain.links() - 1, e.contact.link + 1); ++link)
-      if (model.parameters.table_normal && frame.speed[link] < kMovingSpeeds * model.parameters.coulomb_speed &&
-          frame.friction[link] > 0.0)
+      if (frame.hidden[link] > 0.0 && frame.speed[link] < kMovingSpeeds * model.parameters.coulomb_speed)
         e.moving = false;
     out.push_back(e);
   }
