@@ -18,7 +18,7 @@ constexpr double kTouching = 16.3;
 constexpr double kTouchingWeight = 0.04;
 
 // Nothing touches a rope most of the time: without evidence an automatic contact is so much less likely than none.
-constexpr double kOddsOfNone = 100.0;
+constexpr double kOddsOfNone = 3.0;
 
 constexpr double kMovingSpeeds = 3.0;  // of the friction's regularization speed, beyond which friction is known (SPEC 7)
 constexpr double kLeastTorque = 1e-6;  // of weight times length, keeps covariances invertible
