@@ -16,7 +16,9 @@ layout(std430, binding = 5) buffer Counters { uint counters[]; };
 // lavapipe ends all loops of an invocation after 65535 iterations in sum: fewer, longer ones
 const uint kUnrolled = 16u;
 
-shared uvec2 key[kRankLimit];
+const uint kStep = 8u;  // keys compared in one turn of the loop, whose control costs more than a compare
+shared uint depth_key[kRankLimit + kStep];
+shared uint replica_key[kRankLimit];
 
 bool before(uvec2 a, uvec2 b) { return a.x < b.x || (a.x == b.x && a.y < b.y); }
 
@@ -29,13 +31,25 @@ void main() {
     n = 0u;
   }
   if (n <= kRankLimit) {
-    for (uint k = lane; k < n; k += lanes) key[k] = entries[start + k].xy;
+    for (uint k = lane; k < n; k += lanes) {
+      uvec2 key = entries[start + k].xy;
+      depth_key[k] = key.x;
+      replica_key[k] = key.y;
+    }
+    for (uint k = lane; k < kStep; k += lanes) depth_key[n + k] = 0xffffffffu;  // behind everything
     barrier();
     for (uint k = lane; k < n; k += lanes) {
-      uvec2 mine = key[k];
-      uint rank = 0u;
-      for (uint m = 0u; m < n; ++m) rank += before(key[m], mine) ? 1u : 0u;
-      sorted[start + rank] = entries[start + k].zw;
+      uint depth = depth_key[k], nearer = 0u, equal = 0u;
+      for (uint first = 0u; first < n; first += kStep) {
+        for (uint m = 0u; m < kStep; ++m) {
+          nearer += depth_key[first + m] < depth ? 1u : 0u;
+          equal += depth_key[first + m] == depth ? 1u : 0u;
+        }
+      }
+      // equal depths are rare: only then is the replica's number looked at
+      uint replica = replica_key[k], ties = equal > 1u ? n : 0u;
+      for (uint m = 0u; m < ties; ++m) nearer += depth_key[m] == depth && replica_key[m] < replica ? 1u : 0u;
+      sorted[start + nearer] = entries[start + k].zw;
     }
   } else {
     // every compare puts the smaller one first, so that places beyond n act as infinity and need no memory

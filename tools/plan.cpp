@@ -209,7 +209,7 @@ dynamics::Model read_truth(const std::string& file, const Path& run) {
   if (chain.is_object() && chain.contains("chain")) chain = chain["chain"];  // a whole twin.json does too
   Json document = Json::parse(core::read_file(run / "twin.json"));
   document["chain"] = std::move(chain);
-  for (const char* key : {"identification", "gaussians", "states", "rollout"}) document.erase(key);
+  for (const char* key : {"gaussians", "states", "rollout"}) document.erase(key);
   const Path folder = std::filesystem::temp_directory_path() / ("chainsplat_simulate_" + std::to_string(::getpid()));
   make_folder(folder);
   struct Remove {

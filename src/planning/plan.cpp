@@ -15,9 +15,9 @@ constexpr struct {
   int iterations;
 } kCoarse[] = {{1e3, 1e-6, 5}, {1e4, 1e-7, 6}};
 constexpr double kFinalSharpness = 1e5;
-constexpr double kFinalSmoothness = 2e-8;
+constexpr double kFinalSmoothness = 3e-9;
 constexpr int kFinalIterations = 10;
-constexpr double kGoodMiss = 1e-4;    // m: no further start is tried
+constexpr double kGoodMiss = 0.3;     // of the tolerance: no further start is tried
 constexpr int kGroups[] = {1, 1, 2, 4, 4};  // starts optimized side by side; the next group only where the last failed
 constexpr double kLeastLoad = 0.25, kMostLoad = 0.95;  // of the limits, of random motions
 constexpr std::uint64_t kTargetStream = 0x7461726765740001ull;  // random numbers of random_target
@@ -215,7 +215,7 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
     }
     if (core::stop_requested()) throw Interrupted(core::stop_requested());
     // samples have a spread that no motion removes
-    const double enough = models.size() > 1 ? options.tolerance : kGoodMiss;
+    const double enough = models.size() > 1 ? options.tolerance : kGoodMiss * options.tolerance;
     if (best.good && merit(best, options) <= enough) break;
     if (best.good && models.size() > 1 && group > 1) break;
   }

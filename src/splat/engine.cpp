@@ -23,7 +23,7 @@ using shared::SplatView;
 constexpr double kClampMargin = 1.3;  // of the half image, for the projection's Jacobian (SPEC 2.5)
 constexpr int kActiveMargin = 16;  // px around the mask that training draws and charges: SSIM's reach twice, and a bit
 constexpr std::uint32_t kMostTiles = 60000;  // of one submission: below every device's group count limit (65535)
-constexpr std::uint32_t kRankLimit = 256;    // longest tile list sorted by rank; longer ones by the bitonic network
+constexpr std::uint32_t kRankLimit = 512;    // longest tile list sorted by rank; longer ones by the bitonic network
 constexpr double kGrowth = 1.25;             // spare room when a capacity is raised
 constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;  // Adam, as in 3DGS
 
