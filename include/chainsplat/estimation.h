@@ -1,4 +1,4 @@
-// chainsplat/estimation.h - a rope followed live from one camera: joint angles, rates and how sure they are (SPEC 6).
+// chainsplat/estimation.h - a rope followed live, from one camera or more: joint angles, rates and how sure they are (SPEC 6).
 //
 // An iterated extended Kalman filter. Its motion model is the twin's own dynamics under the base's motion; what the
 // model does not know (a hand, a finger, its own errors) is a force on the rope that wanders slowly and is estimated
@@ -7,7 +7,9 @@
 // covariance says how well.
 #pragma once
 #include <optional>
+#include <span>
 #include <string>
+#include <vector>
 
 #include "chainsplat/capture.h"
 #include "chainsplat/dynamics.h"
@@ -16,6 +18,7 @@
 
 namespace chainsplat::estimation {
 
+// Unknown forces are per kilogram of rope. The values were chosen on captures with truth.
 struct Options {
   double model_force = 0.06;         // N/sqrt(s) a kilogram of rope, random walk of the unknown force without contact
   double contact_force = 4.0;        // N/sqrt(s) a kilogram, the same while the motion does not follow the model
@@ -50,7 +53,7 @@ struct Filter {
   dynamics::Model model;
   bool identified = false;  // the twin has dynamics; else angles go on at constant rate
   bool shifts = false;      // the unknown force is a part of the state
-  capture::Camera camera;
+  std::vector<capture::Camera> cameras;
   dynamics::BaseFunction base;
   Options options;
   std::optional<Belief> belief;  // none before the first frame
@@ -64,11 +67,12 @@ struct Filter {
 
 // `base_start`: the first time that `base` is good for. Throws InputError where the twin's chain or parameters are no
 // good.
-Filter start(const twin::Twin& twin, const capture::Camera& camera, dynamics::BaseFunction base, double base_start,
-             const Options& options = {});
+Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
+             double base_start, const Options& options = {});
 
-// One frame: an undistorted crop with its mask, which may be empty. Times must increase. `view.camera` is ignored.
-Estimate update(Filter& filter, const capture::View& view);
+// One frame: undistorted crops with their masks, which may be empty, of one camera or of several at nearly one time
+// (that of the first; View::camera counts in Filter::cameras). Times must increase.
+Estimate update(Filter& filter, std::span<const capture::View* const> views);
 
 // The belief at a later time, without looking. `contact`: the unknown force may change as under a hand.
 Belief predict(const Filter& filter, const Belief& belief, double time, bool contact);

@@ -225,9 +225,9 @@ struct Measured {
   double surprise = 0.0;  // squared innovation over its expectation
 };
 
-// The view brought to `predicted`. The fit's variance is partly old news: the prior is tightened in proportion, which
+// The views brought to `predicted`. The fit's variance is partly old news: the prior is tightened in proportion, which
 // gives the same angles as weakening the data, and the covariance is widened again.
-Measured measure(const Filter& filter, const Belief& predicted, const capture::View& view, bool warm) {
+Measured measure(const Filter& filter, const Belief& predicted, std::span<const capture::View* const> views, bool warm) {
   const int n = filter.model.chain.angles();
   const double share = filter.options.new_share;
   const MatrixX prior = predicted.covariance.topLeftCorner(n, n);
@@ -238,12 +238,10 @@ Measured measure(const Filter& filter, const Belief& predicted, const capture::V
   options.prior.information = information / share;
   options.edge_offset = filter.edge_offset;
   options.edge_offset_deviation = std::sqrt(filter.edge_offset_variance);
-  capture::View alone = view;
-  alone.camera = 0;
-  const capture::View* const views[] = {&alone};
+  const double time = views.front()->time;
 
   Measured out;
-  out.fit = silhouette::fit_frame(filter.model.chain, filter.base(view.time).pose, views, {filter.camera},
+  out.fit = silhouette::fit_frame(filter.model.chain, filter.base(time).pose, views, filter.cameras,
                                   predicted.mean.head(n), warm, options);
   MatrixX posterior = out.fit.covariance / share;
   symmetrize(posterior);
@@ -253,7 +251,7 @@ Measured measure(const Filter& filter, const Belief& predicted, const capture::V
 
   // rates and shifts follow by what ties them to the angles
   const MatrixX gain = predicted.covariance.leftCols(n) * information;  // 3 n x n, identity on top
-  out.belief.time = view.time;
+  out.belief.time = time;
   out.belief.mean = predicted.mean + gain * change;
   out.belief.mean.head(n) = out.fit.theta;
   out.belief.covariance = predicted.covariance - gain * (prior - posterior) * gain.transpose();
@@ -272,8 +270,8 @@ bool explains(const silhouette::FrameFit& fit) { return fit.covered >= kLostShar
 
 }  // namespace
 
-Filter start(const twin::Twin& twin, const capture::Camera& camera, dynamics::BaseFunction base, double base_start,
-             const Options& options) {
+Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
+             double base_start, const Options& options) {
   Filter filter;
   filter.identified = twin.parameters.has_value();
   if (filter.identified) {
@@ -286,7 +284,7 @@ Filter start(const twin::Twin& twin, const capture::Camera& camera, dynamics::Ba
   }
   filter.everywhere = VectorX::Constant(twin.chain.links() - 1, 1.0 / (twin.chain.links() - 1));
   filter.place = filter.everywhere;
-  filter.camera = camera;
+  filter.cameras = cameras;
   filter.base = std::move(base);
   filter.base_start = base_start;
   filter.options = options;
@@ -341,7 +339,9 @@ Belief predict(const Filter& filter, const Belief& belief, double time, bool con
   return out;
 }
 
-Estimate update(Filter& filter, const capture::View& view) {
+Estimate update(Filter& filter, std::span<const capture::View* const> views) {
+  CHAINSPLAT_CHECK(!views.empty(), "no view");
+  const capture::View& view = *views.front();
   const int n = filter.model.chain.angles();
   const bool first = !filter.belief;
   const auto believed = [&](bool contact) {
@@ -354,21 +354,21 @@ Estimate update(Filter& filter, const capture::View& view) {
   Estimate out;
   out.frame = view.frame;
   out.time = view.time;
-  out.seen = has_mask(view);
+  out.seen = std::any_of(views.begin(), views.end(), [](const capture::View* v) { return has_mask(*v); });
   if (out.seen) {
-    Measured measured = measure(filter, predicted, view, !first);
+    Measured measured = measure(filter, predicted, views, !first);
     if (!first && (measured.surprise > kSurprise || !explains(measured.fit))) {
       filter.contact_until = view.time + kContactMemory;
       if (!in_contact) {
         predicted = believed(true);
-        measured = measure(filter, predicted, view, true);
+        measured = measure(filter, predicted, views, true);
       }
     }
     if (!explains(measured.fit)) {  // sought again from afar
       Belief wide = first_belief(filter, view.time);
       wide.covariance.diagonal().head(n).array() += kLostAngle * kLostAngle;
       wide.covariance.diagonal().segment(n, n).array() += kLostRate * kLostRate;
-      const Measured again = measure(filter, wide, view, false);
+      const Measured again = measure(filter, wide, views, false);
       if (explains(again.fit)) measured = again;
     }
     out.lost = !explains(measured.fit);
@@ -392,7 +392,9 @@ Estimate update(Filter& filter, const capture::View& view) {
   out.thetadot = filter.belief->mean.segment(n, n);
   out.covariance = filter.belief->covariance.topLeftCorner(2 * n, 2 * n);
   out.covariance.topLeftCorner(n, n) += shape_covariance(filter.model.chain, filter.base(view.time).pose, out.theta);
-  out.iou = tube_iou(filter.model.chain, filter.base(view.time).pose, out.theta, view, filter.camera);
+  for (const capture::View* const v : views)
+    out.iou += tube_iou(filter.model.chain, filter.base(view.time).pose, out.theta, *v, filter.cameras.at(v->camera)) /
+               views.size();
   return out;
 }
 

@@ -12,7 +12,8 @@ constexpr double kTruthStep = 1.0 / 240.0;   // s, between states of the true ch
 constexpr double kReplanSharpness = 3e4;     // m^-2
 constexpr double kReplanSmoothness = 1e-8;
 constexpr int kReplanIterations = 4;
-constexpr double kShortest = 0.1;            // s before the hit, after which nothing is changed any more
+constexpr double kShortest = 0.15;           // s before the hit, after which nothing is changed any more
+constexpr int kParts = 4;                    // halvings of a correction that is too fast
 constexpr double kLeastPiece = 0.35;         // s, of a correction
 constexpr double kPieceMargin = 1.6;         // its length over the time to the hit, in free space
 constexpr int kReplanNodes = 60;             // of its rollout, where the substeps allow
@@ -154,9 +155,14 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
         for (std::size_t a = 0; a < motion.axes.size(); ++a) task.held[a * kPerAxis + kBasisCount] = true;
       VectorX q = VectorX::Zero(static_cast<Eigen::Index>(motion.axes.size()) * kPerAxis);
       minimize(task, q, {kReplanSharpness, kReplanSmoothness}, kReplanIterations);
-      Rollout rollout;
-      if (roll_out(problem.model, task.motion, task.grid, q, estimate, false, rollout)) {
+      // a correction that asks too much of the arm is taken in part
+      bool within = false;
+      for (int part = 0; part < kParts && !within; ++part, q *= within ? 1.0 : 0.5) {
         set_unknowns(motion, q);
+        within = peaks(motion, now, now + length, options.limits).over.empty();
+      }
+      Rollout rollout;
+      if (within && roll_out(problem.model, task.motion, task.grid, q, estimate, false, rollout)) {
         out.motion = std::move(motion);
         hit_time = measure(task, problem.model, rollout).time;
       }
