@@ -353,14 +353,14 @@ TEST_CASE("the state of one chain is found from points of another") {
 }
 
 TEST_CASE("feedback mends what a wrong model misses and follows a target that moves") {
-  Problem problem = problem_of(chain::Bending::planar, false);
+  Problem problem = problem_of(chain::Bending::spatial, false);
   Options options;
   options.horizon = 1.5;
   options.starts = 8;
-  problem.targets = {problem.base.translation + Vector3(0.25, 0, -0.2)};
+  problem.targets = {problem.base.translation + Vector3(0.25, 0.1, -0.24)};
   const Plan found = plan(problem, options);
   REQUIRE(found.reached);
-  const dynamics::Model truth = rope(chain::Bending::planar, false, 24, 0.6);
+  const dynamics::Model truth = rope(chain::Bending::spatial, false, 24, 0.6);
   LoopOptions loop;
   loop.feedback = false;
   const LoopResult blind = closed_loop(problem, options, found, truth, loop);
@@ -371,5 +371,7 @@ TEST_CASE("feedback mends what a wrong model misses and follows a target that mo
   CHECK(seeing.replans > 3);
   CHECK(seeing.peaks.over.empty());
   loop.target_velocity = {0.03, 0, 0};
-  CHECK(closed_loop(problem, options, found, truth, loop).hit.miss < 4e-3);
+  const double followed = closed_loop(problem, options, found, truth, loop).hit.miss;
+  loop.feedback = false;
+  CHECK(followed < 0.5 * closed_loop(problem, options, found, truth, loop).hit.miss);
 }

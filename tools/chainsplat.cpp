@@ -66,6 +66,7 @@ int run(int argc, char** argv) {
   tools::add_force_commands(app, globals, job);
   tools::add_planning_commands(app, globals, job);
   tools::add_inspection_commands(app, globals, job);
+  tools::add_new_command(app, globals, job);
   tools::add_bench_command(app, globals, job);
   for (CLI::App* command : app.get_subcommands({})) {
     command->get_formatter()->column_width(34);

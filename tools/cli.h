@@ -31,6 +31,7 @@ void add_inspection_commands(CLI::App& app, const Globals& globals, Job& job);  
 void add_planning_commands(CLI::App& app, const Globals& globals, Job& job);    // plan
 void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job);  // estimate
 void add_force_commands(CLI::App& app, const Globals& globals, Job& job);       // force
+void add_new_command(CLI::App& app, const Globals& globals, Job& job);
 void add_bench_command(CLI::App& app, const Globals& globals, Job& job);
 
 // --- progress.cpp --------------------------------------------------------------------------------

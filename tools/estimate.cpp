@@ -20,8 +20,8 @@ namespace {
 
 using Json = nlohmann::json;
 
-constexpr int kBlack = 16;      // brightness up to which a pixel of a masked video is background (lossy coding)
-constexpr int kMargin = 24;     // px about what a frame shows
+constexpr int kBlack = 16;         // brightness up to which a pixel of a masked video is background (lossy coding)
+constexpr int kMargin = 24;        // px about what a frame shows
 constexpr double kTogether = 0.5;  // of a frame's interval: frames of several cameras nearer than that are one moment
 
 struct EstimateRequest {
@@ -117,15 +117,18 @@ bool read_raw(const capture::Camera& camera, capture::Image8& image) {
   const std::size_t got = std::fread(image.pixels.data(), 1, image.pixels.size(), stdin);
   if (got == image.pixels.size()) return true;
   if (got != 0)
-    throw WorkError("standard input", "ends within a frame", "send whole frames of the calibration's size; the states so far are kept");
+    throw WorkError("standard input", "ends within a frame",
+                    "send whole frames of the calibration's size; the states so far are kept");
   return false;
 }
 
 void estimate(const Globals& globals, const EstimateRequest& request) {
-  if (globals.json) throw InputError("--json", "estimate writes one JSON line a frame, not one document", "leave it out");
+  if (globals.json)
+    throw InputError("--json", "estimate writes one JSON line a frame, not one document", "leave it out");
   if (request.drop < 1) throw InputError("--drop", "must be 1 or more", "give 2 for every second frame");
   if (!request.centerline.empty()) check_output_file(request.centerline);
-  if (request.centerline == "-") throw InputError("--centerline", "standard output is for the estimates", "name a file");
+  if (request.centerline == "-")
+    throw InputError("--centerline", "standard output is for the estimates", "name a file");
   const auto [first, last] = parse_frames(request.frames);
   const twin::Twin twin = load_twin(request.run);
   if (!twin.parameters)
@@ -202,8 +205,8 @@ void estimate(const Globals& globals, const EstimateRequest& request) {
 
   const double base_start = base.start(), base_end = base.end();
   const bool base_moves = base.samples().size() > 1;
-  estimation::Filter filter =
-      estimation::start(twin, cameras, [&](double time) { return base.at(time); }, base_start);
+  estimation::Filter filter = estimation::start(
+      twin, cameras, [&](double time) { return base.at(time); }, base_start);
   chain::States states;
   std::vector<capture::View> views;
   int count = 0, lost = 0, read = 0;
@@ -218,10 +221,10 @@ void estimate(const Globals& globals, const EstimateRequest& request) {
       if (core::stop_requested()) throw Interrupted(core::stop_requested());
       const double slack = 1.0 / 30.0;  // s, a frame beyond the last sample
       if (base_moves && views[0].time > base_end + slack)
-        throw WorkError(request.base.empty() ? request.camera : request.base,
-                        "the base motion ends at " + core::exact(base_end) + " s, before frame " +
-                            std::to_string(views[0].frame),
-                        "give a base motion as long as the frames; the states so far are kept");
+        throw WorkError(
+            request.base.empty() ? request.camera : request.base,
+            "the base motion ends at " + core::exact(base_end) + " s, before frame " + std::to_string(views[0].frame),
+            "give a base motion as long as the frames; the states so far are kept");
       std::vector<const capture::View*> pointers;
       for (const capture::View& view : views) pointers.push_back(&view);
       const estimation::Estimate e = estimation::update(filter, pointers);
@@ -259,14 +262,16 @@ void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job) {
                    "the rope on black, or - for raw RGB24 frames on standard input")
       ->required()
       ->type_name("SOURCE");
-  command->add_option("--calibration", request->calibration, "Camera object as in capture.json")->type_name("FILE.json");
+  command->add_option("--calibration", request->calibration, "Camera object as in capture.json")
+      ->type_name("FILE.json");
   command->add_option("--rate", request->rate, "Frames a second (default: the calibration's, else the video's)")
       ->type_name("HZ");
   command->add_option("--base", request->base, "Base motion (default: the capture's; with --calibration at rest)")
       ->type_name("FILE.tum");
   command->add_option("--frames", request->frames, "Only frames A to B - 1")->type_name("A:B");
   command->add_option("--drop", request->drop, "Use every N-th frame (default 1)")->type_name("N");
-  command->add_option("--centerline", request->centerline, "Also write the world points of the grasp, joints and free end")
+  command
+      ->add_option("--centerline", request->centerline, "Also write the world points of the grasp, joints and free end")
       ->type_name("FILE.csv");
   command->callback([&globals, &job, request] { job = [&globals, request] { estimate(globals, *request); }; });
 }

@@ -38,7 +38,8 @@ void read_estimates(const std::string& name, int angles, chain::States& states, 
       const auto deviation = object.at("sigma").get<std::vector<double>>();
       const double time = object.at("time").get<double>();
       if (static_cast<int>(theta.size()) != angles || deviation.size() != theta.size())
-        throw InputError(where, "has not the twin's " + std::to_string(angles) + " angles", "give estimates of this twin");
+        throw InputError(where, "has not the twin's " + std::to_string(angles) + " angles",
+                         "give estimates of this twin");
       if (!states.time.empty() && !(time > states.time.back()))
         throw InputError(where, "its time does not increase", "give the lines in order");
       states.time.push_back(time);
@@ -91,14 +92,14 @@ std::vector<ContactPoint> read_contacts(const std::string& name) {
 }
 
 void force(const Globals& globals, const ForceRequest& request) {
-  if (globals.json) throw InputError("--json", "force writes one JSON line a time step, not one document", "leave it out");
+  if (globals.json)
+    throw InputError("--json", "force writes one JSON line a time step, not one document", "leave it out");
   if (request.states.empty() == request.estimate.empty())
     throw InputError("--states, --estimate", "one of the two is needed", "give the angles over time");
   const twin::Twin twin = load_twin(request.run);
   const dynamics::Model model = model_of(twin, request.run);
   const trajectory::Trajectory base = request.base.empty() ? own_base(request.run) : read_base(request.base);
-  if (request.base.empty())
-    core::warn("--base: is missing; the base motion of the twin's own capture is assumed");
+  if (request.base.empty()) core::warn("--base: is missing; the base motion of the twin's own capture is assumed");
   chain::States states;
   std::vector<math::VectorX> sigma;
   if (request.estimate.empty())
@@ -137,11 +138,12 @@ void force(const Globals& globals, const ForceRequest& request) {
     char rest = 0;
     if (std::sscanf(request.contact.c_str(), "%lf,%lf,%lf%c", &point[0], &point[1], &point[2], &rest) != 3 ||
         !point.allFinite())
-      throw InputError("--contact", "'" + request.contact + "' is no point", "give X,Y,Z in meters, a FILE.csv or auto");
+      throw InputError("--contact", "'" + request.contact + "' is no point",
+                       "give X,Y,Z in meters, a FILE.csv or auto");
     for (std::size_t f = 0; f < count; ++f) contacts.push_back(nearest(f, point));
   }
-  const std::vector<force::Estimate> estimates =
-      force::estimate(model, [&](double time) { return base.at(time); }, motion, contacts, request.live);
+  const std::vector<force::Estimate> estimates = force::estimate(
+      model, [&](double time) { return base.at(time); }, motion, contacts, request.live);
   int touching = 0;
   for (const force::Estimate& e : estimates) {
     std::cout << force::to_json(e, twin.known_mass) << "\n" << std::flush;
@@ -162,8 +164,9 @@ void add_force_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("FILE.jsonl");
   command->add_option("--base", request->base, "Base motion (default: that of the twin's own capture)")
       ->type_name("FILE.tum");
-  command->add_option("--contact", request->contact,
-                      "Where it is touched: X,Y,Z in the world, FILE.csv with time,x,y,z, or auto (default)")
+  command
+      ->add_option("--contact", request->contact,
+                   "Where it is touched: X,Y,Z in the world, FILE.csv with time,x,y,z, or auto (default)")
       ->type_name("X,Y,Z|FILE.csv|auto");
   command->add_option("--hand", request->hand, "Point cloud of the hand; the nearest Gaussian is touched")
       ->type_name("FILE.ply");

@@ -318,17 +318,15 @@ void plan(const Globals& globals, PlanRequest& request) {
       problem.targets.push_back({v[0], v[1], v[2]});
     }
   }
-  for (const math::Vector3& target : problem.targets)
-    if (target.allFinite()) {
-      const double bound = planning::unreachable_distance(problem, options, target);
-      if (bound > options.tolerance) {
-        char text[160];
-        std::snprintf(text, sizeof text,
-                      "--target: at least %.1f mm beyond what rope length, stroke and axes allow; looking for the nearest motion",
-                      1e3 * bound);
-        core::warn(text);
-      }
-    }
+  for (const math::Vector3& target : problem.targets) {
+    const double bound = planning::unreachable_distance(problem, options, target);
+    if (!(bound > options.tolerance)) continue;
+    char text[160];
+    std::snprintf(text, sizeof text,
+                  "--target: at least %.1f mm beyond what rope length, stroke and axes allow; the nearest motion is planned",
+                  1e3 * bound);
+    core::warn(text);
+  }
   if (request.simulate.empty() && (request.mpc || !request.target_velocity.empty()))
     throw InputError("--mpc", "feedback needs a rope to see", "give --simulate CHAIN.json as the true one");
   std::optional<dynamics::Model> truth;

@@ -15,6 +15,7 @@
 #include "chainsplat/recognition.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
+#include "markers.h"
 #include "picture.h"
 #include "run_folder.h"
 
@@ -351,15 +352,40 @@ void train(const Globals& globals, const Request& request) {
   }
 }
 
-void identify(const Globals& globals, const std::string& run) {
+// Marker positions take the place of recognized states; the twin can be an empty one.
+void identify_markers(twin::Twin& twin, const std::string& run, const std::string& file, std::uint64_t seed) {
+  const Stopwatch watch(twin, "identify");
+  const MarkerFile measured = read_markers(file);
+  const trajectory::Trajectory base = trajectory::fit(measured.base, file);
+  std::vector<math::MatrixX> covariances;
+  twin.states = identification::fit_markers(twin.chain, base, measured.markers, &covariances);
+  identification::Result found =
+      identification::identify(twin.chain, base, measured.markers, identification_options(twin, false, seed));
+  twin.parameters = std::move(found.parameters);
+  twin.initial = std::move(found.initial);
+  twin.estimates = std::move(found.estimates);
+  twin.rollout = std::move(found.rollout);
+  twin.provenance.options["markers"] = Path(file).filename().string();
+  core::write_file(Path(run) / kBaseFile, trajectory::write_tum(measured.base));
+  core::write_file(Path(run) / kCovarianceFile, covariance_csv(twin.states, covariances));
+  char text[80];
+  std::snprintf(text, sizeof text, "markers against the rollout: RMS %.2f mm", 1e3 * found.node_rms);
+  say(text);
+}
+
+void identify(const Globals& globals, const std::string& run, const std::string& markers) {
   watch_signals();
-  twin::Twin twin = load_twin(run);
-  const trajectory::Trajectory base = own_base(run);
-  const std::vector<math::MatrixX> covariances = read_covariances(Path(run) / kCovarianceFile, twin.states);
-  const auto mode = twin.provenance.options.find("mode");
-  identify_stage(twin, base, covariances, mode != twin.provenance.options.end() && mode->second == "paper",
-                 globals.seed);
-  rollout_stage(twin, base, run);
+  twin::Twin twin = markers.empty() ? load_twin(run) : twin::load(run);
+  if (markers.empty()) {
+    const trajectory::Trajectory base = own_base(run);
+    const std::vector<math::MatrixX> covariances = read_covariances(Path(run) / kCovarianceFile, twin.states);
+    const auto mode = twin.provenance.options.find("mode");
+    identify_stage(twin, base, covariances, mode != twin.provenance.options.end() && mode->second == "paper",
+                   globals.seed);
+    rollout_stage(twin, base, run);
+  } else {
+    identify_markers(twin, run, markers, globals.seed);
+  }
   std::error_code ignored;
   // what was measured on the old parameters is not true any more
   if (fs::remove(Path(run) / kMetricsFile, ignored))
@@ -443,7 +469,14 @@ void add_training_commands(CLI::App& app, const Globals& globals, Job& job) {
       app.add_subcommand("identify", "The second stage alone: masses, stiffness, damping, friction of a twin");
   auto run = std::make_shared<std::string>();
   identifier->add_option("RUN", *run, "Run folder with recognized states; it is updated")->required();
-  identifier->callback([&globals, &job, run] { job = [&globals, run] { identify(globals, *run); }; });
+  auto markers = std::make_shared<std::string>();
+  identifier
+      ->add_option("--markers", *markers,
+                   "Measured positions of points of the rope and the base's motion instead of recognized states; RUN\n"
+                   "can be an empty twin (see new)")
+      ->type_name("FILE.csv");
+  identifier->callback(
+      [&globals, &job, run, markers] { job = [&globals, run, markers] { identify(globals, *run, *markers); }; });
 }
 
 }  // namespace chainsplat::tools

@@ -1,4 +1,5 @@
-// chainsplat/estimation.h - a rope followed live, from one camera or more: joint angles, rates and how sure they are (SPEC 6).
+// chainsplat/estimation.h - a rope followed live, from one camera or more: joint angles, rates and how sure they are
+// (SPEC 6).
 //
 // An iterated extended Kalman filter. Its motion model is the twin's own dynamics under the base's motion; what the
 // model does not know (a hand, a finger, its own errors) is a force on the rope that wanders slowly and is estimated
@@ -24,7 +25,8 @@ struct Options {
   double contact_force = 4.0;        // N/sqrt(s) a kilogram, the same while the motion does not follow the model
   double force_memory = 0.5;         // s, in which an unknown force that nothing confirms is forgotten
   double acceleration = 2.0;         // rad/s^2, of every angle, independent from frame to frame
-  double blind_acceleration = 30.0;  // rad/s^2, the same where the twin has no identified dynamics
+  double blind_acceleration = 30.0;  // rad/s^2, the same where the motion does not follow the model and
+                                     // no force is estimated (no dynamics or stiffness)
   double new_share = 0.4;            // of a silhouette's variance that is new in every frame (the rest stays)
   silhouette::Options silhouette;    // the prior is set by the filter
 };
@@ -56,12 +58,12 @@ struct Filter {
   std::vector<capture::Camera> cameras;
   dynamics::BaseFunction base;
   Options options;
-  std::optional<Belief> belief;  // none before the first frame
-  double base_start = 0.0;       // s, from here on the base's motion is known: the rope is thought at rest there
-  math::VectorX rest;            // rad, how the rope rests (or lies) at that time
-  double contact_until = 0.0;    // s, until then the motion is thought not to follow the model
+  std::optional<Belief> belief;     // none before the first frame
+  double base_start = 0.0;          // s, from here on the base's motion is known: the rope is thought at rest there
+  math::VectorX rest;               // rad, how the rope rests (or lies) at that time
+  double contact_until = 0.0;       // s, until then the motion is thought not to follow the model
   math::VectorX everywhere, place;  // shares of the links' ends in the unknown force: evenly, and as learned in contact
-  double last_seen = 0.0;        // s
+  double last_seen = 0.0;           // s
   double edge_offset = 0.0, edge_offset_variance = 0.0;  // px, px^2: how much wider the masks are than the tube
 };
 
@@ -78,8 +80,8 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views);
 Belief predict(const Filter& filter, const Belief& belief, double time, bool contact);
 
 // Share of pixels in both the mask and the tube about the chain among those in either.
-double tube_iou(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta, const capture::View& view,
-                const capture::Camera& camera);
+double tube_iou(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta,
+                const capture::View& view, const capture::Camera& camera);
 
 // The line of INTERFACE 5, without line feed. `latency`: s.
 std::string to_json(const Estimate& estimate, double latency);

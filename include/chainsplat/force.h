@@ -1,8 +1,9 @@
 // chainsplat/force.h - angles over time and a twin -> the force that the outside exerts on the rope (SPEC 7).
 //
 // At a material point with position Jacobian J the force f solves J^T f = r, with the generalized force that the model
-// does not explain, r = M ddtheta + h + K (theta - theta_0) + D dtheta. Where J sees a direction badly (along a straight
-// rope) or not at all (the bending axis of a planar chain) the prior keeps f small and the standard error says so.
+// does not explain, r = M ddtheta + h + K (theta - theta_0) + D dtheta. Where J sees a direction badly (along a
+// straight rope) or not at all (the bending axis of a planar chain) the prior keeps f small and the standard error says
+// so.
 #pragma once
 #include <optional>
 #include <span>
@@ -33,20 +34,20 @@ struct Motion {
 Motion smooth(const chain::States& states, std::span<const VectorX> sigma, bool live);
 
 struct Options {
-  double force_scale = 0.5;            // N a 60 g rope is pushed with, in proportion to the mass: the prior's deviation
-  double along = 0.3;                  // the same along the rope, in proportion: fingers slip
-  double relative_deviation = 0.2;     // of the joints' stiffness and damping torques: what identification leaves open
-  double gravity_deviation = 0.004;    // of the rope's weight times its length: torque error of any joint
-  double window = 0.15;                // s to either side over which the place of an automatic contact is one
-  int places = 60;                     // arclengths tried for an automatic contact
+  double force_scale = 0.5;          // N a 60 g rope is pushed with, in proportion to the mass: the prior's deviation
+  double along = 0.3;                // the same along the rope, in proportion: fingers slip
+  double relative_deviation = 0.2;   // of the joints' stiffness and damping torques: what identification leaves open
+  double gravity_deviation = 0.004;  // of the rope's weight times its length: torque error of any joint
+  double window = 0.15;              // s to either side over which the place of an automatic contact is one
+  int places = 60;                   // arclengths tried for an automatic contact
 };
 
 // The force at one place.
 struct Fit {
-  Vector3 force = Vector3::Zero();            // N, world, on the rope
-  Matrix3 covariance = Matrix3::Identity();   // N^2
-  double explained = 0.0;                     // fall of chi square by the force, prior included
-  double evidence = 0.0;                      // log likelihood of the residual over that without any force
+  Vector3 force = Vector3::Zero();           // N, world, on the rope
+  Matrix3 covariance = Matrix3::Identity();  // N^2
+  double explained = 0.0;                    // fall of chi square by the force, prior included
+  double evidence = 0.0;                     // log likelihood of the residual over that without any force
 };
 
 // (J C^-1 J^T + prior^-1)^-1 J C^-1 r. `jacobian` 3 x n, `residual` n, `covariance` n x n of the residual; `prior`:
@@ -60,8 +61,8 @@ VectorX residual_torque(const dynamics::Model& model, const trajectory::BaseMoti
 // Where the rope is touched.
 struct Contact {
   int link = 0;
-  double arclength = 0.0;            // m
-  Vector3 home = Vector3::Zero();    // of the material point, base frame, m
+  double arclength = 0.0;          // m
+  Vector3 home = Vector3::Zero();  // of the material point, base frame, m
 };
 
 // The Gaussian nearest to any of the `points` (world, columns), on its most probable link; without Gaussians the
@@ -72,22 +73,24 @@ Contact nearest_contact(const chain::Chain& chain, const splat::Gaussians& gauss
 struct Estimate {
   double time = 0.0;
   Contact contact;
-  Vector3 point = Vector3::Zero();      // of the contact, world, m
-  Vector3 force = Vector3::Zero();      // N, or N a kilogram of rope; with an automatic contact times its probability
-  Vector3 sigma = Vector3::Zero();      // standard errors
-  Vector3 observed = Vector3::Zero();   // 0 (only the prior speaks) .. 1, by component
-  double explained = 0.0;               // fall of chi square by the force
-  double arclength_sigma = 0.0;         // m, of an automatic contact; else 0
+  Vector3 point = Vector3::Zero();     // of the contact, world, m
+  Vector3 force = Vector3::Zero();     // N, or N a kilogram of rope; with an automatic contact times its probability
+  Vector3 sigma = Vector3::Zero();     // standard errors
+  Vector3 observed = Vector3::Zero();  // 0 (only the prior speaks) .. 1, by component
+  double explained = 0.0;              // fall of chi square by the force
+  double arclength_sigma = 0.0;        // m, of an automatic contact; else 0
   bool touching = false;
-  bool moving = true;                   // false: friction at rest hides forces; sigma has what it may hold
+  bool moving = true;  // false: friction at rest hides forces; sigma has what it may hold
 };
 
 // One line a time of `motion`. `contacts`: a time each, empty where nothing is said to touch; an empty span: automatic.
 // `live`: the place of a contact is found from the past alone.
 std::vector<Estimate> estimate(const dynamics::Model& model, const dynamics::BaseFunction& base, const Motion& motion,
-                               std::span<const std::optional<Contact>> contacts, bool live, const Options& options = {});
+                               std::span<const std::optional<Contact>> contacts, bool live,
+                               const Options& options = {});
 
-// The line of INTERFACE 5, without line feed. `known_mass` false: forces are per kilogram of rope, and the line says so.
+// The line of INTERFACE 5, without line feed. `known_mass` false: forces are per kilogram of rope, and the line says
+// so.
 std::string to_json(const Estimate& estimate, bool known_mass);
 
 }  // namespace chainsplat::force

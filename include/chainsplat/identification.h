@@ -36,6 +36,25 @@ struct Result {
   double node_rms = 0.0;  // m, rollout against recognized nodes, over nodes but the grasp and frames
 };
 
+// Measured world positions of material points on the centerline, e.g. motion-capture markers.
+struct Markers {
+  std::vector<double> arclengths;    // m, from the grasp
+  std::vector<double> time;          // s, increasing
+  std::vector<math::MatrixX> world;  // a time: 3 x markers, m; NaN where a marker is not seen
+  double deviation = 5e-3;           // m, of one measured coordinate about the chain: mounts, and what the chain lacks
+};
+
+// The smoothest chain through the markers at every time: least squares with priors on bending, on its differences from
+// joint to joint and from time to time, so that few markers suffice. `covariances`, where given, is filled with those of
+// theta, n x n. Throws InputError where arclengths, times or sizes do not fit, or a time shows no marker.
+chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers,
+                          std::vector<math::MatrixX>* covariances = nullptr);
+
+// As identify() below, with fit_markers() as the start and the markers themselves as residuals. `node_rms` is that of
+// the markers.
+Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers,
+                const Options& options);
+
 // `recognized`: at least 3 times, increasing. `covariances`: of each theta, n x n, or empty. Throws InputError for too
 // little data, WorkError where no start gives a rollout that stays finite.
 Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,

@@ -22,7 +22,7 @@ struct Options {
   int every = 5;  // frames that train the Gaussians
   Mode mode = Mode::fast;
   std::uint64_t seed = 0;
-  int budget = 1500;  // most Gaussians (fast)
+  int budget = 0;  // most Gaussians (fast); 0: 100 a diameter of the rope's length (1,500 for 30 cm of 2 cm)
   int paper_gaussians = 5000;
   int paper_iterations = 30000;
   Path checkpoint;      // folder for checkpoints; empty: none

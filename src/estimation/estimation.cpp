@@ -1,7 +1,6 @@
 #include "chainsplat/estimation.h"
 
 #include <algorithm>
-#include <array>
 #include <cmath>
 
 namespace chainsplat::estimation {
@@ -27,8 +26,8 @@ constexpr double kSurprise = 1.5;
 constexpr double kContactMemory = 0.5;  // s
 constexpr double kContactForce = 0.05;  // of the rope's weight
 
-// A hand touches a rope at one place. Where, is learned from the force found so far: each frame by this share, and every
-// link keeps a little.
+// A hand touches a rope at one place. Where, is learned from the force found so far: each frame by this share, and
+// every link keeps a little.
 constexpr double kPlaceRate = 0.5;
 constexpr double kPlaceFloor = 0.005;
 constexpr double kPlaceRidge = 1e-3;  // of the mean variance of the torques, which a force at few places cannot give
@@ -38,10 +37,10 @@ constexpr double kPlaceRidge = 1e-3;  // of the mean variance of the torques, wh
 constexpr double kLinkDeviation = 0.02;
 constexpr double kUnseenAngle = 0.5;  // rad, of angles that move no joint (twist)
 
-constexpr double kLostShare = 0.5;    // of the mask explained, under which the rope is lost (SPEC 6)
-constexpr double kLongUnseen = 0.5;   // s without a mask after which the rope counts as lost
-constexpr double kLostAngle = 0.5;    // rad, and
-constexpr double kLostRate = 5.0;     // rad/s: standard deviations from which a lost rope is sought
+constexpr double kLostShare = 0.5;      // of the mask explained, under which the rope is lost (SPEC 6)
+constexpr double kLongUnseen = 0.5;     // s without a mask after which the rope counts as lost
+constexpr double kLostAngle = 0.5;      // rad, and
+constexpr double kLostRate = 5.0;       // rad/s: standard deviations from which a lost rope is sought
 constexpr double kNoSmoothness = 1e-9;  // 1/rad^2: the filter's prior replaces the fit's own
 
 // of the masks' edge offset: how sure it is at first, at best, and after how many frames
@@ -123,7 +122,8 @@ MatrixX shape_covariance(const chain::Chain& chain, const Pose& base, const Vect
   const int n = chain.angles();
   const double deviation = kLinkDeviation * chain.diameter;
   const std::vector<MatrixX> jacobians = link_end_jacobians(chain, base, theta);
-  MatrixX information = torque_covariance(jacobians, VectorX::Constant(jacobians.size(), 1.0 / (deviation * deviation)));
+  MatrixX information =
+      torque_covariance(jacobians, VectorX::Constant(jacobians.size(), 1.0 / (deviation * deviation)));
   information.diagonal().array() += 1.0 / (kUnseenAngle * kUnseenAngle);
   return information.llt().solve(MatrixX::Identity(n, n));
 }
@@ -167,8 +167,7 @@ Motion move(const Filter& filter, const Belief& belief, double time) {
       unknowns[2 * n + k].rest_angle.assign(n, 0.0);
       unknowns[2 * n + k].rest_angle[k] = 1.0;
     }
-    const dynamics::BaseGrid grid =
-        dynamics::sample_base(filter.base, belief.time, {time}, model.parameters.substeps);
+    const dynamics::BaseGrid grid = dynamics::sample_base(filter.base, belief.time, {time}, model.parameters.substeps);
     chain::States states;
     dynamics::Sensitivities sensitivities;
     if (dynamics::simulate(model, grid, belief.mean.head(n), belief.mean.segment(n, n), states, unknowns,
@@ -227,7 +226,8 @@ struct Measured {
 
 // The views brought to `predicted`. The fit's variance is partly old news: the prior is tightened in proportion, which
 // gives the same angles as weakening the data, and the covariance is widened again.
-Measured measure(const Filter& filter, const Belief& predicted, std::span<const capture::View* const> views, bool warm) {
+Measured measure(const Filter& filter, const Belief& predicted, std::span<const capture::View* const> views,
+                 bool warm) {
   const int n = filter.model.chain.angles();
   const double share = filter.options.new_share;
   const MatrixX prior = predicted.covariance.topLeftCorner(n, n);
@@ -290,7 +290,7 @@ Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras
   filter.options = options;
   filter.edge_offset_variance = kOffsetDeviation * kOffsetDeviation;
   if (twin.tabletop || !filter.identified) {
-    filter.rest = twin.initial                 ? twin.initial->theta
+    filter.rest = twin.initial                ? twin.initial->theta
                   : twin.states.theta.empty() ? VectorX::Zero(twin.chain.angles())
                                               : twin.states.theta.front();
   } else {
@@ -318,7 +318,8 @@ Belief predict(const Filter& filter, const Belief& belief, double time, bool con
   if (filter.shifts) {
     const double force = (contact ? filter.options.contact_force : filter.options.model_force) *
                          total_mass(filter.model.parameters) * std::sqrt(h);
-    const MatrixX shift = shift_covariance(filter, filter.base(time).pose, motion.theta, force, contact ? filter.place : filter.everywhere);
+    const MatrixX shift = shift_covariance(filter, filter.base(time).pose, motion.theta, force,
+                                           contact ? filter.place : filter.everywhere);
     // the force changes during the step: a third of the change acts all along in the mean square
     MatrixX noise = transition.rightCols(n);
     noise.topRows(2 * n) *= std::sqrt(1.0 / 3.0);
@@ -326,7 +327,8 @@ Belief predict(const Filter& filter, const Belief& belief, double time, bool con
     out.covariance += noise * shift * noise.transpose();
   }
   // an acceleration that is new every frame
-  const double a = filter.identified ? filter.options.acceleration : filter.options.blind_acceleration;
+  const bool explained = filter.identified && (filter.shifts || !contact);
+  const double a = explained ? filter.options.acceleration : filter.options.blind_acceleration;
   const double rate = a * a * h * kFrame;
   for (int k = 0; k < n; ++k) {
     out.covariance(k, k) += rate * h * h / 3.0;

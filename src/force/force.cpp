@@ -20,7 +20,8 @@ constexpr double kTouchingWeight = 0.04;
 // Nothing touches a rope most of the time: without evidence an automatic contact is so much less likely than none.
 constexpr double kOddsOfNone = 3.0;
 
-constexpr double kMovingSpeeds = 3.0;  // of the friction's regularization speed, beyond which friction is known (SPEC 7)
+constexpr double kMovingSpeeds =
+    3.0;  // of the friction's regularization speed, beyond which friction is known (SPEC 7)
 constexpr double kLeastTorque = 1e-6;  // of weight times length, keeps covariances invertible
 
 double total_mass(const dynamics::Parameters& parameters) {
@@ -36,7 +37,7 @@ struct Frame {
   MatrixX axes;
   std::vector<Pose> motions;
   std::vector<double> hidden;  // N a link, friction that may balance a force unseen
-  std::vector<double> speed;     // m/s a link, of its middle, across the table
+  std::vector<double> speed;   // m/s a link, of its middle, across the table
 };
 
 Frame frame_of(const dynamics::Model& model, const trajectory::BaseMotion& base, const Motion& motion, std::size_t f,
@@ -161,10 +162,10 @@ std::vector<Estimate> estimate(const dynamics::Model& model, const dynamics::Bas
   const double across = options.force_scale * mass / kPushedMass, along = options.along * across;
   const auto solve_at = [&](const Frame& frame, const Contact& contact) {
     const Vector3 tangent = frame.motions[contact.link].rotation * chain.direction;
-    const Matrix3 prior = across * across * Matrix3::Identity() +
-                          (along * along - across * across) * tangent * tangent.transpose();
-    const MatrixX jacobian = chain::point_jacobian(chain, frame.axes, contact.link,
-                                                   frame.motions[contact.link] * contact.home);
+    const Matrix3 prior =
+        across * across * Matrix3::Identity() + (along * along - across * across) * tangent * tangent.transpose();
+    const MatrixX jacobian =
+        chain::point_jacobian(chain, frame.axes, contact.link, frame.motions[contact.link] * contact.home);
     return std::pair(solve(jacobian, frame.residual, frame.covariance, prior), prior);
   };
   std::vector<Frame> frames;

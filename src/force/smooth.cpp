@@ -15,9 +15,9 @@ constexpr double kFirstRate = 10.0, kFirstAcceleration = 100.0;  // rad/s, rad/s
 constexpr double kLeastNoise = 1e-5;                             // rad
 
 struct Filtered {
-  std::vector<Vector3> predicted, mean;           // theta, thetadot, thetaddot
+  std::vector<Vector3> predicted, mean;                   // theta, thetadot, thetaddot
   std::vector<Matrix3> predicted_covariance, covariance;  // for noise of 1 rad
-  double noise = 0.0;                             // rad, of the observations, found
+  double noise = 0.0;                                     // rad, of the observations, found
   double log_likelihood = 0.0;
 };
 

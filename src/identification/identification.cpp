@@ -31,6 +31,7 @@ struct Problem {
   std::vector<VectorX> theta;      // recognized
   BaseGrid grid;
   std::vector<std::size_t> nodes;  // of the grid, up to and with each output
+  bool has_markers = false;        // the points are markers; unseen ones have no weight
 };
 
 // Points of the centerline in the base frame and, where asked, their derivatives by theta.
@@ -241,7 +242,7 @@ void initial_motion(const chain::States& states, VectorX& theta, VectorX& thetad
 }
 
 Problem make_problem(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,
-                     std::span<const MatrixX> covariances, const Options& options) {
+                     std::span<const MatrixX> covariances, const Options& options, const Markers* markers = nullptr) {
   const std::size_t frames = recognized.time.size();
   if (frames < 3 || recognized.theta.size() != frames)
     throw InputError("identify", std::to_string(frames) + " recognized states", "give at least 3 with their times");
@@ -251,7 +252,8 @@ Problem make_problem(const chain::Chain& chain, const trajectory::Trajectory& ba
   CHAINSPLAT_CHECK(covariances.empty() || covariances.size() == frames, std::to_string(covariances.size()));
 
   Problem problem{chain, {}, recognized.time, {}, {}, {}, {}, recognized.theta, {}, {}};
-  for (int link = 1; link < chain.links(); ++link) {
+  problem.has_markers = markers != nullptr;
+  for (int link = 1; !markers && link < chain.links(); ++link) {
     problem.home.push_back(0.5 * (chain.link_start(link) + chain.link_end(link)) * chain.direction);
     problem.home.push_back(chain.link_end(link) * chain.direction);
     problem.links.insert(problem.links.end(), 2, link);
@@ -259,14 +261,32 @@ Problem make_problem(const chain::Chain& chain, const trajectory::Trajectory& ba
   const bool twists = std::any_of(chain.axes.begin(), chain.axes.end(), [&](const math::Vector6& axis) {
     return std::abs(axis.head<3>().dot(chain.direction)) > 0.5;
   });
-  for (int link = 1; twists && link < chain.links(); ++link) {
+  for (int link = 1; !markers && twists && link < chain.links(); ++link) {
     problem.home.push_back(chain.link_end(link) * chain.direction + 0.5 * chain.diameter * chain.bending_axis);
     problem.links.push_back(link);
+  }
+
+  for (std::size_t i = 0; markers && i < markers->arclengths.size(); ++i) {
+    problem.home.push_back(markers->arclengths[i] * chain.direction);
+    problem.links.push_back(chain::link_at(chain, markers->arclengths[i]));
   }
 
   const std::size_t points = problem.home.size();
   std::vector<MatrixX> jacobians;
   for (std::size_t k = 0; k < frames; ++k) {
+    if (markers) {
+      MatrixX target = MatrixX::Zero(3, points), whitening = MatrixX::Zero(3, 3 * points);
+      const math::Pose base_from_world = base.pose(recognized.time[k]).inverse();
+      for (std::size_t i = 0; i < points; ++i) {
+        const Vector3 seen = markers->world[k].col(i);
+        if (!seen.allFinite()) continue;
+        target.col(i) = base_from_world * seen;
+        whitening.middleCols<3>(3 * i) = math::Matrix3::Identity() / markers->deviation;
+      }
+      problem.target.push_back(target);
+      problem.whitening.push_back(whitening);
+      continue;
+    }
     MatrixX target, whitening(3, 3 * points);
     place_points(problem, recognized.theta[k], target, covariances.empty() ? nullptr : &jacobians);
     for (std::size_t i = 0; i < points; ++i) {
@@ -420,9 +440,7 @@ MatrixX covariance_of(const Problem& problem, const Normal& normal) {
 
 }  // namespace
 
-Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,
-                std::span<const MatrixX> covariances, const Options& options) {
-  const Problem problem = make_problem(chain, base, recognized, covariances, options);
+static Result solve(const chain::Chain& chain, const Problem& problem, const Options& options) {
   const Fit fit = options.paper ? fit_angles(problem, options) : fit_centerline(problem, options);
   Result result;
   dynamics::Sensitivities slopes;
@@ -448,11 +466,27 @@ Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, c
   MatrixX points;
   for (std::size_t k = 0; k < problem.times.size(); ++k) {
     place_points(problem, result.rollout.theta[k], points, nullptr);
-    for (int i = 1; i < 2 * (chain.links() - 1); i += 2, ++count)  // odd ones are the links' ends
+    const int stop = problem.has_markers ? static_cast<int>(points.cols()) : 2 * (chain.links() - 1);
+    for (int i = problem.has_markers ? 0 : 1; i < stop; i += problem.has_markers ? 1 : 2) {  // odd: the links' ends
+      if (problem.whitening[k].middleCols<3>(3 * i).isZero(0.0)) continue;
+      ++count;
       sum += (points.col(i) - problem.target[k].col(i)).squaredNorm();
+    }
   }
   result.node_rms = std::sqrt(sum / static_cast<double>(count));
   return result;
+}
+
+Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,
+                std::span<const MatrixX> covariances, const Options& options) {
+  return solve(chain, make_problem(chain, base, recognized, covariances, options), options);
+}
+
+Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers,
+                const Options& options) {
+  std::vector<MatrixX> covariances;
+  const chain::States fitted = fit_markers(chain, base, markers, &covariances);
+  return solve(chain, make_problem(chain, base, fitted, covariances, options, &markers), options);
 }
 
 }  // namespace chainsplat::identification

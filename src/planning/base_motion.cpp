@@ -6,7 +6,6 @@
 namespace chainsplat::planning {
 namespace {
 
-constexpr double kPeakStep = 1e-3;  // s, grid on which limits are verified
 constexpr double kRounding = 1e-9;  // relative, of a limit that is met exactly
 
 }  // namespace
@@ -101,9 +100,9 @@ trajectory::BaseMotion base_at(const Motion& motion, double time) {
   return base_from(motion, coordinates(motion, time));
 }
 
-Peaks peaks(const Motion& motion, double from, double to, const Limits& limits) {
+Peaks peaks(const Motion& motion, double from, double to, const Limits& limits, double step) {
   Peaks out;
-  const int steps = std::max(1, static_cast<int>(std::ceil((to - from) / kPeakStep)));
+  const int steps = std::max(1, static_cast<int>(std::ceil((to - from) / step)));
   for (int k = 0; k <= steps; ++k) {
     const Coordinates c = coordinates(motion, from + (to - from) * k / steps);
     out.velocity = std::max(out.velocity, c.col(1).head<3>().norm());

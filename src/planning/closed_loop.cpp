@@ -12,7 +12,9 @@ constexpr double kTruthStep = 1.0 / 240.0;   // s, between states of the true ch
 constexpr double kReplanSharpness = 3e4;     // m^-2
 constexpr double kReplanSmoothness = 1e-8;
 constexpr int kReplanIterations = 4;
+constexpr double kReplanDamping = 1e-7;      // of the curvature's trace, which limits may dominate
 constexpr double kShortest = 0.15;           // s before the hit, after which nothing is changed any more
+constexpr double kPeakStep = 0.002;          // s, between tests of the limits while replanning
 constexpr int kParts = 4;                    // halvings of a correction that is too fast
 constexpr double kLeastPiece = 0.35;         // s, of a correction
 constexpr double kPieceMargin = 1.6;         // its length over the time to the hit, in free space
@@ -148,18 +150,20 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
       const int full = problem.model.parameters.substeps;
       const int substeps = std::clamp(static_cast<int>(kReplanNodes / (30.0 * length)), full > 4 ? 2 : 1, full);
       Task task = make_task(problem, options, {&problem.model}, motion, estimate, problem.targets.front(), substeps);
+      task.exact = false;
       task.target = target_at(now);
       task.target_velocity = loop.target_velocity;
       task.target_time = now;
       if (options.terminal)
         for (std::size_t a = 0; a < motion.axes.size(); ++a) task.held[a * kPerAxis + kBasisCount] = true;
       VectorX q = VectorX::Zero(static_cast<Eigen::Index>(motion.axes.size()) * kPerAxis);
-      minimize(task, q, {kReplanSharpness, kReplanSmoothness}, kReplanIterations);
+      minimize(task, q, {kReplanSharpness, kReplanSmoothness}, kReplanIterations, kReplanDamping);
       // a correction that asks too much of the arm is taken in part
       bool within = false;
-      for (int part = 0; part < kParts && !within; ++part, q *= within ? 1.0 : 0.5) {
+      for (int part = 0; part < kParts && !within; ++part) {
         set_unknowns(motion, q);
-        within = peaks(motion, now, now + length, options.limits).over.empty();
+        within = peaks(motion, now, end, options.limits, kPeakStep).over.empty();
+        if (!within) q *= 0.5;
       }
       Rollout rollout;
       if (within && roll_out(problem.model, task.motion, task.grid, q, estimate, false, rollout)) {
@@ -201,7 +205,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
       const VectorX theta = i == 0 ? out.states.theta[k] : chain::interpolate(out.states, time);
       const MatrixX points =
           chain::centerline(truth.chain, chain::link_motions(truth.chain, theta, base(time).pose), counts);
-      Vector3 nearest;
+      Vector3 nearest = Vector3::Zero();
       const double miss = distance_to(points, target_at(time), nearest);
       if (miss < out.hit.miss) out.hit.miss = miss, out.hit.time = time, out.hit.point = nearest;
     }

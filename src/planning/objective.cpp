@@ -70,7 +70,7 @@ void watch(const Task& task, const chain::Chain& chain, const std::vector<math::
       use(link, point, distance - sphere.radius - radius, distance > 0.0 ? Vector3(away / distance) : Vector3::UnitZ());
     }
     for (const Box& box : options.boxes) {
-      Vector3 outward;
+      Vector3 outward = Vector3::Zero();
       const double distance = box_distance(box, point, outward);
       use(link, point, distance - radius, outward);
     }
@@ -154,7 +154,8 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
   std::vector<Rollout> rollouts(samples);
   std::vector<char> finite(samples);
   core::parallel_for(samples, [&](std::int64_t m) {
-    finite[m] = roll_out(*task.models[m], task.motion, task.grid, unknowns, task.initial, derivatives, rollouts[m]);
+    finite[m] = roll_out(*task.models[m], task.motion, task.grid, unknowns, task.initial, derivatives, rollouts[m],
+                         task.exact);
   });
   if (std::find(finite.begin(), finite.end(), 0) != finite.end()) return sum;
   sum.good = true;
@@ -208,7 +209,7 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
         watch(task, chain, motions, [&](int link, const Vector3& point, double distance, const Vector3& outward) {
           const double residual = kClearanceMargin - distance;
           if (residual <= 0.0) return;
-          const double weight = kClearanceWeight / samples;
+          const double weight = task.limit_weight * kClearanceWeight / samples;
           if (!derivatives) {
             sum.value += weight * residual * residual;
             return;
@@ -230,7 +231,7 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
     const double residual = value / most - kLimitMargin;
     if (residual <= 0.0) return;
     if (!derivatives) {
-      sum.value += kLimitWeight * residual * residual;
+      sum.value += task.limit_weight * kLimitWeight * residual * residual;
       return;
     }
     VectorX slope = VectorX::Zero(size);
@@ -240,7 +241,7 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
       const double direction = base[node](static_cast<int>(axis), derivative) / value;
       slope.segment(static_cast<Eigen::Index>(a) * kPerAxis, kPerAxis) = direction / most * b.col(derivative);
     }
-    add(sum, kLimitWeight, residual, slope);
+    add(sum, task.limit_weight * kLimitWeight, residual, slope);
   };
   const Limits& limits = options.limits;
   const bool smooth = task.motion.window == Window::smooth;
@@ -273,7 +274,7 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
       if (residual <= 0.0) continue;
       VectorX slope = VectorX::Zero(size);
       slope.segment(first, kPerAxis) = (offset < 0.0 ? -1.0 : 1.0) / most * b.col(0);
-      add(sum, kLimitWeight, residual, slope);
+      add(sum, task.limit_weight * kLimitWeight, residual, slope);
     }
   }
   if (derivatives) {

@@ -16,6 +16,8 @@ struct Task {
   double target_time = 0.0;
   const Options* options = nullptr;
   std::vector<bool> held;                      // unknowns that keep their value
+  bool exact = true;                           // derivatives of the discrete map
+  double limit_weight = 1.0;                   // of limits and obstacles, against the usual
 
   Vector3 target_at(double time) const { return target + (time - target_time) * target_velocity; }
 };

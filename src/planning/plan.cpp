@@ -18,6 +18,7 @@ constexpr double kFinalSharpness = 1e5;
 constexpr double kFinalSmoothness = 3e-9;
 constexpr int kFinalIterations = 10;
 constexpr double kGoodMiss = 0.3;     // of the tolerance: no further start is tried
+constexpr double kStrictLimits = 100.0;  // times the usual weight
 constexpr int kGroups[] = {1, 1, 2, 4, 4};  // starts optimized side by side; the next group only where the last failed
 constexpr double kLeastLoad = 0.25, kMostLoad = 0.95;  // of the limits, of random motions
 constexpr std::uint64_t kTargetStream = 0x7461726765740001ull;  // random numbers of random_target
@@ -140,6 +141,12 @@ Found optimize(const Task& coarse, const Task& fine, VectorX unknowns) {
     found.iterations += minimize(coarse, found.unknowns, {stage.sharpness, stage.smoothness}, stage.iterations);
   found.iterations += minimize(fine, found.unknowns, {kFinalSharpness, kFinalSmoothness}, kFinalIterations);
   judge(fine, found);
+  if (found.good || !std::isfinite(found.hit.miss)) return found;
+  // a far target pulls harder than the limits push: once more with limits that count more
+  Task strict = fine;
+  strict.limit_weight = kStrictLimits;
+  found.iterations += minimize(strict, found.unknowns, {kFinalSharpness, kFinalSmoothness}, kFinalIterations);
+  judge(fine, found);
   return found;
 }
 
@@ -225,6 +232,7 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
 }  // namespace
 
 double unreachable_distance(const Problem& problem, const Options& options, const Vector3& asked) {
+  validate(problem, options);
   const chain::Chain& chain = problem.model.chain;
   const Vector3 target = at_rope_height(problem, asked);
   const std::vector<Axis> axes = options.axes.empty() ? default_axes(chain) : options.axes;
@@ -299,12 +307,12 @@ Plan plan(const Problem& problem, const Options& options) {
       const double bound = unreachable_distance(problem, options, problem.targets[t]);
       const std::string which = problem.targets.size() > 1 ? "target " + std::to_string(t + 1) + ": " : "";
       if (!plan.reason.empty()) plan.reason += "; ";
-      if (!best.peaks.over.empty())
+      if (bound > options.tolerance)
+        plan.reason += which + "it is at least " + millimeters(bound) + " beyond what rope length, stroke and axes allow";
+      else if (!best.peaks.over.empty())
         plan.reason += which + "no motion found keeps the " + best.peaks.over + " limit";
       else if (best.clearance < 0.0)
         plan.reason += which + "no motion found stays clear of what must be kept out of";
-      else if (bound > options.tolerance)
-        plan.reason += which + "it is at least " + millimeters(bound) + " beyond what rope length, stroke and axes allow";
       else
         plan.reason += which + "the nearest of all starts misses by " + millimeters(best.hit.miss) +
                        " with these axes, limits and horizon";

@@ -6,7 +6,6 @@
 namespace chainsplat::planning {
 namespace {
 
-constexpr double kFirstDamping = 1e-2;  // of the curvature's trace
 constexpr double kLeastDamping = 1e-9, kMostDamping = 1e6;
 constexpr double kLessDamping = 0.15, kMoreDamping = 6.0;
 constexpr double kConverged = 1e-4;  // relative decrease of the objective
@@ -67,7 +66,7 @@ Task make_task(const Problem& problem, const Options& options, const std::vector
   return task;
 }
 
-int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, int iterations) {
+int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, int iterations, double first_damping) {
   Evaluation now = evaluate(task, unknowns, sharpness, true);
   if (!now.good) return 1;
   // unit of the damping: acceleration, so that a step changes the motion as little as it can
@@ -80,24 +79,29 @@ int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, in
   for (Eigen::Index i = 0; i < unknowns.size(); ++i)
     if (task.held[i]) metric.row(i).setZero(), metric.col(i).setZero(), metric(i, i) = 1.0;
   metric /= metric.trace();
-  double damping = kFirstDamping;
+  double damping = first_damping;
   int count = 1;
   while (count < iterations) {
     const double scale = now.curvature.trace();
     VectorX step;
     Evaluation next;
-    for (;;) {
+    for (bool again = false;; again = true) {
       MatrixX matrix = now.curvature + damping * scale * metric;
       // the metric has no part in directions without acceleration; held unknowns have no row
       matrix.diagonal().array() += 1e-12 * scale;
       step = -matrix.ldlt().solve(now.gradient);
       for (Eigen::Index i = 0; i < step.size(); ++i)
         if (task.held[i]) step[i] = 0.0;
-      next = evaluate(task, unknowns + step, sharpness, true);
-      ++count;
-      if (next.good && next.value < now.value) break;
+      // the first step is mostly good; once one was not, look before the derivatives are paid for
+      next = evaluate(task, unknowns + step, sharpness, !again);
+      if (next.good && next.value < now.value) {
+        if (again) next = evaluate(task, unknowns + step, sharpness, true);
+        ++count;
+        break;
+      }
+      if (!again) ++count;
       damping *= kMoreDamping;
-      if (damping > kMostDamping || count >= iterations) return count;
+      if (damping > kMostDamping || count >= iterations + 1) return count;
     }
     const double decrease = now.value - next.value;
     unknowns += step;

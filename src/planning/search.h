@@ -17,8 +17,10 @@ Vector3 at_rope_height(const Problem& problem, const Vector3& target);
 
 void set_unknowns(Motion& motion, const VectorX& unknowns);  // of the last piece
 
-// Damped Gauss-Newton; ends after `iterations`, or when nothing changes any more. Returns those it took.
-int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, int iterations);
+// Damped Gauss-Newton; ends after about `iterations` evaluations of the derivatives, or when nothing changes any more.
+// Returns those it took. `first_damping`: of the curvature's trace, small near a solution.
+int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, int iterations,
+             double first_damping = 1e-2);
 
 // A random motion whose largest peak is `fraction` of its limit.
 VectorX random_unknowns(const Task& task, core::Random& random, double fraction);

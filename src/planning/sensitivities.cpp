@@ -194,7 +194,7 @@ Grid make_grid(const Motion& motion, int substeps) {
 }
 
 bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& grid, const VectorX& unknowns,
-              const dynamics::InitialState& initial, bool derivatives, Rollout& out) {
+              const dynamics::InitialState& initial, bool derivatives, Rollout& out, bool exact) {
   const int n = model.chain.angles(), nodes = grid.nodes();
   const auto columns = static_cast<Eigen::Index>(motion.axes.size()) * kPerAxis;
   CHAINSPLAT_CHECK(unknowns.size() == columns, std::to_string(unknowns.size()));
@@ -244,13 +244,15 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
     };
     // d_work holds M^-1 times the change of `work`, without the second derivatives
     const auto solve_tangents = [&](int i) {
-      const double shift = kProbe * h * kTimeWeight[i];
-      if (!other.place(motion, shifted(base, shift), theta + kProbe * k_theta[i], rate + kProbe * k_rate[i], true))
-        return false;
-      other.tangent_forces(shifted(base, shift), shifted(grid.basis[k], shift), slope, rate_slope);
-      curvature = other.forces;
-      other.solve_mass(curvature);
-      d_work += (curvature - now_rate) / kProbe;
+      if (exact) {
+        const double shift = kProbe * h * kTimeWeight[i];
+        if (!other.place(motion, shifted(base, shift), theta + kProbe * k_theta[i], rate + kProbe * k_rate[i], true))
+          return false;
+        other.tangent_forces(shifted(base, shift), shifted(grid.basis[k], shift), slope, rate_slope);
+        curvature = other.forces;
+        other.solve_mass(curvature);
+        d_work += (curvature - now_rate) / kProbe;
+      }
       dk_rate[i].noalias() = engine.mass * d_work;
       dk_rate[i].noalias() -= g * (engine.stiffness * d_right);
       dk_rate[i] = g * factor.solve(dk_rate[i]);

@@ -26,8 +26,9 @@ struct Rollout {
   std::vector<MatrixX> theta_slope, thetadot_slope;  // n x unknowns; empty without derivatives
 };
 // `unknowns` of the last piece, kPerAxis an axis. False where the motion diverges. Without derivatives it is
-// dynamics::simulate on this grid. The engine's linearization is that of `model`.
+// dynamics::simulate on this grid. Not `exact`: without the second derivatives, of lower order in the step and twice as
+// fast; enough for a Gauss-Newton step.
 bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& grid, const VectorX& unknowns,
-              const dynamics::InitialState& initial, bool derivatives, Rollout& out);
+              const dynamics::InitialState& initial, bool derivatives, Rollout& out, bool exact = true);
 
 }  // namespace chainsplat::planning

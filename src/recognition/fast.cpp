@@ -14,8 +14,9 @@ namespace {
 constexpr int kRounds = 4;
 constexpr int kSteps = 100;  // Adam steps a round
 constexpr int kBatch = 3;    // views a step
-constexpr int kFirstGaussians = 1200;
-constexpr int kAddedARound = 150;
+constexpr double kGaussiansADiameter =
+    100.0;                           // of the rope's length, when no budget is given: more gain little (DESIGN)
+constexpr double kFirstShare = 0.8;  // of the budget, placed at the start; the rest goes where the images ask
 constexpr int kAngleIterations = 1;  // Gauss-Newton steps a round and frame
 constexpr int kFinalIterations = 1;  // for every frame, at the end
 constexpr int kFinalSteps = 120;     // Adam steps after the last round, rates falling
@@ -72,6 +73,10 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
                              bending, options.twist);
   };
   const int total_steps = kRounds * kSteps + kFinalSteps;
+  constexpr double kLeastBudget = 300, kMostBudget = 6000;  // of the automatic choice: short stubs and thin cables
+  const double by_size = std::clamp(kGaussiansADiameter * capture.length / capture.diameter, kLeastBudget, kMostBudget);
+  const int budget = options.budget > 0 ? options.budget : static_cast<int>(std::lround(by_size));
+  const int added_a_round = std::max(1, budget / 10);
   int done_steps = 0, first_round = 0;
   splat::Gaussians gaussians;
   chain::States states;
@@ -149,7 +154,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   if (!before) {
     core::Random random(options.seed * 1000003 + 1);
     gaussians = place_along_chain(chain, capture, states, frames, training.frames,
-                                  std::min(kFirstGaussians, options.budget), random);
+                                  static_cast<int>(kFirstShare * budget), random);
   }
 
   const splat::LossWeights weights{1.0f, 0.0f, kMaskWeight};
@@ -226,7 +231,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
       std::vector<Drawn> drawn;
       for (std::size_t i = 0; i < pictures.size(); ++i)
         drawn.push_back({&capture.views[training.views[i]], &specs[i].motions, &pictures[i]});
-      add_and_prune(gaussians, chain, capture, drawn, options.budget, kAddedARound, random);
+      add_and_prune(gaussians, chain, capture, drawn, budget, added_a_round, random);
       if (round + 1 == kShRound && gaussians.degree == 0) gaussians.resize(gaussians.count, gaussians.links, 1);
     }
   }

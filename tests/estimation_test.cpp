@@ -1,0 +1,287 @@
+// The filter on masks drawn from a known motion: a rope of the twin's kind with other parameters, seen by one camera.
+#include "chainsplat/estimation.h"
+
+#include <doctest/doctest.h>
+
+#include <cmath>
+#include <nlohmann/json.hpp>
+
+namespace {
+
+using namespace chainsplat;
+using math::MatrixX;
+using math::Pose;
+using math::Vector2;
+using math::Vector3;
+using math::VectorX;
+
+constexpr double kInterval = 1.0 / 30.0;
+
+twin::Twin rope_twin() {
+  twin::Twin twin;
+  twin.chain = chain::make_chain(0.3, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 6, chain::Bending::spatial, false);
+  dynamics::Parameters p;
+  for (auto* list : {&p.viscous_friction, &p.coulomb_friction, &p.air_linear, &p.air_quadratic}) list->assign(6, 0.0);
+  p.link_mass.assign(6, 0.01);
+  p.stiffness.assign(12, 0.012);
+  p.damping.assign(12, 1e-3);
+  p.rest_angle.assign(12, 0.0);
+  p.radius = 0.01;
+  twin.parameters = p;
+  return twin;
+}
+
+// Swings along x, the camera looks along -y: out-of-plane motion is depth.
+trajectory::BaseMotion moving_base(double t) {
+  const double a = 0.05, w = 3.0;
+  trajectory::BaseMotion base;
+  base.pose.translation = Vector3(a * (1.0 - std::cos(w * t)), 0.0, 0.55);
+  base.velocity[3] = a * w * std::sin(w * t);
+  base.acceleration[3] = a * w * w * std::cos(w * t);
+  return base;
+}
+
+capture::Camera front_camera() {
+  capture::Camera c;
+  c.name = "front";
+  c.width = 320;
+  c.height = 240;
+  c.fx = c.fy = 300.0;
+  c.cx = 160.0;
+  c.cy = 120.0;
+  c.world_from_camera.rotation << 1, 0, 0, 0, 0, 1, 0, -1, 0;  // x right, z down, looks along +y
+  c.world_from_camera.translation = Vector3(0.05, -0.7, 0.4);
+  return c;
+}
+
+// Pixels whose rays pass within the radius of the rope's axis, tried at 3 x 3 places of a pixel.
+capture::View draw(const chain::Chain& chain, const VectorX& theta, double time, int frame, const capture::Camera& c) {
+  const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, moving_base(time).pose));
+  const Vector3 eye = c.world_from_camera.translation;
+  const double radius = 0.5 * chain.diameter;
+  const auto hit = [&](double u, double v) {
+    const Vector3 ray =
+        (c.world_from_camera.rotation * Vector3((u - c.cx) / c.fx, (v - c.cy) / c.fy, 1.0)).normalized();
+    for (int i = 0; i + 1 < nodes.cols(); ++i) {
+      const Vector3 a = nodes.col(i), d = nodes.col(i + 1) - nodes.col(i);
+      if (d.norm() <= 0.0) continue;
+      // nearest points of the ray and the axis
+      const Vector3 across = ray.cross(d);
+      const double t = across.dot(ray.cross(eye - a)) / across.squaredNorm();
+      if (t < (i == 0 ? 0.0 : -0.02) || t > 1.0) continue;
+      if (std::abs(across.normalized().dot(eye - a)) <= radius) return true;
+    }
+    return false;
+  };
+  capture::View view;
+  view.time = time;
+  view.frame = frame;
+  view.width = c.width;
+  view.height = c.height;
+  view.rgba.assign(4 * static_cast<std::size_t>(c.width) * c.height, 0);
+  for (int y = 0; y < c.height; ++y)
+    for (int x = 0; x < c.width; ++x) {
+      int hits = 0;
+      for (int i = 0; i < 9; ++i) hits += hit(x + (i % 3 + 0.5) / 3.0, y + (i / 3 + 0.5) / 3.0);
+      if (hits >= 5) view.rgba[4 * (static_cast<std::size_t>(y) * c.width + x) + 3] = 255;
+    }
+  return view;
+}
+
+// True motion: from a bend out of the plane that the twin does not know of.
+chain::States true_motion(const twin::Twin& twin, int frames) {
+  dynamics::InitialState initial;
+  initial.theta = VectorX::Zero(12);
+  initial.thetadot = VectorX::Zero(12);
+  for (int k = 1; k < 12; k += 2) initial.theta[k] = 0.03;
+  std::vector<double> times;
+  for (int f = 0; f < frames; ++f) times.push_back(f * kInterval);
+  dynamics::Parameters p = *twin.parameters;
+  p.stiffness.assign(12, 0.010);
+  p.damping.assign(12, 1.2e-3);
+  return dynamics::rollout(dynamics::make_model(twin.chain, p), moving_base, initial, times);
+}
+
+double rms(const chain::Chain& chain, const VectorX& a, const VectorX& b) {
+  const std::vector<double> arclengths = chain::equal_arclengths(chain, 31);
+  const MatrixX p = chain::centerline(chain, chain::link_motions(chain, a, Pose{}), arclengths);
+  const MatrixX q = chain::centerline(chain, chain::link_motions(chain, b, Pose{}), arclengths);
+  return std::sqrt((p - q).squaredNorm() / p.cols());
+}
+
+// Standard deviation of the centerline, as rms measures it.
+double deviation(const chain::Chain& chain, const estimation::Estimate& e) {
+  const std::vector<double> arclengths = chain::equal_arclengths(chain, 31);
+  const MatrixX p = chain::centerline(chain, chain::link_motions(chain, e.theta, Pose{}), arclengths);
+  const MatrixX axes = chain::world_axes(chain, e.theta, Pose{});
+  const int n = chain.angles();
+  double variance = 0.0;
+  for (int i = 0; i < p.cols(); ++i) {
+    const MatrixX j = chain::point_jacobian(chain, axes, chain::link_at(chain, arclengths[i]), p.col(i));
+    variance += (j * e.covariance.topLeftCorner(n, n) * j.transpose()).trace() / p.cols();
+  }
+  return std::sqrt(variance);
+}
+
+std::vector<estimation::Estimate> follow(estimation::Filter& filter, const std::vector<capture::View>& views) {
+  std::vector<estimation::Estimate> out;
+  for (const capture::View& view : views) {
+    const capture::View* const one[] = {&view};
+    out.push_back(estimation::update(filter, one));
+  }
+  return out;
+}
+
+const twin::Twin& shared_twin() {
+  static const twin::Twin twin = rope_twin();
+  return twin;
+}
+const chain::States& shared_truth() {
+  static const chain::States truth = true_motion(shared_twin(), 45);
+  return truth;
+}
+const std::vector<capture::View>& shared_views() {
+  static const std::vector<capture::View> views = [] {
+    std::vector<capture::View> drawn;
+    for (int f = 0; f < 45; ++f)
+      drawn.push_back(draw(shared_twin().chain, shared_truth().theta[f], f * kInterval, f, front_camera()));
+    return drawn;
+  }();
+  return views;
+}
+
+TEST_CASE("one camera and the dynamics follow a rope in space, with honest deviations") {
+  const twin::Twin& twin = shared_twin();
+  for (const int drop : {1, 2}) {
+    CAPTURE(drop);
+    estimation::Filter filter = estimation::start(twin, {front_camera()}, moving_base, 0.0);
+    std::vector<capture::View> views;
+    for (std::size_t f = 0; f < shared_views().size(); f += drop) views.push_back(shared_views()[f]);
+    double square = 0.0;
+    int used = 0, honest = 0;
+    for (const estimation::Estimate& e : follow(filter, views)) {
+      CHECK_FALSE(e.lost);
+      CHECK(e.seen);
+      CHECK(e.iou > 0.85);
+      const double error = rms(twin.chain, e.theta, shared_truth().theta[e.frame]);
+      honest += error <= 3.0 * deviation(twin.chain, e);
+      CHECK(error < 8e-3);
+      if (e.frame < 10) continue;
+      square += error * error;
+      ++used;
+    }
+    CHECK(std::sqrt(square / used) < 4e-3);  // 1 pixel is 2.3 mm here
+    CHECK(honest >= 0.95 * static_cast<double>(views.size()));
+  }
+}
+
+TEST_CASE("depth comes from the dynamics: without them it is worse, and said to be less sure") {
+  twin::Twin still = shared_twin();
+  still.parameters.reset();
+  estimation::Filter with = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  estimation::Filter without = estimation::start(still, {front_camera()}, moving_base, 0.0);
+  const auto a = follow(with, shared_views()), b = follow(without, shared_views());
+  CHECK(deviation(still.chain, b.back()) > 2.0 * deviation(still.chain, a.back()));
+  double error_with = 0.0, error_without = 0.0;
+  for (std::size_t f = 15; f < a.size(); ++f) {
+    error_with += rms(still.chain, a[f].theta, shared_truth().theta[f]);
+    error_without += rms(still.chain, b[f].theta, shared_truth().theta[f]);
+  }
+  CHECK(error_with < error_without);
+}
+
+TEST_CASE("a rope out of sight is predicted, counts as lost in time, and is found again") {
+  std::vector<capture::View> views = shared_views();
+  for (int f = 10; f < 32; ++f) std::fill(views[f].rgba.begin(), views[f].rgba.end(), std::uint8_t{0});
+  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  const auto found = follow(filter, views);
+  CHECK_FALSE(found[12].seen);
+  CHECK_FALSE(found[12].lost);
+  CHECK(rms(shared_twin().chain, found[12].theta, shared_truth().theta[12]) < 8e-3);
+  CHECK(deviation(shared_twin().chain, found[30]) > deviation(shared_twin().chain, found[9]));
+  CHECK(found[30].lost);
+  CHECK_FALSE(found[33].lost);
+  CHECK(rms(shared_twin().chain, found[40].theta, shared_truth().theta[40]) < 4e-3);
+}
+
+TEST_CASE("a mask elsewhere is not the rope: lost, and the prediction stays") {
+  std::vector<capture::View> views(shared_views().begin(), shared_views().begin() + 14);
+  for (int f = 8; f < 11; ++f) {
+    std::fill(views[f].rgba.begin(), views[f].rgba.end(), std::uint8_t{0});
+    for (int y = 5; y < 25; ++y)
+      for (int x = 270; x < 310; ++x) views[f].rgba[4 * (y * views[f].width + x) + 3] = 255;
+  }
+  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  const auto found = follow(filter, views);
+  for (int f = 8; f < 11; ++f) {
+    CHECK(found[f].lost);
+    CHECK(rms(shared_twin().chain, found[f].theta, shared_truth().theta[f]) < 10e-3);
+  }
+  CHECK_FALSE(found[13].lost);
+  CHECK(rms(shared_twin().chain, found[13].theta, shared_truth().theta[13]) < 5e-3);
+}
+
+TEST_CASE("the predicted covariance is that of the predicted mean's derivative") {
+  const int n = 12;
+  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  estimation::Belief belief;
+  belief.time = 0.3;
+  belief.mean = VectorX::Zero(3 * n);
+  for (int k = 0; k < 3 * n; ++k) belief.mean[k] = 0.1 * std::sin(1.0 + k);
+  VectorX direction(3 * n);  // smooth along the rope: the variational equation is second order in stiff modes
+  for (int k = 0; k < 3 * n; ++k) direction[k] = 1.0 + 0.3 * std::cos(0.2 * k);
+  const double size = 1e4;  // makes the process noise small beside
+  belief.covariance = size * size * direction * direction.transpose();
+  const estimation::Belief moved = estimation::predict(filter, belief, 0.3 + kInterval, false);
+  const double step = 1e-5;
+  estimation::Belief a = belief, b = belief;
+  a.mean += step * direction;
+  b.mean -= step * direction;
+  const VectorX slope = (estimation::predict(filter, a, 0.3 + kInterval, false).mean -
+                         estimation::predict(filter, b, 0.3 + kInterval, false).mean) /
+                        (2.0 * step);
+  const VectorX expected = size * slope.cwiseAbs(), got = moved.covariance.diagonal().cwiseSqrt();
+  CHECK((got - expected).norm() <= 0.05 * expected.norm());
+}
+
+TEST_CASE("the tube covers its own mask, and half of it when the other half is hidden") {
+  const twin::Twin& twin = shared_twin();
+  capture::View view = shared_views()[20];
+  const VectorX theta = shared_truth().theta[20];
+  const Pose base = moving_base(20 * kInterval).pose;
+  const double whole = estimation::tube_iou(twin.chain, base, theta, view, front_camera());
+  CHECK(whole > 0.93);
+  int mask = 0, kept = 0;
+  for (int y = 0; y < view.height; ++y)
+    for (int x = 0; x < view.width; ++x) {
+      std::uint8_t& a = view.rgba[4 * (y * view.width + x) + 3];
+      mask += a != 0;
+      if (y > 120) a = 0;
+      kept += a != 0;
+    }
+  CHECK(estimation::tube_iou(twin.chain, base, theta, view, front_camera()) ==
+        doctest::Approx(whole * kept / mask).epsilon(0.05));
+}
+
+TEST_CASE("a line of JSON holds what INTERFACE 5 names") {
+  estimation::Estimate e;
+  e.frame = 12;
+  e.time = 0.4;
+  e.theta = VectorX::Constant(2, 0.5);
+  e.thetadot = VectorX::Constant(2, -1.0);
+  e.covariance = 0.04 * MatrixX::Identity(4, 4);
+  e.iou = 0.94;
+  e.residual = 0.25;
+  const auto line = nlohmann::json::parse(estimation::to_json(e, 0.0079));
+  CHECK(line["frame"] == 12);
+  CHECK(line["time"] == 0.4);
+  CHECK(line["theta"].size() == 2);
+  CHECK(line["thetadot"][1] == -1.0);
+  CHECK(line["sigma"][0].get<double>() == doctest::Approx(0.2));
+  CHECK(line["iou"] == 0.94);
+  CHECK(line["residual"] == 0.25);
+  CHECK(line["lost"] == false);
+  CHECK(line["latency_ms"].get<double>() == doctest::Approx(7.9));
+}
+
+}  // namespace

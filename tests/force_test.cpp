@@ -1,0 +1,211 @@
+// External forces against vectors made without this code (tests/data/vectors), motions known in closed form, and ropes
+// put in balance with a force.
+#include "chainsplat/force.h"
+
+#include <doctest/doctest.h>
+
+#include <cmath>
+#include <nlohmann/json.hpp>
+
+namespace {
+
+using namespace chainsplat;
+using math::Matrix3;
+using math::MatrixX;
+using math::Vector3;
+using math::VectorX;
+using Json = nlohmann::json;
+
+VectorX vector_of(const Json& list) {
+  const auto values = list.get<std::vector<double>>();
+  return Eigen::Map<const VectorX>(values.data(), static_cast<Eigen::Index>(values.size()));
+}
+
+dynamics::Parameters uniform(int joints, int angles, double mass, double stiffness, double damping, double radius) {
+  dynamics::Parameters p;
+  for (auto* list : {&p.viscous_friction, &p.coulomb_friction, &p.air_linear, &p.air_quadratic})
+    list->assign(joints, 0.0);
+  p.link_mass.assign(joints, mass / joints);
+  p.stiffness.assign(angles, stiffness);
+  p.damping.assign(angles, damping);
+  p.rest_angle.assign(angles, 0.0);
+  p.radius = radius;
+  return p;
+}
+
+// The elastic rope of DESIGN's captures, hanging, with rest angles that put it in balance at `theta` with a force.
+struct Balanced {
+  dynamics::Model model;
+  math::Pose base;
+  VectorX theta;
+};
+
+Balanced balance(chain::Bending bending, const VectorX& theta, double arclength, const Vector3& force) {
+  Balanced out;
+  const chain::Chain rope = chain::make_chain(0.3, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 8, bending, false);
+  dynamics::Parameters p = uniform(8, rope.angles(), 0.06, 0.012, 1e-3, 0.01);
+  out.base.translation = Vector3(0.1, 0.0, 0.55);
+  out.theta = theta;
+  out.model = dynamics::make_model(rope, p);
+  const int link = chain::link_at(rope, arclength);
+  const auto motions = chain::link_motions(rope, theta, out.base);
+  const MatrixX jacobian = chain::point_jacobian(rope, chain::world_axes(rope, theta, out.base), link,
+                                                 motions[link] * Vector3(arclength * rope.direction));
+  const VectorX zero = VectorX::Zero(theta.size());
+  const VectorX gravity = dynamics::inverse_dynamics(out.model, dynamics::at_rest(out.base), theta, zero, zero);
+  // J^T f = gravity + K (theta - rest)
+  for (int k = 0; k < theta.size(); ++k)
+    p.rest_angle[k] = theta[k] + (gravity[k] - jacobian.col(k).dot(force)) / p.stiffness[k];
+  out.model = dynamics::make_model(rope, p);
+  return out;
+}
+
+force::Motion at_rest(const VectorX& theta, int count) {
+  chain::States states;
+  for (int f = 0; f < count; ++f) {
+    states.time.push_back(f / 30.0);
+    states.theta.push_back(theta);
+  }
+  return force::smooth(states, {}, false);
+}
+
+VectorX bent(int angles) {
+  VectorX theta(angles);
+  for (int k = 0; k < angles; ++k) theta[k] = 0.04 * std::cos(0.7 * k) + 0.02;
+  return theta;
+}
+
+TEST_CASE("Jacobian, residual torque and force of the vectors") {
+  const Json file = Json::parse(core::read_file(Path(CHAINSPLAT_SOURCE_DIR) / "tests/data/vectors/force.json"));
+  const Json& c = file["chain"];
+  const int links = c["links"];
+  const chain::Chain rope = chain::make_chain(c["length"], 0.02, vector_of(c["direction"]), vector_of(c["axis"]), links,
+                                              chain::Bending::planar, false);
+  const dynamics::Model model =
+      dynamics::make_model(rope, uniform(links, links, c["mass"], c["stiffness"], c["damping"], c["radius"]));
+  for (const Json& test : file["cases"]) {
+    CAPTURE(test["name"].get<std::string>());
+    trajectory::BaseMotion base;
+    for (int r = 0; r < 3; ++r) {
+      for (int column = 0; column < 3; ++column) base.pose.rotation(r, column) = test["T_b"][r][column];
+      base.pose.translation[r] = test["T_b"][r][3];
+    }
+    base.velocity = vector_of(test["V_b"]);
+    base.acceleration = vector_of(test["Vdot_b"]);
+    const VectorX theta = vector_of(test["theta"]);
+    const VectorX residual =
+        force::residual_torque(model, base, theta, vector_of(test["thetadot"]), vector_of(test["thetaddot"]));
+    const VectorX expected = vector_of(test["residual_torque"]);
+    CHECK((residual - expected).norm() <= 1e-10 * expected.norm());
+
+    const int link = test["link"];
+    const auto motions = chain::link_motions(rope, theta, base.pose);
+    const Vector3 home = rope.link_start(link) * rope.direction + Vector3(vector_of(test["point_in_link"]));
+    const MatrixX jacobian =
+        chain::point_jacobian(rope, chain::world_axes(rope, theta, base.pose), link, motions[link] * home);
+    for (int r = 0; r < 3; ++r) CHECK((jacobian.row(r).transpose() - vector_of(test["jacobian"][r])).norm() <= 1e-12);
+    const force::Fit fit =
+        force::solve(jacobian, residual, 1e-8 * MatrixX::Identity(links, links), 1e6 * Matrix3::Identity());
+    CHECK((fit.force - Vector3(vector_of(test["estimate"]))).norm() <= 1e-6);
+    // the bending axis is invisible and said to be
+    CHECK(fit.covariance(1, 1) == doctest::Approx(1e6));
+  }
+}
+
+TEST_CASE("smoothing finds angle, rate and acceleration of a swing, and its own errors") {
+  chain::States states;
+  core::Random random(3);
+  const double w = 2.5, noise = 0.005;
+  const int count = 120;
+  for (int f = 0; f < count; ++f) {
+    const double t = f / 30.0;
+    states.time.push_back(t);
+    states.theta.push_back(VectorX::Constant(1, 0.4 * std::sin(w * t) + noise * random.normal()));
+  }
+  for (const bool live : {false, true}) {
+    CAPTURE(live);
+    const force::Motion motion = force::smooth(states, {}, live);
+    double rate = 0.0, acceleration = 0.0;
+    int inside = 0, used = 0;
+    for (int f = 20; f + 20 < count; ++f) {
+      const double t = states.time[f];
+      const double a = motion.thetaddot[f][0] + 0.4 * w * w * std::sin(w * t);
+      rate += std::pow(motion.thetadot[f][0] - 0.4 * w * std::cos(w * t), 2);
+      acceleration += a * a;
+      inside += std::abs(a) <= 3.0 * std::sqrt(motion.covariance[f][0](2, 2));
+      ++used;
+    }
+    CHECK(std::sqrt(rate / used) < (live ? 0.12 : 0.04));
+    CHECK(std::sqrt(acceleration / used) < (live ? 1.2 : 0.5));  // second differences: 11 rad/s^2
+    CHECK(inside >= 0.95 * used);
+  }
+}
+
+TEST_CASE("a force is found where it acts, automatically") {
+  for (const double arclength : {0.12, 0.18, 0.26}) {
+    CAPTURE(arclength);
+    const Vector3 force(0.10, 0.04, -0.01);
+    const Balanced rope = balance(chain::Bending::spatial, bent(16), arclength, force);
+    const auto base = [&](double) { return dynamics::at_rest(rope.base); };
+    const std::vector<force::Estimate> found = force::estimate(rope.model, base, at_rest(rope.theta, 9), {}, false);
+    for (const force::Estimate& e : found) {
+      CHECK(e.touching);
+      CHECK(std::abs(e.contact.arclength - arclength) < 0.015);
+      CHECK((e.force - force).norm() < 0.2 * force.norm());
+      for (int i = 0; i < 3; ++i) CHECK(std::abs(e.force[i] - force[i]) <= 3.0 * e.sigma[i]);
+    }
+  }
+}
+
+TEST_CASE("nothing touches a rope in balance with its weight alone") {
+  const Balanced rope = balance(chain::Bending::spatial, bent(16), 0.2, Vector3::Zero());
+  const auto base = [&](double) { return dynamics::at_rest(rope.base); };
+  for (const force::Estimate& e : force::estimate(rope.model, base, at_rest(rope.theta, 5), {}, false)) {
+    CHECK_FALSE(e.touching);
+    CHECK(e.force.norm() < 0.05 * 0.06 * 9.81);
+  }
+}
+
+TEST_CASE("a planar chain says that it does not see the force along its bending axis") {
+  const double arclength = 0.2;
+  const Balanced rope = balance(chain::Bending::planar, bent(8), arclength, Vector3(0.08, 0.0, 0.0));
+  const auto base = [&](double) { return dynamics::at_rest(rope.base); };
+  std::vector<std::optional<force::Contact>> contacts(5, force::Contact{});
+  contacts[2].reset();
+  for (auto& contact : contacts)
+    if (contact)
+      contact = force::Contact{chain::link_at(rope.model.chain, arclength), arclength,
+                               arclength * rope.model.chain.direction};
+  const auto found = force::estimate(rope.model, base, at_rest(rope.theta, 5), contacts, false);
+  CHECK(found[0].observed.y() < 0.01);
+  CHECK(found[0].observed.x() > 0.9);
+  CHECK(found[0].sigma.y() > 0.4);
+  CHECK(found[0].force.x() == doctest::Approx(0.08).epsilon(0.1));
+  CHECK(found[2].force.norm() == 0.0);
+  CHECK_FALSE(found[2].touching);
+  const Json line = Json::parse(force::to_json(found[0], false));
+  CHECK(line["unit"] == "N/kg");
+  CHECK(line["link"] == found[0].contact.link);
+  CHECK(line["force"][0] == found[0].force.x());
+}
+
+TEST_CASE("the contact is the nearest Gaussian on its most probable link, else the nearest point of the centerline") {
+  const chain::Chain rope =
+      chain::make_chain(0.3, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 4, chain::Bending::planar, false);
+  splat::Gaussians gaussians;
+  gaussians.resize(2, rope.links(), 0);
+  const float mean[] = {0.01f, 0.0f, -0.1f, -0.01f, 0.0f, -0.25f};
+  std::copy(mean, mean + 6, gaussians.mean.begin());
+  gaussians.link_logits[0 * rope.links() + 2] = 5.0f;
+  gaussians.link_logits[1 * rope.links() + 4] = 5.0f;
+  const VectorX theta = VectorX::Zero(4);
+  const MatrixX point = Vector3(0.05, 0.0, -0.20);
+  const force::Contact surface = force::nearest_contact(rope, gaussians, math::Pose{}, theta, point);
+  CHECK(surface.link == 4);
+  CHECK(surface.arclength == doctest::Approx(0.25));
+  const force::Contact axis = force::nearest_contact(rope, {}, math::Pose{}, theta, point);
+  CHECK(axis.arclength == doctest::Approx(0.20));
+  CHECK(axis.link == 3);
+}
+
+}  // namespace

@@ -1,0 +1,107 @@
+// new.cpp - an empty twin: a chain to identify from measured markers instead of videos.
+#include <CLI/CLI.hpp>
+#include <iostream>
+#include <memory>
+#include <nlohmann/json.hpp>
+
+#include "chainsplat/twin.h"
+#include "cli.h"
+
+namespace chainsplat::tools {
+
+namespace {
+
+constexpr int kMostJoints = 64;
+constexpr double kPerpendicular = 1e-6;  // largest cosine between direction and bending axis that is taken as 0
+
+struct Request {
+  std::string out, bending = "spatial";
+  double length = 0.0, diameter = 0.02, mass = 0.0;  // m, m, kg; mass 0: unknown
+  int joints = 8;
+  std::vector<double> direction{0, 0, -1}, bending_axis, gravity{0, 0, -9.81};
+  bool force = false;
+};
+
+math::Vector3 vector_of(const std::vector<double>& values) { return {values[0], values[1], values[2]}; }
+
+math::Vector3 unit_of(const std::vector<double>& values, const char* option) {
+  const math::Vector3 v = vector_of(values);
+  if (!v.allFinite() || !(v.norm() > 0.0))
+    throw InputError(option, "has no direction", "give three numbers, not all 0");
+  return v.normalized();
+}
+
+void make_new(const Globals& globals, const Request& request) {
+  check_output_folder(request.out, request.force, "name another folder, or give --force");
+  const math::Vector3 direction = unit_of(request.direction, "--direction");
+  math::Vector3 bending_axis;
+  if (request.bending_axis.empty()) {
+    // any axis across the rope; y where it is one, as in the examples of captures
+    const math::Vector3 y = math::Vector3::UnitY(), z = math::Vector3::UnitZ();
+    const math::Vector3 across = std::abs(direction.dot(y)) < 0.9 ? y : z;
+    bending_axis = (across - direction * direction.dot(across)).normalized();
+  } else {
+    bending_axis = unit_of(request.bending_axis, "--bending-axis");
+    if (std::abs(bending_axis.dot(direction)) > kPerpendicular)
+      throw InputError("--bending-axis", "is not perpendicular to --direction", "give an axis across the rope");
+  }
+  twin::Twin twin;
+  twin.gravity = vector_of(request.gravity);
+  if (!twin.gravity.allFinite()) throw InputError("--gravity", "is not finite", "give three finite numbers in m/s^2");
+  twin.chain = chain::make_chain(request.length, request.diameter, direction, bending_axis, request.joints,
+                                 request.bending == "planar" ? chain::Bending::planar : chain::Bending::spatial, false);
+  twin.known_mass = request.mass > 0.0;
+  if (twin.known_mass) twin.provenance.options["mass"] = core::exact(request.mass);
+  twin.provenance.version = CHAINSPLAT_VERSION;
+  twin.provenance.seed = globals.seed;
+  twin.provenance.options["bending"] = request.bending;
+  twin.provenance.options["joints"] = std::to_string(request.joints);
+  twin::save(twin, request.out);
+  if (globals.json) {
+    nlohmann::ordered_json document;
+    document["run"] = request.out;
+    document["joints"] = twin.chain.links() - 1;
+    document["angles"] = twin.chain.angles();
+    std::cout << document.dump(1) << "\n";
+  } else {
+    std::cout << "twin: " << request.out << "\n";
+  }
+}
+
+}  // namespace
+
+void add_new_command(CLI::App& app, const Globals& globals, Job& job) {
+  CLI::App* command = app.add_subcommand("new", "Make an empty twin, to identify from markers instead of videos");
+  auto request = std::make_shared<Request>();
+  command->add_option("-o,--output", request->out, "Run folder to make: the twin")->required()->type_name("RUN");
+  command->add_option("--length", request->length, "From the grasp to the free end, m")
+      ->required()
+      ->check(CLI::PositiveNumber)
+      ->type_name("M");
+  command->add_option("--diameter", request->diameter, "m (default 0.02)")->check(CLI::PositiveNumber)->type_name("M");
+  command->add_option("--joints", request->joints, "Joints along the rope (default 8)")
+      ->check(CLI::Range(1, kMostJoints))
+      ->type_name("N");
+  command->add_option("--bending", request->bending, "Axes a joint: planar (one) or spatial (two, default)")
+      ->check(CLI::IsMember({"planar", "spatial"}))
+      ->type_name("KIND");
+  command->add_option("--direction", request->direction, "Where the rope leaves the grasp, base frame (default 0,0,-1)")
+      ->delimiter(',')
+      ->expected(3)
+      ->type_name("X,Y,Z");
+  command->add_option("--bending-axis", request->bending_axis, "Axis of bending, base frame (default: across, near y)")
+      ->delimiter(',')
+      ->expected(3)
+      ->type_name("X,Y,Z");
+  command->add_option("--gravity", request->gravity, "World frame, m/s^2 (default 0,0,-9.81)")
+      ->delimiter(',')
+      ->expected(3)
+      ->type_name("X,Y,Z");
+  command->add_option("--mass", request->mass, "kg (default: unknown, forces are per kilogram)")
+      ->check(CLI::PositiveNumber)
+      ->type_name("KG");
+  command->add_flag("--force", request->force, "Also into a folder that is not empty");
+  command->callback([&globals, &job, request] { job = [&globals, request] { make_new(globals, *request); }; });
+}
+
+}  // namespace chainsplat::tools
