@@ -246,6 +246,30 @@ TEST_CASE("a rope simulated by another program is followed open loop within half
   CHECK(std::exp(estimate(result, "log_damping")) == doctest::Approx(9.6e-4).epsilon(0.3));
 }
 
+TEST_CASE("markers alone tell the motion between and beyond them") {
+  const Scene s = scene(false, chain::Bending::planar, 0.0);
+  Markers markers;
+  markers.arclengths = {0.1, 0.2, 0.3};
+  markers.deviation = 1e-3;
+  core::Random random(3);
+  for (std::size_t k = 0; k < s.clean.time.size(); ++k) {
+    const auto motions = chain::link_motions(s.chain, s.clean.theta[k], s.base.pose(s.clean.time[k]));
+    MatrixX seen = chain::centerline(s.chain, motions, markers.arclengths);
+    for (Eigen::Index i = 0; i < seen.size(); ++i) seen.data()[i] += 1e-3 * random.normal();
+    if (k % 10 == 3) seen.col(1).setConstant(NAN);  // a marker that is hidden now and then
+    markers.time.push_back(s.clean.time[k]);
+    markers.world.push_back(seen);
+  }
+  const chain::States fitted = fit_markers(s.chain, s.base, markers);
+  CHECK(node_rms(s.chain, fitted, s.clean) < 2e-3);
+  Options options;
+  options.mass = 0.06;
+  const Result result = identify(s.chain, s.base, markers, options);
+  CHECK(node_rms(s.chain, result.rollout, s.clean) < 1e-3);  // less than one marker's noise
+  markers.arclengths[2] = 0.4;  // beyond the rope
+  CHECK_THROWS_AS(fit_markers(s.chain, s.base, markers), InputError);
+}
+
 TEST_CASE("too little or broken data are refused") {
   const Scene s = scene(false, chain::Bending::planar, 0.0, 5);
   chain::States few = s.seen;
