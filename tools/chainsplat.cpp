@@ -60,6 +60,7 @@ int run(int argc, char** argv) {
   app.add_flag("--no-progress", globals.no_progress, "No progress, but messages");
   app.add_flag("--json", globals.json, "Standard output is one JSON document and nothing else");
   tools::add_training_commands(app, globals, job);
+  tools::add_identify_command(app, globals, job);
   tools::add_motion_commands(app, globals, job);
   tools::add_result_commands(app, globals, job);
   tools::add_estimation_commands(app, globals, job);

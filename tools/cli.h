@@ -24,7 +24,8 @@ struct Globals {
 using Job = std::function<void()>;
 
 // Each adds its commands to `app`; the one that was named sets `job`.
-void add_training_commands(CLI::App& app, const Globals& globals, Job& job);    // train, recognize, identify
+void add_training_commands(CLI::App& app, const Globals& globals, Job& job);  // train, recognize
+void add_identify_command(CLI::App& app, const Globals& globals, Job& job);
 void add_motion_commands(CLI::App& app, const Globals& globals, Job& job);      // rollout, render
 void add_result_commands(CLI::App& app, const Globals& globals, Job& job);      // eval, export, synth
 void add_inspection_commands(CLI::App& app, const Globals& globals, Job& job);  // check, doctor
