@@ -4,6 +4,7 @@
 // Twists and wrenches are (angular, linear), in the frame of their link. Equations are named by SPEC's numbers.
 #pragma once
 #include <functional>
+#include <memory>
 #include <optional>
 #include <span>
 #include <string>
@@ -69,8 +70,8 @@ struct Model {
   std::vector<math::Matrix6> inertia;  // G_i, in {i}; 0 for massless bodies, the tip mass in the last one
 };
 
-// Throws InputError where an array has the wrong length, a number is not finite or negative where it must not be, or an
-// axis does not pass through its joint.
+// Throws InputError where an array has the wrong length, a number is not finite or negative where it must not be, a
+// link has no mass, or an axis does not pass through its joint.
 Model make_model(const chain::Chain& chain, const Parameters& parameters);
 
 // The base at rest in `pose`.
@@ -83,7 +84,8 @@ VectorX inverse_dynamics(const Model& model, const trajectory::BaseMotion& base,
 VectorX joint_law(const Model& model, const VectorX& theta, const VectorX& thetadot);
 // M(theta), n x n, kg m^2. SPEC 3.4.
 MatrixX mass_matrix(const Model& model, const VectorX& theta);
-// thetaddot of the free motion: dense M and Cholesky. Throws WorkError where M is not positive definite.
+// thetaddot of the free motion: dense M and Cholesky. Throws InputError, with the joint, where M is not positive
+// definite.
 VectorX forward_dynamics(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                          const VectorX& thetadot);
 // The same by the articulated body algorithm, O(n). SPEC 3.4.
@@ -107,6 +109,15 @@ struct Linearization {
 // `base_jerk` is the component-wise derivative of `base.acceleration`.
 Linearization linearize(const Model& model, const trajectory::BaseMotion& base, const Vector6& base_jerk,
                         const VectorX& theta, const VectorX& thetadot);
+
+// d tau_ID at fixed thetaddot = a by the base motion, components as in BaseMotion; rotation: by a small turn of the
+// base about its own axes, R_b <- R_b exp([.]). da/d(.) = -M^-1 of them.
+struct BaseSlopes {
+  MatrixX acceleration, velocity;  // n x 6
+  MatrixX rotation;                // n x 3
+};
+BaseSlopes base_slopes(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
+                       const VectorX& thetadot);
 
 // The stacked matrices of SPEC 3.5 (paper, "Closed-form dynamics", corrected): for reading and checking, O(n^3),
 // viscous and other wrenches as in 3.3. M thetaddot + coriolis + gravity + base - friction = -K(theta - theta_0) - D
@@ -149,9 +160,20 @@ struct Tangent {
   double tip_mass = 0.0;
   VectorX theta, thetadot;
 };
+// d(joint law - tau_ID) / d unknowns at fixed thetaddot = a, n x unknowns; M^-1 of it is da / d unknowns. The tangents'
+// initial states have no part in it.
+MatrixX unknown_forces(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
+                       const VectorX& thetadot, std::span<const Tangent> unknowns);
 // d theta / d unknowns and d thetadot / d unknowns at every output time, n x unknowns each.
 struct Sensitivities {
   std::vector<MatrixX> theta, thetadot;
+};
+
+// Where a motion left all bounds, or where the mass matrix was singular.
+struct Divergence {
+  double time = 0.0;  // s
+  int angle = 0;      // from 0: the first beyond bounds, or the first without inertia
+  bool singular = false;
 };
 
 // Integrates over the grid and fills `states` at the output nodes (allocated once, reused). False where the motion left
@@ -159,10 +181,29 @@ struct Sensitivities {
 // only): trapezoidal rule with the factorization of the step, second order, not the exact derivative of the discrete
 // map.
 bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta, const VectorX& thetadot,
-              chain::States& states, std::span<const Tangent> unknowns = {}, Sensitivities* sensitivities = nullptr);
+              chain::States& states, std::span<const Tangent> unknowns = {}, Sensitivities* sensitivities = nullptr,
+              Divergence* divergence = nullptr);
+
+// One evaluation or one step at a time, without allocation: for loops that cannot wait for a rollout (filters,
+// control). `model` must outlive it.
+class Step;
+class Stepper {
+ public:
+  explicit Stepper(const Model& model);
+  ~Stepper();
+  // thetaddot of the free motion as forward_dynamics(); NaN where M is singular. Valid until the next call.
+  const VectorX& acceleration(const trajectory::BaseMotion& base, const VectorX& theta, const VectorX& thetadot);
+  // From `now` (motion, jerk, step) to the base motion `next`, with the model's integrator; `substeps` are the
+  // caller's. False where the state leaves all bounds or M is singular.
+  bool step(const BaseGrid::Node& now, const trajectory::BaseMotion& next, VectorX& theta, VectorX& thetadot);
+
+ private:
+  std::unique_ptr<Step> step_;
+};
 
 // States at `times` from `initial` (times increasing, the first >= initial.time). Where a rollout diverges it is
-// repeated with finer steps, up to 32 times; then throws WorkError.
+// repeated with half the step, down to 1/32, then the Euler step gives way to RODAS3; each with a warning. Throws
+// WorkError with time and joint where all diverge, InputError where M is singular or sizes do not fit.
 chain::States rollout(const Model& model, const BaseFunction& base, const InitialState& initial,
                       const std::vector<double>& times);
 chain::States rollout(const Model& model, const trajectory::Trajectory& base, const InitialState& initial,

@@ -7,6 +7,7 @@ namespace {
 
 // Three-point Gauss-Legendre rule on [0, 1] (SPEC 3.3).
 const double kGaussPoint[3] = {0.5 * (1.0 - std::sqrt(0.6)), 0.5, 0.5 * (1.0 + std::sqrt(0.6))};
+constexpr double kSingular = 1e-13;  // of an angle's own inertia: less is rounding
 constexpr double kGaussWeight[3] = {5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0};
 
 void add_skew(Matrix3& m, double scale, const Vector3& w) {
@@ -62,7 +63,8 @@ Engine::Engine(const Model& m) : model(m), angles(m.chain.angles()), link_count(
     links.push_back(link);
   }
   for (const Vector6& a : model.axis) local_axis_.push_back(a.head<3>());
-  for (VectorX* v : {&torque, &bias, &force, &acceleration, &inverse, &drive_rate}) v->setZero(angles);
+  for (VectorX* v : {&torque, &bias, &force, &acceleration, &inverse, &drive_rate, &theta_, &thetadot_})
+    v->setZero(angles);
   for (MatrixX* a : {&mass, &cholesky, &stiffness, &damping}) a->setZero(angles, angles);
   for (auto* v : {&axis, &inner_velocity, &inner_acceleration, &turn, &psi_, &weighted_axis_}) v->resize(angles);
   rotation.resize(angles);
@@ -222,7 +224,11 @@ bool Engine::factor_mass() {
       for (int i = j; i < angles; ++i) cholesky(i, j) -= factor * cholesky(i, k);
     }
     const double pivot = cholesky(j, j);
-    if (!(pivot > 0.0)) return false;
+    // what is left of the diagonal after rounding in a singular matrix is no inertia
+    if (!(pivot > kSingular * mass(j, j))) {
+      singular_angle = j;
+      return false;
+    }
     const double scale = 1.0 / std::sqrt(pivot);
     for (int i = j; i < angles; ++i) cholesky(i, j) *= scale;
   }
@@ -297,6 +303,29 @@ void Engine::linearize(const Vector6& base_jerk) {
   }
 }
 
+void Engine::base_slopes(BaseSlopes& slopes) const {
+  slopes.acceleration.resize(angles, 6), slopes.velocity.resize(angles, 6), slopes.rotation.resize(angles, 3);
+  const Matrix3& r = base_rotation_;
+  for (int j = 0; j < link_count; ++j)
+    for (int k = links[j].first_angle; k < links[j].end_angle; ++k) {
+      const Vector6 velocity_row = slope_[j].transpose() * axis[k];
+      const Vector6& inertia_row = weighted_axis_[k];
+      for (int c = 0; c < 6; ++c) {
+        Vector6 unit = Vector6::Zero();
+        unit.segment<3>(c < 3 ? 0 : 3) = r.col(c % 3);
+        slopes.acceleration(k, c) = dot(inertia_row, unit);
+        // E u has the acceleration I (u x V) of bodies that carry the base's own velocity along; here dV_0 stays
+        slopes.velocity(k, c) = dot(velocity_row, unit) + dot(inertia_row, cross(base_velocity_, unit));
+      }
+      for (int c = 0; c < 3; ++c) {
+        // with everything turned but gravity and the table
+        const Vector3 spin = r.col(c);
+        slopes.rotation(k, c) = inertia_row.tail<3>().dot(spin.cross(gravity_));
+        if (table_) slopes.rotation(k, c) -= axis[k].dot(turning_[j] * spin);
+      }
+    }
+}
+
 void Engine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces) {
   const Parameters& parameters = model.parameters;
   // wrenches of a unit of each link parameter, as they enter F_i (external ones with a minus)
@@ -357,7 +386,7 @@ void Engine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces) 
 }
 
 // SPEC 3.4, in world axes: X = I, and the massless bodies of a joint take part with zero own inertia.
-void Engine::articulated_acceleration() {
+bool Engine::articulated_acceleration() {
   std::vector<Vector6> u_vector(angles);
   VectorX pivot(angles), u(angles);
   Matrix6 articulated = Matrix6::Zero();
@@ -374,6 +403,10 @@ void Engine::articulated_acceleration() {
     for (int k = links[j].end_angle - 1; k >= links[j].first_angle; --k) {
       u_vector[k] = articulated * axis[k];
       pivot[k] = dot(axis[k], u_vector[k]);
+      if (!(pivot[k] > kSingular * mass(k, k))) {
+        singular_angle = k;
+        return false;
+      }
       u[k] = torque[k] - dot(axis[k], bias_force);
       articulated -= u_vector[k] * u_vector[k].transpose() / pivot[k];
       bias_force += articulated * (turn[k] * thetadot_[k]) + u_vector[k] * (u[k] / pivot[k]);
@@ -385,6 +418,7 @@ void Engine::articulated_acceleration() {
     acceleration[k] = (u[k] - dot(u_vector[k], a)) / pivot[k];
     a += axis[k] * acceleration[k];
   }
+  return true;
 }
 
 }  // namespace chainsplat::dynamics

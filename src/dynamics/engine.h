@@ -66,18 +66,21 @@ class Engine {
   // The calls build on one another: place, factor_mass, accelerate, linearize, unknown_forces.
   // Poses, axes, velocities, M, bias; with `slopes` also what linearize needs.
   void place(const trajectory::BaseMotion& base, const VectorX& theta, const VectorX& thetadot, bool slopes);
-  bool factor_mass();  // false where M is not positive definite
+  bool factor_mass();  // false, and `singular_angle`, where M is not positive definite
   void accelerate();   // acceleration = M^-1 force
   // Adds `acceleration` to the placed bodies (once a place): fills body_force and `inverse`.
   void inverse_torque();
   // inverse_torque, then stiffness, damping and drive_rate (needs place with slopes).
   void linearize(const Vector6& base_jerk);
+  // What BaseSlopes says, at the linearized state.
+  void base_slopes(BaseSlopes& slopes) const;
   // Column p of `forces`: d(torque - tau_ID)/d(unknown p) at the present state and acceleration.
   void unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces);
-  void articulated_acceleration();  // acceleration by the articulated body algorithm; allocates
+  bool articulated_acceleration();  // acceleration by the articulated body algorithm; allocates; false as factor_mass
 
   const Model& model;
   int angles, link_count;
+  int singular_angle = -1;
   std::vector<LinkConstants> links;
 
   VectorX torque;        // joint law

@@ -24,6 +24,10 @@ Model make_model(const chain::Chain& chain, const Parameters& p) {
   const int links = chain.links() - 1, angles = chain.angles();
   require(links >= 1 && angles >= 1, "the chain has no joint", "make it with at least one");
   check_array(p.link_mass, links, "link_mass");
+  for (int j = 0; j < links; ++j)
+    require(p.link_mass[j] > 0.0,
+            "link " + std::to_string(j + 1) + " has a mass of " + core::exact(p.link_mass[j]) + " kg",
+            "give every link a mass > 0");
   check_array(p.viscous_friction, links, "viscous_friction");
   check_array(p.coulomb_friction, links, "coulomb_friction");
   check_array(p.air_linear, links, "air_linear");
@@ -69,6 +73,31 @@ Model make_model(const chain::Chain& chain, const Parameters& p) {
   return model;
 }
 
+namespace {
+
+// An angle in messages.
+std::string joint_name(const chain::Chain& chain, int angle) {
+  return "joint " + std::to_string(chain.child_link[angle]) + " (angle " + std::to_string(angle + 1) + ")";
+}
+
+[[noreturn]] void throw_singular(const Model& model, int angle) {
+  throw InputError("dynamics", "the mass matrix is singular: no inertia about " + joint_name(model.chain, angle),
+                   "give every link mass, and the rope a diameter where it can twist");
+}
+
+// The state of the chain, checked at the edge.
+void check_state(const Model& model, const VectorX& theta, const VectorX& thetadot) {
+  const Eigen::Index n = model.chain.angles();
+  for (const VectorX* v : {&theta, &thetadot}) {
+    require(v->size() == n,
+            "a state has " + std::to_string(v->size()) + " numbers, the chain " + std::to_string(n) + " angles",
+            "give the states of this rope");
+    require(v->allFinite(), "a state is not finite", "give finite angles and rates");
+  }
+}
+
+}  // namespace
+
 trajectory::BaseMotion at_rest(const math::Pose& pose) {
   trajectory::BaseMotion base;
   base.pose = pose;
@@ -85,6 +114,8 @@ VectorX joint_law(const Model& model, const VectorX& theta, const VectorX& theta
 
 VectorX inverse_dynamics(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                          const VectorX& thetadot, const VectorX& thetaddot) {
+  check_state(model, theta, thetadot);
+  check_state(model, thetaddot, thetadot);
   Engine engine(model);
   engine.place(base, theta, thetadot, false);
   engine.acceleration = thetaddot;
@@ -98,28 +129,22 @@ MatrixX mass_matrix(const Model& model, const VectorX& theta) {
   return engine.mass;
 }
 
-namespace {
-void factor_or_throw(Engine& engine) {
-  if (!engine.factor_mass())
-    throw WorkError("dynamics", "the mass matrix is not positive definite",
-                    "give every link mass, and a radius where it can twist");
-}
-}  // namespace
-
 VectorX forward_dynamics(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                          const VectorX& thetadot) {
+  check_state(model, theta, thetadot);
   Engine engine(model);
   engine.place(base, theta, thetadot, false);
-  factor_or_throw(engine);
+  if (!engine.factor_mass()) throw_singular(model, engine.singular_angle);
   engine.accelerate();
   return engine.acceleration;
 }
 
 VectorX forward_dynamics_articulated(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                                      const VectorX& thetadot) {
+  check_state(model, theta, thetadot);
   Engine engine(model);
   engine.place(base, theta, thetadot, false);
-  engine.articulated_acceleration();
+  if (!engine.articulated_acceleration()) throw_singular(model, engine.singular_angle);
   return engine.acceleration;
 }
 
@@ -142,6 +167,7 @@ static MatrixX in_link_frames(const Engine& engine, bool wrenches) {
 
 MatrixX external_wrenches(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                           const VectorX& thetadot) {
+  check_state(model, theta, thetadot);
   Engine engine(model);
   engine.place(base, theta, thetadot, false);
   return in_link_frames(engine, true);
@@ -149,6 +175,7 @@ MatrixX external_wrenches(const Model& model, const trajectory::BaseMotion& base
 
 MatrixX body_twists(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                     const VectorX& thetadot) {
+  check_state(model, theta, thetadot);
   Engine engine(model);
   engine.place(base, theta, thetadot, false);
   return in_link_frames(engine, false);
@@ -156,12 +183,39 @@ MatrixX body_twists(const Model& model, const trajectory::BaseMotion& base, cons
 
 Linearization linearize(const Model& model, const trajectory::BaseMotion& base, const Vector6& base_jerk,
                         const VectorX& theta, const VectorX& thetadot) {
+  check_state(model, theta, thetadot);
   Engine engine(model);
   engine.place(base, theta, thetadot, true);
-  factor_or_throw(engine);
+  if (!engine.factor_mass()) throw_singular(model, engine.singular_angle);
   engine.accelerate();
   engine.linearize(base_jerk);
   return {engine.acceleration, engine.mass, engine.stiffness, engine.damping, engine.drive_rate};
+}
+
+BaseSlopes base_slopes(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
+                       const VectorX& thetadot) {
+  check_state(model, theta, thetadot);
+  Engine engine(model);
+  engine.place(base, theta, thetadot, true);
+  if (!engine.factor_mass()) throw_singular(model, engine.singular_angle);
+  engine.accelerate();
+  engine.linearize(Vector6::Zero());
+  BaseSlopes slopes;
+  engine.base_slopes(slopes);
+  return slopes;
+}
+
+MatrixX unknown_forces(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
+                       const VectorX& thetadot, std::span<const Tangent> unknowns) {
+  check_state(model, theta, thetadot);
+  Engine engine(model);
+  engine.place(base, theta, thetadot, false);
+  if (!engine.factor_mass()) throw_singular(model, engine.singular_angle);
+  engine.accelerate();
+  engine.inverse_torque();
+  MatrixX forces(engine.angles, static_cast<Eigen::Index>(unknowns.size()));
+  engine.unknown_forces(unknowns, forces);
+  return forces;
 }
 
 double potential_energy(const Model& model, const math::Pose& base, const VectorX& theta) {
