@@ -10,6 +10,8 @@
 #include <nlohmann/json.hpp>
 #include <sstream>
 
+#include "chainsplat/capture.h"
+#include "chainsplat/estimation.h"
 #include "chainsplat/planning.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
@@ -23,7 +25,7 @@ using Json = nlohmann::ordered_json;
 using planning::Axis;
 
 struct PlanRequest {
-  std::string run, out, axes, initial, terminal, horizon = "3", window = "smooth";
+  std::string run, out, axes, initial, state_from, terminal, horizon = "3", window = "smooth";
   std::vector<std::string> targets, spheres, boxes;
   double rate = 100.0;
   bool force = false, mpc = false;
@@ -68,6 +70,8 @@ std::vector<Axis> parse_axes(const std::string& text) {
   return out;
 }
 
+constexpr const char* kAssumed = "mass, stiffness, damping and friction are assumed, and the rope may miss by centimeters";
+
 // Planning needs numbers for everything: what identification starts from, for a 60 g/m rope where the mass is unknown.
 dynamics::Parameters assumed_parameters(const twin::Twin& twin) {
   constexpr double kMass = 0.2;         // kg/m
@@ -95,13 +99,43 @@ dynamics::Parameters assumed_parameters(const twin::Twin& twin) {
   return p;
 }
 
+// The rope as one camera sees it in its first frame, and the base where it is then; taken to be at rest, since one
+// image shows no speed.
+void start_from_image(const std::string& source, const twin::Twin& twin, planning::Problem& problem) {
+  const auto [folder, name] = split_camera(source);
+  capture::LoadOptions load;
+  load.camera = name;
+  load.last = 1;
+  const capture::Capture seen = capture::load(folder, load);
+  if (seen.cameras.size() != 1)
+    throw InputError("--state-from", "'" + source + "' names no single camera", "give CAPTURE:NAME, for example CAPTURE:cam0");
+  if (seen.views.empty() || seen.views[0].width == 0)
+    throw InputError("--state-from", "the first frame of '" + source + "' does not show the rope", "name another camera");
+  const capture::View& view = seen.views[0];
+  problem.base = seen.base.pose(view.time);
+  estimation::Filter filter = estimation::start(
+      twin, seen.cameras, [&](double) { return dynamics::at_rest(problem.base); }, view.time);
+  const capture::View* const views[] = {&view};
+  const estimation::Estimate found = estimation::update(filter, views);
+  if (!found.seen || found.lost) {
+    std::string what = "the rope was not recognized in the first frame of '";
+    what += source + "'";
+    throw InputError("--state-from", what, "name another camera, or give the state with --initial");
+  }
+  problem.initial.theta = found.theta;
+  char text[160];
+  std::snprintf(text, sizeof text, "the rope starts as %s sees it: overlap %.3f, outline within %.2f px",
+                seen.cameras[0].name.c_str(), found.iou, found.residual);
+  say(text);
+}
+
 planning::Problem make_problem(const PlanRequest& request, const twin::Twin& twin) {
   planning::Problem problem;
   dynamics::Parameters parameters;
   if (twin.parameters) {
     parameters = *twin.parameters;
   } else {
-    core::warn(request.run + ": its dynamics are not identified; mass, stiffness, damping and friction are assumed");
+    core::warn(request.run + ": its dynamics are not identified; " + kAssumed);
     parameters = assumed_parameters(twin);
   }
   problem.model = dynamics::make_model(twin.chain, parameters);
@@ -117,6 +151,8 @@ planning::Problem make_problem(const PlanRequest& request, const twin::Twin& twi
     if (given.time.empty()) throw InputError(request.initial, "has no rows", "give at least one");
     problem.initial.theta = given.theta[0];
     if (!given.thetadot.empty()) problem.initial.thetadot = given.thetadot[0];
+  } else if (!request.state_from.empty()) {
+    start_from_image(request.state_from, twin, problem);
   } else if (twin.tabletop) {
     problem.initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
   } else {
@@ -225,13 +261,14 @@ dynamics::Model read_truth(const std::string& file, const Path& run) {
     if (!truth.parameters) throw InputError(file, "has no masses, stiffness and damping", "give an identified chain");
     return dynamics::make_model(truth.chain, *truth.parameters);
   } catch (const InputError& error) {
-    // name the file that the user knows
-    std::string text = error.what();
-    const std::string inner = (folder / "twin.json").string();
-    if (const std::size_t at = text.find(inner); at != std::string::npos) text.replace(at, inner.size(), file);
-    const std::size_t mend = text.rfind("; "), where = text.find(": ");
-    if (mend == std::string::npos || where == std::string::npos || where > mend) throw;
-    throw InputError(text.substr(0, where), text.substr(where + 2, mend - where - 2), text.substr(mend + 2));
+    // name the file that the user knows, not the copy: WHERE: WHAT; HOW TO MEND
+    const std::string text = error.what(), inner = (folder / "twin.json").string();
+    const std::size_t at = text.find(inner), where = text.find(": ", at == std::string::npos ? 0 : at + inner.size());
+    const std::size_t mend = text.rfind("; ");
+    if (at == std::string::npos || where == std::string::npos || mend == std::string::npos || where > mend) throw;
+    std::string place = file;
+    place.append(text, at + inner.size(), where - at - inner.size());
+    throw InputError(place, text.substr(where + 2, mend - where - 2), text.substr(mend + 2));
   }
 }
 
@@ -395,6 +432,11 @@ void add_planning_commands(CLI::App& app, const Globals& globals, Job& job) {
   planner->add_option("--horizon", request->horizon, "Seconds for each target (default 3), or free: the shortest that does")
       ->type_name("S|free");
   planner->add_option("--initial", request->initial, "Start from its first row (default: at rest)")->type_name("STATES.csv");
+  planner
+      ->add_option("--state-from", request->state_from,
+                   "Start from what one camera shows in its first frame, with the base where it is then, at rest")
+      ->type_name("CAPTURE:NAME")
+      ->excludes("--initial");
   planner->add_option("--terminal", request->terminal, "Where the base ends, from its start, one number an axis (default: free)")
       ->type_name("OFFSETS");
   planner->add_option("--window", request->window, "smooth: no acceleration at the ends; paper: s^2(1-s)^2")

@@ -59,7 +59,7 @@ struct Peaks {
   double yaw_velocity = 0.0, yaw_acceleration = 0.0, yaw_jerk = 0.0, turn = 0.0;
   std::string over;  // the first limit that is exceeded, empty: none
 };
-// On a grid of `step` s.
+// On a grid of `step` s and where the jerk jumps.
 Peaks peaks(const Motion& motion, double from, double to, const Limits& limits, double step = 1e-3);
 
 // Rope and gripper stay out of these. Box: axis-aligned in the world.

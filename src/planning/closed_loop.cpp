@@ -1,8 +1,11 @@
 // Model predictive control: the motion's rest is planned anew at a fixed rate, from the state that is seen.
+#include <time.h>
+
 #include <algorithm>
 #include <cmath>
 #include <limits>
 
+#include "adaptation.h"
 #include "search.h"
 
 namespace chainsplat::planning {
@@ -11,11 +14,11 @@ namespace {
 constexpr double kTruthStep = 1.0 / 240.0;   // s, between states of the true chain
 constexpr double kReplanSharpness = 3e4;     // m^-2
 constexpr double kReplanSmoothness = 1e-8;
-constexpr int kReplanIterations = 4;
+constexpr int kReplanIterations = 3;         // two steps: the motion so far is the start, and the next replan goes on
 constexpr double kReplanDamping = 1e-7;      // of the curvature's trace, which limits may dominate
 constexpr double kShortest = 0.15;           // s before the hit, after which nothing is changed any more
-constexpr double kPeakStep = 0.002;          // s, between tests of the limits while replanning
-constexpr int kParts = 4;                    // halvings of a correction that is too fast
+constexpr double kLimitStep = 0.002;         // s, between tests of the limits
+constexpr double kLimitPart = 0.995;         // of the limits: between the tests no more than 0.2 % is added
 constexpr double kLeastPiece = 0.35;         // s, of a correction
 constexpr double kPieceMargin = 1.6;         // its length over the time to the hit, in free space
 constexpr int kReplanNodes = 60;             // of its rollout, where the substeps allow
@@ -94,6 +97,84 @@ dynamics::InitialState fit_state(const chain::Chain& chain, const trajectory::Ba
   return out;
 }
 
+namespace {
+
+// Time that this thread had a core, s: what a replan costs does not depend on what else the machine does.
+double core_time() {
+  timespec time{};
+  ::clock_gettime(CLOCK_THREAD_CPUTIME_ID, &time);
+  return static_cast<double>(time.tv_sec) + 1e-9 * static_cast<double>(time.tv_nsec);
+}
+
+// The largest part <= `part` of the change `d` for which |f + part d| <= most, or stays what it was where that is more.
+template <class Fixed, class Change>
+double part_within(const Fixed& f, const Change& d, double most, double part) {
+  const double room = std::max(0.0, most * most - f.squaredNorm());
+  const double change = d.squaredNorm(), along = f.dot(d);
+  // |f + part d|^2 - |f|^2 = part (2 along + part change) <= room
+  if (part * (2.0 * along + part * change) <= room) return part;
+  return (std::sqrt(along * along + change * room) - along) / change;
+}
+
+// The executed motion, sampled over time, so that a replan need not sum up all corrections before it.
+class Samples {
+ public:
+  explicit Samples(const Motion& motion) {
+    const int count = static_cast<int>(std::ceil(motion.end() / kLimitStep)) + 1;
+    for (int i = 0; i < count; ++i) watch(motion, i * kLimitStep);
+    for (const Piece& piece : motion.pieces)
+      for (double time : jumps(piece)) watch(motion, time);
+  }
+  // Makes the last piece of `motion` so much smaller that it keeps the limits together with the others, and takes it in.
+  void take_within(Motion& motion, const Limits& limits) {
+    Piece& last = motion.pieces.back();
+    Motion others = motion, alone = motion;
+    others.pieces.pop_back();
+    alone.pieces = {last};
+    alone.origin.translation.setZero();
+    for (double time : jumps(last)) watch(others, time);
+    std::vector<Coordinates> change;
+    double part = 1.0;
+    const bool smooth = motion.window == Window::smooth;
+    const double most[] = {limits.stroke, limits.velocity, limits.acceleration, limits.jerk};
+    const double yaw_most[] = {limits.turn, limits.yaw_velocity, limits.yaw_acceleration, limits.yaw_jerk};
+    for (std::size_t i = 0; i < time_.size(); ++i) {
+      if (time_[i] < last.start) continue;
+      const Coordinates d = coordinates(alone, time_[i]);
+      Coordinates c = at_[i];
+      c.col(0).head<3>() -= motion.origin.translation;
+      for (int order = 0; order <= (smooth ? 3 : 2); ++order) {
+        for (int row = 0; order == 0 && row < 3; ++row)  // the stroke is one along each axis
+          part = part_within(c.block<1, 1>(row, 0).col(0), d.block<1, 1>(row, 0).col(0), kLimitPart * most[0], part);
+        if (order > 0) part = part_within(c.col(order).head<3>(), d.col(order).head<3>(), kLimitPart * most[order], part);
+        part = part_within(c.block<1, 1>(3, order).col(0), d.block<1, 1>(3, order).col(0), kLimitPart * yaw_most[order],
+                           part);
+      }
+      change.push_back(d);
+    }
+    last.weights *= part, last.terminal *= part;
+    for (std::size_t i = 0, k = 0; i < time_.size(); ++i)
+      if (time_[i] >= last.start) at_[i] += part * change[k++];
+  }
+
+ private:
+  // The jerk jumps at both ends of a piece; coordinates() gives the value after a jump.
+  static std::vector<double> jumps(const Piece& piece) {
+    constexpr double kBefore = 1e-9;  // s
+    const double end = piece.start + piece.duration;
+    return {piece.start - kBefore, piece.start, end - kBefore, end};
+  }
+  void watch(const Motion& motion, double time) {
+    time_.push_back(time);
+    at_.push_back(coordinates(motion, time));
+  }
+
+  std::vector<double> time_;
+  std::vector<Coordinates> at_;
+};
+
+}  // namespace
+
 LoopResult closed_loop(const Problem& problem, const Options& options, const Plan& plan, const dynamics::Model& truth,
                        const LoopOptions& loop) {
   if (plan.hits.size() != 1) throw InputError("--simulate", "plays one target only", "give one --target");
@@ -129,27 +210,38 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
   out.states.time.push_back(0.0), out.states.theta.push_back(state.theta), out.states.thetadot.push_back(state.thetadot);
 
   double hit_time = plan.hits.front().time;
-  VectorX guess = problem.initial.theta;
+  Samples samples(out.motion);
+  Adaptation adaptation = start_adaptation(problem.model);
+  dynamics::InitialState last_seen = problem.initial;
+  last_seen.time = 0.0;
+  // the twin's state from the points of the rope that a camera could follow
+  const auto look = [&](double now) {
+    const trajectory::BaseMotion here = base(now);
+    const MatrixX points =
+        chain::centerline(truth.chain, chain::link_motions(truth.chain, state.theta, here.pose), true_seen);
+    const MatrixX speeds = centerline_velocity(truth.chain, state.theta, state.thetadot, here, true_seen);
+    dynamics::InitialState found = fit_state(chain, here, seen, points, speeds, last_seen.theta);
+    found.time = now;
+    return found;
+  };
   const int intervals = std::max(1, static_cast<int>(std::ceil(end * loop.rate - 1e-9)));
   for (int k = 0; k < intervals; ++k) {
     const double now = k / loop.rate, next = std::min(end, (k + 1) / loop.rate);
     const double left = (problem.tabletop ? end : hit_time) - now;
+    if (loop.feedback && k == 0) last_seen = look(now);
     if (loop.feedback && k > 0 && left > kShortest) {
-      const trajectory::BaseMotion here = base(now);
-      const MatrixX points =
-          chain::centerline(truth.chain, chain::link_motions(truth.chain, state.theta, here.pose), true_seen);
-      const MatrixX speeds = centerline_velocity(truth.chain, state.theta, state.thetadot, here, true_seen);
-      const double begin = core::seconds_now();
-      dynamics::InitialState estimate = fit_state(chain, here, seen, points, speeds, guess);
-      estimate.time = now;
-      guess = estimate.theta;
+      const double begin = core_time();
+      const dynamics::InitialState estimate = look(now);
+      adapt(adaptation, base, last_seen, estimate, seen);
+      last_seen = estimate;
       const double rest = end - now;
       const double length = problem.tabletop ? rest : std::min(rest, std::max(kLeastPiece, kPieceMargin * left));
       Motion motion = out.motion;
       append_piece(motion, now, length);
       const int full = problem.model.parameters.substeps;
       const int substeps = std::clamp(static_cast<int>(kReplanNodes / (30.0 * length)), full > 4 ? 2 : 1, full);
-      Task task = make_task(problem, options, {&problem.model}, motion, estimate, problem.targets.front(), substeps);
+      Task task =
+          make_task(problem, options, {&adaptation.model}, motion, estimate, problem.targets.front(), substeps);
       task.exact = false;
       task.target = target_at(now);
       task.target_velocity = loop.target_velocity;
@@ -159,18 +251,13 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
       VectorX q = VectorX::Zero(static_cast<Eigen::Index>(motion.axes.size()) * kPerAxis);
       minimize(task, q, {kReplanSharpness, kReplanSmoothness}, kReplanIterations, kReplanDamping);
       // a correction that asks too much of the arm is taken in part
-      bool within = false;
-      for (int part = 0; part < kParts && !within; ++part) {
-        set_unknowns(motion, q);
-        within = peaks(motion, now, end, options.limits, kPeakStep).over.empty();
-        if (!within) q *= 0.5;
-      }
+      set_unknowns(motion, q);
+      samples.take_within(motion, options.limits);
       Rollout rollout;
-      if (within && roll_out(problem.model, task.motion, task.grid, q, estimate, false, rollout)) {
-        out.motion = std::move(motion);
-        hit_time = measure(task, problem.model, rollout).time;
-      }
-      const double seconds = core::seconds_now() - begin;
+      if (roll_out(adaptation.model, task.motion, task.grid, unknowns_of(motion), estimate, false, rollout))
+        hit_time = measure(task, adaptation.model, rollout).time;
+      out.motion = std::move(motion);
+      const double seconds = core_time() - begin;
       ++out.replans;
       out.longest_replan = std::max(out.longest_replan, seconds);
       out.mean_replan += (seconds - out.mean_replan) / out.replans;

@@ -176,6 +176,7 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
     for (const Soft& s : soft) sum.value += s.value / samples, sum.miss += s.miss / samples;
   }
 
+  double counted = sum.value;  // what is no violation
   for (int m = 0; m < samples; ++m) {
     const dynamics::Model& model = *task.models[m];
     const chain::Chain& chain = model.chain;
@@ -263,7 +264,8 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
     const double most = yaw ? limits.turn : limits.stroke;
     for (int node = 0; node < nodes; ++node) {
       const Basis& b = task.grid.basis[node];
-      sum.value += weight * base[node](row, 2) * base[node](row, 2);
+      const double smoothness = weight * base[node](row, 2) * base[node](row, 2);
+      sum.value += smoothness, counted += smoothness;
       if (derivatives) {
         sum.gradient.segment(first, kPerAxis) += 2.0 * weight * base[node](row, 2) * b.col(2);
         sum.curvature.block(first, first, kPerAxis, kPerAxis) += 2.0 * weight * b.col(2) * b.col(2).transpose();
@@ -277,6 +279,7 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
       add(sum, task.limit_weight * kLimitWeight, residual, slope);
     }
   }
+  sum.violation = sum.value - counted;
   if (derivatives) {
     sum.curvature.triangularView<Eigen::StrictlyUpper>() = sum.curvature.transpose();
     for (Eigen::Index i = 0; i < size; ++i)

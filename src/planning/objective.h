@@ -31,6 +31,7 @@ struct Evaluation {
   bool good = false;  // the motion stayed finite
   double value = 0.0;   // m^2
   double miss = 0.0;    // m, hard minimum over the nodes, mean (or worst) of the samples
+  double violation = 0.0;  // m^2, the part of limits, obstacles and, on a table, speed left in the end
   VectorX gradient;
   MatrixX curvature;  // Gauss-Newton, positive semidefinite
 };

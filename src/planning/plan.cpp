@@ -13,10 +13,11 @@ namespace {
 constexpr struct {
   double sharpness, smoothness;
   int iterations;
-} kCoarse[] = {{1e3, 1e-6, 5}, {1e4, 1e-7, 6}};
+} kCoarse[] = {{1e3, 1e-6, 6}, {1e4, 1e-7, 7}};
 constexpr double kFinalSharpness = 1e5;
 constexpr double kFinalSmoothness = 3e-9;
-constexpr int kFinalIterations = 10;
+constexpr int kFinalIterations = 12;
+constexpr double kEnough = 0.1;       // of the tolerance: no further iteration is made
 constexpr double kGoodMiss = 0.3;     // of the tolerance: no further start is tried
 constexpr double kStrictLimits = 100.0;  // times the usual weight
 constexpr int kGroups[] = {1, 1, 2, 4, 4};  // starts optimized side by side; the next group only where the last failed
@@ -135,11 +136,19 @@ bool better(const Found& a, const Found& b, const Options& options) {
 }
 
 Found optimize(const Task& coarse, const Task& fine, VectorX unknowns) {
+  Task quick = fine;
+  quick.exact = false;
   Found found;
   found.unknowns = std::move(unknowns);
+  const double enough = kEnough * fine.options->tolerance;
+  const Sharpness last{kFinalSharpness, kFinalSmoothness};
   for (const auto& stage : kCoarse)
     found.iterations += minimize(coarse, found.unknowns, {stage.sharpness, stage.smoothness}, stage.iterations);
-  found.iterations += minimize(fine, found.unknowns, {kFinalSharpness, kFinalSmoothness}, kFinalIterations);
+  found.iterations += minimize(quick, found.unknowns, last, kFinalIterations, kFirstDamping, enough);
+  judge(fine, found);
+  if (found.good && merit(found, *fine.options) <= kGoodMiss * fine.options->tolerance) return found;
+  // where something is left, the derivatives of lower order end too early
+  found.iterations += minimize(fine, found.unknowns, last, kFinalIterations, kFirstDamping, enough);
   judge(fine, found);
   if (found.good || !std::isfinite(found.hit.miss)) return found;
   // a far target pulls harder than the limits push: once more with limits that count more
@@ -179,6 +188,7 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
   const int substeps = problem.model.parameters.substeps;
   Task fine = make_task(problem, options, models, motion, initial, target, substeps);
   Task coarse = make_task(problem, options, models, motion, initial, target, std::max(1, substeps / 2));
+  coarse.exact = false;
   VectorX rest = VectorX::Zero(static_cast<Eigen::Index>(motion.axes.size()) * kPerAxis);
   if (terminal)
     for (Task* task : {&fine, &coarse})

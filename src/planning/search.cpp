@@ -46,6 +46,14 @@ void set_unknowns(Motion& motion, const VectorX& unknowns) {
   }
 }
 
+VectorX unknowns_of(const Motion& motion) {
+  const Piece& piece = motion.pieces.back();
+  VectorX unknowns(piece.terminal.size() * kPerAxis);
+  for (Eigen::Index a = 0; a < piece.terminal.size(); ++a)
+    unknowns.segment(a * kPerAxis, kPerAxis) << piece.weights.col(a), piece.terminal[a];
+  return unknowns;
+}
+
 Vector3 at_rope_height(const Problem& problem, const Vector3& target) {
   if (!problem.tabletop || !problem.model.parameters.table_normal) return target;
   const Vector3& normal = *problem.model.parameters.table_normal;
@@ -66,9 +74,13 @@ Task make_task(const Problem& problem, const Options& options, const std::vector
   return task;
 }
 
-int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, int iterations, double first_damping) {
+int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, int iterations, double first_damping,
+             double enough) {
+  const auto done = [&](const Evaluation& e) {
+    return e.good && e.miss < enough && e.violation < enough * enough;
+  };
   Evaluation now = evaluate(task, unknowns, sharpness, true);
-  if (!now.good) return 1;
+  if (!now.good || done(now)) return 1;
   // unit of the damping: acceleration, so that a step changes the motion as little as it can
   MatrixX metric = MatrixX::Zero(unknowns.size(), unknowns.size());
   for (const Basis& b : task.grid.basis)
@@ -93,21 +105,21 @@ int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, in
       for (Eigen::Index i = 0; i < step.size(); ++i)
         if (task.held[i]) step[i] = 0.0;
       // the first step is mostly good; once one was not, look before the derivatives are paid for
-      next = evaluate(task, unknowns + step, sharpness, !again);
+      const bool last = count + 1 >= iterations;
+      next = evaluate(task, unknowns + step, sharpness, !again && !last);
+      ++count;
       if (next.good && next.value < now.value) {
-        if (again) next = evaluate(task, unknowns + step, sharpness, true);
-        ++count;
+        if (again && !last) next = evaluate(task, unknowns + step, sharpness, true);
         break;
       }
-      if (!again) ++count;
       damping *= kMoreDamping;
-      if (damping > kMostDamping || count >= iterations + 1) return count;
+      if (damping > kMostDamping || count >= iterations) return count;
     }
     const double decrease = now.value - next.value;
     unknowns += step;
     now = std::move(next);
     damping = std::max(kLeastDamping, kLessDamping * damping);
-    if (decrease < kNothing || decrease < kConverged * std::abs(now.value)) break;
+    if (done(now) || decrease < kNothing || decrease < kConverged * std::abs(now.value)) break;
   }
   return count;
 }

@@ -16,11 +16,14 @@ Task make_task(const Problem& problem, const Options& options, const std::vector
 Vector3 at_rope_height(const Problem& problem, const Vector3& target);
 
 void set_unknowns(Motion& motion, const VectorX& unknowns);  // of the last piece
+VectorX unknowns_of(const Motion& motion);
 
-// Damped Gauss-Newton; ends after about `iterations` evaluations of the derivatives, or when nothing changes any more.
-// Returns those it took. `first_damping`: of the curvature's trace, small near a solution.
+inline constexpr double kFirstDamping = 1e-2;  // of the curvature's trace
+// Damped Gauss-Newton; ends after `iterations` evaluations, of which the last is one without derivatives, or when nothing
+// changes any more. Returns those it took. `first_damping` is small near a solution. `enough`: ends where the miss is
+// smaller, m, with limits and obstacles kept and, on a table, the rope at rest.
 int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, int iterations,
-             double first_damping = 1e-2);
+             double first_damping = kFirstDamping, double enough = 0.0);
 
 // A random motion whose largest peak is `fraction` of its limit.
 VectorX random_unknowns(const Task& task, core::Random& random, double fraction);
