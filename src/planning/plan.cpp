@@ -14,13 +14,15 @@ constexpr struct {
   double sharpness, smoothness;
   int iterations;
 } kCoarse[] = {{1e3, 1e-6, 6}, {1e4, 1e-7, 7}};
-constexpr double kFinalSharpness = 1e5;
+constexpr double kFinalSharpness = 1e5, kSharpest = 1e6;  // m^-2
 constexpr double kFinalSmoothness = 3e-9;
 constexpr int kFinalIterations = 12;
 constexpr double kEnough = 0.1;       // of the tolerance: no further iteration is made
 constexpr double kGoodMiss = 0.3;     // of the tolerance: no further start is tried
 constexpr double kStrictLimits = 100.0;  // times the usual weight
 constexpr int kGroups[] = {1, 1, 2, 4, 4};  // starts optimized side by side; the next group only where the last failed
+constexpr double kPromising = 10.0;   // of the tolerance: a coarse miss from which it is worth to go on at once
+constexpr int kLastTries = 2;         // of the nearest others, where no start was good
 constexpr double kLeastLoad = 0.25, kMostLoad = 0.95;  // of the limits, of random motions
 constexpr std::uint64_t kTargetStream = 0x7461726765740001ull;  // random numbers of random_target
 constexpr double kHorizons[] = {0.25, 0.35, 0.5, 0.7, 1.0};     // of the longest, for a free one
@@ -135,28 +137,35 @@ bool better(const Found& a, const Found& b, const Options& options) {
   return merit(a, options) < merit(b, options);
 }
 
-Found optimize(const Task& coarse, const Task& fine, VectorX unknowns) {
-  Task quick = fine;
-  quick.exact = false;
+// With coarse steps and a soft minimum that is sharpened.
+Found approach(const Task& coarse, VectorX unknowns) {
   Found found;
   found.unknowns = std::move(unknowns);
-  const double enough = kEnough * fine.options->tolerance;
-  const Sharpness last{kFinalSharpness, kFinalSmoothness};
   for (const auto& stage : kCoarse)
     found.iterations += minimize(coarse, found.unknowns, {stage.sharpness, stage.smoothness}, stage.iterations);
+  judge(coarse, found);
+  return found;
+}
+
+// With full steps from what approach() left.
+void finish(const Task& fine, Found& found) {
+  Task quick = fine;
+  quick.exact = false;
+  const double enough = kEnough * fine.options->tolerance;
+  const Sharpness last{kFinalSharpness, kFinalSmoothness};
   found.iterations += minimize(quick, found.unknowns, last, kFinalIterations, kFirstDamping, enough);
   judge(fine, found);
-  if (found.good && merit(found, *fine.options) <= kGoodMiss * fine.options->tolerance) return found;
-  // where something is left, the derivatives of lower order end too early
-  found.iterations += minimize(fine, found.unknowns, last, kFinalIterations, kFirstDamping, enough);
+  if (found.good && merit(found, *fine.options) <= kGoodMiss * fine.options->tolerance) return;
+  // what is left: the soft minimum likes to stay near for long, and derivatives of lower order end too early
+  const Sharpness sharpest{kSharpest, kFinalSmoothness};
+  found.iterations += minimize(fine, found.unknowns, sharpest, kFinalIterations, kFirstDamping, enough);
   judge(fine, found);
-  if (found.good || !std::isfinite(found.hit.miss)) return found;
+  if (found.good || !std::isfinite(found.hit.miss)) return;
   // a far target pulls harder than the limits push: once more with limits that count more
   Task strict = fine;
   strict.limit_weight = kStrictLimits;
-  found.iterations += minimize(strict, found.unknowns, {kFinalSharpness, kFinalSmoothness}, kFinalIterations);
+  found.iterations += minimize(strict, found.unknowns, last, kFinalIterations);
   judge(fine, found);
-  return found;
 }
 
 // Motions that carry a point of the resting rope to the target, as far as the limits allow.
@@ -215,28 +224,44 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
   std::stable_sort(order.begin(), order.end(), [&](int a, int b) { return value[a] < value[b]; });
   tried += static_cast<int>(starts.size());
 
-  Found best;
-  bool first = true;
+  // samples have a spread that no motion removes
+  const double enough = models.size() > 1 ? options.tolerance : kGoodMiss * options.tolerance;
+  const auto good = [&](const Found& found) { return found.good && merit(found, options) <= enough; };
+  const auto by_merit = [&](const Found& a, const Found& b) { return better(a, b, options); };
+  std::vector<Found> near;  // where a start led with coarse steps, not gone further
+  std::optional<Found> best;
+  const auto go_further = [&](Found found) {
+    found.iterations = 0;
+    finish(fine, found);
+    iterations += found.iterations;
+    if (!best || better(found, *best, options)) best = std::move(found);
+  };
   std::size_t next = 0;
   for (const int group : kGroups) {
     const std::size_t count = std::min<std::size_t>(group, order.size() - next);
     std::vector<Found> found(count);
     core::parallel_for(static_cast<std::int64_t>(count), [&](std::int64_t i) {
-      found[i] = optimize(coarse, fine, starts[order[next + static_cast<std::size_t>(i)]]);
+      found[i] = approach(coarse, starts[order[next + static_cast<std::size_t>(i)]]);
     });
     next += count;
     for (Found& f : found) {
       iterations += f.iterations;
-      if (first || better(f, best, options)) best = std::move(f);
-      first = false;
+      near.push_back(std::move(f));
+    }
+    std::stable_sort(near.begin(), near.end(), by_merit);
+    if (!near.empty() && merit(near.front(), options) <= kPromising * options.tolerance) {
+      go_further(near.front());
+      near.erase(near.begin());
     }
     if (core::stop_requested()) throw Interrupted(core::stop_requested());
-    // samples have a spread that no motion removes
-    const double enough = models.size() > 1 ? options.tolerance : kGoodMiss * options.tolerance;
-    if (best.good && merit(best, options) <= enough) break;
-    if (best.good && models.size() > 1 && group > 1) break;
+    if (best && good(*best)) return *best;
+    if (best && best->good && models.size() > 1 && group > 1) return *best;
   }
-  return best;
+  for (int i = 0; i < kLastTries && !near.empty() && !(best && good(*best)); ++i) {
+    go_further(near.front());
+    near.erase(near.begin());
+  }
+  return *best;
 }
 
 }  // namespace
