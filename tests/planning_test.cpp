@@ -1,8 +1,9 @@
 #include "chainsplat/planning.h"
 
-#include <cmath>
 #include <doctest/doctest.h>
+#include <cmath>
 
+#include "planning/adaptation.h"
 #include "planning/search.h"
 
 using namespace chainsplat;
@@ -43,8 +44,8 @@ Problem problem_of(chain::Bending bending, bool tabletop) {
   if (tabletop) problem.table_point = Vector3::Zero();
   problem.base.translation = tabletop ? Vector3(0, -0.15, 0.0105) : Vector3(0, 0, 0.55);
   const int n = problem.model.chain.angles();
-  problem.initial.theta = tabletop ? VectorX(0.03 * VectorX::Ones(n))
-                                   : dynamics::static_equilibrium(problem.model, problem.base);
+  problem.initial.theta =
+      tabletop ? VectorX(0.03 * VectorX::Ones(n)) : dynamics::static_equilibrium(problem.model, problem.base);
   problem.initial.thetadot = VectorX::Zero(n);
   return problem;
 }
@@ -95,8 +96,7 @@ TEST_CASE("the base's twist and its derivatives agree with differences of the po
   set(motion, wave(4 * kPerAxis, 0.3));
   const double t = 0.83, e = 1e-4;
   const auto at = [&](double time) { return base_at(motion, time); };
-  const math::Vector6 twist =
-      math::log_se3(at(t - e).pose.inverse() * at(t + e).pose) / (2.0 * e);
+  const math::Vector6 twist = math::log_se3(at(t - e).pose.inverse() * at(t + e).pose) / (2.0 * e);
   CHECK((twist - at(t).velocity).norm() < 1e-6);
   CHECK(((at(t + e).velocity - at(t - e).velocity) / (2 * e) - at(t).acceleration).norm() < 1e-5);
   math::Vector6 jerk;
@@ -167,10 +167,17 @@ TEST_CASE("the objective's gradient agrees with differences, limits and obstacle
     Problem problem = problem_of(tabletop ? chain::Bending::planar : chain::Bending::spatial, tabletop);
     Options options;
     options.axes = tabletop ? std::vector<Axis>{Axis::x, Axis::yaw} : std::vector<Axis>{Axis::x, Axis::z, Axis::yaw};
-    options.limits = {.velocity = 0.2, .acceleration = 1.0, .jerk = 8.0, .stroke = 0.05, .yaw_velocity = 0.3,
-                      .yaw_acceleration = 1.0, .yaw_jerk = 10.0, .turn = 0.1};
+    options.limits = {.velocity = 0.2,
+                      .acceleration = 1.0,
+                      .jerk = 8.0,
+                      .stroke = 0.05,
+                      .yaw_velocity = 0.3,
+                      .yaw_acceleration = 1.0,
+                      .yaw_jerk = 10.0,
+                      .turn = 0.1};
     options.spheres = {{problem.base.translation + 0.15 * problem.model.chain.direction, 0.05}};
-    options.boxes = {{problem.base.translation - Vector3(0.1, 0.02, 0.1), problem.base.translation + Vector3(0.02, 0.3, 0.02)}};
+    options.boxes = {
+        {problem.base.translation - Vector3(0.1, 0.02, 0.1), problem.base.translation + Vector3(0.02, 0.3, 0.02)}};
     problem.targets = {problem.base.translation + 0.27 * problem.model.chain.direction + Vector3(0.05, 0, 0)};
     Motion motion = motion_of(problem, options.axes, 0.8);
     const Task task = task_of(problem, options, motion);
@@ -347,8 +354,7 @@ TEST_CASE("the state of one chain is found from points of another") {
   CHECK((own.theta - theta).norm() < 1e-3);
   CHECK((own.thetadot - rate).norm() < 1e-2);
   const auto other = fit_state(fine.chain, base, s, centerline(theta), {}, VectorX::Zero(48));
-  const MatrixX near =
-      chain::centerline(fine.chain, chain::link_motions(fine.chain, other.theta, base.pose), s);
+  const MatrixX near = chain::centerline(fine.chain, chain::link_motions(fine.chain, other.theta, base.pose), s);
   CHECK((near - centerline(theta)).colwise().norm().maxCoeff() < 1e-3);
 }
 
@@ -374,4 +380,58 @@ TEST_CASE("feedback mends what a wrong model misses and follows a target that mo
   const double followed = closed_loop(problem, options, found, truth, loop).hit.miss;
   loop.feedback = false;
   CHECK(followed < 0.5 * closed_loop(problem, options, found, truth, loop).hit.miss);
+}
+
+TEST_CASE("what the rope does tells by how much its parameters are off") {
+  for (bool tabletop : {false, true}) {
+    Problem problem = problem_of(chain::Bending::planar, tabletop);
+    dynamics::Parameters off = problem.model.parameters;
+    for (double& k : off.stiffness) k *= 0.8;
+    for (double& d : off.damping) d *= 1.25;
+    for (double& mu : off.coulomb_friction) mu *= 1.2;
+    const dynamics::Model truth = dynamics::make_model(problem.model.chain, off);
+    Motion motion = motion_of(problem, {Axis::x}, 2.0);
+    set(motion, wave(kPerAxis, 0.3));
+    const auto base = [&](double time) { return base_at(motion, time); };
+    std::vector<double> times;
+    for (int k = 1; k <= 20; ++k) times.push_back(0.1 * k);
+    const chain::States states = dynamics::rollout(truth, base, problem.initial, times);
+    Adaptation adaptation = start_adaptation(problem.model);
+    dynamics::InitialState before = problem.initial;
+    const std::vector<double> seen = chain::equal_arclengths(problem.model.chain, 17);
+    for (std::size_t k = 0; k < times.size(); ++k) {
+      const dynamics::InitialState after{times[k], states.theta[k], states.thetadot[k]};
+      adapt(adaptation, base, before, after, seen);
+      before = after;
+    }
+    // stiffness, damping, then friction or drag
+    CHECK(std::exp(adaptation.factors[0]) == doctest::Approx(0.8).epsilon(0.03));
+    CHECK(std::exp(adaptation.factors[1]) == doctest::Approx(1.25).epsilon(0.06));
+    CHECK(std::exp(adaptation.factors[2]) == doctest::Approx(tabletop ? 1.2 : 1.0).epsilon(0.06));
+    CHECK(adaptation.covariance(0, 0) < 0.1 * 0.1);
+  }
+}
+
+TEST_CASE("feedback on a table copes with another friction and keeps tight limits, also where the jerk jumps") {
+  Problem problem = problem_of(chain::Bending::planar, true);
+  Options options;
+  options.horizon = 1.5;
+  options.starts = 8;
+  options.limits.jerk = 40.0;
+  options.limits.acceleration = 4.0;
+  problem.targets = {random_target(problem, options, 1)};
+  const Plan found = plan(problem, options);
+  REQUIRE(found.reached);
+  dynamics::Parameters off = rope(chain::Bending::planar, true, 24).parameters;
+  for (double& k : off.stiffness) k *= 0.8;
+  for (double& mu : off.coulomb_friction) mu *= 1.2;
+  const dynamics::Model truth = dynamics::make_model(rope(chain::Bending::planar, true, 24).chain, off);
+  LoopOptions loop;
+  loop.rate = 7.0;  // replans between the tests of the limits
+  const LoopResult seeing = closed_loop(problem, options, found, truth, loop);
+  loop.feedback = false;
+  const LoopResult blind = closed_loop(problem, options, found, truth, loop);
+  CHECK(blind.hit.miss > 1e-3);
+  CHECK(seeing.hit.miss < 0.5 * blind.hit.miss);
+  CHECK(peaks(seeing.motion, 0.0, 1.5, options.limits, 1e-4).over.empty());
 }

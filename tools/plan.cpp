@@ -70,13 +70,14 @@ std::vector<Axis> parse_axes(const std::string& text) {
   return out;
 }
 
-constexpr const char* kAssumed = "mass, stiffness, damping and friction are assumed, and the rope may miss by centimeters";
+constexpr const char* kAssumed =
+    "mass, stiffness, damping and friction are assumed, and the rope may miss by centimeters";
 
 // Planning needs numbers for everything: what identification starts from, for a 60 g/m rope where the mass is unknown.
 dynamics::Parameters assumed_parameters(const twin::Twin& twin) {
-  constexpr double kMass = 0.2;         // kg/m
-  constexpr double kStiffness = 0.1;    // of weight times length, N m/rad at a joint
-  constexpr double kRetardation = 0.07;  // s, damping over stiffness
+  constexpr double kMass = 0.2;                   // kg/m
+  constexpr double kStiffness = 0.1;              // of weight times length, N m/rad at a joint
+  constexpr double kRetardation = 0.07;           // s, damping over stiffness
   constexpr double kCoulomb = 0.3, kDrag = 0.72;  // -, N s^2/m^3 per meter of diameter
   const chain::Chain& chain = twin.chain;
   dynamics::Parameters p;
@@ -108,9 +109,11 @@ void start_from_image(const std::string& source, const twin::Twin& twin, plannin
   load.last = 1;
   const capture::Capture seen = capture::load(folder, load);
   if (seen.cameras.size() != 1)
-    throw InputError("--state-from", "'" + source + "' names no single camera", "give CAPTURE:NAME, for example CAPTURE:cam0");
+    throw InputError("--state-from", "'" + source + "' names no single camera",
+                     "give CAPTURE:NAME, for example CAPTURE:cam0");
   if (seen.views.empty() || seen.views[0].width == 0)
-    throw InputError("--state-from", "the first frame of '" + source + "' does not show the rope", "name another camera");
+    throw InputError("--state-from", "the first frame of '" + source + "' does not show the rope",
+                     "name another camera");
   const capture::View& view = seen.views[0];
   problem.base = seen.base.pose(view.time);
   estimation::Filter filter = estimation::start(
@@ -303,10 +306,14 @@ void write_motion(const Path& out, const planning::Motion& motion, const std::ve
     const planning::Coordinates c = planning::coordinates(motion, time);
     samples.push_back({time, planning::base_at(motion, time).pose});
     csv += core::exact(time);
+    const auto field = [&csv](double value) {
+      csv += ',';
+      csv += core::exact(value);
+    };
     for (int d = 0; d < 3; ++d)
-      for (int i = 0; i < 3; ++i) csv += "," + core::exact(c(i, d));
-    for (int d = 0; d < 3; ++d) csv += "," + core::exact(c(3, d));
-    csv += "\n";
+      for (int i = 0; i < 3; ++i) field(c(i, d));
+    for (int d = 0; d < 3; ++d) field(c(3, d));
+    csv += '\n';
   }
   core::write_file(out / "base.tum", trajectory::write_tum(samples));
   core::write_file(out / "base.csv", csv);
@@ -359,9 +366,10 @@ void plan(const Globals& globals, PlanRequest& request) {
     const double bound = planning::unreachable_distance(problem, options, target);
     if (!(bound > options.tolerance)) continue;
     char text[160];
-    std::snprintf(text, sizeof text,
-                  "--target: at least %.1f mm beyond what rope length, stroke and axes allow; the nearest motion is planned",
-                  1e3 * bound);
+    std::snprintf(
+        text, sizeof text,
+        "--target: at least %.1f mm beyond what rope length, stroke and axes allow; the nearest motion is planned",
+        1e3 * bound);
     core::warn(text);
   }
   if (request.simulate.empty() && (request.mpc || !request.target_velocity.empty()))
@@ -419,9 +427,10 @@ void add_planning_commands(CLI::App& app, const Globals& globals, Job& job) {
   planning::Limits& limits = request->options.limits;
   planner->add_option("RUN", request->run, "Run folder of an identified twin")->required();
   planner
-      ->add_option("--target", request->targets,
-                   "Point to hit, m, world: with the tip at any time, on a table with any point of the rope at the end.\n"
-                   "Several are hit one after the other. random:SEED: a point that a random motion passes")
+      ->add_option(
+          "--target", request->targets,
+          "Point to hit, m, world: with the tip at any time, on a table with any point of the rope at the end.\n"
+          "Several are hit one after the other. random:SEED: a point that a random motion passes")
       ->required()
       ->type_name("X,Y,Z");
   planner->add_option("-o,--output", request->out, "Folder for base.tum, base.csv, states.csv, plan.json, picture.svg")
@@ -429,15 +438,20 @@ void add_planning_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("PLAN");
   planner->add_option("--axes", request->axes, "What moves (default: x, for a chain with two bending axes x,y)")
       ->type_name("x,y,z,yaw");
-  planner->add_option("--horizon", request->horizon, "Seconds for each target (default 3), or free: the shortest that does")
+  planner
+      ->add_option("--horizon", request->horizon,
+                   "Seconds for each target (default 3), or free: the shortest that does")
       ->type_name("S|free");
-  planner->add_option("--initial", request->initial, "Start from its first row (default: at rest)")->type_name("STATES.csv");
+  planner->add_option("--initial", request->initial, "Start from its first row (default: at rest)")
+      ->type_name("STATES.csv");
   planner
       ->add_option("--state-from", request->state_from,
                    "Start from what one camera shows in its first frame, with the base where it is then, at rest")
       ->type_name("CAPTURE:NAME")
       ->excludes("--initial");
-  planner->add_option("--terminal", request->terminal, "Where the base ends, from its start, one number an axis (default: free)")
+  planner
+      ->add_option("--terminal", request->terminal,
+                   "Where the base ends, from its start, one number an axis (default: free)")
       ->type_name("OFFSETS");
   planner->add_option("--window", request->window, "smooth: no acceleration at the ends; paper: s^2(1-s)^2")
       ->check(CLI::IsMember({"smooth", "paper"}));
@@ -451,21 +465,25 @@ void add_planning_commands(CLI::App& app, const Globals& globals, Job& job) {
   planner->add_option("--turn", limits.turn, "Farthest yaw from the start, rad (default 1.6)");
   planner->add_option("--keep-out-sphere", request->spheres, "Rope and gripper stay out of it")->type_name("X,Y,Z,R");
   planner->add_option("--keep-out-box", request->boxes, "Rope and gripper stay out of it")->type_name("X,Y,Z,X,Y,Z");
-  planner->add_option("--gripper-radius", request->options.gripper_radius, "Of a sphere about the base, m (default 0.04)");
+  planner->add_option("--gripper-radius", request->options.gripper_radius,
+                      "Of a sphere about the base, m (default 0.04)");
   planner->add_option("--tolerance", request->options.tolerance, "A smaller miss counts as reached, m (default 0.001)");
   planner->add_option("--starts", request->options.starts, "Random motions to begin from (default 24)")
       ->check(CLI::Range(0, 100000));
-  planner->add_option("--samples", request->options.samples,
-                      "Also plan for N parameter sets drawn from the identification's covariance")
+  planner
+      ->add_option("--samples", request->options.samples,
+                   "Also plan for N parameter sets drawn from the identification's covariance")
       ->check(CLI::Range(0, 1000))
       ->type_name("N");
   planner->add_flag("--worst-case", request->options.worst_case, "Minimize the samples' worst miss, not the mean");
   planner->add_option("--simulate", request->simulate, "Also play the plan on this true chain (a twin.json's 'chain')")
       ->type_name("CHAIN.json");
-  planner->add_flag("--mpc", request->mpc, "With --simulate: plan the rest anew from the state that is seen; base.* is\n"
-                                           "then the motion as corrected");
+  planner->add_flag("--mpc", request->mpc,
+                    "With --simulate: plan the rest anew from the state that is seen; base.* is\n"
+                    "then the motion as corrected");
   planner->add_option("--mpc-rate", request->loop.rate, "Replans a second (default 10)")->type_name("HZ");
-  planner->add_option("--target-velocity", request->target_velocity, "With --mpc: the target moves from the start on, m/s")
+  planner
+      ->add_option("--target-velocity", request->target_velocity, "With --mpc: the target moves from the start on, m/s")
       ->type_name("VX,VY,VZ");
   planner->add_option("--rate", request->rate, "Rows a second of the files (default 100)")->type_name("HZ");
   planner->add_flag("--force", request->force, "Write into a folder that is not empty");

@@ -27,7 +27,7 @@ enum class Window { smooth, paper };
 // What the arm can do. Speeds are of the translation (norm of the vector); those of yaw are separate. Stroke: farthest
 // offset from the start along each axis. Yaw's are of a wrist like the UR5e's (180 deg/s).
 struct Limits {
-  double velocity = 1.5, acceleration = 10.0, jerk = 200.0, stroke = 0.6;           // m, s
+  double velocity = 1.5, acceleration = 10.0, jerk = 200.0, stroke = 0.6;            // m, s
   double yaw_velocity = 3.1, yaw_acceleration = 20.0, yaw_jerk = 400.0, turn = 1.6;  // rad, s
 };
 
@@ -42,8 +42,8 @@ struct Piece {
 
 // The sum of all pieces; each rests at its terminal value after its end.
 struct Motion {
-  math::Pose origin;                   // base pose where all coordinates are 0
-  Vector3 up = Vector3::UnitZ();       // unit, world; yaw turns about it
+  math::Pose origin;              // base pose where all coordinates are 0
+  Vector3 up = Vector3::UnitZ();  // unit, world; yaw turns about it
   std::vector<Axis> axes;
   Window window = Window::smooth;
   std::vector<Piece> pieces;
@@ -72,19 +72,19 @@ struct Box {
 };
 
 struct Options {
-  std::vector<Axis> axes;              // empty: x for a planar chain, else x and y
+  std::vector<Axis> axes;  // empty: x for a planar chain, else x and y
   Window window = Window::smooth;
-  double horizon = 3.0;                // s, for each target
-  bool free_horizon = false;           // the shortest of a set of horizons that reaches it; `horizon` is the longest
-  std::optional<VectorX> terminal;     // offset from the start at the end, one an axis; none: free
+  double horizon = 3.0;             // s, for each target
+  bool free_horizon = false;        // the shortest of a set of horizons that reaches it; `horizon` is the longest
+  std::optional<VectorX> terminal;  // offset from the start at the end, one an axis; none: free
   Limits limits;
   std::vector<Sphere> spheres;
   std::vector<Box> boxes;
-  double gripper_radius = 0.04;        // m, of the sphere about the base that must stay out of them
-  double tolerance = 0.001;            // m, a smaller miss counts as reached
-  int starts = 24;                     // random motions that are tried before the best ones are optimized
-  int samples = 0;                     // parameter sets drawn from the covariance; 0: the identified one alone
-  bool worst_case = false;             // of the samples, instead of their mean
+  double gripper_radius = 0.04;  // m, of the sphere about the base that must stay out of them
+  double tolerance = 0.001;      // m, a smaller miss counts as reached
+  int starts = 24;               // random motions that are tried before the best ones are optimized
+  int samples = 0;               // parameter sets drawn from the covariance; 0: the identified one alone
+  bool worst_case = false;       // of the samples, instead of their mean
   std::uint64_t seed = 0;
 };
 
@@ -96,14 +96,14 @@ struct Problem {
   std::optional<Vector3> table_point;  // m, world
   math::Pose base;                     // at the start
   dynamics::InitialState initial;
-  std::vector<Vector3> targets;        // m, world; reached one after the other
-  dynamics::Estimates estimates;       // for `samples`
+  std::vector<Vector3> targets;   // m, world; reached one after the other
+  dynamics::Estimates estimates;  // for `samples`
 };
 
 struct Hit {
-  double miss = 0.0;                  // m, hard minimum, between the steps too
-  double time = 0.0;                  // s
-  Vector3 point = Vector3::Zero();    // of the rope, m, world
+  double miss = 0.0;                         // m, hard minimum, between the steps too
+  double time = 0.0;                         // s
+  Vector3 point = Vector3::Zero();           // of the rope, m, world
   double mean_miss = 0.0, worst_miss = 0.0;  // over the samples; the miss itself without them
 };
 
@@ -111,7 +111,7 @@ struct Plan {
   Motion motion;
   std::vector<Hit> hits;  // one a target
   bool reached = false;
-  std::string reason;     // why not
+  std::string reason;  // why not
   Peaks peaks;
   int starts = 0, iterations = 0;
   double seconds = 0.0;
@@ -141,22 +141,26 @@ dynamics::InitialState fit_state(const chain::Chain& chain, const trajectory::Ba
                                  const std::vector<double>& arclengths, const MatrixX& points,
                                  const MatrixX& velocities, const VectorX& start);
 
-// Replanning from the rope's measured state while another chain plays the rope's part.
+// Replanning while another chain plays the rope's part. What is seen of it are points of its centerline and their
+// speeds, without noise; from them come the twin's state and, by what the model did not foretell since the last look,
+// common factors of its stiffness, damping, friction and drag. A replan is two steps of Gauss-Newton from the motion so
+// far; the correction is taken as far as it keeps the limits, so that the executed motion keeps them where the plan
+// did.
 struct LoopOptions {
   bool feedback = true;                       // else the plan is played as it is
   double rate = 10.0;                         // replans a second
   Vector3 target_velocity = Vector3::Zero();  // m/s; seen by the replanning only, the plan knows the first place
 };
 struct LoopResult {
-  Motion motion;                // as executed
-  chain::States states;         // of the true chain
-  Hit hit;                      // of the true chain, against the target where it is then
+  Motion motion;         // as executed
+  chain::States states;  // of the true chain
+  Hit hit;               // of the true chain, against the target where it is then
   Peaks peaks;
   int replans = 0;
-  double longest_replan = 0.0, mean_replan = 0.0;  // s
+  double longest_replan = 0.0, mean_replan = 0.0;  // s of one core
 };
-// Plays `plan` (of one target) on `truth`, from rest: in free space in its own equilibrium, on a table with the shape of
-// the problem's initial state.
+// Plays `plan` (of one target) on `truth`, from rest: in free space in its own equilibrium, on a table with the shape
+// of the problem's initial state.
 LoopResult closed_loop(const Problem& problem, const Options& options, const Plan& plan, const dynamics::Model& truth,
                        const LoopOptions& loop);
 

@@ -6,8 +6,8 @@
 namespace chainsplat::planning {
 namespace {
 
-constexpr double kPriorSpread = 0.3;    // of the logarithms: another day, another surface
-constexpr double kDrift = 0.02;         // of the logarithms from one look to the next: what one factor means changes
+constexpr double kPriorSpread = 0.3;  // of the logarithms: another day, another surface
+constexpr double kDrift = 0.02;       // of the logarithms from one look to the next: what one factor means changes
 constexpr double kPositionError = 0.002, kSpeedError = 0.04;  // m, m/s, of what the model cannot explain
 constexpr double kLargestStep = 0.5, kLargest = 1.0;          // of a logarithm: no look may break the model
 
@@ -63,8 +63,7 @@ void adapt(Adaptation& adaptation, const dynamics::BaseFunction& base, const dyn
   if (size == 0) return;
   const chain::Chain& chain = adaptation.model.chain;
   const double now[] = {before.time, after.time};
-  const dynamics::BaseGrid grid =
-      dynamics::sample_base(base, now[0], {now[1]}, adaptation.model.parameters.substeps);
+  const dynamics::BaseGrid grid = dynamics::sample_base(base, now[0], {now[1]}, adaptation.model.parameters.substeps);
   // the derivative by a logarithm is the group as it stands now
   std::vector<dynamics::Tangent> groups = adaptation.groups;
   for (Eigen::Index g = 0; g < size; ++g)

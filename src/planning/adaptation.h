@@ -8,9 +8,9 @@
 namespace chainsplat::planning {
 
 struct Adaptation {
-  dynamics::Model nominal, model;          // as identified, and with the factors
-  std::vector<dynamics::Tangent> groups;   // of the nominal parameters, one a factor: the derivative by its logarithm
-  VectorX factors;                         // logarithms
+  dynamics::Model nominal, model;         // as identified, and with the factors
+  std::vector<dynamics::Tangent> groups;  // of the nominal parameters, one a factor: the derivative by its logarithm
+  VectorX factors;                        // logarithms
   MatrixX covariance;
 };
 Adaptation start_adaptation(const dynamics::Model& model);

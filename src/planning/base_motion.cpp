@@ -91,8 +91,7 @@ trajectory::BaseMotion base_from(const Motion& motion, const Coordinates& c, mat
   out.velocity << spin, v;
   out.acceleration << spin_rate, v_rate;
   if (jerk)
-    *jerk << c(3, 3) * axis,
-        back * c.col(3).head<3>() - spin.cross(a) - spin_rate.cross(v) - spin.cross(v_rate);
+    *jerk << c(3, 3) * axis, back * c.col(3).head<3>() - spin.cross(a) - spin_rate.cross(v) - spin.cross(v_rate);
   return out;
 }
 

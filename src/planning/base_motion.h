@@ -4,7 +4,7 @@
 
 namespace chainsplat::planning {
 
-inline constexpr int kPerAxis = kBasisCount + 1;  // unknowns an axis: the weights, then the terminal offset
+inline constexpr int kPerAxis = kBasisCount + 1;   // unknowns an axis: the weights, then the terminal offset
 using Basis = Eigen::Matrix<double, kPerAxis, 4>;  // an unknown's value and first three time derivatives
 
 // At `time` of a stretch; clamped to its ends, where the derivatives are 0.

@@ -11,20 +11,21 @@
 namespace chainsplat::planning {
 namespace {
 
-constexpr double kTruthStep = 1.0 / 240.0;   // s, between states of the true chain
-constexpr double kReplanSharpness = 3e4;     // m^-2
+constexpr double kTruthStep = 1.0 / 240.0;  // s, between states of the true chain
+constexpr double kReplanSharpness = 3e5;    // m^-2
 constexpr double kReplanSmoothness = 1e-8;
-constexpr int kReplanIterations = 3;         // two steps: the motion so far is the start, and the next replan goes on
-constexpr double kReplanDamping = 1e-7;      // of the curvature's trace, which limits may dominate
-constexpr double kShortest = 0.15;           // s before the hit, after which nothing is changed any more
-constexpr double kLimitStep = 0.002;         // s, between tests of the limits
-constexpr double kLimitPart = 0.995;         // of the limits: between the tests no more than 0.2 % is added
-constexpr double kLeastPiece = 0.35;         // s, of a correction
-constexpr double kPieceMargin = 1.6;         // its length over the time to the hit, in free space
-constexpr int kReplanNodes = 60;             // of its rollout, where the substeps allow
+// Two steps: the motion so far is the start, and the next replan goes on. The damping is a part of the curvature's
+// trace, which limits may dominate; where the rope sticks or a limit is near, full steps fail and much shorter ones do.
+constexpr Effort kReplanEffort{.steps = 2, .trials = 3, .damping = 1e-7, .more_damping = 200.0, .hopeful = false};
+constexpr double kShortest = 0.15;    // s before the hit, after which nothing is changed any more
+constexpr double kLimitStep = 0.002;  // s, between tests of the limits
+constexpr double kLimitPart = 0.995;  // of the limits: between the tests no more than 0.2 % is added
+constexpr double kLeastPiece = 0.35;  // s, of a correction
+constexpr double kPieceMargin = 1.6;  // its length over the time to the hit, in free space
+constexpr int kReplanNodes = 60;      // of its rollout, where the substeps allow
 constexpr int kFitIterations = 20;
-constexpr double kFitStiffness = 1e-5;       // m/rad: angles that the points leave open stay as they are
-constexpr int kSeenPoints = 33;              // of the rope's centerline
+constexpr double kFitStiffness = 1e-5;  // m/rad: angles that the points leave open stay as they are
+constexpr int kSeenPoints = 33;         // of the rope's centerline
 
 // Distance of `target` to a polyline.
 double distance_to(const MatrixX& points, const Vector3& target, Vector3& nearest) {
@@ -48,8 +49,8 @@ MatrixX centerline_velocity(const chain::Chain& chain, const VectorX& theta, con
   for (std::size_t i = 0; i < arclengths.size(); ++i) {
     const int link = chain::link_at(chain, arclengths[i]);
     const Vector3 point = motions[link] * (arclengths[i] * chain.direction);
-    out.col(static_cast<Eigen::Index>(i)) = speed + spin.cross(point - base.pose.translation) +
-                                            chain::point_jacobian(chain, axes, link, point) * thetadot;
+    out.col(static_cast<Eigen::Index>(i)) =
+        speed + spin.cross(point - base.pose.translation) + chain::point_jacobian(chain, axes, link, point) * thetadot;
   }
   return out;
 }
@@ -125,7 +126,8 @@ class Samples {
     for (const Piece& piece : motion.pieces)
       for (double time : jumps(piece)) watch(motion, time);
   }
-  // Makes the last piece of `motion` so much smaller that it keeps the limits together with the others, and takes it in.
+  // Makes the last piece of `motion` so much smaller that it keeps the limits together with the others, and takes it
+  // in.
   void take_within(Motion& motion, const Limits& limits) {
     Piece& last = motion.pieces.back();
     Motion others = motion, alone = motion;
@@ -146,7 +148,8 @@ class Samples {
       for (int order = 0; order <= (smooth ? 3 : 2); ++order) {
         for (int row = 0; order == 0 && row < 3; ++row)  // the stroke is one along each axis
           part = part_within(c.block<1, 1>(row, 0).col(0), d.block<1, 1>(row, 0).col(0), kLimitPart * most[0], part);
-        if (order > 0) part = part_within(c.col(order).head<3>(), d.col(order).head<3>(), kLimitPart * most[order], part);
+        if (order > 0)
+          part = part_within(c.col(order).head<3>(), d.col(order).head<3>(), kLimitPart * most[order], part);
         part = part_within(c.block<1, 1>(3, order).col(0), d.block<1, 1>(3, order).col(0), kLimitPart * yaw_most[order],
                            part);
       }
@@ -180,8 +183,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
   if (plan.hits.size() != 1) throw InputError("--simulate", "plays one target only", "give one --target");
   if (!(loop.rate > 0.0) || !std::isfinite(loop.rate))
     throw InputError("--mpc-rate", "must be above 0", "give replans a second, for example 10");
-  if (!loop.target_velocity.allFinite())
-    throw InputError("--target-velocity", "is not finite", "give VX,VY,VZ in m/s");
+  if (!loop.target_velocity.allFinite()) throw InputError("--target-velocity", "is not finite", "give VX,VY,VZ in m/s");
   if (truth.chain.direction != problem.model.chain.direction)
     throw InputError("--simulate", "the chain leaves the gripper in another direction", "give one of the same grasp");
   const chain::Chain& chain = problem.model.chain;
@@ -207,7 +209,8 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
     state.theta = dynamics::static_equilibrium(truth, problem.base);
   }
   state.thetadot = VectorX::Zero(truth.chain.angles());
-  out.states.time.push_back(0.0), out.states.theta.push_back(state.theta), out.states.thetadot.push_back(state.thetadot);
+  out.states.time.push_back(0.0), out.states.theta.push_back(state.theta),
+      out.states.thetadot.push_back(state.thetadot);
 
   double hit_time = plan.hits.front().time;
   Samples samples(out.motion);
@@ -240,8 +243,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
       append_piece(motion, now, length);
       const int full = problem.model.parameters.substeps;
       const int substeps = std::clamp(static_cast<int>(kReplanNodes / (30.0 * length)), full > 4 ? 2 : 1, full);
-      Task task =
-          make_task(problem, options, {&adaptation.model}, motion, estimate, problem.targets.front(), substeps);
+      Task task = make_task(problem, options, {&adaptation.model}, motion, estimate, problem.targets.front(), substeps);
       task.exact = false;
       task.target = target_at(now);
       task.target_velocity = loop.target_velocity;
@@ -249,7 +251,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
       if (options.terminal)
         for (std::size_t a = 0; a < motion.axes.size(); ++a) task.held[a * kPerAxis + kBasisCount] = true;
       VectorX q = VectorX::Zero(static_cast<Eigen::Index>(motion.axes.size()) * kPerAxis);
-      minimize(task, q, {kReplanSharpness, kReplanSmoothness}, kReplanIterations, kReplanDamping);
+      minimize(task, q, {kReplanSharpness, kReplanSmoothness}, kReplanEffort);
       // a correction that asks too much of the arm is taken in part
       set_unknowns(motion, q);
       samples.take_within(motion, options.limits);

@@ -7,14 +7,14 @@
 namespace chainsplat::planning {
 namespace {
 
-constexpr double kLimitWeight = 1.0;     // m^2: 1 % too fast costs as much as 10 mm
-constexpr double kLimitMargin = 0.97;    // of a limit, where its cost begins: verified on a finer grid afterwards
+constexpr double kLimitWeight = 1.0;   // m^2: 1 % too fast costs as much as 10 mm
+constexpr double kLimitMargin = 0.97;  // of a limit, where its cost begins: verified on a finer grid afterwards
 constexpr double kClearanceWeight = 30.0;
 constexpr double kClearanceMargin = 0.004;  // m
-constexpr double kRestTime = 0.01;       // s: 10 cm/s left on the table cost as much as 1 mm
-constexpr double kNegligible = 1e-7;     // weight in the soft minimum
-constexpr int kHermiteSteps = 16;        // between two nodes, for the hard minimum
-constexpr double kLimitInterval = 0.02;  // s, between tests of limits and obstacles
+constexpr double kRestTime = 0.01;          // s: 10 cm/s left on the table cost as much as 1 mm
+constexpr double kNegligible = 1e-7;        // weight in the soft minimum
+constexpr int kHermiteSteps = 16;           // between two nodes, for the hard minimum
+constexpr double kLimitInterval = 0.02;     // s, between tests of limits and obstacles
 
 // 3 x unknowns: a world point fixed to link `link`.
 MatrixX point_slope(const Task& task, const chain::Chain& chain, const Rollout& rollout, const MatrixX& axes, int node,
@@ -154,8 +154,8 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
   std::vector<Rollout> rollouts(samples);
   std::vector<char> finite(samples);
   core::parallel_for(samples, [&](std::int64_t m) {
-    finite[m] = roll_out(*task.models[m], task.motion, task.grid, unknowns, task.initial, derivatives, rollouts[m],
-                         task.exact);
+    finite[m] =
+        roll_out(*task.models[m], task.motion, task.grid, unknowns, task.initial, derivatives, rollouts[m], task.exact);
   });
   if (std::find(finite.begin(), finite.end(), 0) != finite.end()) return sum;
   sum.good = true;
@@ -296,8 +296,7 @@ Hit measure(const Task& task, const dynamics::Model& model, const Rollout& rollo
   Hit hit;
   double least = std::numeric_limits<double>::infinity();
   const auto consider = [&](double time, const VectorX& theta, const math::Pose& base) {
-    const Nearest best =
-        nearest(chain, chain::link_motions(chain, theta, base), task.tabletop, task.target_at(time));
+    const Nearest best = nearest(chain, chain::link_motions(chain, theta, base), task.tabletop, task.target_at(time));
     if (best.squared < least) least = best.squared, hit.time = time, hit.point = best.point;
     return best.squared;
   };

@@ -8,16 +8,16 @@ namespace chainsplat::planning {
 struct Task {
   std::vector<const dynamics::Model*> models;  // one, or the samples
   bool tabletop = false;
-  Motion motion;                               // the last piece's numbers do not count
+  Motion motion;  // the last piece's numbers do not count
   Grid grid;
   dynamics::InitialState initial;
-  Vector3 target = Vector3::Zero();            // at `target_time`, at the rope's height
-  Vector3 target_velocity = Vector3::Zero();   // m/s
+  Vector3 target = Vector3::Zero();           // at `target_time`, at the rope's height
+  Vector3 target_velocity = Vector3::Zero();  // m/s
   double target_time = 0.0;
   const Options* options = nullptr;
-  std::vector<bool> held;                      // unknowns that keep their value
-  bool exact = true;                           // derivatives of the discrete map
-  double limit_weight = 1.0;                   // of limits and obstacles, against the usual
+  std::vector<bool> held;     // unknowns that keep their value
+  bool exact = true;          // derivatives of the discrete map
+  double limit_weight = 1.0;  // of limits and obstacles, against the usual
 
   Vector3 target_at(double time) const { return target + (time - target_time) * target_velocity; }
 };
@@ -28,9 +28,9 @@ struct Sharpness {
 };
 
 struct Evaluation {
-  bool good = false;  // the motion stayed finite
-  double value = 0.0;   // m^2
-  double miss = 0.0;    // m, hard minimum over the nodes, mean (or worst) of the samples
+  bool good = false;       // the motion stayed finite
+  double value = 0.0;      // m^2
+  double miss = 0.0;       // m, hard minimum over the nodes, mean (or worst) of the samples
   double violation = 0.0;  // m^2, the part of limits, obstacles and, on a table, speed left in the end
   VectorX gradient;
   MatrixX curvature;  // Gauss-Newton, positive semidefinite

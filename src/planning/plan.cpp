@@ -9,24 +9,24 @@
 namespace chainsplat::planning {
 namespace {
 
-// Annealing of the soft minimum (SPEC 8), with the iterations for each.
+// Annealing of the soft minimum (SPEC 8), with the steps for each.
 constexpr struct {
   double sharpness, smoothness;
-  int iterations;
-} kCoarse[] = {{1e3, 1e-6, 6}, {1e4, 1e-7, 7}};
+  int steps;
+} kCoarse[] = {{1e3, 1e-6, 4}, {1e4, 1e-7, 5}};
 constexpr double kFinalSharpness = 1e5, kSharpest = 1e6;  // m^-2
 constexpr double kFinalSmoothness = 3e-9;
-constexpr int kFinalIterations = 12;
-constexpr double kEnough = 0.1;       // of the tolerance: no further iteration is made
-constexpr double kGoodMiss = 0.3;     // of the tolerance: no further start is tried
-constexpr double kStrictLimits = 100.0;  // times the usual weight
+constexpr int kFinalSteps = 9;
+constexpr double kEnough = 0.1;             // of the tolerance: no further iteration is made
+constexpr double kGoodMiss = 0.3;           // of the tolerance: no further start is tried
+constexpr double kStrictLimits = 100.0;     // times the usual weight
 constexpr int kGroups[] = {1, 1, 2, 4, 4};  // starts optimized side by side; the next group only where the last failed
-constexpr double kPromising = 10.0;   // of the tolerance: a coarse miss from which it is worth to go on at once
-constexpr int kLastTries = 2;         // of the nearest others, where no start was good
-constexpr double kLeastLoad = 0.25, kMostLoad = 0.95;  // of the limits, of random motions
+constexpr double kPromising = 10.0;         // of the tolerance: a coarse miss from which it is worth to go on at once
+constexpr int kLastTries = 2;               // of the nearest others, where no start was good
+constexpr double kLeastLoad = 0.25, kMostLoad = 0.95;           // of the limits, of random motions
 constexpr std::uint64_t kTargetStream = 0x7461726765740001ull;  // random numbers of random_target
 constexpr double kHorizons[] = {0.25, 0.35, 0.5, 0.7, 1.0};     // of the longest, for a free one
-constexpr double kTableSlack = 1e-6;  // m, a target may lie in the table's plane
+constexpr double kTableSlack = 1e-6;                            // m, a target may lie in the table's plane
 
 std::string millimeters(double meters) {
   char text[32];
@@ -57,7 +57,8 @@ void validate(const Problem& problem, const Options& options) {
       throw InputError("--axes", "an axis is named twice", "name each of x, y, z, yaw once at most");
   if (problem.tabletop && problem.model.parameters.table_normal)
     for (Axis axis : axes)
-      if (axis != Axis::yaw && std::abs(problem.model.parameters.table_normal->operator[](static_cast<int>(axis))) > 0.1)
+      if (axis != Axis::yaw &&
+          std::abs(problem.model.parameters.table_normal->operator[](static_cast<int>(axis))) > 0.1)
         throw InputError("--axes", "one leaves the table and the rope is known on the table only", "leave it out");
   for (const Vector3& target : problem.targets) {
     if (!target.allFinite())
@@ -142,7 +143,7 @@ Found approach(const Task& coarse, VectorX unknowns) {
   Found found;
   found.unknowns = std::move(unknowns);
   for (const auto& stage : kCoarse)
-    found.iterations += minimize(coarse, found.unknowns, {stage.sharpness, stage.smoothness}, stage.iterations);
+    found.iterations += minimize(coarse, found.unknowns, {stage.sharpness, stage.smoothness}, {.steps = stage.steps});
   judge(coarse, found);
   return found;
 }
@@ -151,20 +152,20 @@ Found approach(const Task& coarse, VectorX unknowns) {
 void finish(const Task& fine, Found& found) {
   Task quick = fine;
   quick.exact = false;
-  const double enough = kEnough * fine.options->tolerance;
+  const Effort effort{.steps = kFinalSteps, .enough = kEnough * fine.options->tolerance};
   const Sharpness last{kFinalSharpness, kFinalSmoothness};
-  found.iterations += minimize(quick, found.unknowns, last, kFinalIterations, kFirstDamping, enough);
+  found.iterations += minimize(quick, found.unknowns, last, effort);
   judge(fine, found);
   if (found.good && merit(found, *fine.options) <= kGoodMiss * fine.options->tolerance) return;
   // what is left: the soft minimum likes to stay near for long, and derivatives of lower order end too early
   const Sharpness sharpest{kSharpest, kFinalSmoothness};
-  found.iterations += minimize(fine, found.unknowns, sharpest, kFinalIterations, kFirstDamping, enough);
+  found.iterations += minimize(fine, found.unknowns, sharpest, effort);
   judge(fine, found);
   if (found.good || !std::isfinite(found.hit.miss)) return;
   // a far target pulls harder than the limits push: once more with limits that count more
   Task strict = fine;
   strict.limit_weight = kStrictLimits;
-  found.iterations += minimize(strict, found.unknowns, last, kFinalIterations);
+  found.iterations += minimize(strict, found.unknowns, last, {.steps = kFinalSteps});
   judge(fine, found);
 }
 
@@ -326,8 +327,8 @@ Plan plan(const Problem& problem, const Options& options) {
       if (!options.free_horizon && part != 1.0) continue;
       Motion trial = plan.motion;
       append_piece(trial, start, part * options.horizon);
-      Found found = solve(problem, options, models, trial, state, problem.targets[t], terminal, plan.starts,
-                          plan.iterations);
+      Found found =
+          solve(problem, options, models, trial, state, problem.targets[t], terminal, plan.starts, plan.iterations);
       if (first || better(found, best, options)) best = std::move(found), motion = std::move(trial);
       first = false;
       if (best.good && merit(best, options) <= options.tolerance) break;
@@ -343,7 +344,8 @@ Plan plan(const Problem& problem, const Options& options) {
       const std::string which = problem.targets.size() > 1 ? "target " + std::to_string(t + 1) + ": " : "";
       if (!plan.reason.empty()) plan.reason += "; ";
       if (bound > options.tolerance)
-        plan.reason += which + "it is at least " + millimeters(bound) + " beyond what rope length, stroke and axes allow";
+        plan.reason +=
+            which + "it is at least " + millimeters(bound) + " beyond what rope length, stroke and axes allow";
       else if (!best.peaks.over.empty())
         plan.reason += which + "no motion found keeps the " + best.peaks.over + " limit";
       else if (best.clearance < 0.0)

@@ -6,8 +6,8 @@
 namespace chainsplat::planning {
 namespace {
 
-constexpr double kLeastDamping = 1e-9, kMostDamping = 1e6;
-constexpr double kLessDamping = 0.15, kMoreDamping = 6.0;
+constexpr double kLeastDamping = 1e-9;
+constexpr double kLessDamping = 0.15;
 constexpr double kConverged = 1e-4;  // relative decrease of the objective
 constexpr double kNothing = 1e-11;   // m^2, (3 um)^2: a smaller decrease does not count
 
@@ -74,10 +74,9 @@ Task make_task(const Problem& problem, const Options& options, const std::vector
   return task;
 }
 
-int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, int iterations, double first_damping,
-             double enough) {
+int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, const Effort& effort) {
   const auto done = [&](const Evaluation& e) {
-    return e.good && e.miss < enough && e.violation < enough * enough;
+    return e.good && e.miss < effort.enough && e.violation < effort.enough * effort.enough;
   };
   Evaluation now = evaluate(task, unknowns, sharpness, true);
   if (!now.good || done(now)) return 1;
@@ -91,29 +90,28 @@ int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, in
   for (Eigen::Index i = 0; i < unknowns.size(); ++i)
     if (task.held[i]) metric.row(i).setZero(), metric.col(i).setZero(), metric(i, i) = 1.0;
   metric /= metric.trace();
-  double damping = first_damping;
+  double damping = effort.damping;
   int count = 1;
-  while (count < iterations) {
+  for (int taken = 0; taken < effort.steps; ++taken) {
+    const bool last = taken + 1 == effort.steps;
     const double scale = now.curvature.trace();
     VectorX step;
     Evaluation next;
-    for (bool again = false;; again = true) {
+    for (int trial = 0;; ++trial, damping *= effort.more_damping) {
+      if (trial == effort.trials) return count;
       MatrixX matrix = now.curvature + damping * scale * metric;
       // the metric has no part in directions without acceleration; held unknowns have no row
       matrix.diagonal().array() += 1e-12 * scale;
       step = -matrix.ldlt().solve(now.gradient);
       for (Eigen::Index i = 0; i < step.size(); ++i)
         if (task.held[i]) step[i] = 0.0;
-      // the first step is mostly good; once one was not, look before the derivatives are paid for
-      const bool last = count + 1 >= iterations;
-      next = evaluate(task, unknowns + step, sharpness, !again && !last);
+      // where the first trial is mostly good it brings the derivatives along
+      const bool ahead = effort.hopeful && trial == 0 && !last;
+      next = evaluate(task, unknowns + step, sharpness, ahead);
       ++count;
-      if (next.good && next.value < now.value) {
-        if (again && !last) next = evaluate(task, unknowns + step, sharpness, true);
-        break;
-      }
-      damping *= kMoreDamping;
-      if (damping > kMostDamping || count >= iterations) return count;
+      if (!(next.good && next.value < now.value)) continue;
+      if (!ahead && !last) next = evaluate(task, unknowns + step, sharpness, true);
+      break;
     }
     const double decrease = now.value - next.value;
     unknowns += step;

@@ -18,12 +18,16 @@ Vector3 at_rope_height(const Problem& problem, const Vector3& target);
 void set_unknowns(Motion& motion, const VectorX& unknowns);  // of the last piece
 VectorX unknowns_of(const Motion& motion);
 
-inline constexpr double kFirstDamping = 1e-2;  // of the curvature's trace
-// Damped Gauss-Newton; ends after `iterations` evaluations, of which the last is one without derivatives, or when nothing
-// changes any more. Returns those it took. `first_damping` is small near a solution. `enough`: ends where the miss is
-// smaller, m, with limits and obstacles kept and, on a table, the rope at rest.
-int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, int iterations,
-             double first_damping = kFirstDamping, double enough = 0.0);
+// What one call of minimize() may cost. Damping is a part of the curvature's trace.
+struct Effort {
+  int steps = 10, trials = 8;  // steps taken at most, and lengths tried for each
+  double damping = 1e-2;       // of the first step; small near a solution
+  double more_damping = 6.0;   // times, after a step that did not help
+  bool hopeful = true;         // evaluate the derivatives with a step's first trial
+  double enough = 0.0;         // m; ends where the miss is smaller, limits and obstacles kept, the rope at rest (table)
+};
+// Damped Gauss-Newton; ends where nothing changes any more. Returns the evaluations.
+int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, const Effort& effort);
 
 // A random motion whose largest peak is `fraction` of its limit.
 VectorX random_unknowns(const Task& task, core::Random& random, double fraction);
