@@ -73,8 +73,8 @@ std::string picture_svg(const Problem& problem, const Options& options, const Pl
       "font-family=\"sans-serif\" font-size=\"14\">\n<rect width=\"100%%\" height=\"100%%\" fill=\"white\"/>\n",
       width, height, width, height);
   for (const Sphere& s : options.spheres)
-    out += text("<circle cx=\"%.1f\" cy=\"%.1f\" r=\"%.1f\" fill=\"#d9534f\" fill-opacity=\"0.3\"/>\n", view.x(s.center),
-                view.y(s.center), view.scale * s.radius);
+    out += text("<circle cx=\"%.1f\" cy=\"%.1f\" r=\"%.1f\" fill=\"#d9534f\" fill-opacity=\"0.3\"/>\n",
+                view.x(s.center), view.y(s.center), view.scale * s.radius);
   for (const Box& b : options.boxes)
     out += text("<rect x=\"%.1f\" y=\"%.1f\" width=\"%.1f\" height=\"%.1f\" fill=\"#d9534f\" fill-opacity=\"0.3\"/>\n",
                 view.x(b.low), view.y(b.high), view.scale * (b.high - b.low)[view.right],
@@ -85,14 +85,14 @@ std::string picture_svg(const Problem& problem, const Options& options, const Pl
     const int light = 200 - static_cast<int>(160 * k / (ropes.size() - 1));  // later is darker
     out += polyline(view, ropes[k], text("stroke=\"rgb(%d,%d,230)\" stroke-width=\"3\"", light, light).c_str());
   }
-  for (const Hit& hit : plan.hits)
-    out += polyline(view, rope_at(hit.time), "stroke=\"#e08020\" stroke-width=\"3\"");
+  for (const Hit& hit : plan.hits) out += polyline(view, rope_at(hit.time), "stroke=\"#e08020\" stroke-width=\"3\"");
   for (const Vector3& p : problem.targets)
     out += text("<circle cx=\"%.1f\" cy=\"%.1f\" r=\"7\" fill=\"none\" stroke=\"#208040\" stroke-width=\"3\"/>\n",
                 view.x(p), view.y(p));
-  out += text("<text x=\"%.0f\" y=\"%.0f\">miss %.2f mm, %.2f s; %c right, %c up; orange: at the hit; bar: 0.1 m</text>\n",
-              kBorder, height - 12, plan.hits.empty() ? 0.0 : 1e3 * plan.hits.front().miss, end, "xyz"[view.right],
-              "xyz"[view.up]);
+  out +=
+      text("<text x=\"%.0f\" y=\"%.0f\">miss %.2f mm, %.2f s; %c right, %c up; orange: at the hit; bar: 0.1 m</text>\n",
+           kBorder, height - 12, plan.hits.empty() ? 0.0 : 1e3 * plan.hits.front().miss, end, "xyz"[view.right],
+           "xyz"[view.up]);
   out += text("<line x1=\"%.1f\" y1=\"%.1f\" x2=\"%.1f\" y2=\"%.1f\" stroke=\"black\" stroke-width=\"2\"/>\n", kBorder,
               height - 34, kBorder + 0.1 * view.scale, height - 34);
   return out + "</svg>\n";

@@ -75,15 +75,26 @@ void validate(const Problem& problem, const Options& options) {
       if (std::abs((*options.terminal)[static_cast<Eigen::Index>(a)]) >
           (axes[a] == Axis::yaw ? limits.turn : limits.stroke))
         throw InputError("--terminal", "is outside the stroke", "raise the stroke limit or end nearer to the start");
-    // the fastest way from rest to rest: the blend's own peaks
-    Motion motion = empty_motion(problem, options);
-    append_piece(motion, 0.0, options.horizon * static_cast<double>(problem.targets.size()));
-    motion.pieces.back().terminal = *options.terminal;
-    if (const Peaks p = peaks(motion, 0.0, motion.end(), limits);
-        p.over == "velocity" && options.terminal->head(1).size() > 0 &&
-        p.velocity > 1.9 * limits.velocity)  // 1.9: mean to peak speed of the blend; no motion in time is slower
-      throw InputError("--terminal", "cannot be reached in time within the velocity limit",
-                       "give a longer horizon or a nearer end");
+    // from rest to rest: half the time faster and half slower, each limit alone
+    const double time = options.horizon * static_cast<double>(problem.targets.size());
+    for (std::size_t a = 0; a < axes.size(); ++a) {
+      const double way = std::abs((*options.terminal)[static_cast<Eigen::Index>(a)]);
+      const bool yaw = axes[a] == Axis::yaw;
+      const char* limit = nullptr;
+      if (way > (yaw ? limits.yaw_velocity : limits.velocity) * time)
+        limit = "velocity";
+      else if (way > (yaw ? limits.yaw_acceleration : limits.acceleration) * time * time / 4.0)
+        limit = "acceleration";
+      else if (way > (yaw ? limits.yaw_jerk : limits.jerk) * time * time * time / 32.0)
+        limit = "jerk";
+      if (limit) {
+        std::string what = "cannot be reached in ";
+        what += core::exact(time);
+        what += " s within the ";
+        what += limit;
+        throw InputError("--terminal", what + " limit", "give a longer horizon, a nearer end or a higher limit");
+      }
+    }
   }
   for (const Sphere& s : options.spheres)
     if (!s.center.allFinite() || !(s.radius > 0.0))
@@ -91,6 +102,18 @@ void validate(const Problem& problem, const Options& options) {
   for (const Box& b : options.boxes)
     if (!b.low.allFinite() || !b.high.allFinite() || !((b.high - b.low).minCoeff() > 0.0))
       throw InputError("--keep-out-box", "is no box", "give the lower corner, then the upper corner");
+  if (!options.spheres.empty() || !options.boxes.empty()) {
+    Motion motion = empty_motion(problem, options);
+    append_piece(motion, 0.0, options.horizon);
+    Task task = make_task(problem, options, {&problem.model}, motion, problem.initial, problem.base.translation, 1);
+    task.grid.basis.resize(1);
+    Rollout start;
+    start.base = {task.grid.fixed[0]}, start.theta = {problem.initial.theta};
+    if (clearance(task, problem.model, start) < 0.0)
+      throw InputError(options.spheres.empty() ? "--keep-out-box" : "--keep-out-sphere",
+                       "rope or gripper touch it at the start",
+                       "move it, or give the gripper's size with --gripper-radius");
+  }
 }
 
 struct Found {
@@ -373,6 +396,9 @@ chain::States predict(const Problem& problem, const Motion& motion, const std::v
 }
 
 Vector3 random_target(const Problem& problem, const Options& options, std::uint64_t seed) {
+  Problem asked = problem;
+  asked.targets = {problem.base.translation};
+  validate(asked, options);
   Motion motion = empty_motion(problem, options);
   append_piece(motion, 0.0, options.horizon);
   dynamics::InitialState initial = problem.initial;

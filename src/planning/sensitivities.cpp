@@ -12,7 +12,7 @@ using math::Matrix3;
 using math::Vector6;
 
 constexpr double kFrame = 1.0 / 30.0;  // s, what `substeps` counts in
-constexpr double kProbe = 1e-5;        // e of the second derivatives: truncation and rounding both below 1e-8
+constexpr double kProbe = 3e-6;        // e of the second derivatives: truncation and rounding both below 1e-8
 constexpr double kAngleBound = 1e3;    // rad, beyond which a motion counts as diverged
 constexpr double kRateBound = 1e5;     // rad/s
 const double kGaussPoint[3] = {0.5 * (1.0 - std::sqrt(0.6)), 0.5, 0.5 * (1.0 + std::sqrt(0.6))};
@@ -86,8 +86,8 @@ class BaseResponse {
         if (!used_[i]) continue;
         wrench_[i] += body * change_[i].psi;
         const Vector3 turn = change_[i].u.head<3>();
-        wrench_[i].head<3>() += 2.0 * w.cross(body.rotational * turn) - trace * w.cross(turn) -
-                                2.0 * body.moment.cross(v.cross(turn));
+        wrench_[i].head<3>() +=
+            2.0 * w.cross(body.rotational * turn) - trace * w.cross(turn) - 2.0 * body.moment.cross(v.cross(turn));
         wrench_[i].tail<3>() -= 2.0 * momentum.cross(turn);
       }
       const dynamics::LinkConstants& link = engine_.links[j];
@@ -112,8 +112,7 @@ class BaseResponse {
         }
         for (std::size_t i = 0; i < change_.size(); ++i) {
           if (!used_[i] || !change_[i].moves()) continue;
-          const Vector3 f =
-              kGaussWeight[g] * (slope * (change_[i].u.tail<3>() + change_[i].u.head<3>().cross(c)));
+          const Vector3 f = kGaussWeight[g] * (slope * (change_[i].u.tail<3>() + change_[i].u.head<3>().cross(c)));
           wrench_[i].head<3>() -= c.cross(f);
           wrench_[i].tail<3>() -= f;
         }
@@ -213,7 +212,7 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
   MatrixX slope = MatrixX::Zero(n, p), rate_slope = MatrixX::Zero(n, p);
   VectorX k_theta[4], k_rate[4], right(n), work(n), stage_theta(n), stage_rate(n);
   MatrixX dk_theta[4], dk_rate[4], d_right(n, p), d_work(n, p), now_rate(n, p), stage_slope(n, p),
-      stage_rate_slope(n, p), curvature(n, p);
+      stage_rate_slope(n, p);
   Eigen::PartialPivLU<MatrixX> factor(n);
   MatrixX matrix(n, n);
   const double h = grid.step, g = 0.5 * h;
@@ -245,13 +244,14 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
     // d_work holds M^-1 times the change of `work`, without the second derivatives
     const auto solve_tangents = [&](int i) {
       if (exact) {
-        const double shift = kProbe * h * kTimeWeight[i];
-        if (!other.place(motion, shifted(base, shift), theta + kProbe * k_theta[i], rate + kProbe * k_rate[i], true))
-          return false;
-        other.tangent_forces(shifted(base, shift), shifted(grid.basis[k], shift), slope, rate_slope);
-        curvature = other.forces;
-        other.solve_mass(curvature);
-        d_work += (curvature - now_rate) / kProbe;
+        for (const double e : {kProbe, -kProbe}) {
+          const double shift = e * h * kTimeWeight[i];
+          if (!other.place(motion, shifted(base, shift), theta + e * k_theta[i], rate + e * k_rate[i], true))
+            return false;
+          other.tangent_forces(shifted(base, shift), shifted(grid.basis[k], shift), slope, rate_slope);
+          other.solve_mass(other.forces);
+          d_work += other.forces / (2.0 * e);
+        }
       }
       dk_rate[i].noalias() = engine.mass * d_work;
       dk_rate[i].noalias() -= g * (engine.stiffness * d_right);
