@@ -25,6 +25,7 @@ struct Options {
   int substeps = 0;           // a frame of 1/30 s; 0: 4, on a table 8 (stick and slip)
   std::uint64_t seed = 0;     // of further starts where the first ones fit poorly
   int max_iterations = 25;    // of Levenberg-Marquardt, a horizon
+  double model_error = 1e-3;  // m, of one coordinate of a point of the chain, beside what `covariances` say
   int adam_iterations = 300;  // paper
 };
 

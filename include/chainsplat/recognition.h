@@ -41,4 +41,27 @@ struct Result {
 // "recognize".
 Result recognize(gpu::Device& device, const capture::Capture& capture, const Options& options);
 
+// --- the two halves of a round of `fast`, for what goes on with a recognized twin ------------------------------------
+
+// What is known of every frame's angles beside the pictures. Empty: nothing.
+struct AnglePrior {
+  std::vector<math::VectorX> mean;         // a frame
+  std::vector<math::MatrixX> information;  // n x n, inverse covariance
+};
+// What the silhouettes know.
+AnglePrior prior_of(const silhouette::SequenceFit& fit);
+
+// Gauss-Newton on every frame's angles with the Gaussians held, from `states`, which is updated. Returns the
+// covariances of theta, as in Result.
+std::vector<math::MatrixX> refine_states(gpu::Device& device, const capture::Capture& capture,
+                                         const chain::Chain& chain, const splat::Gaussians& gaussians,
+                                         const AnglePrior& prior, int iterations, chain::States& states);
+
+// Adam on the Gaussians with the angles held, views of every `every`-th frame in random batches.
+void polish(gpu::Device& device, const capture::Capture& capture, const chain::Chain& chain,
+            const chain::States& states, int every, int steps, std::uint64_t seed, splat::Gaussians& gaussians);
+
+// thetadot from theta by quadratic fits over seven frames.
+void differentiate(chain::States& states);
+
 }  // namespace chainsplat::recognition

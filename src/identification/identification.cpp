@@ -13,7 +13,6 @@ using dynamics::BaseGrid;
 using math::Vector3;
 
 constexpr double kHorizons[] = {1.0 / 3, 2.0 / 3, 4.0 / 3, 8.0 / 3};  // s, then everything
-constexpr double kModelError = 1e-3;                                  // m, added to what the covariances say of a point
 constexpr double kResidualShare = 1.0 / 9.0;  // of a residual that counts: neighbors in space and time err alike
 constexpr double kHuber = 3.0;                // in robust standard deviations of a point's residual
 constexpr double kThetaSd = 0.02;             // rad, initial angles about the recognized ones without covariances
@@ -290,7 +289,7 @@ Problem make_problem(const chain::Chain& chain, const trajectory::Trajectory& ba
     MatrixX target, whitening(3, 3 * points);
     place_points(problem, recognized.theta[k], target, covariances.empty() ? nullptr : &jacobians);
     for (std::size_t i = 0; i < points; ++i) {
-      math::Matrix3 covariance = kModelError * kModelError * math::Matrix3::Identity();
+      math::Matrix3 covariance = options.model_error * options.model_error * math::Matrix3::Identity();
       if (!covariances.empty()) covariance += jacobians[i] * covariances[k] * jacobians[i].transpose();
       whitening.middleCols<3>(3 * i) = covariance.llt().matrixL().solve(math::Matrix3::Identity());
     }

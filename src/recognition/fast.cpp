@@ -13,19 +13,18 @@ namespace {
 // The schedule: rounds of Adam on the Gaussians, additions where the images ask, and Gauss-Newton on the angles.
 constexpr int kRounds = 4;
 constexpr int kSteps = 100;  // Adam steps a round
-constexpr int kBatch = 3;    // views a step
 constexpr double kGaussiansADiameter =
     100.0;                           // of the rope's length, when no budget is given: more gain little (DESIGN)
 constexpr double kFirstShare = 0.8;  // of the budget, placed at the start; the rest goes where the images ask
 constexpr int kAngleIterations = 1;  // Gauss-Newton steps a round and frame
 constexpr int kFinalIterations = 1;  // for every frame, at the end
 constexpr int kFinalSteps = 120;     // Adam steps after the last round, rates falling
-constexpr float kMaskWeight = 0.3f;  // of the mask term: without it black hides transparency (DESIGN)
 constexpr int kShRound = 1;  // from this round on colors depend on the view (SH degree 1): +0.7 dB in the object
 
-splat::AdamRates rates(double fraction) {
-  // fraction: 0 at the start, 1 at the end of all steps; rates fall by ten
-  const auto fall = static_cast<float>(std::pow(0.1, fraction));
+}  // namespace
+
+splat::AdamRates rates(double fraction, double scale) {
+  const auto fall = static_cast<float>(scale * std::pow(0.1, fraction));
   splat::AdamRates r;
   r.mean = 2.5e-4f * fall;  // m: a tenth of a Gaussian's spacing on the rope
   r.rotation = 0.02f * fall;
@@ -36,6 +35,8 @@ splat::AdamRates rates(double fraction) {
   r.link_logits = 0.0f;  // hard on their link: soft gained nothing (DESIGN, 'Recognition')
   return r;
 }
+
+namespace {
 
 struct TrainingViews {
   std::vector<int> frames;    // that train
@@ -110,13 +111,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     }
     states = fit.states;
     // what the silhouettes know stays known: appearance alone would pull angles to explain rolling and shading
-    prior.mean = fit.states.theta;
-    for (const silhouette::FrameFit& frame : fit.frames) {
-      constexpr double kLeastVariance = 1e-12;  // rad^2
-      prior.information.push_back(
-          (frame.covariance + kLeastVariance * math::MatrixX::Identity(result.chain.angles(), result.chain.angles()))
-              .inverse());
-    }
+    prior = prior_of(fit);
   }
   std::vector<math::VectorX> coarse = states.theta;  // to carry corrections to the frames that do not train
   if (before) {
@@ -157,7 +152,6 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
                                   static_cast<int>(kFirstShare * budget), random);
   }
 
-  const splat::LossWeights weights{1.0f, 0.0f, kMaskWeight};
   const int batch_size = std::min<int>(kBatch, static_cast<int>(training.views.size()));
   double loss = NAN, psnr = NAN;
   const auto checkpoint = [&](int round) {
@@ -191,7 +185,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
       constexpr int kReadEvery = 10;
       const bool read = step % kReadEvery == 0;
       const splat::LossValues values =
-          engine.step(batch, weights, rates(static_cast<double>(done_steps) / total_steps), read);
+          engine.step(batch, kLossWeights, rates(static_cast<double>(done_steps) / total_steps, 1.0), read);
       ++done_steps;
       if (read) {
         loss = values.total / static_cast<double>(batch.size());

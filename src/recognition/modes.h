@@ -11,14 +11,17 @@ namespace chainsplat::recognition {
 // 1: 0.94 mm, 3: 0.83, 8: 0.75; in free space no difference.
 constexpr double kAngleMaskWeight = 5.0;
 
+// `fast` trains the Gaussians with these.
+constexpr int kBatch = 3;                                     // views a step
+constexpr splat::LossWeights kLossWeights{1.0f, 0.0f, 0.3f};  // without the mask black hides transparency (DESIGN)
+// `fraction`: 0 at the start, 1 at the end of all steps; rates fall by ten. `scale`: of the usual ones.
+splat::AdamRates rates(double fraction, double scale);
+
 Result recognize_fast(gpu::Device& device, const capture::Capture& capture, const Options& options);
 Result recognize_paper(gpu::Device& device, const capture::Capture& capture, const Options& options);
 
 // Text of everything that the result depends on, to recognize a checkpoint of another job.
 std::string job_text(const capture::Capture& capture, const Options& options);
-
-// thetadot from theta by quadratic fits over seven frames.
-void differentiate(chain::States& states);
 
 // Improves every frame's angles with the Gaussians held. `frames` as assigned to states.time.
 std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain& chain, const capture::Capture& capture,

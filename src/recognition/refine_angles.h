@@ -11,6 +11,7 @@
 
 #include "chainsplat/capture.h"
 #include "chainsplat/chain.h"
+#include "chainsplat/recognition.h"
 #include "chainsplat/splat.h"
 #include "src/recognition/frames.h"
 
@@ -30,12 +31,6 @@ struct RefineOptions {
   int iterations = 3;
   double mask_weight = 1.0;
   double smooth_sigma = 0.15;  // rad, prior on the difference of neighboring joints' same-axis angles
-};
-
-// What is known of a frame's angles before: from the silhouettes. Empty: nothing.
-struct AnglePrior {
-  std::vector<math::VectorX> mean;         // a frame of the sequence
-  std::vector<math::MatrixX> information;  // n x n, inverse covariance
 };
 
 struct RefineSummary {

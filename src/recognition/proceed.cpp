@@ -1,0 +1,74 @@
+// proceed.cpp - the halves of a round of `fast` by themselves, each from a recognized twin's values.
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+
+#include "src/recognition/modes.h"
+
+namespace chainsplat::recognition {
+
+AnglePrior prior_of(const silhouette::SequenceFit& fit) {
+  constexpr double kLeastVariance = 1e-12;  // rad^2
+  AnglePrior prior;
+  prior.mean = fit.states.theta;
+  for (const silhouette::FrameFit& frame : fit.frames) {
+    const Eigen::Index n = frame.covariance.rows();
+    prior.information.push_back((frame.covariance + kLeastVariance * math::MatrixX::Identity(n, n)).inverse());
+  }
+  return prior;
+}
+
+std::vector<math::MatrixX> refine_states(gpu::Device& device, const capture::Capture& capture,
+                                         const chain::Chain& chain, const splat::Gaussians& gaussians,
+                                         const AnglePrior& prior, int iterations, chain::States& states) {
+  const std::vector<FrameViews> frames = assign_views(capture, states.time);
+  std::vector<int> seen;
+  for (int k = 0; k < static_cast<int>(frames.size()); ++k)
+    if (!frames[k].views.empty()) seen.push_back(k);
+  splat::Engine engine(device);
+  const std::vector<math::MatrixX> found =
+      refine_all(engine, chain, capture, frames, gaussians, seen, iterations, prior, states);
+  differentiate(states);
+  std::vector<math::MatrixX> covariances(frames.size(), math::MatrixX::Identity(chain.angles(), chain.angles()));
+  for (std::size_t i = 0; i < seen.size(); ++i) covariances[seen[i]] = found[i];
+  return covariances;
+}
+
+void polish(gpu::Device& device, const capture::Capture& capture, const chain::Chain& chain,
+            const chain::States& states, int every, int steps, std::uint64_t seed, splat::Gaussians& gaussians) {
+  const std::vector<FrameViews> frames = assign_views(capture, states.time);
+  std::vector<splat::ViewSpec> specs;
+  std::vector<const std::vector<std::uint8_t>*> targets;
+  for (int k = 0; k < static_cast<int>(frames.size()); k += std::max(1, every)) {
+    for (const int v : frames[k].views) {
+      const capture::View& view = capture.views[v];
+      specs.push_back(
+          view_spec(capture, view, view_motions(chain, capture, states, frames[k], k, states.theta[k], view)));
+      targets.push_back(&view.rgba);
+    }
+  }
+  if (specs.empty()) return;
+  splat::Engine engine(device);
+  engine.set_views(specs, targets);
+  engine.set_gaussians(gaussians);
+  core::Random random(seed * 1000003 + 7001);
+  std::vector<int> order(specs.size());
+  std::iota(order.begin(), order.end(), 0);
+  std::size_t next = order.size();
+  const std::size_t batch_size = std::min<std::size_t>(kBatch, specs.size());
+  for (int step = 0; step < steps; ++step) {
+    if (const int signal = core::stop_requested()) throw Interrupted(signal);
+    std::vector<int> batch;
+    while (batch.size() < batch_size) {
+      if (next == order.size()) {
+        for (std::size_t i = order.size() - 1; i > 0; --i) std::swap(order[i], order[random.next() % (i + 1)]);
+        next = 0;
+      }
+      batch.push_back(order[next++]);
+    }
+    engine.step(batch, kLossWeights, rates(static_cast<double>(step) / steps, 1.0), false);
+  }
+  gaussians = engine.gaussians();
+}
+
+}  // namespace chainsplat::recognition
