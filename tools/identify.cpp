@@ -14,11 +14,6 @@
 
 namespace chainsplat::tools {
 
-namespace {
-
-namespace fs = std::filesystem;
-using Json = nlohmann::ordered_json;
-
 identification::Options identification_options(const twin::Twin& twin, bool paper, std::uint64_t seed) {
   identification::Options options;
   options.tabletop = twin.tabletop;
@@ -36,6 +31,11 @@ identification::Options identification_options(const twin::Twin& twin, bool pape
   options.seed = seed;
   return options;
 }
+
+namespace {
+
+namespace fs = std::filesystem;
+using Json = nlohmann::ordered_json;
 
 // Marker positions take the place of recognized states; the twin can be an empty one.
 void identify_markers(twin::Twin& twin, const std::string& run, const std::string& file, std::uint64_t seed) {

@@ -3,6 +3,7 @@
 #include <string>
 #include <vector>
 
+#include "chainsplat/identification.h"
 #include "run_folder.h"
 
 namespace chainsplat::tools {
@@ -21,6 +22,8 @@ class Stopwatch {
   double start_;
 };
 
+// What the twin and its capture say of how to identify it.
+identification::Options identification_options(const twin::Twin& twin, bool paper, std::uint64_t seed);
 // `twin`: recognized. Fills in parameters, initial state, estimates and rollout.
 void identify_stage(twin::Twin& twin, const trajectory::Trajectory& base, const std::vector<math::MatrixX>& covariances,
                     bool paper, std::uint64_t seed);

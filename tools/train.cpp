@@ -15,6 +15,7 @@
 #include "chainsplat/twin.h"
 #include "cli.h"
 #include "identify.h"
+#include "joint.h"
 #include "picture.h"
 #include "run_folder.h"
 
@@ -33,7 +34,7 @@ struct Request {
   std::string stages;  // empty: all
   std::string bending = "auto", mode = "fast", frames;
   int joints = 8, every = 5;
-  bool twist = false, resume = false, force = false;
+  bool twist = false, joint = false, resume = false, force = false;
 };
 
 struct Stages {
@@ -211,13 +212,18 @@ void train(const Globals& globals, const Request& request) {
   twin.provenance.seconds["load"] += core::seconds_now() - load_start;
   const bool recognize = stages.recognize && !continued;
   const bool identify = stages.identify && (stages.named || recognize || !twin.parameters);
-  const bool roll_out = stages.rollout && (stages.named || identify || twin.rollout.time.empty());
+  const bool joint = request.joint && !twin.provenance.options.count("joint");
+  if (joint && !identify && !twin.parameters)
+    throw InputError("--joint", "needs identified dynamics", "add identify to --stages");
+  if (joint && request.mode == "paper") throw InputError("--joint", "goes with --mode fast", "leave one of them out");
+  const bool roll_out = stages.rollout && (stages.named || identify || joint || twin.rollout.time.empty());
   if (roll_out && !identify && !twin.parameters)
     throw InputError("--stages", "nothing is identified that could be rolled out", "add identify");
   std::vector<math::MatrixX> covariances;
-  if (continued && identify) covariances = read_covariances(out / kCovarianceFile, twin.states);
+  if (continued && (identify || joint)) covariances = read_covariances(out / kCovarianceFile, twin.states);
+  if (continued && joint) check_joint(twin, covariances, out);
   gpu::DevicePtr device;
-  if (recognize || stages.evaluate) {
+  if (recognize || joint || stages.evaluate) {
     device = gpu::open_device({.selector = globals.device});
     const gpu::DeviceInfo& info = gpu::info(*device);
     twin.provenance.device = info.name;
@@ -240,6 +246,12 @@ void train(const Globals& globals, const Request& request) {
     }
     if (identify) {
       identify_stage(twin, capture.base, covariances, request.mode == "paper", globals.seed);
+      twin::save(twin, out);
+      stop_if_asked();
+    }
+    if (joint) {
+      joint_stage(twin, covariances, capture, *device, globals.seed);
+      core::write_file(out / kCovarianceFile, covariance_csv(twin.states, covariances));
       twin::save(twin, out);
       stop_if_asked();
     }
@@ -329,6 +341,8 @@ void add_training_commands(CLI::App& app, const Globals& globals, Job& job) {
   add_recognition_options(*trainer, *request);
   trainer->add_option("--stages", request->stages, "Only these, by comma: recognize,identify,rollout,evaluate")
       ->type_name("LIST");
+  trainer->add_flag("--joint", request->joint,
+                    "Refine angles, Gaussians and dynamics together: helps where a single camera hardly sees depth");
   trainer->add_option("--picture", request->picture, "Also make a picture: observed beside rendered frames")
       ->type_name("FILE.png");
   trainer->callback([&globals, &job, request] { job = [&globals, request] { train(globals, *request); }; });
