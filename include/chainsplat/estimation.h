@@ -43,6 +43,7 @@ struct Estimate {
   double time = 0.0;              // s
   math::VectorX theta, thetadot;  // rad, rad/s; n
   math::MatrixX covariance;       // of (theta, thetadot), 2 n x 2 n
+  double centerline_sigma = 0.0;  // m, standard deviation of the centerline, RMS over the rope
   double iou = 0.0;               // of the chain's tube and the mask
   double residual = 0.0;          // px, RMS of the mask's outline about the tube's, robust
   double surprise = 0.0;          // squared innovation over its expectation; about 1 as long as the model holds
@@ -64,6 +65,7 @@ struct Filter {
   double contact_until = 0.0;       // s, until then the motion is thought not to follow the model
   math::VectorX everywhere, place;  // shares of the links' ends in the unknown force: evenly, and as learned in contact
   double last_seen = 0.0;           // s
+  bool lost = false;                // in the last frame
   double edge_offset = 0.0, edge_offset_variance = 0.0;  // px, px^2: how much wider the masks are than the tube
 };
 
@@ -79,11 +81,15 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views);
 // The belief at a later time, without looking. `contact`: the unknown force may change as under a hand.
 Belief predict(const Filter& filter, const Belief& belief, double time, bool contact);
 
+// Where the rope will be at `time`, for whoever must look for it there; none before the first frame and while lost.
+std::optional<math::VectorX> expected(const Filter& filter, double time);
+
 // Share of pixels in both the mask and the tube about the chain among those in either.
 double tube_iou(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta,
                 const capture::View& view, const capture::Camera& camera);
 
-// The line of INTERFACE 5, without line feed. `latency`: s.
-std::string to_json(const Estimate& estimate, double latency);
+// The line of INTERFACE 5, without line feed. `latency`: s. `covariance`: with the lower triangle of (theta,
+// thetadot)'s.
+std::string to_json(const Estimate& estimate, double latency, bool covariance = false);
 
 }  // namespace chainsplat::estimation

@@ -128,6 +128,20 @@ MatrixX shape_covariance(const chain::Chain& chain, const Pose& base, const Vect
   return information.llt().solve(MatrixX::Identity(n, n));
 }
 
+// Standard deviation of the centerline, RMS over the rope, m.
+double centerline_deviation(const chain::Chain& chain, const VectorX& theta, const MatrixX& covariance) {
+  const std::vector<MatrixX> jacobians = link_end_jacobians(chain, Pose{}, theta);
+  // the rope's half of each link end's neighbors counts for it; what varies is linear between them
+  double variance = 0.0;
+  for (std::size_t i = 0; i < jacobians.size(); ++i) {
+    const int link = static_cast<int>(i) + 1;
+    const double next = link + 1 < chain.links() ? chain.link_end(link + 1) - chain.link_start(link + 1) : 0.0;
+    const double share = 0.5 * (chain.link_end(link) - chain.link_start(link) + next) / chain.length;
+    variance += share * (jacobians[i] * covariance * jacobians[i].transpose()).trace();
+  }
+  return std::sqrt(variance);
+}
+
 // After a frame: where the force acts and whether it still does.
 void learn_force(Filter& filter, double time) {
   if (!filter.shifts) return;
@@ -341,6 +355,13 @@ Belief predict(const Filter& filter, const Belief& belief, double time, bool con
   return out;
 }
 
+std::optional<VectorX> expected(const Filter& filter, double time) {
+  if (!filter.belief || filter.lost) return std::nullopt;
+  const int n = filter.model.chain.angles();
+  if (time <= filter.belief->time) return filter.belief->mean.head(n);
+  return move(filter, *filter.belief, time).theta;
+}
+
 Estimate update(Filter& filter, std::span<const capture::View* const> views) {
   CHAINSPLAT_CHECK(!views.empty(), "no view");
   const capture::View& view = *views.front();
@@ -390,10 +411,12 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
     filter.belief = predicted;
     out.lost = out.lost || view.time - filter.last_seen > kLongUnseen;
   }
+  filter.lost = out.lost;
   out.theta = filter.belief->mean.head(n);
   out.thetadot = filter.belief->mean.segment(n, n);
   out.covariance = filter.belief->covariance.topLeftCorner(2 * n, 2 * n);
   out.covariance.topLeftCorner(n, n) += shape_covariance(filter.model.chain, filter.base(view.time).pose, out.theta);
+  out.centerline_sigma = centerline_deviation(filter.model.chain, out.theta, out.covariance.topLeftCorner(n, n));
   for (const capture::View* const v : views)
     out.iou += tube_iou(filter.model.chain, filter.base(view.time).pose, out.theta, *v, filter.cameras.at(v->camera)) /
                views.size();
@@ -462,19 +485,24 @@ double tube_iou(const chain::Chain& chain, const Pose& base, const VectorX& thet
   return either > 0 ? static_cast<double>(both) / either : 0.0;
 }
 
-std::string to_json(const Estimate& estimate, double latency) {
+std::string to_json(const Estimate& estimate, double latency, bool covariance) {
   const auto list = [](const VectorX& values) {
     std::string text = "[";
     for (Eigen::Index k = 0; k < values.size(); ++k) text += (k ? "," : "") + core::exact(values[k]);
     return text + "]";
   };
   const int n = static_cast<int>(estimate.theta.size());
+  std::string triangle;
+  for (Eigen::Index r = 0; covariance && r < estimate.covariance.rows(); ++r)
+    for (Eigen::Index c = 0; c <= r; ++c)
+      triangle.append(r ? "," : "").append(core::exact(estimate.covariance(r, c)));
   char milliseconds[32];
   std::snprintf(milliseconds, sizeof milliseconds, "%.3f", 1e3 * latency);
   return "{\"frame\":" + std::to_string(estimate.frame) + ",\"time\":" + core::exact(estimate.time) +
          ",\"theta\":" + list(estimate.theta) + ",\"thetadot\":" + list(estimate.thetadot) +
          ",\"sigma\":" + list(estimate.covariance.diagonal().head(n).cwiseSqrt()) +
-         ",\"iou\":" + core::exact(estimate.iou) + ",\"residual\":" + core::exact(estimate.residual) +
+         ",\"centerline_sigma\":" + core::exact(estimate.centerline_sigma) + ",\"iou\":" + core::exact(estimate.iou) +
+         ",\"residual\":" + core::exact(estimate.residual) + (covariance ? ",\"covariance\":[" + triangle + "]" : "") +
          ",\"lost\":" + (estimate.lost ? "true" : "false") + ",\"latency_ms\":" + milliseconds + "}";
 }
 

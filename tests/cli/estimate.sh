@@ -1,0 +1,82 @@
+#!/bin/bash
+# estimate: its inputs, its lines, and what is left when the input ends in the wrong way. Needs no Vulkan device.
+. "$(dirname "$0")/lib.sh"
+export VK_DRIVER_FILES=/nonexistent VK_ICD_FILENAMES=/nonexistent
+demo=$source_dir/assets/demo_free_30
+twin=$work/twin
+
+# a twin without dynamics that has been recognized once, hanging straight
+run new --length 0.3 --joints 8 --bending spatial -o "$twin"
+expect_code 0 new
+sed -i '$d' "$twin/twin.json"
+echo ', "states": "states.csv"}' >>"$twin/twin.json"
+{ echo "time$(seq -f ',theta_%g' -s '' 16)"; echo "0$(printf ',0%.0s' {1..16})"; } >"$twin/states.csv"
+cp "$demo/base.tum" "$twin/"
+
+lines() {  # count name
+  [ "$(wc -l <"$work/stdout")" -eq "$1" ] || fail "$2: $(wc -l <"$work/stdout") lines instead of $1"
+  [ "$(grep -c '^{"frame":.*,"time":.*,"theta":\[.*\],"thetadot":\[.*\],"sigma":\[.*,"latency_ms":[0-9.]*}$' \
+    "$work/stdout")" -eq "$1" ] || fail "$2: lines that are no estimates"
+}
+# exit code 1, one error line that matches, `count` estimates
+broken() {  # count pattern arguments...
+  local count=$1 pattern=$2
+  shift 2
+  run estimate "$twin" "$@"
+  expect_code 1 "estimate $*"
+  [ "$(grep -c '^chainsplat: error: ' "$work/stderr")" -eq 1 ] || fail "estimate $*: not exactly one error line"
+  grep -Eq -- "^chainsplat: error: $pattern" "$work/stderr" || fail "estimate $*: no line like '$pattern'"
+  lines "$count" "estimate $*"
+}
+
+run estimate "$twin" --camera "$demo:cam0"
+expect_code 0 'one camera'
+lines 60 'one camera'
+[ "$(grep -c '"lost":false' "$work/stdout")" -eq 60 ] || fail 'one camera: lost'
+grep -Eq '^60 frames; p50 .* ms, p99 .* ms\.$' "$work/stderr" || fail 'one camera: no latency'
+run estimate "$twin" --camera "$demo" --drop 2 --frames 10:30 --centerline "$work/line.csv" --covariance
+expect_code 0 'all cameras'
+lines 10 'all cameras'
+[ "$(grep -c '"covariance":\[' "$work/stdout")" -eq 10 ] || fail 'all cameras: no covariance'
+[ "$(wc -l <"$work/line.csv")" -eq 11 ] || fail 'all cameras: not a centerline for every frame'
+
+# a calibration, and frames that have its size or not
+{ echo '{"name": "cam0", "width": 320, "height": 240, "fx": 307.5, "fy": 307.5, "cx": 160, "cy": 120, "rate": 30,'
+  echo ' "world_from_camera": [1,0,0,0, 0,0,1,-0.8, 0,-1,0,0.4, 0,0,0,1]}'; } >"$work/camera.json"
+sed 's/"width": 320/"width": 322/' "$work/camera.json" >"$work/other.json"
+frame_bytes=$((3 * 320 * 240))
+head -c $((5 * frame_bytes)) /dev/zero >"$work/frames"
+stream() {  # file for standard input, arguments...
+  local file=$1
+  shift
+  "$program" estimate "$twin" "$@" <"$file" >"$work/stdout" 2>"$work/stderr"
+  code=$?
+}
+stream "$work/frames" --camera - --calibration "$work/camera.json"
+expect_code 0 'raw frames'
+lines 5 'raw frames'
+head -c $((3 * frame_bytes + 100)) "$work/frames" >"$work/cut"
+stream "$work/cut" --camera - --calibration "$work/camera.json"
+expect_code 1 'raw frames that end within one'
+lines 3 'raw frames that end within one'
+grep -q '^chainsplat: error: standard input: ends within a frame' "$work/stderr" || fail 'raw frames, cut: which line?'
+broken 0 '.*cam0\.mp4: frame 0 has 320x240 pixels, the calibration says 322x240; ' \
+  --camera "$demo/cam0.mp4" --calibration "$work/other.json"
+
+# a video that ends early: its last part is missing
+head -c $(($(stat -c %s "$demo/cam0.mp4") * 9 / 10)) "$demo/cam0.mp4" >"$work/cut.mp4"
+run estimate "$twin" --camera "$work/cut.mp4" --calibration "$work/camera.json"
+expect_code 1 'a video that ends early'
+count=$(wc -l <"$work/stdout")
+[ "$count" -gt 30 ] && [ "$count" -lt 60 ] || fail "a video that ends early: $count lines"
+[ "$(grep -c '^chainsplat: error: .*cut\.mp4: frame' "$work/stderr")" -eq 1 ] || fail 'a video that ends early: which line?'
+
+# a base motion that stops: the first second
+awk '$1 <= 1.0 || /^#/' "$demo/base.tum" >"$work/base.tum"
+broken 32 '.*base\.tum: the base motion ends at [0-9.]+ s, before frame 32; ' --camera "$demo:cam0" --base "$work/base.tum" \
+  --centerline "$work/stopped.csv"
+[ "$(wc -l <"$work/stopped.csv")" -eq 33 ] || fail 'a base motion that stops: the centerline was not kept'
+
+expect_error 2 'does not exist' estimate "$twin" --camera "$work/none.mp4" --calibration "$work/camera.json"
+expect_error 2 '--drop' estimate "$twin" --camera "$demo:cam0" --drop 0
+finish

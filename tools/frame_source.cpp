@@ -1,0 +1,198 @@
+#include "frame_source.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <nlohmann/json.hpp>
+
+#include "cli.h"
+
+namespace chainsplat::tools {
+
+namespace {
+
+using Json = nlohmann::json;
+
+constexpr int kBlack = 16;         // brightness up to which a pixel of a masked video is background (lossy coding)
+constexpr int kMargin = 24;        // px about what a frame shows
+constexpr double kTogether = 0.5;  // of a frame's interval: frames of several cameras nearer than that are one moment
+
+// A camera object as in capture.json.
+capture::Camera read_calibration(const std::string& file, double& rate, double& start) {
+  Json object;
+  try {
+    object = Json::parse(core::read_file(file));
+  } catch (const Json::exception&) {
+    throw InputError(file, "is no JSON document", "give a camera object as in capture.json");
+  }
+  if (object.contains("cameras") && object["cameras"].is_array() && object["cameras"].size() == 1)
+    object = object["cameras"][0];
+  capture::Camera camera;
+  const auto number = [&](const char* key) {
+    if (!object.contains(key) || !object[key].is_number())
+      throw InputError(file + ": " + key, "is missing or no number", "give a camera object as in capture.json");
+    return object[key].get<double>();
+  };
+  camera.name = object.value("name", std::string("camera"));
+  camera.width = static_cast<int>(number("width"));
+  camera.height = static_cast<int>(number("height"));
+  camera.fx = number("fx"), camera.fy = number("fy"), camera.cx = number("cx"), camera.cy = number("cy");
+  if (camera.width <= 0 || camera.height <= 0 || !(camera.fx > 0.0) || !(camera.fy > 0.0))
+    throw InputError(file, "width, height, fx and fy must be above 0", "correct them");
+  const auto list = [&](const char* key, std::size_t size) {
+    const bool good = object.contains(key) && object[key].is_array() && object[key].size() == size &&
+                      std::all_of(object[key].begin(), object[key].end(), [](const Json& x) { return x.is_number(); });
+    if (!good)
+      throw InputError(file + ": " + key, "is no list of " + std::to_string(size) + " numbers",
+                       "give a camera object as in capture.json");
+    return object[key].get<std::vector<double>>();
+  };
+  if (object.contains("distortion")) {
+    const std::vector<double> distortion = list("distortion", 5);
+    std::copy(distortion.begin(), distortion.end(), camera.distortion.begin());
+  }
+  const std::vector<double> pose = list("world_from_camera", 16);
+  math::Matrix3 rotation;
+  for (int r = 0; r < 3; ++r) {
+    for (int c = 0; c < 3; ++c) rotation(r, c) = pose[4 * r + c];
+    camera.world_from_camera.translation[r] = pose[4 * r + 3];
+  }
+  camera.world_from_camera.rotation = math::orthonormalized(rotation);
+  if (object.contains("rate")) rate = number("rate");
+  if (object.contains("start")) start = number("start");
+  return camera;
+}
+
+// Raw RGB24 from standard input; an incomplete last frame ends the work.
+bool read_raw(const capture::Camera& camera, capture::Image8& image) {
+  image.width = camera.width, image.height = camera.height, image.channels = 3;
+  image.pixels.resize(3 * static_cast<std::size_t>(camera.width) * camera.height);
+  const std::size_t got = std::fread(image.pixels.data(), 1, image.pixels.size(), stdin);
+  if (got == image.pixels.size()) return true;
+  if (got != 0)
+    throw WorkError("standard input", "ends within a frame",
+                    "send whole frames of the calibration's size; the states so far are kept");
+  return false;
+}
+
+// A capture, loaded and checked as a whole.
+FrameSource open_capture(const SourceRequest& request) {
+  const auto [folder, name] = split_camera(request.camera);
+  capture::LoadOptions load;
+  load.camera = name;
+  load.first = request.first;
+  load.last = request.last;
+  const auto recorded = std::make_shared<const capture::Capture>(capture::load(folder, load));
+  std::shared_ptr<const capture::Capture> whole;
+  if (request.pictures) {
+    load.camera = recorded->cameras.front().name;
+    load.masked = load.undistort = false;
+    whole = std::make_shared<const capture::Capture>(capture::load(folder, load));
+  }
+  FrameSource source;
+  source.cameras = recorded->cameras;
+  source.base = recorded->base;
+  source.masked = true;
+  source.next = [recorded, whole, at = std::size_t{0}](LiveFrame& frame) mutable {
+    // the first camera sets the pace, the others' nearest frames join
+    if (at >= recorded->views.size() || recorded->views[at].camera != 0) return false;
+    const capture::View& leader = recorded->views[at];
+    frame.frame = leader.frame;
+    frame.time = leader.time;
+    frame.views.assign(1, leader);
+    const std::vector<double>& times = recorded->times[0];
+    const double interval = times.size() > 1 ? (times.back() - times.front()) / (times.size() - 1.0) : 0.0;
+    for (int c = 1; c < static_cast<int>(recorded->cameras.size()); ++c) {
+      const capture::View* nearest = nullptr;
+      for (const capture::View& view : recorded->views)
+        if (view.camera == c && std::abs(view.time - leader.time) <= kTogether * interval &&
+            (!nearest || std::abs(view.time - leader.time) < std::abs(nearest->time - leader.time)))
+          nearest = &view;
+      if (nearest) frame.views.push_back(*nearest);
+    }
+    if (whole) {
+      const capture::View& view = whole->views.at(at);
+      frame.picture.width = view.width, frame.picture.height = view.height, frame.picture.channels = 3;
+      frame.picture.pixels.resize(view.rgba.size() / 4 * 3);
+      for (std::size_t i = 0; i < view.rgba.size() / 4; ++i)
+        std::copy_n(&view.rgba[4 * i], 3, &frame.picture.pixels[3 * i]);
+    }
+    ++at;
+    frame.arrived = core::seconds_now();
+    return true;
+  };
+  return source;
+}
+
+// Frames of one camera whose calibration is given: from a file, a device or standard input.
+FrameSource open_stream(const SourceRequest& request) {
+  double rate = request.rate, start = 0.0, own_rate = 0.0;
+  FrameSource source;
+  source.cameras = {read_calibration(request.calibration, own_rate, start)};
+  if (rate <= 0.0) rate = own_rate;
+  std::shared_ptr<capture::VideoReader> reader;
+  if (request.camera != "-") {
+    if (rate <= 0.0) rate = capture::video_facts(request.camera).rate;
+    reader = std::make_shared<capture::VideoReader>(request.camera);
+  }
+  if (!(rate > 0.0) || !std::isfinite(rate))
+    throw InputError("--rate", "is needed to know the frames' times", "give frames a second, for example 30");
+  const std::string where = request.camera == "-" ? "standard input" : request.camera;
+  source.next = [camera = source.cameras[0], request, reader, rate, start, where,
+                 count = 0](LiveFrame& frame) mutable {
+    do {
+      if (request.last >= 0 && count >= request.last) return false;
+      if (!(reader ? reader->next(frame.picture) : read_raw(camera, frame.picture))) return false;
+      if (frame.picture.width != camera.width || frame.picture.height != camera.height)
+        throw WorkError(where,
+                        "frame " + std::to_string(count) + " has " + std::to_string(frame.picture.width) + "x" +
+                            std::to_string(frame.picture.height) + " pixels, the calibration says " +
+                            std::to_string(camera.width) + "x" + std::to_string(camera.height),
+                        "give the calibration of this camera; the states so far are kept");
+    } while (count++ < request.first);
+    frame.frame = count - 1;
+    frame.time = start + frame.frame / rate;
+    frame.views.clear();
+    frame.arrived = core::seconds_now();
+    return true;
+  };
+  return source;
+}
+
+}  // namespace
+
+FrameSource open_frames(const SourceRequest& request) {
+  return request.calibration.empty() ? open_capture(request) : open_stream(request);
+}
+
+capture::View bright_view(const capture::Image8& picture, const capture::Camera& camera) {
+  std::vector<std::uint8_t> mask(static_cast<std::size_t>(camera.width) * camera.height, 0);
+  const bool distorted = camera.distorted();
+  int x0 = camera.width, y0 = camera.height, x1 = 0, y1 = 0;
+  for (int y = 0; y < camera.height; ++y)
+    for (int x = 0; x < camera.width; ++x) {
+      int u = x, v = y;
+      if (distorted) {
+        const math::Vector2 from = capture::distort(camera, math::Vector2(x + 0.5, y + 0.5));
+        u = static_cast<int>(std::floor(from.x())), v = static_cast<int>(std::floor(from.y()));
+        if (u < 0 || v < 0 || u >= camera.width || v >= camera.height) continue;
+      }
+      const std::uint8_t* const rgb = &picture.pixels[3 * (static_cast<std::size_t>(v) * camera.width + u)];
+      if (std::max({rgb[0], rgb[1], rgb[2]}) <= kBlack) continue;
+      mask[static_cast<std::size_t>(y) * camera.width + x] = 255;
+      x0 = std::min(x0, x), x1 = std::max(x1, x + 1), y0 = std::min(y0, y), y1 = y + 1;
+    }
+  capture::View view;
+  if (x1 <= x0) return view;
+  view.x0 = std::max(0, x0 - kMargin), view.y0 = std::max(0, y0 - kMargin);
+  view.width = std::min(camera.width, x1 + kMargin) - view.x0;
+  view.height = std::min(camera.height, y1 + kMargin) - view.y0;
+  view.rgba.assign(4 * static_cast<std::size_t>(view.width) * view.height, 0);
+  for (int y = 0; y < view.height; ++y)
+    for (int x = 0; x < view.width; ++x)
+      view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] =
+          mask[static_cast<std::size_t>(view.y0 + y) * camera.width + view.x0 + x];
+  return view;
+}
+
+}  // namespace chainsplat::tools
