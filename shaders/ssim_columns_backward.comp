@@ -1,42 +1,52 @@
-// ssim_columns_backward.comp - one invocation a pixel: the window along y, and the gradient of the D-SSIM term added to the
-// pixel's gradient: w*P + 2x (w*Q) + y (w*R) (SPEC 2.7).
+// ssim_columns_backward.comp - the window along y over what ssim_rows_backward left, a lane a strip of a column, and the
+// gradient of the D-SSIM term added to the pixel's gradient: w*P + 2x (w*Q) + y (w*R) (SPEC 2.7).
 #version 460
 #extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
 #include "shared/splat.h"
-#include "inc/ssim.glsl"
-layout(local_size_x_id = 0) in;
+layout(local_size_x_id = 0) in;  // kTileWidth * kTileHeight / kPixels
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
+layout(constant_id = 3) const uint kPixels = 8u;
 layout(push_constant) uniform Push { SplatPush p; };
 layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
 layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 2) readonly buffer Rows { vec4 rows[]; };
-layout(std430, binding = 3) readonly buffer Image { vec4 image[]; };
-layout(std430, binding = 4) readonly buffer Target { uint target[]; };
-layout(std430, binding = 5) buffer PixelGradient { vec4 pixel_gradient[]; };
+layout(std430, binding = 2) readonly buffer TileMap { uint tile_map[]; };
+layout(std430, binding = 3) readonly buffer Rows { float rows[]; };
+layout(std430, binding = 4) readonly buffer Image { vec4 image[]; };
+layout(std430, binding = 5) readonly buffer Target { uint target[]; };
+layout(std430, binding = 6) buffer PixelGradient { vec4 pixel_gradient[]; };
+#include "inc/ssim.glsl"
 
 void main() {
-  SplatTile t = tiles[gl_WorkGroupID.x];
+  uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
+  SplatTile t = tiles[tile];
   SplatView view = views[t.view];
-  for (uint k = gl_LocalInvocationID.x; k < kTileWidth * kTileHeight; k += gl_WorkGroupSize.x) {
-    uint x = t.x * kTileWidth + k % kTileWidth, y = t.y * kTileHeight + k / kTileWidth;
+  uint column = lane % kTileWidth, first = lane / kTileWidth * kPixels;
+  uint above = ssim_tile(view, int(t.x), int(t.y) - 1), below = ssim_tile(view, int(t.x), int(t.y) + 1);
+  float sum[9u * kPixels];
+  [[unroll]] for (uint k = 0u; k < 9u * kPixels; ++k) sum[k] = 0.0;
+  [[unroll]] for (int m = -kReach; m < int(kPixels) + kReach; ++m) {
+    int row = int(first) + m;  // in the tile
+    uint from = row < 0 ? above : row < int(kTileHeight) ? tile : below;
+    bool there = from != kNoTile;
+    uint at = 9u * ssim_place(there ? from : tile, column, uint(row + int(kTileHeight)) % kTileHeight);
+    [[unroll]] for (uint c = 0u; c < 9u; ++c) {
+      float value = there ? rows[at + c] : 0.0;
+      [[unroll]] for (int k = 0; k < int(kPixels); ++k)
+        if (abs(m - k) <= kReach) sum[9u * uint(k) + c] += window(m - k) * value;
+    }
+  }
+  uint x = t.x * kTileWidth + column;
+  [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
+    uint y = t.y * kTileHeight + first + k;
     if (x < view.width && y < view.height) {
-      vec4 s0 = vec4(0.0), s1 = vec4(0.0);
-      float s2 = 0.0;
-      for (int m = -kReach; m <= kReach; ++m) {
-        int at = int(y) + m;
-        if (at >= 0 && at < int(view.height)) {
-          uint row = 4u * (view.pixel + uint(at) * view.width + x);
-          float w = kWindow[m + kReach];
-          s0 += w * rows[row];
-          s1 += w * rows[row + 1u];
-          s2 += w * rows[row + 2u].x;
-        }
-      }
       uint offset = y * view.width + x;
       vec3 shown = image[view.pixel + offset].xyz, wanted = unpackUnorm4x8(target[view.target + offset]).xyz;
-      vec3 g = s0.xyz + 2.0 * shown * vec3(s0.w, s1.xy) + wanted * vec3(s1.zw, s2);
-      pixel_gradient[view.pixel + offset] += vec4(g, 0.0);
+      vec3 mean = vec3(sum[9u * k], sum[9u * k + 1u], sum[9u * k + 2u]);
+      vec3 square = vec3(sum[9u * k + 3u], sum[9u * k + 4u], sum[9u * k + 5u]);
+      vec3 product = vec3(sum[9u * k + 6u], sum[9u * k + 7u], sum[9u * k + 8u]);
+      pixel_gradient[view.pixel + offset] += vec4(mean + 2.0 * shown * square + wanted * product, 0.0);
     }
   }
 }

@@ -1,45 +1,55 @@
-// ssim_rows.comp - one invocation a pixel: the window along x over image, target and their products, four vec4 a pixel:
-//   0: x.rgb, y.r   1: y.gb, xx.rg   2: xx.b, yy.rgb   3: xy.rgb, -
+// ssim_rows.comp - the window along x over image, target, the sum of their squares and their product; a lane a strip of a
+// row. Three vec4 a pixel:   0: x.rgb, y.r   1: y.gb, (xx + yy).rg   2: (xx + yy).b, xy.rgb
 #version 460
 #extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
 #include "shared/splat.h"
-#include "inc/ssim.glsl"
-layout(local_size_x_id = 0) in;
+layout(local_size_x_id = 0) in;  // kTileWidth * kTileHeight / kPixels
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
+layout(constant_id = 3) const uint kPixels = 8u;
 layout(push_constant) uniform Push { SplatPush p; };
 layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
 layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 2) readonly buffer Image { vec4 image[]; };
-layout(std430, binding = 3) readonly buffer Target { uint target[]; };
-layout(std430, binding = 4) writeonly buffer Rows { vec4 rows[]; };
+layout(std430, binding = 2) readonly buffer TileMap { uint tile_map[]; };
+layout(std430, binding = 3) readonly buffer Image { vec4 image[]; };
+layout(std430, binding = 4) readonly buffer Target { uint target[]; };
+layout(std430, binding = 5) writeonly buffer Rows { vec4 rows[]; };
+#include "inc/ssim.glsl"
 
 void main() {
-  SplatTile t = tiles[gl_WorkGroupID.x];
+  uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
+  SplatTile t = tiles[tile];
   SplatView view = views[t.view];
-  for (uint k = gl_LocalInvocationID.x; k < kTileWidth * kTileHeight; k += gl_WorkGroupSize.x) {
-    uint x = t.x * kTileWidth + k % kTileWidth, y = t.y * kTileHeight + k / kTileWidth;
-    if (x < view.width && y < view.height) {
-      vec3 a = vec3(0.0), b = vec3(0.0), aa = vec3(0.0), bb = vec3(0.0), ab = vec3(0.0);
-      for (int m = -kReach; m <= kReach; ++m) {
-        int at = int(x) + m;
-        if (at >= 0 && at < int(view.width)) {
-          uint offset = y * view.width + uint(at);
-          vec3 shown = image[view.pixel + offset].xyz;
-          vec3 wanted = unpackUnorm4x8(target[view.target + offset]).xyz;
-          float w = kWindow[m + kReach];
-          a += w * shown;
-          b += w * wanted;
-          aa += w * shown * shown;
-          bb += w * wanted * wanted;
-          ab += w * shown * wanted;
-        }
-      }
-      uint row = 4u * (view.pixel + y * view.width + x);
-      rows[row] = vec4(a, b.x);
-      rows[row + 1u] = vec4(b.yz, aa.xy);
-      rows[row + 2u] = vec4(aa.z, bb);
-      rows[row + 3u] = vec4(ab, 0.0);
+  uint row = lane % kTileHeight, first = lane / kTileHeight * kPixels;
+  uint y = t.y * kTileHeight + row;
+  bool inside = y < view.height;
+  bool left = active_tile(view, int(t.x) - 1, int(t.y)) != kNoTile;
+  bool right = active_tile(view, int(t.x) + 1, int(t.y)) != kNoTile;
+  vec3 a[kPixels], b[kPixels], squares[kPixels], ab[kPixels];
+  [[unroll]] for (uint k = 0u; k < kPixels; ++k) a[k] = b[k] = squares[k] = ab[k] = vec3(0.0);
+  [[unroll]] for (int m = -kReach; m < int(kPixels) + kReach; ++m) {
+    int column = int(first) + m;  // in the tile
+    int x = int(t.x * kTileWidth) + column;
+    bool there = inside && x >= 0 && x < int(view.width);
+    bool drawn = there && (column < 0 ? left : column < int(kTileWidth) || right);
+    uint offset = there ? y * view.width + uint(x) : 0u;
+    vec3 shown = drawn ? image[view.pixel + offset].xyz : vec3(0.0);
+    vec3 wanted = there ? unpackUnorm4x8(target[view.target + offset]).xyz : vec3(0.0);
+    vec3 square = shown * shown + wanted * wanted, product = shown * wanted;
+    [[unroll]] for (int k = 0; k < int(kPixels); ++k) {
+      if (abs(m - k) > kReach) continue;
+      float w = window(m - k);
+      a[k] += w * shown;
+      b[k] += w * wanted;
+      squares[k] += w * square;
+      ab[k] += w * product;
     }
+  }
+  [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
+    uint at = 3u * ssim_place(tile, first + k, row);
+    rows[at] = vec4(a[k], b[k].x);
+    rows[at + 1u] = vec4(b[k].yz, squares[k].xy);
+    rows[at + 2u] = vec4(squares[k].z, ab[k]);
   }
 }

@@ -1,38 +1,41 @@
-// ssim_rows_backward.comp - one invocation a pixel: the window along x over the gradient factors P, Q, R.
+// ssim_rows_backward.comp - the window along x over the gradient factors P, Q, R; a lane a strip of a row.
 #version 460
 #extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
 #include "shared/splat.h"
-#include "inc/ssim.glsl"
-layout(local_size_x_id = 0) in;
+layout(local_size_x_id = 0) in;  // kTileWidth * kTileHeight / kPixels
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
+layout(constant_id = 3) const uint kPixels = 8u;
 layout(push_constant) uniform Push { SplatPush p; };
 layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
 layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 2) readonly buffer Factors { vec4 factors[]; };
-layout(std430, binding = 3) writeonly buffer Rows { vec4 rows[]; };
+layout(std430, binding = 2) readonly buffer TileMap { uint tile_map[]; };
+layout(std430, binding = 3) readonly buffer Factors { float factors[]; };
+layout(std430, binding = 4) writeonly buffer Rows { float rows[]; };
+#include "inc/ssim.glsl"
 
 void main() {
-  SplatTile t = tiles[gl_WorkGroupID.x];
+  uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
+  SplatTile t = tiles[tile];
   SplatView view = views[t.view];
-  for (uint k = gl_LocalInvocationID.x; k < kTileWidth * kTileHeight; k += gl_WorkGroupSize.x) {
-    uint x = t.x * kTileWidth + k % kTileWidth, y = t.y * kTileHeight + k / kTileWidth;
-    if (x < view.width && y < view.height) {
-      vec3 s0 = vec3(0.0), s1 = vec3(0.0), s2 = vec3(0.0);
-      for (int m = -kReach; m <= kReach; ++m) {
-        int at = int(x) + m;
-        if (at >= 0 && at < int(view.width)) {
-          uint row = 3u * (view.pixel + y * view.width + uint(at));
-          float w = kWindow[m + kReach];
-          s0 += w * factors[row].xyz;
-          s1 += w * factors[row + 1u].xyz;
-          s2 += w * factors[row + 2u].xyz;
-        }
-      }
-      uint out_row = 4u * (view.pixel + y * view.width + x);
-      rows[out_row] = vec4(s0, s1.x);
-      rows[out_row + 1u] = vec4(s1.yz, s2.xy);
-      rows[out_row + 2u] = vec4(s2.z, 0.0, 0.0, 0.0);
+  uint row = lane % kTileHeight, first = lane / kTileHeight * kPixels;
+  uint left = ssim_tile(view, int(t.x) - 1, int(t.y)), right = ssim_tile(view, int(t.x) + 1, int(t.y));
+  float sum[9u * kPixels];
+  [[unroll]] for (uint k = 0u; k < 9u * kPixels; ++k) sum[k] = 0.0;
+  [[unroll]] for (int m = -kReach; m < int(kPixels) + kReach; ++m) {
+    int column = int(first) + m;  // in the tile
+    uint from = column < 0 ? left : column < int(kTileWidth) ? tile : right;
+    bool there = from != kNoTile;
+    uint at = 9u * ssim_place(there ? from : tile, uint(column + int(kTileWidth)) % kTileWidth, row);
+    [[unroll]] for (uint c = 0u; c < 9u; ++c) {
+      float value = there ? factors[at + c] : 0.0;
+      [[unroll]] for (int k = 0; k < int(kPixels); ++k)
+        if (abs(m - k) <= kReach) sum[9u * uint(k) + c] += window(m - k) * value;
     }
+  }
+  [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
+    uint at = 9u * ssim_place(tile, first + k, row);
+    [[unroll]] for (uint c = 0u; c < 9u; ++c) rows[at + c] = sum[9u * k + c];
   }
 }

@@ -1,7 +1,10 @@
 // bench.cpp - fixed benchmarks of drawing and training, defined here and seeded, so that two machines measure the same
 // work.
+#include <sys/resource.h>
+
 #include <CLI/CLI.hpp>
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <iomanip>
 #include <iostream>
@@ -21,9 +24,25 @@ namespace {
 using Json = nlohmann::ordered_json;
 
 struct Request {
-  std::string gaussians = "2000,20000", views = "1,9,30", scene = "both";
-  int repeats = 7;
+  std::string gaussians, views;  // empty: the fixed cases
+  std::string scene = "both", capture;
+  bool whole = false;
+  int repeats = 9;
 };
+
+// What is measured: one scene, defined by these numbers and a seed.
+struct Case {
+  bool close = false;
+  int gaussians = 0, views = 0, joints = 8;
+  bool whole = false;  // uncropped images
+};
+
+// The README's cases: sizes of one step, a whole batch, the number of links, and few views against many.
+constexpr std::array kCases = {Case{true, 2000, 1, 8, true},    Case{true, 20000, 1, 8, true},
+                               Case{true, 90000, 1, 8, true},   Case{false, 1000, 1, 8, false},
+                               Case{false, 1000, 9, 8, false},  Case{false, 1000, 90, 8, false},
+                               Case{false, 2000, 9, 3, false},  Case{false, 2000, 9, 7, false},
+                               Case{false, 2000, 9, 15, false}, Case{false, 2000, 9, 31, false}};
 
 // A bent rope of 30 cm, 2 cm thick, seen by cameras on a half circle: `far`, 1 m away, fills about 1 % of 640x480;
 // `close` fills about 8 %.
@@ -49,12 +68,12 @@ capture::Camera camera_at(const math::Vector3& eye, const math::Vector3& target,
   return camera;
 }
 
-Scene make_scene(bool close, int count, int views, std::uint64_t seed) {
-  constexpr int kJoints = 8;
+Scene make_scene(const Case& what, std::uint64_t seed) {
+  const int count = what.gaussians, views = what.views;
   constexpr double kLength = 0.3, kDiameter = 0.02, kFocal = 615.0;  // m, m, px
   Scene scene;
   const chain::Chain chain = chain::make_chain(kLength, kDiameter, -math::Vector3::UnitZ(), math::Vector3::UnitY(),
-                                               kJoints, chain::Bending::planar, false);
+                                               what.joints, chain::Bending::planar, false);
   core::Random random(seed);
   splat::Gaussians& g = scene.gaussians;
   g.resize(count, chain.links(), 0);
@@ -72,16 +91,20 @@ Scene make_scene(bool close, int count, int views, std::uint64_t seed) {
     g.link_logits[g.links * i + chain::link_at(chain, std::min(s, kLength * (1 - 1e-9)))] =
         12.0f;  // one live replica each
   }
-  const double distance = close ? 0.36 : 1.0;
+  const double distance = what.close ? 0.36 : 1.0;
   scene.cameras.reserve(views);
   std::vector<math::VectorX> theta;
   for (int v = 0; v < views; ++v) {
     const double around = std::numbers::pi * (v + 0.5) / views;
     scene.cameras.push_back(
         camera_at({distance * std::cos(around), distance * std::sin(around), -0.15}, {0, 0, -0.15}, kFocal));
-    const math::VectorX bent = math::VectorX::Constant(chain.angles(), 0.1 * std::sin(1.0 + v));
-    // the crop: the rope's projection and 24 px
+    const math::VectorX bent = math::VectorX::Constant(chain.angles(), 0.8 / what.joints * std::sin(1.0 + v));
     const auto motions = chain::link_motions(chain, bent, math::Pose{});
+    if (what.whole) {
+      scene.views.push_back({&scene.cameras[v], 0, 0, scene.cameras[v].width, scene.cameras[v].height, motions});
+      continue;
+    }
+    // the crop: the rope's projection and 24 px
     const math::MatrixX points = chain::centerline(chain, motions, chain::equal_arclengths(chain, 33));
     math::Vector2 low = math::Vector2::Constant(1e9), high = -low;
     for (int p = 0; p < points.cols(); ++p) {
@@ -121,89 +144,145 @@ std::vector<int> numbers(const std::string& text, const char* option) {
   return out;
 }
 
+// User and system time of all of the process' threads, s. Unlike the clock it says what the work costs on a busy
+// machine.
+double processor_seconds() {
+  rusage usage{};
+  getrusage(RUSAGE_SELF, &usage);
+  const auto seconds = [](const timeval& t) { return static_cast<double>(t.tv_sec) + 1e-6 * t.tv_usec; };
+  return seconds(usage.ru_utime) + seconds(usage.ru_stime);
+}
+
+double peak_memory_mib() {
+  rusage usage{};
+  getrusage(RUSAGE_SELF, &usage);
+  constexpr double kKibPerMib = 1024.0;
+  return static_cast<double>(usage.ru_maxrss) / kKibPerMib;
+}
+
+struct Measured {
+  double median = 0, least = 0, processor = 0;  // ms; processor: median
+  std::map<std::string, double> passes;         // median ms on the device
+};
+
+template <class Work>
+Measured measure(const splat::Engine& engine, int repeats, Work&& work) {
+  constexpr int kWarm = 2;  // kernels compile and buffers grow
+  std::vector<double> clock, processor;
+  std::map<std::string, std::vector<double>> passes;
+  for (int k = 0; k < kWarm + repeats; ++k) {
+    if (const int signal = core::stop_requested()) throw Interrupted(signal);
+    const double start = core::seconds_now(), used = processor_seconds();
+    work();
+    if (k < kWarm) continue;
+    clock.push_back(1e3 * (core::seconds_now() - start));
+    processor.push_back(1e3 * (processor_seconds() - used));
+    for (const gpu::Timing& t : engine.timings()) passes[t.label].push_back(t.milliseconds);
+  }
+  Measured out{median(clock), *std::min_element(clock.begin(), clock.end()), median(processor), {}};
+  for (const auto& [label, values] : passes) out.passes[label] = median(values);
+  return out;
+}
+
+// Pictures of the scene with other Gaussians as 8-bit targets, so that every term has a gradient.
+std::vector<std::vector<std::uint8_t>> make_targets(splat::Engine& engine, const Scene& scene, const Case& what,
+                                                    std::uint64_t seed) {
+  std::vector<std::vector<std::uint8_t>> targets;
+  for (const splat::Picture& picture : engine.draw(make_scene(what, seed).gaussians, scene.views)) {
+    targets.emplace_back(picture.rgba.size());
+    for (std::size_t k = 0; k < picture.rgba.size(); ++k)
+      targets.back()[k] = static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(picture.rgba[k], 0.0f, 1.0f)));
+    for (std::size_t k = 3; k < targets.back().size(); k += 4) {
+      const bool object = targets.back()[k] >= 128;
+      targets.back()[k] = object ? 255 : 0;
+      if (!object) std::fill_n(targets.back().begin() + static_cast<std::ptrdiff_t>(k) - 3, 3, 0);
+    }
+  }
+  return targets;
+}
+
+std::string passes_text(const std::map<std::string, double>& passes) {
+  std::vector<std::pair<double, std::string>> order;
+  for (const auto& [label, milliseconds] : passes) order.emplace_back(-milliseconds, label);
+  std::sort(order.begin(), order.end());
+  std::ostringstream text;
+  text << std::fixed << std::setprecision(1);
+  constexpr std::size_t kShown = 6;
+  for (std::size_t k = 0; k < std::min(kShown, order.size()); ++k)
+    text << (k ? ", " : "") << order[k].second << " " << -order[k].first;
+  return text.str();
+}
+
+Json bench_case(gpu::Device& device, const Case& what, int repeats, std::uint64_t seed, bool table) {
+  const Scene scene = make_scene(what, seed + 1);
+  splat::Engine engine(device);
+  const auto targets = make_targets(engine, scene, what, seed + 2);
+  std::vector<const std::vector<std::uint8_t>*> pointers;
+  for (const auto& target : targets) pointers.push_back(&target);
+  engine.set_views(scene.views, pointers);
+  engine.set_gaussians(scene.gaussians);
+  std::vector<int> batch(what.views);
+  for (int v = 0; v < what.views; ++v) batch[v] = v;
+  const splat::AdamRates rates{};  // all zero: the scene stays the same
+  const std::array<std::pair<const char*, Measured>, 3> works = {
+      std::pair{"draw", measure(engine, repeats, [&] { engine.draw_views(batch); })},
+      std::pair{"step", measure(engine, repeats,
+                                [&] {
+                                  engine.step(batch, {1.0f, 0.0f, 0.3f}, rates, true);
+                                })},
+      std::pair{"step_dssim", measure(engine, repeats, [&] {
+                  engine.step(batch, {0.8f, 0.2f, 0.3f}, rates, true);
+                })}};
+  Json entry;
+  entry["scene"] = what.close ? "close" : "far";
+  entry["gaussians"] = what.gaussians;
+  entry["views"] = what.views;
+  entry["links"] = what.joints + 1;
+  entry["cropped"] = !what.whole;
+  for (const auto& [name, measured] : works) {
+    entry[name] = {{"median_ms", measured.median}, {"least_ms", measured.least}, {"processor_ms", measured.processor}};
+    for (const auto& [label, milliseconds] : measured.passes) entry[name]["passes_ms"][label] = milliseconds;
+  }
+  if (table) {
+    std::ostringstream line;
+    line << std::fixed << std::setprecision(1) << std::left << std::setw(6) << (what.close ? "close" : "far")
+         << std::setw(8) << (what.whole ? "whole" : "cropped") << std::right << std::setw(10) << what.gaussians
+         << std::setw(6) << what.views << std::setw(6) << what.joints + 1;
+    for (const auto& [name, measured] : works) line << std::setw(9) << measured.median;
+    line << std::setw(9) << works[2].second.least << std::setw(9) << works[2].second.processor << "   "
+         << passes_text(works[2].second.passes);
+    std::cout << line.str() << std::endl;
+  }
+  return entry;
+}
+
 void bench(const Globals& globals, const Request& request) {
   if (request.scene != "far" && request.scene != "close" && request.scene != "both")
     throw InputError("--scene", "'" + request.scene + "' is not a scene", "name far, close or both");
   if (request.repeats < 1) throw InputError("--repeats", "is less than 1", "measure at least once");
+  std::vector<Case> cases(kCases.begin(), kCases.end());
+  if (!request.gaussians.empty() || !request.views.empty()) {
+    cases.clear();
+    for (const int count : numbers(request.gaussians.empty() ? "2000" : request.gaussians, "--gaussians"))
+      for (const int views : numbers(request.views.empty() ? "1" : request.views, "--views"))
+        for (const bool close : {false, true}) cases.push_back({close, count, views, 8, request.whole});
+  }
+  if (request.scene != "both")
+    std::erase_if(cases, [&](const Case& what) { return what.close != (request.scene == "close"); });
   const gpu::DevicePtr device = gpu::open_device({.selector = globals.device});
   Json document;
   document["version"] = CHAINSPLAT_VERSION;
   document["device"] = gpu::info(*device).name;
   document["driver"] = gpu::info(*device).driver;
   document["threads"] = core::threads();
-  document["results"] = Json::array();
-  if (!globals.json) {
-    std::cout << gpu::info(*device).name << ", medians of " << request.repeats << ", milliseconds a submission\n"
-              << "scene  gaussians  views   draw  step  step with D-SSIM   passes of the step\n";
-  }
-  for (const bool close : {false, true}) {
-    if (request.scene != "both" && close != (request.scene == "close")) continue;
-    for (const int count : numbers(request.gaussians, "--gaussians")) {
-      for (const int views : numbers(request.views, "--views")) {
-        const Scene scene = make_scene(close, count, views, globals.seed + 1);
-        splat::Engine engine(*device);
-        // targets: the scene itself, a little off, so that every term has a gradient
-        Scene other = make_scene(close, count, views, globals.seed + 2);
-        std::vector<std::vector<std::uint8_t>> targets;
-        for (const splat::Picture& picture : engine.draw(other.gaussians, scene.views)) {
-          targets.emplace_back(picture.rgba.size());
-          for (std::size_t k = 0; k < picture.rgba.size(); ++k)
-            targets.back()[k] =
-                static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(picture.rgba[k], 0.0f, 1.0f)));
-          for (std::size_t k = 3; k < targets.back().size(); k += 4) {
-            const bool object = targets.back()[k] >= 128;
-            targets.back()[k] = object ? 255 : 0;
-            if (!object) std::fill_n(targets.back().begin() + static_cast<std::ptrdiff_t>(k) - 3, 3, 0);
-          }
-        }
-        std::vector<const std::vector<std::uint8_t>*> pointers;
-        for (const auto& target : targets) pointers.push_back(&target);
-        engine.set_views(scene.views, pointers);
-        engine.set_gaussians(scene.gaussians);
-        std::vector<int> batch(views);
-        for (int v = 0; v < views; ++v) batch[v] = v;
-        const auto measure = [&](auto&& work, std::map<std::string, std::vector<double>>* passes) {
-          constexpr int kWarm = 2;  // kernels compile and buffers grow
-          std::vector<double> milliseconds;
-          for (int k = 0; k < kWarm + request.repeats; ++k) {
-            if (const int signal = core::stop_requested()) throw Interrupted(signal);
-            const double start = core::seconds_now();
-            work();
-            if (k < kWarm) continue;
-            milliseconds.push_back(1e3 * (core::seconds_now() - start));
-            if (passes)
-              for (const gpu::Timing& t : engine.timings()) (*passes)[t.label].push_back(t.milliseconds);
-          }
-          return median(milliseconds);
-        };
-        const splat::AdamRates rates{};  // all zero: the scene stays the same
-        std::map<std::string, std::vector<double>> passes;
-        const double draw = measure([&] { engine.draw_views(batch); }, nullptr);
-        const double step = measure([&] { engine.step(batch, {1.0f, 0.0f, 0.3f}, rates, true); }, &passes);
-        const double dssim = measure([&] { engine.step(batch, {0.8f, 0.2f, 0.3f}, rates, true); }, nullptr);
-        Json entry;
-        entry["scene"] = close ? "close" : "far";
-        entry["gaussians"] = count;
-        entry["views"] = views;
-        entry["draw_ms"] = draw;
-        entry["step_ms"] = step;
-        entry["step_dssim_ms"] = dssim;
-        for (const auto& [label, values] : passes) entry["passes_ms"][label] = median(values);
-        document["results"].push_back(entry);
-        if (globals.json) continue;
-        std::ostringstream line;
-        line << std::fixed << std::setprecision(1) << std::left << std::setw(7) << (close ? "close" : "far")
-             << std::right << std::setw(9) << count << std::setw(7) << views << std::setw(7) << draw << std::setw(6)
-             << step << std::setw(18) << dssim << "   ";
-        std::vector<std::pair<double, std::string>> order;
-        for (const auto& [label, values] : passes) order.emplace_back(-median(values), label);
-        std::sort(order.begin(), order.end());
-        for (std::size_t k = 0; k < std::min<std::size_t>(5, order.size()); ++k)
-          line << (k ? ", " : "") << order[k].second << " " << -order[k].first;
-        std::cout << line.str() << std::endl;
-      }
-    }
-  }
+  document["repeats"] = request.repeats;
+  if (!globals.json)
+    std::cout << gpu::info(*device).name << ", milliseconds a submission, medians of " << request.repeats << "\n"
+              << "                                                              with D-SSIM\n"
+              << "scene         gaussians views links     draw     step   median    least processor   its passes\n";
+  for (const Case& what : cases)
+    document["results"].push_back(bench_case(*device, what, request.repeats, globals.seed, !globals.json));
+  document["peak_memory_mib"] = peak_memory_mib();
   if (globals.json) std::cout << document.dump(1) << "\n";
 }
 
@@ -212,9 +291,11 @@ void bench(const Globals& globals, const Request& request) {
 void add_bench_command(CLI::App& app, const Globals& globals, Job& job) {
   CLI::App* command = app.add_subcommand("bench", "Measure drawing and training steps on fixed synthetic scenes");
   auto request = std::make_shared<Request>();
-  command->add_option("--gaussians", request->gaussians, "Numbers of Gaussians, with commas between")
-      ->capture_default_str();
-  command->add_option("--views", request->views, "Views a submission, with commas between")->capture_default_str();
+  command->add_option("--gaussians", request->gaussians,
+                      "Numbers of Gaussians, with commas between, in place of the fixed cases");
+  command->add_option("--views", request->views,
+                      "Views a submission, with commas between, in place of the fixed cases");
+  command->add_flag("--whole", request->whole, "Whole images of 640x480 in these, not crops about the rope");
   command->add_option("--scene", request->scene, "far (1 % of the image), close (8 %) or both")->capture_default_str();
   command->add_option("--repeats", request->repeats, "Measurements of each")->capture_default_str();
   command->callback([&globals, &job, request] { job = [&globals, request] { bench(globals, *request); }; });

@@ -28,7 +28,8 @@ struct SplatTile {
 struct SplatPush {
   uint gaussians, links, coefficients, views;
   uint live_capacity, instance_capacity, tiles, slots;
-  float weight_l1, weight_dssim, weight_mask, padding;  // already divided by what means are taken over
+  float weight_l1, weight_dssim, weight_mask;  // already divided by what means are taken over
+  uint near_tiles;                             // the first so many active tiles have a D-SSIM term
   uint scan_length, scan_per_live, scan_counter, flags;
 };
 

@@ -194,10 +194,11 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   adam = gpu::Pipeline(d, "splat_adam", 5, sizeof(AdamPush), {});
   const std::vector<std::uint32_t> tile_constants{tile_lanes, tile_width, tile_height};
   loss_pixel = gpu::Pipeline(d, "loss_pixel", 6, push, tile_constants);
-  ssim_rows = gpu::Pipeline(d, "ssim_rows", 5, push, tile_constants);
-  ssim_columns = gpu::Pipeline(d, "ssim_columns", 5, push, tile_constants);
-  ssim_rows_backward = gpu::Pipeline(d, "ssim_rows_backward", 4, push, tile_constants);
-  ssim_columns_backward = gpu::Pipeline(d, "ssim_columns_backward", 6, push, tile_constants);
+  const std::vector<std::uint32_t> strip_constants{lanes, tile_width, tile_height, pixels_per_lane};
+  ssim_rows = gpu::Pipeline(d, "ssim_rows", 6, push, strip_constants);
+  ssim_columns = gpu::Pipeline(d, "ssim_columns", 6, push, strip_constants);
+  ssim_rows_backward = gpu::Pipeline(d, "ssim_rows_backward", 5, push, strip_constants);
+  ssim_columns_backward = gpu::Pipeline(d, "ssim_columns_backward", 7, push, strip_constants);
   need(counters, shared::kCounters * sizeof(std::uint32_t), "counters");
 }
 
@@ -278,19 +279,22 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
 
 // Views that go into one submission: bounded by buffer ranges and group counts of the device, never by time.
 std::vector<std::vector<int>> Engine::State::chunks(const Scene& scene, std::span<const int> batch, bool dssim) const {
-  const std::size_t row_bytes = dssim ? 4 * sizeof(glm::vec4) : sizeof(glm::vec4);
-  const std::size_t most_pixels = range_limit / row_bytes;
+  const std::size_t most_pixels = range_limit / sizeof(glm::vec4);
+  // the row sums of D-SSIM are the largest of what lies tile by tile
+  const std::size_t most_tiles =
+      dssim ? std::min<std::size_t>(kMostTiles, range_limit / (12 * sizeof(float) * tile_width * tile_height))
+            : kMostTiles;
   std::vector<std::vector<int>> out;
   std::size_t pixels = 0, tile_total = 0;
   for (const int v : batch) {
     const SceneView& view = scene.views[v];
     const std::size_t view_pixels = static_cast<std::size_t>(view.width) * view.height;
-    if (view_pixels > most_pixels || view.active.size() > kMostTiles)
+    if (view_pixels > most_pixels || view.active.size() > most_tiles)
       throw WorkError("splat",
                       "an image of " + std::to_string(view.width) + "x" + std::to_string(view.height) +
                           " pixels does not fit this device's buffers",
                       "use smaller images or another device");
-    if (out.empty() || pixels + view_pixels > most_pixels || tile_total + view.active.size() > kMostTiles ||
+    if (out.empty() || pixels + view_pixels > most_pixels || tile_total + view.active.size() > most_tiles ||
         static_cast<int>(out.back().size()) >= most_views) {
       out.emplace_back();
       pixels = tile_total = 0;
@@ -326,7 +330,6 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   chunk_tile_view.clear();
   chunk_pixel.assign(view_count, 0);
   std::size_t pixels = 0;
-  bool all_active = true;
   for (std::uint32_t v = 0; v < view_count; ++v) {
     const SceneView& view = scene.views[chunk[v]];
     CHAINSPLAT_CHECK(view.motions.size() == links || count == 0, std::to_string(view.motions.size()));
@@ -347,7 +350,6 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
     chunk_pixel[v] = pixels;
     pixels += static_cast<std::size_t>(view.width) * view.height;
     map.resize(map.size() + static_cast<std::size_t>(view.tiles_x) * view.tiles_y, shared::kNoTile);
-    all_active = all_active && view.near == static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
     for (std::uint32_t j = 0; j < std::min<std::size_t>(links, view.motions.size()); ++j) {
       const math::Pose pose = view.camera_from_world * view.motions[j];
       for (int r = 0; r < 3; ++r)
@@ -413,8 +415,9 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   const bool dssim = options.loss && options.weights.dssim > 0.0f;
   if (options.loss) need(pixel_gradient, vectors(pixels), "pixel gradient");
   if (dssim) {
-    need(ssim_row_sums, 4 * vectors(pixels), "ssim rows");
-    need(ssim_factors, 3 * vectors(pixels), "ssim factors");
+    const std::size_t near_pixels = static_cast<std::size_t>(near_total) * tile_width * tile_height;
+    need(ssim_row_sums, 12 * words(near_pixels), "ssim rows");
+    need(ssim_factors, 9 * words(near_pixels), "ssim factors");
   }
   if (options.backward) {
     need(partials, vectors(static_cast<std::size_t>(shared::kPartialRows) * slots * instance_capacity), "partials");
@@ -432,6 +435,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   push.instance_capacity = instance_capacity;
   push.tiles = tile_total;
   push.slots = slots;
+  push.near_tiles = near_total;
   push.weight_l1 = static_cast<float>(options.weights.l1 * options.color_scale);
   push.weight_dssim = static_cast<float>(options.weights.dssim * options.color_scale);
   push.weight_mask = static_cast<float>(options.weights.mask * options.mask_scale);
@@ -455,12 +459,6 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   commands.fill(tile_cursor, 0, 0, words(std::max(1u, tile_total)));
   commands.no_barrier();
   commands.fill(tile_used, 0, 0, words(std::max(1u, tile_total)));
-  if (dssim && !all_active) {
-    // neighbors of active tiles are read by the windows: black there
-    commands.fill(image, 0, 0, vectors(pixels));
-    commands.fill(ssim_row_sums, 0, 0, 4 * vectors(pixels));
-    commands.fill(ssim_factors, 0, 0, 3 * vectors(pixels));
-  }
   commands.stamp("clear");
   dispatch(replicate, {&scene.parameters, &replica_opacity, &live_flag}, groups(count));
   push.scan_length = static_cast<std::uint32_t>(replicas);
@@ -497,11 +495,11 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
     dispatch(loss_pixel, {&tiles, &views, &image, &scene.target, &pixel_gradient, &tile_loss}, tile_total);
     commands.stamp("loss");
     if (dssim) {
-      dispatch(ssim_rows, {&tiles, &views, &image, &scene.target, &ssim_row_sums}, near_total);
-      dispatch(ssim_columns, {&tiles, &views, &ssim_row_sums, &ssim_factors, &tile_loss}, near_total);
-      dispatch(ssim_rows_backward, {&tiles, &views, &ssim_factors, &ssim_row_sums}, near_total);
-      dispatch(ssim_columns_backward, {&tiles, &views, &ssim_row_sums, &image, &scene.target, &pixel_gradient},
-               near_total);
+      dispatch(ssim_rows, {&tiles, &views, &tile_map, &image, &scene.target, &ssim_row_sums}, near_total);
+      dispatch(ssim_columns, {&tiles, &views, &tile_map, &ssim_row_sums, &ssim_factors, &tile_loss}, near_total);
+      dispatch(ssim_rows_backward, {&tiles, &views, &tile_map, &ssim_factors, &ssim_row_sums}, near_total);
+      dispatch(ssim_columns_backward,
+               {&tiles, &views, &tile_map, &ssim_row_sums, &image, &scene.target, &pixel_gradient}, near_total);
       commands.stamp("ssim");
     }
   }
