@@ -3,6 +3,7 @@
 // its product with the pixel's gradient is carried. Each subgroup stores its sum in a slot of its own (no atomics).
 #version 460
 #extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_shuffle : require
 #include "shared/splat.h"
@@ -24,7 +25,7 @@ layout(std430, binding = 7) readonly buffer Counters { uint counters[]; };
 layout(std430, binding = 8) readonly buffer Image { vec4 image[]; };
 layout(std430, binding = 9) readonly buffer TileUsed { uint tile_used[]; };
 layout(std430, binding = 10) readonly buffer PixelGradient { vec4 pixel_gradient[]; };  // of color and alpha
-layout(std430, binding = 11) writeonly buffer Partials { vec4 partials[]; };
+layout(std430, binding = 11) writeonly buffer Partials { float partials[]; };  // kPartialRows vec4 a slot
 
 #include "inc/alpha.glsl"
 
@@ -38,6 +39,26 @@ float subgroup_sum(float x) {
   if (kSubgroup > 2u) x += subgroupShuffleXor(x, 2u);
   if (kSubgroup > 1u) x += subgroupShuffleXor(x, 1u);
   return x;
+}
+
+// Sums of eight values over a subgroup of eight lanes or more: lane l ends with that of value l % 8. Each exchange halves
+// the values that a lane holds: ten exchanges instead of eight times as many.
+float subgroup_sums(float v[8]) {
+  uint lane = gl_SubgroupInvocationID;
+  bool upper = (lane & 4u) != 0u;
+  float four[4], two[2];
+  [[unroll]] for (uint k = 0u; k < 4u; ++k)
+    four[k] = (upper ? v[k + 4u] : v[k]) + subgroupShuffleXor(upper ? v[k] : v[k + 4u], 4u);
+  upper = (lane & 2u) != 0u;
+  [[unroll]] for (uint k = 0u; k < 2u; ++k)
+    two[k] = (upper ? four[k + 2u] : four[k]) + subgroupShuffleXor(upper ? four[k] : four[k + 2u], 2u);
+  upper = (lane & 1u) != 0u;
+  float one = (upper ? two[1] : two[0]) + subgroupShuffleXor(upper ? two[0] : two[1], 1u);
+  if (kSubgroup > 8u) one += subgroupShuffleXor(one, 8u);
+  if (kSubgroup > 16u) one += subgroupShuffleXor(one, 16u);
+  if (kSubgroup > 32u) one += subgroupShuffleXor(one, 32u);
+  if (kSubgroup > 64u) one += subgroupShuffleXor(one, 64u);
+  return one;
 }
 
 void main() {
@@ -93,26 +114,30 @@ void main() {
       grad_cov += g * vec3(q.x * q.x, q.x * q.y, q.y * q.y);
       transmittance[k] = seen ? after : transmittance[k];
     }
-    grad_u = vec2(subgroup_sum(grad_u.x), subgroup_sum(grad_u.y));
-    grad_cov = vec3(subgroup_sum(grad_cov.x), subgroup_sum(grad_cov.y), subgroup_sum(grad_cov.z));
-    grad_color = vec3(subgroup_sum(grad_color.x), subgroup_sum(grad_color.y), subgroup_sum(grad_color.z));
-    grad_opacity = subgroup_sum(grad_opacity);
-    if (subgroupElect()) {
-      uint slot = kPartialRows * (item.y * p.slots + gl_SubgroupID);
-      partials[slot] = vec4(grad_u, grad_opacity, grad_color.x);
-      partials[slot + 1u] = vec4(grad_cov, grad_color.y);
-      partials[slot + 2u] = vec4(grad_color.z, 0.0, 0.0, 0.0);
+    uint slot = 4u * kPartialRows * (item.y * p.slots + gl_SubgroupID);
+    float blue = subgroup_sum(grad_color.z);
+    float sums[8] = float[](grad_u.x, grad_u.y, grad_opacity, grad_color.x, grad_cov.x, grad_cov.y, grad_cov.z,
+                            grad_color.y);
+    if (kSubgroup >= 8u) {
+      float sum = subgroup_sums(sums);
+      if (gl_SubgroupInvocationID < 8u) partials[slot + gl_SubgroupInvocationID] = sum;
+    } else {
+      [[unroll]] for (uint k = 0u; k < 8u; ++k) sums[k] = subgroup_sum(sums[k]);
+      if (subgroupElect()) {
+        [[unroll]] for (uint k = 0u; k < 8u; ++k) partials[slot + k] = sums[k];
+      }
     }
+    if (subgroupElect()) partials[slot + 8u] = blue;
   }
   // entries that no pixel reached, and slots that a wider subgroup left free
   for (uint k = used + lane; k < n; k += gl_WorkGroupSize.x) {
-    uint slot = kPartialRows * p.slots * sorted[start + k].y;
-    for (uint m = 0u; m < kPartialRows * p.slots; ++m) partials[slot + m] = vec4(0.0);
+    uint slot = 4u * kPartialRows * p.slots * sorted[start + k].y;
+    for (uint m = 0u; m < 4u * kPartialRows * p.slots; ++m) partials[slot + m] = 0.0;
   }
   if (gl_NumSubgroups < p.slots) {
     for (uint k = lane; k < used; k += gl_WorkGroupSize.x) {
-      uint slot = kPartialRows * (p.slots * sorted[start + k].y + gl_NumSubgroups);
-      for (uint m = 0u; m < kPartialRows * (p.slots - gl_NumSubgroups); ++m) partials[slot + m] = vec4(0.0);
+      uint slot = 4u * kPartialRows * (p.slots * sorted[start + k].y + gl_NumSubgroups);
+      for (uint m = 0u; m < 4u * kPartialRows * (p.slots - gl_NumSubgroups); ++m) partials[slot + m] = 0.0;
     }
   }
 }

@@ -23,7 +23,7 @@ void main() {
   uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
   SplatTile t = tiles[tile];
   SplatView view = views[t.view];
-  uint column = lane % kTileWidth, first = lane / kTileWidth * kPixels;
+  uint column = lane % kTileWidth, first = kPixels == kTileHeight ? 0u : lane / kTileWidth * kPixels;
   uint above = ssim_tile(view, int(t.x), int(t.y) - 1), below = ssim_tile(view, int(t.x), int(t.y) + 1);
   vec4 s0[kPixels], s1[kPixels], s2[kPixels];
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) s0[k] = s1[k] = s2[k] = vec4(0.0);

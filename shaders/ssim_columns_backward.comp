@@ -22,7 +22,7 @@ void main() {
   uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
   SplatTile t = tiles[tile];
   SplatView view = views[t.view];
-  uint column = lane % kTileWidth, first = lane / kTileWidth * kPixels;
+  uint column = lane % kTileWidth, first = kPixels == kTileHeight ? 0u : lane / kTileWidth * kPixels;
   uint above = ssim_tile(view, int(t.x), int(t.y) - 1), below = ssim_tile(view, int(t.x), int(t.y) + 1);
   float sum[9u * kPixels];
   [[unroll]] for (uint k = 0u; k < 9u * kPixels; ++k) sum[k] = 0.0;

@@ -21,7 +21,7 @@ void main() {
   uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
   SplatTile t = tiles[tile];
   SplatView view = views[t.view];
-  uint row = lane % kTileHeight, first = lane / kTileHeight * kPixels;
+  uint row = lane % kTileHeight, first = kPixels == kTileWidth ? 0u : lane / kTileHeight * kPixels;
   uint y = t.y * kTileHeight + row;
   bool inside = y < view.height;
   bool left = active_tile(view, int(t.x) - 1, int(t.y)) != kNoTile;

@@ -19,7 +19,7 @@ void main() {
   uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
   SplatTile t = tiles[tile];
   SplatView view = views[t.view];
-  uint row = lane % kTileHeight, first = lane / kTileHeight * kPixels;
+  uint row = lane % kTileHeight, first = kPixels == kTileWidth ? 0u : lane / kTileHeight * kPixels;
   uint left = ssim_tile(view, int(t.x) - 1, int(t.y)), right = ssim_tile(view, int(t.x) + 1, int(t.y));
   float sum[9u * kPixels];
   [[unroll]] for (uint k = 0u; k < 9u * kPixels; ++k) sum[k] = 0.0;

@@ -46,6 +46,7 @@ const uint kCounterDispatch = 4u;   // 3 uints: groups of the passes over (repli
 const uint kCounterWantLive = 7u;   // what the capacities would have to be
 const uint kCounterWantInstances = 8u;
 const uint kCounterTooLong = 9u;    // not 0: a tile's list is longer than kLongestList
+const uint kCounterLongTiles = 10u; // 3 uints: groups of splat_sort_long; the host sets the last two
 const uint kCounters = 16u;
 const uint kLongestList = 32768u;   // entries of a tile that sorting and blending get through on every device
 

@@ -20,10 +20,11 @@ using shared::SplatPush;
 using shared::SplatTile;
 using shared::SplatView;
 
-constexpr double kClampMargin = 1.3;  // of the half image, for the projection's Jacobian (SPEC 2.5)
-constexpr int kActiveMargin = 16;  // px around the mask that training draws and charges: SSIM's reach twice, and a bit
+constexpr double kClampMargin = 1.3;         // of the half image, for the projection's Jacobian (SPEC 2.5)
+constexpr int kActiveMargin = 16;            // px around the mask that training draws and charges
+constexpr int kDssimMargin = 10;             // px around the mask that get the D-SSIM term: SSIM's reach twice
 constexpr std::uint32_t kMostTiles = 60000;  // of one submission: below every device's group count limit (65535)
-constexpr std::uint32_t kRankLimit = 512;    // longest tile list sorted by rank; longer ones by the bitonic network
+constexpr std::uint32_t kRankLimit = 192;    // longest tile list sorted by rank; longer ones by radix
 constexpr double kGrowth = 1.25;             // spare room when a capacity is raised
 constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;  // Adam, as in 3DGS
 
@@ -84,9 +85,13 @@ Gaussians unpacked(const std::vector<float>& all, int count, int links, int degr
   return g;
 }
 
-// Grid cells within kActiveMargin of a mask pixel.
-std::vector<std::uint32_t> active_cells(const SceneView& view, const std::vector<std::uint8_t>& rgba, int tile_width,
-                                        int tile_height) {
+// For every grid cell whether a mask pixel is within each of two margins (px) of it; `inner` <= `outer`.
+struct Nearness {
+  std::vector<bool> inner, outer;
+};
+
+Nearness near_mask(const SceneView& view, const std::vector<std::uint8_t>& rgba, int tile_width, int tile_height,
+                   int inner, int outer) {
   std::vector<std::uint32_t> sum(static_cast<std::size_t>(view.width + 1) * (view.height + 1), 0);
   const auto at = [&](int x, int y) -> std::uint32_t& {
     return sum[static_cast<std::size_t>(y) * (view.width + 1) + x];
@@ -97,16 +102,20 @@ std::vector<std::uint32_t> active_cells(const SceneView& view, const std::vector
       at(x + 1, y + 1) = object + at(x, y + 1) + at(x + 1, y) - at(x, y);
     }
   }
-  std::vector<std::uint32_t> cells;
+  const auto within = [&](int tx, int ty, int margin) {
+    const int x0 = std::max(0, tx * tile_width - margin), y0 = std::max(0, ty * tile_height - margin);
+    const int x1 = std::min(view.width, (tx + 1) * tile_width + margin);
+    const int y1 = std::min(view.height, (ty + 1) * tile_height + margin);
+    return at(x1, y1) - at(x0, y1) - at(x1, y0) + at(x0, y0) > 0;
+  };
+  Nearness out;
   for (int ty = 0; ty < view.tiles_y; ++ty) {
     for (int tx = 0; tx < view.tiles_x; ++tx) {
-      const int x0 = std::max(0, tx * tile_width - kActiveMargin), y0 = std::max(0, ty * tile_height - kActiveMargin);
-      const int x1 = std::min(view.width, (tx + 1) * tile_width + kActiveMargin);
-      const int y1 = std::min(view.height, (ty + 1) * tile_height + kActiveMargin);
-      if (at(x1, y1) - at(x0, y1) - at(x1, y0) + at(x0, y0) > 0) cells.push_back(ty * view.tiles_x + tx);
+      out.inner.push_back(within(tx, ty, inner));
+      out.outer.push_back(within(tx, ty, outer));
     }
   }
-  return cells;
+  return out;
 }
 
 }  // namespace
@@ -118,9 +127,9 @@ struct Engine::State {
   double clamp_margin;      // of the half image
   std::size_t range_limit;  // bytes of one storage buffer
 
-  gpu::Pipeline replicate, compact, scan_block, scan_sums, project, bin, sort, blend, blend_depth, blend_backward,
-      project_backward, gather, link_twist, adam, loss_pixel, ssim_rows, ssim_columns, ssim_rows_backward,
-      ssim_columns_backward;
+  gpu::Pipeline replicate, compact, scan_block, scan_sums, project, bin, sort, sort_long, blend, blend_depth,
+      blend_backward, project_backward, gather, link_twist, adam, loss_pixel, ssim_rows, ssim_columns,
+      ssim_rows_backward, ssim_columns_backward;
   gpu::Commands commands;
 
   // work buffers, grown as needed
@@ -128,7 +137,7 @@ struct Engine::State {
   Buffer views, motions, tile_map, tiles;
   Buffer splats, instance_count, instance_prefix, instance_block, records, link_twists;
   Buffer tile_count, tile_prefix, tile_block, tile_cursor, tile_used, tile_loss;
-  Buffer entries, sorted, partials;
+  Buffer entries, long_tiles, sort_scratch, sorted, partials;
   Buffer image, depth_image, pixel_gradient, ssim_row_sums, ssim_factors;
   std::uint32_t live_capacity = 0, instance_capacity = 0;
   int most_views = 1 << 20;  // of one submission, lowered when a buffer would pass the device's limit
@@ -182,7 +191,8 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   bin = gpu::Pipeline(d, "splat_bin", 11, push, {});
   // as many lanes a tile as a subgroup of the device: no lane waits at the barriers for another subgroup
   const std::uint32_t tile_lanes = device_info.software ? 8 : 32;
-  sort = gpu::Pipeline(d, "splat_sort", 6, push, {tile_lanes, kRankLimit});
+  sort = gpu::Pipeline(d, "splat_sort", 7, push, {tile_lanes, kRankLimit});
+  sort_long = gpu::Pipeline(d, "splat_sort_long", 7, push, {tile_lanes});
   blend = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 0});
   blend_depth = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 1});
   blend_backward = gpu::Pipeline(
@@ -258,18 +268,19 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
       view.target = all_targets.size() / 4;
       all_targets.insert(all_targets.end(), target.begin(), target.end());
       for (std::size_t k = 3; k < target.size(); k += 4) object_pixels += target[k] >= 128 ? 1.0 : 0.0;
-      if (active != Active::everywhere)
-        view.active = active_cells(view, target, static_cast<int>(tile_width), static_cast<int>(tile_height));
     }
+    const auto cells = static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
+    Nearness near{std::vector<bool>(cells, true), std::vector<bool>(cells, true)};
+    if (!targets.empty() && active != Active::everywhere) {
+      near = near_mask(view, *targets[v], static_cast<int>(tile_width), static_cast<int>(tile_height), kDssimMargin,
+                       kActiveMargin);
+      if (active == Active::everywhere_dssim_near_mask) near.outer.assign(cells, true);
+    }
+    for (std::size_t cell = 0; cell < cells; ++cell)
+      if (near.inner[cell]) view.active.push_back(static_cast<std::uint32_t>(cell));
     view.near = view.active.size();
-    if (active != Active::near_mask) {
-      const auto cells = static_cast<std::uint32_t>(view.tiles_x * view.tiles_y);
-      std::vector<bool> there(cells, false);
-      for (const std::uint32_t cell : view.active) there[cell] = true;
-      for (std::uint32_t cell = 0; cell < cells; ++cell)
-        if (!there[cell]) view.active.push_back(cell);
-      if (active == Active::everywhere) view.near = view.active.size();
-    }
+    for (std::size_t cell = 0; cell < cells; ++cell)
+      if (near.outer[cell] && !near.inner[cell]) view.active.push_back(static_cast<std::uint32_t>(cell));
     scene.views.push_back(std::move(view));
   }
   scene.target_pixels = all_targets.size() / 4;
@@ -409,6 +420,8 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   need(tile_used, words(tile_total), "tile used");
   need(tile_loss, 2 * vectors(tile_total), "tile loss");
   need(entries, vectors(instance_capacity), "entries");
+  need(long_tiles, words(tile_total), "long tiles");
+  need(sort_scratch, 4 * words(instance_capacity), "sort scratch");
   need(sorted, 2 * words(instance_capacity), "sorted");
   need(image, vectors(pixels), "image");
   need(depth_image, options.depth ? words(pixels) : 0, "depth image");
@@ -454,6 +467,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
 
   commands.begin();
   commands.fill(counters, 0, 0, words(shared::kCounters));
+  commands.fill(counters, 1, words(shared::kCounterLongTiles + 1), words(2));
   commands.fill(tile_count, 0, 0, words(std::max(1u, tile_total)));
   commands.no_barrier();
   commands.fill(tile_cursor, 0, 0, words(std::max(1u, tile_total)));
@@ -484,7 +498,12 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   dispatch_live(bin, {&live, &views, &tile_map, &counters, &splats, &instance_prefix, &instance_block, &tile_prefix,
                       &tile_block, &tile_cursor, &entries});
   commands.stamp("bin");
-  dispatch(sort, {&tile_prefix, &tile_block, &tile_count, &entries, &sorted, &counters}, tile_total);
+  dispatch(sort, {&tile_prefix, &tile_block, &tile_count, &entries, &long_tiles, &sorted, &counters}, tile_total);
+  const std::array long_buffers = {static_cast<const Buffer*>(&tile_prefix), static_cast<const Buffer*>(&tile_block),
+                                   static_cast<const Buffer*>(&tile_count),  static_cast<const Buffer*>(&entries),
+                                   static_cast<const Buffer*>(&long_tiles),  static_cast<const Buffer*>(&sort_scratch),
+                                   static_cast<const Buffer*>(&sorted)};
+  commands.dispatch_indirect(sort_long, long_buffers, &push, sizeof push, counters, words(shared::kCounterLongTiles));
   commands.stamp("sort");
   dispatch(options.depth ? blend_depth : blend,
            {&tiles, &views, &tile_prefix, &tile_block, &tile_count, &sorted, &splats, &counters, &image, &tile_used,
