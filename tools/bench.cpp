@@ -12,10 +12,17 @@
 #include <memory>
 #include <nlohmann/json.hpp>
 #include <numbers>
+#include <numeric>
 #include <sstream>
 
+#include "chainsplat/estimation.h"
+#include "chainsplat/eval.h"
+#include "chainsplat/recognition.h"
+#include "chainsplat/render.h"
 #include "chainsplat/splat.h"
 #include "cli.h"
+#include "identify.h"
+#include "run_folder.h"
 
 namespace chainsplat::tools {
 
@@ -26,7 +33,7 @@ using Json = nlohmann::ordered_json;
 struct Request {
   std::string gaussians, views;  // empty: the fixed cases
   std::string scene = "both", capture;
-  bool whole = false;
+  bool whole = false, only_capture = false;
   int repeats = 9;
 };
 
@@ -256,6 +263,67 @@ Json bench_case(gpu::Device& device, const Case& what, int repeats, std::uint64_
   return entry;
 }
 
+// The whole work on a capture: training by stage, drawing every frame (no files), and following the rope from its first
+// camera. Single runs, s.
+Json bench_capture(gpu::Device& device, const Path& folder, std::uint64_t seed) {
+  Json entry;
+  entry["name"] = folder.filename().string();
+  double start = core::seconds_now();
+  const auto lap = [&](const char* stage) {
+    if (const int signal = core::stop_requested()) throw Interrupted(signal);
+    const double now = core::seconds_now();
+    entry["seconds"][stage] = now - start;
+    start = core::seconds_now();
+  };
+  const capture::Capture capture = capture::load(folder);
+  lap("load");
+  recognition::Options options;
+  options.seed = seed;
+  recognition::Result found = recognition::recognize(device, capture, options);
+  lap("recognize");
+  twin::Twin twin = twin_in_scene(capture);
+  twin.chain = std::move(found.chain);
+  twin.gaussians = std::move(found.gaussians);
+  twin.states = std::move(found.states);
+  identify_stage(twin, capture.base, found.covariances, false, seed);
+  lap("identify");
+  {
+    capture::LoadOptions recorded_options;
+    recorded_options.depth = true;
+    recorded_options.undistort = false;
+    const capture::Capture recorded = capture::load(folder, recorded_options);
+    splat::Engine engine(device);
+    eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, recorded);
+    eval::evaluate(engine, twin.gaussians, twin.chain, twin.rollout, recorded);
+  }
+  lap("evaluate");
+  splat::Engine engine(device);
+  std::size_t drawn = 0;
+  for (std::size_t c = 0; c < capture.cameras.size(); ++c)
+    render::for_batches(engine, twin.gaussians, twin.chain, twin.rollout, capture.base, capture.cameras[c],
+                        static_cast<int>(c), capture.times[c], {},
+                        [&](std::vector<render::Frame>& batch) { drawn += batch.size(); });
+  lap("render");
+  entry["frames_drawn"] = drawn;
+  estimation::Filter filter = estimation::start(
+      twin, {capture.cameras.front()}, [&](double time) { return capture.base.at(time); }, capture.base.start());
+  std::vector<double> latency;
+  for (const capture::View& view : capture.views) {
+    if (view.camera != 0) continue;
+    const std::array<const capture::View*, 1> one = {&view};
+    const double begun = core::seconds_now();
+    estimation::update(filter, one);
+    latency.push_back(1e3 * (core::seconds_now() - begun));
+  }
+  std::sort(latency.begin(), latency.end());
+  const double total = std::accumulate(latency.begin(), latency.end(), 0.0);
+  entry["estimate"] = {{"frames", latency.size()},
+                       {"frames_per_second", 1e3 * static_cast<double>(latency.size()) / total},
+                       {"median_ms", latency[latency.size() / 2]},
+                       {"p99_ms", latency[latency.size() * 99 / 100]}};
+  return entry;
+}
+
 void bench(const Globals& globals, const Request& request) {
   if (request.scene != "far" && request.scene != "close" && request.scene != "both")
     throw InputError("--scene", "'" + request.scene + "' is not a scene", "name far, close or both");
@@ -267,6 +335,9 @@ void bench(const Globals& globals, const Request& request) {
       for (const int views : numbers(request.views.empty() ? "1" : request.views, "--views"))
         for (const bool close : {false, true}) cases.push_back({close, count, views, 8, request.whole});
   }
+  if (request.only_capture && request.capture.empty())
+    throw InputError("--only-capture", "there is no capture", "name one with --capture");
+  if (request.only_capture) cases.clear();
   if (request.scene != "both")
     std::erase_if(cases, [&](const Case& what) { return what.close != (request.scene == "close"); });
   const gpu::DevicePtr device = gpu::open_device({.selector = globals.device});
@@ -276,13 +347,30 @@ void bench(const Globals& globals, const Request& request) {
   document["driver"] = gpu::info(*device).driver;
   document["threads"] = core::threads();
   document["repeats"] = request.repeats;
-  if (!globals.json)
+  document["results"] = Json::array();
+  if (!globals.json && !cases.empty())
     std::cout << gpu::info(*device).name << ", milliseconds a submission, medians of " << request.repeats << "\n"
               << "                                                              with D-SSIM\n"
               << "scene         gaussians views links     draw     step   median    least processor   its passes\n";
   for (const Case& what : cases)
     document["results"].push_back(bench_case(*device, what, request.repeats, globals.seed, !globals.json));
+  if (!request.capture.empty()) {
+    const Json entry = bench_capture(*device, request.capture, globals.seed);
+    if (!globals.json) {
+      std::cout << "\n" << entry["name"].get<std::string>() << ":";
+      for (const auto& [stage, seconds] : entry["seconds"].items())
+        std::cout << " " << stage << " " << std::fixed << std::setprecision(2) << seconds.get<double>() << " s,";
+      const Json& estimate = entry["estimate"];
+      std::cout << " " << entry["frames_drawn"] << " frames drawn; estimate " << std::setprecision(0)
+                << estimate["frames_per_second"].get<double>() << " frames/s, 99 % within " << std::setprecision(2)
+                << estimate["p99_ms"].get<double>() << " ms\n";
+    }
+    document["captures"].push_back(entry);
+  }
   document["peak_memory_mib"] = peak_memory_mib();
+  if (!globals.json)
+    std::cout << "largest memory of the process: " << std::fixed << std::setprecision(0) << peak_memory_mib()
+              << " MiB\n";
   if (globals.json) std::cout << document.dump(1) << "\n";
 }
 
@@ -295,6 +383,11 @@ void add_bench_command(CLI::App& app, const Globals& globals, Job& job) {
                       "Numbers of Gaussians, with commas between, in place of the fixed cases");
   command->add_option("--views", request->views,
                       "Views a submission, with commas between, in place of the fixed cases");
+  command
+      ->add_option("--capture", request->capture,
+                   "Also the whole work on this capture: training by stage, drawing every frame, following the rope")
+      ->type_name("CAPTURE");
+  command->add_flag("--only-capture", request->only_capture, "Nothing but the capture's work");
   command->add_flag("--whole", request->whole, "Whole images of 640x480 in these, not crops about the rope");
   command->add_option("--scene", request->scene, "far (1 % of the image), close (8 %) or both")->capture_default_str();
   command->add_option("--repeats", request->repeats, "Measurements of each")->capture_default_str();

@@ -9,6 +9,19 @@
 
 namespace chainsplat::tools {
 
+twin::Twin twin_in_scene(const capture::Capture& capture) {
+  twin::Twin twin;
+  twin.tabletop = capture.tabletop;
+  twin.gravity = capture.gravity;
+  if (capture.table) {
+    twin.table_point = capture.table->point;
+    twin.table_normal = capture.table->normal;
+  }
+  twin.known_mass = capture.mass.has_value();
+  if (capture.mass) twin.provenance.options["mass"] = core::exact(*capture.mass);
+  return twin;
+}
+
 twin::Twin load_twin(const Path& run) {
   twin::Twin twin = twin::load(run);
   if (twin.states.time.empty())

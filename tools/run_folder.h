@@ -15,6 +15,8 @@ inline constexpr const char* kMetricsFile = "metrics.json";
 inline constexpr const char* kLogFile = "log.jsonl";
 inline constexpr const char* kCheckpointFolder = "checkpoint";
 
+// A twin that knows what the capture says of its scene, and nothing yet of the rope.
+twin::Twin twin_in_scene(const capture::Capture& capture);
 // The twin in `run` with something recognized in it. Throws InputError.
 twin::Twin load_twin(const Path& run);
 // The base motion of `file` ("-": standard input).

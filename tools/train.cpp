@@ -116,14 +116,7 @@ void recognize_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, 
 
 // What the capture and the command line say of a new twin.
 twin::Twin new_twin(const capture::Capture& capture, const Request& request, const Globals& globals) {
-  twin::Twin twin;
-  twin.tabletop = capture.tabletop;
-  twin.gravity = capture.gravity;
-  if (capture.table) {
-    twin.table_point = capture.table->point;
-    twin.table_normal = capture.table->normal;
-  }
-  twin.known_mass = capture.mass.has_value();
+  twin::Twin twin = twin_in_scene(capture);
   twin.provenance.version = CHAINSPLAT_VERSION;
   twin.provenance.capture = capture.name;
   twin.provenance.capture_hash = hash_text(capture.hash);
@@ -132,7 +125,6 @@ twin::Twin new_twin(const capture::Capture& capture, const Request& request, con
   // from the run folder, so that the two can be moved together
   twin.provenance.options["path"] =
       fs::proximate(fs::absolute(request.capture), fs::absolute(request.out)).lexically_normal().generic_string();
-  if (capture.mass) twin.provenance.options["mass"] = core::exact(*capture.mass);
   return twin;
 }
 
