@@ -5,6 +5,8 @@
 #include <fstream>
 #include <nlohmann/json.hpp>
 
+#include "dynamics/planar.h"
+
 using namespace chainsplat;
 using namespace chainsplat::dynamics;
 using math::Matrix6;
@@ -414,6 +416,49 @@ TEST_CASE("static equilibrium hangs down, also from above, and is where a damped
   const VectorX still = VectorX::Zero(n);
   CHECK(forward_dynamics(damped, at_rest(tilted), theta, still).norm() < 1e-6);
   CHECK((end.theta[0] - theta).norm() < 1e-6);
+}
+
+TEST_CASE("the planar equations agree with the spatial ones, the base moving and turning out of the plane too") {
+  core::Random random(12);
+  for (const double first_joint : {0.0, 0.02})
+    for (const bool table : {true, false}) {
+      Model model = rope(6, chain::Bending::planar);
+      Parameters p = model.parameters;
+      if (!table) p.table_normal.reset();
+      for (double& m : p.link_mass) m *= random.uniform(0.5, 1.5);
+      const Vector3 d = Vector3(0.3, -0.5, 0.8).normalized(), a = d.cross(Vector3(1, 2, 0.5)).normalized();
+      model = make_model(chain::make_chain(0.3, 0.02, d, a, 6, chain::Bending::planar, false, first_joint), p);
+      REQUIRE(is_planar(model.chain));
+      CHECK(!is_planar(rope(6, chain::Bending::spatial).chain));
+      std::vector<Tangent> unknowns(7);
+      unknowns[0].link_mass = unknowns[1].viscous_friction = unknowns[2].coulomb_friction = unknowns[3].air_linear =
+          unknowns[4].air_quadratic = {0.1, 0.2, 0.3, 0.2, 0.4, 0.1};
+      unknowns[5].tip_mass = 1.0;
+      unknowns[6].stiffness = unknowns[6].damping = unknowns[6].rest_angle = {0.1, 0.2, 0.3, 0.2, 0.4, 0.1};
+      for (int trial = 0; trial < 3; ++trial) {
+        const trajectory::BaseMotion base = random_base(random);
+        const Vector6 jerk = random_vector(random, 6, 5.0);
+        const VectorX theta = random_vector(random, 6, 0.5), thetadot = random_vector(random, 6, 2.0);
+        Engine general(model);
+        PlanarEngine planar(model);
+        MatrixX forces(6, 7), planar_forces(6, 7);
+        for (Engine* engine : {&general, static_cast<Engine*>(&planar)}) {
+          engine->place(base, theta, thetadot, true);
+          REQUIRE(engine->factor_mass());
+          engine->accelerate();
+          engine->linearize(jerk);
+          engine->unknown_forces(unknowns, engine == &general ? forces : planar_forces);
+        }
+        CHECK(difference(planar.mass, general.mass) < 1e-12);
+        CHECK(difference(planar.bias, general.bias) < 1e-12);
+        CHECK(difference(planar.acceleration, general.acceleration) < 1e-10);
+        CHECK(difference(planar.inverse, general.inverse) < 1e-9);
+        CHECK(difference(planar.stiffness, general.stiffness) < 1e-11);
+        CHECK(difference(planar.damping, general.damping) < 1e-11);
+        CHECK(difference(planar.drive_rate, general.drive_rate) < 1e-11);
+        for (int u = 0; u < 7; ++u) CHECK(difference(planar_forces.col(u), forces.col(u)) < 1e-9);
+      }
+    }
 }
 
 TEST_CASE("derivatives by every parameter and by the base motion agree with central differences") {

@@ -138,16 +138,31 @@ void Engine::friction(int j, bool slopes) {
   }
 }
 
+void Engine::set_state(const VectorX& theta, const VectorX& thetadot) {
+  theta_ = theta, thetadot_ = thetadot;
+  const Parameters& p = model.parameters;
+  for (int k = 0; k < angles; ++k)
+    torque[k] = -p.stiffness[k] * (theta[k] - p.rest_angle[k]) - p.damping[k] * thetadot[k];
+}
+
+void Engine::joint_forces(const Tangent& d, Eigen::Ref<VectorX> column) const {
+  const Parameters& p = model.parameters;
+  column.setZero();
+  if (!d.stiffness.empty())
+    for (int k = 0; k < angles; ++k) column[k] -= d.stiffness[k] * (theta_[k] - p.rest_angle[k]);
+  if (!d.rest_angle.empty())
+    for (int k = 0; k < angles; ++k) column[k] += p.stiffness[k] * d.rest_angle[k];
+  if (!d.damping.empty())
+    for (int k = 0; k < angles; ++k) column[k] -= d.damping[k] * thetadot_[k];
+}
+
 void Engine::place(const trajectory::BaseMotion& base, const VectorX& theta, const VectorX& thetadot, bool slopes) {
   const Matrix3& r0 = base.pose.rotation;
   base_rotation_ = r0;
   base_velocity_ << r0 * base.velocity.head<3>(), r0 * base.velocity.tail<3>();
   base_turn_ << r0 * base.acceleration.head<3>(), r0 * base.acceleration.tail<3>();
   base_acceleration_ << base_turn_.head<3>(), base_turn_.tail<3>() - gravity_;
-  theta_ = theta, thetadot_ = thetadot;
-  const Parameters& p = model.parameters;
-  for (int k = 0; k < angles; ++k)
-    torque[k] = -p.stiffness[k] * (theta[k] - p.rest_angle[k]) - p.damping[k] * thetadot[k];
+  set_state(theta, thetadot);
 
   Matrix3 r = r0;
   Vector3 position = model.chain.link_end(0) * (r0 * model.chain.direction);
@@ -362,13 +377,7 @@ void Engine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces) 
   for (std::size_t p = 0; p < unknowns.size(); ++p) {
     const Tangent& d = unknowns[p];
     auto column = forces.col(static_cast<Eigen::Index>(p));
-    column.setZero();
-    if (!d.stiffness.empty())
-      for (int k = 0; k < angles; ++k) column[k] -= d.stiffness[k] * (theta_[k] - parameters.rest_angle[k]);
-    if (!d.rest_angle.empty())
-      for (int k = 0; k < angles; ++k) column[k] += parameters.stiffness[k] * d.rest_angle[k];
-    if (!d.damping.empty())
-      for (int k = 0; k < angles; ++k) column[k] -= d.damping[k] * thetadot_[k];
+    joint_forces(d, column);
     const bool tip = d.tip_mass != 0.0;
     if (d.link_mass.empty() && d.viscous_friction.empty() && d.coulomb_friction.empty() && d.air_linear.empty() &&
         d.air_quadratic.empty() && !tip)

@@ -63,19 +63,20 @@ RigidInertia world_inertia(double mass, double center, double transverse, double
 class Engine {
  public:
   explicit Engine(const Model& model);
+  virtual ~Engine() = default;
   // The calls build on one another: place, factor_mass, accelerate, linearize, unknown_forces.
   // Poses, axes, velocities, M, bias; with `slopes` also what linearize needs.
-  void place(const trajectory::BaseMotion& base, const VectorX& theta, const VectorX& thetadot, bool slopes);
+  virtual void place(const trajectory::BaseMotion& base, const VectorX& theta, const VectorX& thetadot, bool slopes);
   bool factor_mass();  // false, and `singular_angle`, where M is not positive definite
   void accelerate();   // acceleration = M^-1 force
   // Adds `acceleration` to the placed bodies (once a place): fills body_force and `inverse`.
   void inverse_torque();
   // inverse_torque, then stiffness, damping and drive_rate (needs place with slopes).
-  void linearize(const Vector6& base_jerk);
+  virtual void linearize(const Vector6& base_jerk);
   // What BaseSlopes says, at the linearized state.
   void base_slopes(BaseSlopes& slopes) const;
   // Column p of `forces`: d(torque - tau_ID)/d(unknown p) at the present state and acceleration.
-  void unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces);
+  virtual void unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces);
   bool articulated_acceleration();  // acceleration by the articulated body algorithm; allocates; false as factor_mass
 
   const Model& model;
@@ -102,6 +103,14 @@ class Engine {
   std::vector<Vector3> origin, direction;
   std::vector<Vector6> velocity, link_acceleration, wrench, body_force;  // the last: of all outer bodies
   std::vector<RigidInertia> inertia;
+
+ protected:
+  const Vector3& gravity() const { return gravity_; }  // world; without the part that a table carries
+  const Vector3& normal() const { return normal_; }    // world
+  bool has_table() const { return table_; }
+  void set_state(const VectorX& theta, const VectorX& thetadot);  // and the joint law's torque
+  // A tangent's part in the joint law.
+  void joint_forces(const Tangent& unknown, Eigen::Ref<VectorX> column) const;
 
  private:
   struct UnitWrenches {

@@ -12,9 +12,10 @@ constexpr double kRateBound = 1e5;   // rad/s
 }  // namespace
 
 Step::Step(const Model& model)
-    : engine(model),
+    : engine_(make_engine(model)),
+      stage_(make_engine(model)),
+      engine(*engine_),
       factor(model.chain.angles()),
-      stage_(model),
       rodas_(model.parameters.integrator == Integrator::rodas3) {
   const int n = model.chain.angles();
   for (VectorX* v : {&right_theta_, &stage_theta_, &stage_thetadot_, &stage_acceleration_, &work_}) v->setZero(n);
@@ -53,9 +54,9 @@ bool Step::linearize(const BaseGrid::Node& now, const VectorX& theta, const Vect
 // Acceleration at the stage's state under the base motion of the next node.
 bool Step::evaluate(const trajectory::BaseMotion& motion) {
   if (!bounded(stage_theta_, stage_thetadot_)) return false;
-  stage_.place(motion, stage_theta_, stage_thetadot_, false);
-  if (!factor_mass(stage_)) return false;
-  stage_.accelerate();
+  stage_->place(motion, stage_theta_, stage_thetadot_, false);
+  if (!factor_mass(*stage_)) return false;
+  stage_->accelerate();
   return true;
 }
 
@@ -90,7 +91,7 @@ bool Step::advance(double h, const trajectory::BaseMotion& next, VectorX& theta,
   stage_thetadot_ = thetadot + 2.0 * k_rate_[0];
   if (!evaluate(next)) return false;
   right_theta_ = stage_thetadot_ + (k_theta_[0] - k_theta_[1]) / h;
-  stage_acceleration_ = stage_.acceleration + (k_rate_[0] - k_rate_[1]) / h;
+  stage_acceleration_ = stage_->acceleration + (k_rate_[0] - k_rate_[1]) / h;
   work_.noalias() = engine.mass * stage_acceleration_;
   solve_stage(2, g);
   // stage 4
@@ -98,7 +99,7 @@ bool Step::advance(double h, const trajectory::BaseMotion& next, VectorX& theta,
   stage_thetadot_ += k_rate_[2];
   if (!evaluate(next)) return false;
   right_theta_ = stage_thetadot_ + (k_theta_[0] - k_theta_[1] - (8.0 / 3.0) * k_theta_[2]) / h;
-  stage_acceleration_ = stage_.acceleration + (k_rate_[0] - k_rate_[1] - (8.0 / 3.0) * k_rate_[2]) / h;
+  stage_acceleration_ = stage_->acceleration + (k_rate_[0] - k_rate_[1] - (8.0 / 3.0) * k_rate_[2]) / h;
   work_.noalias() = engine.mass * stage_acceleration_;
   solve_stage(3, g);
   theta = stage_theta_ + k_theta_[3];

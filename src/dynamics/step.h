@@ -4,7 +4,7 @@
 #include <cmath>
 #include <vector>
 
-#include "engine.h"
+#include "planar.h"
 
 namespace chainsplat::dynamics {
 
@@ -53,6 +53,8 @@ class Factor {
 };
 
 class Step {
+  std::unique_ptr<Engine> engine_, stage_;
+
  public:
   explicit Step(const Model& model);
   // Linearizes at the node and factors M + G C (+ G^2 K). With the last node's step of 0 there is no factor.
@@ -60,8 +62,8 @@ class Step {
   // From the linearized node to the next.
   bool advance(double h, const trajectory::BaseMotion& next, VectorX& theta, VectorX& thetadot);
 
-  Engine engine;  // at the node
-  Factor factor;  // M + G C + G^2 K (Euler: M + h C)
+  Engine& engine;  // at the node
+  Factor factor;   // M + G C + G^2 K (Euler: M + h C)
   // After a failure: the first angle beyond all bounds, or without inertia.
   int bad_angle = 0;
   bool singular = false;
@@ -74,7 +76,6 @@ class Step {
   bool evaluate(const trajectory::BaseMotion& motion);
   void solve_stage(int i, double g);
 
-  Engine stage_;
   bool rodas_;
   VectorX right_theta_, stage_theta_, stage_thetadot_, stage_acceleration_, work_;
   VectorX k_theta_[4], k_rate_[4];
