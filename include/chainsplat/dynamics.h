@@ -160,6 +160,14 @@ struct Tangent {
   double tip_mass = 0.0;
   VectorX theta, thetadot;
 };
+// `parameters` after the numbers that identification calls `names` (Estimates) have changed by `change`: an addition to
+// a log or logit, or to a rest angle. The total mass stays. Names of initial states change nothing.
+Parameters moved(const chain::Chain& chain, const Parameters& parameters, std::span<const std::string> names,
+                 const VectorX& change);
+// The derivatives of that, and of the initial state for names theta_k and thetadot_k.
+std::vector<Tangent> tangents(const chain::Chain& chain, const Parameters& parameters,
+                              std::span<const std::string> names);
+bool is_parameter(const Tangent& tangent);  // it changes parameters, not an initial state alone
 // d(joint law - tau_ID) / d unknowns at fixed thetaddot = a, n x unknowns; M^-1 of it is da / d unknowns. The tangents'
 // initial states have no part in it.
 MatrixX unknown_forces(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
