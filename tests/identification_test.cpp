@@ -1,8 +1,8 @@
 #include "chainsplat/identification.h"
 
+#include <doctest/doctest.h>
 #include <algorithm>
 #include <cmath>
-#include <doctest/doctest.h>
 #include <sstream>
 
 using namespace chainsplat;
@@ -266,7 +266,100 @@ TEST_CASE("markers alone tell the motion between and beyond them") {
   options.mass = 0.06;
   const Result result = identify(s.chain, s.base, markers, options);
   CHECK(node_rms(s.chain, result.rollout, s.clean) < 1e-3);  // less than one marker's noise
-  markers.arclengths[2] = 0.4;  // beyond the rope
+  markers.arclengths[2] = 0.4;                               // beyond the rope
+  CHECK_THROWS_AS(fit_markers(s.chain, s.base, markers), InputError);
+}
+
+TEST_CASE("two recordings of one rope give one set of parameters, better known than from one") {
+  const Scene slow = scene(false, chain::Bending::planar, 0.5 * kDegree, 60);
+  Scene other = scene(false, chain::Bending::planar, 0.0, 60);
+  // another motion of the same rope: let go from the side
+  other.base = trajectory::fit({trajectory::Sample{0.0, {math::Matrix3::Identity(), Vector3(0, 0, 0.5)}}}, "rest");
+  const VectorX theta = VectorX::Constant(6, 0.15);
+  const auto record = [&](const dynamics::Parameters& rope) {
+    chain::States seen = dynamics::rollout(dynamics::make_model(other.chain, rope), other.base,
+                                           {0.0, theta, VectorX::Zero(6)}, frames(60));
+    core::Random random(5);
+    for (VectorX& angles : seen.theta)
+      for (int k = 0; k < 6; ++k) angles[k] += 0.5 * kDegree * random.normal();
+    return seen;
+  };
+  Options options;
+  options.mass = 0.06;
+  std::vector<Recording> recordings{{slow.base, slow.seen, {}}, {other.base, record(slow.truth), {}}};
+  const std::vector<Result> both = identify(slow.chain, recordings, options);
+  REQUIRE(both.size() == 2);
+  CHECK(both[0].parameters.stiffness == both[1].parameters.stiffness);
+  CHECK(both[1].initial.theta[5] == doctest::Approx(0.15).epsilon(0.3));
+  CHECK(both[0].parameters.stiffness[3] / 0.012 == doctest::Approx(1.0).epsilon(0.15));
+  for (const Result& r : both) CHECK(r.node_rms < 1.5 * r.alone_rms);
+  const Result one = identify(slow.chain, slow.base, slow.seen, {}, options);
+  CHECK(both[0].estimates.names == one.estimates.names);
+  CHECK(both[0].estimates.standard_errors[0] < one.estimates.standard_errors[0]);
+
+  dynamics::Parameters stiff = slow.truth;
+  for (double& k : stiff.stiffness) k *= 4.0;
+  recordings[1].recognized = record(stiff);
+  const std::vector<Result> mixed = identify(slow.chain, recordings, options);
+  CHECK(std::max(mixed[0].node_rms / mixed[0].alone_rms, mixed[1].node_rms / mixed[1].alone_rms) > 3.0);
+}
+
+TEST_CASE("a rope that hangs still tells nothing of what acts on motion only") {
+  Scene s = scene(false, chain::Bending::planar, 0.0, 3);
+  s.base = trajectory::fit({trajectory::Sample{0.0, {math::Matrix3::Identity(), Vector3(0, 0, 0.5)}}}, "rest");
+  const VectorX rest = s.clean.theta[0];
+  s.seen = {frames(20), std::vector<VectorX>(20, rest), {}};
+  const Result result = identify(s.chain, s.base, s.seen, {}, {});
+  const auto weak = [&](const std::string& name) {
+    for (const auto& direction : result.estimates.weak)
+      for (const auto& part : direction.parts)
+        if (part.first == name) return direction.singular_value;
+    return 1.0;
+  };
+  CHECK(weak("log_damping") < 0.1);
+  CHECK(weak("log_drag") < 0.1);
+  for (std::size_t i = 1; i < result.estimates.weak.size(); ++i)
+    CHECK(result.estimates.weak[i].singular_value >= result.estimates.weak[i - 1].singular_value);
+}
+
+TEST_CASE("whole turns in recognized angles change nothing") {
+  Scene s = scene(false, chain::Bending::planar, 0.5 * kDegree, 40);
+  const Result as_is = identify(s.chain, s.base, s.seen, {}, {});
+  for (std::size_t k = 4; k < s.seen.theta.size(); ++k) s.seen.theta[k][2] += 2.0 * M_PI;
+  const Result turned = identify(s.chain, s.base, s.seen, {}, {});
+  CHECK(node_rms(s.chain, as_is.rollout, turned.rollout) < 1e-6);
+}
+
+TEST_CASE("a chain whose joints stand for their part of a rod has the rod's first bending frequency") {
+  // Euler-Bernoulli, clamped and free, no gravity: omega = 1.8751^2 / L^2 sqrt(EI L / M)
+  const double length = 0.52, mass = 0.327, stiffness = 1.267;
+  const double omega = std::pow(1.8751041 / length, 2) * std::sqrt(stiffness * length / mass);
+  for (const double first_joint : {0.0, 0.02}) {
+    const chain::Chain chain = chain::make_chain(length, 0.001, Vector3::UnitX(), Vector3::UnitY(), 16,
+                                                 chain::Bending::planar, false, first_joint);
+    dynamics::Parameters p;
+    p.viscous_friction = p.coulomb_friction = p.air_linear = p.air_quadratic = std::vector<double>(16, 0.0);
+    p.rest_angle = p.damping = std::vector<double>(16, 0.0);
+    p.gravity.setZero();
+    for (int j = 1; j <= 16; ++j) {
+      p.link_mass.push_back(mass * (chain.link_end(j) - chain.link_start(j)) / length);
+      p.stiffness.push_back(stiffness / chain::bent_length(chain, j));
+    }
+    const MatrixX inertia = dynamics::mass_matrix(dynamics::make_model(chain, p), VectorX::Zero(16));
+    const VectorX k = Eigen::Map<const VectorX>(p.stiffness.data(), 16);
+    const Eigen::GeneralizedSelfAdjointEigenSolver<MatrixX> modes(MatrixX(k.asDiagonal()), inertia);
+    CHECK(std::sqrt(modes.eigenvalues()[0]) == doctest::Approx(omega).epsilon(first_joint > 0.0 ? 0.01 : 0.003));
+  }
+}
+
+TEST_CASE("markers farther from the grasp than their arclength are refused") {
+  const Scene s = scene(false, chain::Bending::planar, 0.0, 5);
+  Markers markers;
+  markers.arclengths = {0.3};
+  markers.time = frames(4);
+  markers.world.assign(4, MatrixX(Vector3(0, 0, 0.2)));
+  CHECK(fit_markers(s.chain, s.base, markers).theta.size() == 4);
+  markers.world[2](2, 0) = -200.0;  // millimeters, say
   CHECK_THROWS_AS(fit_markers(s.chain, s.base, markers), InputError);
 }
 

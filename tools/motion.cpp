@@ -52,6 +52,8 @@ dynamics::InitialState start_of(const RolloutRequest& request, const twin::Twin&
                        "run 'chainsplat identify' or give --initial");
     initial = *twin.initial;
   } else if (twin.tabletop) {
+    if (!twin.initial && twin.states.theta.empty())
+      throw InputError(request.run, "holds no state to start from on the table", "give --initial");
     initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
   } else {
     initial.theta = dynamics::static_equilibrium(model, base.pose(base.start()));
@@ -66,7 +68,7 @@ void rollout(const Globals& globals, const RolloutRequest& request) {
     throw InputError("--json", "standard output is wanted by '-' too", "name a file");
   check_output_file(request.out);
   if (!request.centerline.empty()) check_output_file(request.centerline);
-  const twin::Twin twin = load_twin(request.run);
+  const twin::Twin twin = twin::load(request.run);
   const dynamics::Model model = model_of(twin, request.run);
   const trajectory::Trajectory base = request.base.empty() ? own_base(request.run) : read_base(request.base);
   const dynamics::InitialState initial = start_of(request, twin, model, base);

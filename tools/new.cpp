@@ -1,4 +1,4 @@
-// new.cpp - an empty twin: a chain to identify from measured markers instead of videos.
+// new.cpp - a twin without videos: empty, to identify from measured markers, or a rod of known stiffness and mass.
 #include <CLI/CLI.hpp>
 #include <iostream>
 #include <memory>
@@ -16,7 +16,8 @@ constexpr double kPerpendicular = 1e-6;  // largest cosine between direction and
 
 struct Request {
   std::string out, bending = "spatial";
-  double length = 0.0, diameter = 0.02, mass = 0.0;  // m, m, kg; mass 0: unknown
+  double length = 0.0, diameter = 0.02, mass = 0.0;    // m, m, kg; mass 0: unknown
+  double bending_stiffness = -1.0, retardation = 0.0;  // EI, N m^2, negative: not given; s
   int joints = 8;
   std::vector<double> direction{0, 0, -1}, bending_axis, gravity{0, 0, -9.81};
   bool force = false;
@@ -31,7 +32,29 @@ math::Vector3 unit_of(const std::vector<double>& values, const char* option) {
   return v.normalized();
 }
 
+// A uniform straight rod that hangs free, in still air without drag.
+dynamics::Parameters rod(const chain::Chain& chain, const Request& request, const math::Vector3& gravity) {
+  dynamics::Parameters rod;
+  const int links = chain.links() - 1;
+  rod.gravity = gravity;
+  rod.radius = 0.5 * chain.diameter;
+  for (std::vector<double>* zeros : {&rod.viscous_friction, &rod.coulomb_friction, &rod.air_linear, &rod.air_quadratic})
+    zeros->assign(links, 0.0);
+  for (int j = 1; j <= links; ++j)
+    rod.link_mass.push_back(request.mass * (chain.link_end(j) - chain.link_start(j)) / chain.length);
+  for (const int link : chain.child_link) {
+    rod.stiffness.push_back(request.bending_stiffness / chain::bent_length(chain, link));
+    rod.damping.push_back(request.retardation * rod.stiffness.back());
+    rod.rest_angle.push_back(0.0);
+  }
+  return rod;
+}
+
 void make_new(const Globals& globals, const Request& request) {
+  if (request.bending_stiffness >= 0.0 && !(request.mass > 0.0))
+    throw InputError("--bending-stiffness", "moves nothing without a mass", "give --mass too");
+  if (request.retardation > 0.0 && request.bending_stiffness < 0.0)
+    throw InputError("--retardation", "is damping over stiffness, and there is none", "give --bending-stiffness too");
   check_output_folder(request.out, request.force, "name another folder, or give --force");
   const math::Vector3 direction = unit_of(request.direction, "--direction");
   math::Vector3 bending_axis;
@@ -52,6 +75,7 @@ void make_new(const Globals& globals, const Request& request) {
                                  request.bending == "planar" ? chain::Bending::planar : chain::Bending::spatial, false);
   twin.known_mass = request.mass > 0.0;
   if (twin.known_mass) twin.provenance.options["mass"] = core::exact(request.mass);
+  if (request.bending_stiffness >= 0.0) twin.parameters = rod(twin.chain, request, twin.gravity);
   twin.provenance.version = CHAINSPLAT_VERSION;
   twin.provenance.seed = globals.seed;
   twin.provenance.options["bending"] = request.bending;
@@ -71,7 +95,8 @@ void make_new(const Globals& globals, const Request& request) {
 }  // namespace
 
 void add_new_command(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* command = app.add_subcommand("new", "Make an empty twin, to identify from markers instead of videos");
+  CLI::App* command =
+      app.add_subcommand("new", "Make a twin without videos: empty, to identify from markers, or of a known rod");
   auto request = std::make_shared<Request>();
   command->add_option("-o,--output", request->out, "Run folder to make: the twin")->required()->type_name("RUN");
   command->add_option("--length", request->length, "From the grasp to the free end, m")
@@ -100,6 +125,14 @@ void add_new_command(CLI::App& app, const Globals& globals, Job& job) {
   command->add_option("--mass", request->mass, "kg (default: unknown, forces are per kilogram)")
       ->check(CLI::PositiveNumber)
       ->type_name("KG");
+  command
+      ->add_option("--bending-stiffness", request->bending_stiffness,
+                   "EI of a uniform straight rod, N m^2; with --mass the twin is then ready for rollout")
+      ->check(CLI::NonNegativeNumber)
+      ->type_name("EI");
+  command->add_option("--retardation", request->retardation, "Its damping over its stiffness, s (default 0)")
+      ->check(CLI::NonNegativeNumber)
+      ->type_name("S");
   command->add_flag("--force", request->force, "Also into a folder that is not empty");
   command->callback([&globals, &job, request] { job = [&globals, request] { make_new(globals, *request); }; });
 }

@@ -56,6 +56,12 @@ struct Estimates {
   std::vector<double> values, standard_errors;  // in the units of the name
   MatrixX covariance;
   std::vector<std::pair<std::string, std::string>> held;  // name -> why it was not fitted
+  // A combination of parameters of which the data tell less than the priors.
+  struct Weak {
+    double singular_value = 0.0;  // of the sensitivities in units of the priors' deviations; below 1, weakest first
+    std::vector<std::pair<std::string, double>> parts;  // name, large components of the unit vector
+  };
+  std::vector<Weak> weak;
 };
 
 using BaseFunction = std::function<trajectory::BaseMotion(double)>;  // base motion at a time, s

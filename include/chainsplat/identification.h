@@ -35,6 +35,15 @@ struct Result {
   chain::States rollout;           // at all recognized times, under the capture's base motion
   dynamics::Estimates estimates;
   double node_rms = 0.0;  // m, rollout against recognized nodes, over nodes but the grasp and frames
+  // m, the same with parameters of this recording alone. Much less: it is of another rope than the others.
+  double alone_rms = 0.0;
+};
+
+// A recording of the rope: how its base moved and what was seen of it.
+struct Recording {
+  trajectory::Trajectory base;
+  chain::States recognized;                // at least 3 times, increasing
+  std::vector<math::MatrixX> covariances;  // of each theta, n x n, or empty
 };
 
 // Measured world positions of material points on the centerline, e.g. motion-capture markers.
@@ -46,19 +55,27 @@ struct Markers {
 };
 
 // The smoothest chain through the markers at every time: least squares with priors on bending, on its differences from
-// joint to joint and from time to time, so that few markers suffice. `covariances`, where given, is filled with those of
-// theta, n x n. Throws InputError where arclengths, times or sizes do not fit, or a time shows no marker.
+// joint to joint and from time to time, so that few markers suffice. `covariances`, where given, is filled with those
+// of theta, n x n. Throws InputError where arclengths, times or sizes do not fit, or a time shows no marker.
 chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers,
                           std::vector<math::MatrixX>* covariances = nullptr);
-
-// As identify() below, with fit_markers() as the start and the markers themselves as residuals. `node_rms` is that of
-// the markers.
-Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers,
-                const Options& options);
 
 // `recognized`: at least 3 times, increasing. `covariances`: of each theta, n x n, or empty. Throws InputError for too
 // little data, WorkError where no start gives a rollout that stays finite.
 Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,
                 std::span<const math::MatrixX> covariances, const Options& options);
+// The same with fit_markers() as the start and the markers themselves as residuals. `node_rms` is that of the markers.
+Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers,
+                const Options& options);
+
+// Several recordings of one rope: one set of parameters, an initial state each. A result a recording: its own initial
+// state and rollout, and the estimates of the shared parameters followed by those of its initial state.
+std::vector<Result> identify(const chain::Chain& chain, std::span<const Recording> recordings, const Options& options);
+struct MarkerRecording {
+  trajectory::Trajectory base;
+  Markers markers;
+};
+std::vector<Result> identify(const chain::Chain& chain, std::span<const MarkerRecording> recordings,
+                             const Options& options);
 
 }  // namespace chainsplat::identification

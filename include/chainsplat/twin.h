@@ -13,7 +13,8 @@
 //     tip_mass*, regularization* { coulomb_speed, drag_speed }, integrator* { name, substeps a 1/30 s }
 //     initial_state* time, theta, thetadot
 //   identification  known_mass (false: masses are relative, forces per kilogram); names*, estimates*, standard_errors*,
-//                   covariance* (by rows), held* [ { name, reason } ]; null where a number is not known
+//                   covariance* (by rows), held* [ { name, reason } ]; null where a number is not known;
+//                   weak* [ { singular_value, direction { name: component } } ]: what the data cannot tell apart
 //   gaussians, states, rollout   file names, each absent until that file is there
 //   provenance      version, capture, capture_hash, options, seed, device, driver, durations { stage: s }
 #pragma once

@@ -37,6 +37,12 @@ Chain make_chain(double length, double diameter, const Vector3& direction, const
   return chain;
 }
 
+double bent_length(const Chain& chain, int joint) {
+  const double behind = 0.5 * (chain.link_end(joint) - chain.link_start(joint));
+  const double before = chain.link_end(joint - 1) - chain.link_start(joint - 1);
+  return behind + (joint == 1 ? before : 0.5 * before);
+}
+
 std::vector<Pose> link_motions(const Chain& chain, const VectorX& theta, const Pose& base) {
   CHAINSPLAT_CHECK(theta.size() == chain.angles(), std::to_string(theta.size()));
   std::vector<Pose> motions(chain.links());

@@ -12,14 +12,18 @@ namespace {
 using dynamics::BaseGrid;
 using math::Vector3;
 
-constexpr double kHorizons[] = {1.0 / 3, 2.0 / 3, 4.0 / 3, 8.0 / 3};  // s, then everything
+constexpr double kHorizons[] = {1.0 / 3, 2.0 / 3, 4.0 / 3};  // s, then doubled until everything is within
+// Of the length: open-loop error of a few links. Ropes of 0.3 m: 0.1 to 0.5 %; a foam noodle of 1.9 m: 2 %. Larger
+// values let the priors hold what two markers cannot tell, smaller ones make the loss rough.
+constexpr double kMarkerModelShare = 5e-3;
 constexpr double kResidualShare = 1.0 / 9.0;  // of a residual that counts: neighbors in space and time err alike
 constexpr double kHuber = 3.0;                // in robust standard deviations of a point's residual
 constexpr double kThetaSd = 0.02;             // rad, initial angles about the recognized ones without covariances
 constexpr int kLag = 10;                      // frames over which residuals are taken to be correlated (SPEC 5)
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
-struct Problem {
+// One recording, its own unknowns after the shared ones.
+struct Part {
   const chain::Chain& chain;
   Unknowns unknowns;
   std::vector<double> times;
@@ -28,53 +32,77 @@ struct Problem {
   std::vector<MatrixX> target;     // a frame: 3 x points, base frame
   std::vector<MatrixX> whitening;  // a frame: 3 x 3 blocks side by side
   std::vector<VectorX> theta;      // recognized
-  BaseGrid grid;
-  std::vector<std::size_t> nodes;  // of the grid, up to and with each output
-  bool has_markers = false;        // the points are markers; unseen ones have no weight
+  BaseGrid grids[2];               // half the substeps, for the way to the minimum, and all of them
+  std::vector<std::size_t> nodes[2];  // of the grid, up to and with each output
+  bool has_markers = false;           // the points are markers; unseen ones have no weight
+};
+
+// All recordings. The unknowns: those that are shared, then the initial state of each recording.
+struct Problem {
+  const chain::Chain& chain;
+  std::vector<Part> parts;
+  int shared = 0;
+  VectorX mean;
+  MatrixX precision;
+
+  int own() const { return parts[0].unknowns.size() - shared; }
+  // where the unknowns of a recording are among all: `shared` and then its own
+  VectorX of_part(const VectorX& p, std::size_t part) const {
+    VectorX out(shared + own());
+    out << p.head(shared), p.segment(shared + part * own(), own());
+    return out;
+  }
 };
 
 // Points of the centerline in the base frame and, where asked, their derivatives by theta.
-void place_points(const Problem& problem, const VectorX& theta, MatrixX& points, std::vector<MatrixX>* slopes) {
-  const auto motions = chain::link_motions(problem.chain, theta, {});
-  const std::size_t count = problem.home.size();
+void place_points(const Part& part, const VectorX& theta, MatrixX& points, std::vector<MatrixX>* slopes) {
+  const auto motions = chain::link_motions(part.chain, theta, {});
+  const std::size_t count = part.home.size();
   points.resize(3, count);
-  for (std::size_t i = 0; i < count; ++i) points.col(i) = motions[problem.links[i]] * problem.home[i];
+  for (std::size_t i = 0; i < count; ++i) points.col(i) = motions[part.links[i]] * part.home[i];
   if (!slopes) return;
-  const MatrixX axes = chain::world_axes(problem.chain, theta, {});
+  const MatrixX axes = chain::world_axes(part.chain, theta, {});
   slopes->resize(count);
   for (std::size_t i = 0; i < count; ++i)
-    (*slopes)[i] = chain::point_jacobian(problem.chain, axes, problem.links[i], points.col(i));
+    (*slopes)[i] = chain::point_jacobian(part.chain, axes, part.links[i], points.col(i));
 }
 
-BaseGrid prefix(const Problem& problem, std::size_t frames) {
+BaseGrid prefix(const Part& part, std::size_t frames, bool fine) {
   BaseGrid grid;
-  grid.nodes.assign(problem.grid.nodes.begin(), problem.grid.nodes.begin() + problem.nodes[frames - 1] + 1);
+  const auto& nodes = part.grids[fine].nodes;
+  grid.nodes.assign(nodes.begin(), nodes.begin() + part.nodes[fine][frames - 1] + 1);
   grid.nodes.back().step = 0.0;
   return grid;
 }
 
-bool simulate(const Problem& problem, const BaseGrid& grid, const VectorX& p, chain::States& states,
+std::size_t frames_within(const Part& part, double horizon) {
+  std::size_t count = 0;
+  while (count < part.times.size() && part.times[count] <= part.times[0] + horizon + 1e-9) ++count;
+  return std::clamp<std::size_t>(count, 3, part.times.size());
+}
+
+bool simulate(const Part& part, const BaseGrid& grid, const VectorX& p, chain::States& states,
               dynamics::Sensitivities* sensitivities = nullptr) {
-  const State state = apply(problem.chain, problem.unknowns, p);
-  const dynamics::Model model = dynamics::make_model(problem.chain, state.parameters);
+  const State state = apply(part.chain, part.unknowns, p);
+  const dynamics::Model model = dynamics::make_model(part.chain, state.parameters);
   if (!sensitivities) return dynamics::simulate(model, grid, state.theta, state.thetadot, states);
-  const auto unknowns = tangents(problem.chain, problem.unknowns, p);
+  const auto unknowns = tangents(part.chain, part.unknowns, p);
   if (model.parameters.integrator == dynamics::Integrator::rodas3)
     return dynamics::simulate(model, grid, state.theta, state.thetadot, states, unknowns, sensitivities);
   // the Euler step has no variational equation: differences of rollouts
   if (!dynamics::simulate(model, grid, state.theta, state.thetadot, states)) return false;
   const std::size_t frames = states.theta.size();
   const int size = static_cast<int>(p.size());
-  sensitivities->theta.assign(frames, MatrixX::Zero(problem.chain.angles(), size));
+  sensitivities->theta.assign(frames, MatrixX::Zero(part.chain.angles(), size));
   std::vector<char> good(size, 0);
   core::parallel_for(size, [&](std::int64_t i) {
     constexpr double kStep = 1e-5;  // of a log or an angle
     VectorX moved = p;
     moved[i] += kStep;
-    const State shifted = apply(problem.chain, problem.unknowns, moved);
+    const State shifted = apply(part.chain, part.unknowns, moved);
     chain::States out;
-    if (!dynamics::simulate(dynamics::make_model(problem.chain, shifted.parameters), grid, shifted.theta,
-                            shifted.thetadot, out))
+    if (!dynamics::simulate(dynamics::make_model(part.chain, shifted.parameters), grid, shifted.theta, shifted.thetadot,
+                            out))
       return;
     good[i] = 1;
     for (std::size_t k = 0; k < frames; ++k) sensitivities->theta[k].col(i) = (out.theta[k] - states.theta[k]) / kStep;
@@ -82,35 +110,35 @@ bool simulate(const Problem& problem, const BaseGrid& grid, const VectorX& p, ch
   return std::all_of(good.begin(), good.end(), [](char g) { return g != 0; });
 }
 
-void residuals(const Problem& problem, const chain::States& states, std::vector<MatrixX>& out) {
+void residuals(const Part& part, const chain::States& states, std::vector<MatrixX>& out) {
   out.resize(states.theta.size());
   MatrixX points;
   for (std::size_t k = 0; k < states.theta.size(); ++k) {
-    place_points(problem, states.theta[k], points, nullptr);
+    place_points(part, states.theta[k], points, nullptr);
     out[k].resize(3, points.cols());
     for (Eigen::Index i = 0; i < points.cols(); ++i)
-      out[k].col(i) = problem.whitening[k].middleCols<3>(3 * i) * (points.col(i) - problem.target[k].col(i));
+      out[k].col(i) = part.whitening[k].middleCols<3>(3 * i) * (points.col(i) - part.target[k].col(i));
   }
 }
 
-double median_norm(const std::vector<MatrixX>& values) {
+double median_norm(const std::vector<std::vector<MatrixX>>& values) {
   std::vector<double> norms;
-  for (const MatrixX& frame : values)
-    for (Eigen::Index i = 0; i < frame.cols(); ++i) norms.push_back(frame.col(i).norm());
+  for (const auto& part : values)
+    for (const MatrixX& frame : part)
+      for (Eigen::Index i = 0; i < frame.cols(); ++i) norms.push_back(frame.col(i).norm());
   std::nth_element(norms.begin(), norms.begin() + norms.size() / 2, norms.end());
   return norms[norms.size() / 2];
 }
 
-// Huber's loss of whitened residuals with threshold `limit`, plus the prior.
-double cost_of(const Problem& problem, const std::vector<MatrixX>& values, const VectorX& p, double limit) {
-  double cost = 0.0;
+// Huber's loss of whitened residuals with threshold `limit`.
+double loss_of(const std::vector<MatrixX>& values, double limit) {
+  double loss = 0.0;
   for (const MatrixX& frame : values)
     for (Eigen::Index i = 0; i < frame.cols(); ++i) {
       const double r = frame.col(i).norm();
-      cost += r <= limit ? 0.5 * r * r : limit * (r - 0.5 * limit);
+      loss += r <= limit ? 0.5 * r * r : limit * (r - 0.5 * limit);
     }
-  const VectorX off = p - problem.unknowns.mean;
-  return kResidualShare * cost + 0.5 * off.dot(problem.unknowns.precision * off);
+  return kResidualShare * loss;
 }
 
 struct Normal {
@@ -119,11 +147,11 @@ struct Normal {
   MatrixX scores;    // a frame's part of the gradient, unknowns x frames
 };
 
-Normal normal_equations(const Problem& problem, const chain::States& states, const dynamics::Sensitivities& slopes,
+Normal normal_equations(const Part& part, const chain::States& states, const dynamics::Sensitivities& slopes,
                         const std::vector<MatrixX>& values, double limit) {
-  const Eigen::Index size = problem.unknowns.size();
+  const Eigen::Index size = part.unknowns.size();
   const std::size_t frames = values.size();
-  const Eigen::Index points = static_cast<Eigen::Index>(problem.home.size());
+  const Eigen::Index points = static_cast<Eigen::Index>(part.home.size());
   // blocks of frames, summed in fixed order: the result does not depend on the number of threads
   constexpr std::size_t kBlock = 10;
   const std::size_t blocks = (frames + kBlock - 1) / kBlock;
@@ -133,15 +161,15 @@ Normal normal_equations(const Problem& problem, const chain::States& states, con
   core::parallel_for(static_cast<std::int64_t>(blocks), [&](std::int64_t block) {
     MatrixX& hessian = hessians[block];
     hessian = MatrixX::Zero(size, size);
-    MatrixX placed, by_angle(3 * points, problem.chain.angles()), rows(3 * points, size);
+    MatrixX placed, by_angle(3 * points, part.chain.angles()), rows(3 * points, size);
     VectorX right(3 * points);
     std::vector<MatrixX> jacobians;
     for (std::size_t k = block * kBlock; k < std::min(frames, (block + 1) * kBlock); ++k) {
-      place_points(problem, states.theta[k], placed, &jacobians);
+      place_points(part, states.theta[k], placed, &jacobians);
       for (Eigen::Index i = 0; i < points; ++i) {
         const double r = values[k].col(i).norm();
         const double weight = std::sqrt(kResidualShare * (r <= limit ? 1.0 : limit / r));
-        by_angle.middleRows<3>(3 * i).noalias() = weight * problem.whitening[k].middleCols<3>(3 * i) * jacobians[i];
+        by_angle.middleRows<3>(3 * i).noalias() = weight * part.whitening[k].middleCols<3>(3 * i) * jacobians[i];
         right.segment<3>(3 * i) = weight * values[k].col(i);
       }
       rows.noalias() = by_angle * slopes.theta[k];
@@ -150,9 +178,59 @@ Normal normal_equations(const Problem& problem, const chain::States& states, con
     }
   });
   out.hessian = MatrixX::Zero(size, size);
-  for (const MatrixX& part : hessians) out.hessian += part;
+  for (const MatrixX& sum : hessians) out.hessian += sum;
   out.hessian = out.hessian.selfadjointView<Eigen::Lower>();
   out.gradient = out.scores.rowwise().sum();
+  return out;
+}
+
+// All recordings up to a horizon.
+struct Rollouts {
+  std::vector<BaseGrid> grids;
+  std::vector<chain::States> states;
+  std::vector<dynamics::Sensitivities> slopes;
+  std::vector<std::vector<MatrixX>> values;  // whitened residuals: a recording, a frame
+
+  Rollouts(const Problem& problem, double horizon, bool fine)
+      : states(problem.parts.size()), slopes(problem.parts.size()) {
+    for (const Part& part : problem.parts) grids.push_back(prefix(part, frames_within(part, horizon), fine));
+    values.resize(grids.size());
+  }
+  // False where a motion leaves all bounds.
+  bool run(const Problem& problem, const VectorX& p, bool with_slopes) {
+    std::vector<char> good(grids.size());
+    core::parallel_for(static_cast<std::int64_t>(grids.size()), [&](std::int64_t i) {
+      const Part& part = problem.parts[i];
+      good[i] = simulate(part, grids[i], problem.of_part(p, i), states[i], with_slopes ? &slopes[i] : nullptr);
+      if (good[i]) residuals(part, states[i], values[i]);
+    });
+    return std::all_of(good.begin(), good.end(), [](char g) { return g != 0; });
+  }
+  // With the prior.
+  double cost(const Problem& problem, const VectorX& p, double limit) const {
+    const VectorX off = p - problem.mean;
+    double cost = 0.5 * off.dot(problem.precision * off);
+    for (const auto& part : values) cost += loss_of(part, limit);
+    return cost;
+  }
+};
+
+// Sums of all recordings in the order of the unknowns; `scores`, where asked, recording by recording.
+Normal normal_equations(const Problem& problem, const Rollouts& rollouts, double limit,
+                        std::vector<MatrixX>* scores = nullptr) {
+  const int shared = problem.shared, own = problem.own();
+  Normal out{MatrixX::Zero(problem.mean.size(), problem.mean.size()), VectorX::Zero(problem.mean.size()), {}};
+  for (std::size_t i = 0; i < problem.parts.size(); ++i) {
+    Normal part = normal_equations(problem.parts[i], rollouts.states[i], rollouts.slopes[i], rollouts.values[i], limit);
+    const Eigen::Index first = shared + static_cast<Eigen::Index>(i) * own;
+    out.hessian.topLeftCorner(shared, shared) += part.hessian.topLeftCorner(shared, shared);
+    out.hessian.block(0, first, shared, own) = part.hessian.topRightCorner(shared, own);
+    out.hessian.block(first, 0, own, shared) = part.hessian.bottomLeftCorner(own, shared);
+    out.hessian.block(first, first, own, own) = part.hessian.bottomRightCorner(own, own);
+    out.gradient.head(shared) += part.gradient.head(shared);
+    out.gradient.segment(first, own) = part.gradient.tail(own);
+    if (scores) scores->push_back(std::move(part.scores));
+  }
   return out;
 }
 
@@ -162,28 +240,23 @@ struct Fit {
   double limit = kInfinity;  // Huber's, in whitened units
 };
 
-// Levenberg-Marquardt over the first `frames` frames.
-void improve(const Problem& problem, std::size_t frames, int iterations, Fit& fit) {
+// Levenberg-Marquardt over the first `horizon` seconds of every recording.
+void improve(const Problem& problem, double horizon, bool fine, int iterations, Fit& fit) {
   constexpr double kProgress = 1e-4;  // relative, below which a horizon is done
-  const BaseGrid grid = prefix(problem, frames);
-  chain::States states, trial_states;
-  dynamics::Sensitivities slopes;
-  std::vector<MatrixX> values, trial_values;
-  if (!simulate(problem, grid, fit.p, states, &slopes)) {
+  Rollouts now(problem, horizon, fine), trial = now;
+  if (!now.run(problem, fit.p, true)) {
     fit.cost = kInfinity;
     return;
   }
-  residuals(problem, states, values);
   // 1.54: median norm of three unit normal residuals
-  fit.limit = std::max(kHuber * median_norm(values) / 1.54, kHuber * 0.3);
-  fit.cost = cost_of(problem, values, fit.p, fit.limit);
+  fit.limit = std::max(kHuber * median_norm(now.values) / 1.54, kHuber * 0.3);
+  fit.cost = now.cost(problem, fit.p, fit.limit);
   double damping = 1e-3;
-  const MatrixX& prior = problem.unknowns.precision;
   for (int iteration = 0; iteration < iterations; ++iteration) {
     if (core::stop_requested()) throw Interrupted(core::stop_requested());
-    const Normal normal = normal_equations(problem, states, slopes, values, fit.limit);
-    const MatrixX hessian = normal.hessian + prior;
-    const VectorX gradient = normal.gradient + prior * (fit.p - problem.unknowns.mean);
+    const Normal normal = normal_equations(problem, now, fit.limit);
+    const MatrixX hessian = normal.hessian + problem.precision;
+    const VectorX gradient = normal.gradient + problem.precision * (fit.p - problem.mean);
     bool better = false;
     double gained = 0.0;
     for (int attempt = 0; attempt < 6 && !better; ++attempt) {
@@ -195,9 +268,8 @@ void improve(const Problem& problem, std::size_t frames, int iterations, Fit& fi
       if (!(largest < kInfinity)) break;
       if (largest > kMaxStep) step *= kMaxStep / largest;
       const VectorX p = fit.p + step;
-      if (simulate(problem, grid, p, trial_states)) {
-        residuals(problem, trial_states, trial_values);
-        const double cost = cost_of(problem, trial_values, p, fit.limit);
+      if (trial.run(problem, p, false)) {
+        const double cost = trial.cost(problem, p, fit.limit);
         if (cost < fit.cost) {
           gained = fit.cost - cost;
           fit.p = p, fit.cost = cost;
@@ -209,8 +281,7 @@ void improve(const Problem& problem, std::size_t frames, int iterations, Fit& fi
       damping = std::max(10.0 * damping, 1e-4);
     }
     if (!better || gained < kProgress * fit.cost) break;
-    if (!simulate(problem, grid, fit.p, states, &slopes)) break;
-    residuals(problem, states, values);
+    if (!now.run(problem, fit.p, true)) break;
   }
 }
 
@@ -240,8 +311,8 @@ void initial_motion(const chain::States& states, VectorX& theta, VectorX& thetad
   if (signal > 0.0) thetadot *= std::max(0.0, signal - noise) / signal;
 }
 
-Problem make_problem(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,
-                     std::span<const MatrixX> covariances, const Options& options, const Markers* markers = nullptr) {
+Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,
+               std::span<const MatrixX> covariances, const Options& options, const Markers* markers = nullptr) {
   const std::size_t frames = recognized.time.size();
   if (frames < 3 || recognized.theta.size() != frames)
     throw InputError("identify", std::to_string(frames) + " recognized states", "give at least 3 with their times");
@@ -250,27 +321,30 @@ Problem make_problem(const chain::Chain& chain, const trajectory::Trajectory& ba
       throw InputError("identify", "a recognized state is not finite or of another chain", "recognize again");
   CHAINSPLAT_CHECK(covariances.empty() || covariances.size() == frames, std::to_string(covariances.size()));
 
-  Problem problem{chain, {}, recognized.time, {}, {}, {}, {}, recognized.theta, {}, {}};
-  problem.has_markers = markers != nullptr;
+  Part part{chain, {}, recognized.time, {}, {}, {}, {}, recognized.theta};
+  for (std::size_t k = 1; k < frames; ++k)  // angles are known up to whole turns: the nearest to the frame before
+    for (Eigen::Index i = 0; i < part.theta[k].size(); ++i)
+      part.theta[k][i] -= 2.0 * M_PI * std::round((part.theta[k][i] - part.theta[k - 1][i]) / (2.0 * M_PI));
+  part.has_markers = markers != nullptr;
   for (int link = 1; !markers && link < chain.links(); ++link) {
-    problem.home.push_back(0.5 * (chain.link_start(link) + chain.link_end(link)) * chain.direction);
-    problem.home.push_back(chain.link_end(link) * chain.direction);
-    problem.links.insert(problem.links.end(), 2, link);
+    part.home.push_back(0.5 * (chain.link_start(link) + chain.link_end(link)) * chain.direction);
+    part.home.push_back(chain.link_end(link) * chain.direction);
+    part.links.insert(part.links.end(), 2, link);
   }
   const bool twists = std::any_of(chain.axes.begin(), chain.axes.end(), [&](const math::Vector6& axis) {
     return std::abs(axis.head<3>().dot(chain.direction)) > 0.5;
   });
   for (int link = 1; !markers && twists && link < chain.links(); ++link) {
-    problem.home.push_back(chain.link_end(link) * chain.direction + 0.5 * chain.diameter * chain.bending_axis);
-    problem.links.push_back(link);
+    part.home.push_back(chain.link_end(link) * chain.direction + 0.5 * chain.diameter * chain.bending_axis);
+    part.links.push_back(link);
   }
 
   for (std::size_t i = 0; markers && i < markers->arclengths.size(); ++i) {
-    problem.home.push_back(markers->arclengths[i] * chain.direction);
-    problem.links.push_back(chain::link_at(chain, markers->arclengths[i]));
+    part.home.push_back(markers->arclengths[i] * chain.direction);
+    part.links.push_back(chain::link_at(chain, markers->arclengths[i]));
   }
 
-  const std::size_t points = problem.home.size();
+  const std::size_t points = part.home.size();
   std::vector<MatrixX> jacobians;
   for (std::size_t k = 0; k < frames; ++k) {
     if (markers) {
@@ -280,51 +354,74 @@ Problem make_problem(const chain::Chain& chain, const trajectory::Trajectory& ba
         const Vector3 seen = markers->world[k].col(i);
         if (!seen.allFinite()) continue;
         target.col(i) = base_from_world * seen;
-        whitening.middleCols<3>(3 * i) = math::Matrix3::Identity() / markers->deviation;
+        whitening.middleCols<3>(3 * i) =
+            math::Matrix3::Identity() / std::hypot(markers->deviation, kMarkerModelShare * chain.length);
       }
-      problem.target.push_back(target);
-      problem.whitening.push_back(whitening);
+      part.target.push_back(target);
+      part.whitening.push_back(whitening);
       continue;
     }
     MatrixX target, whitening(3, 3 * points);
-    place_points(problem, recognized.theta[k], target, covariances.empty() ? nullptr : &jacobians);
+    place_points(part, recognized.theta[k], target, covariances.empty() ? nullptr : &jacobians);
     for (std::size_t i = 0; i < points; ++i) {
       math::Matrix3 covariance = options.model_error * options.model_error * math::Matrix3::Identity();
       if (!covariances.empty()) covariance += jacobians[i] * covariances[k] * jacobians[i].transpose();
       whitening.middleCols<3>(3 * i) = covariance.llt().matrixL().solve(math::Matrix3::Identity());
     }
-    problem.target.push_back(target);
-    problem.whitening.push_back(whitening);
+    part.target.push_back(target);
+    part.whitening.push_back(whitening);
   }
 
   VectorX theta, thetadot, theta_sd = VectorX::Constant(chain.angles(), kThetaSd);
-  initial_motion(recognized, theta, thetadot);
+  initial_motion({part.times, part.theta, {}}, theta, thetadot);
   if (options.paper) theta = recognized.theta[0];
   if (!covariances.empty()) theta_sd = (covariances[0].diagonal().array() + 0.25 * kThetaSd * kThetaSd).sqrt();
-  problem.unknowns = make_unknowns(chain, options, theta, thetadot, theta_sd);
-  problem.grid = dynamics::sample_base([&](double t) { return base.at(t); }, recognized.time[0], recognized.time,
-                                       problem.unknowns.fixed.substeps);
-  for (std::size_t i = 0; i < problem.grid.nodes.size(); ++i)
-    if (problem.grid.nodes[i].output) problem.nodes.push_back(i);
-  return problem;
+  part.unknowns = make_unknowns(chain, options, theta, thetadot, theta_sd);
+  const int substeps = part.unknowns.fixed.substeps;
+  for (bool fine : {false, true}) {
+    BaseGrid& grid = part.grids[fine];
+    grid = dynamics::sample_base([&](double t) { return base.at(t); }, recognized.time[0], recognized.time,
+                                 fine ? substeps : std::max(1, substeps / 2));
+    for (std::size_t i = 0; i < grid.nodes.size(); ++i)
+      if (grid.nodes[i].output) part.nodes[fine].push_back(i);
+  }
+  return part;
 }
 
-std::size_t frames_within(const Problem& problem, double horizon) {
-  std::size_t count = 0;
-  while (count < problem.times.size() && problem.times[count] <= problem.times[0] + horizon + 1e-9) ++count;
-  return std::clamp<std::size_t>(count, 3, problem.times.size());
+Problem make_problem(const chain::Chain& chain, std::vector<Part> parts) {
+  const Unknowns& first = parts.front().unknowns;
+  const int shared = first.theta < 0 ? first.size() : first.theta;
+  Problem problem{chain, std::move(parts), shared, {}, {}};
+  const int own = problem.own();
+  const Eigen::Index size = shared + own * static_cast<Eigen::Index>(problem.parts.size());
+  problem.mean.resize(size);
+  problem.precision = MatrixX::Zero(size, size);
+  for (std::size_t i = 0; i < problem.parts.size(); ++i) {
+    const Unknowns& u = problem.parts[i].unknowns;  // no prior links the shared ones with an initial state
+    const Eigen::Index at = shared + static_cast<Eigen::Index>(i) * own;
+    problem.mean.head(shared) = u.mean.head(shared);
+    problem.mean.segment(at, own) = u.mean.tail(own);
+    problem.precision.topLeftCorner(shared, shared) = u.precision.topLeftCorner(shared, shared);
+    problem.precision.block(at, at, own, own) = u.precision.bottomRightCorner(own, own);
+  }
+  return problem;
 }
 
 // Best of several starts: stiffness and damping scaled together, then random ones where all fit poorly.
 Fit fit_centerline(const Problem& problem, const Options& options) {
-  const Unknowns& u = problem.unknowns;
+  const Unknowns& u = problem.parts[0].unknowns;
   constexpr double kScales[] = {1.0, 0.2, 5.0};
   constexpr int kRandomStarts = 3;
   constexpr double kPoor = 4.0;  // median whitened residual, i.e. mm without covariances
-  const std::size_t all = problem.times.size(), trial = frames_within(problem, kHorizons[2]);
+  std::int64_t all = 0;
+  double longest = 0.0;  // s
+  for (const Part& part : problem.parts) {
+    all += static_cast<std::int64_t>(part.times.size());
+    longest = std::max(longest, part.times.back() - part.times.front());
+  }
 
   const auto start = [&](int index) {
-    VectorX p = u.mean;
+    VectorX p = problem.mean;
     if (index < 3) {
       for (int i : {u.stiffness, u.damping})
         if (i >= 0) p[i] += std::log(kScales[index]);
@@ -340,45 +437,49 @@ Fit fit_centerline(const Problem& problem, const Options& options) {
     Fit fit;
     fit.p = start(index);
     for (double horizon : {kHorizons[0], kHorizons[1], kHorizons[2]})
-      improve(problem, frames_within(problem, horizon), std::min(options.max_iterations, 10), fit);
+      improve(problem, horizon, false, std::min(options.max_iterations, 10), fit);
     return fit;
   };
   const auto finish = [&](Fit fit) {
-    // the whole twice: again with the threshold of the better fit
-    for (std::size_t frames : {frames_within(problem, kHorizons[3]), all, all}) {
-      improve(problem, frames, options.max_iterations, fit);
-      core::report({"identify", static_cast<std::int64_t>(frames), static_cast<std::int64_t>(all), fit.cost, NAN,
-                    "fitting the rollout to the recognized motion"});
+    std::vector<double> horizons;
+    for (double horizon = 2.0 * kHorizons[2]; horizon < longest; horizon *= 2.0) horizons.push_back(horizon);
+    // the whole twice: again with all substeps and the threshold of the better fit
+    horizons.insert(horizons.end(), 2, kInfinity);
+    for (std::size_t i = 0; i < horizons.size(); ++i) {
+      const double horizon = horizons[i];
+      improve(problem, horizon, i + 1 == horizons.size(), options.max_iterations, fit);
+      std::int64_t frames = 0;
+      for (const Part& part : problem.parts) frames += static_cast<std::int64_t>(frames_within(part, horizon));
+      core::report({"identify", frames, all, fit.cost, NAN, "fitting the rollout to the recognized motion"});
     }
     return fit;
   };
-  // a common scale for comparing: the plain robust cost of the trial horizon with a fixed threshold
-  const auto score = [&](const Fit& fit, std::size_t frames, double limit) {
-    chain::States states;
-    std::vector<MatrixX> values;
-    if (fit.cost == kInfinity || !simulate(problem, prefix(problem, frames), fit.p, states)) return kInfinity;
-    residuals(problem, states, values);
-    return cost_of(problem, values, fit.p, limit);
+  // a common scale for comparing: the robust cost of a horizon with a fixed threshold
+  const auto score = [&](const Fit& fit, double horizon) {
+    if (fit.cost == kInfinity) return kInfinity;
+    Rollouts rollouts(problem, horizon, true);
+    return rollouts.run(problem, fit.p, false) ? rollouts.cost(problem, fit.p, kHuber) : kInfinity;
   };
   const auto best_of = [&](int first, int count) {
     std::vector<Fit> fits(count);
     core::parallel_for(count, [&](std::int64_t i) { fits[i] = warm(first + static_cast<int>(i)); });
     std::size_t best = 0;
-    for (std::size_t i = 1; i < fits.size(); ++i)
-      if (score(fits[i], trial, kHuber) < score(fits[best], trial, kHuber)) best = i;
+    double best_score = kInfinity;
+    for (std::size_t i = 0; i < fits.size(); ++i) {
+      const double value = score(fits[i], kHorizons[2]);
+      if (value < best_score) best = i, best_score = value;
+    }
     return finish(fits[best]);
   };
   Fit best = best_of(0, 3);
   const auto poor = [&](const Fit& fit) {
-    chain::States states;
-    std::vector<MatrixX> values;
-    if (fit.cost == kInfinity || !simulate(problem, problem.grid, fit.p, states)) return true;
-    residuals(problem, states, values);
-    return median_norm(values) > kPoor;
+    if (fit.cost == kInfinity) return true;
+    Rollouts rollouts(problem, kInfinity, true);
+    return !rollouts.run(problem, fit.p, false) || median_norm(rollouts.values) > kPoor;
   };
   if (poor(best)) {
     const Fit other = best_of(3, kRandomStarts);
-    if (score(other, all, kHuber) < score(best, all, kHuber)) best = other;
+    if (score(other, kInfinity) < score(best, kInfinity)) best = other;
   }
   return best;
 }
@@ -387,14 +488,13 @@ Fit fit_centerline(const Problem& problem, const Options& options) {
 Fit fit_angles(const Problem& problem, const Options& options) {
   constexpr double kRate = 0.05, kBeta1 = 0.9, kBeta2 = 0.999, kEpsilon = 1e-12;
   Fit best, fit;
-  fit.p = problem.unknowns.mean;
+  fit.p = problem.mean;
   double rate = kRate;
   VectorX first = VectorX::Zero(fit.p.size()), second = first;
+  Rollouts rollouts(problem, kInfinity, true);
   for (int iteration = 1; iteration <= options.adam_iterations; ++iteration) {
     if (core::stop_requested()) throw Interrupted(core::stop_requested());
-    chain::States states;
-    dynamics::Sensitivities slopes;
-    if (!simulate(problem, problem.grid, fit.p, states, &slopes)) {
+    if (!rollouts.run(problem, fit.p, true)) {
       // beyond the step's stability: go back and step less
       if (best.cost == kInfinity)
         fit.p.array() += 0.3;
@@ -406,11 +506,12 @@ Fit fit_angles(const Problem& problem, const Options& options) {
     }
     double cost = 0.0;
     VectorX gradient = VectorX::Zero(fit.p.size());
-    for (std::size_t k = 0; k < states.theta.size(); ++k) {
-      const VectorX off = states.theta[k] - problem.theta[k];
-      cost += 0.5 * off.squaredNorm();
-      gradient += slopes.theta[k].transpose() * off;
-    }
+    for (std::size_t i = 0; i < problem.parts.size(); ++i)
+      for (std::size_t k = 0; k < rollouts.states[i].theta.size(); ++k) {
+        const VectorX off = rollouts.states[i].theta[k] - problem.parts[i].theta[k];
+        cost += 0.5 * off.squaredNorm();
+        gradient += rollouts.slopes[i].theta[k].transpose() * off;  // [P] fits no initial state: all are shared
+      }
     fit.cost = cost;
     if (cost < best.cost) best = fit;
     first = kBeta1 * first + (1.0 - kBeta1) * gradient;
@@ -422,70 +523,159 @@ Fit fit_angles(const Problem& problem, const Options& options) {
 }
 
 // Sandwich covariance of the estimate in the position metric ([P] included): residuals of frames up to kLag apart are
-// correlated (Newey-West, SPEC 5).
-MatrixX covariance_of(const Problem& problem, const Normal& normal) {
-  const MatrixX& prior = problem.unknowns.precision;
-  MatrixX meat = normal.scores * normal.scores.transpose();
-  const Eigen::Index frames = normal.scores.cols();
-  for (int lag = 1; lag <= kLag && lag < frames; ++lag) {
-    const double weight = 1.0 - lag / (kLag + 1.0);
-    const MatrixX part = normal.scores.rightCols(frames - lag) * normal.scores.leftCols(frames - lag).transpose();
-    meat += weight * (part + part.transpose());
+// correlated (Newey-West, SPEC 5); recordings are independent.
+MatrixX covariance_of(const Problem& problem, const MatrixX& hessian, const std::vector<MatrixX>& scores) {
+  const MatrixX& prior = problem.precision;
+  const Eigen::Index shared = problem.shared, own = problem.own();
+  MatrixX meat = prior;
+  for (std::size_t i = 0; i < scores.size(); ++i) {
+    const MatrixX& s = scores[i];
+    const Eigen::Index frames = s.cols(), first = shared + static_cast<Eigen::Index>(i) * own;
+    MatrixX part = s * s.transpose();
+    for (int lag = 1; lag <= kLag && lag < frames; ++lag) {
+      const double weight = 1.0 - lag / (kLag + 1.0);
+      const MatrixX lagged = s.rightCols(frames - lag) * s.leftCols(frames - lag).transpose();
+      part += weight * (lagged + lagged.transpose());
+    }
+    meat.topLeftCorner(shared, shared) += part.topLeftCorner(shared, shared);
+    meat.block(0, first, shared, own) += part.topRightCorner(shared, own);
+    meat.block(first, 0, own, shared) += part.bottomLeftCorner(own, shared);
+    meat.block(first, first, own, own) += part.bottomRightCorner(own, own);
   }
-  const MatrixX bread = (normal.hessian + prior).ldlt().solve(MatrixX::Identity(prior.rows(), prior.cols()));
-  const MatrixX out = bread * (meat + prior) * bread;
+  const MatrixX bread = (hessian + prior).ldlt().solve(MatrixX::Identity(prior.rows(), prior.cols()));
+  const MatrixX out = bread * meat * bread;
   return 0.5 * (out + out.transpose());
+}
+
+double rms_of(const Part& part, const chain::States& rollout) {
+  double sum = 0.0;
+  std::size_t count = 0;
+  MatrixX points;
+  for (std::size_t k = 0; k < part.times.size(); ++k) {
+    place_points(part, rollout.theta[k], points, nullptr);
+    const int stop = part.has_markers ? static_cast<int>(points.cols()) : 2 * (part.chain.links() - 1);
+    for (int i = part.has_markers ? 0 : 1; i < stop; i += part.has_markers ? 1 : 2) {  // odd: the links' ends
+      if (part.whitening[k].middleCols<3>(3 * i).isZero(0.0)) continue;
+      ++count;
+      sum += (points.col(i) - part.target[k].col(i)).squaredNorm();
+    }
+  }
+  return std::sqrt(sum / static_cast<double>(count));
+}
+
+// Eigenvectors of the information about the shared unknowns, those of the initial states eliminated, in units of the
+// priors' deviations; the roots of its eigenvalues are the singular values of the weighted, scaled sensitivities.
+std::vector<dynamics::Estimates::Weak> weak_directions(const Problem& problem, const MatrixX& hessian) {
+  const int shared = problem.shared, own = problem.own();
+  MatrixX information = hessian.topLeftCorner(shared, shared);
+  for (std::size_t i = 0; own > 0 && i < problem.parts.size(); ++i) {
+    const Eigen::Index first = shared + static_cast<Eigen::Index>(i) * own;
+    const MatrixX with_prior = hessian.block(first, first, own, own) + problem.precision.block(first, first, own, own);
+    const MatrixX cross = hessian.block(first, 0, own, shared);
+    information -= cross.transpose() * with_prior.ldlt().solve(cross);
+  }
+  const MatrixX prior = problem.precision.topLeftCorner(shared, shared);
+  const VectorX deviation = prior.ldlt().solve(MatrixX::Identity(shared, shared)).diagonal().cwiseMax(0.0).cwiseSqrt();
+  const Eigen::SelfAdjointEigenSolver<MatrixX> eigen(deviation.asDiagonal() * information * deviation.asDiagonal());
+  constexpr double kLarge = 0.3;  // a component that is named: a tenth of the vector's square
+  std::vector<dynamics::Estimates::Weak> weak;
+  for (int i = 0; i < shared && eigen.eigenvalues()[i] < 1.0; ++i) {
+    dynamics::Estimates::Weak direction{std::sqrt(std::max(0.0, eigen.eigenvalues()[i])), {}};
+    VectorX vector = eigen.eigenvectors().col(i);
+    Eigen::Index largest = 0;
+    vector.cwiseAbs().maxCoeff(&largest);
+    if (vector[largest] < 0.0) vector = -vector;
+    for (int k = 0; k < shared; ++k)
+      if (k == largest || std::abs(vector[k]) >= kLarge)
+        direction.parts.emplace_back(problem.parts[0].unknowns.names[k], vector[k]);
+    std::stable_sort(direction.parts.begin(), direction.parts.end(),
+                     [](const auto& a, const auto& b) { return std::abs(a.second) > std::abs(b.second); });
+    weak.push_back(std::move(direction));
+  }
+  return weak;
+}
+
+// How well a recording can be followed with parameters of its own, from those of all.
+double alone_rms(const Problem& problem, std::size_t index, const VectorX& p) {
+  constexpr int kIterations = 8;
+  const Problem alone = make_problem(problem.chain, {problem.parts[index]});
+  Fit fit;
+  fit.p = problem.of_part(p, index);
+  improve(alone, kInfinity, true, kIterations, fit);
+  Rollouts rollouts(alone, kInfinity, true);
+  return fit.cost < kInfinity && rollouts.run(alone, fit.p, false) ? rms_of(alone.parts[0], rollouts.states[0])
+                                                                   : kInfinity;
+}
+
+std::vector<Result> solve(const chain::Chain& chain, std::vector<Part> parts, const Options& options) {
+  const Problem problem = make_problem(chain, std::move(parts));
+  const Fit fit = options.paper ? fit_angles(problem, options) : fit_centerline(problem, options);
+  Rollouts rollouts(problem, kInfinity, true);
+  if (fit.cost == kInfinity || !rollouts.run(problem, fit.p, true))
+    throw WorkError("identify", "no parameters gave a rollout that stays finite",
+                    "check the base trajectory, the recognized angles and the object's length");
+  std::vector<MatrixX> scores;
+  const Normal normal = normal_equations(problem, rollouts, fit.limit, &scores);
+  const MatrixX covariance = covariance_of(problem, normal.hessian, scores);
+  const Eigen::Index shared = problem.shared, own = problem.own();
+
+  std::vector<Result> results(problem.parts.size());
+  const std::vector<dynamics::Estimates::Weak> weak = weak_directions(problem, normal.hessian);
+  for (std::size_t i = 0; i < results.size(); ++i) {
+    Result& result = results[i];
+    const Part& part = problem.parts[i];
+    const VectorX p = problem.of_part(fit.p, i);
+    const State state = apply(chain, part.unknowns, p);
+    result.parameters = state.parameters;
+    result.initial = {part.times[0], state.theta, state.thetadot};
+    result.rollout = std::move(rollouts.states[i]);
+    result.node_rms = result.alone_rms = rms_of(part, result.rollout);
+    if (results.size() > 1 && !options.paper)
+      result.alone_rms = std::min(result.node_rms, alone_rms(problem, i, fit.p));
+    dynamics::Estimates& e = result.estimates;
+    e.names = part.unknowns.names;
+    e.held = part.unknowns.held;
+    e.weak = weak;
+    e.values.assign(p.begin(), p.end());
+    const Eigen::Index first = shared + static_cast<Eigen::Index>(i) * own;
+    e.covariance.resize(shared + own, shared + own);
+    e.covariance << covariance.topLeftCorner(shared, shared), covariance.block(0, first, shared, own),
+        covariance.block(first, 0, own, shared), covariance.block(first, first, own, own);
+    for (Eigen::Index k = 0; k < p.size(); ++k)
+      e.standard_errors.push_back(std::sqrt(std::max(0.0, e.covariance(k, k))));
+  }
+  return results;
 }
 
 }  // namespace
 
-static Result solve(const chain::Chain& chain, const Problem& problem, const Options& options) {
-  const Fit fit = options.paper ? fit_angles(problem, options) : fit_centerline(problem, options);
-  Result result;
-  dynamics::Sensitivities slopes;
-  if (fit.cost == kInfinity || !simulate(problem, problem.grid, fit.p, result.rollout, &slopes))
-    throw WorkError("identify", "no parameters gave a rollout that stays finite",
-                    "check the base trajectory, the recognized angles and the object's length");
-  const State state = apply(chain, problem.unknowns, fit.p);
-  result.parameters = state.parameters;
-  result.initial = {problem.times[0], state.theta, state.thetadot};
+std::vector<Result> identify(const chain::Chain& chain, std::span<const Recording> recordings, const Options& options) {
+  std::vector<Part> parts;
+  for (const Recording& r : recordings) parts.push_back(make_part(chain, r.base, r.recognized, r.covariances, options));
+  return solve(chain, std::move(parts), options);
+}
 
-  std::vector<MatrixX> values;
-  residuals(problem, result.rollout, values);
-  const Normal normal = normal_equations(problem, result.rollout, slopes, values, fit.limit);
-  result.estimates.names = problem.unknowns.names;
-  result.estimates.values.assign(fit.p.begin(), fit.p.end());
-  result.estimates.covariance = covariance_of(problem, normal);
-  for (Eigen::Index i = 0; i < fit.p.size(); ++i)
-    result.estimates.standard_errors.push_back(std::sqrt(std::max(0.0, result.estimates.covariance(i, i))));
-  result.estimates.held = problem.unknowns.held;
-
-  double sum = 0.0;
-  std::size_t count = 0;
-  MatrixX points;
-  for (std::size_t k = 0; k < problem.times.size(); ++k) {
-    place_points(problem, result.rollout.theta[k], points, nullptr);
-    const int stop = problem.has_markers ? static_cast<int>(points.cols()) : 2 * (chain.links() - 1);
-    for (int i = problem.has_markers ? 0 : 1; i < stop; i += problem.has_markers ? 1 : 2) {  // odd: the links' ends
-      if (problem.whitening[k].middleCols<3>(3 * i).isZero(0.0)) continue;
-      ++count;
-      sum += (points.col(i) - problem.target[k].col(i)).squaredNorm();
-    }
+std::vector<Result> identify(const chain::Chain& chain, std::span<const MarkerRecording> recordings,
+                             const Options& options) {
+  std::vector<Part> parts;
+  for (const MarkerRecording& r : recordings) {
+    std::vector<MatrixX> covariances;
+    const chain::States fitted = fit_markers(chain, r.base, r.markers, &covariances);
+    parts.push_back(make_part(chain, r.base, fitted, covariances, options, &r.markers));
   }
-  result.node_rms = std::sqrt(sum / static_cast<double>(count));
-  return result;
+  return solve(chain, std::move(parts), options);
 }
 
 Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,
                 std::span<const MatrixX> covariances, const Options& options) {
-  return solve(chain, make_problem(chain, base, recognized, covariances, options), options);
+  const Recording recording{base, recognized, {covariances.begin(), covariances.end()}};
+  return std::move(identify(chain, std::span(&recording, 1), options).front());
 }
 
 Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers,
                 const Options& options) {
-  std::vector<MatrixX> covariances;
-  const chain::States fitted = fit_markers(chain, base, markers, &covariances);
-  return solve(chain, make_problem(chain, base, fitted, covariances, options, &markers), options);
+  const MarkerRecording recording{base, markers};
+  return std::move(identify(chain, std::span(&recording, 1), options).front());
 }
 
 }  // namespace chainsplat::identification

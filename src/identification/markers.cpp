@@ -1,4 +1,5 @@
 #include <cmath>
+#include <cstdio>
 
 #include "chainsplat/identification.h"
 
@@ -6,15 +7,18 @@ namespace chainsplat::identification {
 namespace {
 
 using math::MatrixX;
+using math::Vector3;
 using math::VectorX;
 
 constexpr double kBendSd = 0.7;      // rad, one angle about the straight rope
 constexpr double kSmoothSd = 0.15;   // rad, between the same axes of neighboring joints
-constexpr double kStepSd = 0.3;      // rad, from one time to the next
+constexpr double kRateSd = 9.0;      // rad/s, from one time to the next
+constexpr double kStretch = 0.05;    // of a rope, and
+constexpr double kMountMost = 0.03;  // m, of a marker's mount: how far beyond its arclength a marker may be
 constexpr int kIterations = 30;      // of Levenberg-Marquardt, a time
 constexpr double kConverged = 1e-9;  // rad, largest step
 
-void check(const chain::Chain& chain, const Markers& markers) {
+void check(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers) {
   const auto refuse = [](const std::string& what, const std::string& mend) { throw InputError("markers", what, mend); };
   if (markers.arclengths.empty()) refuse("there are none", "give at least one with its arclength");
   for (double s : markers.arclengths)
@@ -30,6 +34,17 @@ void check(const chain::Chain& chain, const Markers& markers) {
       refuse(at + "the times do not increase", "sort them");
     if (markers.world[k].rows() != 3 || markers.world[k].cols() != static_cast<Eigen::Index>(markers.arclengths.size()))
       refuse(at + "the number of positions is another", "give one a marker, NaN where it is not seen");
+    // a straight rope reaches as far as its arclength; more is another rope, another unit or another frame
+    const Vector3 grasp = base.pose(markers.time[k]).translation;
+    for (Eigen::Index i = 0; i < markers.world[k].cols(); ++i) {
+      const double distance = (markers.world[k].col(i) - grasp).norm(), reach = markers.arclengths[i];
+      if (distance > (1.0 + kStretch) * reach + kMountMost) {
+        char text[120];
+        std::snprintf(text, sizeof text, "marker %d is %.3g m from the grasp and its arclength is %.3g m",
+                      static_cast<int>(i) + 1, distance, reach);
+        refuse(at + text, "is it another rope, another unit, or the base in another frame?");
+      }
+    }
     bool seen = false;
     for (Eigen::Index i = 0; i < markers.world[k].cols(); ++i) seen |= markers.world[k].col(i).allFinite();
     if (!seen) refuse(at + "no marker is seen", "leave that time out");
@@ -40,7 +55,7 @@ void check(const chain::Chain& chain, const Markers& markers) {
 
 chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers,
                           std::vector<MatrixX>* covariances) {
-  check(chain, markers);
+  check(chain, base, markers);
   const int n = chain.angles();
   MatrixX shape = MatrixX::Identity(n, n) / (kBendSd * kBendSd);
   for (int i = 0; i < n; ++i)
@@ -56,7 +71,8 @@ chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajector
   for (std::size_t frame = 0; frame < markers.time.size(); ++frame) {
     const math::Pose pose = base.pose(markers.time[frame]);
     const VectorX before = theta;
-    const double hold = frame == 0 ? 0.0 : 1.0 / (kStepSd * kStepSd);
+    const double step_sd = frame == 0 ? 0.0 : kRateSd * (markers.time[frame] - markers.time[frame - 1]);
+    const double hold = frame == 0 ? 0.0 : 1.0 / (step_sd * step_sd);
     MatrixX hessian;
     const auto cost_at = [&](const VectorX& angles, VectorX* gradient) {
       const auto motions = chain::link_motions(chain, angles, pose);

@@ -11,6 +11,7 @@ constexpr double kTipSd = 1.0;            // logit of the tip's part of the mass
 constexpr double kJointSd = 0.5;          // stiffness and damping of one joint about the shared value
 constexpr double kMassSd = 0.15;          // mass of one link about the mean
 constexpr double kSmoothSd = 0.3;         // between neighbors, of those
+constexpr double kGraspSd = 0.5;          // the second axis over the first, where the rope leaves the fingers
 constexpr double kCoulombSd = 1.5;        // coefficient of one link
 constexpr double kCoulombSmoothSd = 1.0;  // between neighbors: a lifted link next to one that carries is usual
 constexpr double kViscousSd = 1.0;
@@ -51,14 +52,9 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
   fixed.integrator = options.paper ? dynamics::Integrator::implicit_velocity_euler : options.integrator;
   fixed.substeps = options.paper ? 1 : options.substeps > 0 ? options.substeps : options.tabletop ? 8 : 4;
 
-  // a joint stands for the rope from the middle of the link before it to the middle of its own (SPEC 3.1); a base link
-  // before the first joint bends with it
   const double reference = (chain.length - chain.joint_arclength[0]) / links;
   for (int k = 0; k < n; ++k) {
-    const int link = chain.child_link[k];
-    const double own = 0.5 * (chain.link_end(link) - chain.link_start(link));
-    const double before = link == 1 ? chain.link_end(0) : 0.5 * (chain.link_end(link - 1) - chain.link_start(link - 1));
-    u.compliance.push_back(options.paper ? 1.0 : reference / (own + before));
+    u.compliance.push_back(options.paper ? 1.0 : reference / chain::bent_length(chain, chain.child_link[k]));
     u.twist.push_back(std::abs(chain.axes[k].head<3>().dot(chain.direction)) > 0.5);
   }
 
@@ -86,6 +82,9 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
   for (bool t : u.twist) has_twist |= t;
   if (stiff) {
     u.stiffness = add("log_stiffness", std::log(kStiffnessPart * torque), kSharedSd);
+    // two fingers hold a rope more stiffly one way than the other (a foam noodle in a gripper: 1.5)
+    if (options.per_joint && n > 1 && chain.child_link[1] == 1 && !u.twist[1])
+      u.grasp_stiffness = add("log_grasp_stiffness_ratio", 0.0, kGraspSd);
     if (has_twist) u.twist_stiffness = add("log_twist_stiffness_ratio", 0.0, 0.7);
   } else {
     u.held.emplace_back("stiffness", options.paper ? "0, as in the paper" : "held at 0 on request");
@@ -160,8 +159,9 @@ State apply(const chain::Chain& chain, const Unknowns& u, const VectorX& p) {
   for (int k = 0; k < n; ++k) {
     const int joint = chain.child_link[k] - 1;
     if (u.stiffness >= 0)
-      q.stiffness[k] = u.compliance[k] * std::exp(p[u.stiffness] + (u.twist[k] ? p[u.twist_stiffness] : 0.0) +
-                                                  (u.joint_stiffness < 0 ? 0.0 : p[u.joint_stiffness + joint]));
+      q.stiffness[k] = (k == 1 && u.grasp_stiffness >= 0 ? std::exp(p[u.grasp_stiffness]) : 1.0) * u.compliance[k] *
+                       std::exp(p[u.stiffness] + (u.twist[k] ? p[u.twist_stiffness] : 0.0) +
+                                (u.joint_stiffness < 0 ? 0.0 : p[u.joint_stiffness + joint]));
     q.damping[k] = u.compliance[k] * std::exp((u.damping < 0 ? 0.0 : p[u.damping]) +
                                               (u.joint_damping < 0 ? 0.0 : p[u.joint_damping + joint]));
     if (u.rest >= 0) q.rest_angle[k] = p[u.rest + k];
@@ -178,6 +178,7 @@ std::vector<dynamics::Tangent> tangents(const chain::Chain& chain, const Unknown
   const auto zeros = [](int count) { return std::vector<double>(count, 0.0); };
   const double free_mass = u.total_mass - q.tip_mass;
   if (u.stiffness >= 0) out[u.stiffness].stiffness = q.stiffness;
+  if (u.grasp_stiffness >= 0) (out[u.grasp_stiffness].stiffness = zeros(n))[1] = q.stiffness[1];
   if (u.twist_stiffness >= 0) {
     auto& d = out[u.twist_stiffness].stiffness = q.stiffness;
     for (int k = 0; k < n; ++k)

@@ -18,7 +18,8 @@ struct Unknowns {
   std::vector<std::pair<std::string, std::string>> held;
 
   // first index of each group in p, -1 where the group is held
-  int stiffness = -1, twist_stiffness = -1, damping = -1, drag = -1, tip = -1, coulomb = -1, viscous = -1;
+  int stiffness = -1, twist_stiffness = -1, grasp_stiffness = -1, damping = -1, drag = -1, tip = -1, coulomb = -1,
+      viscous = -1;
   int joint_stiffness = -1, joint_damping = -1, link_mass = -1, rest = -1, theta = -1, thetadot = -1;
   double total_mass = 1.0;
   std::vector<double> compliance;  // an angle: reference over tributary length, times the shared stiffness and damping

@@ -157,6 +157,12 @@ Json identification_json(const Twin& twin) {
     out["covariance"].push_back(list(math::VectorX(e.covariance.row(row))));
   out["held"] = Json::array();
   for (const auto& [name, reason] : e.held) out["held"].push_back({{"name", name}, {"reason", reason}});
+  out["weak"] = Json::array();
+  for (const auto& weak : e.weak) {
+    Json parts = Json::object();
+    for (const auto& [name, component] : weak.parts) parts[name] = component;
+    out["weak"].push_back({{"singular_value", weak.singular_value}, {"direction", parts}});
+  }
   return out;
 }
 
@@ -388,6 +394,12 @@ dynamics::Estimates read_estimates(const Node& node) {
       e.covariance(static_cast<Eigen::Index>(row), column) = values[column];
   }
   for (const Node& held : node["held"].entries()) e.held.emplace_back(held["name"].text(), held["reason"].text());
+  if (node.has("weak"))  // absent in files of older versions
+    for (const Node& weak : node["weak"].entries()) {
+      e.weak.push_back({weak["singular_value"].number(), {}});
+      for (const auto& [name, component] : weak["direction"].members())
+        e.weak.back().parts.emplace_back(name, component.number());
+    }
   return e;
 }
 

@@ -1,0 +1,96 @@
+#!/bin/bash
+# new, rollout of a known rod, identify from markers and from several runs, and what they refuse. No Vulkan device.
+. "$(dirname "$0")/lib.sh"
+export VK_DRIVER_FILES=/nonexistent VK_ICD_FILENAMES=/nonexistent
+
+expect_error 2 'mass' new -o "$work/bad" --length 0.3 --mass 0
+expect_error 2 'mass' new -o "$work/bad" --length 0.3 --mass=-1
+expect_error 2 'length' new -o "$work/bad" --length 0
+expect_error 2 'bending-axis' new -o "$work/bad" --length 0.3 --bending-axis 0,0,1
+expect_error 2 'bending-stiffness: .*mass' new -o "$work/bad" --length 0.3 --bending-stiffness 1e-3
+[ -e "$work/bad" ] && fail 'new: a refused twin was written'
+
+# a known rod, moved along x, seen at three points
+base() {  # amplitude in m
+  awk -v a="$1" 'BEGIN { for (k = 0; k <= 300; ++k) { t = k / 100; e = 1 - exp(-(t / 0.4) ^ 3)
+    printf "%.2f %.9f 0 0.5 0 0 0 1\n", t, a * e * sin(2 * 3.14159265 * 0.7 * t) } }'
+}
+recording() {  # rod, amplitude, name: name.tum and name.csv
+  base "$2" >"$work/$3.tum"
+  run rollout "$work/$1" --base "$work/$3.tum" --rate 50 -o "$work/states.csv" --centerline "$work/line.csv"
+  expect_code 0 "rollout of $1"
+  # nodes of four joints: grasp, joints 1-4 (the first at the grasp), end
+  awk -F, -v base="$work/$3.tum" 'BEGIN { while ((getline line < base) > 0) { split(line, b, " "); x[b[1] + 0] = b[2] }
+      print "# marker a 0.15\n# marker b 0.225\n# marker c 0.3"
+      print "time,bx,by,bz,bqw,bqx,bqy,bqz,a_x,a_y,a_z,b_x,b_y,b_z,c_x,c_y,c_z" }
+    NR > 1 { t = sprintf("%.2f", $1) + 0
+      printf "%.2f,%.9f,0,0.5,1,0,0,0,%s,%s,%s,%s,%s,%s,%s,%s,%s\n", t, x[t], $11, $12, $13, $14, $15, $16, $17, $18, $19 }
+  ' "$work/line.csv" >"$work/$3.csv"
+}
+rod() {  # name, EI
+  run new -o "$work/$1" --length 0.3 --joints 4 --bending planar --mass 0.06 --bending-stiffness "$2" --retardation 0.08
+  expect_code 0 "new $1"
+}
+rod rod 4.5e-4
+rod stiff 4.5e-3
+recording rod 0.1 one
+recording rod 0.15 two
+recording stiff 0.1 other
+
+run new -o "$work/twin" --length 0.3 --joints 4 --bending planar --mass 0.06
+expect_code 0 'new'
+expect_error 1 'identif' rollout "$work/twin" --base "$work/one.tum" -o "$work/states.csv"
+run identify "$work/twin" --markers "$work/one.csv" "$work/two.csv"
+expect_code 0 'identify --markers'
+# EI over the length that one joint stands for: 4.5e-4 / 0.075 = 0.006, within 10 %
+awk '$1 == "log_stiffness" { exit !(exp($2) > 0.0054 && exp($2) < 0.0066) }' "$work/stdout" ||
+  fail "identify --markers: stiffness $(awk '$1 == "log_stiffness" { print exp($2) }' "$work/stdout") instead of 0.006"
+expect_output 'The data tell less than the priors' 'identify --markers'
+run identify "$work/twin" --markers "$work/one.csv" --json
+expect_code 0 'identify --json'
+expect_output '"weak"' 'identify --json'
+expect_error 2 'other.csv: is of another rope' identify "$work/twin" --markers "$work/one.csv" "$work/other.csv"
+
+# several runs: recognized states stand for themselves
+for name in one two other; do
+  run new -o "$work/run_$name" --length 0.3 --joints 4 --bending planar --mass 0.06
+  run identify "$work/run_$name" --markers "$work/$name.csv" --shape-only
+  expect_code 0 'identify --shape-only'
+done
+grep -q '"stiffness"' "$work/run_one/twin.json" && fail 'identify --shape-only: has dynamics'
+run identify "$work/run_one" "$work/run_two"
+expect_code 0 'identify RUN RUN'
+joints() { sed -n '/"joints"/,/"links"/p' "$work/$1/twin.json"; }
+[ "$(joints run_one)" = "$(joints run_two)" ] || fail 'identify RUN RUN: the parameters differ'
+cmp -s "$work/run_one/rollout.csv" "$work/run_two/rollout.csv" && fail 'identify RUN RUN: the rollouts do not differ'
+cp -r "$work/run_one" "$work/kept"
+expect_error 2 'another rope' identify "$work/run_one" "$work/run_other"
+cmp -s "$work/kept/twin.json" "$work/run_one/twin.json" || fail 'identify RUN RUN: a refused twin was written'
+expect_error 2 'named twice' identify "$work/run_one" "$work/run_one/"
+run new -o "$work/longer" --length 0.4 --joints 4 --bending planar --mass 0.06
+run identify "$work/longer" --markers "$work/one.csv" --shape-only
+expect_error 2 'another rope.*0\.4' identify "$work/run_one" "$work/longer"
+run new -o "$work/finer" --length 0.3 --joints 5 --bending planar --mass 0.06
+run identify "$work/finer" --markers "$work/one.csv" --shape-only
+expect_error 2 '5 joints' identify "$work/run_one" "$work/finer"
+expect_error 2 'markers: goes with one RUN' identify "$work/run_one" "$work/run_two" --markers "$work/one.csv"
+
+# marker files that are wrong in one way each
+refused() { expect_error 2 "$1" identify "$work/twin" --markers "$work/wrong.csv"; }
+before=$(cat "$work/twin/twin.json")
+sed '10{h;d};11{G}' "$work/one.csv" >"$work/wrong.csv"
+refused 'wrong\.csv:[0-9]+: the times do not increase'
+sed '10s/,[^,]*$//' "$work/one.csv" >"$work/wrong.csv"
+refused 'wrong\.csv:10: has 16 cells'
+sed '10s/,[^,]*$/,abc/' "$work/one.csv" >"$work/wrong.csv"
+refused "wrong\.csv:10: 'abc' is no number"
+sed '/^# marker/d' "$work/one.csv" >"$work/wrong.csv"
+refused 'no marker is named'
+sed 's/marker c 0.3/marker c 0.5/' "$work/one.csv" >"$work/wrong.csv"
+refused 'arclength 0\.5 .*another rope'
+sed 's/marker c 0.3/marker c 0.2/' "$work/one.csv" >"$work/wrong.csv"
+refused 'from the grasp.*another rope'
+head -6 "$work/one.csv" >"$work/wrong.csv"
+refused 'fewer than 3 rows'
+[ "$before" = "$(cat "$work/twin/twin.json")" ] || fail 'a refused file changed the twin'
+finish
