@@ -39,7 +39,7 @@ recording stiff 0.1 other
 
 run new -o "$work/twin" --length 0.3 --joints 4 --bending planar --mass 0.06
 expect_code 0 'new'
-expect_error 1 'identif' rollout "$work/twin" --base "$work/one.tum" -o "$work/states.csv"
+expect_error 2 'identif' rollout "$work/twin" --base "$work/one.tum" -o "$work/states.csv"
 run identify "$work/twin" --markers "$work/one.csv" "$work/two.csv"
 expect_code 0 'identify --markers'
 # EI over the length that one joint stands for: 4.5e-4 / 0.075 = 0.006, within 10 %
