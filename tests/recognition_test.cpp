@@ -1,6 +1,7 @@
 #include "chainsplat/recognition.h"
 
 #include <doctest/doctest.h>
+#include <unistd.h>
 
 #include <cmath>
 
@@ -61,8 +62,8 @@ TEST_CASE("the demo's first frames are recognized to half a millimeter, the same
 
 TEST_CASE("refined angles come back to where the picture was drawn") {
   // the target is drawn by the splatting itself at known angles; the start is off by 20 px at the tip
-  const chain::Chain chain = chain::make_chain(0.3, 0.02, -math::Vector3::UnitZ(), math::Vector3::UnitY(), 4,
-                                               chain::Bending::planar, false);
+  const chain::Chain chain =
+      chain::make_chain(0.3, 0.02, -math::Vector3::UnitZ(), math::Vector3::UnitY(), 4, chain::Bending::planar, false);
   capture::Capture capture;
   capture.cameras.resize(2);
   for (int c = 0; c < 2; ++c) {
@@ -74,8 +75,7 @@ TEST_CASE("refined angles come back to where the picture was drawn") {
     camera.world_from_camera.rotation.col(0) = math::Vector3(std::cos(0.4), side * std::sin(0.4), 0);
     camera.world_from_camera.rotation.col(1) = -math::Vector3::UnitZ();
     camera.world_from_camera.rotation.col(2) = math::Vector3(-side * std::sin(0.4), std::cos(0.4), 0);
-    camera.world_from_camera.translation =
-        math::Vector3(0, 0, -0.15) - 0.9 * camera.world_from_camera.rotation.col(2);
+    camera.world_from_camera.translation = math::Vector3(0, 0, -0.15) - 0.9 * camera.world_from_camera.rotation.col(2);
   }
   capture.base = trajectory::fit({{0.0, math::Pose{}}}, "test");
   splat::Gaussians g;
@@ -130,32 +130,50 @@ TEST_CASE("refined angles come back to where the picture was drawn") {
   check_silent();
 }
 
-TEST_CASE("a damaged checkpoint, and one of another job, are refused") {
-  const Path folder = std::filesystem::temp_directory_path() / "chainsplat_recognition_test";
+TEST_CASE("a damaged checkpoint gives way to the one before; one of another job is refused") {
+  const Path folder = std::filesystem::temp_directory_path() / ("chainsplat_checkpoint_" + std::to_string(getpid()));
   std::filesystem::remove_all(folder);
+  static std::vector<std::string> warnings;
+  warnings.clear();
+  core::set_listener({[](const std::string& line) { warnings.push_back(line); }, {}});
   CHECK_FALSE(load_checkpoint(folder, "job"));
   Checkpoint c;
   c.job = "job";
-  c.stage = 3;
   c.states.time = {0.0, 0.1};
   c.states.theta = {math::VectorX::Ones(2), math::VectorX::Zero(2)};
-  c.snapshot.gaussians.resize(2, 3, 1);
-  save_checkpoint(c, folder);
+  c.gaussians.resize(2, 3, 1);
+  c.snapshot.gaussians.resize(1, 3, 0);
+  c.watch.least_loss = 0.25;
+  for (c.stage = 3; c.stage <= 4; ++c.stage) save_checkpoint(c, folder);
   const auto back = load_checkpoint(folder, "job");
   REQUIRE(back);
-  CHECK(back->stage == 3);
+  CHECK(back->stage == 4);
   CHECK(back->states.theta[0] == c.states.theta[0]);
-  CHECK(back->snapshot.gaussians.sh.size() == 24);
+  CHECK(back->gaussians.sh.size() == 24);
+  CHECK(back->snapshot.gaussians.count == 1);
+  CHECK(back->watch.least_loss == 0.25);
   CHECK_THROWS_AS(load_checkpoint(folder, "another job"), InputError);
-  const Path file = folder / "recognize.bin";
-  std::string bytes = core::read_file(file);
-  for (const std::size_t place : {std::size_t{3}, bytes.size() / 2, bytes.size() - 1}) {
+  CHECK(warnings.empty());
+  const Path last = folder / "recognize.bin", before = folder / "recognize.before.bin";
+  const std::string bytes = core::read_file(last), whole = core::read_file(before);
+  for (const std::size_t place : {std::size_t{3}, std::size_t{30}, bytes.size() / 2, bytes.size() - 1}) {
     std::string damaged = bytes;
     damaged[place] ^= 1;
-    core::write_file(file, damaged);
-    CHECK_THROWS_AS(load_checkpoint(folder, "job"), InputError);
+    core::write_file(last, damaged);
+    REQUIRE(load_checkpoint(folder, "job"));
+    CHECK(load_checkpoint(folder, "job")->stage == 3);
   }
-  core::write_file(file, bytes.substr(0, bytes.size() - 5));
-  CHECK_THROWS_AS(load_checkpoint(folder, "job"), InputError);
+  CHECK(warnings.size() == 8);
+  for (const std::size_t length : {std::size_t{0}, std::size_t{10}, bytes.size() - 5}) {
+    core::write_file(last, bytes.substr(0, length));
+    CHECK(load_checkpoint(folder, "job")->stage == 3);
+  }
+  std::filesystem::remove(last);  // as a kill between the two renames leaves it
+  CHECK(load_checkpoint(folder, "job")->stage == 3);
+  core::write_file(last, bytes.substr(0, 40));
+  core::write_file(before, whole.substr(0, whole.size() - 1));
+  CHECK_FALSE(load_checkpoint(folder, "job"));
+  CHECK(warnings.back().find("begins anew") != std::string::npos);
+  core::set_listener({});
   std::filesystem::remove_all(folder);
 }

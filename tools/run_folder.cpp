@@ -1,8 +1,15 @@
 #include "run_folder.h"
 
+#include <fcntl.h>
+#include <sys/file.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <cerrno>
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
 #include <sstream>
 
 #include "cli.h"
@@ -20,6 +27,45 @@ twin::Twin twin_in_scene(const capture::Capture& capture) {
   twin.known_mass = capture.mass.has_value();
   if (capture.mass) twin.provenance.options["mass"] = core::exact(*capture.mass);
   return twin;
+}
+
+FolderLock::FolderLock(const Path& file) : file_(::open(file.c_str(), O_RDWR | O_CREAT | O_CLOEXEC, 0644)) {
+  if (file_ < 0)
+    throw WorkError(file.string(), std::string("cannot be made (") + std::strerror(errno) + ")",
+                    "make room or choose a folder that can be written");
+  const int refused = ::flock(file_, LOCK_EX | LOCK_NB) == 0 ? 0 : errno;
+  // the file can be gone since it was opened: its owner removes it when all is done
+  struct stat held {
+  }, named{};
+  const bool gone = ::fstat(file_, &held) != 0 || ::stat(file.c_str(), &named) != 0 || held.st_ino != named.st_ino;
+  if (refused == EWOULDBLOCK || gone) {
+    ::close(file_);
+    throw InputError(file.parent_path().parent_path().string(), "another process works in this folder",
+                     "wait for it to end, or name another folder");
+  }
+  if (refused)
+    core::warn(file.string() + ": cannot be locked (" + std::strerror(refused) +
+               "); see to it that no other process works in this folder");
+}
+
+FolderLock::~FolderLock() { ::close(file_); }
+
+bool is_locked(const Path& file) {
+  const int opened = ::open(file.c_str(), O_RDONLY | O_CLOEXEC);
+  if (opened < 0) return false;
+  const bool locked = ::flock(opened, LOCK_SH | LOCK_NB) != 0 && errno == EWOULDBLOCK;
+  ::close(opened);
+  return locked;
+}
+
+void remove_half_written(const Path& folder) {
+  std::error_code ignored;
+  for (const auto& entry : std::filesystem::directory_iterator(folder, ignored)) {
+    const std::string ending = entry.path().extension().string();
+    if (ending.starts_with(".tmp") && ending.size() > 4 &&
+        ending.find_first_not_of("0123456789", 4) == std::string::npos)
+      std::filesystem::remove(entry.path(), ignored);
+  }
 }
 
 twin::Twin load_twin(const Path& run) {

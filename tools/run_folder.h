@@ -14,6 +14,24 @@ inline constexpr const char* kCovarianceFile = "covariance.csv";  // of the reco
 inline constexpr const char* kMetricsFile = "metrics.json";
 inline constexpr const char* kLogFile = "log.jsonl";
 inline constexpr const char* kCheckpointFolder = "checkpoint";
+inline constexpr const char* kLockFile = "checkpoint/lock";  // held by the process that trains
+
+// One process at a time in a folder: the lock ends with the process, however that ends.
+class FolderLock {
+ public:
+  // Makes `file` and locks it. Throws InputError when another process has it; warns where the file system has no locks.
+  explicit FolderLock(const Path& file);
+  ~FolderLock();
+  FolderLock(const FolderLock&) = delete;
+  FolderLock& operator=(const FolderLock&) = delete;
+
+ private:
+  int file_ = -1;
+};
+bool is_locked(const Path& file);  // by any process; makes nothing
+
+// Removes what a killed process left half-written in `folder` (core::write_file's temporary files).
+void remove_half_written(const Path& folder);
 
 // A twin that knows what the capture says of its scene, and nothing yet of the rope.
 twin::Twin twin_in_scene(const capture::Capture& capture);

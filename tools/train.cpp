@@ -69,13 +69,21 @@ void stop_if_asked() {
   if (const int signal = core::stop_requested()) throw Interrupted(signal);
 }
 
-// All that a training writes.
-void remove_results(const Path& out) {
+// All that a training writes; of the checkpoint folder only when `checkpoint`.
+void remove_results(const Path& out, bool checkpoint = true) {
   std::error_code ignored;
   for (const char* name :
        {"twin.json", "gaussians.ply", "states.csv", "rollout.csv", kMetricsFile, kLogFile, kBaseFile, kCovarianceFile})
     fs::remove(out / name, ignored);
-  fs::remove_all(out / kCheckpointFolder, ignored);
+  if (checkpoint) fs::remove_all(out / kCheckpointFolder, ignored);
+}
+
+// For --force: all but the lock that this process holds.
+void remove_old(const Path& out) {
+  remove_results(out, false);
+  std::error_code ignored;
+  for (const auto& entry : fs::directory_iterator(out / kCheckpointFolder, ignored))
+    if (entry.path() != out / kLockFile) fs::remove_all(entry.path(), ignored);
 }
 
 // The same failure, with what is kept named in its last part.
@@ -225,9 +233,12 @@ void train(const Globals& globals, const Request& request) {
   stop_if_asked();
 
   const bool was_there = fs::exists(out);
-  if (request.force) remove_results(out);
+  make_folder(out / kCheckpointFolder);
+  const FolderLock lock(out / kLockFile);
+  remove_half_written(out);
+  remove_half_written(out / kCheckpointFolder);
+  if (request.force) remove_old(out);
   try {
-    make_folder(out / kCheckpointFolder);
     log_to(out / kLogFile);
     core::write_file(out / kBaseFile, trajectory::write_tum(capture.base.samples()));
     if (recognize) {

@@ -25,6 +25,7 @@ struct Options {
   int budget = 0;  // most Gaussians (fast); 0: 100 a diameter of the rope's length (1,500 for 30 cm of 2 cm)
   int paper_gaussians = 5000;
   int paper_iterations = 30000;
+  double step = 1.0;    // of Adam's usual step sizes (fast); lowered by itself where the optimization runs away
   Path checkpoint;      // folder for checkpoints; empty: none
   bool resume = false;  // continue from the checkpoint when one is there
 };

@@ -59,6 +59,7 @@ struct LossValues {
   double total = 0.0;
   std::vector<double> l1, ssim, mask;  // one a view: means over the view's `normalizer` pixels
   std::vector<double> psnr_object;     // dB over pixels with mask >= 128
+  int not_finite = 0;                  // step() only: parameters left alone because their gradient was NaN or infinite
 };
 
 struct Settings {

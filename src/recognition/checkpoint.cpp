@@ -6,8 +6,9 @@ namespace chainsplat::recognition {
 
 namespace {
 
-constexpr char kMagic[] = "chainsplat-checkpoint/1\n";
+constexpr char kMagic[] = "chainsplat-checkpoint/2\n";
 constexpr char kFile[] = "recognize.bin";
+constexpr char kFileBefore[] = "recognize.before.bin";
 
 struct Writer {
   std::string bytes;
@@ -43,6 +44,24 @@ struct Reader {
   }
 };
 
+void put_gaussians(Writer& w, const splat::Gaussians& g) {
+  w.put(g.count);
+  w.put(g.links);
+  w.put(g.degree);
+  for (const auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
+    w.put_all(*part);
+}
+
+splat::Gaussians get_gaussians(Reader& r) {
+  splat::Gaussians g;
+  g.count = r.get<int>();
+  g.links = r.get<int>();
+  g.degree = r.get<int>();
+  for (auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
+    *part = r.get_all<float>();
+  return g;
+}
+
 std::vector<double> flat(const std::vector<math::VectorX>& rows) {
   std::vector<double> all;
   for (const auto& row : rows) all.insert(all.end(), row.data(), row.data() + row.size());
@@ -57,24 +76,62 @@ std::vector<math::VectorX> rows_of(const std::vector<double>& all, std::size_t c
   return rows;
 }
 
+// None when it is damaged.
+std::optional<Checkpoint> parse(const std::string& bytes) {
+  const std::size_t head = sizeof kMagic - 1 + sizeof(std::uint64_t);
+  if (bytes.size() < head || bytes.compare(0, sizeof kMagic - 1, kMagic) != 0) return std::nullopt;
+  Reader sum{std::string_view(bytes).substr(sizeof kMagic - 1)};
+  if (sum.get<std::uint64_t>() != core::fnv1a(std::string_view(bytes).substr(head))) return std::nullopt;
+  Reader r{std::string_view(bytes).substr(head)};
+  try {
+    Checkpoint c;
+    const auto name = r.get_all<char>();
+    c.job.assign(name.begin(), name.end());
+    c.stage = r.get<int>();
+    c.step = r.get<int>();
+    c.watch.smooth_loss = r.get<double>();
+    c.watch.least_loss = r.get<double>();
+    c.watch.bad_steps = r.get<int>();
+    c.watch.bad_in_a_row = r.get<int>();
+    c.watch.restarts = r.get<int>();
+    c.spatial = r.get<bool>();
+    c.out_of_plane_rms = r.get<double>();
+    c.deviation = r.get<double>();
+    c.states.time = r.get_all<double>();
+    c.states.theta = rows_of(r.get_all<double>(), c.states.time.size());
+    c.states.thetadot = rows_of(r.get_all<double>(), c.states.time.size());
+    c.gaussians = get_gaussians(r);
+    c.snapshot.gaussians = get_gaussians(r);
+    c.snapshot.first_moment = r.get_all<float>();
+    c.snapshot.second_moment = r.get_all<float>();
+    c.snapshot.step = r.get<int>();
+    c.extra = r.get_all<double>();
+    return c;
+  } catch (const std::out_of_range&) {
+    return std::nullopt;
+  }
+}
+
 }  // namespace
 
 void save_checkpoint(const Checkpoint& c, const Path& folder) {
   Writer w;
   w.put_all(std::vector<char>(c.job.begin(), c.job.end()));
   w.put(c.stage);
+  w.put(c.step);
+  w.put(c.watch.smooth_loss);
+  w.put(c.watch.least_loss);
+  w.put(c.watch.bad_steps);
+  w.put(c.watch.bad_in_a_row);
+  w.put(c.watch.restarts);
   w.put(c.spatial);
   w.put(c.out_of_plane_rms);
   w.put(c.deviation);
   w.put_all(c.states.time);
   w.put_all(flat(c.states.theta));
   w.put_all(flat(c.states.thetadot));
-  const splat::Gaussians& g = c.snapshot.gaussians;
-  w.put(g.count);
-  w.put(g.links);
-  w.put(g.degree);
-  for (const auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
-    w.put_all(*part);
+  put_gaussians(w, c.gaussians);
+  put_gaussians(w, c.snapshot.gaussians);
   w.put_all(c.snapshot.first_moment);
   w.put_all(c.snapshot.second_moment);
   w.put(c.snapshot.step);
@@ -82,49 +139,28 @@ void save_checkpoint(const Checkpoint& c, const Path& folder) {
   Writer head;
   head.put(core::fnv1a(w.bytes));
   std::filesystem::create_directories(folder);
+  // a kill between the two leaves the one before, which is as good
+  std::error_code absent;
+  std::filesystem::rename(folder / kFile, folder / kFileBefore, absent);
   core::write_file(folder / kFile, kMagic + head.bytes + w.bytes);
 }
 
 std::optional<Checkpoint> load_checkpoint(const Path& folder, const std::string& job) {
-  const Path file = folder / kFile;
-  if (!std::filesystem::exists(file)) return std::nullopt;
-  const std::string bytes = core::read_file(file);
-  const std::size_t head = sizeof kMagic - 1 + sizeof(std::uint64_t);
-  const auto damaged = [&] {
-    return InputError(file.string(), "the checkpoint is damaged", "remove it and train anew");
-  };
-  if (bytes.size() < head || bytes.compare(0, sizeof kMagic - 1, kMagic) != 0) throw damaged();
-  Reader sum{std::string_view(bytes).substr(sizeof kMagic - 1)};
-  if (sum.get<std::uint64_t>() != core::fnv1a(std::string_view(bytes).substr(head))) throw damaged();
-  Reader r{std::string_view(bytes).substr(head)};
-  try {
-    Checkpoint c;
-    const auto name = r.get_all<char>();
-    c.job.assign(name.begin(), name.end());
-    if (c.job != job)
-      throw InputError(file.string(), "the checkpoint is of another job (" + c.job + ")",
+  bool damaged = false;
+  for (const char* name : {kFile, kFileBefore}) {
+    const Path file = folder / name;
+    std::error_code error;
+    if (!std::filesystem::exists(file, error)) continue;
+    std::optional<Checkpoint> found = parse(core::read_file(file));
+    if (found && found->job != job)
+      throw InputError(file.string(), "the checkpoint is of another job (" + found->job + ")",
                        "resume with the options that it was started with, or start anew with --force");
-    c.stage = r.get<int>();
-    c.spatial = r.get<bool>();
-    c.out_of_plane_rms = r.get<double>();
-    c.deviation = r.get<double>();
-    c.states.time = r.get_all<double>();
-    c.states.theta = rows_of(r.get_all<double>(), c.states.time.size());
-    c.states.thetadot = rows_of(r.get_all<double>(), c.states.time.size());
-    splat::Gaussians& g = c.snapshot.gaussians;
-    g.count = r.get<int>();
-    g.links = r.get<int>();
-    g.degree = r.get<int>();
-    for (auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
-      *part = r.get_all<float>();
-    c.snapshot.first_moment = r.get_all<float>();
-    c.snapshot.second_moment = r.get_all<float>();
-    c.snapshot.step = r.get<int>();
-    c.extra = r.get_all<double>();
-    return c;
-  } catch (const std::out_of_range&) {
-    throw damaged();
+    if (found) return found;
+    damaged = true;
+    core::warn(file.string() + ": the checkpoint is damaged or of another version and is passed over");
   }
+  if (damaged) core::warn(folder.string() + ": no checkpoint is whole, recognition begins anew");
+  return std::nullopt;
 }
 
 }  // namespace chainsplat::recognition

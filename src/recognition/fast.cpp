@@ -5,6 +5,7 @@
 #include "src/recognition/checkpoint.h"
 #include "src/recognition/modes.h"
 #include "src/recognition/place_gaussians.h"
+#include "src/recognition/step_watch.h"
 
 namespace chainsplat::recognition {
 
@@ -19,6 +20,7 @@ constexpr double kFirstShare = 0.8;  // of the budget, placed at the start; the 
 constexpr int kAngleIterations = 1;  // Gauss-Newton steps a round and frame
 constexpr int kFinalIterations = 1;  // for every frame, at the end
 constexpr int kFinalSteps = 120;     // Adam steps after the last round, rates falling
+constexpr int kMostRestarts = 3;     // of a round that runs away, each with smaller steps
 constexpr int kShRound = 1;  // from this round on colors depend on the view (SH degree 1): +0.7 dB in the object
 
 }  // namespace
@@ -78,7 +80,8 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   const double by_size = std::clamp(kGaussiansADiameter * capture.length / capture.diameter, kLeastBudget, kMostBudget);
   const int budget = options.budget > 0 ? options.budget : static_cast<int>(std::lround(by_size));
   const int added_a_round = std::max(1, budget / 10);
-  int done_steps = 0, first_round = 0;
+  int first_round = 0;
+  StepWatch watch;
   splat::Gaussians gaussians;
   chain::States states;
   AnglePrior prior;
@@ -90,9 +93,9 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
                       before->deviation};
     result.chain = make(result.bending.bending);
     states = before->states;
-    gaussians = before->snapshot.gaussians;
+    gaussians = before->gaussians;
     first_round = before->stage;
-    done_steps = first_round * kSteps;
+    watch = before->watch;
   } else {
     // coarse: silhouettes
     core::report({"recognize", 0, total_steps, NAN, NAN, "silhouettes"});
@@ -154,26 +157,32 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
 
   const int batch_size = std::min<int>(kBatch, static_cast<int>(training.views.size()));
   double loss = NAN, psnr = NAN;
-  const auto checkpoint = [&](int round) {
+  const auto checkpoint = [&](int round, int step) {
     if (options.checkpoint.empty()) return;
     Checkpoint c;
     c.job = job;
     c.stage = round;
+    c.step = step;
+    c.watch = watch;
     c.spatial = result.bending.bending == chain::Bending::spatial;
     c.out_of_plane_rms = result.bending.out_of_plane_rms;
     c.deviation = result.bending.deviation;
     c.states = states;
-    c.snapshot.gaussians = gaussians;
+    c.gaussians = gaussians;
+    if (step > 0) c.snapshot = engine.snapshot();
     for (const math::VectorX& theta : coarse) c.extra.insert(c.extra.end(), theta.data(), theta.data() + theta.size());
     for (const math::MatrixX& m : prior.information) c.extra.insert(c.extra.end(), m.data(), m.data() + m.size());
     save_checkpoint(c, options.checkpoint);
   };
-  const auto adam = [&](int steps, core::Random& random, const std::string& note) {
+  // Adam's steps of one round (the last is the polish). Which views make a batch depends on the round alone: a resumed
+  // one draws those of the steps before `first_step` again. False: the optimization ran away.
+  const auto adam = [&](int round, int first_step, core::Random& random) {
+    const std::string note =
+        round < kRounds ? "round " + std::to_string(round + 1) + " of " + std::to_string(kRounds) : "last polish";
     std::vector<int> order(training.views.size());
     std::iota(order.begin(), order.end(), 0);
     std::size_t next = order.size();
-    for (int step = 0; step < steps; ++step) {
-      if (const int signal = core::stop_requested()) throw Interrupted(signal);
+    for (int step = 0; step < (round < kRounds ? kSteps : kFinalSteps); ++step) {
       std::vector<int> batch;
       while (static_cast<int>(batch.size()) < batch_size) {
         if (next == order.size()) {
@@ -182,20 +191,26 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
         }
         batch.push_back(order[next++]);
       }
+      if (step < first_step) continue;
+      if (const int signal = core::stop_requested()) {
+        checkpoint(round, step);
+        throw Interrupted(signal);
+      }
       constexpr int kReadEvery = 10;
       const bool read = step % kReadEvery == 0;
+      const int done_steps = round * kSteps + step + 1;
       const splat::LossValues values =
-          engine.step(batch, kLossWeights, rates(static_cast<double>(done_steps) / total_steps, 1.0), read);
-      ++done_steps;
+          engine.step(batch, kLossWeights,
+                      rates(static_cast<double>(done_steps - 1) / total_steps, options.step * step_scale(watch)), read);
+      if (watch_gradients(watch, values.not_finite, done_steps) == Course::diverged) return false;
       if (read) {
         loss = values.total / static_cast<double>(batch.size());
         psnr = mean(values.psnr_object);
-        if (!std::isfinite(loss))
-          throw WorkError("recognize", "the loss is not finite at step " + std::to_string(done_steps),
-                          "report the capture; try another --seed");
+        if (watch_loss(watch, loss) == Course::diverged) return false;
         core::report({"recognize", done_steps, total_steps, loss, psnr, note});
       }
     }
+    return true;
   };
   const Draw draw_training = [&](std::span<const int> views, std::span<const std::vector<math::Pose>> motions) {
     std::vector<int> batch;
@@ -205,12 +220,40 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     }
     return engine.draw_views(batch, true);
   };
-  for (int round = first_round; round < kRounds; ++round) {
-    checkpoint(round);
-    core::Random random(options.seed * 1000003 + 100 + round);
-    const std::string note = "round " + std::to_string(round + 1) + " of " + std::to_string(kRounds);
-    engine.set_gaussians(gaussians);
-    adam(kSteps, random, note);
+  for (int round = first_round; round <= kRounds; ++round) {
+    const bool polish = round == kRounds;
+    core::Random random(options.seed * 1000003 + (polish ? 999 : 100 + round));
+    int first_step = 0;
+    if (before && round == first_round && before->step > 0) {
+      first_step = before->step;
+      engine.restore(before->snapshot);
+    } else {
+      begin_round(watch);
+      checkpoint(round, 0);
+      engine.set_gaussians(gaussians);
+    }
+    if (!adam(round, first_step, random)) {
+      // once more from the round's start, with smaller steps from here on
+      ++watch.restarts;
+      const std::string trouble = watch.bad_in_a_row > 0 ? "gradients are not finite" : "the loss runs away";
+      if (watch.restarts > kMostRestarts)
+        throw WorkError("recognize",
+                        trouble + " in round " + std::to_string(round + 1) + " at step sizes down to " +
+                            core::exact(step_scale(watch)) + " of the usual ones",
+                        "look at the capture with 'chainsplat check'; if it is sound, report it");
+      core::warn("recognize: " + trouble + " in round " + std::to_string(round + 1) +
+                 "; it is repeated from its start with steps of " + core::exact(step_scale(watch)) +
+                 " of the usual ones");
+      watch.bad_in_a_row = 0;
+      before.reset();
+      --round;
+      continue;
+    }
+    if (polish) {
+      gaussians = engine.gaussians();
+      checkpoint(kRounds + 1, 0);
+      break;
+    }
     RefineOptions refine;
     refine.iterations = kAngleIterations;
     refine.mask_weight = kAngleMaskWeight;
@@ -229,14 +272,6 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
       if (round + 1 == kShRound && gaussians.degree == 0) gaussians.resize(gaussians.count, gaussians.links, 1);
     }
   }
-  checkpoint(kRounds);
-  {
-    core::Random random(options.seed * 1000003 + 999);
-    engine.set_gaussians(gaussians);
-    adam(kFinalSteps, random, "last polish");
-    gaussians = engine.gaussians();
-  }
-
   // every frame: start from the silhouettes plus the correction of the training frames around it
   core::report({"recognize", total_steps, total_steps, loss, psnr, "all frames"});
   chain::States correction;

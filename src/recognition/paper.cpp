@@ -7,6 +7,7 @@
 
 #include "src/recognition/checkpoint.h"
 #include "src/recognition/modes.h"
+#include "src/recognition/step_watch.h"
 
 namespace chainsplat::recognition {
 
@@ -153,11 +154,13 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
   for (auto& m : moments) m.first = m.second = math::VectorX::Zero(chain.angles());
   core::Random random(options.seed * 1000003 + 7);
   int first = 0;
+  StepWatch watch;
   std::optional<Checkpoint> before;
   if (options.resume && !options.checkpoint.empty()) before = load_checkpoint(options.checkpoint, job);
   if (before) {
     states = before->states;
     first = before->stage;
+    watch = before->watch;
     engine.restore(before->snapshot);
     const double* from = before->extra.data();
     for (auto& m : moments) {
@@ -195,6 +198,7 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
     c.job = job;
     c.stage = iteration;
     c.spatial = result.bending.bending == chain::Bending::spatial;
+    c.watch = watch;
     c.states = states;
     c.snapshot = engine.snapshot();
     for (const auto& m : moments) {
@@ -234,6 +238,11 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
     const int batch[] = {static_cast<int>(v)};
     std::vector<math::MatrixX> twists;
     const splat::LossValues values = engine.step(batch, weights, rates, read, &twists);
+    // no restart with smaller steps: the paper's rates are what this mode is for
+    if (watch_gradients(watch, values.not_finite, iteration + 1) == Course::diverged ||
+        (read && !std::isfinite(values.total)))
+      throw WorkError("recognize", "losses or gradients are not finite at iteration " + std::to_string(iteration + 1),
+                      "try --mode fast or another --seed");
     if (read)
       core::report(
           {"recognize", iteration, options.paper_iterations, values.total, values.psnr_object[0], "paper mode"});

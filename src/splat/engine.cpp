@@ -140,6 +140,7 @@ struct Engine::State {
   Buffer entries, long_tiles, sort_scratch, sorted, partials;
   Buffer image, depth_image, pixel_gradient, ssim_row_sums, ssim_factors;
   std::uint32_t live_capacity = 0, instance_capacity = 0;
+  int not_finite = 0;        // gradients of the last run that Adam left alone
   int most_views = 1 << 20;  // of one submission, lowered when a buffer would pass the device's limit
   std::vector<gpu::Timing> timings;
 
@@ -566,6 +567,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   if (read[shared::kCounterTooLong] != 0)
     throw WorkError("splat", "more than " + std::to_string(shared::kLongestList) + " Gaussians cover one tile",
                     "use fewer or smaller Gaussians");
+  not_finite = static_cast<int>(read[shared::kCounterNotFinite]);
   if (read[shared::kCounterOverflow] == 0) return true;
   // raise what was too small, as far as one buffer may reach
   const std::size_t want_live = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantLive]) + 64;
@@ -819,6 +821,7 @@ LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, 
     if (twists)
       for (math::MatrixX& twist : s.twists(scene, chunk)) twists->push_back(std::move(twist));
   });
+  values.not_finite = s.not_finite;
   return values;
 }
 

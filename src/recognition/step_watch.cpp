@@ -1,0 +1,37 @@
+#include "src/recognition/step_watch.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace chainsplat::recognition {
+
+double step_scale(const StepWatch& watch) {
+  constexpr double kSmaller = 0.25;
+  return std::pow(kSmaller, watch.restarts);
+}
+
+void begin_round(StepWatch& watch) { watch.smooth_loss = watch.least_loss = -1.0; }
+
+Course watch_loss(StepWatch& watch, double loss) {
+  // A loss is that of a few views, and views differ: of 90 readings of sound trainings the smoothed one was never more
+  // than kUsual times the least before it.
+  constexpr double kNew = 0.3, kTooMuch = 3.0;
+  if (!std::isfinite(loss)) return Course::diverged;
+  watch.smooth_loss = watch.smooth_loss < 0 ? loss : (1 - kNew) * watch.smooth_loss + kNew * loss;
+  watch.least_loss = watch.least_loss < 0 ? watch.smooth_loss : std::min(watch.least_loss, watch.smooth_loss);
+  return watch.smooth_loss > kTooMuch * watch.least_loss ? Course::diverged : Course::fine;
+}
+
+Course watch_gradients(StepWatch& watch, int not_finite, int step) {
+  constexpr int kPersistent = 20;  // steps: transient trouble passes sooner
+  if (not_finite == 0) {
+    watch.bad_in_a_row = 0;
+    return Course::fine;
+  }
+  if (watch.bad_steps++ == 0)
+    core::warn("recognize: at step " + std::to_string(step) + " the gradient of " + std::to_string(not_finite) +
+               " parameters is not finite; they are left as they are");
+  return ++watch.bad_in_a_row >= kPersistent ? Course::diverged : Course::fine;
+}
+
+}  // namespace chainsplat::recognition
