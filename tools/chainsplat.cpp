@@ -67,6 +67,8 @@ int run(int argc, char** argv) {
   tools::add_force_commands(app, globals, job);
   tools::add_planning_commands(app, globals, job);
   tools::add_inspection_commands(app, globals, job);
+  tools::add_batch_command(app, globals, job);
+  tools::add_diff_command(app, globals, job);
   tools::add_new_command(app, globals, job);
   tools::add_bench_command(app, globals, job);
   for (CLI::App* command : app.get_subcommands({})) {

@@ -53,6 +53,14 @@ struct DeviceOptions {
   std::string selector;
   bool validation = false;  // needs the layer; throws InputError when it is missing
   bool least = false;       // as on the least device: descriptor sets, staged transfers (for tests)
+  // faults, for tests; 0: none
+  std::uint64_t most_bytes = 0;    // of all buffers together: beyond it, as if the device's memory were full
+  std::uint64_t most_submits = 0;  // after so many the device is lost
+};
+
+// There is no room for a buffer: the caller can try again with less work at a time.
+struct OutOfMemory : WorkError {
+  using WorkError::WorkError;
 };
 
 class Device;  // opened device; keep it alive longer than what was made from it
@@ -74,7 +82,7 @@ enum class Domain {
 class Buffer {
  public:
   Buffer();
-  // Its content is undefined until written. Throws WorkError: out of device memory, or larger than max_storage_range.
+  // Its content is undefined until written. Throws OutOfMemory, or WorkError when larger than max_storage_range.
   Buffer(Device& device, std::size_t bytes, Domain domain, const char* name);
   Buffer(Buffer&&) noexcept;
   Buffer& operator=(Buffer&&) noexcept;

@@ -9,20 +9,20 @@ using uint = unsigned;
 
 // One view of the batch. Camera frame: OpenCV axes, origin at the camera center. Crop pixels.
 struct SplatView {
-  vec4 intrinsics;     // fx, fy, cx - x0, cy - y0 (px)
-  vec4 limits;         // x, y: largest |x/z|, |y/z| in the projection's Jacobian (SPEC 2.5); z, w unused
-  vec4 moment_point;   // xyz: base origin in the camera frame (m), about which link moments are summed; w unused
-  uint width, height;  // px of the crop
+  vec4 intrinsics;   // fx, fy, cx - x0, cy - y0 (px)
+  vec4 limits;       // x, y: largest |x/z|, |y/z| in the projection's Jacobian (SPEC 2.5); z, w unused
+  vec4 moment_point; // xyz: base origin in the camera frame (m), about which link moments are summed; w unused
+  uint width, height;            // px of the crop
   uint tiles_x, tiles_y;
-  uint tile_map;  // first entry in the tile map (grid cell -> active tile or kNoTile)
-  uint pixel;     // first pixel in the image buffers
-  uint target;    // first pixel in the target buffer
-  uint motion;    // first link pose, in units of one pose (3 vec4 rows of camera_from_home)
+  uint tile_map;                 // first entry in the tile map (grid cell -> active tile or kNoTile)
+  uint pixel;                    // first pixel in the image buffers
+  uint target;                   // first pixel in the target buffer
+  uint motion;                   // first link pose, in units of one pose (3 vec4 rows of camera_from_home)
 };
 
 // One active tile: a tile of a view that is blended and charged.
 struct SplatTile {
-  uint view, x, y, padding;  // x, y in tiles
+  uint view, x, y, padding;      // x, y in tiles
 };
 
 struct SplatPush {
@@ -34,8 +34,8 @@ struct SplatPush {
 };
 
 const uint kNoTile = 0xffffffffu;
-const uint kScanBlock = 1024u;  // elements one group scans
-const uint kGroup = 64u;        // invocations of the passes that run one invocation an item
+const uint kScanBlock = 1024u;      // elements one group scans
+const uint kGroup = 64u;            // invocations of the passes that run one invocation an item
 
 // counters[]: filled by scan_sums
 const uint kCounterLive = 0u;       // live replicas R
@@ -49,13 +49,12 @@ const uint kCounterTooLong = 9u;    // not 0: a tile's list is longer than kLong
 const uint kCounterLongTiles = 10u; // 3 uints: groups of splat_sort_long; the host sets the last two
 const uint kCounterNotFinite = 13u; // gradients that Adam left alone
 const uint kCounters = 16u;
-const uint kLongestList = 32768u;  // entries of a tile that sorting and blending get through on every device
+const uint kLongestList = 32768u;   // entries of a tile that sorting and blending get through on every device
 
-const uint kFlagAccumulate = 1u;  // gradients of this chunk of views are added to those before
+const uint kFlagAccumulate = 1u;    // gradients of this chunk of views are added to those before
 
 // splat record: 3 vec4
-//   0: u (px), opacity, depth (m)   1: conic xx, xy, yy, tile rectangle x0 | x1 << 16   2: color, rectangle y0 | y1 <<
-//   16
+//   0: u (px), opacity, depth (m)   1: conic xx, xy, yy, tile rectangle x0 | x1 << 16   2: color, rectangle y0 | y1 << 16
 const uint kSplatRows = 3u;
 // gradient record of one (replica, view): 6 vec4
 //   0: mean (home), opacity   1: rotation   2: log scale   3: color   4: link moment   5: link force (camera frame)

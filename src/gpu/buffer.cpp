@@ -56,6 +56,7 @@ void in_parts(Device& device, std::size_t bytes, Transfer transfer) {
 Buffer::Handles::~Handles() {
   vkDestroyBuffer(device->handle, buffer, nullptr);
   vkFreeMemory(device->handle, memory, nullptr);  // unmaps too
+  device->buffer_bytes -= allocated;
 }
 
 Buffer::Buffer(Device& device, std::size_t bytes, Domain domain, const char* name)
@@ -63,8 +64,9 @@ Buffer::Buffer(Device& device, std::size_t bytes, Domain domain, const char* nam
   handles_->device = &device;
   const std::string where = "device " + device.info.name;
   if (bytes > device.info.max_storage_range) {
-    throw WorkError(where, std::string("buffer '") + name + "' needs " + mebibytes(bytes) +
-                               ", the device binds at most " + mebibytes(device.info.max_storage_range),
+    throw WorkError(where,
+                    std::string("buffer '") + name + "' needs " + mebibytes(bytes) + ", the device binds at most " +
+                        mebibytes(device.info.max_storage_range),
                     "use a smaller picture, fewer Gaussians or fewer views at a time");
   }
   auto create = of_type<VkBufferCreateInfo>(VK_STRUCTURE_TYPE_BUFFER_CREATE_INFO);
@@ -81,12 +83,17 @@ Buffer::Buffer(Device& device, std::size_t bytes, Domain domain, const char* nam
   auto allocate = of_type<VkMemoryAllocateInfo>(VK_STRUCTURE_TYPE_MEMORY_ALLOCATE_INFO);
   allocate.allocationSize = needs.size;
   allocate.memoryTypeIndex = static_cast<std::uint32_t>(type);
-  const VkResult result = vkAllocateMemory(device.handle, &allocate, nullptr, &handles_->memory);
+  const bool room = device.most_bytes == 0 || device.buffer_bytes + needs.size <= device.most_bytes;
+  const VkResult result =
+      room ? vkAllocateMemory(device.handle, &allocate, nullptr, &handles_->memory) : VK_ERROR_OUT_OF_DEVICE_MEMORY;
   if (result != VK_SUCCESS) {
-    throw WorkError(where, std::string("no ") + mebibytes(needs.size) + " left for buffer '" + name + "' (" +
-                               result_name(result) + ")",
-                    "use a smaller picture, fewer Gaussians or a device with more memory");
+    throw OutOfMemory(
+        where,
+        std::string("no ") + mebibytes(needs.size) + " left for buffer '" + name + "' (" + result_name(result) + ")",
+        "use a smaller picture, fewer Gaussians or a device with more memory");
   }
+  handles_->allocated = needs.size;
+  device.buffer_bytes += needs.size;
   device.check(vkBindBufferMemory(device.handle, handles_->buffer, handles_->memory, 0), "bind memory");
   if (domain == Domain::host || device.info.unified_memory) {
     const VkMemoryPropertyFlags flags = device.memory.memoryTypes[type].propertyFlags;
@@ -112,8 +119,8 @@ Buffer& Buffer::operator=(Buffer&& other) noexcept {
 Buffer::~Buffer() = default;
 
 void upload(Device& device, Buffer& buffer, const void* data, std::size_t bytes, std::size_t offset) {
-  CHAINSPLAT_CHECK(offset + bytes <= buffer.bytes(), std::to_string(offset) + " + " + std::to_string(bytes) + ", " +
-                                                         std::to_string(buffer.bytes()));
+  CHAINSPLAT_CHECK(offset + bytes <= buffer.bytes(),
+                   std::to_string(offset) + " + " + std::to_string(bytes) + ", " + std::to_string(buffer.bytes()));
   if (bytes == 0) return;
   if (buffer.mapped()) {
     std::memcpy(static_cast<char*>(buffer.mapped()) + offset, data, bytes);
@@ -129,8 +136,8 @@ void upload(Device& device, Buffer& buffer, const void* data, std::size_t bytes,
 }
 
 void download(Device& device, const Buffer& buffer, void* data, std::size_t bytes, std::size_t offset) {
-  CHAINSPLAT_CHECK(offset + bytes <= buffer.bytes(), std::to_string(offset) + " + " + std::to_string(bytes) + ", " +
-                                                         std::to_string(buffer.bytes()));
+  CHAINSPLAT_CHECK(offset + bytes <= buffer.bytes(),
+                   std::to_string(offset) + " + " + std::to_string(bytes) + ", " + std::to_string(buffer.bytes()));
   if (bytes == 0) return;
   if (buffer.mapped()) {
     std::memcpy(data, static_cast<const char*>(buffer.mapped()) + offset, bytes);

@@ -271,6 +271,8 @@ void Commands::submit() {
   info.signalSemaphoreInfoCount = 1;
   info.pSignalSemaphoreInfos = &signal;
   std::lock_guard lock(s.device.queue_mutex);
+  if (s.device.most_submits > 0 && s.device.submitted >= s.device.most_submits)
+    s.device.check(VK_ERROR_DEVICE_LOST, "start work");
   signal.value = s.device.submitted + 1;
   s.device.check(vkQueueSubmit2(s.device.queue, 1, &info, VK_NULL_HANDLE), "start work");
   s.submitted = ++s.device.submitted;

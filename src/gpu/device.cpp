@@ -448,6 +448,8 @@ DevicePtr open_device(const DeviceOptions& options) {
   d.timestamp_mask = c.timestamp_bits >= 64 ? ~0ull : (1ull << c.timestamp_bits) - 1;
   d.timestamp_period = c.timestamp_period;
   d.validation = options.validation;
+  d.most_bytes = options.most_bytes;
+  d.most_submits = options.most_submits;
   vkGetPhysicalDeviceMemoryProperties(d.physical, &d.memory);
 
   Features there, wanted;

@@ -85,6 +85,8 @@ class Device {
   std::uint64_t timestamp_mask = 0;    // 0: no timestamps
   double timestamp_period = 1.0;       // ns a tick
   bool validation = false;
+  std::uint64_t most_bytes = 0, most_submits = 0;      // see DeviceOptions
+  mutable std::atomic<std::uint64_t> buffer_bytes{0};  // of all buffers there are
 
   // every submit signals the next value, in queue order
   std::mutex queue_mutex;
@@ -113,6 +115,7 @@ struct Buffer::Handles {
   const Device* device = nullptr;
   VkBuffer buffer = VK_NULL_HANDLE;
   VkDeviceMemory memory = VK_NULL_HANDLE;
+  std::uint64_t allocated = 0;  // bytes
   ~Handles();
 };
 

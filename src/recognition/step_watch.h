@@ -17,7 +17,7 @@ double step_scale(const StepWatch& watch);
 
 enum class Course { fine, diverged };
 
-// Takes the loss of one step: diverged when it is not finite or has become several times the round's least.
+// Takes the loss of one step: diverged when it is not finite or has become twice the round's least.
 Course watch_loss(StepWatch& watch, double loss);
 void begin_round(StepWatch& watch);  // losses of different rounds are not compared
 

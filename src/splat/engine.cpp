@@ -152,6 +152,7 @@ struct Engine::State {
 
   State(gpu::Device& d, const Settings& settings);
   void need(Buffer& buffer, std::size_t bytes, const char* name);
+  void release_view_buffers();
   void write(Buffer& buffer, const void* data, std::size_t bytes, const char* name);
   void load_gaussians(Scene& scene, const Gaussians& gaussians);
   void load_views(Scene& scene, std::span<const ViewSpec> specs,
@@ -219,6 +220,18 @@ void Engine::State::need(Buffer& buffer, std::size_t bytes, const char* name) {
     buffer = Buffer();  // the old one goes first
     buffer = Buffer(device, std::max(bytes, kLeast), Domain::device, name);
   }
+}
+
+// All whose size follows the number of views in a submission; run() makes them again.
+void Engine::State::release_view_buffers() {
+  commands.wait();
+  for (Buffer* buffer :
+       {&views,           &motions,        &tile_map,    &tiles,          &splats,        &instance_count,
+        &instance_prefix, &instance_block, &records,     &link_twists,    &tile_count,    &tile_prefix,
+        &tile_block,      &tile_cursor,    &tile_used,   &tile_loss,      &entries,       &sorted,
+        &partials,        &image,          &depth_image, &pixel_gradient, &ssim_row_sums, &ssim_factors})
+    *buffer = Buffer();
+  instance_capacity = 0;
 }
 
 void Engine::State::write(Buffer& buffer, const void* data, std::size_t bytes, const char* name) {
@@ -601,7 +614,17 @@ void Engine::State::run_all(Scene& scene, std::span<const int> batch, const RunO
     RunOptions with = options;
     with.accumulate = done > 0;
     const bool last = done + chunk.size() == batch.size();
-    if (!run(scene, chunk, with, last ? adam_push : nullptr)) continue;
+    bool finished = false;
+    try {
+      finished = run(scene, chunk, with, last ? adam_push : nullptr);
+    } catch (const gpu::OutOfMemory&) {
+      if (chunk.size() == 1) throw;
+      most_views = static_cast<int>(chunk.size()) / 2;
+      release_view_buffers();
+      core::warn("device memory is short: at most " + std::to_string(most_views) +
+                 (most_views == 1 ? " view" : " views") + " in one submission from now on");
+    }
+    if (!finished) continue;
     after(std::span<const int>(chunk), done);
     done += chunk.size();
   }
