@@ -31,6 +31,13 @@ Options small_options() {
   return options;
 }
 
+gpu::DevicePtr limited_device(std::uint64_t most_bytes, std::uint64_t most_submits) {
+  gpu::DeviceOptions options;
+  options.most_bytes = most_bytes;
+  options.most_submits = most_submits;
+  return gpu::open_device(options);
+}
+
 // Warnings while it lives.
 struct Warnings {
   std::vector<std::string> lines;
@@ -57,7 +64,7 @@ TEST_CASE("a lost device leaves a checkpoint, from which another device ends wit
   Options options = small_options();
   options.checkpoint = folder;
   constexpr std::uint64_t kInTheThirdRound = 260;  // submits
-  const gpu::DevicePtr weak = gpu::open_device({.most_submits = kInTheThirdRound});
+  const gpu::DevicePtr weak = limited_device(0, kInTheThirdRound);
   bool lost = false;
   try {
     recognize(*weak, demo(), options);
@@ -93,7 +100,7 @@ TEST_CASE("too little device memory: fewer views in a submission, a warning, and
 
   Warnings warnings;
   constexpr std::uint64_t kRoom = 8u << 20;  // of some 30 MB that 18 views take at once
-  const gpu::DevicePtr small_device = gpu::open_device({.most_bytes = kRoom});
+  const gpu::DevicePtr small_device = limited_device(kRoom, 0);
   splat::Engine small(*small_device);
   const auto pictures = small.draw(g, views);
   CHECK(warnings.tell("device memory is short"));
@@ -101,7 +108,7 @@ TEST_CASE("too little device memory: fewer views in a submission, a warning, and
   for (std::size_t v = 0; v < pictures.size(); ++v) CHECK(pictures[v].rgba == expected[v].rgba);
 
   // not even one view
-  const gpu::DevicePtr tiny_device = gpu::open_device({.most_bytes = 1u << 20});
+  const gpu::DevicePtr tiny_device = limited_device(1u << 20, 0);
   splat::Engine tiny(*tiny_device);
   CHECK_THROWS_AS(tiny.draw(g, views), gpu::OutOfMemory);
 }
