@@ -35,8 +35,7 @@ FolderLock::FolderLock(const Path& file) : file_(::open(file.c_str(), O_RDWR | O
                     "make room or choose a folder that can be written");
   const int refused = ::flock(file_, LOCK_EX | LOCK_NB) == 0 ? 0 : errno;
   // the file can be gone since it was opened: its owner removes it when all is done
-  struct stat held {
-  }, named{};
+  struct stat held = {}, named = {};
   const bool gone = ::fstat(file_, &held) != 0 || ::stat(file.c_str(), &named) != 0 || held.st_ino != named.st_ino;
   if (refused == EWOULDBLOCK || gone) {
     ::close(file_);

@@ -229,7 +229,8 @@ void Engine::State::release_view_buffers() {
        {&views,           &motions,        &tile_map,    &tiles,          &splats,        &instance_count,
         &instance_prefix, &instance_block, &records,     &link_twists,    &tile_count,    &tile_prefix,
         &tile_block,      &tile_cursor,    &tile_used,   &tile_loss,      &entries,       &sorted,
-        &partials,        &image,          &depth_image, &pixel_gradient, &ssim_row_sums, &ssim_factors})
+        &partials,        &image,          &depth_image, &pixel_gradient, &ssim_row_sums, &ssim_factors,
+        &long_tiles,      &sort_scratch})
     *buffer = Buffer();
   instance_capacity = 0;
 }
