@@ -9,6 +9,7 @@
 
 #include "chainsplat/capture.h"
 #include "chainsplat/estimation.h"
+#include "chainsplat/gpu.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
 #include "frame_source.h"
@@ -20,7 +21,7 @@ namespace {
 
 struct EstimateRequest {
   SourceRequest source;
-  std::string run, base, frames, centerline;
+  std::string run, base, frames, centerline, solver;
   int drop = 1;
   bool covariance = false;
 };
@@ -113,6 +114,23 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   if (base.samples().size() > 1) options.base_end = base.end();
   estimation::Filter filter = estimation::start(
       twin, source.cameras, [&](double time) { return base.at(time); }, base.start());
+  gpu::DevicePtr device;
+  std::optional<splat::Engine> engine;
+  if (request.solver != "silhouette" && twin.gaussians.count > 0) {
+    try {
+      device = gpu::open_device({.selector = globals.device});
+      engine.emplace(*device);
+    } catch (const InputError& error) {
+      if (!request.solver.empty()) throw;  // asked for
+      core::warn(std::string(error.what()) + "; the rope is followed by its outline alone");
+    }
+  }
+  if (engine) {
+    filter.draw = [&](const capture::View& view, const std::vector<math::Pose>& motions) {
+      const splat::ViewSpec spec{&source.cameras.at(view.camera), view.x0, view.y0, view.width, view.height, motions};
+      return std::move(engine->draw(twin.gaussians, {&spec, 1}, true).front());
+    };
+  }
   const MaskMaker mask = [&](const capture::Image8& picture, const math::Pose&, const std::optional<math::VectorX>&) {
     return bright_view(picture, source.cameras[0]);
   };
@@ -181,6 +199,13 @@ void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("HZ");
   command->add_option("--base", request->base, "Base motion (default: the capture's; with --calibration at rest)")
       ->type_name("FILE.tum");
+  command
+      ->add_option("--solver", request->solver,
+                   "newton: outlines, then the colors inside them, drawn on the Vulkan device (default, where there\n"
+                   "is one)\n"
+                   "silhouette: outlines alone, without a device")
+      ->check(CLI::IsMember({"newton", "silhouette"}))
+      ->type_name("KIND");
   command->add_option("--frames", request->frames, "Only frames A to B - 1")->type_name("A:B");
   command->add_option("--drop", request->drop, "Use every N-th frame (default 1)")->type_name("N");
   command

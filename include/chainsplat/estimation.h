@@ -3,10 +3,12 @@
 //
 // An iterated extended Kalman filter. Its motion model is the twin's own dynamics under the base's motion; what the
 // model does not know (a hand, a finger, its own errors) is a force on the rope that wanders slowly and is estimated
-// too, as a shift of the joints' rest angles. Its measurement is the silhouette fit of one mask, with the prediction as
-// the fit's prior (silhouette.h). Depth along the camera's rays is hardly seen; the dynamics supply it, and the
-// covariance says how well.
+// too, as a shift of the joints' rest angles. Its first measurement is the silhouette fit of one mask, with the
+// prediction as the fit's prior (silhouette.h); its second, where the twin can be drawn, the colors inside the mask: by
+// them marks along the rope are recognized, which tells its slope in depth. Depth along the camera's rays is else
+// hardly seen; the dynamics supply it, and the covariance says how well.
 #pragma once
+#include <functional>
 #include <optional>
 #include <span>
 #include <string>
@@ -15,6 +17,7 @@
 #include "chainsplat/capture.h"
 #include "chainsplat/dynamics.h"
 #include "chainsplat/silhouette.h"
+#include "chainsplat/splat.h"
 #include "chainsplat/twin.h"
 
 namespace chainsplat::estimation {
@@ -28,6 +31,9 @@ struct Options {
   double blind_acceleration = 30.0;  // rad/s^2, the same where the motion does not follow the model and
                                      // no force is estimated (no dynamics or stiffness)
   double new_share = 0.4;            // of a silhouette's variance that is new in every frame (the rest stays)
+  double color_share = 0.002;        // of a pixel's and channel's information that counts: channels are alike, pixels
+                                     // over about 5 x 5, and the errors of the twin's looks stay for many frames
+  int color_steps = 1;               // Gauss-Newton steps on the colors
   silhouette::Options silhouette;    // the prior is set by the filter
 };
 
@@ -38,6 +44,9 @@ struct Belief {
   math::MatrixX covariance;
 };
 
+// The twin at these link motions in the pixels of a view, with depth. Throws WorkError.
+using Draw = std::function<splat::Picture(const capture::View& view, const std::vector<math::Pose>& motions)>;
+
 struct Estimate {
   int frame = 0;
   double time = 0.0;              // s
@@ -46,6 +55,8 @@ struct Estimate {
   double centerline_sigma = 0.0;  // m, standard deviation of the centerline, RMS over the rope
   double iou = 0.0;               // of the chain's tube and the mask
   double residual = 0.0;          // px, RMS of the mask's outline about the tube's, robust
+  double color_residual = 0.0;    // RMS of drawn against seen colors inside the mask, of 1; 0: not looked at
+  double gain = 1.0, bias = 0.0;  // exposure of the (last) view against the twin's looks
   double surprise = 0.0;          // squared innovation over its expectation; about 1 as long as the model holds
   bool seen = false;              // the mask showed something
   bool lost = false;              // the estimate does not explain the mask, or nothing was seen for long
@@ -59,6 +70,7 @@ struct Filter {
   std::vector<capture::Camera> cameras;
   dynamics::BaseFunction base;
   Options options;
+  Draw draw;                        // empty: silhouettes alone
   std::optional<Belief> belief;     // none before the first frame
   double base_start = 0.0;          // s, from here on the base's motion is known: the rope is thought at rest there
   math::VectorX rest;               // rad, how the rope rests (or lies) at that time

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "src/estimation/color.h"
+
 namespace chainsplat::estimation {
 
 using math::MatrixX;
@@ -35,6 +37,9 @@ constexpr double kPlaceRidge = 1e-3;  // of the mean variance of the torques, wh
 // What straight links and a tube of constant width cannot follow, a coordinate of every joint's position: of the
 // diameter. Not in the filter, only in what is reported.
 constexpr double kLinkDeviation = 0.02;
+// A straight link stands for an arc: where it turns by an angle they are up to length * angle / 8 apart, half of that
+// to either side of a link that is laid through the arc's middle.
+constexpr double kArc = 1.0 / 16.0;
 constexpr double kUnseenAngle = 0.5;  // rad, of angles that move no joint (twist)
 
 constexpr double kLostShare = 0.5;      // of the mask explained, under which the rope is lost (SPEC 6)
@@ -46,6 +51,8 @@ constexpr double kNoSmoothness = 1e-9;  // 1/rad^2: the filter's prior replaces 
 // of the masks' edge offset: how sure it is at first, at best, and after how many frames
 constexpr double kOffsetDeviation = 0.5, kLeastOffsetDeviation = 0.05;  // px
 constexpr double kOffsetFrames = 30.0;
+
+constexpr double kLeastColorWeight = 100;  // pixels and channels; fewer say nothing
 
 constexpr double kLeastVariance = 1e-12;  // rad^2, keeps covariances invertible
 
@@ -117,27 +124,42 @@ FoundForce found_force(const Filter& filter, const Belief& belief) {
   return out;
 }
 
-// Variance of the angles that the model's own shape leaves open.
-MatrixX shape_covariance(const chain::Chain& chain, const Pose& base, const VectorX& theta) {
+// Variance of every link end's position that the model's own shape leaves open, a coordinate, m^2.
+std::vector<double> shape_variances(const chain::Chain& chain, const VectorX& theta) {
+  std::vector<double> variances(chain.links() - 1, 0.0);
+  for (int link = 1; link < chain.links(); ++link) {
+    double bend2 = 0.0;  // at the link's start and at its end, rad^2
+    for (int k = 0; k < chain.angles(); ++k)
+      if (chain.child_link[k] == link || chain.child_link[k] == link + 1) bend2 += 0.5 * theta[k] * theta[k];
+    const double arc = kArc * (chain.link_end(link) - chain.link_start(link));
+    const double straight = kLinkDeviation * chain.diameter;
+    variances[link - 1] = straight * straight + arc * arc * bend2;
+  }
+  return variances;
+}
+
+// The same of the angles.
+MatrixX shape_covariance(const chain::Chain& chain, const std::vector<double>& variances, const VectorX& theta) {
   const int n = chain.angles();
-  const double deviation = kLinkDeviation * chain.diameter;
-  const std::vector<MatrixX> jacobians = link_end_jacobians(chain, base, theta);
-  MatrixX information =
-      torque_covariance(jacobians, VectorX::Constant(jacobians.size(), 1.0 / (deviation * deviation)));
+  VectorX weights(variances.size());
+  for (std::size_t i = 0; i < variances.size(); ++i) weights[i] = 1.0 / variances[i];
+  MatrixX information = torque_covariance(link_end_jacobians(chain, Pose{}, theta), weights);
   information.diagonal().array() += 1.0 / (kUnseenAngle * kUnseenAngle);
   return information.llt().solve(MatrixX::Identity(n, n));
 }
 
-// Standard deviation of the centerline, RMS over the rope, m.
-double centerline_deviation(const chain::Chain& chain, const VectorX& theta, const MatrixX& covariance) {
+// Standard deviation of the centerline, RMS over the rope, m: of the angles, `covariance`, and of the shape, which also
+// leaves the directions in which no angle moves a link.
+double centerline_deviation(const chain::Chain& chain, const VectorX& theta, const MatrixX& covariance,
+                            const std::vector<double>& shape) {
   const std::vector<MatrixX> jacobians = link_end_jacobians(chain, Pose{}, theta);
-  // the rope's half of each link end's neighbors counts for it; what varies is linear between them
+  // a link end counts for its half of the links on either side
   double variance = 0.0;
   for (std::size_t i = 0; i < jacobians.size(); ++i) {
     const int link = static_cast<int>(i) + 1;
     const double next = link + 1 < chain.links() ? chain.link_end(link + 1) - chain.link_start(link + 1) : 0.0;
     const double share = 0.5 * (chain.link_end(link) - chain.link_start(link) + next) / chain.length;
-    variance += share * (jacobians[i] * covariance * jacobians[i].transpose()).trace();
+    variance += share * ((jacobians[i] * covariance * jacobians[i].transpose()).trace() + 3.0 * shape[i]);
   }
   return std::sqrt(variance);
 }
@@ -274,6 +296,42 @@ Measured measure(const Filter& filter, const Belief& predicted, std::span<const 
   return out;
 }
 
+// The belief with the colors inside the masks. The drawn rope must be near: a stripe's width.
+void look_at_colors(const Filter& filter, std::span<const capture::View* const> views, Belief& belief, Estimate& out) {
+  const int n = filter.model.chain.angles();
+  const Belief before = belief;
+  const MatrixX by_angles = before.covariance.leftCols(n);
+  for (int step = 0; step < filter.options.color_steps; ++step) {
+    const VectorX theta = belief.mean.head(n);
+    MatrixX information = MatrixX::Zero(n, n);
+    VectorX right = VectorX::Zero(n);
+    double weight = 0.0, square = 0.0;
+    for (const capture::View* const view : views) {
+      if (view->width <= 0 || view->height <= 0) continue;
+      const Pose base = filter.base(view->time).pose;
+      const splat::Picture drawn = filter.draw(*view, chain::link_motions(filter.model.chain, theta, base));
+      const ColorEquations e =
+          color_equations(filter.model.chain, base, theta, filter.cameras.at(view->camera), *view, drawn);
+      if (e.weight < kLeastColorWeight || !(e.square > 0.0)) continue;
+      const double scale = filter.options.color_share * e.weight / e.square;  // by what this view's residuals are
+      information += scale * e.normal;
+      right += scale * e.right;
+      weight += e.weight;
+      square += e.square;
+      out.gain = e.gain;
+      out.bias = e.bias;
+    }
+    if (weight == 0.0) return;
+    out.color_residual = std::sqrt(square / weight);
+    right += information * (before.mean.head(n) - theta);  // linearized at theta, seen from the belief before
+    const MatrixX inverse = (MatrixX::Identity(n, n) + information * before.covariance.topLeftCorner(n, n)).inverse();
+    belief.mean = before.mean - by_angles * (inverse * right);
+    belief.covariance = before.covariance - by_angles * (inverse * information) * by_angles.transpose();
+    symmetrize(belief.covariance);
+    belief.covariance.diagonal().array() += kLeastVariance;
+  }
+}
+
 bool has_mask(const capture::View& view) {
   for (std::size_t i = 3; i < view.rgba.size(); i += 4)
     if (view.rgba[i] >= 128) return true;
@@ -400,6 +458,7 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
     if (!out.lost) {
       filter.last_seen = view.time;
       filter.belief = measured.belief;
+      if (filter.draw) look_at_colors(filter, views, *filter.belief, out);
       learn_force(filter, view.time);
       const double gain = 1.0 / kOffsetFrames;
       filter.edge_offset += gain * (measured.fit.edge_offset - filter.edge_offset);
@@ -415,8 +474,9 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
   out.theta = filter.belief->mean.head(n);
   out.thetadot = filter.belief->mean.segment(n, n);
   out.covariance = filter.belief->covariance.topLeftCorner(2 * n, 2 * n);
-  out.covariance.topLeftCorner(n, n) += shape_covariance(filter.model.chain, filter.base(view.time).pose, out.theta);
-  out.centerline_sigma = centerline_deviation(filter.model.chain, out.theta, out.covariance.topLeftCorner(n, n));
+  const std::vector<double> shape = shape_variances(filter.model.chain, out.theta);
+  out.centerline_sigma = centerline_deviation(filter.model.chain, out.theta, out.covariance.topLeftCorner(n, n), shape);
+  out.covariance.topLeftCorner(n, n) += shape_covariance(filter.model.chain, shape, out.theta);
   for (const capture::View* const v : views)
     out.iou += tube_iou(filter.model.chain, filter.base(view.time).pose, out.theta, *v, filter.cameras.at(v->camera)) /
                views.size();
@@ -494,16 +554,17 @@ std::string to_json(const Estimate& estimate, double latency, bool covariance) {
   const int n = static_cast<int>(estimate.theta.size());
   std::string triangle;
   for (Eigen::Index r = 0; covariance && r < estimate.covariance.rows(); ++r)
-    for (Eigen::Index c = 0; c <= r; ++c)
-      triangle.append(r ? "," : "").append(core::exact(estimate.covariance(r, c)));
+    for (Eigen::Index c = 0; c <= r; ++c) triangle.append(r ? "," : "").append(core::exact(estimate.covariance(r, c)));
   char milliseconds[32];
   std::snprintf(milliseconds, sizeof milliseconds, "%.3f", 1e3 * latency);
   return "{\"frame\":" + std::to_string(estimate.frame) + ",\"time\":" + core::exact(estimate.time) +
          ",\"theta\":" + list(estimate.theta) + ",\"thetadot\":" + list(estimate.thetadot) +
          ",\"sigma\":" + list(estimate.covariance.diagonal().head(n).cwiseSqrt()) +
          ",\"centerline_sigma\":" + core::exact(estimate.centerline_sigma) + ",\"iou\":" + core::exact(estimate.iou) +
-         ",\"residual\":" + core::exact(estimate.residual) + (covariance ? ",\"covariance\":[" + triangle + "]" : "") +
-         ",\"lost\":" + (estimate.lost ? "true" : "false") + ",\"latency_ms\":" + milliseconds + "}";
+         ",\"residual\":" + core::exact(estimate.residual) +
+         ",\"color_residual\":" + core::exact(estimate.color_residual) +
+         (covariance ? ",\"covariance\":[" + triangle + "]" : "") + ",\"lost\":" + (estimate.lost ? "true" : "false") +
+         ",\"latency_ms\":" + milliseconds + "}";
 }
 
 }  // namespace chainsplat::estimation
