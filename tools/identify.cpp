@@ -10,6 +10,7 @@
 
 #include "chainsplat/identification.h"
 #include "cli.h"
+#include "joint.h"
 #include "markers.h"
 
 namespace chainsplat::tools {
@@ -39,7 +40,7 @@ using Json = nlohmann::ordered_json;
 
 struct Request {
   std::vector<std::string> runs, markers;
-  bool shape_only = false;
+  bool shape_only = false, joint = false;
 };
 
 void take(twin::Twin& twin, identification::Result result) {
@@ -162,6 +163,8 @@ void identify_several(std::vector<twin::Twin>& twins, const std::vector<std::str
 void identify(const Globals& globals, const Request& request) {
   watch_signals();
   const std::vector<std::string>& runs = request.runs;
+  if (request.joint && runs.size() > 1)
+    throw InputError("--joint", "goes with one RUN", "refine them one after the other");
   std::vector<twin::Twin> twins;
   if (!request.markers.empty()) {
     if (runs.size() > 1)
@@ -182,8 +185,10 @@ void identify(const Globals& globals, const Request& request) {
       identify_several(twins, runs, globals.seed);
     } else {
       const trajectory::Trajectory base = own_base(runs[0]);
-      identify_stage(twins[0], base, read_covariances(Path(runs[0]) / kCovarianceFile, twins[0].states), paper,
-                     globals.seed);
+      const std::vector<math::MatrixX> covariances = read_covariances(Path(runs[0]) / kCovarianceFile, twins[0].states);
+      if (request.joint) check_joint(twins[0], covariances, runs[0]);
+      identify_stage(twins[0], base, covariances, paper, globals.seed);
+      if (request.joint) joint_stage(twins[0], runs[0], globals);
       rollout_stage(twins[0], base, runs[0]);
     }
   }
@@ -287,6 +292,12 @@ void add_identify_command(CLI::App& app, const Globals& globals, Job& job) {
           ->type_name("FILE.csv ...");
   identifier->add_flag("--shape-only", request->shape_only, "With --markers: only the angles at each time, no dynamics")
       ->needs(markers);
+  identifier
+      ->add_flag(
+          "--joint", request->joint,
+          "Then refine angles, Gaussians and dynamics of one RUN together with the capture's images: helps where\n"
+          "a single camera hardly sees depth")
+      ->excludes(markers);
   identifier->callback([&globals, &job, request] { job = [&globals, request] { identify(globals, *request); }; });
 }
 

@@ -1,9 +1,9 @@
 #include "joint.h"
 
 #include <cstdio>
+#include <tuple>
 
 #include "chainsplat/refinement.h"
-#include "cli.h"
 
 namespace chainsplat::tools {
 
@@ -45,7 +45,8 @@ void joint_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, cons
   twin.provenance.options["joint"] = "yes";
 }
 
-capture::Capture load_own_capture(const twin::Twin& twin, const Path& run) {
+// The frames that the twin in `run` was made from. Throws InputError where they are gone or have changed.
+static capture::Capture load_own_capture(const twin::Twin& twin, const Path& run) {
   const auto& options = twin.provenance.options;
   const auto path = options.find("path");
   if (path == options.end())
@@ -57,6 +58,15 @@ capture::Capture load_own_capture(const twin::Twin& twin, const Path& run) {
   if (twin.provenance.capture_hash != hash_text(capture.hash))
     throw InputError(capture.folder.string(), "has changed since " + run.string() + " was made", "train it again");
   return capture;
+}
+
+void joint_stage(twin::Twin& twin, const Path& run, const Globals& globals) {
+  std::vector<math::MatrixX> covariances = read_covariances(run / kCovarianceFile, twin.states);
+  check_joint(twin, covariances, run);
+  const capture::Capture capture = load_own_capture(twin, run);
+  const gpu::DevicePtr device = gpu::open_device({.selector = globals.device});
+  joint_stage(twin, covariances, capture, *device, globals.seed);
+  core::write_file(run / kCovarianceFile, covariance_csv(twin.states, covariances));
 }
 
 }  // namespace chainsplat::tools

@@ -1,6 +1,7 @@
 // joint.h - --joint: what follows identification in train and identify.
 #pragma once
 #include "chainsplat/gpu.h"
+#include "cli.h"
 #include "identify.h"
 
 namespace chainsplat::tools {
@@ -10,8 +11,8 @@ void check_joint(const twin::Twin& twin, const std::vector<math::MatrixX>& covar
 // Refines an identified twin and its covariances with its capture's images (undistorted).
 void joint_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, const capture::Capture& capture,
                  gpu::Device& device, std::uint64_t seed);
-// The frames of the capture that the twin in `run` was made from, as it was made. Throws InputError where it is gone or
-// has changed.
-capture::Capture load_own_capture(const twin::Twin& twin, const Path& run);
+// The same for identify: reads the capture that the twin in `run` was made from, writes the covariances. The caller
+// saves the twin.
+void joint_stage(twin::Twin& twin, const Path& run, const Globals& globals);
 
 }  // namespace chainsplat::tools

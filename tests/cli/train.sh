@@ -86,6 +86,17 @@ run identify "$work/whole"
 expect_code 0 identify
 cmp -s "$work/whole/rollout.csv" "$work/stopped/rollout.csv" || fail 'identify alone: not the rollout of train'
 
+# images and dynamics together, once; the capture's place is kept relative to the run folder
+cp -r "$work/whole" "$work/joint"
+run identify "$work/joint" --joint
+expect_code 0 'identify --joint'
+grep -q 'joint: images' "$work/stderr" || fail 'identify --joint: does not say what it found'
+grep -q '"joint": "yes"' "$work/joint/twin.json" || fail 'identify --joint: twin.json does not say so'
+cmp -s "$work/joint/rollout.csv" "$work/whole/rollout.csv" && fail 'identify --joint: the rollout of identify alone'
+expect_error 2 'refined already' identify "$work/joint" --joint
+rm "$work/whole/covariance.csv"
+expect_error 2 'covariance.csv' identify "$work/whole" --joint
+
 # no room on the disk: a file size limit stands for it
 ( ulimit -f 8; exec "$program" train "$demo" -o "$work/full" "${small[@]}" ) >"$work/stdout" 2>"$work/stderr" </dev/null
 code=$?
