@@ -411,6 +411,9 @@ TEST_CASE("a line of JSON holds what INTERFACE 5 names") {
   CHECK(line["theta"].size() == 2);
   CHECK(line["thetadot"][1] == -1.0);
   CHECK(line["sigma"][0].get<double>() == doctest::Approx(0.2));
+  REQUIRE(line["covariance"].size() == 3);
+  CHECK(line["covariance"][1] == 0.0);
+  CHECK(line["covariance"][2].get<double>() == doctest::Approx(0.04));
   CHECK(line["iou"] == 0.94);
   CHECK(line["residual"] == 0.25);
   CHECK(line["lost"] == false);

@@ -132,13 +132,42 @@ TEST_CASE("smoothing finds angle, rate and acceleration of a swing, and its own 
       const double a = motion.thetaddot[f][0] + 0.4 * w * w * std::sin(w * t);
       rate += std::pow(motion.thetadot[f][0] - 0.4 * w * std::cos(w * t), 2);
       acceleration += a * a;
-      inside += std::abs(a) <= 3.0 * std::sqrt(motion.covariance[f][0](2, 2));
+      inside += std::abs(a) <= 3.0 * std::sqrt(motion.noise(0, 0) * motion.covariance[f](2, 2));
       ++used;
     }
     CHECK(std::sqrt(rate / used) < (live ? 0.12 : 0.04));
     CHECK(std::sqrt(acceleration / used) < (live ? 1.2 : 0.5));  // second differences: 11 rad/s^2
     CHECK(inside >= 0.95 * used);
   }
+}
+
+TEST_CASE("angles seen by where the rope is: a straight chain's angles are second differences of its ends") {
+  const int joints = 5;
+  const chain::Chain rope =
+      chain::make_chain(0.3, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), joints, chain::Bending::planar, false);
+  MatrixX differences = MatrixX::Zero(joints, joints);
+  for (int k = 0; k < joints; ++k) {
+    differences(k, k) = 1.0;
+    if (k > 0) differences(k, k - 1) = -2.0;
+    if (k > 1) differences(k, k - 2) = 1.0;
+  }
+  const MatrixX expected = differences * differences.transpose();
+  const VectorX sigma = 0.01 * expected.diagonal().cwiseSqrt();
+  const MatrixX covariance = force::angle_covariance(rope, VectorX::Zero(joints), sigma);
+  CHECK((covariance - 1e-4 * expected).norm() < 0.01 * covariance.norm());
+}
+
+TEST_CASE("noise that two angles share is found as such") {
+  chain::States states;
+  core::Random random(5);
+  for (int f = 0; f < 200; ++f) {
+    states.time.push_back(f / 30.0);
+    const double common = 0.01 * random.normal(), own = 0.002 * random.normal();
+    states.theta.push_back(math::Vector2(common, own - common));
+  }
+  const MatrixX noise = force::smooth(states, {}, false).noise;
+  CHECK(std::sqrt(noise(0, 0)) == doctest::Approx(0.01).epsilon(0.15));
+  CHECK(noise(0, 1) / std::sqrt(noise(0, 0) * noise(1, 1)) < -0.9);
 }
 
 TEST_CASE("a force is found where it acts, automatically") {

@@ -25,7 +25,9 @@ struct ForceRequest {
 };
 
 // Lines of `estimate`.
-void read_estimates(const std::string& name, int angles, chain::States& states, std::vector<math::VectorX>& sigma) {
+void read_estimates(const std::string& name, const chain::Chain& chain, chain::States& states,
+                    std::vector<math::MatrixX>& standing) {
+  const int angles = chain.angles();
   std::istringstream lines(core::read_file(input_path(name)));
   std::string line;
   for (int number = 1; std::getline(lines, line); ++number) {
@@ -44,7 +46,19 @@ void read_estimates(const std::string& name, int angles, chain::States& states, 
         throw InputError(where, "its time does not increase", "give the lines in order");
       states.time.push_back(time);
       states.theta.push_back(Eigen::Map<const math::VectorX>(theta.data(), angles));
-      sigma.push_back(Eigen::Map<const math::VectorX>(deviation.data(), angles));
+      if (!object.contains("covariance")) {
+        standing.push_back(force::angle_covariance(chain, states.theta.back(),
+                                                   Eigen::Map<const math::VectorX>(deviation.data(), angles)));
+        continue;
+      }
+      const auto triangle = object.at("covariance").get<std::vector<double>>();
+      const std::size_t all = 2 * static_cast<std::size_t>(angles);  // with the rates: their rows follow
+      if (triangle.size() != angles * (angles + std::size_t{1}) / 2 && triangle.size() != all * (all + 1) / 2)
+        throw InputError(where + ": covariance", "is no lower triangle of the angles", "give the output of estimate");
+      standing.emplace_back(angles, angles);
+      for (int row = 0, i = 0; row < angles; ++row)
+        for (int column = 0; column <= row; ++column, ++i)
+          standing.back()(row, column) = standing.back()(column, row) = triangle[i];
     } catch (const Json::exception&) {
       throw InputError(where, "is no line of 'chainsplat estimate'", "give its output");
     }
@@ -101,15 +115,15 @@ void force(const Globals& globals, const ForceRequest& request) {
   const trajectory::Trajectory base = request.base.empty() ? own_base(request.run) : read_base(request.base);
   if (request.base.empty()) core::warn("--base: is missing; the base motion of the twin's own capture is assumed");
   chain::States states;
-  std::vector<math::VectorX> sigma;
+  std::vector<math::MatrixX> standing;
   if (request.estimate.empty())
     states = twin::read_states(input_path(request.states), twin.chain.angles());
   else
-    read_estimates(request.estimate, twin.chain.angles(), states, sigma);
+    read_estimates(request.estimate, twin.chain, states, standing);
   if (states.time.size() < 3)
     throw InputError(request.estimate.empty() ? request.states : request.estimate, "has fewer than three states",
                      "give more: forces need accelerations");
-  const force::Motion motion = force::smooth(states, sigma, request.live);
+  const force::Motion motion = force::smooth(states, standing, request.live);
 
   const std::size_t count = motion.time.size();
   std::vector<std::optional<force::Contact>> contacts;

@@ -21,17 +21,25 @@ using math::MatrixX;
 using math::Vector3;
 using math::VectorX;
 
-// Angles with their derivatives and how sure each angle's (theta, thetadot, thetaddot) is.
+// Angles with their derivatives, and how sure they are: the covariance of (theta, thetadot, thetaddot) at time f is the
+// Kronecker product covariance[f] x noise; theta may be off by `standing` besides, for longer than the smoother sees.
 struct Motion {
   std::vector<double> time;                         // s
   std::vector<VectorX> theta, thetadot, thetaddot;  // n
-  std::vector<std::vector<Matrix3>> covariance;     // a time, an angle
+  MatrixX noise;                                    // n x n, rad^2, of the angles that were given
+  std::vector<Matrix3> covariance;                  // a time
+  std::vector<MatrixX> standing;                    // n x n, rad^2, a time, or empty
 };
 
 // Kalman filter and, unless `live`, Rauch-Tung-Striebel smoother of every angle under random jerk. How large jerk and
-// noise are is found by maximum likelihood, one ratio for all angles. `sigma`: standard deviations of the angles, n
-// a time, which bound the noise from below, or empty. Throws InputError for fewer than three times.
-Motion smooth(const chain::States& states, std::span<const VectorX> sigma, bool live);
+// noise are, and how the angles' errors hang together, is found by maximum likelihood; the ratio of jerk and noise is
+// one for all angles. `standing`: covariances of the angles' lasting errors, n x n a time, or empty. Throws InputError
+// for fewer than three times.
+Motion smooth(const chain::States& states, std::span<const MatrixX> standing, bool live);
+
+// Covariance of angles of which only the standard deviations are known. Cameras see where the rope is: errors of the
+// links' ends are independent, so those of neighboring angles cancel.
+MatrixX angle_covariance(const chain::Chain& chain, const VectorX& theta, const VectorX& sigma);
 
 struct Options {
   double force_scale = 0.5;          // N a 60 g rope is pushed with, in proportion to the mass: the prior's deviation

@@ -545,16 +545,20 @@ double tube_iou(const chain::Chain& chain, const Pose& base, const VectorX& thet
   return either > 0 ? static_cast<double>(both) / either : 0.0;
 }
 
-std::string to_json(const Estimate& estimate, double latency, bool covariance) {
+std::string to_json(const Estimate& estimate, double latency, bool rates) {
   const auto list = [](const VectorX& values) {
     std::string text = "[";
     for (Eigen::Index k = 0; k < values.size(); ++k) text += (k ? "," : "") + core::exact(values[k]);
     return text + "]";
   };
   const int n = static_cast<int>(estimate.theta.size());
-  std::string triangle;
-  for (Eigen::Index r = 0; covariance && r < estimate.covariance.rows(); ++r)
-    for (Eigen::Index c = 0; c <= r; ++c) triangle.append(r ? "," : "").append(core::exact(estimate.covariance(r, c)));
+  std::string covariance;
+  for (Eigen::Index row = 0; row < (rates ? 2 * n : n); ++row)
+    for (Eigen::Index column = 0; column <= row; ++column) {
+      char number[32];
+      std::snprintf(number, sizeof number, "%s%.9g", row ? "," : "", estimate.covariance(row, column));
+      covariance += number;
+    }
   char milliseconds[32];
   std::snprintf(milliseconds, sizeof milliseconds, "%.3f", 1e3 * latency);
   return "{\"frame\":" + std::to_string(estimate.frame) + ",\"time\":" + core::exact(estimate.time) +
@@ -562,9 +566,8 @@ std::string to_json(const Estimate& estimate, double latency, bool covariance) {
          ",\"sigma\":" + list(estimate.covariance.diagonal().head(n).cwiseSqrt()) +
          ",\"centerline_sigma\":" + core::exact(estimate.centerline_sigma) + ",\"iou\":" + core::exact(estimate.iou) +
          ",\"residual\":" + core::exact(estimate.residual) +
-         ",\"color_residual\":" + core::exact(estimate.color_residual) +
-         (covariance ? ",\"covariance\":[" + triangle + "]" : "") + ",\"lost\":" + (estimate.lost ? "true" : "false") +
-         ",\"latency_ms\":" + milliseconds + "}";
+         ",\"color_residual\":" + core::exact(estimate.color_residual) + ",\"covariance\":[" + covariance +
+         "],\"lost\":" + (estimate.lost ? "true" : "false") + ",\"latency_ms\":" + milliseconds + "}";
 }
 
 }  // namespace chainsplat::estimation

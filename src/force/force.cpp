@@ -21,7 +21,8 @@ constexpr double kTouchingWeight = 0.04;
 constexpr double kOddsOfNone = 3.0;
 
 constexpr double kMovingSpeeds =
-    3.0;  // of the friction's regularization speed, beyond which friction is known (SPEC 7)
+    3.0;                              // of the friction's regularization speed, beyond which friction is known (SPEC 7)
+constexpr double kUnseenLever = 0.1;  // diameters; angles that move no link's end (twist) are seen on the surface alone
 constexpr double kLeastTorque = 1e-6;  // of weight times length, keeps covariances invertible
 
 double total_mass(const dynamics::Parameters& parameters) {
@@ -40,6 +41,16 @@ struct Frame {
   std::vector<double> speed;   // m/s a link, of its middle, across the table
 };
 
+// Of the joints after the first and the free end: the ends of the links 1.. .
+std::vector<MatrixX> link_end_jacobians(const chain::Chain& chain, const MatrixX& axes,
+                                        const std::vector<Pose>& motions) {
+  const MatrixX nodes = chain::nodes(chain, motions);
+  std::vector<MatrixX> jacobians;
+  for (int link = 1; link < chain.links(); ++link)
+    jacobians.push_back(chain::point_jacobian(chain, axes, link, nodes.col(link + 1)));
+  return jacobians;
+}
+
 Frame frame_of(const dynamics::Model& model, const trajectory::BaseMotion& base, const Motion& motion, std::size_t f,
                const Options& options) {
   const chain::Chain& chain = model.chain;
@@ -52,14 +63,14 @@ Frame frame_of(const dynamics::Model& model, const trajectory::BaseMotion& base,
   out.motions = chain::link_motions(chain, theta, base.pose);
 
   const dynamics::Linearization at = dynamics::linearize(model, base, math::Vector6::Zero(), theta, thetadot);
-  MatrixX by_angle = MatrixX::Zero(n, n);
-  for (int k = 0; k < n; ++k) {
-    const Matrix3& c = motion.covariance[f][k];
-    MatrixX columns(n, 3);
-    columns << at.stiffness.col(k), at.damping.col(k), at.mass.col(k);
-    by_angle.noalias() += columns * c * columns.transpose();
-  }
-  out.covariance = by_angle;
+  const MatrixX* const by[] = {&at.stiffness, &at.damping, &at.mass};
+  out.covariance = MatrixX::Zero(n, n);
+  for (int a = 0; a < 3; ++a)
+    for (int b = 0; b < 3; ++b)
+      out.covariance.noalias() += motion.covariance[f](a, b) * *by[a] * motion.noise * by[b]->transpose();
+  const std::vector<MatrixX> jacobians = link_end_jacobians(chain, out.axes, out.motions);
+  if (!motion.standing.empty())
+    out.covariance.noalias() += at.stiffness * motion.standing[f] * at.stiffness.transpose();
   const double moment = total_mass(p) * p.gravity.norm() * chain.length;
   for (int k = 0; k < n; ++k) {
     const double spring = options.relative_deviation * p.stiffness[k] * (theta[k] - p.rest_angle[k]);
@@ -70,10 +81,7 @@ Frame frame_of(const dynamics::Model& model, const trajectory::BaseMotion& base,
   // and at the free end would make it
   const double error = options.gravity_deviation * total_mass(p) * p.gravity.norm();
   const MatrixX nodes = chain::nodes(chain, out.motions);
-  for (int link = 1; link < chain.links(); ++link) {
-    const MatrixX jacobian = chain::point_jacobian(chain, out.axes, link, nodes.col(link + 1));
-    out.covariance.noalias() += error * error * jacobian.transpose() * jacobian;
-  }
+  for (const MatrixX& jacobian : jacobians) out.covariance.noalias() += error * error * jacobian.transpose() * jacobian;
 
   // friction at rest balances anything up to its limit
   out.hidden.assign(chain.links(), 0.0);
@@ -102,6 +110,17 @@ Contact contact_at(const chain::Chain& chain, double arclength) {
 }
 
 }  // namespace
+
+MatrixX angle_covariance(const chain::Chain& chain, const VectorX& theta, const VectorX& sigma) {
+  const MatrixX axes = chain::world_axes(chain, theta, Pose{});
+  MatrixX information = MatrixX::Zero(sigma.size(), sigma.size());
+  for (const MatrixX& jacobian : link_end_jacobians(chain, axes, chain::link_motions(chain, theta, Pose{})))
+    information.noalias() += jacobian.transpose() * jacobian;
+  information.diagonal().array() += std::pow(kUnseenLever * chain.diameter, 2);
+  const MatrixX covariance = information.llt().solve(MatrixX::Identity(sigma.size(), sigma.size()));
+  const VectorX scale = sigma.cwiseQuotient(covariance.diagonal().cwiseSqrt());
+  return scale.asDiagonal() * covariance * scale.asDiagonal();
+}
 
 VectorX residual_torque(const dynamics::Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                         const VectorX& thetadot, const VectorX& thetaddot) {

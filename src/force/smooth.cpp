@@ -1,5 +1,4 @@
 // Angles along time under random jerk: Kalman filter and Rauch-Tung-Striebel smoother.
-#include <array>
 #include <cmath>
 
 #include "chainsplat/force.h"
@@ -13,11 +12,14 @@ constexpr double kLeastRatio = 1e3, kLargestRatio = 1e9;
 constexpr int kRatios = 13;
 constexpr double kFirstRate = 10.0, kFirstAcceleration = 100.0;  // rad/s, rad/s^2, before anything was seen
 constexpr double kLeastNoise = 1e-5;                             // rad
+constexpr double kCorrelationTimes = 2.0;  // an angle, as many as are needed to believe half of a correlation
 
+// All angles share the gains, which depend on the ratio and the times alone, so that variances are the noise's times
+// one 3 x 3 matrix a time.
 struct Filtered {
-  std::vector<Vector3> predicted, mean;                   // theta, thetadot, thetaddot
+  std::vector<MatrixX> predicted, mean;                   // n x 3: theta, thetadot, thetaddot
   std::vector<Matrix3> predicted_covariance, covariance;  // for noise of 1 rad
-  double noise = 0.0;                                     // rad, of the observations, found
+  MatrixX noise;                                          // n x n, rad^2, covariance of the observations, found
   double log_likelihood = 0.0;
 };
 
@@ -35,92 +37,91 @@ Matrix3 jerk(double h) {
   return q;
 }
 
-// One angle, in units of the noise; `least_noise` bounds what is found.
-Filtered filter(const std::vector<double>& time, const std::vector<VectorX>& theta, int angle, double ratio,
-                double least_noise) {
+Filtered filter(const std::vector<double>& time, const std::vector<VectorX>& theta, double ratio) {
   Filtered out;
   const std::size_t count = time.size();
-  Vector3 mean(theta[0][angle], 0.0, 0.0);
+  const Eigen::Index n = theta[0].size();
+  MatrixX mean = MatrixX::Zero(n, 3);
+  mean.col(0) = theta[0];
   // far wider than any motion, in units of noise of a milliradian
   Matrix3 covariance = Vector3(1.0, std::pow(kFirstRate * 1e3, 2), std::pow(kFirstAcceleration * 1e3, 2)).asDiagonal();
-  double squares = 0.0, logs = 0.0;
+  MatrixX squares = MatrixX::Zero(n, n);
+  double logs = 0.0;
   int used = 0;
   for (std::size_t f = 0; f < count; ++f) {
     if (f > 0) {
       const double h = time[f] - time[f - 1];
-      mean = transition(h) * mean;
-      covariance = transition(h) * covariance * transition(h).transpose() + ratio * jerk(h);
+      const Matrix3 step = transition(h);
+      mean = (mean * step.transpose()).eval();
+      covariance = (step * covariance * step.transpose() + ratio * jerk(h)).eval();
     }
     out.predicted.push_back(mean);
     out.predicted_covariance.push_back(covariance);
-    const double innovation = theta[f][angle] - mean[0], variance = covariance(0, 0) + 1.0;
+    const VectorX innovation = theta[f] - mean.col(0);
+    const double variance = covariance(0, 0) + 1.0;
     if (f > 2) {
-      squares += innovation * innovation / variance;
+      squares += innovation * innovation.transpose() / variance;
       logs += std::log(variance);
       ++used;
     }
     const Vector3 gain = covariance.col(0) / variance;
-    mean += gain * innovation;
+    mean += innovation * gain.transpose();
     covariance -= gain * covariance.row(0);
     covariance = (0.5 * (covariance + covariance.transpose())).eval();
     out.mean.push_back(mean);
     out.covariance.push_back(covariance);
   }
-  const double noise2 = std::max(least_noise * least_noise, used > 0 ? squares / used : 0.0);
-  out.noise = std::sqrt(noise2);
-  out.log_likelihood = -0.5 * (logs + used * std::log(noise2) + squares / noise2);
+  // few times do not tell how the angles' errors hang together
+  out.noise = MatrixX::Zero(n, n);
+  if (used > 0) {
+    const double trust = used / (used + kCorrelationTimes * n);
+    out.noise = trust / used * squares;
+    out.noise.diagonal() = squares.diagonal() / used;
+  }
+  out.noise.diagonal().array() += kLeastNoise * kLeastNoise;
+  const Eigen::LLT<MatrixX> factor(out.noise);
+  out.log_likelihood = -0.5 * (n * logs + 2.0 * used * factor.matrixLLT().diagonal().array().log().sum() +
+                               factor.solve(squares).trace());
   return out;
 }
 
 }  // namespace
 
-Motion smooth(const chain::States& states, std::span<const VectorX> sigma, bool live) {
+Motion smooth(const chain::States& states, std::span<const MatrixX> standing, bool live) {
   const std::size_t count = states.time.size();
   if (count < 3) throw InputError("states", "are fewer than three", "give more: forces need accelerations");
-  const int n = static_cast<int>(states.theta[0].size());
-  std::vector<Filtered> best;
-  double best_likelihood = 0.0;
+  Filtered best;
   for (int i = 0; i < kRatios; ++i) {
     const double ratio = kLeastRatio * std::pow(kLargestRatio / kLeastRatio, i / (kRatios - 1.0));
-    std::vector<Filtered> angles;
-    double likelihood = 0.0;
-    for (int k = 0; k < n; ++k) {
-      angles.push_back(filter(states.time, states.theta, k, ratio, kLeastNoise));
-      likelihood += angles.back().log_likelihood;
-    }
-    if (best.empty() || likelihood > best_likelihood) {
-      best = std::move(angles);
-      best_likelihood = likelihood;
-    }
+    Filtered tried = filter(states.time, states.theta, ratio);
+    if (i == 0 || tried.log_likelihood > best.log_likelihood) best = std::move(tried);
   }
   Motion out;
   out.time = states.time;
-  out.theta.assign(count, VectorX(n));
-  out.thetadot.assign(count, VectorX(n));
-  out.thetaddot.assign(count, VectorX(n));
-  out.covariance.assign(count, std::vector<Matrix3>(n));
-  for (int k = 0; k < n; ++k) {
-    const Filtered& a = best[k];
-    Vector3 mean = a.mean.back();
-    Matrix3 covariance = a.covariance.back();
-    for (std::size_t back = 0; back < count; ++back) {
-      const std::size_t f = count - 1 - back;
-      if (live) {
-        mean = a.mean[f];
-        covariance = a.covariance[f];
-      } else if (back > 0) {
-        const Matrix3 f_next = transition(states.time[f + 1] - states.time[f]);
-        const Matrix3 gain = a.covariance[f] * f_next.transpose() * a.predicted_covariance[f + 1].inverse();
-        mean = a.mean[f] + gain * (mean - a.predicted[f + 1]);
-        covariance = (a.covariance[f] + gain * (covariance - a.predicted_covariance[f + 1]) * gain.transpose()).eval();
-      }
-      out.theta[f][k] = mean[0];
-      out.thetadot[f][k] = mean[1];
-      out.thetaddot[f][k] = mean[2];
-      out.covariance[f][k] = a.noise * a.noise * 0.5 * (covariance + covariance.transpose());
-      // errors that stay from frame to frame are not noise: they are known to the giver of the states alone
-      if (!sigma.empty()) out.covariance[f][k](0, 0) += sigma[f][k] * sigma[f][k];
+  out.theta.resize(count);
+  out.thetadot.resize(count);
+  out.thetaddot.resize(count);
+  out.covariance.resize(count);
+  out.noise = best.noise;
+  out.standing.assign(standing.begin(), standing.end());
+  MatrixX mean = best.mean.back();
+  Matrix3 covariance = best.covariance.back();
+  for (std::size_t back = 0; back < count; ++back) {
+    const std::size_t f = count - 1 - back;
+    if (live) {
+      mean = best.mean[f];
+      covariance = best.covariance[f];
+    } else if (back > 0) {
+      const Matrix3 step = transition(states.time[f + 1] - states.time[f]);
+      const Matrix3 gain = best.covariance[f] * step.transpose() * best.predicted_covariance[f + 1].inverse();
+      mean = (best.mean[f] + (mean - best.predicted[f + 1]) * gain.transpose()).eval();
+      covariance =
+          (best.covariance[f] + gain * (covariance - best.predicted_covariance[f + 1]) * gain.transpose()).eval();
     }
+    out.theta[f] = mean.col(0);
+    out.thetadot[f] = mean.col(1);
+    out.thetaddot[f] = mean.col(2);
+    out.covariance[f] = 0.5 * (covariance + covariance.transpose());
   }
   return out;
 }
