@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstdio>
 #include <iostream>
+#include <limits>
 #include <memory>
 #include <nlohmann/json.hpp>
 #include <sstream>
@@ -18,6 +19,8 @@ namespace chainsplat::tools {
 namespace {
 
 using Json = nlohmann::json;
+
+constexpr double kNear = 3.0;  // diameters from the rope within which something may touch it
 
 struct ForceRequest {
   std::string run, states, estimate, base, contact = "auto", hand;
@@ -123,12 +126,33 @@ void force(const Globals& globals, const ForceRequest& request) {
   if (states.time.size() < 3)
     throw InputError(request.estimate.empty() ? request.states : request.estimate, "has fewer than three states",
                      "give more: forces need accelerations");
+  const double slack = 1.0 / 30.0;  // s, a frame beyond the last sample
+  if (base.samples().size() > 1 &&
+      (states.time.front() < base.start() - slack || states.time.back() > base.end() + slack))
+    throw InputError(request.base.empty() ? request.run : request.base,
+                     "the base motion covers " + core::exact(base.start()) + " to " + core::exact(base.end()) +
+                         " s, the states " + core::exact(states.time.front()) + " to " +
+                         core::exact(states.time.back()) + " s",
+                     "give the base motion of these states with --base");
   const force::Motion motion = force::smooth(states, standing, request.live);
 
   const std::size_t count = motion.time.size();
   std::vector<std::optional<force::Contact>> contacts;
   const auto nearest = [&](std::size_t f, const math::MatrixX& points) {
     return force::nearest_contact(twin.chain, twin.gaussians, base.pose(motion.time[f]), motion.theta[f], points);
+  };
+  // what is far from the rope does not touch it; what always is was meant otherwise
+  const auto keep_near = [&](const std::string& where) {
+    double least = std::numeric_limits<double>::infinity();
+    for (std::optional<force::Contact>& contact : contacts) {
+      if (!contact) continue;
+      least = std::min(least, contact->distance);
+      if (contact->distance > kNear * twin.chain.diameter) contact.reset();
+    }
+    if (!std::isfinite(least)) throw InputError(where, "names no contact at any of the states' times", "correct it");
+    if (least > kNear * twin.chain.diameter)
+      throw InputError(where, "never comes nearer to the rope than " + core::exact(least) + " m",
+                       "give meters in the world frame, and the base motion of the states");
   };
   if (!request.hand.empty()) {
     const splat::Gaussians cloud = twin::read_ply(request.hand);
@@ -137,6 +161,7 @@ void force(const Globals& globals, const ForceRequest& request) {
     for (int i = 0; i < cloud.count; ++i)
       points.col(i) << cloud.mean[3 * i], cloud.mean[3 * i + 1], cloud.mean[3 * i + 2];
     for (std::size_t f = 0; f < count; ++f) contacts.push_back(nearest(f, points));
+    keep_near(request.hand);
   } else if (request.contact.ends_with(".csv") || request.contact == "-") {
     const std::vector<ContactPoint> given = read_contacts(request.contact);
     const double most = count > 1 ? (motion.time.back() - motion.time.front()) / (count - 1.0) : 0.0;  // s apart
@@ -147,6 +172,7 @@ void force(const Globals& globals, const ForceRequest& request) {
       contacts.emplace_back();
       if (at->point && std::abs(at->time - motion.time[f]) <= most) contacts.back() = nearest(f, *at->point);
     }
+    keep_near(request.contact);
   } else if (request.contact != "auto") {
     math::Vector3 point;
     char rest = 0;
@@ -155,6 +181,7 @@ void force(const Globals& globals, const ForceRequest& request) {
       throw InputError("--contact", "'" + request.contact + "' is no point",
                        "give X,Y,Z in meters, a FILE.csv or auto");
     for (std::size_t f = 0; f < count; ++f) contacts.push_back(nearest(f, point));
+    keep_near("--contact");
   }
   const std::vector<force::Estimate> estimates = force::estimate(
       model, [&](double time) { return base.at(time); }, motion, contacts, request.live);
@@ -180,7 +207,8 @@ void add_force_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("FILE.tum");
   command
       ->add_option("--contact", request->contact,
-                   "Where it is touched: X,Y,Z in the world, FILE.csv with time,x,y,z, or auto (default)")
+                   "Where it is touched: X,Y,Z in the world, FILE.csv with time,x,y,z, or auto (default).\n"
+                   "Points farther than three diameters from the rope do not touch it")
       ->type_name("X,Y,Z|FILE.csv|auto");
   command->add_option("--hand", request->hand, "Point cloud of the hand; the nearest Gaussian is touched")
       ->type_name("FILE.ply");

@@ -43,10 +43,12 @@ MatrixX angle_covariance(const chain::Chain& chain, const VectorX& theta, const 
 
 struct Options {
   double force_scale = 0.5;          // N a 60 g rope is pushed with, in proportion to the mass: the prior's deviation
-  double along = 0.3;                // the same along the rope, in proportion: fingers slip
+  double along = 0.3;                // of the force across: the same along the rope, where fingers slip
   double relative_deviation = 0.2;   // of the joints' stiffness and damping torques: what identification leaves open
   double gravity_deviation = 0.004;  // of the rope's weight times its length: torque error of any joint
-  double window = 0.15;              // s to either side over which the place of an automatic contact is one
+  double error_memory = 0.1;         // s, in which the model's and the states' errors stay the same
+  double contact_time = 1.0;         // s, a contact lasts in the mean
+  double slide = 0.1;                // lengths of the rope in 1/sqrt(s), a contact wanders along it
   int places = 60;                   // arclengths tried for an automatic contact
 };
 
@@ -71,6 +73,7 @@ struct Contact {
   int link = 0;
   double arclength = 0.0;          // m
   Vector3 home = Vector3::Zero();  // of the material point, base frame, m
+  double distance = 0.0;           // m, from where a hand was said to be
 };
 
 // The Gaussian nearest to any of the `points` (world, columns), on its most probable link; without Gaussians the
@@ -82,17 +85,20 @@ struct Estimate {
   double time = 0.0;
   Contact contact;
   Vector3 point = Vector3::Zero();     // of the contact, world, m
-  Vector3 force = Vector3::Zero();     // N, or N a kilogram of rope; with an automatic contact times its probability
+  Vector3 force = Vector3::Zero();     // N, or N a kilogram of rope; times the probability of an automatic contact
   Vector3 sigma = Vector3::Zero();     // standard errors
+  Vector3 low = Vector3::Zero();       // what the force may be where friction at rest, of all links together, hides
+  Vector3 high = Vector3::Zero();      // a part of it (SPEC 7), by component; else the force. Without its sigma
   Vector3 observed = Vector3::Zero();  // 0 (only the prior speaks) .. 1, by component
-  double explained = 0.0;              // fall of chi square by the force
+  double probability = 0.0;            // that something touches
   double arclength_sigma = 0.0;        // m, of an automatic contact; else 0
   bool touching = false;
-  bool moving = true;  // false: friction at rest hides forces; sigma has what it may hold
+  bool moving = true;  // false: the rope rests where it is touched, and friction there may hide forces
 };
 
 // One line a time of `motion`. `contacts`: a time each, empty where nothing is said to touch; an empty span: automatic.
-// `live`: the place of a contact is found from the past alone.
+// Whether something touches, and an automatic contact's place, are followed over time, `live` from the past alone. An
+// automatic contact lies on the centerline.
 std::vector<Estimate> estimate(const dynamics::Model& model, const dynamics::BaseFunction& base, const Motion& motion,
                                std::span<const std::optional<Contact>> contacts, bool live,
                                const Options& options = {});

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <numeric>
 
 namespace chainsplat::force {
 
@@ -12,13 +13,13 @@ namespace {
 
 constexpr double kPushedMass = 0.06;  // kg, of the rope that Options::force_scale is for
 
-// A force is said to touch where it explains this much chi square (three components: beyond 99.9 %) and is larger than
-// this share of the rope's weight, which model errors feign.
-constexpr double kTouching = 16.3;
+// A force is said to touch where that is more likely than not and it is larger than this share of the rope's weight,
+// which model errors feign.
 constexpr double kTouchingWeight = 0.04;
 
-// Nothing touches a rope most of the time: without evidence an automatic contact is so much less likely than none.
-constexpr double kOddsOfNone = 3.0;
+// How much longer nothing touches a rope than something does, where contacts are sought, and where the user names one.
+constexpr double kOddsOfNone = 3.0, kOddsWhereNamed = 1.0;
+constexpr double kNotSaid = -1e6;  // log likelihood of a contact where the user says that there is none
 
 constexpr double kMovingSpeeds =
     3.0;                              // of the friction's regularization speed, beyond which friction is known (SPEC 7)
@@ -34,7 +35,8 @@ double total_mass(const dynamics::Parameters& parameters) {
 // What one frame contributes: the unexplained torque, how sure it is, and where the rope is.
 struct Frame {
   VectorX residual;
-  MatrixX covariance;
+  MatrixX covariance;          // with friction at rest as noise,
+  MatrixX sliding_covariance;  // and without
   MatrixX axes;
   std::vector<Pose> motions;
   std::vector<double> hidden;  // N a link, friction that may balance a force unseen
@@ -83,6 +85,7 @@ Frame frame_of(const dynamics::Model& model, const trajectory::BaseMotion& base,
   const MatrixX nodes = chain::nodes(chain, out.motions);
   for (const MatrixX& jacobian : jacobians) out.covariance.noalias() += error * error * jacobian.transpose() * jacobian;
 
+  out.sliding_covariance = out.covariance;
   // friction at rest balances anything up to its limit
   out.hidden.assign(chain.links(), 0.0);
   out.speed.assign(chain.links(), 0.0);
@@ -98,15 +101,88 @@ Frame frame_of(const dynamics::Model& model, const trajectory::BaseMotion& base,
       out.speed[link] = v.norm();
       const double limit = p.coulomb_friction[link - 1] * p.link_mass[link - 1] * std::abs(p.gravity.dot(normal));
       out.hidden[link] = limit * p.coulomb_speed / std::hypot(v.norm(), p.coulomb_speed);
-      const MatrixX tangential = across * jacobian;
-      out.covariance.noalias() += std::pow(out.hidden[link], 2) * tangential.transpose() * tangential;
+      const MatrixX along = across * jacobian;
+      out.covariance.noalias() += std::pow(out.hidden[link], 2) * along.transpose() * along;
     }
   }
   return out;
 }
 
 Contact contact_at(const chain::Chain& chain, double arclength) {
-  return {chain::link_at(chain, arclength), arclength, arclength * chain.direction};
+  return {chain::link_at(chain, arclength), arclength, arclength * chain.direction, 0.0};
+}
+
+// Whether the rope is touched, and where, along time: a hidden Markov chain over 'nowhere' and the places.
+struct Track {
+  std::vector<double> probability;           // of being touched, a time
+  std::vector<double> arclength, deviation;  // m, if touched
+};
+
+// `evidence`: places x times, log likelihood of a force there over that of none. `odds`: of none over a contact, before
+// anything was seen. Backward from the future unless `live`.
+Track follow(const MatrixX& evidence, const std::vector<double>& time, const std::vector<double>& arclengths,
+             double odds, double slide, bool live, const Options& options) {
+  const Eigen::Index places = evidence.rows(), count = evidence.cols();
+  // likelihoods a time, row 0 of 'nowhere'; errors last, so what is near in time is in part the same news
+  MatrixX likely(places + 1, count);
+  for (Eigen::Index f = 0; f < count; ++f) {
+    const double h = f > 0 ? time[f] - time[f - 1] : count > 1 ? time[1] - time[0] : options.error_memory;
+    VectorX column(places + 1);
+    column << 0.0, std::min(1.0, h / options.error_memory) * evidence.col(f);
+    likely.col(f) = (column.array() - column.maxCoeff()).exp();
+  }
+  const auto transition = [&](double h) {  // column: from
+    MatrixX out = MatrixX::Zero(places + 1, places + 1);
+    const double leave = 1.0 - std::exp(-h / options.contact_time), come = leave / odds;
+    out(0, 0) = 1.0 - come;
+    out.col(0).tail(places).setConstant(come / places);
+    for (Eigen::Index i = 0; i < places; ++i) {
+      VectorX to(places);
+      for (Eigen::Index k = 0; k < places; ++k)
+        to[k] = std::exp(-0.5 * std::pow(arclengths[k] - arclengths[i], 2) / (slide * slide * h));
+      out(0, 1 + i) = leave;
+      out.col(1 + i).tail(places) = (1.0 - leave) / to.sum() * to;
+    }
+    return out;
+  };
+  MatrixX step;
+  double step_time = 0.0;
+  const auto over = [&](double h) -> const MatrixX& {
+    if (step.size() == 0 || std::abs(h - step_time) > 1e-9) step = transition(step_time = h);
+    return step;
+  };
+  MatrixX belief(places + 1, count);
+  for (Eigen::Index f = 0; f < count; ++f) {
+    VectorX before(places + 1);
+    if (f == 0) {
+      before.setConstant(1.0 / (places * (1.0 + odds)));
+      before[0] = odds / (1.0 + odds);
+    } else {
+      before = over(time[f] - time[f - 1]) * belief.col(f - 1);
+    }
+    belief.col(f) = before.cwiseProduct(likely.col(f));
+    belief.col(f) /= belief.col(f).sum();
+  }
+  if (!live) {
+    VectorX later = VectorX::Ones(places + 1);
+    for (Eigen::Index f = count - 1; f-- > 0;) {
+      later = over(time[f + 1] - time[f]).transpose() * later.cwiseProduct(likely.col(f + 1));
+      later /= later.sum();
+      belief.col(f) = belief.col(f).cwiseProduct(later).eval();
+      belief.col(f) /= belief.col(f).sum();
+    }
+  }
+  Track out;
+  const Eigen::Map<const VectorX> s(arclengths.data(), places);
+  for (Eigen::Index f = 0; f < count; ++f) {
+    const VectorX at = belief.col(f).tail(places);
+    out.probability.push_back(1.0 - belief(0, f));
+    const double mean = at.sum() > 0.0 ? at.dot(s) / at.sum() : s.mean();
+    out.arclength.push_back(mean);
+    out.deviation.push_back(at.sum() > 0.0 ? std::sqrt(at.dot((s.array() - mean).square().matrix()) / at.sum())
+                                           : s.maxCoeff() - s.minCoeff());
+  }
+  return out;
 }
 
 }  // namespace
@@ -151,7 +227,7 @@ Contact nearest_contact(const chain::Chain& chain, const splat::Gaussians& gauss
       const double distance = (points.col(i) - x).squaredNorm();
       if (distance >= least) continue;
       least = distance;
-      best = {link, arclength, home};
+      best = {link, arclength, home, std::sqrt(distance)};
     }
   };
   if (gaussians.count > 0 && gaussians.links == chain.links()) {
@@ -179,13 +255,16 @@ std::vector<Estimate> estimate(const dynamics::Model& model, const dynamics::Bas
   CHAINSPLAT_CHECK(automatic || contacts.size() == count, std::to_string(contacts.size()));
   const double mass = total_mass(model.parameters), weight = mass * model.parameters.gravity.norm();
   const double across = options.force_scale * mass / kPushedMass, along = options.along * across;
-  const auto solve_at = [&](const Frame& frame, const Contact& contact) {
+  const auto jacobian_at = [&](const Frame& frame, const Contact& contact) {
+    return chain::point_jacobian(chain, frame.axes, contact.link, frame.motions[contact.link] * contact.home);
+  };
+  const auto prior_at = [&](const Frame& frame, const Contact& contact) {
     const Vector3 tangent = frame.motions[contact.link].rotation * chain.direction;
-    const Matrix3 prior =
-        across * across * Matrix3::Identity() + (along * along - across * across) * tangent * tangent.transpose();
-    const MatrixX jacobian =
-        chain::point_jacobian(chain, frame.axes, contact.link, frame.motions[contact.link] * contact.home);
-    return std::pair(solve(jacobian, frame.residual, frame.covariance, prior), prior);
+    return Matrix3(across * across * Matrix3::Identity() +
+                   (along * along - across * across) * tangent * tangent.transpose());
+  };
+  const auto evidence_at = [&](const Frame& frame, const Contact& contact) {
+    return solve(jacobian_at(frame, contact), frame.residual, frame.covariance, prior_at(frame, contact)).evidence;
   };
   std::vector<Frame> frames;
   for (std::size_t f = 0; f < count; ++f) frames.push_back(frame_of(model, base(motion.time[f]), motion, f, options));
@@ -198,8 +277,15 @@ std::vector<Estimate> estimate(const dynamics::Model& model, const dynamics::Bas
     evidence.resize(options.places, static_cast<Eigen::Index>(count));
     for (std::size_t f = 0; f < count; ++f)
       for (int i = 0; i < options.places; ++i)
-        evidence(i, f) = solve_at(frames[f], contact_at(chain, arclengths[i])).first.evidence;
+        evidence(i, f) = evidence_at(frames[f], contact_at(chain, arclengths[i]));
+  } else {
+    arclengths.push_back(chain.length);
+    evidence.resize(1, static_cast<Eigen::Index>(count));
+    for (std::size_t f = 0; f < count; ++f)
+      evidence(0, f) = contacts[f] ? evidence_at(frames[f], *contacts[f]) : kNotSaid;
   }
+  const Track track = follow(evidence, motion.time, arclengths, automatic ? kOddsOfNone : kOddsWhereNamed,
+                             options.slide * chain.length, live, options);
 
   std::vector<Estimate> out;
   for (std::size_t f = 0; f < count; ++f) {
@@ -207,45 +293,34 @@ std::vector<Estimate> estimate(const dynamics::Model& model, const dynamics::Bas
     Estimate e;
     e.time = motion.time[f];
     e.contact = contact_at(chain, chain.length);
-    bool said = true;
-    double probability = 1.0;
     if (automatic) {
-      // neighboring times see nearly the same contact, and their errors are nearly the same too: the mean, not the sum
-      VectorX mean = VectorX::Zero(options.places);
-      double used = 0.0;
-      for (std::size_t g = 0; g < count; ++g) {
-        if (std::abs(motion.time[g] - e.time) > options.window || (live && g > f)) continue;
-        mean += evidence.col(g);
-        used += 1.0;
-      }
-      mean /= used;
-      Eigen::Index at = 0;
-      mean.maxCoeff(&at);
-      double s = arclengths[at];
-      const double step = chain.length / options.places;
-      e.arclength_sigma = chain.length;
-      if (at > 0 && at + 1 < options.places) {
-        const double curvature = 2.0 * mean[at] - mean[at - 1] - mean[at + 1];
-        if (curvature > 0.0) {
-          s += 0.5 * step * (mean[at + 1] - mean[at - 1]) / curvature;
-          e.arclength_sigma = std::min(chain.length, step / std::sqrt(curvature));
-        }
-      }
-      e.contact = contact_at(chain, std::clamp(s, 0.0, chain.length));
-      probability = 1.0 / (1.0 + kOddsOfNone * std::exp(-evidence(at, f)));
+      e.contact = contact_at(chain, track.arclength[f]);
+      e.arclength_sigma = track.deviation[f];
     } else if (contacts[f]) {
       e.contact = *contacts[f];
-    } else {
-      said = false;
     }
     e.point = frame.motions[e.contact.link] * e.contact.home;
-    if (said) {
-      const auto [fit, prior] = solve_at(frame, e.contact);
-      e.force = probability * fit.force;
-      e.sigma = fit.covariance.diagonal().cwiseSqrt();
-      e.explained = fit.explained;
-      e.observed = (Vector3::Ones() - fit.covariance.diagonal().cwiseQuotient(prior.diagonal())).cwiseMax(0.0);
-      e.touching = e.explained > kTouching && e.force.norm() > kTouchingWeight * weight;
+    if (automatic || contacts[f]) {
+      e.probability = track.probability[f];
+      const MatrixX jacobian = jacobian_at(frame, e.contact);
+      const Matrix3 prior = prior_at(frame, e.contact);
+      const Fit fit = solve(jacobian, frame.residual, frame.covariance, prior);
+      const Vector3 variance = fit.covariance.diagonal();
+      // a contact that was named is believed
+      const double believed = automatic ? e.probability : 1.0;
+      e.force = believed * fit.force;
+      e.sigma = (variance + believed * (1.0 - believed) * fit.force.cwiseProduct(fit.force)).cwiseSqrt();
+      e.observed = (Vector3::Ones() - variance.cwiseQuotient(prior.diagonal())).cwiseMax(0.0);
+      e.touching = e.probability > 0.5 && e.force.norm() > kTouchingWeight * weight;
+      // friction at rest may balance any force up to its limit: about what the rope would feel if it balanced none
+      const Fit fit_sliding = solve(jacobian, frame.residual, frame.sliding_covariance, prior);
+      const double limit = std::accumulate(frame.hidden.begin(), frame.hidden.end(), 0.0);
+      e.low = e.high = e.force;
+      if (const auto& normal = model.parameters.table_normal) {
+        const Vector3 reach = limit * (Vector3::Ones() - normal->cwiseProduct(*normal)).cwiseMax(0.0).cwiseSqrt();
+        e.low = e.force.cwiseMin(fit_sliding.force - reach);
+        e.high = e.force.cwiseMax(fit_sliding.force + reach);
+      }
     }
     // friction is known where the links about the contact slide
     for (int link = std::max(1, e.contact.link - 1); link <= std::min(chain.links() - 1, e.contact.link + 1); ++link)
@@ -264,8 +339,10 @@ std::string to_json(const Estimate& e, bool known_mass) {
   return "{\"time\":" + core::exact(e.time) + ",\"link\":" + std::to_string(e.contact.link) +
          ",\"arclength\":" + core::exact(e.contact.arclength) + ",\"point\":" + list(e.point) +
          ",\"force\":" + list(e.force) + ",\"sigma\":" + list(e.sigma) + ",\"touching\":" + truth(e.touching) +
-         ",\"observed\":" + list(e.observed) + ",\"arclength_sigma\":" + core::exact(e.arclength_sigma) +
-         ",\"moving\":" + truth(e.moving) + ",\"unit\":\"" + (known_mass ? "N" : "N/kg") + "\"}";
+         ",\"probability\":" + core::exact(e.probability) + ",\"observed\":" + list(e.observed) +
+         ",\"low\":" + list(e.low) + ",\"high\":" + list(e.high) +
+         ",\"arclength_sigma\":" + core::exact(e.arclength_sigma) + ",\"moving\":" + truth(e.moving) + ",\"unit\":\"" +
+         (known_mass ? "N" : "N/kg") + "\"}";
 }
 
 }  // namespace chainsplat::force

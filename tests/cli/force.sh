@@ -1,0 +1,35 @@
+#!/bin/bash
+# 'chainsplat force': what each way to name a contact gives, and what is wrong with the others.
+. "$(dirname "$0")/lib.sh"
+demo=$source_dir/assets/demo_free_30
+
+run train "$demo" -o "$work/twin" --joints 3 --bending planar --frames 0:12
+expect_code 0 train
+states=$work/twin/states.csv
+force() { run force "$work/twin" --states "$states" --base "$demo/base.tum" "$@"; }
+
+force
+expect_code 0 'force'
+[ "$(wc -l <"$work/stdout")" -eq 12 ] || fail 'force: not a line a state'
+expect_output '^\{"time":.*"link":.*"arclength":.*"force":\[.*"sigma":\[.*"touching":.*"low":\[.*"unit":"N' force
+force --live
+expect_code 0 'force --live'
+
+# a contact at the free end, and none
+point=$(sed -n '1s/.*"point":\[\([^]]*\)\].*/\1/p' "$work/stdout")
+force --contact "$point"
+expect_code 0 'force --contact X,Y,Z'
+printf 'time,x,y,z\n0,%s\n0.1,,,\n' "$point" >"$work/contact.csv"
+force --contact "$work/contact.csv"
+expect_code 0 'force --contact FILE.csv'
+
+printf 'time,x,y,z\n0,,,\n' >"$work/none.csv"
+expect_error 2 'no contact' force "$work/twin" --states "$states" --base "$demo/base.tum" --contact "$work/none.csv"
+expect_error 2 'never comes nearer' force "$work/twin" --states "$states" --base "$demo/base.tum" --contact 100,0,0
+expect_error 2 'is no point' force "$work/twin" --states "$states" --base "$demo/base.tum" --contact 1,2
+sed '1!s/^[^,]*/9&/' "$states" >"$work/late.csv"
+expect_error 2 'base motion covers' force "$work/twin" --states "$work/late.csv" --base "$demo/base.tum"
+printf 'time,theta_1\n0,0\n1,0\n2,0\n' >"$work/other.csv"
+expect_error 2 'other.csv' force "$work/twin" --states "$work/other.csv" --base "$demo/base.tum"
+expect_error 2 'one of the two' force "$work/twin"
+finish
