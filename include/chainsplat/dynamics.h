@@ -125,6 +125,25 @@ struct BaseSlopes {
 BaseSlopes base_slopes(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                        const VectorX& thetadot);
 
+// linearize() and base_slopes() at one state after another without allocation: for integrators and derivatives outside
+// of this module. `model` must outlive it.
+class Engine;
+class Linearizer {
+ public:
+  explicit Linearizer(const Model& model);
+  ~Linearizer();
+  // Fills `out`; without `slopes` its acceleration only. False where M is not positive definite.
+  bool at(const trajectory::BaseMotion& base, const Vector6& base_jerk, const VectorX& theta, const VectorX& thetadot,
+          bool slopes, Linearization& out);
+  // Where at() was with `slopes`.
+  void base_slopes(BaseSlopes& out) const;
+  // x = M^-1 x where at() was.
+  void solve_mass(MatrixX& x) const;
+
+ private:
+  std::unique_ptr<Engine> engine_;
+};
+
 // The stacked matrices of SPEC 3.5 (paper, "Closed-form dynamics", corrected): for reading and checking, O(n^3),
 // viscous and other wrenches as in 3.3. M thetaddot + coriolis + gravity + base - friction = -K(theta - theta_0) - D
 // thetadot.

@@ -2,163 +2,70 @@
 
 #include <cmath>
 
-#include "dynamics/engine.h"
-
 namespace chainsplat::planning {
 namespace {
-
-using dynamics::Engine;
-using math::Matrix3;
-using math::Vector6;
 
 constexpr double kFrame = 1.0 / 30.0;  // s, what `substeps` counts in
 constexpr double kProbe = 3e-6;        // e of the second derivatives: truncation and rounding both below 1e-8
 constexpr double kAngleBound = 1e3;    // rad, beyond which a motion counts as diverged
 constexpr double kRateBound = 1e5;     // rad/s
-const double kGaussPoint[3] = {0.5 * (1.0 - std::sqrt(0.6)), 0.5, 0.5 * (1.0 + std::sqrt(0.6))};
-constexpr double kGaussWeight[3] = {5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0};
 
-// A change of the base motion as the placed bodies feel it (world axes, base origin): velocity u, acceleration psi.
-struct BaseChange {
-  Vector6 psi = Vector6::Zero(), u = Vector6::Zero();
-  bool moves() const { return !u.isZero(0.0); }
-};
-
-// Forces on the joints for a unit of each basis derivative of an axis: column d of `unit[axis]` goes with the d-th.
-class BaseResponse {
- public:
-  BaseResponse(const Engine& engine, const Motion& motion) : engine_(engine), motion_(motion) {
-    forces_.setZero(engine.angles, 3 * static_cast<Eigen::Index>(motion.axes.size()));
-  }
-
-  // Adds d(torque - tau_ID)/d(unknowns) at the placed and linearized state.
-  void add(const Coordinates& c, const Basis& basis, MatrixX& out) {
-    changes(c);
-    respond();
-    for (std::size_t a = 0; a < motion_.axes.size(); ++a)
-      for (int d = 0; d < 3; ++d) {
-        const Eigen::Index column = 3 * static_cast<Eigen::Index>(a) + d;
-        if (!used_[column]) continue;
-        out.middleCols(static_cast<Eigen::Index>(a) * kPerAxis, kPerAxis).noalias() +=
-            forces_.col(column) * basis.col(d).transpose();
-      }
-  }
-
- private:
-  // The rope seen in axes that turn with the yaw: a change of the yaw turns velocity and acceleration back.
-  void changes(const Coordinates& c) {
-    const Vector3& up = motion_.up;
-    const dynamics::Parameters& p = engine_.model.parameters;
-    Vector3 gravity = p.gravity;
-    if (p.table_normal && p.table_carries_weight) gravity -= *p.table_normal * p.table_normal->dot(gravity);
-    const Vector3 v = c.col(1).head<3>(), a = c.col(2).head<3>();
-    change_.assign(3 * motion_.axes.size(), {});
-    used_.assign(3 * motion_.axes.size(), true);
-    for (std::size_t k = 0; k < motion_.axes.size(); ++k) {
-      BaseChange *value = &change_[3 * k], *rate = value + 1, *second = value + 2;
-      if (motion_.axes[k] != Axis::yaw) {
-        used_[3 * k] = false;
-        const Vector3 e = Vector3::Unit(static_cast<int>(motion_.axes[k]));
-        rate->u.tail<3>() = e;
-        second->psi.tail<3>() = e;
-      } else {
-        value->u.tail<3>() = -up.cross(v);
-        value->psi.tail<3>() = -up.cross(a - gravity);
-        rate->u.head<3>() = up;
-        rate->psi.tail<3>() = -2.0 * up.cross(v);
-        second->psi.head<3>() = up;
-      }
-    }
-  }
-
-  // -s_k^T (I psi + 2 B u - dW/dV u) of the outer links, for every change (see dynamics/engine.h).
-  void respond() {
-    const dynamics::Parameters& p = engine_.model.parameters;
-    const bool table = p.table_normal.has_value();
-    const Vector3 normal = table ? *p.table_normal : Vector3::Zero();
-    wrench_.assign(change_.size(), Vector6::Zero());
-    for (int j = engine_.link_count - 1; j >= 0; --j) {
-      const dynamics::RigidInertia& body = engine_.inertia[j];
-      const Vector3 w = engine_.velocity[j].head<3>(), v = engine_.velocity[j].tail<3>();
-      const Vector3 momentum = body.mass * v - body.moment.cross(w);
-      const double trace = body.rotational.trace();
-      for (std::size_t i = 0; i < change_.size(); ++i) {
-        if (!used_[i]) continue;
-        wrench_[i] += body * change_[i].psi;
-        const Vector3 turn = change_[i].u.head<3>();
-        wrench_[i].head<3>() +=
-            2.0 * w.cross(body.rotational * turn) - trace * w.cross(turn) - 2.0 * body.moment.cross(v.cross(turn));
-        wrench_[i].tail<3>() -= 2.0 * momentum.cross(turn);
-      }
-      const dynamics::LinkConstants& link = engine_.links[j];
-      const bool rubs = table && (link.viscous > 0.0 || link.coulomb > 0.0);
-      const bool drags = link.air_linear > 0.0 || link.air_quadratic > 0.0;
-      for (int g = 0; g < 3 && (rubs || drags); ++g) {
-        const Vector3& d = engine_.direction[j];
-        const Vector3 c = engine_.origin[j] + kGaussPoint[g] * link.length * d;
-        const Vector3 speed = v + w.cross(c);
-        Matrix3 slope = Matrix3::Zero();  // df/dv of SPEC 3.3
-        if (rubs) {
-          const Vector3 vt = speed - normal.dot(speed) * normal;
-          const double s = std::sqrt(vt.squaredNorm() + p.coulomb_speed * p.coulomb_speed);
-          slope -= (link.viscous + link.coulomb / s) * (Matrix3::Identity() - normal * normal.transpose());
-          slope += link.coulomb / (s * s * s) * vt * vt.transpose();
-        }
-        if (drags) {
-          const Vector3 vn = speed - d.dot(speed) * d;
-          const double s = std::sqrt(vn.squaredNorm() + p.drag_speed * p.drag_speed);
-          slope -= (link.air_linear + link.air_quadratic * s) * (Matrix3::Identity() - d * d.transpose());
-          slope -= link.air_quadratic / s * vn * vn.transpose();
-        }
-        for (std::size_t i = 0; i < change_.size(); ++i) {
-          if (!used_[i] || !change_[i].moves()) continue;
-          const Vector3 f = kGaussWeight[g] * (slope * (change_[i].u.tail<3>() + change_[i].u.head<3>().cross(c)));
-          wrench_[i].head<3>() -= c.cross(f);
-          wrench_[i].tail<3>() -= f;
-        }
-      }
-      for (int k = link.first_angle; k < link.end_angle; ++k)
-        for (std::size_t i = 0; i < change_.size(); ++i)
-          forces_(k, static_cast<Eigen::Index>(i)) = -engine_.axis[k].dot(wrench_[i]);
-    }
-  }
-
-  const Engine& engine_;
-  const Motion& motion_;
-  std::vector<BaseChange> change_;
-  std::vector<bool> used_;
-  std::vector<Vector6> wrench_;
-  MatrixX forces_;
-};
-
-// One state of the rope with the engine linearized there.
+// One state of the rope with the equations of motion linearized there.
 struct Point {
-  Engine engine;
-  BaseResponse response;
+  dynamics::Linearizer linearizer;
+  dynamics::Linearization now;
   MatrixX forces;  // of the tangents
 
   Point(const dynamics::Model& model, const Motion& motion, Eigen::Index columns)
-      : engine(model), response(engine, motion), forces(model.chain.angles(), columns) {}
+      : linearizer(model), forces(model.chain.angles(), columns), motion_(motion) {}
 
-  bool place(const Motion& motion, const Coordinates& c, const VectorX& theta, const VectorX& thetadot, bool slopes) {
-    Vector6 jerk;
-    const trajectory::BaseMotion base = base_from(motion, c, &jerk);
-    engine.place(base, theta, thetadot, slopes);
-    if (!engine.factor_mass()) return false;
-    engine.accelerate();
-    if (slopes) engine.linearize(jerk);
-    return true;
+  bool place(const Coordinates& c, const VectorX& theta, const VectorX& thetadot, bool slopes) {
+    math::Vector6 jerk;
+    const trajectory::BaseMotion base = base_from(motion_, c, &jerk);
+    return linearizer.at(base, jerk, theta, thetadot, slopes, now);
   }
+
   // M da = forces = base part - K S_theta - C S_rate
   void tangent_forces(const Coordinates& c, const Basis& basis, const MatrixX& slope, const MatrixX& rate_slope) {
-    forces.noalias() = -engine.stiffness * slope;
-    forces.noalias() -= engine.damping * rate_slope;
-    response.add(c, basis, forces);
+    forces.noalias() = -now.stiffness * slope;
+    forces.noalias() -= now.damping * rate_slope;
+    linearizer.base_slopes(slopes_);
+    const math::Matrix3 back = base_from(motion_, c).pose.rotation.transpose();
+    const Vector3 up = back * motion_.up, v = back * c.col(1).head<3>(), a = back * c.col(2).head<3>();
+    const Vector3 spin = c(3, 1) * up;
+    for (std::size_t k = 0; k < motion_.axes.size(); ++k) {
+      // what a change of the coordinate, its rate and its second derivative adds to base_from()
+      Vector3 turn[3] = {Vector3::Zero(), Vector3::Zero(), Vector3::Zero()};
+      math::Vector6 velocity[3] = {math::Vector6::Zero(), math::Vector6::Zero(), math::Vector6::Zero()};
+      math::Vector6 acceleration[3] = {math::Vector6::Zero(), math::Vector6::Zero(), math::Vector6::Zero()};
+      const bool yaw = motion_.axes[k] == Axis::yaw;
+      if (yaw) {
+        turn[0] = up;
+        velocity[0].tail<3>() = -up.cross(v);
+        acceleration[0].tail<3>() = -up.cross(a) + spin.cross(up.cross(v));
+        velocity[1].head<3>() = up;
+        acceleration[1].tail<3>() = -up.cross(v);
+        acceleration[2].head<3>() = up;
+      } else {
+        const Vector3 axis = back.col(static_cast<int>(motion_.axes[k]));
+        velocity[1].tail<3>() = axis;
+        acceleration[1].tail<3>() = -spin.cross(axis);
+        acceleration[2].tail<3>() = axis;
+      }
+      for (int d = yaw ? 0 : 1; d < 3; ++d) {
+        force_.noalias() = slopes_.rotation * turn[d];
+        force_.noalias() += slopes_.velocity * velocity[d];
+        force_.noalias() += slopes_.acceleration * acceleration[d];
+        forces.middleCols(static_cast<Eigen::Index>(k) * kPerAxis, kPerAxis).noalias() -=
+            force_ * basis.col(d).transpose();
+      }
+    }
   }
-  void solve_mass(MatrixX& x) const {
-    engine.cholesky.triangularView<Eigen::Lower>().solveInPlace(x);
-    engine.cholesky.triangularView<Eigen::Lower>().transpose().solveInPlace(x);
-  }
+
+ private:
+  const Motion& motion_;
+  dynamics::BaseSlopes slopes_;
+  VectorX force_;
 };
 
 // What an instant later: derivatives as they are, the highest held.
@@ -224,19 +131,19 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
     if (derivatives) out.theta_slope[k] = slope, out.thetadot_slope[k] = rate_slope;
     if (k + 1 == nodes) break;
     const Coordinates &base = out.base[k], &next = out.base[k + 1];
-    if (!now.place(motion, base, theta, rate, true)) return false;
-    Engine& engine = now.engine;
-    matrix = engine.mass + g * engine.damping + (g * g) * engine.stiffness;
+    if (!now.place(base, theta, rate, true)) return false;
+    const dynamics::Linearization& here = now.now;
+    matrix = here.mass + g * here.damping + (g * g) * here.stiffness;
     factor.compute(matrix);
     if (derivatives) {
       now.tangent_forces(base, grid.basis[k], slope, rate_slope);
       now_rate = now.forces;
-      now.solve_mass(now_rate);
+      now.linearizer.solve_mass(now_rate);
     }
 
     // (1/G - J) k = (right, M^-1 work), the same for the tangents
     const auto solve = [&](int i) {
-      work.noalias() -= g * (engine.stiffness * right);
+      work.noalias() -= g * (here.stiffness * right);
       work *= g;
       k_rate[i] = factor.solve(work);
       k_theta[i] = g * (right + k_rate[i]);
@@ -246,22 +153,22 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
       if (exact) {
         for (const double e : {kProbe, -kProbe}) {
           const double shift = e * h * kTimeWeight[i];
-          if (!other.place(motion, shifted(base, shift), theta + e * k_theta[i], rate + e * k_rate[i], true))
-            return false;
+          if (!other.place(shifted(base, shift), theta + e * k_theta[i], rate + e * k_rate[i], true)) return false;
           other.tangent_forces(shifted(base, shift), shifted(grid.basis[k], shift), slope, rate_slope);
-          other.solve_mass(other.forces);
+          other.linearizer.solve_mass(other.forces);
           d_work += other.forces / (2.0 * e);
         }
       }
-      dk_rate[i].noalias() = engine.mass * d_work;
-      dk_rate[i].noalias() -= g * (engine.stiffness * d_right);
+      dk_rate[i].noalias() = here.mass * d_work;
+      dk_rate[i].noalias() -= g * (here.stiffness * d_right);
       dk_rate[i] = g * factor.solve(dk_rate[i]);
       dk_theta[i] = g * (d_right + dk_rate[i]);
       return true;
     };
 
     right = rate;
-    work = engine.force + (0.5 * h) * engine.drive_rate;
+    work.noalias() = here.mass * here.acceleration;
+    work += (0.5 * h) * here.drive_rate;
     solve(0);
     if (derivatives) {
       d_right = rate_slope;
@@ -269,8 +176,9 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
       if (!solve_tangents(0)) return false;
     }
     right = rate + (4.0 / h) * k_theta[0];
-    work = engine.force + (1.5 * h) * engine.drive_rate;
-    work.noalias() += (4.0 / h) * (engine.mass * k_rate[0]);
+    work.noalias() = here.mass * here.acceleration;
+    work += (1.5 * h) * here.drive_rate;
+    work.noalias() += (4.0 / h) * (here.mass * k_rate[0]);
     solve(1);
     if (derivatives) {
       d_right = rate_slope + (4.0 / h) * dk_theta[0];
@@ -286,16 +194,16 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
     for (int i = 2; i < 4; ++i) {
       const double last = i == 3 ? -8.0 / 3.0 : 0.0;
       if (!bounded(stage_theta, stage_rate)) return false;
-      if (!other.place(motion, next, stage_theta, stage_rate, derivatives)) return false;
+      if (!other.place(next, stage_theta, stage_rate, derivatives)) return false;
       right = stage_rate + (k_theta[0] - k_theta[1]) / h;
-      work = other.engine.acceleration + (k_rate[0] - k_rate[1]) / h;
+      work = other.now.acceleration + (k_rate[0] - k_rate[1]) / h;
       if (i == 3) right += (last / h) * k_theta[2], work += (last / h) * k_rate[2];
-      work = (engine.mass * work).eval();
+      work = (here.mass * work).eval();
       solve(i);
       if (derivatives) {
         other.tangent_forces(next, grid.basis[k + 1], stage_slope, stage_rate_slope);
         d_work = other.forces;
-        other.solve_mass(d_work);
+        other.linearizer.solve_mass(d_work);
         d_work += (dk_rate[0] - dk_rate[1]) / h;
         d_right = stage_rate_slope + (dk_theta[0] - dk_theta[1]) / h;
         if (i == 3) d_right += (last / h) * dk_theta[2], d_work += (last / h) * dk_rate[2];
