@@ -4,7 +4,7 @@
 cd "$(dirname "$0")/.." || exit 1
 declare -A may=(
   [core]="" [math]="core" [gpu]="core" [chain]="math" [trajectory]="math"
-  [capture]="chain trajectory" [silhouette]="capture" [splat]="capture gpu" [dynamics]="chain trajectory"
+  [capture]="chain trajectory" [silhouette]="capture" [masking]="silhouette" [splat]="capture gpu" [dynamics]="chain trajectory"
   [recognition]="silhouette splat" [identification]="dynamics" [twin]="splat dynamics" [render]="twin"
   [refinement]="recognition identification" [eval]="render capture" [export]="render capture" [synth]="render capture"
   [estimation]="render silhouette" [force]="twin" [planning]="twin"

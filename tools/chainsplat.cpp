@@ -70,6 +70,7 @@ int run(int argc, char** argv) {
   tools::add_batch_command(app, globals, job);
   tools::add_diff_command(app, globals, job);
   tools::add_new_command(app, globals, job);
+  tools::add_mask_command(app, globals, job);
   tools::add_bench_command(app, globals, job);
   for (CLI::App* command : app.get_subcommands({})) {
     command->get_formatter()->column_width(34);

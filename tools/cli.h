@@ -35,6 +35,7 @@ void add_force_commands(CLI::App& app, const Globals& globals, Job& job);       
 void add_new_command(CLI::App& app, const Globals& globals, Job& job);
 void add_batch_command(CLI::App& app, const Globals& globals, Job& job);    // batch
 void add_diff_command(CLI::App& app, const Globals& globals, Job& job);     // diff
+void add_mask_command(CLI::App& app, const Globals& globals, Job& job);
 void add_bench_command(CLI::App& app, const Globals& globals, Job& job);
 
 // --- progress.cpp --------------------------------------------------------------------------------

@@ -8,7 +8,10 @@
 #include <cstdio>
 #include <cstdlib>
 #include <fstream>
+#include <mutex>
 #include <nlohmann/json.hpp>
+#include <set>
+#include <string>
 #include <vector>
 
 #include "cli.h"
@@ -150,6 +153,13 @@ void start_listening(const Globals& globals) {
   screen.origin = core::seconds_now();
   core::Listener listener;
   listener.warning = [](const std::string& line) {
+    // a capture may be opened several times; its doubts are told once
+    static std::mutex mutex;
+    static std::set<std::string> told;
+    {
+      const std::lock_guard lock(mutex);
+      if (!told.insert(line).second) return;
+    }
     clear_line();
     std::fprintf(stderr, "chainsplat: warning: %s\n", line.c_str());
   };

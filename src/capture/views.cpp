@@ -342,11 +342,11 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
     }
     covered /= static_cast<double>(range.last - range.first) * source.camera.width * source.camera.height;
     if (covered > kMostCovered)
-      findings.problems.push_back(
-          {source.where + ".masks",
-           source.masks ? "the masks cover more than half of the image"
-                        : "is missing and the background of the images is not black",
-           source.masks ? "the object must be 255 and the rest 0" : "make masks (chainsplat mask) and name them"});
+      findings.problems.push_back({source.where + ".masks",
+                                   source.masks ? "the masks cover more than half of the image"
+                                                : "is missing and the background of the images is not black",
+                                   source.masks ? std::string("the object must be 255 and the rest 0")
+                                                : "make them: chainsplat mask " + manifest.capture.folder.string()});
     if (seen == 0) {
       const std::string what = source.camera.name + " never sees the object: every mask is empty";
       if (range.first == 0 && range.last == source.images.frames)

@@ -1,0 +1,147 @@
+// One picture: votes by pixel, then a graph cut that puts contours where the picture has edges.
+#include <algorithm>
+#include <cmath>
+#include <opencv2/core.hpp>
+#include <opencv2/imgproc.hpp>
+#include <opencv2/imgproc/detail/gcgraph.hpp>
+
+#include "src/masking/look.h"
+
+namespace chainsplat::masking {
+
+namespace {
+
+// place: log odds by the distance to the tube's outline, which is right to about a pixel or two
+constexpr double kPlacePixels = 0.6;                         // px for one unit of log odds
+constexpr double kSurelyInside = 4.5, kSurelyOutside = 8.0;  // inside, what hides the rope can outvote the place
+constexpr double kBand = 8.0;                                // px outside the tube: nothing beyond is looked at
+constexpr double kContour = 2.0;                             // cost of a contour through a plain area, a pixel long
+constexpr double kSpeck = 0.02;                              // share of the largest part under which a part is noise
+constexpr double kLeastShare = 0.1;                          // of the tube's area: less is not the rope
+constexpr int kMargin = 24;                                  // px about the mask: what capture::load leaves
+
+double squared_difference(const Picture& picture, int x, int y, int u, int v) {
+  const std::uint8_t *a = pixel(picture, x, y), *b = pixel(picture, u, v);
+  double sum = 0.0;
+  for (int c = 0; c < 3; ++c) sum += (a[c] - b[c]) * (a[c] - b[c]);
+  return sum;
+}
+
+constexpr int kNeighbors[4][2] = {{1, 0}, {0, 1}, {1, 1}, {-1, 1}};
+
+// Labels (0 or 255) of the box by a minimal cut; `odds` of the box's pixels, NaN: outside for sure.
+cv::Mat least_cut(const Picture& picture, const Box& box, const std::vector<float>& odds) {
+  const int width = box.width(), height = box.height();
+  std::vector<int> node(odds.size(), -1);
+  int nodes = 0;
+  for (std::size_t i = 0; i < odds.size(); ++i)
+    if (!std::isnan(odds[i])) node[i] = nodes++;
+  // as in GrabCut: edges are what is large against the picture's own mean difference
+  double sum = 0.0;
+  int pairs = 0;
+  const auto each_pair = [&](const auto& body) {
+    for (int y = 0; y < height; ++y)
+      for (int x = 0; x < width; ++x) {
+        const int i = y * width + x;
+        if (node[i] < 0) continue;
+        for (const auto& step : kNeighbors) {
+          const int u = x + step[0], v = y + step[1];
+          if (u < 0 || u >= width || v >= height || node[v * width + u] < 0) continue;
+          body(i, v * width + u, squared_difference(picture, box.x0 + x, box.y0 + y, box.x0 + u, box.y0 + v),
+               step[0] != 0 && step[1] != 0);
+        }
+      }
+  };
+  each_pair([&](int, int, double difference, bool) { sum += difference, ++pairs; });
+  const double beta = sum > 0.0 ? pairs / (2.0 * sum) : 0.0;
+  cv::detail::GCGraph<double> graph(nodes, 2 * pairs);
+  for (std::size_t i = 0; i < odds.size(); ++i) {
+    if (node[i] < 0) continue;
+    graph.addVtx();
+    graph.addTermWeights(node[i], std::max(0.0f, odds[i]), std::max(0.0f, -odds[i]));
+  }
+  each_pair([&](int i, int j, double difference, bool diagonal) {
+    const double weight = kContour * std::exp(-beta * difference) * (diagonal ? M_SQRT1_2 : 1.0);
+    graph.addEdges(node[i], node[j], weight, weight);
+  });
+  graph.maxFlow();
+  cv::Mat labels(height, width, CV_8U, cv::Scalar(0));
+  for (int i = 0; i < width * height; ++i)
+    if (node[i] >= 0 && graph.inSourceSegment(node[i])) labels.data[i] = 255;
+  return labels;
+}
+
+// Takes small parts out; returns the area that stays.
+int without_specks(cv::Mat& labels) {
+  cv::Mat parts, facts, centers;
+  const int count = cv::connectedComponentsWithStats(labels, parts, facts, centers, 8);
+  int largest = 0, area = 0;
+  for (int i = 1; i < count; ++i) largest = std::max(largest, facts.at<int>(i, cv::CC_STAT_AREA));
+  for (int y = 0; y < labels.rows; ++y)
+    for (int x = 0; x < labels.cols; ++x) {
+      std::uint8_t& label = labels.at<std::uint8_t>(y, x);
+      if (label && facts.at<int>(parts.at<int>(y, x), cv::CC_STAT_AREA) < kSpeck * largest) label = 0;
+      area += label != 0;
+    }
+  return area;
+}
+
+}  // namespace
+
+capture::View cut(const Look& look, const Picture& picture, const capture::Camera& camera, const chain::Chain& chain,
+                  const math::Pose& base, const std::optional<math::VectorX>& theta, double open_end) {
+  const Reach where = reach(chain, base, camera);
+  Tube place;
+  if (theta) place = tube(chain, base, *theta, camera, 0.0, chain.length + open_end, kBand);
+  const Box box = theta ? place.box : where.box;
+  capture::View view;
+  if (box.empty()) return view;
+  std::vector<float> odds(static_cast<std::size_t>(box.width()) * box.height(), std::nanf(""));
+  double tube_area = 0.0;
+  for (int y = box.y0; y < box.y1; ++y)
+    for (int x = box.x0; x < box.x1; ++x) {
+      double sum = 0.0;
+      if (theta) {
+        const float outside = place.at(x, y);
+        if (outside == Tube::kFar) continue;
+        tube_area += outside < 0.0f;
+        const bool open = open_end > 0.0 && place.arclength(x, y) > chain.length - open_end;
+        sum = std::clamp(-outside / kPlacePixels, -kSurelyOutside, open ? 0.0 : kSurelyInside);
+      } else if (!where.holds(x, y)) {
+        continue;
+      }
+      const std::uint8_t* const rgb = pixel(picture, x, y);
+      if (!theta)
+        sum += std::max(color_odds(look.near, rgb), color_odds(look.far, rgb));
+      else
+        sum += color_odds(place.arclength(x, y) < 0.5 * chain.length ? look.near : look.far, rgb);
+      sum += difference_odds(look.background, picture, x, y);
+      odds[static_cast<std::size_t>(y - box.y0) * box.width() + (x - box.x0)] = static_cast<float>(sum);
+    }
+  cv::Mat labels;
+  if (theta) {
+    labels = least_cut(picture, box, odds);
+  } else {  // rough, and over a large area: most of a neighborhood decides
+    labels = cv::Mat(box.height(), box.width(), CV_8U, cv::Scalar(0));
+    for (std::size_t i = 0; i < odds.size(); ++i) labels.data[i] = odds[i] > 0.0f ? 255 : 0;
+    cv::medianBlur(labels, labels, 5);
+  }
+  const int area = without_specks(labels);
+  if (area == 0 || area < kLeastShare * tube_area) return view;
+  const cv::Rect bounds = cv::boundingRect(labels);
+  view.x0 = std::max(0, box.x0 + bounds.x - kMargin), view.y0 = std::max(0, box.y0 + bounds.y - kMargin);
+  view.width = std::min(camera.width, box.x0 + bounds.x + bounds.width + kMargin) - view.x0;
+  view.height = std::min(camera.height, box.y0 + bounds.y + bounds.height + kMargin) - view.y0;
+  view.rgba.assign(static_cast<std::size_t>(4) * view.width * view.height, 0);
+  for (int y = bounds.y; y < bounds.y + bounds.height; ++y)
+    for (int x = bounds.x; x < bounds.x + bounds.width; ++x) {
+      if (labels.at<std::uint8_t>(y, x) == 0) continue;
+      std::uint8_t* const out =
+          &view.rgba[4 * (static_cast<std::size_t>(box.y0 + y - view.y0) * view.width + box.x0 + x - view.x0)];
+      std::copy_n(pixel(picture, box.x0 + x, box.y0 + y), 3, out);
+      out[3] = 255;
+    }
+  return view;
+}
+
+}  // namespace chainsplat::masking

@@ -1,0 +1,179 @@
+#include "src/masking/look.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace chainsplat::masking {
+
+using math::Vector2;
+using math::Vector3;
+
+namespace {
+
+constexpr double kReachSlack = 1.1;   // of the length: cameras and lengths are not exact
+constexpr double kNearerShare = 0.5;  // of the length that the free end may be nearer to the camera than the grasp
+constexpr double kCore = 0.35;        // of the radius: deeper inside than this is rope for sure, also when the tube is
+                                      // off by a third of it
+constexpr double kAbout = 0.4;        // radii outside from which a pixel is surroundings for sure
+constexpr double kUnheardOf = 0.02;   // share of either side's colors that is thought to be spread over all colors
+constexpr double kSurest = 3.0, kSurestNot = 7.0;  // log odds, the most that a color can say for and against the rope
+constexpr double kLeastNoise = 1.5;                // gray levels
+constexpr double kMostNoise = 25.0;
+constexpr double kTexture = 0.04;  // share of the brightness by which a background pixel may differ: lossy coding
+constexpr double kDarkest = 0.25, kBrightest = 1.08;  // a shadow leaves this share of the light, an automatic exposure
+                                                      // adds some
+constexpr double kSameDifference = 8.0;  // squared differences over their variances, sum of three, that say nothing
+constexpr double kOddsPerDifference = 0.25;
+constexpr double kSurelySame = -2.0,
+                 kSurelyOther = 1.5;  // log odds; other can be a shadow or a hand, same hardly a rope
+
+// [1 2 1] / 4 along each of the three axes.
+void blur(std::vector<double>& counts) {
+  for (const int stride : {1, 32, 32 * 32}) {
+    const std::vector<double> old = counts;
+    for (int i = 0; i < kColorBins; ++i) {
+      const int at = i / stride % 32;
+      const double before = at > 0 ? old[i - stride] : old[i], after = at < 31 ? old[i + stride] : old[i];
+      counts[i] = 0.25 * before + 0.5 * old[i] + 0.25 * after;
+    }
+  }
+}
+
+template <class T>
+T median(std::vector<T>& values) {
+  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
+}
+
+}  // namespace
+
+void settle(Colors& colors) {
+  colors.log_odds.clear();
+  if (colors.object.empty() || colors.surroundings.empty()) return;
+  std::vector<double> object = colors.object, surroundings = colors.surroundings;
+  double object_sum = 0.0, surroundings_sum = 0.0;
+  for (int i = 0; i < kColorBins; ++i) object_sum += object[i], surroundings_sum += surroundings[i];
+  if (object_sum <= 0.0 || surroundings_sum <= 0.0) return;
+  blur(object);
+  blur(surroundings);
+  colors.log_odds.resize(kColorBins);
+  const double floor = kUnheardOf / kColorBins;
+  for (int i = 0; i < kColorBins; ++i)
+    colors.log_odds[i] = static_cast<float>(
+        std::clamp(std::log((object[i] / object_sum + floor) / (surroundings[i] / surroundings_sum + floor)),
+                   -kSurestNot, kSurest));
+}
+
+Reach reach(const chain::Chain& chain, const math::Pose& base, const capture::Camera& camera) {
+  Reach out;
+  const math::Pose camera_from_world = camera.world_from_camera.inverse();
+  const Vector3 grasp = camera_from_world * base.translation;
+  const double nearest = grasp.z() - kNearerShare * chain.length;
+  if (nearest <= 0.0) return out;
+  out.grasp = capture::project(camera, grasp);
+  out.radius = kReachSlack * chain.length * camera.fx / nearest;
+  const Vector3 ahead = camera_from_world * (base * Vector3(chain.diameter * chain.direction));
+  const Vector2 step = capture::project(camera, ahead) - out.grasp;
+  const double diameter = chain.diameter * camera.fx / grasp.z();
+  // a rope that points at the camera has no side that is behind
+  out.along = step.norm() > 0.3 * diameter ? step.normalized() : Vector2::Zero();
+  out.behind = step.norm() > 0.3 * diameter ? 0.0 : 1.0;
+  const auto whole = [](double value, int size) { return static_cast<int>(std::clamp(value, 0.0, 1.0 * size)); };
+  out.box = {whole(out.grasp.x() - out.radius, camera.width), whole(out.grasp.y() - out.radius, camera.height),
+             whole(out.grasp.x() + out.radius + 1, camera.width), whole(out.grasp.y() + out.radius + 1, camera.height)};
+  return out;
+}
+
+void count_colors(Look& look, const Picture& picture, const Tube& tube, const Reach& where, const chain::Chain& chain,
+                  bool local, const capture::View* mask, double open_end) {
+  const auto masked = [&](int x, int y) {
+    x -= mask->x0, y -= mask->y0;
+    return x >= 0 && y >= 0 && x < mask->width && y < mask->height &&
+           mask->rgba[4 * (static_cast<std::size_t>(y) * mask->width + x) + 3] != 0;
+  };
+  for (Colors* const colors : {&look.near, &look.far}) {
+    if (colors->object.empty()) colors->object.assign(kColorBins, 0.0);
+    if (colors->surroundings.empty()) colors->surroundings.assign(kColorBins, 0.0);
+  }
+  const float core = static_cast<float>(-kCore * tube.radius), about = static_cast<float>(kAbout * tube.radius);
+  for (int y = where.box.y0; y < where.box.y1; ++y)
+    for (int x = where.box.x0; x < where.box.x1; ++x) {
+      const float outside = tube.at(x, y);
+      const int bin = color_bin(pixel(picture, x, y));
+      if (outside < core) {
+        const double s = tube.arclength(x, y);
+        if (s > chain.diameter && (!mask || s > chain.length - open_end || masked(x, y)))
+          (s < 0.5 * chain.length ? look.near : look.far).object[bin] += 1.0;
+      } else if (outside > about && (outside < Tube::kFar || !local)) {
+        look.near.surroundings[bin] += 1.0;
+        look.far.surroundings[bin] += 1.0;
+      }
+    }
+}
+
+Background median_background(std::span<const Picture> frames, std::span<const Tube> covered, int least) {
+  Background out;
+  if (frames.empty()) return out;
+  const int width = frames[0].width, height = frames[0].height;
+  out.rgb.assign(static_cast<std::size_t>(3) * width * height, 0);
+  out.noise.assign(static_cast<std::size_t>(width) * height, 0);
+  core::parallel_for(height, [&](std::int64_t row) {
+    const int y = static_cast<int>(row);
+    std::vector<std::uint8_t> values[3], away;
+    for (int x = 0; x < width; ++x) {
+      for (auto& channel : values) channel.clear();
+      away.clear();
+      for (std::size_t i = 0; i < frames.size(); ++i) {
+        // the rope's contact shadow and its soft outline are not background either
+        if (i < covered.size() && covered[i].at(x, y) < covered[i].radius) continue;
+        for (int c = 0; c < 3; ++c) values[c].push_back(pixel(frames[i], x, y)[c]);
+      }
+      if (static_cast<int>(values[0].size()) < least) continue;
+      const std::size_t at = static_cast<std::size_t>(y) * width + x;
+      for (int c = 0; c < 3; ++c) {
+        const std::uint8_t middle = median(values[c]);
+        out.rgb[3 * at + c] = middle;
+        for (const std::uint8_t value : values[c])
+          away.push_back(static_cast<std::uint8_t>(std::abs(static_cast<int>(value) - middle)));
+      }
+      constexpr double kDeviationOfMedian = 1.4826;
+      out.noise[at] = noise_level(kDeviationOfMedian * median(away));
+    }
+  });
+  return out;
+}
+
+std::uint8_t noise_level(double deviation) {
+  return static_cast<std::uint8_t>(std::lround(std::clamp(deviation, kLeastNoise, kMostNoise)));
+}
+
+double difference_odds(const Background& background, const Picture& picture, int x, int y) {
+  if (background.noise.empty()) return 0.0;
+  const std::size_t at = static_cast<std::size_t>(y) * picture.width + x;
+  if (background.noise[at] == 0) return 0.0;
+  const std::uint8_t* const now = pixel(picture, x, y);
+  const std::uint8_t* const then = &background.rgb[3 * at];
+  double product = 0.0, square = 1.0;
+  for (int c = 0; c < 3; ++c) product += now[c] * then[c], square += then[c] * then[c];
+  // a shadow has the background's color with less light
+  const double light = std::clamp(product / square, kDarkest, kBrightest);
+  const double noise = background.noise[at];
+  double difference = 0.0;
+  for (int c = 0; c < 3; ++c) {
+    const double d = now[c] - light * then[c], texture = kTexture * then[c];
+    difference += d * d / (noise * noise + texture * texture);
+  }
+  return std::clamp(kOddsPerDifference * (difference - kSameDifference), kSurelySame, kSurelyOther);
+}
+
+void settle(Look& look) {
+  settle(look.near);
+  settle(look.far);
+}
+
+double color_odds(const Colors& colors, const std::uint8_t* rgb) {
+  return colors.log_odds.empty() ? 0.0 : colors.log_odds[color_bin(rgb)];
+}
+
+}  // namespace chainsplat::masking

@@ -1,0 +1,49 @@
+// Colors and background of one camera: learned from frames, asked by pixel.
+#pragma once
+#include <span>
+
+#include "chainsplat/masking.h"
+#include "src/masking/tube.h"
+
+namespace chainsplat::masking {
+
+constexpr int kColorBins = 32 * 32 * 32;
+inline int color_bin(const std::uint8_t* rgb) { return (rgb[0] >> 3) << 10 | (rgb[1] >> 3) << 5 | rgb[2] >> 3; }
+
+inline const std::uint8_t* pixel(const Picture& picture, int x, int y) {
+  return picture.pixels +
+         static_cast<std::size_t>(picture.channels) * (static_cast<std::size_t>(y) * picture.width + x);
+}
+
+// What pixels the rope can reach at all: nearer to the grasp than its length, and not behind the grasp.
+struct Reach {
+  Box box;
+  math::Vector2 grasp, along;  // px; unit, or zero where the rope points at the camera
+  double radius = 0.0, behind = 0.0;
+  bool holds(int x, int y) const {
+    const math::Vector2 d(x + 0.5 - grasp.x(), y + 0.5 - grasp.y());
+    return d.squaredNorm() <= radius * radius && d.dot(along) >= -behind;
+  }
+};
+Reach reach(const chain::Chain& chain, const math::Pose& base, const capture::Camera& camera);
+
+// Adds the pixels of a frame where the tube is known: its core as object, what is about it as surroundings (`local`: as
+// far as the tube's map goes, else all that the rope can reach). `mask`: of
+// the core only what it holds (a hand may hide the rope), and what lies `open_end` (m) or nearer to the free end or
+// beyond. Nothing of the rope's first diameter: the gripper hides it.
+void count_colors(Look& look, const Picture& picture, const Tube& tube, const Reach& where, const chain::Chain& chain,
+                  bool local, const capture::View* mask = nullptr, double open_end = 0.0);
+
+// Median of the frames, where at least `least` of them show the background. `covered[i]`: tube of frame i, empty when
+// not known.
+Background median_background(std::span<const Picture> frames, std::span<const Tube> covered, int least);
+
+// Noise as Background keeps it, gray levels.
+std::uint8_t noise_level(double deviation);
+
+// Log odds, rope against background, of a pixel for the difference from the background; 0 where it is not known.
+double difference_odds(const Background& background, const Picture& picture, int x, int y);
+double color_odds(const Colors& colors, const std::uint8_t* rgb);
+void settle(Look& look);
+
+}  // namespace chainsplat::masking

@@ -1,0 +1,110 @@
+#include "src/masking/tube.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace chainsplat::masking {
+
+using math::Vector2;
+using math::Vector3;
+
+namespace {
+
+constexpr double kSpacing = 0.003;  // m along the rope between the tube's samples: well under a radius
+constexpr double kNearest = 0.01;   // m, nothing nearer is in front of a camera (SPEC 2.5)
+
+struct Sample {
+  Vector2 at;
+  double radius;     // px
+  double arclength;  // m
+};
+
+}  // namespace
+
+Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta, const capture::Camera& camera,
+          double from, double to, double reach) {
+  Tube out;
+  const int count = std::max(2, static_cast<int>(std::ceil((to - from) / kSpacing)) + 1);
+  std::vector<double> arclengths(count);
+  for (int i = 0; i < count; ++i) arclengths[i] = from + (to - from) * i / (count - 1);
+  const std::vector<math::Pose> motions = chain::link_motions(chain, theta, base);
+  math::MatrixX line = chain::centerline(chain, motions, arclengths);
+  for (int i = 0; i < count; ++i)
+    if (arclengths[i] > chain.length) line.col(i) = motions.back() * Vector3(arclengths[i] * chain.direction);
+  const math::Pose camera_from_world = camera.world_from_camera.inverse();
+  std::vector<Sample> samples;
+  double x0 = 1e9, y0 = 1e9, x1 = -1e9, y1 = -1e9;
+  for (int i = 0; i < count; ++i) {
+    const Vector3 p = camera_from_world * Vector3(line.col(i));
+    if (p.z() < kNearest) continue;
+    const Sample s{capture::project(camera, p), 0.25 * chain.diameter * (camera.fx + camera.fy) / p.z(), arclengths[i]};
+    const double around = s.radius + reach + 1.0;
+    x0 = std::min(x0, s.at.x() - around), x1 = std::max(x1, s.at.x() + around);
+    y0 = std::min(y0, s.at.y() - around), y1 = std::max(y1, s.at.y() + around);
+    out.radius += s.radius;
+    samples.push_back(s);
+  }
+  if (samples.size() < 2) return out;
+  out.radius /= static_cast<double>(samples.size());
+  const auto whole = [](double value, int size) { return static_cast<int>(std::clamp(value, 0.0, 1.0 * size)); };
+  out.box = {whole(std::floor(x0), camera.width), whole(std::floor(y0), camera.height),
+             whole(std::ceil(x1), camera.width), whole(std::ceil(y1), camera.height)};
+  if (out.box.empty()) return out;
+  out.outside.assign(static_cast<std::size_t>(out.box.width()) * out.box.height(), Tube::kFar);
+  out.along.assign(out.outside.size(), 0.0f);
+  for (std::size_t i = 0; i + 1 < samples.size(); ++i) {
+    const Vector2 a = samples[i].at, step = samples[i + 1].at - a;
+    const double length = step.norm();
+    if (length < 1e-9) continue;
+    const Vector2 along = step / length;
+    const bool begins = i == 0, ends = i + 2 == samples.size();
+    const double around = std::max(samples[i].radius, samples[i + 1].radius) + reach;
+    const int left = std::max(out.box.x0, static_cast<int>(std::min(a.x(), a.x() + step.x()) - around));
+    const int right = std::min(out.box.x1, static_cast<int>(std::max(a.x(), a.x() + step.x()) + around) + 1);
+    const int top = std::max(out.box.y0, static_cast<int>(std::min(a.y(), a.y() + step.y()) - around));
+    const int bottom = std::min(out.box.y1, static_cast<int>(std::max(a.y(), a.y() + step.y()) + around) + 1);
+    for (int y = top; y < bottom; ++y)
+      for (int x = left; x < right; ++x) {
+        const Vector2 d = Vector2(x + 0.5, y + 0.5) - a;
+        const double t = d.dot(along);
+        // ends are flat: beyond them the distance is along the rope; between segments round joints close the gaps
+        double distance;
+        const double share = std::clamp(t / length, 0.0, 1.0);
+        const double radius = samples[i].radius + share * (samples[i + 1].radius - samples[i].radius);
+        const double across = std::abs(d.x() * along.y() - d.y() * along.x()) - radius;
+        const double beyond = std::max(-t, t - length);
+        if (beyond <= 0.0)
+          distance = across;
+        else if ((begins && t < 0.0) || (ends && t > length))
+          distance = across > 0.0 ? std::hypot(across, beyond) : beyond;
+        else
+          distance = std::hypot(across + radius, beyond) - radius;
+        if (distance > reach) continue;
+        const std::size_t at = static_cast<std::size_t>(y - out.box.y0) * out.box.width() + (x - out.box.x0);
+        if (distance >= out.outside[at]) continue;
+        out.outside[at] = static_cast<float>(distance);
+        out.along[at] =
+            static_cast<float>(samples[i].arclength + share * (samples[i + 1].arclength - samples[i].arclength));
+      }
+  }
+  // near a flat end the inside is as deep as the end is near
+  const auto cap = [&](const Vector2& end, const Vector2& outward, double radius) {
+    const int x_first = std::max(out.box.x0, static_cast<int>(end.x() - 2 * radius)),
+              x_last = std::min(out.box.x1, static_cast<int>(end.x() + 2 * radius) + 1);
+    for (int y = std::max(out.box.y0, static_cast<int>(end.y() - 2 * radius));
+         y < std::min(out.box.y1, static_cast<int>(end.y() + 2 * radius) + 1); ++y)
+      for (int x = x_first; x < x_last; ++x) {
+        float& value = out.outside[static_cast<std::size_t>(y - out.box.y0) * out.box.width() + (x - out.box.x0)];
+        const Vector2 d = Vector2(x + 0.5, y + 0.5) - end;
+        const double depth = d.dot(outward);
+        if (value < 0.0f && depth < 0.0 && (d - depth * outward).norm() < radius)
+          value = std::max(value, static_cast<float>(depth));
+      }
+  };
+  const std::size_t last = samples.size() - 1;
+  cap(samples[0].at, (samples[0].at - samples[1].at).normalized(), samples[0].radius);
+  cap(samples[last].at, (samples[last].at - samples[last - 1].at).normalized(), samples[last].radius);
+  return out;
+}
+
+}  // namespace chainsplat::masking

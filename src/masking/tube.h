@@ -1,0 +1,37 @@
+// The chain's tube in a picture: how far each pixel is from its outline.
+#pragma once
+#include <vector>
+
+#include "chainsplat/capture.h"
+#include "chainsplat/chain.h"
+
+namespace chainsplat::masking {
+
+struct Box {  // pixels [x0, x1) x [y0, y1)
+  int x0 = 0, y0 = 0, x1 = 0, y1 = 0;
+  bool empty() const { return x1 <= x0 || y1 <= y0; }
+  int width() const { return x1 - x0; }
+  int height() const { return y1 - y0; }
+};
+
+struct Tube {
+  Box box;
+  std::vector<float> outside;  // px to the outline, negative inside; kFar where farther than the reach asked for
+  std::vector<float> along;    // m, arclength of the nearest point of the centerline
+  double radius = 0.0;         // px, mean along the rope
+  float at(int x, int y) const {
+    if (x < box.x0 || y < box.y0 || x >= box.x1 || y >= box.y1) return kFar;
+    return outside[static_cast<std::size_t>(y - box.y0) * box.width() + (x - box.x0)];
+  }
+  float arclength(int x, int y) const {  // of pixels in the box
+    return along[static_cast<std::size_t>(y - box.y0) * box.width() + (x - box.x0)];
+  }
+  static constexpr float kFar = 1e6f;
+};
+
+// Flat at both ends. `from`, `to`: arclengths, m; beyond the free end it goes on straight. `reach`: px beyond the
+// outline. The camera has no distortion.
+Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta, const capture::Camera& camera,
+          double from, double to, double reach);
+
+}  // namespace chainsplat::masking

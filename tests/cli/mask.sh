@@ -1,0 +1,75 @@
+#!/bin/bash
+# Masks for a capture that has none: by our own means, by an outside program, and what can go wrong.
+. "$(dirname "$0")/lib.sh"
+export VK_DRIVER_FILES=/nonexistent VK_ICD_FILENAMES=/nonexistent
+demo=$source_dir/assets/demo_free_30
+capture=$work/capture
+
+bare() {  # the demo without masks
+  rm -rf "$capture"
+  cp -r "$demo" "$capture"
+  rm -rf "$capture/depth" "$capture/truth" "$capture/masks"
+  sed -i '/"depth/d; /"masks"/d' "$capture/capture.json"
+}
+
+# an image that is not masked leads to this command
+bare
+expect_error 2 'make them: chainsplat mask' train "$capture" -o "$work/run" --frames 0:12
+run check "$capture"
+expect_code 2 'check, no masks'
+expect_output '^problem: .*make them: chainsplat mask' 'check, no masks'
+
+# some frames into a folder, compared with the capture's own
+run mask "$demo" -o "$work/masks" --frames 0:8
+expect_code 0 'mask -o'
+expect_output '^cam1: IoU 0\.[789]' 'mask -o'
+[ "$(find "$work/masks" -name '*.png' | wc -l)" -eq 24 ] || fail 'mask -o: not 24 masks'
+expect_error 2 'not empty.*--force' mask "$demo" -o "$work/masks"
+expect_error 2 'cam0 has masks already.*--force' mask "$demo"
+expect_error 2 '--frames.*-o' mask "$capture" --frames 0:8
+expect_error 2 'no frame' mask "$demo" -o "$work/none" --frames 400:410
+[ -e "$work/none" ] && fail 'no frame: something was written'
+
+# an outside program, whose arguments may hold anything
+segmenter="$work/it's a segmenter.sh"
+cat >"$segmenter" <<'SCRIPT'
+#!/bin/bash
+# copies a mask that is there, by the frame's number
+count=$(cat "$STATE/count"); echo $((count + 1)) >"$STATE/count"
+[ -s "$1" ] || exit 9
+echo 'chatter on standard output'
+camera=$((count / FRAMES)) frame=$((count % FRAMES))
+[ "$count" = "$FAIL_AT" ] && exit 3
+cp "$MASKS/cam$camera/$(printf %06d $frame).png" "$2"
+SCRIPT
+chmod +x "$segmenter"
+export STATE=$work MASKS=$demo/masks FRAMES=60 FAIL_AT=none TMPDIR="$work/a folder"
+mkdir "$TMPDIR"
+line="\"$segmenter\" {image} {mask}"
+echo 0 >"$work/count"
+run mask "$capture" --command "$line" --json
+expect_code 0 'mask --command'
+[ "$(head -c 1 "$work/stdout")" = '{' ] || fail 'mask --command --json: something before the document'
+grep -q chatter "$work/stdout" && fail 'mask --command: the program speaks on our standard output'
+cmp -s "$capture/masks/cam2/000059.png" "$demo/masks/cam2/000059.png" ||
+  fail 'mask --command: the last mask is not what the program wrote'
+[ -z "$(ls "$TMPDIR")" ] || fail 'mask --command: something is left in TMPDIR'
+run check "$capture"
+expect_code 0 'check after mask'
+
+# what goes wrong is said with camera and frame
+attempt() {  # pattern line
+  FRAMES=60 expect_error 1 "$1" mask "$demo" -o "$work/attempt" --force --command "$2"
+}
+export FAIL_AT=2
+echo 0 >"$work/count"
+run mask "$demo" -o "$work/attempt" --frames 0:5 --command "$line"
+expect_code 1 'a command that fails'
+grep -q '^chainsplat: error: cam0, frame 2: the command failed with exit code 3; ' "$work/stderr" ||
+  fail 'a command that fails: the frame is not named'
+attempt 'cam0, frame 0: the command wrote no mask' ': {image} {mask}'
+attempt 'cam0, frame 0: .*no image' 'echo nonsense >{mask}; : {image}'
+base64 -d >"$work/small.png" <<<'iVBORw0KGgoAAAANSUhEUgAAAAgAAAAICAAAAADhZOFXAAAADElEQVR42mNgoA4AAABIAAEQRe/SAAAAAElFTkSuQmCC'
+attempt 'cam0, frame 0: .*8x8 pixels.*320x240' "cp '$work/small.png' {mask}; : {image}"
+expect_error 2 '--command.*\{mask\}' mask "$demo" -o "$work/attempt" --command 'segment {image}'
+finish

@@ -1,0 +1,141 @@
+// Masks made without prompts against the exact masks of the demo capture, and the parts they are made of against
+// geometry done by hand.
+#include "chainsplat/masking.h"
+
+#include <doctest/doctest.h>
+
+#include <cmath>
+
+#include "chainsplat/silhouette.h"
+#include "src/masking/look.h"
+
+namespace {
+
+using namespace chainsplat;
+using math::Vector3;
+using math::VectorX;
+
+const Path kDemo = Path(CHAINSPLAT_SOURCE_DIR) / "assets/demo_free_30";
+
+capture::Camera front_camera() {  // at the origin, looks along world z
+  capture::Camera camera;
+  camera.name = "front";
+  camera.width = 200, camera.height = 150;
+  camera.fx = camera.fy = 200.0;
+  camera.cx = 100.0, camera.cy = 75.0;
+  return camera;
+}
+
+double iou(const capture::Image8& a, const capture::Image8& b) {
+  double both = 0, either = 0;
+  for (std::size_t i = 0; i < a.pixels.size(); ++i) {
+    both += a.pixels[i] >= 128 && b.pixels[i] >= 128;
+    either += a.pixels[i] >= 128 || b.pixels[i] >= 128;
+  }
+  return either > 0 ? both / either : 1.0;
+}
+
+capture::Image8 given_mask(int camera, int frame) {
+  char name[64];
+  std::snprintf(name, sizeof name, "masks/cam%d/%06d.png", camera, frame);
+  return capture::read_image8(kDemo / name);
+}
+
+TEST_CASE("the tube of a straight rope is a rectangle with the right sides") {
+  // 0.2 m long along +x, 0.02 m thick, 1 m away: 40 px by 4 px, from column 80 to 120, about row 75
+  const chain::Chain rope =
+      chain::make_chain(0.2, 0.02, Vector3::UnitX(), Vector3::UnitY(), 4, chain::Bending::planar, false);
+  math::Pose base;
+  base.translation = Vector3(-0.1, 0.0, 1.0);
+  const masking::Tube tube = masking::tube(rope, base, VectorX::Zero(4), front_camera(), 0.0, rope.length, 6.0);
+  CHECK(tube.radius == doctest::Approx(2.0));
+  CHECK(tube.at(100, 74) == doctest::Approx(0.5 - 2.0).epsilon(0.01));    // center half a pixel above the axis
+  CHECK(tube.at(100, 79) == doctest::Approx(4.5 - 2.0).epsilon(0.01));    // 4.5 px below
+  CHECK(tube.at(122, 74) == doctest::Approx(122.5 - 120).epsilon(0.01));  // beyond the free end, which is flat
+  CHECK(tube.at(119, 74) == doctest::Approx(-0.5).epsilon(0.01));         // just before it
+  CHECK(tube.at(100, 90) == masking::Tube::kFar);
+  CHECK(tube.arclength(100, 74) == doctest::Approx(0.1 + 0.5 / 200).epsilon(0.01));
+}
+
+TEST_CASE("colors that only the rope has speak for it, others against it, unknown ones hardly") {
+  masking::Colors colors;
+  colors.object.assign(masking::kColorBins, 0.0);
+  colors.surroundings.assign(masking::kColorBins, 0.0);
+  const std::uint8_t red[] = {200, 30, 30}, gray[] = {120, 120, 120}, green[] = {30, 200, 30};
+  colors.object[masking::color_bin(red)] = 900;
+  colors.object[masking::color_bin(gray)] = 100;
+  colors.surroundings[masking::color_bin(gray)] = 1000;
+  masking::settle(colors);
+  CHECK(masking::color_odds(colors, red) > 2.0);
+  CHECK(masking::color_odds(colors, gray) == doctest::Approx(std::log(0.1)).epsilon(0.05));
+  CHECK(std::abs(masking::color_odds(colors, green)) < 0.1);
+}
+
+TEST_CASE("a shadow is background, another color is not") {
+  masking::Background background;
+  background.rgb = {160, 120, 80, 160, 120, 80, 160, 120, 80};
+  background.noise = {2, 2, 0};
+  const std::uint8_t now[] = {80, 60, 40, 60, 60, 160, 0, 0, 0};
+  const masking::Picture picture{now, 3, 1, 3};
+  CHECK(masking::difference_odds(background, picture, 0, 0) < 0.0);
+  CHECK(masking::difference_odds(background, picture, 1, 0) > 0.0);
+  CHECK(masking::difference_odds(background, picture, 2, 0) == 0.0);  // not known there
+}
+
+TEST_CASE("masks of the demo capture without a prompt") {
+  double sum = 0.0, least = 1.0;
+  int frames = 0;
+  const masking::Summary summary = masking::make(kDemo, {}, [&](int camera, int frame, const capture::Image8& mask) {
+    CHECK(mask.channels == 1);
+    const double one = iou(mask, given_mask(camera, frame));
+    sum += one;
+    least = std::min(least, one);
+    ++frames;
+  });
+  CHECK(frames == 180);
+  CHECK(summary.frames == 180);
+  CHECK(summary.empty == 0);
+  CHECK(summary.inside > 0.9);
+  MESSAGE("IoU mean ", sum / frames, ", least ", least);
+  // the rope is 7 px wide here: half a pixel too much on either side is 0.87
+  CHECK(sum / frames > 0.88);
+  CHECK(least > 0.8);
+}
+
+TEST_CASE("live masks of one camera") {
+  capture::LoadOptions first;
+  first.last = 40;
+  const capture::Capture masked = capture::load(kDemo, first);
+  const chain::Chain rope = chain::make_chain(masked.length, masked.diameter, masked.direction, masked.bending_axis, 8,
+                                              chain::Bending::spatial, false);
+  const silhouette::SequenceFit fit = silhouette::fit_sequence(rope, masked);
+  std::vector<std::uint8_t> colors;  // of the first masked view
+  for (std::size_t i = 0; i + 3 < masked.views[0].rgba.size(); i += 4)
+    if (masked.views[0].rgba[i + 3])
+      colors.insert(colors.end(), &masked.views[0].rgba[i], &masked.views[0].rgba[i + 3]);
+  masking::Live live = masking::start(masked.cameras[0], rope, colors);
+  capture::VideoReader video(kDemo / "cam0.mp4");
+  capture::Image8 picture;
+  double sum = 0.0;
+  for (int k = 0; k < 40; ++k) {
+    REQUIRE(video.next(picture));
+    const double time = masked.times[0][k];
+    // expected where it was a frame ago: a prediction that knows nothing of the motion
+    const VectorX expected = chain::interpolate(fit.states, masked.times[0][std::max(0, k - 1)]);
+    const capture::View view = masking::mask(live, picture, masked.base.pose(time), expected);
+    capture::Image8 whole{320, 240, 1, std::vector<std::uint8_t>(320 * 240, 0)};
+    for (int y = 0; y < view.height; ++y)
+      for (int x = 0; x < view.width; ++x)
+        whole.pixels[(view.y0 + y) * 320 + view.x0 + x] = view.rgba[4 * (y * view.width + x) + 3];
+    sum += iou(whole, given_mask(0, k));
+  }
+  MESSAGE("live IoU mean ", sum / 40);
+  CHECK(sum / 40 > 0.8);
+}
+
+TEST_CASE("what cannot be masked is said") {
+  CHECK_THROWS_WITH_AS(masking::make(kDemo, {.first = 500, .last = 510}, [](int, int, const capture::Image8&) {}),
+                       doctest::Contains("no frame"), InputError);
+}
+
+}  // namespace
