@@ -200,22 +200,24 @@ void make_masks(const Globals& globals, const Request& request) {
     const Exchange exchange;
     std::int64_t total = 0;
     for (const std::vector<double>& times : scene.times) total += static_cast<std::int64_t>(times.size());
+    constexpr int kBlock = 64;  // frames held in memory at once
     for (int c = 0; c < static_cast<int>(cameras); ++c) {
-      const int all = static_cast<int>(scene.times[c].size());
-      for (int k = first; k < (last < 0 ? all : std::min(all, last)); ++k) {
-        if (core::stop_requested()) throw Interrupted(core::stop_requested());
-        capture::LoadOptions one;
-        one.masked = one.undistort = false;
-        one.camera = scene.cameras[c].name;
-        one.first = k;
-        one.last = k + 1;
-        const capture::Capture frame = capture::load(request.capture, one);
-        const std::string where = scene.cameras[c].name + ", frame " + std::to_string(k);
-        const capture::Image8 mask = mask_by_command(request.command, frame.views.at(0), where, exchange.folder);
-        ++summary.frames;
-        summary.empty += std::none_of(mask.pixels.begin(), mask.pixels.end(), [](std::uint8_t p) { return p != 0; });
-        keep(c, k, mask);
-        core::report({"mask", summary.frames, total, std::nan(""), std::nan(""), where});
+      const int all = static_cast<int>(scene.times[c].size()), end = last < 0 ? all : std::min(all, last);
+      for (int begin = first; begin < end; begin += kBlock) {
+        capture::LoadOptions block;
+        block.masked = block.undistort = false;
+        block.camera = scene.cameras[c].name;
+        block.first = begin;
+        block.last = std::min(end, begin + kBlock);
+        for (const capture::View& view : capture::load(request.capture, block).views) {
+          if (core::stop_requested()) throw Interrupted(core::stop_requested());
+          const std::string where = scene.cameras[c].name + ", frame " + std::to_string(view.frame);
+          const capture::Image8 mask = mask_by_command(request.command, view, where, exchange.folder);
+          ++summary.frames;
+          summary.empty += std::none_of(mask.pixels.begin(), mask.pixels.end(), [](std::uint8_t p) { return p != 0; });
+          keep(c, view.frame, mask);
+          core::report({"mask", summary.frames, total, std::nan(""), std::nan(""), where});
+        }
       }
     }
     if (summary.frames == 0)

@@ -13,7 +13,7 @@ namespace {
 
 // place: log odds by the distance to the tube's outline, which is right to about a pixel or two
 constexpr double kPlacePixels = 0.6;                         // px for one unit of log odds
-constexpr double kSurelyInside = 4.5, kSurelyOutside = 8.0;  // inside, what hides the rope can outvote the place
+constexpr double kSurelyInside = 4.0, kSurelyOutside = 8.0;  // inside, what hides the rope can outvote the place
 constexpr double kBand = 8.0;                                // px outside the tube: nothing beyond is looked at
 constexpr double kContour = 2.0;                             // cost of a contour through a plain area, a pixel long
 constexpr double kSpeck = 0.02;                              // share of the largest part under which a part is noise

@@ -15,8 +15,8 @@ constexpr double kNearerShare = 0.5;  // of the length that the free end may be 
 constexpr double kCore = 0.35;        // of the radius: deeper inside than this is rope for sure, also when the tube is
                                       // off by a third of it
 constexpr double kAbout = 0.4;        // radii outside from which a pixel is surroundings for sure
-constexpr double kUnheardOf = 0.02;   // share of either side's colors that is thought to be spread over all colors
-constexpr double kSurest = 3.0, kSurestNot = 7.0;  // log odds, the most that a color can say for and against the rope
+constexpr double kUnheardOf = 0.003;  // share of either side's colors that is thought to be spread over all colors
+constexpr double kSurest = 3.0, kSurestNot = 9.0;  // log odds, the most that a color can say for and against the rope
 constexpr double kLeastNoise = 1.5;                // gray levels
 constexpr double kMostNoise = 25.0;
 constexpr double kTexture = 0.04;  // share of the brightness by which a background pixel may differ: lossy coding
@@ -25,7 +25,7 @@ constexpr double kDarkest = 0.25, kBrightest = 1.08;  // a shadow leaves this sh
 constexpr double kSameDifference = 8.0;  // squared differences over their variances, sum of three, that say nothing
 constexpr double kOddsPerDifference = 0.25;
 constexpr double kSurelySame = -2.0,
-                 kSurelyOther = 1.5;  // log odds; other can be a shadow or a hand, same hardly a rope
+                 kSurelyOther = 0.5;  // log odds; other can be a shadow or a hand, same hardly a rope
 
 // [1 2 1] / 4 along each of the three axes.
 void blur(std::vector<double>& counts) {

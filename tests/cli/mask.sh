@@ -20,10 +20,10 @@ expect_code 2 'check, no masks'
 expect_output '^problem: .*make them: chainsplat mask' 'check, no masks'
 
 # some frames into a folder, compared with the capture's own
-run mask "$demo" -o "$work/masks" --frames 0:8
+run mask "$demo" -o "$work/masks" --frames 0:40
 expect_code 0 'mask -o'
 expect_output '^cam1: IoU 0\.[789]' 'mask -o'
-[ "$(find "$work/masks" -name '*.png' | wc -l)" -eq 24 ] || fail 'mask -o: not 24 masks'
+[ "$(find "$work/masks" -name '*.png' | wc -l)" -eq 120 ] || fail 'mask -o: not 120 masks'
 expect_error 2 'not empty.*--force' mask "$demo" -o "$work/masks"
 expect_error 2 'cam0 has masks already.*--force' mask "$demo"
 expect_error 2 '--frames.*-o' mask "$capture" --frames 0:8
@@ -51,11 +51,13 @@ run mask "$capture" --command "$line" --json
 expect_code 0 'mask --command'
 [ "$(head -c 1 "$work/stdout")" = '{' ] || fail 'mask --command --json: something before the document'
 grep -q chatter "$work/stdout" && fail 'mask --command: the program speaks on our standard output'
-cmp -s "$capture/masks/cam2/000059.png" "$demo/masks/cam2/000059.png" ||
-  fail 'mask --command: the last mask is not what the program wrote'
+[ -s "$capture/masks/cam2/000059.png" ] || fail 'mask --command: no last mask'
 [ -z "$(ls "$TMPDIR")" ] || fail 'mask --command: something is left in TMPDIR'
 run check "$capture"
 expect_code 0 'check after mask'
+echo 0 >"$work/count"
+FRAMES=4 run mask "$demo" -o "$work/same" --frames 0:4 --command "$line"
+expect_output '^cam2: IoU 1\.0000' 'mask --command: the masks are what the program wrote'
 
 # what goes wrong is said with camera and frame
 attempt() {  # pattern line
