@@ -6,14 +6,17 @@
 #include <functional>
 #include <iostream>
 #include <memory>
+#include <thread>
 
 #include "chainsplat/capture.h"
 #include "chainsplat/estimation.h"
 #include "chainsplat/gpu.h"
+#include "chainsplat/masking.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
 #include "frame_source.h"
 #include "run_folder.h"
+#include "window.h"
 
 namespace chainsplat::tools {
 
@@ -23,6 +26,7 @@ struct EstimateRequest {
   SourceRequest source;
   std::string run, base, frames, centerline, solver;
   int drop = 1;
+  int serve = 0;  // port of the live window; 0: none
   bool covariance = false;
 };
 
@@ -85,6 +89,31 @@ std::string latency_text(std::vector<double> latencies) {
   return text;
 }
 
+// Colors of a twin's Gaussians, as seen from the sides: what the rope looks like before the first frame.
+std::vector<std::uint8_t> twin_colors(const twin::Twin& twin) {
+  constexpr float kOpaque = 0.0f;  // logit of one half
+  std::vector<std::uint8_t> rgb;
+  const math::Vector3 across = twin.chain.direction.cross(twin.chain.bending_axis);
+  for (int i = 0; i < twin.gaussians.count; ++i) {
+    if (twin.gaussians.opacity_logit[i] < kOpaque) continue;
+    for (const math::Vector3& from : {across, math::Vector3(-across), twin.chain.bending_axis}) {
+      const math::Vector3 color = splat::sh_color(twin.gaussians, i, from);
+      for (int c = 0; c < 3; ++c)
+        rgb.push_back(static_cast<std::uint8_t>(std::lround(255.0 * std::clamp(color[c], 0.0, 1.0))));
+    }
+  }
+  return rgb;
+}
+
+// Whether a picture was masked before: most of it is black.
+bool black_about(const capture::Image8& picture) {
+  constexpr int kBlack = 16;  // of 255: lossy coding does not keep black black
+  std::size_t black = 0;
+  for (std::size_t i = 0; i + 2 < picture.pixels.size(); i += 3)
+    black += std::max({picture.pixels[i], picture.pixels[i + 1], picture.pixels[i + 2]}) <= kBlack;
+  return 2 * black > picture.pixels.size() / 3;
+}
+
 void estimate(const Globals& globals, EstimateRequest& request) {
   if (globals.json)
     throw InputError("--json", "estimate writes one JSON line a frame, not one document", "leave it out");
@@ -97,7 +126,14 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   if (!twin.parameters)
     core::warn(request.run + ": its dynamics are not identified; angles are assumed to go on at constant rate");
 
+  request.source.pictures = request.serve > 0;
   FrameSource source = open_frames(request.source);
+  std::optional<Window> window;
+  if (request.serve > 0) {
+    const capture::Camera& camera = source.cameras[0];
+    window.emplace(request.serve, camera.width, camera.height, request.run + ", " + request.source.camera);
+    say("Live window: http://127.0.0.1:" + std::to_string(request.serve) + "/");
+  }
   trajectory::Trajectory base;
   if (!request.base.empty()) {
     base = read_base(request.base);
@@ -131,8 +167,23 @@ void estimate(const Globals& globals, EstimateRequest& request) {
       return std::move(engine->draw(twin.gaussians, {&spec, 1}, true).front());
     };
   }
-  const MaskMaker mask = [&](const capture::Image8& picture, const math::Pose&, const std::optional<math::VectorX>&) {
-    return bright_view(picture, source.cameras[0]);
+  std::optional<bool> masked_before;  // by the first picture
+  std::optional<masking::Live> live;
+  const MaskMaker mask = [&](const capture::Image8& picture, const math::Pose& pose,
+                             const std::optional<math::VectorX>& theta) {
+    if (!masked_before) {
+      masked_before = black_about(picture);
+      if (!*masked_before) {
+        const std::vector<std::uint8_t> colors = twin_colors(twin);
+        if (colors.empty())
+          core::warn(request.source.camera +
+                     ": is not masked, and the twin has no colors to find the rope by; what is " +
+                     "not black is taken for the rope");
+        else
+          live = masking::start(source.cameras[0], twin.chain, colors);
+      }
+    }
+    return live ? masking::mask(*live, picture, pose, theta) : bright_view(picture, source.cameras[0]);
   };
 
   chain::States states;
@@ -149,6 +200,24 @@ void estimate(const Globals& globals, EstimateRequest& request) {
     latencies.push_back(followed.latency);
     lost += followed.estimate.lost;
   };
+  std::vector<Subscriber> subscribers{print, keep};
+  // recorded frames are shown at the pace at which they were taken
+  const bool recorded = request.source.calibration.empty();
+  const double begun = core::seconds_now();
+  if (window)
+    subscribers.push_back([&](const Followed& followed) {
+      const estimation::Estimate& e = followed.estimate;
+      Shown shown;
+      shown.frame = e.frame, shown.time = e.time, shown.latency = followed.latency;
+      shown.iou = e.iou, shown.residual = e.residual, shown.seen = e.seen, shown.lost = e.lost;
+      shown.line = recorded_line(source.cameras[0],
+                                 chain::nodes(twin.chain, chain::link_motions(twin.chain, e.theta, base.pose(e.time))));
+      if (!followed.frame.picture.pixels.empty()) shown.picture = &followed.frame.picture;
+      if (!followed.views.empty()) shown.view = &followed.views[0];
+      window->show(shown);
+      while (recorded && !core::stop_requested() && core::seconds_now() - begun < e.time - states.time.front())
+        std::this_thread::sleep_for(std::chrono::milliseconds(1));
+    });
   const auto write = [&] {
     if (!request.centerline.empty() && !states.time.empty())
       write_result(request.centerline, twin::centerline_csv(twin.chain, states, base));
@@ -159,7 +228,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
           latency_text(latencies) + ".");
   };
   try {
-    follow(source, filter, mask, options, {print, keep});
+    follow(source, filter, mask, options, subscribers);
   } catch (const Interrupted&) {
     write();
     summarize();
@@ -189,8 +258,8 @@ void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job) {
   command->add_option("RUN", request->run, "Run folder of a twin")->required();
   command
       ->add_option("--camera", request->source.camera,
-                   "CAPTURE:NAME one camera of a capture, CAPTURE all of them together; with --calibration a video of\n"
-                   "the rope on black, or - for raw RGB24 frames on standard input")
+                   "CAPTURE:NAME one camera of a capture, CAPTURE all of them together; with --calibration a video or\n"
+                   "- for raw RGB24 frames on standard input, of the rope on black or as it comes: then masks are made")
       ->required()
       ->type_name("SOURCE");
   command->add_option("--calibration", request->source.calibration, "Camera object as in capture.json")
@@ -211,6 +280,12 @@ void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job) {
   command
       ->add_option("--centerline", request->centerline, "Also write the world points of the grasp, joints and free end")
       ->type_name("FILE.csv");
+  command
+      ->add_option("--serve", request->serve,
+                   "Show picture, chain, trust and latency in a browser at http://127.0.0.1:PORT/; recorded frames at\n"
+                   "their own pace")
+      ->check(CLI::Range(1, 65535))
+      ->type_name("PORT");
   command->add_flag("--covariance", request->covariance,
                     "Also the covariance of theta and thetadot together: its lower triangle, row by row");
   command->callback([&globals, &job, request] { job = [&globals, request] { estimate(globals, *request); }; });
