@@ -321,7 +321,7 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
       throw InputError("identify", "a recognized state is not finite or of another chain", "recognize again");
   CHAINSPLAT_CHECK(covariances.empty() || covariances.size() == frames, std::to_string(covariances.size()));
 
-  Part part{chain, {}, recognized.time, {}, {}, {}, {}, recognized.theta};
+  Part part{chain, {}, recognized.time, {}, {}, {}, {}, recognized.theta, {}, {}};
   for (std::size_t k = 1; k < frames; ++k)  // angles are known up to whole turns: the nearest to the frame before
     for (Eigen::Index i = 0; i < part.theta[k].size(); ++i)
       part.theta[k][i] -= 2.0 * M_PI * std::round((part.theta[k][i] - part.theta[k - 1][i]) / (2.0 * M_PI));
