@@ -87,23 +87,29 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
             static_cast<float>(samples[i].arclength + share * (samples[i + 1].arclength - samples[i].arclength));
       }
   }
-  // near a flat end the inside is as deep as the end is near
-  const auto cap = [&](const Vector2& end, const Vector2& outward, double radius) {
-    const int x_first = std::max(out.box.x0, static_cast<int>(end.x() - 2 * radius)),
-              x_last = std::min(out.box.x1, static_cast<int>(end.x() + 2 * radius) + 1);
-    for (int y = std::max(out.box.y0, static_cast<int>(end.y() - 2 * radius));
-         y < std::min(out.box.y1, static_cast<int>(end.y() + 2 * radius) + 1); ++y)
+  // near a flat end the inside is as deep as the end is near, and what lies beyond it is at least that far outside,
+  // though the round joint of the segment before reaches there
+  const auto cap = [&](const Sample& end, const Vector2& outward) {
+    const double around = end.radius + reach;
+    const double near = 2.0 * around * (samples.back().arclength - samples.front().arclength) /
+                        std::max(1.0, (samples.back().at - samples.front().at).norm());  // m
+    const int x_first = std::max(out.box.x0, static_cast<int>(end.at.x() - around)),
+              x_last = std::min(out.box.x1, static_cast<int>(end.at.x() + around) + 1);
+    for (int y = std::max(out.box.y0, static_cast<int>(end.at.y() - around));
+         y < std::min(out.box.y1, static_cast<int>(end.at.y() + around) + 1); ++y)
       for (int x = x_first; x < x_last; ++x) {
-        float& value = out.outside[static_cast<std::size_t>(y - out.box.y0) * out.box.width() + (x - out.box.x0)];
-        const Vector2 d = Vector2(x + 0.5, y + 0.5) - end;
+        const std::size_t at = static_cast<std::size_t>(y - out.box.y0) * out.box.width() + (x - out.box.x0);
+        float& value = out.outside[at];
+        if (value == Tube::kFar || std::abs(out.along[at] - end.arclength) > near) continue;
+        const Vector2 d = Vector2(x + 0.5, y + 0.5) - end.at;
         const double depth = d.dot(outward);
-        if (value < 0.0f && depth < 0.0 && (d - depth * outward).norm() < radius)
-          value = std::max(value, static_cast<float>(depth));
+        const bool inside = value < 0.0f && depth < 0.0 && (d - depth * outward).norm() < end.radius;
+        if (inside || depth >= 0.0) value = std::max(value, static_cast<float>(depth));
       }
   };
   const std::size_t last = samples.size() - 1;
-  cap(samples[0].at, (samples[0].at - samples[1].at).normalized(), samples[0].radius);
-  cap(samples[last].at, (samples[last].at - samples[last - 1].at).normalized(), samples[last].radius);
+  cap(samples[0], (samples[0].at - samples[1].at).normalized());
+  cap(samples[last], (samples[last].at - samples[last - 1].at).normalized());
   return out;
 }
 

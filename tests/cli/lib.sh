@@ -13,7 +13,7 @@ fail() {  # text
 }
 
 run() {  # arguments of the program; leaves $code, $work/stdout, $work/stderr
-  "$program" "$@" >"$work/stdout" 2>"$work/stderr" </dev/null
+  "$program" --no-progress "$@" >"$work/stdout" 2>"$work/stderr" </dev/null
   code=$?
 }
 
