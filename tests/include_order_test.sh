@@ -7,7 +7,7 @@ declare -A may=(
   [capture]="chain trajectory" [silhouette]="capture" [masking]="silhouette" [splat]="capture gpu" [dynamics]="chain trajectory"
   [recognition]="silhouette splat" [identification]="dynamics" [twin]="splat dynamics" [render]="twin"
   [refinement]="recognition identification" [eval]="render capture" [export]="render capture" [synth]="render capture"
-  [estimation]="render silhouette" [force]="twin" [planning]="twin"
+  [estimation]="render silhouette" [force]="twin" [planning]="twin" [excitation]="planning" [adaptation]="dynamics"
 )
 declare -A all  # module -> everything it may include
 reach() {  # module

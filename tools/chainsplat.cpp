@@ -66,6 +66,7 @@ int run(int argc, char** argv) {
   tools::add_estimation_commands(app, globals, job);
   tools::add_force_commands(app, globals, job);
   tools::add_planning_commands(app, globals, job);
+  tools::add_excite_command(app, globals, job);
   tools::add_inspection_commands(app, globals, job);
   tools::add_batch_command(app, globals, job);
   tools::add_diff_command(app, globals, job);

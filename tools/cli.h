@@ -30,6 +30,7 @@ void add_motion_commands(CLI::App& app, const Globals& globals, Job& job);      
 void add_result_commands(CLI::App& app, const Globals& globals, Job& job);      // eval, export, synth
 void add_inspection_commands(CLI::App& app, const Globals& globals, Job& job);  // check, doctor
 void add_planning_commands(CLI::App& app, const Globals& globals, Job& job);    // plan
+void add_excite_command(CLI::App& app, const Globals& globals, Job& job);
 void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job);  // estimate
 void add_force_commands(CLI::App& app, const Globals& globals, Job& job);       // force
 void add_new_command(CLI::App& app, const Globals& globals, Job& job);

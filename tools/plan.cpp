@@ -8,8 +8,8 @@
 #include <iostream>
 #include <memory>
 #include <nlohmann/json.hpp>
-#include <sstream>
 
+#include "base_motion_files.h"
 #include "chainsplat/capture.h"
 #include "chainsplat/estimation.h"
 #include "chainsplat/planning.h"
@@ -49,24 +49,6 @@ std::vector<double> numbers(const std::string& text, const std::string& where, s
   if (*at != '\0' || (count && out.size() != count) || out.empty())
     throw InputError(where, "'" + text + "' is not " + (count ? std::to_string(count) + " numbers" : "numbers"),
                      "give them with commas between, for example 0.1,0,0.3");
-  return out;
-}
-
-std::vector<Axis> parse_axes(const std::string& text) {
-  std::vector<Axis> out;
-  std::istringstream words(text);
-  std::string word;
-  while (std::getline(words, word, ','))
-    if (word == "x")
-      out.push_back(Axis::x);
-    else if (word == "y")
-      out.push_back(Axis::y);
-    else if (word == "z")
-      out.push_back(Axis::z);
-    else if (word == "yaw")
-      out.push_back(Axis::yaw);
-    else
-      throw InputError("--axes", "'" + word + "' is no axis", "give some of x,y,z,yaw");
   return out;
 }
 
@@ -291,34 +273,6 @@ Json loop_json(const planning::LoopResult& loop) {
   return out;
 }
 
-std::vector<double> row_times(double end, double rate) {
-  constexpr double kSlack = 1e-6;  // s
-  std::vector<double> times;
-  for (int k = 0; k / rate < end - kSlack; ++k) times.push_back(k / rate);
-  times.push_back(end);
-  return times;
-}
-
-void write_motion(const Path& out, const planning::Motion& motion, const std::vector<double>& times) {
-  std::vector<trajectory::Sample> samples;
-  std::string csv = "time,x,y,z,vx,vy,vz,ax,ay,az,yaw,yaw_velocity,yaw_acceleration\n";
-  for (double time : times) {
-    const planning::Coordinates c = planning::coordinates(motion, time);
-    samples.push_back({time, planning::base_at(motion, time).pose});
-    csv += core::exact(time);
-    const auto field = [&csv](double value) {
-      csv += ',';
-      csv += core::exact(value);
-    };
-    for (int d = 0; d < 3; ++d)
-      for (int i = 0; i < 3; ++i) field(c(i, d));
-    for (int d = 0; d < 3; ++d) field(c(3, d));
-    csv += '\n';
-  }
-  core::write_file(out / "base.tum", trajectory::write_tum(samples));
-  core::write_file(out / "base.csv", csv);
-}
-
 void plan(const Globals& globals, PlanRequest& request) {
   if (!(request.rate > 0.0) || !std::isfinite(request.rate))
     throw InputError("--rate", "must be above 0", "give rows a second, for example 100");
@@ -396,7 +350,8 @@ void plan(const Globals& globals, PlanRequest& request) {
   const Path out = request.out;
   make_folder(out);
   const std::vector<double> times = row_times(plan.motion.end(), request.rate);
-  write_motion(out, played, times);
+  core::write_file(out / "base.tum", motion_tum(played, times));
+  core::write_file(out / "base.csv", motion_csv(played, times));
   core::write_file(out / "states.csv", twin::states_csv(planning::predict(problem, played, times)));
   core::write_file(out / "picture.svg", planning::picture_svg(problem, options, plan));
   Json document = plan_json(problem, options, plan, request.horizon);

@@ -1,0 +1,70 @@
+// chainsplat/excitation.h - what to record next: base motions that make the parameters best observable (paper, first of
+// the open problems of identification; D-optimal experiments).
+//
+// What a recording can tell is the information of its frames, the sum of J^T J / sd^2 with J the derivatives of points
+// of the rope by the parameters (variational equation), less what is spent on the unknown initial state. The motion
+// maximizes log det(what is known + that): the volume of what remains uncertain shrinks most.
+#pragma once
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "chainsplat/planning.h"
+
+namespace chainsplat::excitation {
+
+using math::MatrixX;
+using math::VectorX;
+
+struct Options {
+  std::vector<planning::Axis> axes;  // empty: x in free space for a planar chain, x and y for a spatial one; on a table
+                                     // x, y and yaw
+  double duration = 5.0;             // s
+  planning::Limits limits;           // `stroke` too: keep the rope inside of what the cameras see
+  double frame_rate = 30.0;          // 1/s, of the recording
+  double noise = 2e-3;               // m, sd of a recorded point's coordinate about the model
+  double max_bend = 1.2;             // rad, of one angle from where it starts: beyond, recognition is not to be trusted
+  int starts = 24;                   // random motions, of which the best is refined
+  int generations = 24;              // of eight changes of it each
+  std::uint64_t seed = 0;
+};
+
+struct Problem {
+  dynamics::Model model;
+  bool tabletop = false;
+  math::Pose base;                  // at the start
+  dynamics::InitialState initial;   // at rest
+  dynamics::Estimates estimates;    // what is known: names, covariance
+  dynamics::BaseFunction recorded;  // base motion of the recording that was identified, to compare with; may be empty
+  double recorded_start = 0.0, recorded_end = 0.0;  // s
+};
+
+// One entry a parameter; initial states are none.
+struct Prediction {
+  std::vector<std::string> names;
+  std::vector<double> now;       // standard error, in the units of the name
+  std::vector<double> excited;   // after one recording of the motion
+  std::vector<double> repeated;  // after one more recording of the old motion as long as it was; empty without it
+  double gain = 0.0;             // decrease of the log of the uncertain volume a parameter, by the motion
+  double repeated_gain = 0.0;
+};
+
+struct Result {
+  planning::Motion motion;
+  planning::Peaks peaks;
+  chain::States states;  // predicted, at the frame rate
+  Prediction prediction;
+};
+
+// Same seed, same motion. Throws InputError where the twin knows no covariance or limits allow no motion, WorkError
+// where no motion keeps the rope within `max_bend`.
+Result excite(const Problem& problem, const Options& options);
+
+// Information about `names` (initial states left out of the sum) in a recording under `base` at `times`, with noise of
+// the given sd on points of the centerline, and the initial state known as well as recognition knows it. Empty where
+// the rollout diverges. `states`: filled where given.
+MatrixX information(const dynamics::Model& model, const std::vector<std::string>& names,
+                    const dynamics::BaseFunction& base, const dynamics::InitialState& initial,
+                    const std::vector<double>& times, double noise, chain::States* states = nullptr);
+
+}  // namespace chainsplat::excitation

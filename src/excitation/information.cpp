@@ -1,0 +1,54 @@
+#include <cmath>
+
+#include "chainsplat/excitation.h"
+
+namespace chainsplat::excitation {
+namespace {
+
+// As identification weighs them: two points a link, and neighbors in space and time err alike (SPEC 5).
+constexpr double kShare = 1.0 / 9.0;
+constexpr double kThetaSd = 0.02;  // rad, of the recognized initial angles
+constexpr double kRateSd = 0.5;    // rad/s
+
+}  // namespace
+
+MatrixX information(const dynamics::Model& model, const std::vector<std::string>& names,
+                    const dynamics::BaseFunction& base, const dynamics::InitialState& initial,
+                    const std::vector<double>& times, double noise, chain::States* states) {
+  const chain::Chain& chain = model.chain;
+  const int n = chain.angles();
+  const auto size = static_cast<Eigen::Index>(names.size());
+  std::vector<dynamics::Tangent> unknowns = dynamics::tangents(chain, model.parameters, names);
+  for (int i = 0; i < 2 * n; ++i) {
+    dynamics::Tangent start;
+    (i < n ? start.theta : start.thetadot) = VectorX::Unit(n, i % n);
+    unknowns.push_back(start);
+  }
+  chain::States rolled;
+  chain::States& motion = states ? *states : rolled;
+  dynamics::Sensitivities slopes;
+  const dynamics::BaseGrid grid = dynamics::sample_base(base, initial.time, times, model.parameters.substeps);
+  if (!dynamics::simulate(model, grid, initial.theta, initial.thetadot, motion, unknowns, &slopes)) return {};
+
+  MatrixX sum = MatrixX::Zero(size + 2 * n, size + 2 * n);
+  for (int k = 0; k < n; ++k) {
+    sum(size + k, size + k) = 1.0 / (kThetaSd * kThetaSd);
+    sum(size + n + k, size + n + k) = 1.0 / (kRateSd * kRateSd);
+  }
+  for (std::size_t k = 0; k < motion.theta.size(); ++k) {
+    const auto poses = chain::link_motions(chain, motion.theta[k], {});
+    const MatrixX axes = chain::world_axes(chain, motion.theta[k], {});
+    MatrixX by_angle = MatrixX::Zero(n, n);  // J^T J of the points
+    for (int link = 1; link < chain.links(); ++link)
+      for (const double part : {0.5, 1.0}) {
+        const double s = chain.link_start(link) + part * (chain.link_end(link) - chain.link_start(link));
+        const MatrixX jacobian = chain::point_jacobian(chain, axes, link, poses[link] * (s * chain.direction));
+        by_angle += jacobian.transpose() * jacobian;
+      }
+    sum += kShare / (noise * noise) * slopes.theta[k].transpose() * by_angle * slopes.theta[k];
+  }
+  const MatrixX cross = sum.topRightCorner(size, 2 * n);
+  return sum.topLeftCorner(size, size) - cross * sum.bottomRightCorner(2 * n, 2 * n).ldlt().solve(cross.transpose());
+}
+
+}  // namespace chainsplat::excitation

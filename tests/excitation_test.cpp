@@ -1,0 +1,132 @@
+#include "chainsplat/excitation.h"
+
+#include <doctest/doctest.h>
+#include <cmath>
+
+#include "chainsplat/identification.h"
+
+using namespace chainsplat;
+using math::Vector3;
+using math::VectorX;
+
+namespace {
+
+dynamics::Model rope() {
+  const chain::Chain chain =
+      chain::make_chain(0.3, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 5, chain::Bending::planar, false);
+  const auto fill = [](int count, double value) { return std::vector<double>(count, value); };
+  dynamics::Parameters p;
+  p.link_mass = fill(5, 0.012), p.viscous_friction = p.coulomb_friction = p.air_linear = fill(5, 0.0);
+  p.air_quadratic = fill(5, 0.0144 * 0.06);
+  p.stiffness = fill(5, 0.012), p.damping = fill(5, 6e-4), p.rest_angle = fill(5, 0.02);
+  p.stiffness[0] *= 2.0, p.damping[0] *= 2.0;  // the first joint stands for half a link (SPEC 3.2)
+  p.radius = 0.01, p.tip_mass = 0.002;
+  return dynamics::make_model(chain, p);
+}
+
+// 15 cm at 0.25 Hz: a gentle recording.
+trajectory::BaseMotion gentle(double t) {
+  const double a = 0.075, w = 2.0 * M_PI * 0.25;
+  trajectory::BaseMotion base;
+  base.pose.translation.x() = a * (1.0 - std::cos(w * t));
+  base.velocity[3] = a * w * std::sin(w * t);
+  base.acceleration[3] = a * w * w * std::cos(w * t);
+  return base;
+}
+
+struct Recording {
+  trajectory::Trajectory base;
+  chain::States states;
+};
+
+Recording record(const dynamics::Model& model, const dynamics::BaseFunction& motion, double duration,
+                 std::uint64_t seed) {
+  std::vector<trajectory::Sample> samples;
+  for (int k = 0; k <= duration * 100 + 1e-9; ++k) samples.push_back({k / 100.0, motion(k / 100.0).pose});
+  std::vector<double> times;
+  for (int k = 0; k <= duration * 30 + 1e-9; ++k) times.push_back(k / 30.0);
+  const VectorX rest = dynamics::static_equilibrium(model, motion(0.0).pose);
+  dynamics::Model fine = model;
+  fine.parameters.substeps = 16;
+  Recording out{trajectory::fit(samples, "test"),
+                dynamics::rollout(fine, motion, {0.0, rest, VectorX::Zero(rest.size())}, times)};
+  core::Random random(seed);
+  for (VectorX& theta : out.states.theta)
+    for (double& angle : theta) angle += 0.5 * M_PI / 180.0 * random.normal();
+  out.states.thetadot.clear();
+  return out;
+}
+
+}  // namespace
+
+TEST_CASE("the proposed motion keeps the limits, tells more than the old one, and identification confirms it") {
+  const dynamics::Model model = rope();
+  identification::Options options;
+  options.mass = 0.062;
+  options.per_joint = false;
+  const Recording old = record(model, gentle, 4.0, 1);
+  const identification::Result found = identification::identify(model.chain, old.base, old.states, {}, options);
+
+  excitation::Problem problem;
+  problem.model = dynamics::make_model(model.chain, found.parameters);
+  problem.base = old.base.pose(0.0);
+  problem.initial = {0.0, dynamics::static_equilibrium(problem.model, problem.base), VectorX::Zero(5)};
+  problem.estimates = found.estimates;
+  problem.recorded = [&](double t) { return old.base.at(t); };
+  problem.recorded_end = 4.0;
+  excitation::Options request;
+  request.duration = 4.0;
+  request.limits.stroke = 0.15;
+  request.noise = 1e-3;
+  request.starts = 12, request.generations = 8;
+  const excitation::Result result = excitation::excite(problem, request);
+
+  CHECK(result.peaks.over.empty());
+  CHECK(result.peaks.stroke <= 0.15 * (1 + 1e-9));
+  const planning::Peaks fine = planning::peaks(result.motion, 0.0, 4.0, request.limits, 2.7e-4);
+  CHECK(fine.over.empty());
+  for (double t : {0.0, 4.0}) CHECK(planning::base_at(result.motion, t).acceleration.norm() < 1e-9);
+  const excitation::Prediction& p = result.prediction;
+  CHECK(p.gain > p.repeated_gain + 0.2);  // a parameter's uncertainty falls by a further 20 % in the mean
+  for (std::size_t i = 0; i < p.names.size(); ++i) {
+    CHECK(p.excited[i] <= p.now[i] * (1.0 + 1e-9));
+    CHECK(p.repeated[i] <= p.now[i] * (1.0 + 1e-9));
+  }
+  // the same request, the same motion
+  const excitation::Result again = excitation::excite(problem, request);
+  CHECK(again.motion.pieces[0].weights == result.motion.pieces[0].weights);
+
+  // recorded and identified: errors of stiffness, damping and drag under either motion, a few noise seeds
+  const auto error = [&](const dynamics::BaseFunction& motion) {
+    double sum = 0.0;
+    for (std::uint64_t seed = 10; seed < 14; ++seed) {
+      const Recording recording = record(model, motion, 4.0, seed);
+      const dynamics::Parameters q =
+          identification::identify(model.chain, recording.base, recording.states, {}, options).parameters;
+      for (const double log : {std::log(q.stiffness[2] / 0.012), std::log(q.damping[2] / 6e-4),
+                               std::log(q.air_quadratic[2] / model.parameters.air_quadratic[2])})
+        sum += log * log;
+    }
+    return std::sqrt(sum / 12.0);
+  };
+  const double gentle_error = error(gentle),
+               excited_error = error([&](double t) { return planning::base_at(result.motion, t); });
+  MESSAGE("RMS log error ", gentle_error, " under the old motion, ", excited_error,
+          " under the proposed one; predicted ", p.repeated[0], " and ", p.excited[0]);
+  CHECK(excited_error < 0.7 * gentle_error);
+}
+
+TEST_CASE("requests that cannot be met are refused") {
+  excitation::Problem problem;
+  problem.model = rope();
+  problem.initial = {0.0, VectorX::Zero(5), VectorX::Zero(5)};
+  CHECK_THROWS_AS(excitation::excite(problem, {}), InputError);  // nothing known
+  problem.estimates.names = {"log_stiffness"};
+  problem.estimates.covariance = math::MatrixX::Identity(1, 1);
+  excitation::Options options;
+  options.duration = -1.0;
+  CHECK_THROWS_AS(excitation::excite(problem, options), InputError);
+  options = {};
+  options.limits.velocity = 0.0;
+  CHECK_THROWS_AS(excitation::excite(problem, options), InputError);
+}
