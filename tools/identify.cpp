@@ -12,6 +12,7 @@
 #include "cli.h"
 #include "joint.h"
 #include "markers.h"
+#include "online.h"
 
 namespace chainsplat::tools {
 
@@ -298,7 +299,35 @@ void add_identify_command(CLI::App& app, const Globals& globals, Job& job) {
           "Then refine angles, Gaussians and dynamics of one RUN together with the capture's images: helps where\n"
           "a single camera hardly sees depth")
       ->excludes(markers);
-  identifier->callback([&globals, &job, request] { job = [&globals, request] { identify(globals, *request); }; });
+  auto online = std::make_shared<OnlineRequest>();
+  CLI::Option* stream =
+      identifier
+          ->add_option(
+              "--online", online->file,
+              "Follow the states that 'estimate' printed (-: standard input): the twin's parameters move with\n"
+              "the rope, old frames are forgotten")
+          ->type_name("FILE.jsonl")
+          ->excludes(markers)
+          ->excludes("--joint");
+  identifier
+      ->add_option("--base", online->base, "With --online: the base's motion meanwhile (default: the capture's own)")
+      ->type_name("FILE.tum")
+      ->needs(stream);
+  identifier
+      ->add_option("--memory", online->memory,
+                   "With --online: seconds in which old frames fade (default 5; inf: never)")
+      ->type_name("S")
+      ->needs(stream);
+  identifier->callback([&globals, &job, request, online] {
+    job = [&globals, request, online] {
+      if (online->file.empty()) return identify(globals, *request);
+      if (request->runs.size() != 1)
+        throw InputError("--online", "follows one twin, " + std::to_string(request->runs.size()) + " are named",
+                         "name one RUN");
+      online->run = request->runs[0];
+      identify_online(globals, *online);
+    };
+  });
 }
 
 }  // namespace chainsplat::tools
