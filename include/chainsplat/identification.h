@@ -23,6 +23,7 @@ struct Options {
   bool paper = false;                   // kappa = 0; d_j, m_j and viscous mu_j by Adam on the angles
   dynamics::Integrator integrator = dynamics::Integrator::rodas3;  // paper: implicit_velocity_euler, one step a frame
   int substeps = 0;           // a frame of 1/30 s; 0: 4, on a table 8 (stick and slip)
+  double start_factor = 1.0;  // stiffness, damping, drag and friction of the first starts, to what is usual
   std::uint64_t seed = 0;     // of further starts where the first ones fit poorly
   int max_iterations = 25;    // of Levenberg-Marquardt, a horizon
   double model_error = 1e-3;  // m, of one coordinate of a point of the chain, beside what `covariances` say

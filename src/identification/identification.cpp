@@ -422,6 +422,10 @@ Fit fit_centerline(const Problem& problem, const Options& options) {
 
   const auto start = [&](int index) {
     VectorX p = problem.mean;
+    for (int i : {u.stiffness, u.damping, u.drag})
+      if (i >= 0) p[i] += std::log(options.start_factor);
+    for (int j = 0; u.coulomb >= 0 && j < problem.chain.links() - 1; ++j)
+      p[u.coulomb + j] += std::log(options.start_factor);
     if (index < 3) {
       for (int i : {u.stiffness, u.damping})
         if (i >= 0) p[i] += std::log(kScales[index]);
