@@ -15,7 +15,8 @@ constexpr double kPiece = 2.0;        // s, of one stretch of basis functions: u
 constexpr double kOverlap = 0.5;      // of a stretch with the next: no rest between them
 constexpr int kChanges = 8;           // a generation
 constexpr double kFirstChange = 0.5;  // of a weight's spread
-constexpr double kMargin = 0.999;     // of a limit
+constexpr double kMargin = 0.998;     // of a limit: peaks lie between the points of the grid
+constexpr double kGrid = 2e-3;        // s, of that grid
 constexpr int kMaxSofter = 12;        // times that a motion which bends the rope too far is made smaller
 constexpr double kSofter = 0.8;
 
@@ -37,7 +38,7 @@ void scale(planning::Motion& motion, double translation, double yaw) {
 }
 
 // The motion is linear in its weights: scaled so that the tightest limit is just met.
-planning::Peaks scale_to_limits(planning::Motion& motion, const Options& options) {
+void scale_to_limits(planning::Motion& motion, const Options& options) {
   const planning::Limits& l = options.limits;
   const auto factor = [&](const planning::Peaks& p, bool yaw) {
     double out = std::numeric_limits<double>::infinity();
@@ -50,9 +51,8 @@ planning::Peaks scale_to_limits(planning::Motion& motion, const Options& options
     }
     return std::isfinite(out) ? out : 0.0;
   };
-  const planning::Peaks peaks = planning::peaks(motion, 0.0, options.duration, l, 5e-3);
+  const planning::Peaks peaks = planning::peaks(motion, 0.0, options.duration, l, kGrid);
   scale(motion, factor(peaks, false), factor(peaks, true));
-  return planning::peaks(motion, 0.0, options.duration, l);
 }
 
 double log_det(const MatrixX& positive) {

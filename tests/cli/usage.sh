@@ -8,7 +8,7 @@ expect_code 0 --version
 expect_output '^chainsplat [0-9]+\.[0-9]+\.[0-9]+$' --version
 run --help
 expect_code 0 --help
-for command in train recognize identify new check mask rollout render eval export synth estimate force plan batch diff bench doctor; do
+for command in train recognize identify new check mask rollout render eval export synth estimate force plan excite batch diff bench doctor; do
   expect_output "^ +$command " --help
   run "$command" --help
   expect_code 0 "$command --help"
@@ -37,6 +37,10 @@ expect_error 2 '--frames' train capture -o run --frames 5:5
 expect_error 2 '--frames' train capture -o run --frames some
 expect_error 2 'twin.json' rollout "$work/none" -o "$work/states.csv"
 expect_error 2 'ending' export "$work/none" -o "$work/twin.obj"
+expect_error 2 'twin.json' excite "$work/none" -o "$work/motion"
+expect_error 2 '--output' excite "$work/none"
+expect_error 2 'twin.json' identify "$work/none" --online "$work/none.jsonl"
+expect_error 2 '--online' identify "$work/none" --memory 3
 expect_error 2 'folder does not exist' rollout "$work/none" -o "$work/none/states.csv"
 [ "$(ls "$work")" = "$(printf 'stderr\nstdout')" ] || fail 'something was written'
 
