@@ -185,6 +185,40 @@ TEST_CASE("on truth with noise, starts three times off end in one minimum with h
   }
 }
 
+TEST_CASE("dynamics reads the estimates' names as identification writes them") {
+  for (const bool table : {false, true}) {
+    const chain::Chain chain =
+        chain::make_chain(0.3, 0.02, Vector3(0, 0, -1), Vector3(0, 1, 0), 4, chain::Bending::spatial, true);
+    Options options;
+    options.tabletop = table;
+    const int n = chain.angles();
+    const VectorX zero = VectorX::Zero(n);
+    const Unknowns unknowns = make_unknowns(chain, options, zero, zero, VectorX::Constant(n, 0.02));
+    const auto expected = tangents(chain, unknowns, unknowns.mean);
+    const auto found = dynamics::tangents(chain, apply(chain, unknowns, unknowns.mean).parameters, unknowns.names);
+    const auto same = [](const std::vector<double>& a, const std::vector<double>& b) {
+      double off = 0.0, size = 0.0;
+      for (std::size_t i = 0; i < std::max(a.size(), b.size()); ++i) {
+        const double x = i < a.size() ? a[i] : 0.0, y = i < b.size() ? b[i] : 0.0;
+        off = std::max(off, std::abs(x - y)), size = std::max(size, std::abs(x));
+      }
+      return off <= 1e-8 * size;
+    };
+    for (std::size_t i = 0; i < expected.size(); ++i) {
+      CAPTURE(unknowns.names[i]);
+      CHECK(same(expected[i].stiffness, found[i].stiffness));
+      CHECK(same(expected[i].damping, found[i].damping));
+      CHECK(same(expected[i].rest_angle, found[i].rest_angle));
+      CHECK(same(expected[i].link_mass, found[i].link_mass));
+      CHECK(same(expected[i].coulomb_friction, found[i].coulomb_friction));
+      CHECK(same(expected[i].air_quadratic, found[i].air_quadratic));
+      CHECK(std::abs(expected[i].tip_mass - found[i].tip_mass) <= 1e-8 * std::abs(expected[i].tip_mass));
+      CHECK(expected[i].theta.size() == found[i].theta.size());
+      CHECK(expected[i].thetadot.size() == found[i].thetadot.size());
+    }
+  }
+}
+
 TEST_CASE("study: figures on truth over 20 seeds" * doctest::skip()) {
   for (const Case& what : kCases) {
     const Study s = study(what, 20);

@@ -43,6 +43,7 @@ Parameters moved(const chain::Chain& chain, const Parameters& parameters, std::s
     };
     if (name == "log_stiffness") joints(p.stiffness, -1);
     if (name == "log_damping") joints(p.damping, -1);
+    if (name == "log_grasp_stiffness_ratio" && chain.angles() > 1) p.stiffness[1] *= factor;
     if (name == "log_twist_stiffness_ratio")
       for (int k = 0; k < chain.angles(); ++k)
         if (std::abs(chain.axes[k].head<3>().dot(chain.direction)) > 0.5) p.stiffness[k] *= factor;
