@@ -120,8 +120,9 @@ TEST_CASE("live masks of one camera") {
   for (int k = 0; k < 40; ++k) {
     REQUIRE(video.next(picture));
     const double time = masked.times[0][k];
-    // expected where it was a frame ago: a prediction that knows nothing of the motion
-    const VectorX expected = chain::interpolate(fit.states, masked.times[0][std::max(0, k - 1)]);
+    // expected where the last two frames lead at constant velocity: a prediction that knows nothing of the dynamics
+    const VectorX last = chain::interpolate(fit.states, masked.times[0][std::max(0, k - 1)]);
+    const VectorX expected = 2.0 * last - chain::interpolate(fit.states, masked.times[0][std::max(0, k - 2)]);
     const capture::View view = masking::mask(live, picture, masked.base.pose(time), expected);
     capture::Image8 whole{320, 240, 1, std::vector<std::uint8_t>(320 * 240, 0)};
     for (int y = 0; y < view.height; ++y)

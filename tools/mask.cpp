@@ -21,6 +21,7 @@ namespace fs = std::filesystem;
 using Json = nlohmann::ordered_json;
 
 constexpr std::uint8_t kInside = 128;  // mask values from here on are object (INTERFACE 2)
+constexpr double kDoubtful = 0.85;  // share of the chain's centerline in the masks under which they may be wrong
 
 struct Request {
   std::string capture, out, command, frames;
@@ -231,10 +232,14 @@ void make_masks(const Globals& globals, const Request& request) {
   if (summary.empty > 0)
     core::warn(into + ": " + std::to_string(summary.empty) + " of " + std::to_string(summary.frames) +
                " masks are empty; the rope is hidden or was not found there");
+  if (request.command.empty() && summary.inside < kDoubtful)
+    core::warn(into + ": only " + std::to_string(std::lround(100.0 * summary.inside)) +
+               " % of the rope lies in the masks; look at them before you use them, or use --command");
   Json document;
   document["masks"] = into;
   document["frames"] = summary.frames;
   document["empty"] = summary.empty;
+  if (request.command.empty()) document["inside"] = summary.inside;
   for (std::size_t c = 0; c < cameras; ++c)
     if (agreement.frames[c] > 0) document["iou"][scene.cameras[c].name] = agreement.sum[c] / agreement.frames[c];
   if (globals.json) {

@@ -15,7 +15,8 @@ namespace {
 
 constexpr int kBlock = 128;              // frames of one camera held in memory at once
 constexpr int kSamples = 48;             // frames of a camera that background and colors are learned from
-constexpr double kAlwaysCovered = 0.35;  // share of the frames within a diameter: the median picture may show the rope
+constexpr double kOftenCovered = 0.35;   // share of the frames within a diameter: the median picture may show the rope
+constexpr double kMostlyCovered = 0.6;   // and here it does, at the grasp
 constexpr double kAboutPixels = 24.0;    // px about a tube that are told apart from what is far
 constexpr double kLeastUncovered = 0.2;  // of the samples that must show the background
 constexpr int kLeastSamples = 4;
@@ -24,6 +25,7 @@ constexpr double kLinkDiameters = 1.5;            // length of a link of the cha
 constexpr int kFewestJoints = 8, kMostJoints = 16;
 constexpr double kOpenEnd = 1.0;      // diameters
 constexpr int kRounds = 2;            // of learning, cutting and fitting
+constexpr double kCenter = 0.5;       // of the radius: deeper inside than this counts as the centerline
 constexpr double kLeastInside = 0.4;  // of the centerline within the masks, mean: less was no rope
 
 struct Recording {
@@ -66,16 +68,41 @@ struct Samples {
   }
 };
 
-// Whether the grasp stays so near to one place that a median over time may show the rope.
-bool rests(const Recording& recording, const chain::Chain& chain, const Samples& samples) {
+// Where the grasp stays longest: the largest share of the frames that is within a diameter of one of them, and its
+// time.
+struct Rest {
+  double share = 0.0, time = 0.0;
+};
+Rest rest(const Recording& recording, const chain::Chain& chain, const Samples& samples) {
   const trajectory::Trajectory& base = recording.capture.base;
+  Rest out;
   for (const View& a : samples.frames) {
     int near = 0;
     for (const View& b : samples.frames)
       near += (base.pose(a.time).translation - base.pose(b.time).translation).norm() < chain.diameter;
-    if (near > kAlwaysCovered * static_cast<double>(samples.frames.size())) return true;
+    const double share = near / static_cast<double>(samples.frames.size());
+    if (share > out.share) out = {share, a.time};
   }
-  return false;
+  return out;
+}
+
+bool masked_at(const View& view, int x, int y) {
+  x -= view.x0, y -= view.y0;
+  return x >= 0 && y >= 0 && x < view.width && y < view.height &&
+         view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] != 0;
+}
+
+// Share of the chain's centerline, where the camera can see it, that lies in the mask.
+double share_inside(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta,
+                    const capture::Camera& recorded, const View& mask) {
+  capture::Camera camera = recorded;
+  camera.distortion = {};  // of the crop
+  const Tube place = tube(chain, base, theta, camera, 0.0, chain.length, 0.0);
+  int seen = 0, inside = 0;
+  for (int y = place.box.y0; y < place.box.y1; ++y)
+    for (int x = place.box.x0; x < place.box.x1; ++x)
+      if (place.at(x, y) < -kCenter * place.radius) ++seen, inside += masked_at(mask, x, y);
+  return seen ? inside / static_cast<double>(seen) : 1.0;
 }
 
 // The picture's mask in recorded pixels.
@@ -83,11 +110,7 @@ Image8 recorded_mask(const View& view, const capture::Camera& camera) {
   Image8 mask{camera.width, camera.height, 1, {}};
   mask.pixels.assign(static_cast<std::size_t>(camera.width) * camera.height, 0);
   if (view.width == 0) return mask;
-  const auto inside = [&](int x, int y) {
-    x -= view.x0, y -= view.y0;
-    return x >= 0 && y >= 0 && x < view.width && y < view.height &&
-           view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] != 0;
-  };
+  const auto inside = [&](int x, int y) { return masked_at(view, x, y); };
   if (!camera.distorted()) {
     for (int y = view.y0; y < view.y0 + view.height; ++y)
       for (int x = view.x0; x < view.x0 + view.width; ++x)
@@ -150,7 +173,7 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
       tell("background", views.size());
     });
     const std::vector<Picture> pictures = samples[c].pictures();
-    const bool resting = rests(recording, chain, samples[c]);
+    const Rest resting = rest(recording, chain, samples[c]);
     const math::VectorX straight = math::VectorX::Zero(chain.angles());
     const auto learn = [&](Look& look, const Picture& picture, double time) {
       const math::Pose base = scene.base.pose(time);
@@ -160,14 +183,15 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
     };
     for (const View& view : samples[c].frames) learn(looks[c], picture_of(view), view.time);
     Background median = median_background(pictures, {}, 1);
-    if (resting) {
-      // The median shows the rope too: there is no background yet, but at the grasp nothing that passes by. The colors
-      // there must do, and the rope's end may have others.
-      Look still;
-      const Picture picture{median.rgb.data(), scene.cameras[c].width, scene.cameras[c].height, 3};
-      learn(still, picture, samples[c].frames.front().time);
-      looks[c].near.object = still.near.object;
+    if (resting.share > kOftenCovered) {
+      // The median shows the rope too: there is no background yet, and the rope's end may have other colors.
       open_end[c] = kOpenEnd * chain.diameter;
+      if (resting.share > kMostlyCovered) {  // at the grasp it shows nothing that passes by: its colors are better
+        Look still;
+        const Picture picture{median.rgb.data(), scene.cameras[c].width, scene.cameras[c].height, 3};
+        learn(still, picture, resting.time);
+        looks[c].near.object = still.near.object;
+      }
     } else {
       looks[c].background = std::move(median);
     }
@@ -228,13 +252,17 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
                                               std::max(kLeastSamples, static_cast<int>(kLeastUncovered * count)));
     }
   }
+  summary.inside = 0.0;
   masks_by(true, "cut", [&](std::vector<View>& views) {
     for (const View& view : views) {
       ++summary.frames;
+      summary.inside += share_inside(chain, scene.base.pose(view.time), chain::interpolate(states, view.time),
+                                     scene.cameras[view.camera], view);
       summary.empty += view.width == 0;
       sink(view.camera, view.frame, recorded_mask(view, scene.cameras[view.camera]));
     }
   });
+  summary.inside /= summary.frames;
   return summary;
 }
 
