@@ -50,6 +50,7 @@ twin::Twin full_twin() {
   twin.estimates.standard_errors = {0.01, std::numeric_limits<double>::quiet_NaN()};
   twin.estimates.covariance = math::MatrixX::Identity(2, 2) / 3.0;
   twin.estimates.covariance(1, 0) = 1e-300;
+  twin.estimates.weak = {{0.25, {{"rest_angle_3", 0.8}, {"log_stiffness", -0.6}}}};  // not in the alphabet's order
   twin.estimates.held = {{"mass", "given by the capture"}, {"twist", "not observed, \"held\""}};
   twin.provenance = {"1.2.3",
                      "free \xc3\xa4",
@@ -109,6 +110,9 @@ TEST_CASE("a twin reads back bit by bit") {
   CHECK(same_all(read.estimates.standard_errors, twin.estimates.standard_errors));
   CHECK(read.estimates.covariance == twin.estimates.covariance);
   CHECK(read.estimates.held == twin.estimates.held);
+  REQUIRE(read.estimates.weak.size() == 1);
+  CHECK(read.estimates.weak[0].singular_value == 0.25);
+  CHECK(read.estimates.weak[0].parts == twin.estimates.weak[0].parts);
   CHECK(read.provenance.capture == twin.provenance.capture);
   CHECK(read.provenance.options == twin.provenance.options);
   CHECK(read.provenance.seed == twin.provenance.seed);

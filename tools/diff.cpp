@@ -28,14 +28,16 @@ class Comparison {
   void put(const std::string& what, const std::string& a, const std::string& b, const std::string& note = "") {
     if (a != b) found_.push_back({what, a.empty() ? "-" : a, b.empty() ? "-" : b, note});
   }
-  void put(const std::string& what, double a, double b) {
+  // `note_text` empty: the difference in percent
+  void put(const std::string& what, double a, double b, const std::string& note_text = "") {
     if (a == b || (std::isnan(a) && std::isnan(b))) return;
     char first[32], second[32], note[48] = "";
     std::snprintf(first, sizeof first, "%.6g", a);
     std::snprintf(second, sizeof second, "%.6g", b);
     if (a != 0.0 && std::isfinite(a) && std::isfinite(b))
       std::snprintf(note, sizeof note, "%+.3g %%", 100.0 * (b - a) / std::abs(a));
-    found_.push_back({what, std::isnan(a) ? "-" : first, std::isnan(b) ? "-" : second, note});
+    found_.push_back(
+        {what, std::isnan(a) ? "-" : first, std::isnan(b) ? "-" : second, note_text.empty() ? note : note_text});
   }
   const std::vector<Difference>& found() const { return found_; }
 
@@ -95,11 +97,23 @@ void compare_chain(Comparison& out, const twin::Twin& a, const twin::Twin& b) {
   std::vector<std::string> names = a.estimates.names;
   for (const std::string& name : b.estimates.names)
     if (std::find(names.begin(), names.end(), name) == names.end()) names.push_back(name);
-  const auto get = [](const dynamics::Estimates& estimates, const std::string& name) {
-    const auto at = std::find(estimates.names.begin(), estimates.names.end(), name);
-    return at == estimates.names.end() ? NAN : estimates.values[static_cast<std::size_t>(at - estimates.names.begin())];
+  const auto get = [](const dynamics::Estimates& estimates, const std::vector<double>& values,
+                      const std::string& name) {
+    const auto at = static_cast<std::size_t>(std::find(estimates.names.begin(), estimates.names.end(), name) -
+                                             estimates.names.begin());
+    return at < values.size() ? values[at] : NAN;
   };
-  for (const std::string& name : names) out.put("parameter " + name, get(a.estimates, name), get(b.estimates, name));
+  // a difference of an estimate means something against its standard error
+  for (const std::string& name : names) {
+    const double first = get(a.estimates, a.estimates.values, name),
+                 second = get(b.estimates, b.estimates.values, name);
+    const double error = std::hypot(get(a.estimates, a.estimates.standard_errors, name),
+                                    get(b.estimates, b.estimates.standard_errors, name));
+    char note[64] = "";
+    if (error > 0.0 && std::isfinite(second - first))
+      std::snprintf(note, sizeof note, "%+.2g standard errors", (second - first) / error);
+    out.put("parameter " + name, first, second, note);
+  }
   compare_states(out, "recognized states", a.states, b.states);
   compare_states(out, "rollout", a.rollout, b.rollout);
 }

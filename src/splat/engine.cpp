@@ -226,11 +226,10 @@ void Engine::State::need(Buffer& buffer, std::size_t bytes, const char* name) {
 void Engine::State::release_view_buffers() {
   commands.wait();
   for (Buffer* buffer :
-       {&views,           &motions,        &tile_map,    &tiles,          &splats,        &instance_count,
-        &instance_prefix, &instance_block, &records,     &link_twists,    &tile_count,    &tile_prefix,
-        &tile_block,      &tile_cursor,    &tile_used,   &tile_loss,      &entries,       &sorted,
-        &partials,        &image,          &depth_image, &pixel_gradient, &ssim_row_sums, &ssim_factors,
-        &long_tiles,      &sort_scratch})
+       {&views,          &motions,       &tile_map,     &tiles,      &splats,      &instance_count, &instance_prefix,
+        &instance_block, &records,       &link_twists,  &tile_count, &tile_prefix, &tile_block,     &tile_cursor,
+        &tile_used,      &tile_loss,     &entries,      &sorted,     &partials,    &image,          &depth_image,
+        &pixel_gradient, &ssim_row_sums, &ssim_factors, &long_tiles, &sort_scratch})
     *buffer = Buffer();
   instance_capacity = 0;
 }
@@ -416,6 +415,10 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   }
   if (instance_capacity == 0)
     instance_capacity = static_cast<std::uint32_t>(std::max<std::size_t>(1024, kFirstInstances * pairs / 2));
+  // what drawing had grown can be more than gradients have room for; an overflow then takes fewer views
+  if (options.backward)
+    instance_capacity = static_cast<std::uint32_t>(
+        std::min<std::size_t>(instance_capacity, range_limit / (sizeof(glm::vec4) * shared::kPartialRows * slots)));
   const auto words = [](std::size_t n) { return n * sizeof(std::uint32_t); };
   const auto vectors = [](std::size_t n) { return n * sizeof(glm::vec4); };
   const auto blocks = [](std::size_t n) { return n / shared::kScanBlock + 1; };

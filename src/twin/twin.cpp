@@ -242,10 +242,10 @@ class Node {
     if (std::abs(value.norm() - 1.0) > kLengthTolerance) fail("is not a unit vector", "divide it by its length");
     return value;
   }
-  std::map<std::string, Node> members() const {
+  std::vector<std::pair<std::string, Node>> members() const {  // in the file's order
     if (!value_.is_object()) fail("is not an object", "restore it from a run that works");
-    std::map<std::string, Node> out;
-    for (const auto& [key, value] : value_.items()) out.emplace(key, Node(value, file_, key_ + "." + key));
+    std::vector<std::pair<std::string, Node>> out;
+    for (const auto& [key, value] : value_.items()) out.emplace_back(key, Node(value, file_, key_ + "." + key));
     return out;
   }
 
