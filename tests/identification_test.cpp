@@ -359,8 +359,31 @@ TEST_CASE("markers farther from the grasp than their arclength are refused") {
   markers.time = frames(4);
   markers.world.assign(4, MatrixX(Vector3(0, 0, 0.2)));
   CHECK(fit_markers(s.chain, s.base, markers).theta.size() == 4);
-  markers.world[2](2, 0) = -200.0;  // millimeters, say
+  markers.world[2](2, 0) = -200.0;  // one slip of the tracker
+  CHECK(fit_markers(s.chain, s.base, markers).theta.size() == 4);
+  for (auto& at : markers.world) at(2, 0) = -200.0;  // millimeters, say
   CHECK_THROWS_AS(fit_markers(s.chain, s.base, markers), InputError);
+}
+
+TEST_CASE("markers of strongly bent shapes that have nothing to do with each other are fitted") {
+  const chain::Chain chain =
+      chain::make_chain(1.0, 0.02, Vector3::UnitX(), Vector3::UnitY(), 8, chain::Bending::spatial, false);
+  const trajectory::Trajectory base = trajectory::fit({trajectory::Sample{}}, "rest");
+  Markers markers;
+  markers.deviation = 1e-3;
+  for (int i = 1; i <= 10; ++i) markers.arclengths.push_back(0.1 * i);
+  core::Random random(5);
+  for (int k = 0; k < 40; ++k) {
+    VectorX theta(chain.angles());
+    for (double& angle : theta) angle = 0.6 * random.normal();
+    markers.time.push_back(10.0 * k);
+    markers.world.push_back(chain::centerline(chain, chain::link_motions(chain, theta, {}), markers.arclengths));
+  }
+  const chain::States found = fit_markers(chain, base, markers);
+  for (std::size_t k = 0; k < found.theta.size(); ++k) {
+    const MatrixX line = chain::centerline(chain, chain::link_motions(chain, found.theta[k], {}), markers.arclengths);
+    CHECK((line - markers.world[k]).colwise().norm().maxCoeff() < 5e-3);
+  }
 }
 
 TEST_CASE("too little or broken data are refused") {

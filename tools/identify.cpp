@@ -51,12 +51,14 @@ void take(twin::Twin& twin, identification::Result result) {
   twin.rollout = std::move(result.rollout);
 }
 
-// A recording that parameters of its own follow far better is of another rope than the rest. Recordings of one foam
-// noodle, which creeps and softens, stay below kOther; a rope four times as stiff is above.
-void same_rope(const std::vector<identification::Result>& found, const std::vector<std::string>& names) {
-  constexpr double kOther = 3.0, kNoise = 2e-3;  // kNoise: m, what recognition alone can do
+// A recording that parameters of its own follow far better is of another rope than the rest, unless both follow it well
+// enough to be of use: recordings of one foam noodle, which creeps and softens over an hour, differ by 3.6 times and
+// 1.8 % of its length.
+void same_rope(const chain::Chain& chain, const std::vector<identification::Result>& found,
+               const std::vector<std::string>& names) {
+  constexpr double kOther = 3.0, kUseful = 0.02;  // kUseful: of the length
   for (std::size_t i = 0; i < found.size(); ++i)
-    if (found[i].node_rms > kOther * found[i].alone_rms + kNoise) {
+    if (found[i].node_rms > kOther * found[i].alone_rms && found[i].node_rms > kUseful * chain.length) {
       char text[200];
       std::snprintf(text, sizeof text,
                     "is of another rope than the rest: one set of parameters leaves %.1f mm, its own %.1f mm",
@@ -98,7 +100,7 @@ void identify_markers(twin::Twin& twin, const Request& request, std::uint64_t se
   } else {
     std::vector<identification::Result> found =
         identification::identify(twin.chain, recordings, identification_options(twin, false, seed));
-    same_rope(found, request.markers);
+    same_rope(twin.chain, found, request.markers);
     say_fit(found, request.markers);
     take(twin, std::move(found[0]));
   }
@@ -152,7 +154,7 @@ void identify_several(std::vector<twin::Twin>& twins, const std::vector<std::str
     const Stopwatch watch(twins[0], "identify");
     found = identification::identify(twins[0].chain, recordings, options);
   }
-  same_rope(found, runs);
+  same_rope(twins[0].chain, found, runs);
   say_fit(found, runs);
   for (std::size_t i = 0; i < twins.size(); ++i) {
     take(twins[i], std::move(found[i]));

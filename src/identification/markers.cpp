@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <cmath>
 #include <cstdio>
 
@@ -10,13 +11,16 @@ using math::MatrixX;
 using math::Vector3;
 using math::VectorX;
 
-constexpr double kBendSd = 0.7;      // rad, one angle about the straight rope
-constexpr double kSmoothSd = 0.15;   // rad, between the same axes of neighboring joints
+constexpr double kBendSd = 1.0;      // rad, one angle about the straight rope
+constexpr double kSmoothSd = 0.3;    // rad, between the same axes of neighboring joints
 constexpr double kRateSd = 9.0;      // rad/s, from one time to the next
 constexpr double kStretch = 0.05;    // of a rope, and
 constexpr double kMountMost = 0.03;  // m, of a marker's mount: how far beyond its arclength a marker may be
 constexpr int kIterations = 30;      // of Levenberg-Marquardt, a time
 constexpr double kConverged = 1e-9;  // rad, largest step
+constexpr double kDoubt = 0.5;       // deviations: markers farther off, RMS, may mean that the rope was folded wrongly
+constexpr int kAimIterations = 8;    // of Gauss-Newton, a joint,
+constexpr double kAimDamping = 0.1;  // with this added to squared sines: full steps stay below a right angle
 
 void check(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers) {
   const auto refuse = [](const std::string& what, const std::string& mend) { throw InputError("markers", what, mend); };
@@ -28,27 +32,70 @@ void check(const chain::Chain& chain, const trajectory::Trajectory& base, const 
   if (markers.time.size() < 3 || markers.world.size() != markers.time.size())
     refuse(std::to_string(markers.time.size()) + " times", "give at least 3, each with its positions");
   if (!(markers.deviation > 0.0)) refuse("their deviation is not positive", "give a number > 0 in meters");
+  std::vector<int> seen_at(markers.arclengths.size(), 0), beyond = seen_at;
+  std::vector<double> first(markers.arclengths.size(), 0.0);
   for (std::size_t k = 0; k < markers.time.size(); ++k) {
     const std::string at = "at " + core::exact(markers.time[k]) + " s ";
     if (!std::isfinite(markers.time[k]) || (k > 0 && !(markers.time[k] > markers.time[k - 1])))
       refuse(at + "the times do not increase", "sort them");
     if (markers.world[k].rows() != 3 || markers.world[k].cols() != static_cast<Eigen::Index>(markers.arclengths.size()))
       refuse(at + "the number of positions is another", "give one a marker, NaN where it is not seen");
-    // a straight rope reaches as far as its arclength; more is another rope, another unit or another frame
     const Vector3 grasp = base.pose(markers.time[k]).translation;
     for (Eigen::Index i = 0; i < markers.world[k].cols(); ++i) {
-      const double distance = (markers.world[k].col(i) - grasp).norm(), reach = markers.arclengths[i];
-      if (distance > (1.0 + kStretch) * reach + kMountMost) {
-        char text[120];
-        std::snprintf(text, sizeof text, "marker %d is %.3g m from the grasp and its arclength is %.3g m",
-                      static_cast<int>(i) + 1, distance, reach);
-        refuse(at + text, "is it another rope, another unit, or the base in another frame?");
-      }
+      const double distance = (markers.world[k].col(i) - grasp).norm();
+      if (!std::isfinite(distance)) continue;
+      ++seen_at[i];
+      if (distance > (1.0 + kStretch) * markers.arclengths[i] + kMountMost && ++beyond[i] == 1) first[i] = distance;
     }
     bool seen = false;
     for (Eigen::Index i = 0; i < markers.world[k].cols(); ++i) seen |= markers.world[k].col(i).allFinite();
     if (!seen) refuse(at + "no marker is seen", "leave that time out");
   }
+  // A straight rope reaches as far as its arclength. Single markers beyond are slips of the tracker, which the robust
+  // loss bears; half of them are another rope, another unit or another frame.
+  for (std::size_t i = 0; i < beyond.size(); ++i)
+    if (2 * beyond[i] > seen_at[i]) {
+      char text[120];
+      std::snprintf(text, sizeof text, "marker %d is %.3g m from the grasp and its arclength is %.3g m",
+                    static_cast<int>(i) + 1, first[i], markers.arclengths[i]);
+      refuse(text, "is it another rope, another unit, or the base in another frame?");
+    }
+}
+
+// Angles that lay the chain along the polygon of the markers that are seen, one joint after the other from the grasp.
+VectorX along_polygon(const chain::Chain& chain, const math::Pose& pose, const Markers& markers, std::size_t frame) {
+  std::vector<std::pair<double, Vector3>> corners{{0.0, pose.translation}};
+  for (std::size_t i = 0; i < markers.arclengths.size(); ++i)
+    if (markers.world[frame].col(i).allFinite())
+      corners.emplace_back(markers.arclengths[i], markers.world[frame].col(i));
+  std::stable_sort(corners.begin(), corners.end(), [](const auto& a, const auto& b) { return a.first < b.first; });
+  const auto corner_at = [&](double s) {
+    std::size_t i = 1;
+    while (i + 1 < corners.size() && corners[i].first < s) ++i;
+    const auto& [from, a] = corners[i - 1];
+    const auto& [to, b] = corners[i];
+    return to > from ? Vector3(a + (s - from) / (to - from) * (b - a)) : b;
+  };
+  VectorX theta = VectorX::Zero(chain.angles());
+  if (corners.size() < 2) return theta;
+  for (int link = 1; link < chain.links(); ++link) {
+    const double begin = chain.link_start(link), end = chain.link_end(link);
+    const Vector3 aim = (corner_at(end) - corner_at(begin)).normalized();
+    if (!aim.allFinite()) continue;
+    const int last = chain.last_angle(link);
+    int count = 0;
+    while (last - count >= 0 && chain.child_link[last - count] == link) ++count;
+    for (int iteration = 0; iteration < kAimIterations; ++iteration) {
+      const math::Pose motion = chain::link_motions(chain, theta, pose)[link];
+      const Vector3 direction = motion.rotation * chain.direction;
+      const MatrixX axes = chain::world_axes(chain, theta, pose);
+      MatrixX slope(3, count);
+      for (int c = 0; c < count; ++c) slope.col(c) = axes.col(last - count + 1 + c).head<3>().cross(direction);
+      const MatrixX normal = slope.transpose() * slope + kAimDamping * MatrixX::Identity(count, count);
+      theta.segment(last - count + 1, count) += normal.ldlt().solve(slope.transpose() * (aim - direction));
+    }
+  }
+  return theta;
 }
 
 }  // namespace
@@ -74,6 +121,7 @@ chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajector
     const double step_sd = frame == 0 ? 0.0 : kRateSd * (markers.time[frame] - markers.time[frame - 1]);
     const double hold = frame == 0 ? 0.0 : 1.0 / (step_sd * step_sd);
     MatrixX hessian;
+    double squares = 0.0;  // m^2, of the markers that are seen
     const auto cost_at = [&](const VectorX& angles, VectorX* gradient) {
       const auto motions = chain::link_motions(chain, angles, pose);
       const MatrixX axes = chain::world_axes(chain, angles, pose);
@@ -83,35 +131,48 @@ chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajector
         hessian.diagonal().array() += hold;
         *gradient = shape * angles + hold * (angles - before);
       }
+      squares = 0.0;
       const double weight = 1.0 / (markers.deviation * markers.deviation);
       for (std::size_t i = 0; i < markers.arclengths.size(); ++i) {
         const math::Vector3 seen = markers.world[frame].col(i);
         if (!seen.allFinite()) continue;
         const int link = chain::link_at(chain, markers.arclengths[i]);
         const math::Vector3 point = motions[link] * (markers.arclengths[i] * chain.direction);
-        cost += 0.5 * weight * (point - seen).squaredNorm();
+        squares += (point - seen).squaredNorm();
         if (!gradient) continue;
         const MatrixX slope = chain::point_jacobian(chain, axes, link, point);
         hessian += weight * slope.transpose() * slope;
         *gradient += weight * slope.transpose() * (point - seen);
       }
-      return cost;
+      return cost + 0.5 * weight * squares;
     };
-    double damping = 1e-3;
-    for (int iteration = 0; iteration < kIterations; ++iteration) {
-      VectorX gradient;
-      const double cost = cost_at(theta, &gradient);
-      MatrixX damped = hessian;
-      damped.diagonal() *= 1.0 + damping;
-      const VectorX step = damped.ldlt().solve(-gradient);
-      if (cost_at(theta + step, nullptr) <= cost) {
-        theta += step;
-        damping = std::max(0.1 * damping, 1e-12);
-      } else {
-        damping *= 10.0;
+    const auto descend = [&](VectorX theta) {
+      double damping = 1e-3;
+      for (int iteration = 0; iteration < kIterations; ++iteration) {
+        VectorX gradient;
+        const double cost = cost_at(theta, &gradient);
+        MatrixX damped = hessian;
+        damped.diagonal() *= 1.0 + damping;
+        const VectorX step = damped.ldlt().solve(-gradient);
+        if (cost_at(theta + step, nullptr) <= cost) {
+          theta += step;
+          damping = std::max(0.1 * damping, 1e-12);
+        } else {
+          damping *= 10.0;
+        }
+        if (step.cwiseAbs().maxCoeff() < kConverged) break;
       }
-      if (step.cwiseAbs().maxCoeff() < kConverged) break;
+      return theta;
+    };
+    theta = descend(before);
+    const double cost = cost_at(theta, nullptr);
+    const double seen = static_cast<double>(markers.world[frame].array().isFinite().count());
+    if (squares > kDoubt * kDoubt * markers.deviation * markers.deviation * seen) {
+      const VectorX other = descend(along_polygon(chain, pose, markers, frame));
+      if (cost_at(other, nullptr) < cost) theta = other;
     }
+    VectorX gradient;
+    cost_at(theta, &gradient);  // the hessian there
     states.time.push_back(markers.time[frame]);
     states.theta.push_back(theta);
     if (covariances) {
