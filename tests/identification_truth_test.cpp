@@ -18,13 +18,19 @@ namespace {
 constexpr double kMass = 0.06, kLength = 0.3;
 constexpr double kNoise = 0.5 * M_PI / 180.0;  // rad
 constexpr int kFrames = 150;
+constexpr double kStiffness = 0.012, kDamping = 3.6e-4, kDrag = 0.0144, kCoulomb = 0.35, kTip = 0.03;
 
 struct Case {
   const char* name;
   bool table, stiff;
+  bool few;  // shape, drag and tip known, one coefficient of friction (the parameters of DYNAMICS_FIGURES 4)
 };
-const Case kCases[] = {
-    {"free, kappa = 0", false, false}, {"free, elastic", false, true}, {"table, Coulomb", true, true}};
+const Case kCases[] = {{"free, kappa = 0", false, false, false},  {"free, elastic", false, true, false},
+                       {"table, Coulomb", true, true, false},     {"free, kappa = 0, few", false, false, true},
+                       {"free, elastic, few", false, true, true}, {"table, Coulomb, few", true, true, true}};
+
+// Standard errors: stick and slip make the sum of squares rough, so that a descent ends before its minimum.
+constexpr double kRough = 2.0;
 
 struct Truth {
   chain::Chain chain;
@@ -34,18 +40,20 @@ struct Truth {
   chain::States states;
 };
 
-// 15 cm along x and back at 0.4 Hz.
+// 15 cm to either side along x at 0.4 Hz, eased in over the first half second: the motion of DYNAMICS_FIGURES 4.
 trajectory::BaseMotion base_at(double t) {
-  constexpr double kAmplitude = 0.075, kRate = 2.0 * M_PI * 0.4;
+  constexpr double kAmplitude = 0.15, kRate = 2.0 * M_PI * 0.4, kRamp = 0.5;
+  const double u = std::clamp(t / kRamp, 0.0, 1.0), s = std::sin(kRate * t), c = std::cos(kRate * t);
+  const double g = u * u * u * (10.0 - 15.0 * u + 6.0 * u * u), g1 = 30.0 * u * u * (1.0 - u) * (1.0 - u) / kRamp,
+               g2 = 60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) / (kRamp * kRamp);
   trajectory::BaseMotion base;
-  base.pose.translation.x() = kAmplitude * (1.0 - std::cos(kRate * t));
-  base.velocity[3] = kAmplitude * kRate * std::sin(kRate * t);
-  base.acceleration[3] = kAmplitude * kRate * kRate * std::cos(kRate * t);
+  base.pose.translation.x() = kAmplitude * g * s;
+  base.velocity[3] = kAmplitude * (g1 * s + g * kRate * c);
+  base.acceleration[3] = kAmplitude * (g2 * s + 2.0 * g1 * kRate * c - g * kRate * kRate * s);
   return base;
 }
 
 Truth make_truth(const Case& what) {
-  constexpr double kStiffness = 0.012, kDamping = 3.6e-4, kDrag = 0.0144, kCoulomb = 0.35, kTip = 0.03;
   Truth truth;
   truth.chain = chain::make_chain(kLength, 0.02, what.table ? Vector3(0, 1, 0) : Vector3(0, 0, -1),
                                   what.table ? Vector3(0, 0, 1) : Vector3(0, 1, 0), 8, chain::Bending::planar, false);
@@ -85,6 +93,12 @@ Options options_of(const Case& what) {
   options.mass = kMass;
   options.fit_stiffness = what.stiff;
   options.per_joint = false;
+  options.model_error = 0.0;  // the truth is such a chain
+  if (what.few) {
+    options.friction_per_link = false;
+    options.priors = {
+        {"rest_angle", 0.0}, {"log_drag", std::log(kDrag)}, {"logit_tip_mass_fraction", std::log(kTip / (1.0 - kTip))}};
+  }
   return options;
 }
 
@@ -178,12 +192,10 @@ TEST_CASE("on truth with noise, starts three times off end in one minimum with h
   for (const Case& what : kCases) {
     CAPTURE(what.name);
     const Study s = study(what, 1);
-    CHECK(s.same_minimum < 0.3);
+    CHECK(s.same_minimum < (what.table ? kRough : 1e-6));
     CHECK(s.within >= 0.95 * s.parameters);  // of one seed
-    // in the air drag and tip mass take a part of the damping's place, and the standard errors say so
-    if (!what.table) continue;
-    CHECK(std::abs(s.errors.at("log_damping")[0]) < 0.05);
-    CHECK(std::abs(s.errors.at("coulomb")[0]) < 0.05);
+    if (!what.stiff || what.table) CHECK(std::abs(s.errors.at("log_damping")[0]) < 0.05);
+    if (what.table) CHECK(std::abs(s.errors.at("coulomb")[0]) < 0.05);
   }
 }
 
@@ -225,10 +237,13 @@ TEST_CASE("study: figures on truth over 20 seeds" * doctest::skip()) {
   for (const Case& what : kCases) {
     const Study s = study(what, 20);
     print(what, s);
-    CHECK(s.same_minimum < 0.3);
+    CHECK(s.same_minimum < (what.table ? 2.0 * kRough : 1e-6));
     CHECK(s.within >= 0.98 * s.parameters);
-    CHECK(median(s.errors.at("log_damping")) <= 0.015);
-    CHECK(largest(s.errors.at("log_damping")) <= 0.05);
+    // beside its stiffness a rope in the air shows its damping badly, and its standard error says so
+    if (!what.stiff || what.table) {
+      CHECK(median(s.errors.at("log_damping")) <= (what.few ? 0.015 : 0.02));
+      CHECK(largest(s.errors.at("log_damping")) <= 0.05);
+    }
     if (what.table) {
       CHECK(median(s.errors.at("coulomb")) <= 0.015);
       CHECK(largest(s.errors.at("coulomb")) <= 0.05);

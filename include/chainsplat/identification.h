@@ -8,10 +8,19 @@
 #include <cstdint>
 #include <optional>
 #include <span>
+#include <string>
+#include <vector>
 
 #include "chainsplat/dynamics.h"
 
 namespace chainsplat::identification {
+
+// What is known of a parameter beforehand: takes the place of its prior. `name` as in Estimates::names, or without the
+// number at its end for all of a kind ("rest_angle").
+struct Prior {
+  std::string name;
+  double mean = 0.0, deviation = 1e-4;  // in units of the name
+};
 
 struct Options {
   bool tabletop = false;                // Coulomb friction on a table, else air drag
@@ -20,7 +29,9 @@ struct Options {
   std::optional<double> mass;           // kg, links and tip; none: 1 kg, forces are then per kilogram
   bool fit_stiffness = true;            // else 0
   bool per_joint = true;                // stiffness, damping and mass vary smoothly along the rope
-  bool paper = false;                   // kappa = 0; d_j, m_j and viscous mu_j by Adam on the angles
+  bool friction_per_link = true;        // else one Coulomb coefficient for the whole rope
+  std::vector<Prior> priors;
+  bool paper = false;  // kappa = 0; d_j, m_j and viscous mu_j by Adam on the angles
   dynamics::Integrator integrator = dynamics::Integrator::rodas3;  // paper: implicit_velocity_euler, one step a frame
   int substeps = 0;           // a frame of 1/30 s; 0: 4, on a table 8 (stick and slip)
   double start_factor = 1.0;  // stiffness, damping, drag and friction of the first starts, to what is usual

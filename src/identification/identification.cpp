@@ -16,10 +16,12 @@ constexpr double kHorizons[] = {1.0 / 3, 2.0 / 3, 4.0 / 3};  // s, then doubled 
 // Of the length: open-loop error of a few links. Ropes of 0.3 m: 0.1 to 0.5 %; a foam noodle of 1.9 m: 2 %. Larger
 // values let the priors hold what two markers cannot tell, smaller ones make the loss rough.
 constexpr double kMarkerModelShare = 5e-3;
-constexpr double kResidualShare = 1.0 / 9.0;  // of a residual that counts: neighbors in space and time err alike
-constexpr double kHuber = 3.0;                // in robust standard deviations of a point's residual
-constexpr double kThetaSd = 0.02;             // rad, initial angles about the recognized ones without covariances
-constexpr int kLag = 10;                      // frames over which residuals are taken to be correlated (SPEC 5)
+constexpr double kCorrelated = 9.0;  // model errors of neighbors in space and time are alike: so many count as one
+constexpr double kHuber = 1.75;      // times the usual root mean square of a group of residuals
+constexpr double kLeastUsual = 0.1;  // of the standard deviation expected: a closer fit does not make outliers
+constexpr double kMedianRms = 0.9;   // median of the root mean square of a few unit normals
+constexpr double kThetaSd = 0.02;    // rad, initial angles about the recognized ones without covariances
+constexpr int kLag = 10;             // frames over which residuals are taken to be correlated (SPEC 5)
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
 // One recording, its own unknowns after the shared ones.
@@ -27,12 +29,13 @@ struct Part {
   const chain::Chain& chain;
   Unknowns unknowns;
   std::vector<double> times;
-  std::vector<int> links;          // of each compared point: middles and ends of the links, two a link, then
-  std::vector<Vector3> home;       // where the rope can twist a point of its surface a link; base frame, at theta = 0
-  std::vector<MatrixX> target;     // a frame: 3 x points, base frame
-  std::vector<MatrixX> whitening;  // a frame: 3 x 3 blocks side by side
-  std::vector<VectorX> theta;      // recognized
-  BaseGrid grids[2];               // half the substeps, for the way to the minimum, and all of them
+  std::vector<int> links;       // of each compared point: middles and ends of the links, two a link, then
+  std::vector<Vector3> home;    // where the rope can twist a point of its surface a link; base frame, at theta = 0
+  std::vector<MatrixX> target;  // a frame: 3 x points, base frame
+  std::vector<VectorX> theta;   // recognized
+  // a frame: of the angles, n x n, in the metric of the points; of markers, 3 x 3 blocks side by side
+  std::vector<MatrixX> whitening;
+  BaseGrid grids[2];                  // half the substeps, for the way to the minimum, and all of them
   std::vector<std::size_t> nodes[2];  // of the grid, up to and with each output
   bool has_markers = false;           // the points are markers; unseen ones have no weight
 };
@@ -110,10 +113,16 @@ bool simulate(const Part& part, const BaseGrid& grid, const VectorX& p, chain::S
   return std::all_of(good.begin(), good.end(), [](char g) { return g != 0; });
 }
 
+// Whitened residuals of a frame in groups, its columns: all angles at once, or a marker each. The angles' weights are
+// those of the centerline's points near the recognized shape (SPEC 5), so that they need no points here.
 void residuals(const Part& part, const chain::States& states, std::vector<MatrixX>& out) {
   out.resize(states.theta.size());
   MatrixX points;
   for (std::size_t k = 0; k < states.theta.size(); ++k) {
+    if (!part.has_markers) {
+      out[k] = part.whitening[k] * (states.theta[k] - part.theta[k]);
+      continue;
+    }
     place_points(part, states.theta[k], points, nullptr);
     out[k].resize(3, points.cols());
     for (Eigen::Index i = 0; i < points.cols(); ++i)
@@ -121,24 +130,28 @@ void residuals(const Part& part, const chain::States& states, std::vector<Matrix
   }
 }
 
-double median_norm(const std::vector<std::vector<MatrixX>>& values) {
+// Of the groups' root mean squares.
+double median_rms(const std::vector<std::vector<MatrixX>>& values) {
   std::vector<double> norms;
   for (const auto& part : values)
     for (const MatrixX& frame : part)
-      for (Eigen::Index i = 0; i < frame.cols(); ++i) norms.push_back(frame.col(i).norm());
+      for (Eigen::Index i = 0; i < frame.cols(); ++i)
+        norms.push_back(frame.col(i).norm() / std::sqrt(static_cast<double>(frame.rows())));
   std::nth_element(norms.begin(), norms.begin() + norms.size() / 2, norms.end());
   return norms[norms.size() / 2];
 }
 
-// Huber's loss of whitened residuals with threshold `limit`.
+// Huber's loss of whitened groups; `limit`: root mean square of a group from where on it grows linearly.
 double loss_of(const std::vector<MatrixX>& values, double limit) {
   double loss = 0.0;
-  for (const MatrixX& frame : values)
+  for (const MatrixX& frame : values) {
+    const double most = limit * std::sqrt(static_cast<double>(frame.rows()));
     for (Eigen::Index i = 0; i < frame.cols(); ++i) {
       const double r = frame.col(i).norm();
-      loss += r <= limit ? 0.5 * r * r : limit * (r - 0.5 * limit);
+      loss += r <= most ? 0.5 * r * r : most * (r - 0.5 * most);
     }
-  return kResidualShare * loss;
+  }
+  return loss;
 }
 
 struct Normal {
@@ -151,7 +164,6 @@ Normal normal_equations(const Part& part, const chain::States& states, const dyn
                         const std::vector<MatrixX>& values, double limit) {
   const Eigen::Index size = part.unknowns.size();
   const std::size_t frames = values.size();
-  const Eigen::Index points = static_cast<Eigen::Index>(part.home.size());
   // blocks of frames, summed in fixed order: the result does not depend on the number of threads
   constexpr std::size_t kBlock = 10;
   const std::size_t blocks = (frames + kBlock - 1) / kBlock;
@@ -161,16 +173,23 @@ Normal normal_equations(const Part& part, const chain::States& states, const dyn
   core::parallel_for(static_cast<std::int64_t>(blocks), [&](std::int64_t block) {
     MatrixX& hessian = hessians[block];
     hessian = MatrixX::Zero(size, size);
-    MatrixX placed, by_angle(3 * points, part.chain.angles()), rows(3 * points, size);
-    VectorX right(3 * points);
+    MatrixX placed, by_angle, rows;
+    VectorX right;
     std::vector<MatrixX> jacobians;
     for (std::size_t k = block * kBlock; k < std::min(frames, (block + 1) * kBlock); ++k) {
-      place_points(part, states.theta[k], placed, &jacobians);
-      for (Eigen::Index i = 0; i < points; ++i) {
+      const Eigen::Index group = values[k].rows(), groups = values[k].cols();
+      const double most = limit * std::sqrt(static_cast<double>(group));
+      by_angle.resize(group * groups, part.chain.angles());
+      right.resize(group * groups);
+      if (part.has_markers) place_points(part, states.theta[k], placed, &jacobians);
+      for (Eigen::Index i = 0; i < groups; ++i) {
         const double r = values[k].col(i).norm();
-        const double weight = std::sqrt(kResidualShare * (r <= limit ? 1.0 : limit / r));
-        by_angle.middleRows<3>(3 * i).noalias() = weight * part.whitening[k].middleCols<3>(3 * i) * jacobians[i];
-        right.segment<3>(3 * i) = weight * values[k].col(i);
+        const double weight = std::sqrt(r <= most ? 1.0 : most / r);
+        if (part.has_markers)
+          by_angle.middleRows<3>(3 * i).noalias() = weight * part.whitening[k].middleCols<3>(3 * i) * jacobians[i];
+        else
+          by_angle = weight * part.whitening[k];
+        right.segment(group * i, group) = weight * values[k].col(i);
       }
       rows.noalias() = by_angle * slopes.theta[k];
       hessian.selfadjointView<Eigen::Lower>().rankUpdate(rows.transpose());
@@ -237,7 +256,7 @@ Normal normal_equations(const Problem& problem, const Rollouts& rollouts, double
 struct Fit {
   VectorX p;
   double cost = kInfinity;
-  double limit = kInfinity;  // Huber's, in whitened units
+  double limit = kInfinity;  // Huber's, of the root mean square of a whitened group
 };
 
 // Levenberg-Marquardt over the first `horizon` seconds of every recording.
@@ -248,8 +267,7 @@ void improve(const Problem& problem, double horizon, bool fine, int iterations, 
     fit.cost = kInfinity;
     return;
   }
-  // 1.54: median norm of three unit normal residuals
-  fit.limit = std::max(kHuber * median_norm(now.values) / 1.54, kHuber * 0.3);
+  fit.limit = kHuber * std::max(median_rms(now.values) / kMedianRms, kLeastUsual);
   fit.cost = now.cost(problem, fit.p, fit.limit);
   double damping = 1e-3;
   for (int iteration = 0; iteration < iterations; ++iteration) {
@@ -321,7 +339,7 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
       throw InputError("identify", "a recognized state is not finite or of another chain", "recognize again");
   CHAINSPLAT_CHECK(covariances.empty() || covariances.size() == frames, std::to_string(covariances.size()));
 
-  Part part{chain, {}, recognized.time, {}, {}, {}, {}, recognized.theta, {}, {}};
+  Part part{chain, {}, recognized.time, {}, {}, {}, recognized.theta, {}, {}, {}};
   for (std::size_t k = 1; k < frames; ++k)  // angles are known up to whole turns: the nearest to the frame before
     for (Eigen::Index i = 0; i < part.theta[k].size(); ++i)
       part.theta[k][i] -= 2.0 * M_PI * std::round((part.theta[k][i] - part.theta[k - 1][i]) / (2.0 * M_PI));
@@ -355,21 +373,23 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
         if (!seen.allFinite()) continue;
         target.col(i) = base_from_world * seen;
         whitening.middleCols<3>(3 * i) =
-            math::Matrix3::Identity() / std::hypot(markers->deviation, kMarkerModelShare * chain.length);
+            math::Matrix3::Identity() /
+            std::sqrt(kCorrelated * (std::pow(markers->deviation, 2) + std::pow(kMarkerModelShare * chain.length, 2)));
       }
       part.target.push_back(target);
       part.whitening.push_back(whitening);
       continue;
     }
-    MatrixX target, whitening(3, 3 * points);
-    place_points(part, recognized.theta[k], target, covariances.empty() ? nullptr : &jacobians);
-    for (std::size_t i = 0; i < points; ++i) {
-      math::Matrix3 covariance = options.model_error * options.model_error * math::Matrix3::Identity();
-      if (!covariances.empty()) covariance += jacobians[i] * covariances[k] * jacobians[i].transpose();
-      whitening.middleCols<3>(3 * i) = covariance.llt().matrixL().solve(math::Matrix3::Identity());
-    }
+    MatrixX target;
+    place_points(part, recognized.theta[k], target, &jacobians);
+    // what the model's error of the points is in angles, and the recognized angles' own
+    MatrixX normal = MatrixX::Zero(chain.angles(), chain.angles());
+    for (const MatrixX& jacobian : jacobians) normal += jacobian.transpose() * jacobian;
+    const MatrixX unit = MatrixX::Identity(chain.angles(), chain.angles());
+    MatrixX covariance = kCorrelated * options.model_error * options.model_error * normal.ldlt().solve(unit);
+    if (!covariances.empty()) covariance += covariances[k];
     part.target.push_back(target);
-    part.whitening.push_back(whitening);
+    part.whitening.push_back(covariance.llt().matrixL().solve(unit));
   }
 
   VectorX theta, thetadot, theta_sd = VectorX::Constant(chain.angles(), kThetaSd);
@@ -407,12 +427,29 @@ Problem make_problem(const chain::Chain& chain, std::vector<Part> parts) {
   return problem;
 }
 
+double rms_of(const Part& part, const chain::States& rollout) {
+  double sum = 0.0;
+  std::size_t count = 0;
+  MatrixX points;
+  for (std::size_t k = 0; k < part.times.size(); ++k) {
+    place_points(part, rollout.theta[k], points, nullptr);
+    const int stop = part.has_markers ? static_cast<int>(points.cols()) : 2 * (part.chain.links() - 1);
+    for (int i = part.has_markers ? 0 : 1; i < stop; i += part.has_markers ? 1 : 2) {        // odd: the links' ends
+      if (part.has_markers && part.whitening[k].middleCols<3>(3 * i).isZero(0.0)) continue;  // not seen
+      ++count;
+      sum += (points.col(i) - part.target[k].col(i)).squaredNorm();
+    }
+  }
+  return std::sqrt(sum / static_cast<double>(count));
+}
+
 // Best of several starts: stiffness and damping scaled together, then random ones where all fit poorly.
 Fit fit_centerline(const Problem& problem, const Options& options) {
   const Unknowns& u = problem.parts[0].unknowns;
   constexpr double kScales[] = {1.0, 0.2, 5.0};
   constexpr int kRandomStarts = 3;
-  constexpr double kPoor = 4.0;  // median whitened residual, i.e. mm without covariances
+  constexpr double kPoor = 0.02;       // of the rope's length, root mean square: other starts may do better
+  constexpr double kScoreLimit = 0.6;  // of Huber's loss where fits are compared: some 2 mm
   std::int64_t all = 0;
   double longest = 0.0;  // s
   for (const Part& part : problem.parts) {
@@ -462,7 +499,7 @@ Fit fit_centerline(const Problem& problem, const Options& options) {
   const auto score = [&](const Fit& fit, double horizon) {
     if (fit.cost == kInfinity) return kInfinity;
     Rollouts rollouts(problem, horizon, true);
-    return rollouts.run(problem, fit.p, false) ? rollouts.cost(problem, fit.p, kHuber) : kInfinity;
+    return rollouts.run(problem, fit.p, false) ? rollouts.cost(problem, fit.p, kScoreLimit) : kInfinity;
   };
   const auto best_of = [&](int first, int count) {
     std::vector<Fit> fits(count);
@@ -479,7 +516,10 @@ Fit fit_centerline(const Problem& problem, const Options& options) {
   const auto poor = [&](const Fit& fit) {
     if (fit.cost == kInfinity) return true;
     Rollouts rollouts(problem, kInfinity, true);
-    return !rollouts.run(problem, fit.p, false) || median_norm(rollouts.values) > kPoor;
+    if (!rollouts.run(problem, fit.p, false)) return true;
+    for (std::size_t i = 0; i < problem.parts.size(); ++i)
+      if (rms_of(problem.parts[i], rollouts.states[i]) > kPoor * problem.chain.length) return true;
+    return false;
   };
   if (poor(best)) {
     const Fit other = best_of(3, kRandomStarts);
@@ -548,23 +588,9 @@ MatrixX covariance_of(const Problem& problem, const MatrixX& hessian, const std:
   }
   const MatrixX bread = (hessian + prior).ldlt().solve(MatrixX::Identity(prior.rows(), prior.cols()));
   const MatrixX out = bread * meat * bread;
-  return 0.5 * (out + out.transpose());
-}
-
-double rms_of(const Part& part, const chain::States& rollout) {
-  double sum = 0.0;
-  std::size_t count = 0;
-  MatrixX points;
-  for (std::size_t k = 0; k < part.times.size(); ++k) {
-    place_points(part, rollout.theta[k], points, nullptr);
-    const int stop = part.has_markers ? static_cast<int>(points.cols()) : 2 * (part.chain.links() - 1);
-    for (int i = part.has_markers ? 0 : 1; i < stop; i += part.has_markers ? 1 : 2) {  // odd: the links' ends
-      if (part.whitening[k].middleCols<3>(3 * i).isZero(0.0)) continue;
-      ++count;
-      sum += (points.col(i) - part.target[k].col(i)).squaredNorm();
-    }
-  }
-  return std::sqrt(sum / static_cast<double>(count));
+  // the sandwich is itself an estimate, of few independent frames: never less than what the weights alone promise
+  const VectorX least = (bread.diagonal().array() / out.diagonal().array()).max(1.0).sqrt();
+  return least.asDiagonal() * (0.5 * (out + out.transpose())) * least.asDiagonal();
 }
 
 // Eigenvectors of the information about the shared unknowns, those of the initial states eliminated, in units of the

@@ -146,23 +146,23 @@ chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajector
       }
       return cost + 0.5 * weight * squares;
     };
-    const auto descend = [&](VectorX theta) {
+    const auto descend = [&](VectorX angles) {
       double damping = 1e-3;
       for (int iteration = 0; iteration < kIterations; ++iteration) {
         VectorX gradient;
-        const double cost = cost_at(theta, &gradient);
+        const double cost = cost_at(angles, &gradient);
         MatrixX damped = hessian;
         damped.diagonal() *= 1.0 + damping;
         const VectorX step = damped.ldlt().solve(-gradient);
-        if (cost_at(theta + step, nullptr) <= cost) {
-          theta += step;
+        if (cost_at(angles + step, nullptr) <= cost) {
+          angles += step;
           damping = std::max(0.1 * damping, 1e-12);
         } else {
           damping *= 10.0;
         }
         if (step.cwiseAbs().maxCoeff() < kConverged) break;
       }
-      return theta;
+      return angles;
     };
     theta = descend(before);
     const double cost = cost_at(theta, nullptr);

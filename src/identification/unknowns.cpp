@@ -14,6 +14,7 @@ constexpr double kSmoothSd = 0.3;         // between neighbors, of those
 constexpr double kGraspSd = 0.5;          // the second axis over the first, where the rope leaves the fingers
 constexpr double kCoulombSd = 1.5;        // coefficient of one link
 constexpr double kCoulombSmoothSd = 1.0;  // between neighbors: a lifted link next to one that carries is usual
+constexpr double kSameSd = 1e-4;          // between neighbors that are to be the same
 constexpr double kViscousSd = 1.0;
 constexpr double kRestSd = 0.3;  // rad
 constexpr double kRateSd = 0.5;  // rad/s, initial velocity about the differences of the recognized angles
@@ -66,6 +67,9 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
   std::vector<Smooth> smooth;
   const auto add = [&](const std::string& name, double mean, double sd) {
     u.names.push_back(name);
+    for (const Prior& prior : options.priors)
+      if (name == prior.name || name.substr(0, name.find_last_not_of("0123456789")) == prior.name)
+        mean = prior.mean, sd = prior.deviation;
     means.push_back(mean), sds.push_back(sd);
     return static_cast<int>(u.names.size()) - 1;
   };
@@ -109,7 +113,8 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
       u.held.emplace_back("link_mass", "uniform along the rope");
     }
     if (options.tabletop) {
-      u.coulomb = add_many("log_coulomb_friction_link", links, std::log(kCoulombMean), kCoulombSd, kCoulombSmoothSd);
+      u.coulomb = add_many("log_coulomb_friction_link", links, std::log(kCoulombMean), kCoulombSd,
+                           options.friction_per_link ? kCoulombSmoothSd : kSameSd);
       u.held.emplace_back("tip_mass", "0: not observable on a table beside the friction");
       u.held.emplace_back("drag", "0 on a table");
     } else {
