@@ -308,6 +308,73 @@ TEST_CASE("a rope that is elsewhere at once is found again") {
   CHECK(rms(shared_twin().chain, found[29].theta, thrown) < 10e-3);
 }
 
+// Stops the end of link `link` within an instant, as a rod in its way would.
+void strike(const dynamics::Model& model, const trajectory::BaseMotion& base, int link, dynamics::InitialState& state) {
+  const MatrixX axes = chain::world_axes(model.chain, state.theta, base.pose);
+  const MatrixX nodes = chain::nodes(model.chain, chain::link_motions(model.chain, state.theta, base.pose));
+  const MatrixX j = chain::point_jacobian(model.chain, axes, link, nodes.col(link + 1));
+  const Vector3 velocity = j * state.thetadot + base.velocity.tail<3>();  // the base does not turn
+  const MatrixX mass = dynamics::linearize(model, base, math::Vector6::Zero(), state.theta, state.thetadot).mass;
+  const VectorX push = mass.llt().solve(VectorX(j.transpose() * velocity));
+  state.thetadot -= push * (velocity.squaredNorm() / velocity.dot(j * push));
+}
+
+// Where the links end, of a belief conditioned on what a camera that looks along `ray` sees of them, 1 mm exact.
+MatrixX seen_from(const chain::Chain& chain, const Pose& base, const estimation::Belief& belief, const Vector3& ray,
+                  const MatrixX& true_nodes) {
+  const int n = chain.angles(), count = static_cast<int>(true_nodes.cols());
+  const VectorX theta = belief.mean.head(n);
+  const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, base));
+  const MatrixX axes = chain::world_axes(chain, theta, base);
+  const Vector3 right = ray.unitOrthogonal(), down = ray.cross(right);
+  MatrixX rows(2 * count, n);
+  VectorX residual(2 * count);
+  for (int i = 0; i < count; ++i) {
+    const MatrixX j = chain::point_jacobian(chain, axes, std::max(0, i - 1), nodes.col(i));
+    const Vector3 off = true_nodes.col(i) - nodes.col(i);
+    rows.row(2 * i) = right.transpose() * j;
+    rows.row(2 * i + 1) = down.transpose() * j;
+    residual[2 * i] = right.dot(off);
+    residual[2 * i + 1] = down.dot(off);
+  }
+  const MatrixX prior = belief.covariance.topLeftCorner(n, n);
+  const MatrixX innovation = rows * prior * rows.transpose() + 1e-6 * MatrixX::Identity(2 * count, 2 * count);
+  const VectorX found = theta + prior * rows.transpose() * innovation.llt().solve(residual);
+  return chain::nodes(chain, chain::link_motions(chain, found, base));
+}
+
+TEST_CASE("a rope that swung into something is found where one camera does not see it: along the rays") {
+  const twin::Twin& twin = shared_twin();
+  const int n = twin.chain.angles();
+  const dynamics::Model model = dynamics::make_model(twin.chain, *twin.parameters);
+  const Vector3 ray = Vector3(1.0, 0.5, -0.2).normalized();  // the rope swings along x
+  for (const int link : {3, 5}) {
+    CAPTURE(link);
+    dynamics::InitialState state{0.4, VectorX::Zero(n), VectorX::Zero(n)};
+    for (int k = 0; k < n; k += 2) state.thetadot[k] = -1.0;
+    estimation::Filter filter = estimation::start(twin, {front_camera()}, moving_base, 0.0);
+    estimation::Belief belief{state.time, VectorX::Zero(3 * n), 1e-4 * MatrixX::Identity(3 * n, 3 * n)};
+    belief.mean.segment(n, n) = state.thetadot;
+    strike(model, moving_base(state.time), link, state);
+    const double time = state.time + kInterval;
+    const VectorX truth = dynamics::rollout(model, moving_base, state, {time}).theta[0];
+    const Pose base = moving_base(time).pose;
+    const MatrixX true_nodes = chain::nodes(twin.chain, chain::link_motions(twin.chain, truth, base));
+    const estimation::Belief touched = estimation::predict(filter, belief, time, estimation::Contact::touched);
+    const estimation::Belief struck = estimation::predict(filter, belief, time, estimation::Contact::struck);
+    const auto surprise = [&](const estimation::Belief& predicted) {  // squared deviations
+      const VectorX off = truth - predicted.mean.head(n);
+      return off.dot(VectorX(predicted.covariance.topLeftCorner(n, n).llt().solve(off)));
+    };
+    CHECK(surprise(touched) > 2.0 * n);
+    CHECK(surprise(struck) < n);
+    const auto error = [&](const estimation::Belief& predicted) {
+      return (seen_from(twin.chain, base, predicted, ray, true_nodes) - true_nodes).norm();
+    };
+    CHECK(error(struck) < 0.5 * error(touched));
+  }
+}
+
 TEST_CASE("depth comes from the dynamics: without them it is worse, and said to be less sure") {
   twin::Twin still = shared_twin();
   still.parameters.reset();
@@ -365,13 +432,13 @@ TEST_CASE("the predicted covariance is that of the predicted mean's derivative")
   for (int k = 0; k < 3 * n; ++k) direction[k] = 1.0 + 0.3 * std::cos(0.2 * k);
   const double size = 1e4;  // makes the process noise small beside
   belief.covariance = size * size * direction * direction.transpose();
-  const estimation::Belief moved = estimation::predict(filter, belief, 0.3 + kInterval, false);
+  const estimation::Belief moved = estimation::predict(filter, belief, 0.3 + kInterval, estimation::Contact::none);
   const double step = 1e-5;
   estimation::Belief a = belief, b = belief;
   a.mean += step * direction;
   b.mean -= step * direction;
-  const VectorX slope = (estimation::predict(filter, a, 0.3 + kInterval, false).mean -
-                         estimation::predict(filter, b, 0.3 + kInterval, false).mean) /
+  const VectorX slope = (estimation::predict(filter, a, 0.3 + kInterval, estimation::Contact::none).mean -
+                         estimation::predict(filter, b, 0.3 + kInterval, estimation::Contact::none).mean) /
                         (2.0 * step);
   const VectorX expected = size * slope.cwiseAbs(), got = moved.covariance.diagonal().cwiseSqrt();
   CHECK((got - expected).norm() <= 0.05 * expected.norm());

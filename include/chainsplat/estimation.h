@@ -90,8 +90,12 @@ Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras
 // (that of the first; View::camera counts in Filter::cameras). Times must increase.
 Estimate update(Filter& filter, std::span<const capture::View* const> views);
 
-// The belief at a later time, without looking. `contact`: the unknown force may change as under a hand.
-Belief predict(const Filter& filter, const Belief& belief, double time, bool contact);
+// What may have happened to the rope in a step: nothing that the model does not know, a force that changes as under a
+// hand, or a blow too: it ran into something, or was let go.
+enum class Contact { none, touched, struck };
+
+// The belief at a later time, without looking.
+Belief predict(const Filter& filter, const Belief& belief, double time, Contact contact);
 
 // Where the rope will be at `time`, for whoever must look for it there; none before the first frame and while lost.
 std::optional<math::VectorX> expected(const Filter& filter, double time);

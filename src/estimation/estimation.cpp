@@ -23,7 +23,10 @@ constexpr double kFirstRate = 1.0;    // rad/s
 constexpr double kFirstForce = 0.3;   // N a kilogram of rope, standing (a wrong rest shape, for example)
 
 // A frame whose innovation is so many times what the model expects is met again with the force free to change, and so
-// are the frames after it, for a while and as long as the force that was found is a share of the rope's weight.
+// are the frames after it, for a while and as long as the force that was found is a share of the rope's weight. Where
+// that does not explain it either, the rope was struck: a swinging rope that meets a finger loses its velocity in one
+// frame, with many times its weight. Of all such forces those along its path are likely, so that one camera tells from
+// the motion that it sees the one along its rays, which it does not.
 constexpr double kSurprise = 1.5;
 constexpr double kContactMemory = 0.5;  // s
 constexpr double kContactForce = 0.05;  // of the rope's weight
@@ -178,6 +181,27 @@ void learn_force(Filter& filter, double time) {
   const double weight = filter.model.parameters.gravity.norm() * total_mass(filter.model.parameters);
   if (found.sum.norm() > kContactForce * weight)
     filter.contact_until = std::max(filter.contact_until, time + kContactMemory);
+}
+
+// A blow that stops a link's end in the world: for every link, the shift of the rest angles that stands for the force
+// which, acting all through the step along the end's path, takes its velocity. `rate_by_shift`: n x n, of the predicted
+// rates.
+std::vector<VectorX> stopping_shifts(const Filter& filter, const trajectory::BaseMotion& base, const VectorX& theta,
+                                     const VectorX& thetadot, const MatrixX& rate_by_shift) {
+  const chain::Chain& chain = filter.model.chain;
+  const std::vector<MatrixX> jacobians = link_end_jacobians(chain, base.pose, theta);
+  const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, base.pose));
+  std::vector<VectorX> shifts;
+  for (std::size_t i = 0; i < jacobians.size(); ++i) {
+    const Vector3 from_base = base.pose.inverse() * Vector3(nodes.col(i + 2));
+    const Vector3 carried = base.pose.rotation * (base.velocity.tail<3>() + base.velocity.head<3>().cross(from_base));
+    const Vector3 velocity = jacobians[i] * thetadot + carried;
+    VectorX shift = jacobians[i].transpose() * velocity;  // of a force of as many N as the velocity has m/s
+    for (int k = 0; k < shift.size(); ++k) shift[k] /= filter.model.parameters.stiffness[k];
+    const double taken = velocity.dot(jacobians[i] * (rate_by_shift * shift));  // (m/s)^2
+    shifts.push_back(taken > 0.0 ? VectorX(-velocity.squaredNorm() / taken * shift) : VectorX(0.0 * shift));
+  }
+  return shifts;
 }
 
 void symmetrize(MatrixX& matrix) { matrix = (0.5 * (matrix + matrix.transpose())).eval(); }
@@ -371,9 +395,10 @@ Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras
   return filter;
 }
 
-Belief predict(const Filter& filter, const Belief& belief, double time, bool contact) {
+Belief predict(const Filter& filter, const Belief& belief, double time, Contact contact) {
   const int n = filter.model.chain.angles();
   const double h = time - belief.time;
+  const bool touched = contact != Contact::none;
   CHAINSPLAT_CHECK(h > 0.0, std::to_string(h));
   const Motion motion = move(filter, belief, time);
   const double keep = std::exp(-h / filter.options.force_memory);
@@ -388,18 +413,29 @@ Belief predict(const Filter& filter, const Belief& belief, double time, bool con
   out.mean << motion.theta, motion.thetadot, keep * belief.mean.tail(n);
   out.covariance = transition * belief.covariance * transition.transpose();
   if (filter.shifts) {
-    const double force = (contact ? filter.options.contact_force : filter.options.model_force) *
+    const double force = (touched ? filter.options.contact_force : filter.options.model_force) *
                          total_mass(filter.model.parameters) * std::sqrt(h);
     const MatrixX shift = shift_covariance(filter, filter.base(time).pose, motion.theta, force,
-                                           contact ? filter.place : filter.everywhere);
+                                           touched ? filter.place : filter.everywhere);
     // the force changes during the step: a third of the change acts all along in the mean square
     MatrixX noise = transition.rightCols(n);
     noise.topRows(2 * n) *= std::sqrt(1.0 / 3.0);
     noise.bottomRows(n).setIdentity();
     out.covariance += noise * shift * noise.transpose();
+    if (contact == Contact::struck) {
+      const std::vector<VectorX> stops = stopping_shifts(filter, filter.base(time), motion.theta, motion.thetadot,
+                                                         motion.thetadot_by_state.rightCols(n));
+      for (std::size_t i = 0; i < stops.size(); ++i) {
+        VectorX blow = std::sqrt(filter.place[i]) * (transition.topRows(2 * n).rightCols(n) * stops[i]);
+        out.covariance.topLeftCorner(2 * n, 2 * n) += blow * blow.transpose();
+        // it came at any time of the step: its effect on the angles is h/2 of that on the rates, give or take
+        blow.head(n) *= std::sqrt(1.0 / 3.0);
+        out.covariance.topLeftCorner(n, n) += blow.head(n) * blow.head(n).transpose();
+      }
+    }
   }
   // an acceleration that is new every frame
-  const bool explained = filter.identified && (filter.shifts || !contact);
+  const bool explained = filter.identified && (filter.shifts || !touched);
   const double a = explained ? filter.options.acceleration : filter.options.blind_acceleration;
   const double rate = a * a * h * kFrame;
   for (int k = 0; k < n; ++k) {
@@ -425,11 +461,11 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
   const capture::View& view = *views.front();
   const int n = filter.model.chain.angles();
   const bool first = !filter.belief;
-  const auto believed = [&](bool contact) {
+  const auto believed = [&](Contact contact) {
     return first ? first_belief(filter, view.time) : predict(filter, *filter.belief, view.time, contact);
   };
   const bool in_contact = view.time <= filter.contact_until;
-  Belief predicted = believed(in_contact);
+  Belief predicted = believed(in_contact ? Contact::touched : Contact::none);
   if (first) filter.last_seen = view.time;
 
   Estimate out;
@@ -441,7 +477,11 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
     if (!first && (measured.surprise > kSurprise || !explains(measured.fit))) {
       filter.contact_until = view.time + kContactMemory;
       if (!in_contact) {
-        predicted = believed(true);
+        predicted = believed(Contact::touched);
+        measured = measure(filter, predicted, views, true);
+      }
+      if (filter.shifts && (measured.surprise > kSurprise || !explains(measured.fit))) {
+        predicted = believed(Contact::struck);
         measured = measure(filter, predicted, views, true);
       }
     }
