@@ -50,8 +50,13 @@ Balanced balance(chain::Bending bending, const VectorX& theta, double arclength,
   out.model = dynamics::make_model(rope, p);
   const int link = chain::link_at(rope, arclength);
   const auto motions = chain::link_motions(rope, theta, out.base);
-  const MatrixX jacobian = chain::point_jacobian(rope, chain::world_axes(rope, theta, out.base), link,
-                                                 motions[link] * Vector3(arclength * rope.direction));
+  // on the side of the rope that is pushed
+  const Vector3 push = motions[link].rotation.transpose() * force;
+  const Vector3 across = push - rope.direction.dot(push) * rope.direction;
+  Vector3 home = arclength * rope.direction;
+  if (across.norm() > 0.0) home -= p.radius * across.normalized();
+  const MatrixX jacobian =
+      chain::point_jacobian(rope, chain::world_axes(rope, theta, out.base), link, motions[link] * home);
   const VectorX zero = VectorX::Zero(theta.size());
   const VectorX gravity = dynamics::inverse_dynamics(out.model, dynamics::at_rest(out.base), theta, zero, zero);
   // J^T f = gravity + K (theta - rest)
@@ -67,7 +72,7 @@ force::Motion at_rest(const VectorX& theta, int count) {
     states.time.push_back(f / 30.0);
     states.theta.push_back(theta);
   }
-  return force::smooth(states, {}, false);
+  return force::smooth(states, {});
 }
 
 VectorX bent(int angles) {
@@ -123,23 +128,20 @@ TEST_CASE("smoothing finds angle, rate and acceleration of a swing, and its own 
     states.time.push_back(t);
     states.theta.push_back(VectorX::Constant(1, 0.4 * std::sin(w * t) + noise * random.normal()));
   }
-  for (const bool live : {false, true}) {
-    CAPTURE(live);
-    const force::Motion motion = force::smooth(states, {}, live);
-    double rate = 0.0, acceleration = 0.0;
-    int inside = 0, used = 0;
-    for (int f = 20; f + 20 < count; ++f) {
-      const double t = states.time[f];
-      const double a = motion.thetaddot[f][0] + 0.4 * w * w * std::sin(w * t);
-      rate += std::pow(motion.thetadot[f][0] - 0.4 * w * std::cos(w * t), 2);
-      acceleration += a * a;
-      inside += std::abs(a) <= 3.0 * std::sqrt(motion.noise(0, 0) * motion.covariance[f](2, 2));
-      ++used;
-    }
-    CHECK(std::sqrt(rate / used) < (live ? 0.12 : 0.04));
-    CHECK(std::sqrt(acceleration / used) < (live ? 1.2 : 0.5));  // second differences: 11 rad/s^2
-    CHECK(inside >= 0.95 * used);
+  const force::Motion motion = force::smooth(states, {});
+  double rate = 0.0, acceleration = 0.0;
+  int inside = 0, used = 0;
+  for (int f = 20; f + 20 < count; ++f) {
+    const double t = states.time[f];
+    const double a = motion.thetaddot[f][0] + 0.4 * w * w * std::sin(w * t);
+    rate += std::pow(motion.thetadot[f][0] - 0.4 * w * std::cos(w * t), 2);
+    acceleration += a * a;
+    inside += std::abs(a) <= 3.0 * std::sqrt(motion.noise(0, 0) * motion.covariance[f](2, 2));
+    ++used;
   }
+  CHECK(std::sqrt(rate / used) < 0.04);
+  CHECK(std::sqrt(acceleration / used) < 0.5);  // second differences: 11 rad/s^2
+  CHECK(inside >= 0.95 * used);
 }
 
 TEST_CASE("angles seen by where the rope is: a straight chain's angles are second differences of its ends") {
@@ -166,7 +168,7 @@ TEST_CASE("noise that two angles share is found as such") {
     const double common = 0.01 * random.normal(), own = 0.002 * random.normal();
     states.theta.push_back(math::Vector2(common, own - common));
   }
-  const MatrixX noise = force::smooth(states, {}, false).noise;
+  const MatrixX noise = force::smooth(states, {}).noise;
   CHECK(std::sqrt(noise(0, 0)) == doctest::Approx(0.01).epsilon(0.15));
   CHECK(noise(0, 1) / std::sqrt(noise(0, 0) * noise(1, 1)) < -0.9);
 }
@@ -177,11 +179,14 @@ TEST_CASE("a force is found where it acts, automatically") {
     const Vector3 force(0.10, 0.04, -0.01);
     const Balanced rope = balance(chain::Bending::spatial, bent(16), arclength, force);
     const auto base = [&](double) { return dynamics::at_rest(rope.base); };
-    const std::vector<force::Estimate> found = force::estimate(rope.model, base, at_rest(rope.theta, 9), {}, false);
+    const std::vector<force::Estimate> found =
+        force::estimate(rope.model, force::deviations(rope.model, {}), base, at_rest(rope.theta, 9), {});
     for (const force::Estimate& e : found) {
       CHECK(e.touching);
       CHECK(std::abs(e.contact.arclength - arclength) < 0.015);
-      CHECK((e.force - force).norm() < 0.2 * force.norm());
+      // along the rope, which hangs nearly straight, the force and its place are hardly told apart
+      CHECK((e.force - force).head<2>().norm() < 0.1 * force.norm());
+      CHECK((e.force - force).norm() < 0.5 * force.norm());
       for (int i = 0; i < 3; ++i) CHECK(std::abs(e.force[i] - force[i]) <= 3.0 * e.sigma[i]);
     }
   }
@@ -190,7 +195,8 @@ TEST_CASE("a force is found where it acts, automatically") {
 TEST_CASE("nothing touches a rope in balance with its weight alone") {
   const Balanced rope = balance(chain::Bending::spatial, bent(16), 0.2, Vector3::Zero());
   const auto base = [&](double) { return dynamics::at_rest(rope.base); };
-  for (const force::Estimate& e : force::estimate(rope.model, base, at_rest(rope.theta, 5), {}, false)) {
+  for (const force::Estimate& e :
+       force::estimate(rope.model, force::deviations(rope.model, {}), base, at_rest(rope.theta, 5), {})) {
     CHECK_FALSE(e.touching);
     CHECK(e.force.norm() < 0.05 * 0.06 * 9.81);
   }
@@ -206,7 +212,8 @@ TEST_CASE("a planar chain says that it does not see the force along its bending 
     if (contact)
       contact = force::Contact{chain::link_at(rope.model.chain, arclength), arclength,
                                arclength * rope.model.chain.direction};
-  const auto found = force::estimate(rope.model, base, at_rest(rope.theta, 5), contacts, false);
+  const auto found =
+      force::estimate(rope.model, force::deviations(rope.model, {}), base, at_rest(rope.theta, 5), contacts);
   CHECK(found[0].observed.y() < 0.01);
   CHECK(found[0].observed.x() > 0.9);
   CHECK(found[0].sigma.y() > 0.4);
@@ -297,7 +304,19 @@ TEST_CASE("pushes on a swinging rope that is finer and more damped than its twin
   };
   for (const bool live : {false, true}) {
     CAPTURE(live);
-    const auto found = force::estimate(twin, base, force::smooth(seen, {}, live), {}, live);
+    std::vector<force::Estimate> found;
+    if (live) {
+      force::Live follower;
+      follower.model = twin;
+      follower.deviations = force::deviations(twin, {});
+      follower.base = base;
+      for (int f = 0; f < kFrames; ++f)
+        if (const auto line = force::update(follower, seen.time[f], seen.theta[f], {})) found.push_back(*line);
+      for (const force::Estimate& line : force::finish(follower)) found.push_back(line);
+    } else {
+      found = force::estimate(twin, force::deviations(twin, {}), base, force::smooth(seen, {}), {});
+    }
+    REQUIRE(found.size() == kFrames);
     // the component along a hanging rope, and with it the direction, is hardly seen and not judged here
     std::vector<double> share, away;
     for (int f = 0; f < kFrames; ++f) {
@@ -330,7 +349,8 @@ TEST_CASE("on a table friction at rest hides forces, and the interval says how m
     dynamics::Model bent = model;
     for (int k = 0; k < 8; ++k)
       bent.parameters.rest_angle[k] = -(1.0 - held) * jacobian.col(k).dot(push) / bent.parameters.stiffness[k];
-    for (const force::Estimate& e : force::estimate(bent, base, at_rest(VectorX::Zero(8), 5), contacts, false)) {
+    for (const force::Estimate& e :
+         force::estimate(bent, force::deviations(bent, {}), base, at_rest(VectorX::Zero(8), 5), contacts)) {
       CHECK_FALSE(e.moving);
       CHECK(e.low.y() < push.y());
       CHECK(e.high.y() > push.y());

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <fstream>
+#include <functional>
 #include <iostream>
 #include <limits>
 #include <memory>
@@ -20,51 +22,73 @@ namespace {
 
 using Json = nlohmann::json;
 
-constexpr double kNear = 3.0;  // diameters from the rope within which something may touch it
+constexpr double kNear = 3.0;       // diameters from the rope within which something may touch it
+constexpr double kLiveApart = 0.1;  // s, how far from a state a line of a contact file may be, where states come in
 
 struct ForceRequest {
   std::string run, states, estimate, base, contact = "auto", hand;
   bool live = false;
 };
 
-// Lines of `estimate`.
-void read_estimates(const std::string& name, const chain::Chain& chain, chain::States& states,
-                    std::vector<math::MatrixX>& standing) {
+// A state, and the covariance of the error that stays for many frames, if that is known.
+struct State {
+  double time = 0.0;
+  math::VectorX theta;
+  math::MatrixX standing;  // n x n, or empty
+};
+
+// A line of `estimate`; none where it is lost. `before`: time of the state before.
+std::optional<State> read_estimate(const std::string& line, const std::string& where, const chain::Chain& chain,
+                                   double before) {
   const int angles = chain.angles();
-  std::istringstream lines(core::read_file(input_path(name)));
-  std::string line;
-  for (int number = 1; std::getline(lines, line); ++number) {
-    if (line.empty()) continue;
-    const std::string where = name + ": line " + std::to_string(number);
-    try {
-      const Json object = Json::parse(line);
-      if (object.value("lost", false)) continue;
-      const auto theta = object.at("theta").get<std::vector<double>>();
-      const auto deviation = object.at("sigma").get<std::vector<double>>();
-      const double time = object.at("time").get<double>();
-      if (static_cast<int>(theta.size()) != angles || deviation.size() != theta.size())
-        throw InputError(where, "has not the twin's " + std::to_string(angles) + " angles",
-                         "give estimates of this twin");
-      if (!states.time.empty() && !(time > states.time.back()))
-        throw InputError(where, "its time does not increase", "give the lines in order");
-      states.time.push_back(time);
-      states.theta.push_back(Eigen::Map<const math::VectorX>(theta.data(), angles));
-      if (!object.contains("covariance")) {
-        standing.push_back(force::angle_covariance(chain, states.theta.back(),
-                                                   Eigen::Map<const math::VectorX>(deviation.data(), angles)));
-        continue;
-      }
-      const auto triangle = object.at("covariance").get<std::vector<double>>();
-      const std::size_t all = 2 * static_cast<std::size_t>(angles);  // with the rates: their rows follow
-      if (triangle.size() != angles * (angles + std::size_t{1}) / 2 && triangle.size() != all * (all + 1) / 2)
-        throw InputError(where + ": covariance", "is no lower triangle of the angles", "give the output of estimate");
-      standing.emplace_back(angles, angles);
-      for (int row = 0, i = 0; row < angles; ++row)
-        for (int column = 0; column <= row; ++column, ++i)
-          standing.back()(row, column) = standing.back()(column, row) = triangle[i];
-    } catch (const Json::exception&) {
-      throw InputError(where, "is no line of 'chainsplat estimate'", "give its output");
+  State out;
+  try {
+    const Json object = Json::parse(line);
+    if (object.value("lost", false)) return {};
+    const auto theta = object.at("theta").get<std::vector<double>>();
+    const auto deviation = object.at("sigma").get<std::vector<double>>();
+    out.time = object.at("time").get<double>();
+    if (static_cast<int>(theta.size()) != angles || deviation.size() != theta.size())
+      throw InputError(where, "has not the twin's " + std::to_string(angles) + " angles",
+                       "give estimates of this twin");
+    if (!(out.time > before)) throw InputError(where, "its time does not increase", "give the lines in order");
+    out.theta = Eigen::Map<const math::VectorX>(theta.data(), angles);
+    if (!object.contains("covariance")) {
+      out.standing =
+          force::angle_covariance(chain, out.theta, Eigen::Map<const math::VectorX>(deviation.data(), angles));
+      return out;
     }
+    const auto triangle = object.at("covariance").get<std::vector<double>>();
+    const std::size_t all = 2 * static_cast<std::size_t>(angles);  // with the rates: their rows follow
+    if (triangle.size() != angles * (angles + std::size_t{1}) / 2 && triangle.size() != all * (all + 1) / 2)
+      throw InputError(where + ": covariance", "is no lower triangle of the angles", "give the output of estimate");
+    out.standing.resize(angles, angles);
+    for (int row = 0, i = 0; row < angles; ++row)
+      for (int column = 0; column <= row; ++column, ++i)
+        out.standing(row, column) = out.standing(column, row) = triangle[i];
+  } catch (const Json::exception&) {
+    throw InputError(where, "is no line of 'chainsplat estimate'", "give its output");
+  }
+  return out;
+}
+
+// Gives every state to `take`, as soon as its line is there.
+void each_state(const ForceRequest& request, const chain::Chain& chain, const std::function<void(const State&)>& take) {
+  if (request.estimate.empty()) {
+    const chain::States states = twin::read_states(input_path(request.states), chain.angles());
+    for (std::size_t f = 0; f < states.time.size(); ++f) take({states.time[f], states.theta[f], {}});
+    return;
+  }
+  std::ifstream in(input_path(request.estimate));
+  if (!in) throw InputError(request.estimate, "cannot be read", "give the output of estimate, or - for standard input");
+  double before = -std::numeric_limits<double>::infinity();
+  std::string line;
+  for (int number = 1; std::getline(in, line); ++number) {
+    if (line.empty()) continue;
+    const auto state = read_estimate(line, request.estimate + ": line " + std::to_string(number), chain, before);
+    if (!state) continue;
+    before = state->time;
+    take(*state);
   }
 }
 
@@ -108,6 +132,40 @@ std::vector<ContactPoint> read_contacts(const std::string& name) {
   return out;
 }
 
+// What is said to touch, at a time and with the angles then; empty for 'auto'.
+using ContactAt = std::function<std::optional<force::Contact>(double time, const math::VectorX& theta)>;
+
+// `nearest`: of points (world, columns) at a time. `apart`: s, how far from a time a line of a file may be.
+ContactAt contact_of(const ForceRequest& request,
+                     const std::function<force::Contact(double, const math::VectorX&, const math::MatrixX&)>& nearest,
+                     double apart) {
+  if (!request.hand.empty()) {
+    const splat::Gaussians cloud = twin::read_ply(request.hand);
+    if (cloud.count == 0) throw InputError(request.hand, "has no point", "give a point cloud of the hand");
+    math::MatrixX points(3, cloud.count);
+    for (int i = 0; i < cloud.count; ++i)
+      points.col(i) << cloud.mean[3 * i], cloud.mean[3 * i + 1], cloud.mean[3 * i + 2];
+    return [=](double time, const math::VectorX& theta) { return nearest(time, theta, points); };
+  }
+  if (request.contact.ends_with(".csv") || request.contact == "-") {
+    const std::vector<ContactPoint> given = read_contacts(request.contact);
+    return [=](double time, const math::VectorX& theta) -> std::optional<force::Contact> {
+      const auto at = std::min_element(given.begin(), given.end(), [&](const ContactPoint& a, const ContactPoint& b) {
+        return std::abs(a.time - time) < std::abs(b.time - time);
+      });
+      if (!at->point || std::abs(at->time - time) > apart) return {};
+      return nearest(time, theta, *at->point);
+    };
+  }
+  if (request.contact == "auto") return {};
+  math::Vector3 point;
+  char rest = 0;
+  if (std::sscanf(request.contact.c_str(), "%lf,%lf,%lf%c", &point[0], &point[1], &point[2], &rest) != 3 ||
+      !point.allFinite())
+    throw InputError("--contact", "'" + request.contact + "' is no point", "give X,Y,Z in meters, a FILE.csv or auto");
+  return [=](double time, const math::VectorX& theta) { return nearest(time, theta, point); };
+}
+
 void force(const Globals& globals, const ForceRequest& request) {
   if (globals.json)
     throw InputError("--json", "force writes one JSON line a time step, not one document", "leave it out");
@@ -117,81 +175,86 @@ void force(const Globals& globals, const ForceRequest& request) {
   const dynamics::Model model = model_of(twin, request.run);
   const trajectory::Trajectory base = request.base.empty() ? own_base(request.run) : read_base(request.base);
   if (request.base.empty()) core::warn("--base: is missing; the base motion of the twin's own capture is assumed");
-  chain::States states;
-  std::vector<math::MatrixX> standing;
-  if (request.estimate.empty())
-    states = twin::read_states(input_path(request.states), twin.chain.angles());
-  else
-    read_estimates(request.estimate, twin.chain, states, standing);
-  if (states.time.size() < 3)
-    throw InputError(request.estimate.empty() ? request.states : request.estimate, "has fewer than three states",
-                     "give more: forces need accelerations");
-  const double slack = 1.0 / 30.0;  // s, a frame beyond the last sample
-  if (base.samples().size() > 1 &&
-      (states.time.front() < base.start() - slack || states.time.back() > base.end() + slack))
-    throw InputError(request.base.empty() ? request.run : request.base,
-                     "the base motion covers " + core::exact(base.start()) + " to " + core::exact(base.end()) +
-                         " s, the states " + core::exact(states.time.front()) + " to " +
-                         core::exact(states.time.back()) + " s",
-                     "give the base motion of these states with --base");
-  const force::Motion motion = force::smooth(states, standing, request.live);
-
-  const std::size_t count = motion.time.size();
-  std::vector<std::optional<force::Contact>> contacts;
-  const auto nearest = [&](std::size_t f, const math::MatrixX& points) {
-    return force::nearest_contact(twin.chain, twin.gaussians, base.pose(motion.time[f]), motion.theta[f], points);
+  const std::string source = request.estimate.empty() ? request.states : request.estimate;
+  const std::string where = !request.hand.empty()                            ? request.hand
+                            : request.contact.find(',') != std::string::npos ? "--contact"
+                                                                             : request.contact;
+  const double near = kNear * twin.chain.diameter;
+  double least = std::numeric_limits<double>::infinity();  // m, of what is said to touch, from the rope
+  const auto nearest = [&](double time, const math::VectorX& theta, const math::MatrixX& points) {
+    return force::nearest_contact(twin.chain, twin.gaussians, base.pose(time), theta, points);
   };
   // what is far from the rope does not touch it; what always is was meant otherwise
-  const auto keep_near = [&](const std::string& where) {
-    double least = std::numeric_limits<double>::infinity();
-    for (std::optional<force::Contact>& contact : contacts) {
-      if (!contact) continue;
-      least = std::min(least, contact->distance);
-      if (contact->distance > kNear * twin.chain.diameter) contact.reset();
-    }
+  const auto with_near = [&](const ContactAt& contact) -> ContactAt {
+    if (!contact) return {};
+    return [&least, near, contact](double time, const math::VectorX& theta) {
+      std::optional<force::Contact> out = contact(time, theta);
+      if (!out) return out;
+      least = std::min(least, out->distance);
+      if (out->distance > near) out.reset();
+      return out;
+    };
+  };
+  const auto check_near = [&] {
     if (!std::isfinite(least)) throw InputError(where, "names no contact at any of the states' times", "correct it");
-    if (least > kNear * twin.chain.diameter)
+    if (least > near)
       throw InputError(where, "never comes nearer to the rope than " + core::exact(least) + " m",
                        "give meters in the world frame, and the base motion of the states");
   };
-  if (!request.hand.empty()) {
-    const splat::Gaussians cloud = twin::read_ply(request.hand);
-    if (cloud.count == 0) throw InputError(request.hand, "has no point", "give a point cloud of the hand");
-    math::MatrixX points(3, cloud.count);
-    for (int i = 0; i < cloud.count; ++i)
-      points.col(i) << cloud.mean[3 * i], cloud.mean[3 * i + 1], cloud.mean[3 * i + 2];
-    for (std::size_t f = 0; f < count; ++f) contacts.push_back(nearest(f, points));
-    keep_near(request.hand);
-  } else if (request.contact.ends_with(".csv") || request.contact == "-") {
-    const std::vector<ContactPoint> given = read_contacts(request.contact);
-    const double most = count > 1 ? (motion.time.back() - motion.time.front()) / (count - 1.0) : 0.0;  // s apart
-    for (std::size_t f = 0; f < count; ++f) {
-      const auto at = std::min_element(given.begin(), given.end(), [&](const ContactPoint& a, const ContactPoint& b) {
-        return std::abs(a.time - motion.time[f]) < std::abs(b.time - motion.time[f]);
-      });
-      contacts.emplace_back();
-      if (at->point && std::abs(at->time - motion.time[f]) <= most) contacts.back() = nearest(f, *at->point);
-    }
-    keep_near(request.contact);
-  } else if (request.contact != "auto") {
-    math::Vector3 point;
-    char rest = 0;
-    if (std::sscanf(request.contact.c_str(), "%lf,%lf,%lf%c", &point[0], &point[1], &point[2], &rest) != 3 ||
-        !point.allFinite())
-      throw InputError("--contact", "'" + request.contact + "' is no point",
-                       "give X,Y,Z in meters, a FILE.csv or auto");
-    for (std::size_t f = 0; f < count; ++f) contacts.push_back(nearest(f, point));
-    keep_near("--contact");
-  }
-  const std::vector<force::Estimate> estimates = force::estimate(
-      model, [&](double time) { return base.at(time); }, motion, contacts, request.live);
-  int touching = 0;
-  for (const force::Estimate& e : estimates) {
+  const double slack = 1.0 / 30.0;  // s, a frame beyond the last sample
+  const auto check_time = [&](double first, double last) {
+    if (base.samples().size() > 1 && (first < base.start() - slack || last > base.end() + slack))
+      throw InputError(request.base.empty() ? request.run : request.base,
+                       "the base motion covers " + core::exact(base.start()) + " to " + core::exact(base.end()) +
+                           " s, the states " + core::exact(first) + " to " + core::exact(last) + " s",
+                       "give the base motion of these states with --base");
+  };
+  std::size_t lines = 0, touching = 0;
+  const auto write = [&](const force::Estimate& e) {
     std::cout << force::to_json(e, twin.known_mass) << "\n" << std::flush;
+    ++lines;
     touching += e.touching;
+  };
+  const std::string few = "has fewer than three states", more = "give more: forces need accelerations";
+  const std::vector<dynamics::Model> deviations = force::deviations(model, twin.estimates);
+  const dynamics::BaseFunction base_at = [&](double time) { return base.at(time); };
+
+  if (request.live) {
+    force::Live live;
+    live.model = model;
+    live.deviations = deviations;
+    live.base = base_at;
+    live.contact = with_near(contact_of(request, nearest, kLiveApart));
+    double first = std::numeric_limits<double>::infinity();
+    each_state(request, twin.chain, [&](const State& state) {
+      first = std::min(first, state.time);
+      check_time(first, state.time);
+      if (const auto line = force::update(live, state.time, state.theta, state.standing)) write(*line);
+    });
+    if (live.taken < 3) throw InputError(source, few, more);
+    for (const force::Estimate& line : force::finish(live)) write(line);
+    if (live.contact) check_near();
+  } else {
+    chain::States states;
+    std::vector<math::MatrixX> standing;
+    each_state(request, twin.chain, [&](const State& state) {
+      states.time.push_back(state.time);
+      states.theta.push_back(state.theta);
+      if (state.standing.size() > 0) standing.push_back(state.standing);
+    });
+    const std::size_t count = states.time.size();
+    if (count < 3) throw InputError(source, few, more);
+    check_time(states.time.front(), states.time.back());
+    const force::Motion motion = force::smooth(states, standing);
+    const ContactAt contact =
+        with_near(contact_of(request, nearest, (states.time.back() - states.time.front()) / (count - 1.0)));
+    std::vector<std::optional<force::Contact>> contacts;
+    for (std::size_t f = 0; f < count && contact; ++f) contacts.push_back(contact(motion.time[f], motion.theta[f]));
+    if (contact) check_near();
+    for (const force::Estimate& line : force::estimate(model, deviations, base_at, motion, contacts)) write(line);
   }
   if (!twin.known_mass) core::warn(request.run + ": the rope's mass is not known; forces are per kilogram of rope");
-  say(std::to_string(count) + " time steps, touched in " + std::to_string(touching) + ".");
+  say(std::to_string(lines) + " time steps, touched in " + std::to_string(touching) + ".");
 }
 
 }  // namespace
@@ -212,7 +275,8 @@ void add_force_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("X,Y,Z|FILE.csv|auto");
   command->add_option("--hand", request->hand, "Point cloud of the hand; the nearest Gaussian is touched")
       ->type_name("FILE.ply");
-  command->add_flag("--live", request->live, "Use the past alone: a filter instead of a smoother");
+  command->add_flag("--live", request->live,
+                    "While states come in: a line is written two states after its own, from these and earlier ones");
   command->callback([&globals, &job, request] { job = [&globals, request] { force(globals, *request); }; });
 }
 

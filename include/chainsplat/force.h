@@ -5,6 +5,7 @@
 // straight rope) or not at all (the bending axis of a planar chain) the prior keeps f small and the standard error says
 // so.
 #pragma once
+#include <functional>
 #include <optional>
 #include <span>
 #include <string>
@@ -31,11 +32,11 @@ struct Motion {
   std::vector<MatrixX> standing;                    // n x n, rad^2, a time, or empty
 };
 
-// Kalman filter and, unless `live`, Rauch-Tung-Striebel smoother of every angle under random jerk. How large jerk and
-// noise are, and how the angles' errors hang together, is found by maximum likelihood; the ratio of jerk and noise is
-// one for all angles. `standing`: covariances of the angles' lasting errors, n x n a time, or empty. Throws InputError
-// for fewer than three times.
-Motion smooth(const chain::States& states, std::span<const MatrixX> standing, bool live);
+// Kalman filter and Rauch-Tung-Striebel smoother of every angle under random jerk. How large jerk and noise are, and
+// how the angles' errors hang together, is found by maximum likelihood; the ratio of jerk and noise is one for all
+// angles. `standing`: covariances of the angles' lasting errors, n x n a time, or empty. Throws InputError for fewer
+// than three times.
+Motion smooth(const chain::States& states, std::span<const MatrixX> standing);
 
 // Covariance of angles of which only the standard deviations are known. Cameras see where the rope is: errors of the
 // links' ends are independent, so those of neighboring angles cancel.
@@ -44,13 +45,19 @@ MatrixX angle_covariance(const chain::Chain& chain, const VectorX& theta, const 
 struct Options {
   double force_scale = 0.5;          // N a 60 g rope is pushed with, in proportion to the mass: the prior's deviation
   double along = 0.3;                // of the force across: the same along the rope, where fingers slip
-  double relative_deviation = 0.2;   // of the joints' stiffness and damping torques: what identification leaves open
-  double gravity_deviation = 0.004;  // of the rope's weight times its length: torque error of any joint
+  double relative_deviation = 0.1;   // of the joints' stiffness and damping torques: what the joint law lacks
+  double gravity_deviation = 0.002;  // of the rope's weight times its length: torque that a chain of few links lacks
+  double friction_reach = 0.25;      // of the rope's length, over which friction at rest has about one direction
+  double pressing = 0.5;             // of the force in the table's plane: how hard it may press the rope down besides
   double error_memory = 0.1;         // s, in which the model's and the states' errors stay the same
   double contact_time = 1.0;         // s, a contact lasts in the mean
   double slide = 0.1;                // lengths of the rope in 1/sqrt(s), a contact wanders along it
   int places = 60;                   // arclengths tried for an automatic contact
 };
+
+// What identification leaves open, as models as likely as `model`: one standard deviation away along every principal
+// direction of the estimates' covariance. Without one, every joint's stiffness and damping alone.
+std::vector<dynamics::Model> deviations(const dynamics::Model& model, const dynamics::Estimates& estimates);
 
 // The force at one place.
 struct Fit {
@@ -96,12 +103,33 @@ struct Estimate {
   bool moving = true;  // false: the rope rests where it is touched, and friction there may hide forces
 };
 
-// One line a time of `motion`. `contacts`: a time each, empty where nothing is said to touch; an empty span: automatic.
-// Whether something touches, and an automatic contact's place, are followed over time, `live` from the past alone. An
-// automatic contact lies on the centerline.
-std::vector<Estimate> estimate(const dynamics::Model& model, const dynamics::BaseFunction& base, const Motion& motion,
-                               std::span<const std::optional<Contact>> contacts, bool live,
-                               const Options& options = {});
+// One line a time of `motion`. `deviations`: as above. `contacts`: a time each, empty where nothing is said to touch;
+// an empty span: automatic. Whether something touches, and an automatic contact's place, are followed over time. An
+// automatic contact lies on the side of the rope that is pushed, and its force is the mean over the places that it may
+// have.
+std::vector<Estimate> estimate(const dynamics::Model& model, std::span<const dynamics::Model> deviations,
+                               const dynamics::BaseFunction& base, const Motion& motion,
+                               std::span<const std::optional<Contact>> contacts, const Options& options = {});
+
+// The same while states come in: a line is given kLiveLag states after its own, from these and earlier ones. What an
+// acceleration is, the states after it tell: with none of them a push is hardly told from a swing.
+inline constexpr std::size_t kLiveLag = 2;
+struct Live {
+  dynamics::Model model;
+  std::vector<dynamics::Model> deviations;
+  dynamics::BaseFunction base;
+  // what touches at a time, given the angles then; empty: automatic
+  std::function<std::optional<Contact>(double time, const VectorX& theta)> contact;
+  Options options;
+  chain::States states;  // of the last seconds, with `standing` a time, or none
+  std::vector<MatrixX> standing;
+  VectorX belief;  // where it is touched, at the last line's time; empty before the first
+  std::size_t lines = 0, taken = 0;
+};
+// Takes a state in. `standing` n x n, or empty at all times; times must increase. No line for the first states.
+std::optional<Estimate> update(Live& live, double time, const VectorX& theta, const MatrixX& standing);
+// The lines that are still due after the last state; none for fewer than three states.
+std::vector<Estimate> finish(Live& live);
 
 // The line of INTERFACE 5, without line feed. `known_mass` false: forces are per kilogram of rope, and the line says
 // so.

@@ -2,8 +2,10 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstdio>
+#include <limits>
 #include <numeric>
+
+#include "force/track.h"
 
 namespace chainsplat::force {
 
@@ -24,7 +26,9 @@ constexpr double kNotSaid = -1e6;  // log likelihood of a contact where the user
 constexpr double kMovingSpeeds =
     3.0;                              // of the friction's regularization speed, beyond which friction is known (SPEC 7)
 constexpr double kUnseenLever = 0.1;  // diameters; angles that move no link's end (twist) are seen on the surface alone
-constexpr double kLeastTorque = 1e-6;  // of weight times length, keeps covariances invertible
+constexpr double kLeastTorque = 1e-6;      // of weight times length, keeps covariances invertible
+constexpr double kUnknownDeviation = 0.2;  // of a joint's stiffness and damping, where identification says nothing
+constexpr double kLiveWindow = 4.0;        // s of states that a live smoother looks back on
 
 double total_mass(const dynamics::Parameters& parameters) {
   double mass = parameters.tip_mass;
@@ -41,6 +45,8 @@ struct Frame {
   std::vector<Pose> motions;
   std::vector<double> hidden;  // N a link, friction that may balance a force unseen
   std::vector<double> speed;   // m/s a link, of its middle, across the table
+  Contact named;               // what is said to touch; none where it is not
+  bool is_named = false;
 };
 
 // Of the joints after the first and the free end: the ends of the links 1.. .
@@ -53,8 +59,8 @@ std::vector<MatrixX> link_end_jacobians(const chain::Chain& chain, const MatrixX
   return jacobians;
 }
 
-Frame frame_of(const dynamics::Model& model, const trajectory::BaseMotion& base, const Motion& motion, std::size_t f,
-               const Options& options) {
+Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> deviations,
+               const trajectory::BaseMotion& base, const Motion& motion, std::size_t f, const Options& options) {
   const chain::Chain& chain = model.chain;
   const dynamics::Parameters& p = model.parameters;
   const int n = chain.angles();
@@ -73,20 +79,23 @@ Frame frame_of(const dynamics::Model& model, const trajectory::BaseMotion& base,
   const std::vector<MatrixX> jacobians = link_end_jacobians(chain, out.axes, out.motions);
   if (!motion.standing.empty())
     out.covariance.noalias() += at.stiffness * motion.standing[f] * at.stiffness.transpose();
+  for (const dynamics::Model& other : deviations) {
+    const VectorX off = residual_torque(other, base, theta, thetadot, thetaddot) - out.residual;
+    out.covariance.noalias() += off * off.transpose();
+  }
   const double moment = total_mass(p) * p.gravity.norm() * chain.length;
   for (int k = 0; k < n; ++k) {
     const double spring = options.relative_deviation * p.stiffness[k] * (theta[k] - p.rest_angle[k]);
     const double damper = options.relative_deviation * p.damping[k] * thetadot[k];
     out.covariance(k, k) += spring * spring + damper * damper + std::pow(kLeastTorque * moment, 2);
   }
-  // weight that is somewhere else than thought: an error that grows toward the grasp, as a small force at every joint
-  // and at the free end would make it
+  // an error that grows toward the grasp, as a small force at every joint and at the free end would make it
   const double error = options.gravity_deviation * total_mass(p) * p.gravity.norm();
   const MatrixX nodes = chain::nodes(chain, out.motions);
   for (const MatrixX& jacobian : jacobians) out.covariance.noalias() += error * error * jacobian.transpose() * jacobian;
 
   out.sliding_covariance = out.covariance;
-  // friction at rest balances anything up to its limit
+  // friction at rest balances anything up to its limit; neighboring links were dragged there together
   out.hidden.assign(chain.links(), 0.0);
   out.speed.assign(chain.links(), 0.0);
   if (p.table_normal) {
@@ -94,6 +103,7 @@ Frame frame_of(const dynamics::Model& model, const trajectory::BaseMotion& base,
     const Matrix3 across = Matrix3::Identity() - normal * normal.transpose();
     const math::Matrix3& rotation = base.pose.rotation;
     const Vector3 omega = rotation * base.velocity.head<3>(), v0 = rotation * base.velocity.tail<3>();
+    std::vector<MatrixX> friction(chain.links());
     for (int link = 1; link < chain.links(); ++link) {
       const Vector3 x = 0.5 * (nodes.col(link) + nodes.col(link + 1));
       const MatrixX jacobian = chain::point_jacobian(chain, out.axes, link, x);
@@ -101,9 +111,13 @@ Frame frame_of(const dynamics::Model& model, const trajectory::BaseMotion& base,
       out.speed[link] = v.norm();
       const double limit = p.coulomb_friction[link - 1] * p.link_mass[link - 1] * std::abs(p.gravity.dot(normal));
       out.hidden[link] = limit * p.coulomb_speed / std::hypot(v.norm(), p.coulomb_speed);
-      const MatrixX along = across * jacobian;
-      out.covariance.noalias() += std::pow(out.hidden[link], 2) * along.transpose() * along;
+      friction[link] = out.hidden[link] * across * jacobian;
     }
+    for (int a = 1; a < chain.links(); ++a)
+      for (int b = 1; b < chain.links(); ++b) {
+        const double apart = std::abs(chain.link_start(a) - chain.link_start(b)) / chain.length;
+        out.covariance.noalias() += std::exp(-apart / options.friction_reach) * friction[a].transpose() * friction[b];
+      }
   }
   return out;
 }
@@ -112,77 +126,150 @@ Contact contact_at(const chain::Chain& chain, double arclength) {
   return {chain::link_at(chain, arclength), arclength, arclength * chain.direction, 0.0};
 }
 
-// Whether the rope is touched, and where, along time: a hidden Markov chain over 'nowhere' and the places.
-struct Track {
-  std::vector<double> probability;           // of being touched, a time
-  std::vector<double> arclength, deviation;  // m, if touched
+// A contact with the force that the prior allows and the residual tells.
+struct Touch {
+  Contact contact;
+  Matrix3 prior;
+  MatrixX jacobian;
+  Fit fit;
 };
 
-// `evidence`: places x times, log likelihood of a force there over that of none. `odds`: of none over a contact, before
-// anything was seen. Backward from the future unless `live`.
-Track follow(const MatrixX& evidence, const std::vector<double>& time, const std::vector<double>& arclengths,
-             double odds, double slide, bool live, const Options& options) {
-  const Eigen::Index places = evidence.rows(), count = evidence.cols();
-  // likelihoods a time, row 0 of 'nowhere'; errors last, so what is near in time is in part the same news
-  MatrixX likely(places + 1, count);
-  for (Eigen::Index f = 0; f < count; ++f) {
-    const double h = f > 0 ? time[f] - time[f - 1] : count > 1 ? time[1] - time[0] : options.error_memory;
-    VectorX column(places + 1);
-    column << 0.0, std::min(1.0, h / options.error_memory) * evidence.col(f);
-    likely.col(f) = (column.array() - column.maxCoeff()).exp();
-  }
-  const auto transition = [&](double h) {  // column: from
-    MatrixX out = MatrixX::Zero(places + 1, places + 1);
-    const double leave = 1.0 - std::exp(-h / options.contact_time), come = leave / odds;
-    out(0, 0) = 1.0 - come;
-    out.col(0).tail(places).setConstant(come / places);
-    for (Eigen::Index i = 0; i < places; ++i) {
-      VectorX to(places);
-      for (Eigen::Index k = 0; k < places; ++k)
-        to[k] = std::exp(-0.5 * std::pow(arclengths[k] - arclengths[i], 2) / (slide * slide * h));
-      out(0, 1 + i) = leave;
-      out.col(1 + i).tail(places) = (1.0 - leave) / to.sum() * to;
-    }
-    return out;
-  };
-  MatrixX step;
-  double step_time = 0.0;
-  const auto over = [&](double h) -> const MatrixX& {
-    if (step.size() == 0 || std::abs(h - step_time) > 1e-9) step = transition(step_time = h);
-    return step;
-  };
-  MatrixX belief(places + 1, count);
-  for (Eigen::Index f = 0; f < count; ++f) {
-    VectorX before(places + 1);
-    if (f == 0) {
-      before.setConstant(1.0 / (places * (1.0 + odds)));
-      before[0] = odds / (1.0 + odds);
-    } else {
-      before = over(time[f] - time[f - 1]) * belief.col(f - 1);
-    }
-    belief.col(f) = before.cwiseProduct(likely.col(f));
-    belief.col(f) /= belief.col(f).sum();
-  }
-  if (!live) {
-    VectorX later = VectorX::Ones(places + 1);
-    for (Eigen::Index f = count - 1; f-- > 0;) {
-      later = over(time[f + 1] - time[f]).transpose() * later.cwiseProduct(likely.col(f + 1));
-      later /= later.sum();
-      belief.col(f) = belief.col(f).cwiseProduct(later).eval();
-      belief.col(f) /= belief.col(f).sum();
-    }
-  }
-  Track out;
-  const Eigen::Map<const VectorX> s(arclengths.data(), places);
-  for (Eigen::Index f = 0; f < count; ++f) {
-    const VectorX at = belief.col(f).tail(places);
-    out.probability.push_back(1.0 - belief(0, f));
-    const double mean = at.sum() > 0.0 ? at.dot(s) / at.sum() : s.mean();
-    out.arclength.push_back(mean);
-    out.deviation.push_back(at.sum() > 0.0 ? std::sqrt(at.dot((s.array() - mean).square().matrix()) / at.sum())
-                                           : s.maxCoeff() - s.minCoeff());
+Touch touch_at(const dynamics::Model& model, const Frame& frame, const Contact& contact, const Options& options) {
+  const chain::Chain& chain = model.chain;
+  const double across = options.force_scale * total_mass(model.parameters) / kPushedMass,
+               along = options.along * across;
+  const Vector3 tangent = frame.motions[contact.link].rotation * chain.direction;
+  Touch out;
+  out.contact = contact;
+  out.prior = across * across * Matrix3::Identity() + (along * along - across * across) * tangent * tangent.transpose();
+  out.jacobian = chain::point_jacobian(chain, frame.axes, contact.link, frame.motions[contact.link] * contact.home);
+  out.fit = solve(out.jacobian, frame.residual, frame.covariance, out.prior);
+  return out;
+}
+
+// The same at an arclength, on the side of the rope that is pushed: a force along the rope bends it there by the
+// radius.
+Touch touch_on_surface(const dynamics::Model& model, const Frame& frame, double arclength, const Options& options) {
+  const chain::Chain& chain = model.chain;
+  const Touch axis = touch_at(model, frame, contact_at(chain, arclength), options);
+  const Vector3 push = frame.motions[axis.contact.link].rotation.transpose() * axis.fit.force;
+  const Vector3 across = push - chain.direction.dot(push) * chain.direction;
+  if (across.norm() <= kTouchingWeight * total_mass(model.parameters) * model.parameters.gravity.norm()) return axis;
+  Contact contact = axis.contact;
+  contact.home -= 0.5 * chain.diameter * across.normalized();
+  return touch_at(model, frame, contact, options);
+}
+
+// What a frame says of every place that is followed: all along the rope, or the named one.
+std::vector<Fit> fits_at(const dynamics::Model& model, const Frame& frame, const Track& track, bool automatic) {
+  std::vector<Fit> out;
+  if (!automatic && !frame.is_named) {
+    out.emplace_back().evidence = kNotSaid;
+  } else if (!automatic) {
+    out.push_back(touch_at(model, frame, frame.named, track.options).fit);
+  } else {
+    for (const double arclength : track.arclengths)
+      out.push_back(touch_on_surface(model, frame, arclength, track.options).fit);
   }
   return out;
+}
+
+VectorX evidence_of(const std::vector<Fit>& fits) {
+  VectorX out(static_cast<Eigen::Index>(fits.size()));
+  for (std::size_t i = 0; i < fits.size(); ++i) out[static_cast<Eigen::Index>(i)] = fits[i].evidence;
+  return out;
+}
+
+Track track_of(const chain::Chain& chain, bool automatic, const Options& options) {
+  Track out;
+  out.odds = automatic ? kOddsOfNone : kOddsWhereNamed;
+  out.options = options;
+  const int places = automatic ? options.places : 1;
+  for (int i = 1; i <= places; ++i) out.arclengths.push_back(chain.length * i / places);
+  return out;
+}
+
+// The line of one time from what is believed then.
+Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, const std::vector<Fit>& fits,
+                 const VectorX& belief, const Track& track, bool automatic) {
+  const chain::Chain& chain = model.chain;
+  const dynamics::Parameters& p = model.parameters;
+  Estimate e;
+  e.time = time;
+  e.contact = automatic || !frame.is_named ? contact_at(chain, chain.length) : frame.named;
+  if (automatic || frame.is_named) {
+    e.probability = 1.0 - belief[0];
+    const auto at = belief.tail(belief.size() - 1);
+    const Eigen::Map<const VectorX> s(track.arclengths.data(), at.size());
+    Touch touch;
+    Vector3 force;
+    Matrix3 covariance;
+    if (automatic) {
+      // the mean over the places, weighed by the belief, and the spread of their forces beside each one's own error
+      const double sum = std::max(at.sum(), std::numeric_limits<double>::min());
+      const double mean = at.dot(s) / sum;
+      e.arclength_sigma = std::sqrt(at.dot((s.array() - mean).square().matrix()) / sum);
+      touch = touch_on_surface(model, frame, std::clamp(mean, s[0], chain.length), track.options);
+      force.setZero();
+      covariance.setZero();
+      for (std::size_t i = 0; i < fits.size(); ++i) force += at[i] / sum * fits[i].force;
+      for (std::size_t i = 0; i < fits.size(); ++i) {
+        const Vector3 off = fits[i].force - force;
+        covariance += at[i] / sum * (fits[i].covariance + off * off.transpose());
+      }
+    } else {
+      touch = touch_at(model, frame, frame.named, track.options);
+      force = touch.fit.force;
+      covariance = touch.fit.covariance;
+    }
+    e.contact = touch.contact;
+    if (const auto& normal = p.table_normal) {
+      // what presses the rope onto the table adds to the friction there, and no camera sees it
+      const Matrix3 plane = Matrix3::Identity() - *normal * normal->transpose();
+      const double friction = e.contact.link > 0 ? p.coulomb_friction[e.contact.link - 1] : 0.0;
+      covariance += std::pow(friction * track.options.pressing * (plane * force).norm(), 2) * plane;
+    }
+    // a contact that was named is believed
+    const double believed = automatic ? e.probability : 1.0;
+    const Vector3 variance = covariance.diagonal();
+    e.force = believed * force;
+    e.sigma = (variance + believed * (1.0 - believed) * force.cwiseProduct(force)).cwiseSqrt();
+    e.observed = (Vector3::Ones() - variance.cwiseQuotient(touch.prior.diagonal())).cwiseMax(0.0);
+    e.touching = e.probability > 0.5 && e.force.norm() > kTouchingWeight * total_mass(p) * p.gravity.norm();
+    // friction at rest may balance any force up to its limit: about what the rope would feel if it balanced none
+    const Fit sliding = solve(touch.jacobian, frame.residual, frame.sliding_covariance, touch.prior);
+    const double limit = std::accumulate(frame.hidden.begin(), frame.hidden.end(), 0.0);
+    e.low = e.high = e.force;
+    if (const auto& normal = p.table_normal) {
+      const Vector3 reach = limit * (Vector3::Ones() - normal->cwiseProduct(*normal)).cwiseMax(0.0).cwiseSqrt();
+      e.low = e.force.cwiseMin(sliding.force - reach);
+      e.high = e.force.cwiseMax(sliding.force + reach);
+    }
+  }
+  e.point = frame.motions[e.contact.link] * e.contact.home;
+  // friction is known where the links about the contact slide
+  for (int link = std::max(1, e.contact.link - 1); link <= std::min(chain.links() - 1, e.contact.link + 1); ++link)
+    if (frame.hidden[link] > 0.0 && frame.speed[link] < kMovingSpeeds * p.coulomb_speed) e.moving = false;
+  return e;
+}
+
+// The line of state `at` of a live window, which ends with the newest state.
+Estimate live_line(Live& live, std::size_t at) {
+  const bool automatic = !live.contact;
+  const Motion motion = smooth(live.states, live.standing);
+  const double time = motion.time[at];
+  Frame frame = frame_of(live.model, live.deviations, live.base(time), motion, at, live.options);
+  if (!automatic)
+    if (const std::optional<Contact> contact = live.contact(time, motion.theta[at]))
+      frame.named = *contact, frame.is_named = true;
+  const Track track = track_of(live.model.chain, automatic, live.options);
+  const std::vector<Fit> fits = fits_at(live.model, frame, track, automatic);
+  const double interval = at > 0 ? time - motion.time[at - 1] : motion.time[at + 1] - time;
+  const VectorX before =
+      live.belief.size() == 0 ? first_belief(track) : VectorX(transition(track, interval) * live.belief);
+  live.belief = seen(before, likelihood(track, evidence_of(fits), interval));
+  ++live.lines;
+  return line_of(live.model, time, frame, fits, live.belief, track, automatic);
 }
 
 }  // namespace
@@ -247,87 +334,91 @@ Contact nearest_contact(const chain::Chain& chain, const splat::Gaussians& gauss
   return best;
 }
 
-std::vector<Estimate> estimate(const dynamics::Model& model, const dynamics::BaseFunction& base, const Motion& motion,
-                               std::span<const std::optional<Contact>> contacts, bool live, const Options& options) {
+std::vector<dynamics::Model> deviations(const dynamics::Model& model, const dynamics::Estimates& estimates) {
   const chain::Chain& chain = model.chain;
+  std::vector<std::string> names;
+  MatrixX covariance;
+  const auto all = static_cast<Eigen::Index>(estimates.names.size());
+  if (all > 0 && estimates.covariance.rows() == all && estimates.covariance.cols() == all) {
+    const std::vector<dynamics::Tangent> tangents = dynamics::tangents(chain, model.parameters, estimates.names);
+    std::vector<Eigen::Index> of;
+    for (Eigen::Index i = 0; i < all; ++i)
+      if (dynamics::is_parameter(tangents[i])) of.push_back(i), names.push_back(estimates.names[i]);
+    covariance = estimates.covariance(of, of);
+  } else {
+    for (const char* const name : {"log_stiffness_joint_", "log_damping_joint_"})
+      for (int joint = 1; joint < chain.links(); ++joint) names.push_back(name + std::to_string(joint));
+    const auto count = static_cast<Eigen::Index>(names.size());
+    covariance = kUnknownDeviation * kUnknownDeviation * MatrixX::Identity(count, count);
+  }
+  const Eigen::SelfAdjointEigenSolver<MatrixX> principal(covariance);
+  std::vector<dynamics::Model> out;
+  for (Eigen::Index i = 0; i < covariance.rows(); ++i) {
+    const double variance = principal.eigenvalues()[i];
+    if (!(variance > 0.0)) continue;
+    const VectorX change = std::sqrt(variance) * principal.eigenvectors().col(i);
+    out.push_back(dynamics::make_model(chain, dynamics::moved(chain, model.parameters, names, change)));
+  }
+  return out;
+}
+
+std::vector<Estimate> estimate(const dynamics::Model& model, std::span<const dynamics::Model> deviations,
+                               const dynamics::BaseFunction& base, const Motion& motion,
+                               std::span<const std::optional<Contact>> contacts, const Options& options) {
   const std::size_t count = motion.time.size();
   const bool automatic = contacts.empty();
   CHAINSPLAT_CHECK(automatic || contacts.size() == count, std::to_string(contacts.size()));
-  const double mass = total_mass(model.parameters), weight = mass * model.parameters.gravity.norm();
-  const double across = options.force_scale * mass / kPushedMass, along = options.along * across;
-  const auto jacobian_at = [&](const Frame& frame, const Contact& contact) {
-    return chain::point_jacobian(chain, frame.axes, contact.link, frame.motions[contact.link] * contact.home);
-  };
-  const auto prior_at = [&](const Frame& frame, const Contact& contact) {
-    const Vector3 tangent = frame.motions[contact.link].rotation * chain.direction;
-    return Matrix3(across * across * Matrix3::Identity() +
-                   (along * along - across * across) * tangent * tangent.transpose());
-  };
-  const auto evidence_at = [&](const Frame& frame, const Contact& contact) {
-    return solve(jacobian_at(frame, contact), frame.residual, frame.covariance, prior_at(frame, contact)).evidence;
-  };
+  const Track track = track_of(model.chain, automatic, options);
   std::vector<Frame> frames;
-  for (std::size_t f = 0; f < count; ++f) frames.push_back(frame_of(model, base(motion.time[f]), motion, f, options));
-
-  // how much better a force at each place explains each time than none does
-  std::vector<double> arclengths;
-  MatrixX evidence;
-  if (automatic) {
-    for (int i = 1; i <= options.places; ++i) arclengths.push_back(chain.length * i / options.places);
-    evidence.resize(options.places, static_cast<Eigen::Index>(count));
-    for (std::size_t f = 0; f < count; ++f)
-      for (int i = 0; i < options.places; ++i)
-        evidence(i, f) = evidence_at(frames[f], contact_at(chain, arclengths[i]));
-  } else {
-    arclengths.push_back(chain.length);
-    evidence.resize(1, static_cast<Eigen::Index>(count));
-    for (std::size_t f = 0; f < count; ++f)
-      evidence(0, f) = contacts[f] ? evidence_at(frames[f], *contacts[f]) : kNotSaid;
-  }
-  const Track track = follow(evidence, motion.time, arclengths, automatic ? kOddsOfNone : kOddsWhereNamed,
-                             options.slide * chain.length, live, options);
-
-  std::vector<Estimate> out;
+  std::vector<std::vector<Fit>> fits;
+  std::vector<VectorX> likely, belief;
+  const auto interval = [&](std::size_t f) {
+    return f > 0 ? motion.time[f] - motion.time[f - 1] : motion.time[1] - motion.time[0];
+  };
+  MatrixX step;
+  double step_interval = -1.0;
+  const auto step_over = [&](double h) -> const MatrixX& {
+    if (std::abs(h - step_interval) > 1e-9) step = transition(track, step_interval = h);
+    return step;
+  };
   for (std::size_t f = 0; f < count; ++f) {
-    const Frame& frame = frames[f];
-    Estimate e;
-    e.time = motion.time[f];
-    e.contact = contact_at(chain, chain.length);
-    if (automatic) {
-      e.contact = contact_at(chain, track.arclength[f]);
-      e.arclength_sigma = track.deviation[f];
-    } else if (contacts[f]) {
-      e.contact = *contacts[f];
-    }
-    e.point = frame.motions[e.contact.link] * e.contact.home;
-    if (automatic || contacts[f]) {
-      e.probability = track.probability[f];
-      const MatrixX jacobian = jacobian_at(frame, e.contact);
-      const Matrix3 prior = prior_at(frame, e.contact);
-      const Fit fit = solve(jacobian, frame.residual, frame.covariance, prior);
-      const Vector3 variance = fit.covariance.diagonal();
-      // a contact that was named is believed
-      const double believed = automatic ? e.probability : 1.0;
-      e.force = believed * fit.force;
-      e.sigma = (variance + believed * (1.0 - believed) * fit.force.cwiseProduct(fit.force)).cwiseSqrt();
-      e.observed = (Vector3::Ones() - variance.cwiseQuotient(prior.diagonal())).cwiseMax(0.0);
-      e.touching = e.probability > 0.5 && e.force.norm() > kTouchingWeight * weight;
-      // friction at rest may balance any force up to its limit: about what the rope would feel if it balanced none
-      const Fit fit_sliding = solve(jacobian, frame.residual, frame.sliding_covariance, prior);
-      const double limit = std::accumulate(frame.hidden.begin(), frame.hidden.end(), 0.0);
-      e.low = e.high = e.force;
-      if (const auto& normal = model.parameters.table_normal) {
-        const Vector3 reach = limit * (Vector3::Ones() - normal->cwiseProduct(*normal)).cwiseMax(0.0).cwiseSqrt();
-        e.low = e.force.cwiseMin(fit_sliding.force - reach);
-        e.high = e.force.cwiseMax(fit_sliding.force + reach);
-      }
-    }
-    // friction is known where the links about the contact slide
-    for (int link = std::max(1, e.contact.link - 1); link <= std::min(chain.links() - 1, e.contact.link + 1); ++link)
-      if (frame.hidden[link] > 0.0 && frame.speed[link] < kMovingSpeeds * model.parameters.coulomb_speed)
-        e.moving = false;
-    out.push_back(e);
+    frames.push_back(frame_of(model, deviations, base(motion.time[f]), motion, f, options));
+    if (!automatic && contacts[f]) frames[f].named = *contacts[f], frames[f].is_named = true;
+    fits.push_back(fits_at(model, frames[f], track, automatic));
+    likely.push_back(likelihood(track, evidence_of(fits[f]), interval(f)));
+    belief.push_back(seen(f > 0 ? VectorX(step_over(interval(f)) * belief[f - 1]) : first_belief(track), likely[f]));
   }
+  VectorX later = VectorX::Ones(belief.back().size());
+  for (std::size_t f = count - 1; f-- > 0;) {
+    later = step_over(interval(f + 1)).transpose() * later.cwiseProduct(likely[f + 1]);
+    later /= later.sum();
+    belief[f] = seen(belief[f], later);
+  }
+  std::vector<Estimate> out;
+  for (std::size_t f = 0; f < count; ++f)
+    out.push_back(line_of(model, motion.time[f], frames[f], fits[f], belief[f], track, automatic));
+  return out;
+}
+
+std::optional<Estimate> update(Live& live, double time, const VectorX& theta, const MatrixX& standing) {
+  live.states.time.push_back(time);
+  live.states.theta.push_back(theta);
+  if (standing.size() > 0) live.standing.push_back(standing);
+  ++live.taken;
+  // the window keeps what is still needed for a line and a speed before it
+  std::size_t old = 0;
+  while (live.states.time.size() - old > kLiveLag + 3 && live.states.time[old] < time - kLiveWindow) ++old;
+  live.states.time.erase(live.states.time.begin(), live.states.time.begin() + old);
+  live.states.theta.erase(live.states.theta.begin(), live.states.theta.begin() + old);
+  if (!live.standing.empty()) live.standing.erase(live.standing.begin(), live.standing.begin() + old);
+  if (live.taken <= kLiveLag) return {};
+  return live_line(live, live.states.time.size() - 1 - kLiveLag);
+}
+
+std::vector<Estimate> finish(Live& live) {
+  std::vector<Estimate> out;
+  if (live.taken < 3) return out;
+  while (live.lines < live.taken) out.push_back(live_line(live, live.states.time.size() - (live.taken - live.lines)));
   return out;
 }
 

@@ -13,6 +13,9 @@ constexpr int kRatios = 13;
 constexpr double kFirstRate = 10.0, kFirstAcceleration = 100.0;  // rad/s, rad/s^2, before anything was seen
 constexpr double kLeastNoise = 1e-5;                             // rad
 constexpr double kCorrelationTimes = 2.0;  // an angle, as many as are needed to believe half of a correlation
+// What the noise is thought to be before it was seen, and as how many times that counts: the first states of a stream.
+constexpr double kUsualNoise = 2e-3;  // rad
+constexpr double kUsualTimes = 2.0;
 
 // All angles share the gains, which depend on the ratio and the times alone, so that variances are the noise's times
 // one 3 x 3 matrix a time.
@@ -72,13 +75,9 @@ Filtered filter(const std::vector<double>& time, const std::vector<VectorX>& the
     out.covariance.push_back(covariance);
   }
   // few times do not tell how the angles' errors hang together
-  out.noise = MatrixX::Zero(n, n);
-  if (used > 0) {
-    const double trust = used / (used + kCorrelationTimes * n);
-    out.noise = trust / used * squares;
-    out.noise.diagonal() = squares.diagonal() / used;
-  }
-  out.noise.diagonal().array() += kLeastNoise * kLeastNoise;
+  out.noise = squares / (used + kCorrelationTimes * n);
+  out.noise.diagonal() = (squares.diagonal().array() + kUsualTimes * kUsualNoise * kUsualNoise) / (used + kUsualTimes) +
+                         kLeastNoise * kLeastNoise;
   const Eigen::LLT<MatrixX> factor(out.noise);
   out.log_likelihood = -0.5 * (n * logs + 2.0 * used * factor.matrixLLT().diagonal().array().log().sum() +
                                factor.solve(squares).trace());
@@ -87,7 +86,7 @@ Filtered filter(const std::vector<double>& time, const std::vector<VectorX>& the
 
 }  // namespace
 
-Motion smooth(const chain::States& states, std::span<const MatrixX> standing, bool live) {
+Motion smooth(const chain::States& states, std::span<const MatrixX> standing) {
   const std::size_t count = states.time.size();
   if (count < 3) throw InputError("states", "are fewer than three", "give more: forces need accelerations");
   Filtered best;
@@ -108,10 +107,7 @@ Motion smooth(const chain::States& states, std::span<const MatrixX> standing, bo
   Matrix3 covariance = best.covariance.back();
   for (std::size_t back = 0; back < count; ++back) {
     const std::size_t f = count - 1 - back;
-    if (live) {
-      mean = best.mean[f];
-      covariance = best.covariance[f];
-    } else if (back > 0) {
+    if (back > 0) {
       const Matrix3 step = transition(states.time[f + 1] - states.time[f]);
       const Matrix3 gain = best.covariance[f] * step.transpose() * best.predicted_covariance[f + 1].inverse();
       mean = (best.mean[f] + (mean - best.predicted[f + 1]) * gain.transpose()).eval();

@@ -14,6 +14,21 @@ expect_code 0 'force'
 expect_output '^\{"time":.*"link":.*"arclength":.*"force":\[.*"sigma":\[.*"touching":.*"low":\[.*"unit":"N' force
 force --live
 expect_code 0 'force --live'
+[ "$(wc -l <"$work/stdout")" -eq 12 ] || fail 'force --live: not a line a state'
+
+# live, from a pipe: the first line comes when two more states are there, before the stream ends
+estimates() {  # first and last of the 12 states, as 'estimate' prints them
+  awk -F, -v first="$1" -v last="$2" 'NR > first && NR <= last + 1 {
+    printf "{\"time\":%s,\"theta\":[%s,%s,%s],\"sigma\":[0.01,0.01,0.01],\"lost\":false}\n", $1, $2, $3, $4 }' "$states"
+}
+wait_for_line() {  # at most ten seconds
+  for _ in $(seq 200); do [ -s "$work/live" ] && return; sleep 0.05; done
+}
+: >"$work/live"
+{ estimates 1 4; wait_for_line; wc -l <"$work/live" >"$work/early"; estimates 5 12; } |
+  "$program" -q force "$work/twin" --estimate - --base "$demo/base.tum" --live >"$work/live" || fail 'force --live, pipe'
+[ "$(cat "$work/early")" -ge 1 ] || fail 'force --live: no line before the stream ended'
+[ "$(wc -l <"$work/live")" -eq 12 ] || fail 'force --live, pipe: not a line a state'
 
 # a contact at the free end, and none
 point=$(sed -n '1s/.*"point":\[\([^]]*\)\].*/\1/p' "$work/stdout")
