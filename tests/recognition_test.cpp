@@ -16,7 +16,7 @@ namespace {
 const Path kDemo = Path(CHAINSPLAT_SOURCE_DIR) / "assets/demo_free_30";
 
 gpu::Device& device() {
-  static const gpu::DevicePtr opened = gpu::open_device({.validation = true});
+  static const gpu::DevicePtr opened = gpu::open_device({.selector = {}, .validation = true});
   return *opened;
 }
 

@@ -1,11 +1,14 @@
 // bench.cpp - fixed benchmarks of drawing and training, defined here and seeded, so that two machines measure the same
 // work.
 #include <sys/resource.h>
+#include <unistd.h>
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <fstream>
+#include <fstream>
 #include <iomanip>
 #include <iostream>
 #include <map>
@@ -34,7 +37,7 @@ struct Request {
   std::string gaussians, views;  // empty: the fixed cases
   std::string scene = "both", capture;
   bool whole = false, only_capture = false;
-  int repeats = 9;
+  int repeats = 9, trainings = 1;
 };
 
 // What is measured: one scene, defined by these numbers and a seed.
@@ -165,6 +168,14 @@ double peak_memory_mib() {
   getrusage(RUSAGE_SELF, &usage);
   constexpr double kKibPerMib = 1024.0;
   return static_cast<double>(usage.ru_maxrss) / kKibPerMib;
+}
+
+// What the process holds now, MiB; 0 where the system does not say.
+double memory_mib() {
+  std::ifstream file("/proc/self/statm");
+  double all = 0.0, resident = 0.0;
+  file >> all >> resident;
+  return resident * static_cast<double>(sysconf(_SC_PAGESIZE)) / (1024.0 * 1024.0);
 }
 
 struct Measured {
@@ -354,8 +365,9 @@ void bench(const Globals& globals, const Request& request) {
               << "scene         gaussians views links     draw     step   median    least processor   its passes\n";
   for (const Case& what : cases)
     document["results"].push_back(bench_case(*device, what, request.repeats, globals.seed, !globals.json));
-  if (!request.capture.empty()) {
-    const Json entry = bench_capture(*device, request.capture, globals.seed);
+  std::vector<double> held;  // MiB after each training
+  for (int k = 0; !request.capture.empty() && k < request.trainings; ++k) {
+    Json entry = bench_capture(*device, request.capture, globals.seed);
     if (!globals.json) {
       std::cout << "\n" << entry["name"].get<std::string>() << ":";
       for (const auto& [stage, seconds] : entry["seconds"].items())
@@ -365,7 +377,16 @@ void bench(const Globals& globals, const Request& request) {
                 << estimate["frames_per_second"].get<double>() << " frames/s, 99 % within " << std::setprecision(2)
                 << estimate["p99_ms"].get<double>() << " ms\n";
     }
+    held.push_back(memory_mib());
+    entry["memory_mib"] = held.back();
     document["captures"].push_back(entry);
+  }
+  if (held.size() >= 4) {
+    const double growth = 100.0 * (held.back() / held[held.size() / 2] - 1.0);
+    document["memory_growth_percent"] = growth;
+    if (!globals.json)
+      std::cout << "memory after half of the trainings " << std::fixed << std::setprecision(1) << held[held.size() / 2]
+                << " MiB, after all " << held.back() << " MiB: " << std::showpos << growth << std::noshowpos << " %\n";
   }
   document["peak_memory_mib"] = peak_memory_mib();
   if (!globals.json)
@@ -387,6 +408,11 @@ void add_bench_command(CLI::App& app, const Globals& globals, Job& job) {
       ->add_option("--capture", request->capture,
                    "Also the whole work on this capture: training by stage, drawing every frame, following the rope")
       ->type_name("CAPTURE");
+  command
+      ->add_option("--trainings", request->trainings,
+                   "Do the capture's work so many times and say how the memory of the process grows")
+      ->check(CLI::Range(1, 10000))
+      ->capture_default_str();
   command->add_flag("--only-capture", request->only_capture, "Nothing but the capture's work");
   command->add_flag("--whole", request->whole, "Whole images of 640x480 in these, not crops about the rope");
   command->add_option("--scene", request->scene, "far (1 % of the image), close (8 %) or both")->capture_default_str();
