@@ -6,6 +6,7 @@
 #include <functional>
 #include <iostream>
 #include <memory>
+#include <span>
 #include <thread>
 
 #include "chainsplat/capture.h"
@@ -44,6 +45,12 @@ using Subscriber = std::function<void(const Followed&)>;
 using MaskMaker = std::function<capture::View(const capture::Image8& picture, const math::Pose& base,
                                               const std::optional<math::VectorX>& theta)>;
 
+// What follows the rope: frame by frame, and where it expects the rope at a time.
+struct Follower {
+  std::function<estimation::Estimate(std::span<const capture::View* const> views)> update;
+  std::function<std::optional<math::VectorX>(double time)> expected;
+};
+
 struct FollowOptions {
   int drop = 1;
   double base_end = std::numeric_limits<double>::infinity();  // s, until when the base's motion is known
@@ -51,8 +58,8 @@ struct FollowOptions {
 };
 
 // Frame by frame until the source ends.
-void follow(FrameSource& source, estimation::Filter& filter, const MaskMaker& mask, const FollowOptions& options,
-            const std::vector<Subscriber>& subscribers) {
+void follow(FrameSource& source, const Follower& follower, const dynamics::BaseFunction& base, const MaskMaker& mask,
+            const FollowOptions& options, const std::vector<Subscriber>& subscribers) {
   LiveFrame frame;
   std::vector<capture::View> made;
   for (int read = 0; source.next(frame); ++read) {
@@ -65,14 +72,14 @@ void follow(FrameSource& source, estimation::Filter& filter, const MaskMaker& ma
                           std::to_string(frame.frame),
                       "give a base motion as long as the frames; the states so far are kept");
     if (!source.masked) {
-      made.assign(1, mask(frame.picture, filter.base(frame.time).pose, estimation::expected(filter, frame.time)));
+      made.assign(1, mask(frame.picture, base(frame.time).pose, follower.expected(frame.time)));
       made[0].frame = frame.frame;
       made[0].time = frame.time;
     }
     const std::vector<capture::View>& views = source.masked ? frame.views : made;
     std::vector<const capture::View*> pointers;
     for (const capture::View& view : views) pointers.push_back(&view);
-    const estimation::Estimate estimate = estimation::update(filter, pointers);
+    const estimation::Estimate estimate = follower.update(pointers);
     for (const Subscriber& subscriber : subscribers)
       subscriber({frame, views, estimate, core::seconds_now() - frame.arrived});
   }
@@ -161,10 +168,32 @@ void estimate(const Globals& globals, EstimateRequest& request) {
       core::warn(std::string(error.what()) + "; the rope is followed by its outline alone");
     }
   }
-  if (engine) {
+  const bool by_adam = request.solver == "adam";
+  if (by_adam && !engine)
+    throw InputError("--solver", "adam draws the twin, and " + request.run + " has no Gaussians", "train it first");
+  if (engine && !by_adam) {
     filter.draw = [&](const capture::View& view, const std::vector<math::Pose>& motions) {
       const splat::ViewSpec spec{&source.cameras.at(view.camera), view.x0, view.y0, view.width, view.height, motions};
       return std::move(engine->draw(twin.gaussians, {&spec, 1}, true).front());
+    };
+  }
+  Follower follower;
+  follower.update = [&](std::span<const capture::View* const> views) { return estimation::update(filter, views); };
+  follower.expected = [&](double time) { return estimation::expected(filter, time); };
+  estimation::AdamFollower adam;
+  if (by_adam) {
+    adam = estimation::start_adam(filter, [&](const capture::View& view, const std::vector<math::Pose>& motions) {
+      const capture::Camera& camera = source.cameras.at(view.camera);
+      const splat::ViewSpec spec{&camera, view.x0, view.y0, view.width, view.height, motions};
+      const std::vector<std::uint8_t>* const target = &view.rgba;
+      splat::Gradients gradients;
+      engine->loss(twin.gaussians, {&spec, 1}, {&target, 1}, {}, static_cast<double>(camera.width) * camera.height,
+                   &gradients);
+      return std::move(gradients.link_twists.front());
+    });
+    follower.update = [&](std::span<const capture::View* const> views) { return estimation::update(adam, views); };
+    follower.expected = [&](double) {
+      return adam.theta.size() > 0 ? std::optional<math::VectorX>(adam.theta) : std::nullopt;
     };
   }
   std::optional<bool> masked_before;  // by the first picture
@@ -228,7 +257,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
           latency_text(latencies) + ".");
   };
   try {
-    follow(source, filter, mask, options, subscribers);
+    follow(source, follower, filter.base, mask, options, subscribers);
   } catch (const Interrupted&) {
     write();
     summarize();
@@ -272,8 +301,10 @@ void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->add_option("--solver", request->solver,
                    "newton: outlines, then the colors inside them, drawn on the Vulkan device (default, where there\n"
                    "is one)\n"
-                   "silhouette: outlines alone, without a device")
-      ->check(CLI::IsMember({"newton", "silhouette"}))
+                   "silhouette: outlines alone, without a device\n"
+                   "adam: the paper's, 10 Adam steps on the rendering loss from the last frame's angles, without\n"
+                   "deviations; to compare with")
+      ->check(CLI::IsMember({"newton", "silhouette", "adam"}))
       ->type_name("KIND");
   command->add_option("--frames", request->frames, "Only frames A to B - 1")->type_name("A:B");
   command->add_option("--drop", request->drop, "Use every N-th frame (default 1)")->type_name("N");

@@ -51,7 +51,7 @@ struct Estimate {
   int frame = 0;
   double time = 0.0;              // s
   math::VectorX theta, thetadot;  // rad, rad/s; n
-  math::MatrixX covariance;       // of (theta, thetadot), 2 n x 2 n
+  math::MatrixX covariance;       // of (theta, thetadot), 2 n x 2 n; empty: not known
   double centerline_sigma = 0.0;  // m, standard deviation of the centerline, RMS over the rope
   double iou = 0.0;               // of the chain's tube and the mask
   double residual = 0.0;          // px, RMS of the mask's outline about the tube's, robust
@@ -99,6 +99,32 @@ Belief predict(const Filter& filter, const Belief& belief, double time, Contact 
 
 // Where the rope will be at `time`, for whoever must look for it there; none before the first frame and while lost.
 std::optional<math::VectorX> expected(const Filter& filter, double time);
+
+// The paper's way ("State Estimation"), to compare with: a few Adam steps on the rendering loss of every frame, from
+// the last frame's angles. No motion model, no covariance; rates are differences of the angles.
+struct AdamOptions {
+  int steps = 10;         // a frame, the paper's
+  int first_steps = 100;  // of the first frame, from the motion that the twin expects
+  double rate = 0.01;     // rad, as in recognition
+};
+
+// Gradient of the rendering loss with respect to the links' motions: world twists, 6 x links (SPEC 2.8).
+using LinkGradient = std::function<math::MatrixX(const capture::View& view, const std::vector<math::Pose>& motions)>;
+
+struct AdamFollower {
+  Filter filter;  // its twin, cameras and base; it has no belief
+  LinkGradient gradient;
+  AdamOptions options;
+  math::VectorX theta;  // of the last frame; empty before the first
+  double time = 0.0;
+};
+
+AdamFollower start_adam(const Filter& filter, LinkGradient gradient, const AdamOptions& options = {});
+
+// As update() of the filter, with an empty covariance.
+Estimate update(AdamFollower& follower, std::span<const capture::View* const> views);
+
+bool has_mask(const capture::View& view);
 
 // Share of pixels in both the mask and the tube about the chain among those in either.
 double tube_iou(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta,

@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "src/estimation/color.h"
+#include "src/estimation/start.h"
 
 namespace chainsplat::estimation {
 
@@ -45,7 +46,6 @@ constexpr double kLinkDeviation = 0.02;
 constexpr double kArc = 1.0 / 16.0;
 constexpr double kUnseenAngle = 0.5;  // rad, of angles that move no joint (twist)
 
-constexpr double kLostShare = 0.5;      // of the mask explained, under which the rope is lost (SPEC 6)
 constexpr double kLongUnseen = 0.5;     // s without a mask after which the rope counts as lost
 constexpr double kLostAngle = 0.5;      // rad, and
 constexpr double kLostRate = 5.0;       // rad/s: standard deviations from which a lost rope is sought
@@ -251,33 +251,6 @@ Motion move(const Filter& filter, const Belief& belief, double time) {
   return out;
 }
 
-// What is believed before the first frame: the motion from rest that the twin expects, roughly.
-Belief first_belief(const Filter& filter, double time) {
-  const int n = filter.model.chain.angles();
-  Belief belief;
-  belief.time = time;
-  belief.mean = VectorX::Zero(3 * n);
-  belief.mean.head(n) = filter.rest;
-  if (filter.identified && filter.base_start < time) {
-    const dynamics::BaseGrid grid =
-        dynamics::sample_base(filter.base, filter.base_start, {time}, filter.model.parameters.substeps);
-    chain::States states;
-    if (dynamics::simulate(filter.model, grid, filter.rest, VectorX::Zero(n), states)) {
-      belief.mean.head(n) = states.theta.back();
-      belief.mean.segment(n, n) = states.thetadot.back();
-    }
-  }
-  belief.covariance = MatrixX::Zero(3 * n, 3 * n);
-  belief.covariance.diagonal().head(n).setConstant(kFirstAngle * kFirstAngle);
-  belief.covariance.diagonal().segment(n, n).setConstant(kFirstRate * kFirstRate);
-  if (filter.shifts)
-    belief.covariance.bottomRightCorner(n, n) =
-        shift_covariance(filter, filter.base(time).pose, belief.mean.head(n),
-                         kFirstForce * total_mass(filter.model.parameters), filter.everywhere);
-  belief.covariance.diagonal().array() += kLeastVariance;
-  return belief;
-}
-
 struct Measured {
   silhouette::FrameFit fit;
   Belief belief;          // with what was seen
@@ -356,12 +329,6 @@ void look_at_colors(const Filter& filter, std::span<const capture::View* const> 
   }
 }
 
-bool has_mask(const capture::View& view) {
-  for (std::size_t i = 3; i < view.rgba.size(); i += 4)
-    if (view.rgba[i] >= 128) return true;
-  return false;
-}
-
 bool explains(const silhouette::FrameFit& fit) { return fit.covered >= kLostShare && fit.theta.allFinite(); }
 
 }  // namespace
@@ -393,6 +360,38 @@ Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras
     filter.rest = dynamics::static_equilibrium(filter.model, filter.base(base_start).pose);
   }
   return filter;
+}
+
+Belief first_belief(const Filter& filter, double time) {
+  const int n = filter.model.chain.angles();
+  Belief belief;
+  belief.time = time;
+  belief.mean = VectorX::Zero(3 * n);
+  belief.mean.head(n) = filter.rest;
+  if (filter.identified && filter.base_start < time) {
+    const dynamics::BaseGrid grid =
+        dynamics::sample_base(filter.base, filter.base_start, {time}, filter.model.parameters.substeps);
+    chain::States states;
+    if (dynamics::simulate(filter.model, grid, filter.rest, VectorX::Zero(n), states)) {
+      belief.mean.head(n) = states.theta.back();
+      belief.mean.segment(n, n) = states.thetadot.back();
+    }
+  }
+  belief.covariance = MatrixX::Zero(3 * n, 3 * n);
+  belief.covariance.diagonal().head(n).setConstant(kFirstAngle * kFirstAngle);
+  belief.covariance.diagonal().segment(n, n).setConstant(kFirstRate * kFirstRate);
+  if (filter.shifts)
+    belief.covariance.bottomRightCorner(n, n) =
+        shift_covariance(filter, filter.base(time).pose, belief.mean.head(n),
+                         kFirstForce * total_mass(filter.model.parameters), filter.everywhere);
+  belief.covariance.diagonal().array() += kLeastVariance;
+  return belief;
+}
+
+bool has_mask(const capture::View& view) {
+  for (std::size_t i = 3; i < view.rgba.size(); i += 4)
+    if (view.rgba[i] >= 128) return true;
+  return false;
 }
 
 Belief predict(const Filter& filter, const Belief& belief, double time, Contact contact) {
@@ -593,7 +592,8 @@ std::string to_json(const Estimate& estimate, double latency, bool rates) {
   };
   const int n = static_cast<int>(estimate.theta.size());
   std::string covariance;
-  for (Eigen::Index row = 0; row < (rates ? 2 * n : n); ++row)
+  const Eigen::Index rows = std::min<Eigen::Index>(estimate.covariance.rows(), rates ? 2 * n : n);
+  for (Eigen::Index row = 0; row < rows; ++row)
     for (Eigen::Index column = 0; column <= row; ++column) {
       char number[32];
       std::snprintf(number, sizeof number, "%s%.9g", row ? "," : "", estimate.covariance(row, column));
@@ -602,10 +602,10 @@ std::string to_json(const Estimate& estimate, double latency, bool rates) {
   char milliseconds[32];
   std::snprintf(milliseconds, sizeof milliseconds, "%.3f", 1e3 * latency);
   return "{\"frame\":" + std::to_string(estimate.frame) + ",\"time\":" + core::exact(estimate.time) +
-         ",\"theta\":" + list(estimate.theta) + ",\"thetadot\":" + list(estimate.thetadot) +
-         ",\"sigma\":" + list(estimate.covariance.diagonal().head(n).cwiseSqrt()) +
-         ",\"centerline_sigma\":" + core::exact(estimate.centerline_sigma) + ",\"iou\":" + core::exact(estimate.iou) +
-         ",\"residual\":" + core::exact(estimate.residual) +
+         ",\"theta\":" + list(estimate.theta) + ",\"thetadot\":" + list(estimate.thetadot) + ",\"sigma\":" +
+         list(estimate.covariance.diagonal().head(std::min<Eigen::Index>(n, estimate.covariance.rows())).cwiseSqrt()) +
+         ",\"centerline_sigma\":" + (rows > 0 ? core::exact(estimate.centerline_sigma) : "null") +
+         ",\"iou\":" + core::exact(estimate.iou) + ",\"residual\":" + core::exact(estimate.residual) +
          ",\"color_residual\":" + core::exact(estimate.color_residual) + ",\"covariance\":[" + covariance +
          "],\"lost\":" + (estimate.lost ? "true" : "false") + ",\"latency_ms\":" + milliseconds + "}";
 }
