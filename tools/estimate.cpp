@@ -286,9 +286,11 @@ void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job) {
   auto request = std::make_shared<EstimateRequest>();
   command->add_option("RUN", request->run, "Run folder of a twin")->required();
   command
-      ->add_option("--camera", request->source.camera,
-                   "CAPTURE:NAME one camera of a capture, CAPTURE all of them together; with --calibration a video or\n"
-                   "- for raw RGB24 frames on standard input, of the rope on black or as it comes: then masks are made")
+      ->add_option(
+          "--camera", request->source.camera,
+          "CAPTURE:NAME one camera of a capture, CAPTURE all of them together; with --calibration a video, a\n"
+          "V4L2 device such as /dev/video0, or - for raw RGB24 frames on standard input, of the rope on black\n"
+          "or as it comes: then masks are made")
       ->required()
       ->type_name("SOURCE");
   command->add_option("--calibration", request->source.calibration, "Camera object as in capture.json")

@@ -132,14 +132,17 @@ FrameSource open_stream(const SourceRequest& request) {
   if (rate <= 0.0) rate = own_rate;
   std::shared_ptr<capture::VideoReader> reader;
   if (request.camera != "-") {
-    if (rate <= 0.0) rate = capture::video_facts(request.camera).rate;
-    reader = std::make_shared<capture::VideoReader>(request.camera);
+    const capture::Camera& camera = source.cameras[0];
+    reader = std::make_shared<capture::VideoReader>(
+        request.camera, 1, capture::DeviceFormat{.width = camera.width, .height = camera.height, .rate = rate});
+    if (rate <= 0.0) rate = reader->rate();
   }
-  if (!(rate > 0.0) || !std::isfinite(rate))
+  const bool own_clock = reader && reader->device();  // frames that were dropped leave a gap in time
+  if (!own_clock && (!(rate > 0.0) || !std::isfinite(rate)))
     throw InputError("--rate", "is needed to know the frames' times", "give frames a second, for example 30");
   const std::string where = request.camera == "-" ? "standard input" : request.camera;
-  source.next = [camera = source.cameras[0], request, reader, rate, start, where,
-                 count = 0](LiveFrame& frame) mutable {
+  source.next = [camera = source.cameras[0], request, reader, rate, start, where, own_clock, count = 0,
+                 begun = 0.0](LiveFrame& frame) mutable {
     do {
       if (request.last >= 0 && count >= request.last) return false;
       if (!(reader ? reader->next(frame.picture) : read_raw(camera, frame.picture))) return false;
@@ -151,7 +154,8 @@ FrameSource open_stream(const SourceRequest& request) {
                         "give the calibration of this camera; the states so far are kept");
     } while (count++ < request.first);
     frame.frame = count - 1;
-    frame.time = start + frame.frame / rate;
+    if (own_clock && frame.frame == request.first) begun = reader->time();
+    frame.time = own_clock ? start + reader->time() - begun : start + frame.frame / rate;
     frame.views.clear();
     frame.arrived = core::seconds_now();
     return true;
@@ -166,20 +170,21 @@ FrameSource open_frames(const SourceRequest& request) {
 }
 
 capture::View bright_view(const capture::Image8& picture, const capture::Camera& camera) {
-  std::vector<std::uint8_t> mask(static_cast<std::size_t>(camera.width) * camera.height, 0);
+  std::vector<std::int32_t> from(static_cast<std::size_t>(camera.width) * camera.height, -1);  // pixel; black: -1
   const bool distorted = camera.distorted();
   int x0 = camera.width, y0 = camera.height, x1 = 0, y1 = 0;
   for (int y = 0; y < camera.height; ++y)
     for (int x = 0; x < camera.width; ++x) {
       int u = x, v = y;
       if (distorted) {
-        const math::Vector2 from = capture::distort(camera, math::Vector2(x + 0.5, y + 0.5));
-        u = static_cast<int>(std::floor(from.x())), v = static_cast<int>(std::floor(from.y()));
+        const math::Vector2 at = capture::distort(camera, math::Vector2(x + 0.5, y + 0.5));
+        u = static_cast<int>(std::floor(at.x())), v = static_cast<int>(std::floor(at.y()));
         if (u < 0 || v < 0 || u >= camera.width || v >= camera.height) continue;
       }
-      const std::uint8_t* const rgb = &picture.pixels[3 * (static_cast<std::size_t>(v) * camera.width + u)];
+      const std::int32_t pixel = v * camera.width + u;
+      const std::uint8_t* const rgb = &picture.pixels[3 * static_cast<std::size_t>(pixel)];
       if (std::max({rgb[0], rgb[1], rgb[2]}) <= kBlack) continue;
-      mask[static_cast<std::size_t>(y) * camera.width + x] = 255;
+      from[static_cast<std::size_t>(y) * camera.width + x] = pixel;
       x0 = std::min(x0, x), x1 = std::max(x1, x + 1), y0 = std::min(y0, y), y1 = y + 1;
     }
   capture::View view;
@@ -189,9 +194,13 @@ capture::View bright_view(const capture::Image8& picture, const capture::Camera&
   view.height = std::min(camera.height, y1 + kMargin) - view.y0;
   view.rgba.assign(4 * static_cast<std::size_t>(view.width) * view.height, 0);
   for (int y = 0; y < view.height; ++y)
-    for (int x = 0; x < view.width; ++x)
-      view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] =
-          mask[static_cast<std::size_t>(view.y0 + y) * camera.width + view.x0 + x];
+    for (int x = 0; x < view.width; ++x) {
+      const std::int32_t pixel = from[static_cast<std::size_t>(view.y0 + y) * camera.width + view.x0 + x];
+      if (pixel < 0) continue;
+      std::uint8_t* const rgba = &view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x)];
+      std::copy_n(&picture.pixels[3 * static_cast<std::size_t>(pixel)], 3, rgba);
+      rgba[3] = 255;
+    }
   return view;
 }
 

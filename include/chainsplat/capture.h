@@ -106,14 +106,24 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
 
 // Decodes a video frame by frame, in display order. Colors: swscale's default bicubic, matrix and range from the
 // stream's tags, else BT.601 limited. Throws InputError (missing, not a video, a frame that cannot be decoded).
+struct DeviceFormat {  // asked of a camera; 0: its own choice
+  int width = 0, height = 0;
+  double rate = 0.0;  // frames a second
+};
+
 class VideoReader {
  public:
-  explicit VideoReader(const Path& file, int threads = 1);
+  // A file, a pipe, or the camera behind a character device (V4L2): then `format` is asked for, and a camera that
+  // disappears is a frame that cannot be decoded.
+  explicit VideoReader(const Path& file, int threads = 1, const DeviceFormat& format = {});
   ~VideoReader();
   VideoReader(VideoReader&&) noexcept;
   VideoReader& operator=(VideoReader&&) noexcept;
   bool next(Image8& rgb);  // false at the end; reuses the memory of `rgb`
   bool skip();             // the same without the conversion to RGB
+  bool device() const;     // a camera, not a recording
+  double rate() const;     // mean frames a second that the stream claims, 0 when unknown
+  double time() const;     // s, of the last frame by the stream's clock; NaN when it has none
 
  private:
   struct Implementation;

@@ -1,6 +1,7 @@
-// Videos through libav: decoding frame by frame, counting, encoding.
+// Videos and cameras through libav: decoding frame by frame, counting, encoding.
 extern "C" {
 #include <libavcodec/avcodec.h>
+#include <libavdevice/avdevice.h>
 #include <libavformat/avformat.h>
 #include <libavutil/opt.h>
 #include <libswscale/swscale.h>
@@ -8,7 +9,9 @@ extern "C" {
 
 #include <unistd.h>
 
+#include <cmath>
 #include <cstring>
+#include <limits>
 #include <mutex>
 #include <new>
 
@@ -60,15 +63,35 @@ struct Opened {
   const AVStream& video() const { return *format->streams[stream]; }
 };
 
-Opened open_video(const Path& file) {
+bool is_device(const Path& file) {
+  std::error_code error;
+  return std::filesystem::is_character_file(file, error);
+}
+
+Opened open_video(const Path& file, const DeviceFormat& format = {}) {
   silence();
   std::error_code error;
   if (!std::filesystem::exists(file, error)) throw InputError(file.string(), "does not exist", "check the path");
   AVFormatContext* raw = nullptr;
-  int code = avformat_open_input(&raw, file.c_str(), nullptr, nullptr);
-  if (code < 0)
-    throw InputError(file.string(), "is not a readable video (" + error_text(code) + ")",
-                     "write it again, or name an image pattern like cam0/%06d.png");
+  int code = 0;
+  if (is_device(file)) {
+    avdevice_register_all();
+    AVDictionary* asked = nullptr;
+    if (format.width > 0 && format.height > 0)
+      av_dict_set(&asked, "video_size", (std::to_string(format.width) + "x" + std::to_string(format.height)).c_str(),
+                  0);
+    if (format.rate > 0.0) av_dict_set(&asked, "framerate", core::exact(format.rate).c_str(), 0);
+    code = avformat_open_input(&raw, file.c_str(), av_find_input_format("video4linux2"), &asked);
+    av_dict_free(&asked);
+    if (code < 0)
+      throw InputError(file.string(), "is no camera that V4L2 can read in this format (" + error_text(code) + ")",
+                       "'v4l2-ctl --list-devices' and '--list-formats-ext' show what there is");
+  } else {
+    code = avformat_open_input(&raw, file.c_str(), nullptr, nullptr);
+    if (code < 0)
+      throw InputError(file.string(), "is not a readable video (" + error_text(code) + ")",
+                       "write it again, or name an image pattern like cam0/%06d.png");
+  }
   Opened opened{Owned<AVFormatContext>(raw), 0};
   code = avformat_find_stream_info(raw, nullptr);
   if (code >= 0) code = av_find_best_stream(raw, AVMEDIA_TYPE_VIDEO, -1, -1, nullptr, 0);
@@ -114,17 +137,19 @@ struct VideoReader::Implementation {
   Owned<SwsContext> scaler;
   Owned<AVFrame> converted;
   int scaler_width = 0, scaler_height = 0, scaler_format = -1, scaler_matrix = -1;
-  bool scaler_full = false, at_end = false;
+  bool scaler_full = false, at_end = false, device = false;
   int frames = 0;
 
   bool decode();
   void convert(Image8& rgb);
 };
 
-VideoReader::VideoReader(const Path& file, int threads) : implementation_(std::make_unique<Implementation>()) {
+VideoReader::VideoReader(const Path& file, int threads, const DeviceFormat& format)
+    : implementation_(std::make_unique<Implementation>()) {
   Implementation& self = *implementation_;
   self.file = file;
-  self.input = open_video(file);
+  self.device = is_device(file);
+  self.input = open_video(file, format);
   const AVCodecParameters& parameters = *self.input.video().codecpar;
   const AVCodec* codec = avcodec_find_decoder(parameters.codec_id);
   if (!codec)
@@ -161,8 +186,10 @@ bool VideoReader::Implementation::decode() {
       }
     }
     if (code < 0)
-      throw InputError(file.string() + ": frame " + std::to_string(frames),
-                       "cannot be decoded (" + error_text(code) + ")", "write the video again");
+      throw InputError(
+          file.string() + ": frame " + std::to_string(frames),
+          device ? "cannot be read (" + error_text(code) + ")" : "cannot be decoded (" + error_text(code) + ")",
+          device ? "check the camera and its cable" : "write the video again");
   }
 }
 
@@ -212,6 +239,19 @@ bool VideoReader::skip() {
   if (!implementation_->decode()) return false;
   ++implementation_->frames;
   return true;
+}
+
+bool VideoReader::device() const { return implementation_->device; }
+
+double VideoReader::rate() const {
+  const AVRational rate = implementation_->input.video().avg_frame_rate;
+  return rate.num > 0 && rate.den > 0 ? av_q2d(rate) : 0.0;
+}
+
+double VideoReader::time() const {
+  const std::int64_t stamp = implementation_->frame->best_effort_timestamp;
+  if (stamp == AV_NOPTS_VALUE) return std::numeric_limits<double>::quiet_NaN();
+  return static_cast<double>(stamp) * av_q2d(implementation_->input.video().time_base);
 }
 
 VideoFacts video_facts(const Path& file) {

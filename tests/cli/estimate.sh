@@ -77,6 +77,11 @@ broken 32 '.*base\.tum: the base motion ends at [0-9.]+ s, before frame 32; ' --
   --centerline "$work/stopped.csv"
 [ "$(wc -l <"$work/stopped.csv")" -eq 33 ] || fail 'a base motion that stops: the centerline was not kept'
 
+# devices: one that is none, one that is not there
+expect_error 2 '/dev/null: is no camera that V4L2 can read' estimate "$twin" --camera /dev/null \
+  --calibration "$work/camera.json"
+expect_error 2 '/dev/video97: does not exist' estimate "$twin" --camera /dev/video97 --calibration "$work/camera.json"
+
 expect_error 2 'adam draws the twin' estimate "$twin" --camera "$demo:cam0" --solver adam
 expect_error 2 'does not exist' estimate "$twin" --camera "$work/none.mp4" --calibration "$work/camera.json"
 expect_error 2 '--drop' estimate "$twin" --camera "$demo:cam0" --drop 0
