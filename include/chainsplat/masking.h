@@ -1,10 +1,12 @@
 // chainsplat/masking.h - object masks without prompts or a model file (INTERFACE 1, mask).
 //
 // What is known does most of the work: the rope is a tube of known length and diameter that begins at the base's pose,
-// seen by known cameras. Rough masks from a background picture and the colors near the grasp are enough to lay a chain
-// into them (silhouette.h, all views together); the chain's tube then says where the rope must be, and a graph cut in a
-// band about the tube decides each pixel from three votes - color, difference from the background, place - with
-// contours where the picture has edges. A gripper, a finger or a shadow is not tube, not the rope's color, or both.
+// seen by known cameras. In some moments a chain is grown from the grasp so that its tube best parts the colors inside
+// from those beside it, in all cameras together; nothing need move for that. The tubes say what colors the rope and its
+// surroundings have and what the background is; a graph cut in a band about the tube decides each pixel from votes -
+// color, difference from the background, place, and whether the picture changes at the tube's outline at all or
+// something hides it - with contours where the picture has edges. The masks give a better chain (silhouette.h), that
+// better masks. A gripper, a finger or a shadow is not tube, not the rope's color, or both.
 //
 // Pictures are undistorted pixels unless a function says otherwise. Nothing here depends on time or threads.
 #pragma once
@@ -21,6 +23,7 @@ namespace chainsplat::masking {
 struct Colors {
   std::vector<double> object, surroundings;  // pixels counted, 32^3; empty: nothing known
   std::vector<float> log_odds;               // 32^3, from the counts by settle()
+  double separation = 0.0;                   // mean log odds of the object's pixels less that of the surroundings'
 };
 // Makes log_odds from the counts, smoothed, so that near colors speak for each other.
 void settle(Colors& colors);
@@ -39,14 +42,14 @@ struct Look {
 
 // The mask of one picture, 255 or 0: RGB or RGBA pixels of the camera's size, row-major. With `theta` the chain is
 // thought to be there, to within about half a diameter; without, colors and background decide alone, as far as the rope
-// can reach. `open_end`: m before and after the chain's free end where it is not sure that the rope ends there.
+// can reach. `doubt`: times the usual doubt about the place.
 // Returned as a crop whose RGB is that of the picture inside the mask; empty (width 0) when there is none.
 struct Picture {
   const std::uint8_t* pixels = nullptr;
   int width = 0, height = 0, channels = 3;
 };
 capture::View cut(const Look& look, const Picture& picture, const capture::Camera& camera, const chain::Chain& chain,
-                  const math::Pose& base, const std::optional<math::VectorX>& theta, double open_end = 0.0);
+                  const math::Pose& base, const std::optional<math::VectorX>& theta, double doubt = 1.0);
 
 struct Options {
   int first = 0, last = -1;  // frames [first, last), last < 0: to the end, of each camera
@@ -58,7 +61,7 @@ using Sink = std::function<void(int camera, int frame, const capture::Image8& ma
 struct Summary {
   int frames = 0;     // of all cameras
   int empty = 0;      // masks in which nothing was found
-  double inside = 0;  // share of the chain's centerline that lies in the masks, mean; low: the masks are wrong
+  double inside = 0;  // share of the chain's centerline that lies in the masks, mean; low: hidden, or masks are wrong
 };
 
 // Masks of a whole capture, by camera, then frame; masks that it has are not looked at.

@@ -16,6 +16,11 @@ constexpr double kPlacePixels = 0.6;                         // px for one unit 
 constexpr double kSurelyInside = 4.0, kSurelyOutside = 8.0;  // inside, what hides the rope can outvote the place
 constexpr double kBand = 8.0;                                // px outside the tube: nothing beyond is looked at
 constexpr double kContour = 2.0;                             // cost of a contour through a plain area, a pixel long
+constexpr double kInsideFrom = 0.3, kBesideTo = 1.5;         // radii from the outline: not the outline, still near
+constexpr double kHiddenStep = 0.25;                         // diameters along the rope
+constexpr int kHiddenSteps = 2;                              // on either side that are looked at together
+constexpr double kSeen = 0.4;                                // of the usual separation in color: less is hidden
+constexpr double kSurelyHidden = 6.0;                        // log odds
 constexpr double kSpeck = 0.02;                              // share of the largest part under which a part is noise
 constexpr double kLeastShare = 0.1;                          // of the tube's area: less is not the rope
 constexpr int kMargin = 24;                                  // px about the mask: what capture::load leaves
@@ -71,6 +76,42 @@ cv::Mat least_cut(const Picture& picture, const Box& box, const std::vector<floa
   return labels;
 }
 
+const Colors& colors_at(const Look& look, const chain::Chain& chain, double arclength) {
+  return arclength < 0.5 * chain.length ? look.near : look.far;
+}
+
+// Where a hand hides the rope the picture does not change at the tube's outline as it does elsewhere: log odds by
+// arclength, in steps of `step` m, 0 or less.
+std::vector<double> hidden_odds(const Look& look, const Picture& picture, const Tube& place, const chain::Chain& chain,
+                                double step) {
+  struct Sum {
+    double odds = 0.0;
+    int pixels = 0;
+  };
+  const int steps = static_cast<int>(chain.length / step) + 1;
+  std::vector<Sum> inside(steps), beside(steps);
+  for (int y = place.box.y0; y < place.box.y1; ++y)
+    for (int x = place.box.x0; x < place.box.x1; ++x) {
+      const double outside = place.at(x, y) / place.radius;
+      if (outside > kBesideTo || (outside > -kInsideFrom && outside < kInsideFrom)) continue;
+      const double arclength = place.arclength(x, y);
+      const double odds = color_odds(colors_at(look, chain, arclength), pixel(picture, x, y));
+      const int at = static_cast<int>(arclength / step);
+      for (int k = std::max(0, at - kHiddenSteps); k <= std::min(steps - 1, at + kHiddenSteps); ++k) {
+        Sum& sum = (outside < 0.0 ? inside : beside)[k];
+        sum.odds += odds, ++sum.pixels;
+      }
+    }
+  std::vector<double> out(steps, 0.0);
+  for (int k = 0; k < steps; ++k) {
+    const double usual = colors_at(look, chain, k * step).separation;
+    if (inside[k].pixels == 0 || beside[k].pixels == 0 || usual <= 0.0) continue;
+    const double separation = inside[k].odds / inside[k].pixels - beside[k].odds / beside[k].pixels;
+    out[k] = std::clamp((separation / usual - kSeen) / kSeen * kSurelyHidden, -kSurelyHidden, 0.0);
+  }
+  return out;
+}
+
 // Takes small parts out; returns the area that stays.
 int without_specks(cv::Mat& labels) {
   cv::Mat parts, facts, centers;
@@ -89,14 +130,17 @@ int without_specks(cv::Mat& labels) {
 }  // namespace
 
 capture::View cut(const Look& look, const Picture& picture, const capture::Camera& camera, const chain::Chain& chain,
-                  const math::Pose& base, const std::optional<math::VectorX>& theta, double open_end) {
+                  const math::Pose& base, const std::optional<math::VectorX>& theta, double doubt) {
   const Reach where = reach(chain, base, camera);
   Tube place;
-  if (theta) place = tube(chain, base, *theta, camera, 0.0, chain.length + open_end, kBand);
+  if (theta) place = tube(chain, base, *theta, camera, 0.0, chain.length, kBand + (doubt - 1.0) * 2.0 * kPlacePixels);
   const Box box = theta ? place.box : where.box;
   capture::View view;
   if (box.empty()) return view;
   std::vector<float> odds(static_cast<std::size_t>(box.width()) * box.height(), std::nanf(""));
+  const double step = kHiddenStep * chain.diameter;
+  std::vector<double> hidden;
+  if (theta) hidden = hidden_odds(look, picture, place, chain, step);
   double tube_area = 0.0;
   for (int y = box.y0; y < box.y1; ++y)
     for (int x = box.x0; x < box.x1; ++x) {
@@ -105,16 +149,18 @@ capture::View cut(const Look& look, const Picture& picture, const capture::Camer
         const float outside = place.at(x, y);
         if (outside == Tube::kFar) continue;
         tube_area += outside < 0.0f;
-        const bool open = open_end > 0.0 && place.arclength(x, y) > chain.length - open_end;
-        sum = std::clamp(-outside / kPlacePixels, -kSurelyOutside, open ? 0.0 : kSurelyInside);
+        sum = std::clamp(-outside / (doubt * kPlacePixels), -kSurelyOutside, kSurelyInside);
       } else if (!where.holds(x, y)) {
         continue;
       }
       const std::uint8_t* const rgb = pixel(picture, x, y);
-      if (!theta)
+      if (theta) {
+        const double arclength = place.arclength(x, y);
+        sum += color_odds(colors_at(look, chain, arclength), rgb) +
+               hidden[static_cast<std::size_t>(std::min(arclength, chain.length) / step)];
+      } else {
         sum += std::max(color_odds(look.near, rgb), color_odds(look.far, rgb));
-      else
-        sum += color_odds(place.arclength(x, y) < 0.5 * chain.length ? look.near : look.far, rgb);
+      }
       sum += difference_odds(look.background, picture, x, y);
       odds[static_cast<std::size_t>(y - box.y0) * box.width() + (x - box.x0)] = static_cast<float>(sum);
     }

@@ -59,10 +59,14 @@ void settle(Colors& colors) {
   blur(surroundings);
   colors.log_odds.resize(kColorBins);
   const double floor = kUnheardOf / kColorBins;
+  colors.separation = 0.0;
   for (int i = 0; i < kColorBins; ++i)
     colors.log_odds[i] = static_cast<float>(
         std::clamp(std::log((object[i] / object_sum + floor) / (surroundings[i] / surroundings_sum + floor)),
                    -kSurestNot, kSurest));
+  for (int i = 0; i < kColorBins; ++i)
+    colors.separation +=
+        colors.log_odds[i] * (colors.object[i] / object_sum - colors.surroundings[i] / surroundings_sum);
 }
 
 Reach reach(const chain::Chain& chain, const math::Pose& base, const capture::Camera& camera) {
@@ -86,7 +90,7 @@ Reach reach(const chain::Chain& chain, const math::Pose& base, const capture::Ca
 }
 
 void count_colors(Look& look, const Picture& picture, const Tube& tube, const Reach& where, const chain::Chain& chain,
-                  bool local, const capture::View* mask, double open_end) {
+                  bool local, const capture::View* mask) {
   const auto masked = [&](int x, int y) {
     x -= mask->x0, y -= mask->y0;
     return x >= 0 && y >= 0 && x < mask->width && y < mask->height &&
@@ -103,7 +107,7 @@ void count_colors(Look& look, const Picture& picture, const Tube& tube, const Re
       const int bin = color_bin(pixel(picture, x, y));
       if (outside < core) {
         const double s = tube.arclength(x, y);
-        if (s > chain.diameter && (!mask || s > chain.length - open_end || masked(x, y)))
+        if (s > chain.diameter && (!mask || masked(x, y)))
           (s < 0.5 * chain.length ? look.near : look.far).object[bin] += 1.0;
       } else if (outside > about && (outside < Tube::kFar || !local)) {
         look.near.surroundings[bin] += 1.0;

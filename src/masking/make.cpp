@@ -1,8 +1,10 @@
-// A whole capture: samples for the background, rough masks, a chain through them, then the cut; twice.
+// A whole capture: chains grown in some moments, what they tell of colors and background, then masks and chains in
+// turn.
 #include <algorithm>
 #include <cmath>
 
 #include "chainsplat/silhouette.h"
+#include "src/masking/grow.h"
 #include "src/masking/look.h"
 
 namespace chainsplat::masking {
@@ -15,18 +17,20 @@ namespace {
 
 constexpr int kBlock = 128;              // frames of one camera held in memory at once
 constexpr int kSamples = 48;             // frames of a camera that background and colors are learned from
-constexpr double kOftenCovered = 0.35;   // share of the frames within a diameter: the median picture may show the rope
-constexpr double kMostlyCovered = 0.6;   // and here it does, at the grasp
 constexpr double kAboutPixels = 24.0;    // px about a tube that are told apart from what is far
 constexpr double kLeastUncovered = 0.2;  // of the samples that must show the background
 constexpr int kLeastSamples = 4;
-constexpr double kSeedFrom = 1.0, kSeedTo = 2.5;  // diameters from the grasp: leaves the gripper, not yet bent much
-constexpr double kLinkDiameters = 1.5;            // length of a link of the chain that is laid into the masks
+constexpr double kLinkDiameters = 1.5;  // length of a link of the chain that is laid into the masks
 constexpr int kFewestJoints = 8, kMostJoints = 16;
-constexpr double kOpenEnd = 1.0;      // diameters
-constexpr int kRounds = 2;            // of learning, cutting and fitting
-constexpr double kCenter = 0.5;       // of the radius: deeper inside than this counts as the centerline
-constexpr double kLeastInside = 0.4;  // of the centerline within the masks, mean: less was no rope
+constexpr double kSameMoment = 0.02;    // s between pictures of different cameras
+constexpr double kLeastEvidence = 0.1;  // nats a sample in the best moment: less was no rope
+constexpr double kTrusted = 0.75;       // share of the best moment's evidence from which colors are learned,
+constexpr double kUsable = 0.5;         // and from which a moment says where the rope is
+constexpr int kKnownSamples = 1000;     // that what other moments say of the colors counts for, on each side
+constexpr double kRoughPlace = 3.0;     // times the usual doubt about the place, before the chain is laid into masks
+constexpr int kRounds = 2;              // of learning, cutting and fitting
+constexpr double kCenter = 0.5;         // of the radius: deeper inside than this counts as the centerline
+constexpr double kLeastInside = 0.4;    // of the centerline within the masks, mean: less was no rope
 
 struct Recording {
   const Path& path;
@@ -68,22 +72,65 @@ struct Samples {
   }
 };
 
-// Where the grasp stays longest: the largest share of the frames that is within a diameter of one of them, and its
-// time.
-struct Rest {
-  double share = 0.0, time = 0.0;
-};
-Rest rest(const Recording& recording, const chain::Chain& chain, const Samples& samples) {
-  const trajectory::Trajectory& base = recording.capture.base;
-  Rest out;
-  for (const View& a : samples.frames) {
-    int near = 0;
-    for (const View& b : samples.frames)
-      near += (base.pose(a.time).translation - base.pose(b.time).translation).norm() < chain.diameter;
-    const double share = near / static_cast<double>(samples.frames.size());
-    if (share > out.share) out = {share, a.time};
+// Chains grown in the moments of the first camera that has samples, with what the others show then.
+chain::States grow_moments(const Recording& recording, const chain::Chain& chain,
+                           const std::vector<capture::Camera>& cameras, const std::vector<Samples>& samples) {
+  const capture::Capture& scene = recording.capture;
+  const auto first = std::find_if(samples.begin(), samples.end(), [](const Samples& s) { return !s.frames.empty(); });
+  struct Moment {
+    double time = 0.0;
+    std::vector<Shot> shots;
+    std::vector<int> cameras;  // by shot
+  };
+  std::vector<Moment> moments;
+  for (const View& one : first->frames) {
+    Moment moment{one.time, {}, {}};
+    for (std::size_t c = 0; c < samples.size(); ++c) {
+      const std::vector<View>& frames = samples[c].frames;
+      const auto nearest = std::min_element(frames.begin(), frames.end(), [&](const View& a, const View& b) {
+        return std::abs(a.time - one.time) < std::abs(b.time - one.time);
+      });
+      if (nearest == frames.end() || std::abs(nearest->time - one.time) > kSameMoment) continue;
+      moment.shots.push_back(
+          {picture_of(*nearest), &cameras[c], cameras[c].world_from_camera.inverse() * scene.base.pose(nearest->time)});
+      moment.cameras.push_back(static_cast<int>(c));
+    }
+    moments.push_back(std::move(moment));
   }
-  return out;
+  // first by each moment's own colors; then with those of the moments that show the rope best
+  std::vector<Tally> known(cameras.size());
+  std::vector<Grown> grown(moments.size());
+  double best = 0.0;
+  for (int pass = 0; pass < 2; ++pass) {
+    core::parallel_for(static_cast<std::int64_t>(moments.size()), [&](std::int64_t i) {
+      std::vector<Tally> of_shots;
+      for (const int c : moments[i].cameras) of_shots.push_back(known[c]);
+      grown[i] = grow(chain, moments[i].shots, of_shots);
+    });
+    if (core::stop_requested()) throw Interrupted(core::stop_requested());
+    best = 0.0;
+    for (const Grown& one : grown) best = std::max(best, one.evidence);
+    if (best < kLeastEvidence)
+      throw InputError(recording.path.string(), "nothing like the rope is found at the grasp",
+                       "check cameras, base, length and direction (chainsplat check), or use --command");
+    if (pass == 1) break;
+    for (std::size_t i = 0; i < moments.size(); ++i)
+      for (std::size_t k = 0; grown[i].evidence > kTrusted * best && k < moments[i].cameras.size(); ++k)
+        add(known[moments[i].cameras[k]], grown[i].tallies[k]);
+    for (Tally& tally : known) tally = scaled(tally, kKnownSamples);
+  }
+  chain::States states;
+  for (std::size_t i = 0; i < moments.size(); ++i)
+    if (grown[i].evidence > kUsable * best) {
+      states.time.push_back(moments[i].time);
+      states.theta.push_back(grown[i].theta);
+    }
+  return states;
+}
+
+// Held at the ends, since the first and last frames may lie outside.
+math::VectorX at(const chain::States& states, double time) {
+  return chain::interpolate(states, std::clamp(time, states.time.front(), states.time.back()));
 }
 
 bool masked_at(const View& view, int x, int y) {
@@ -155,10 +202,9 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
       chain::make_chain(scene.length, scene.diameter, scene.direction, scene.bending_axis, joints,
                         scene.tabletop ? chain::Bending::planar : chain::Bending::spatial, false);
 
-  // colors near the grasp and, where the base moves, the background
+  std::vector<capture::Camera> pinholes = scene.cameras;  // of undistorted pictures
+  for (capture::Camera& camera : pinholes) camera.distortion = {};
   std::vector<Samples> samples(cameras);
-  std::vector<Look> looks(cameras);
-  std::vector<double> open_end(cameras, 0.0);
   const std::int64_t work = static_cast<std::int64_t>(total) * (kRounds + 2);
   std::int64_t done = 0;
   const auto tell = [&](const char* note, std::size_t frames) {
@@ -170,46 +216,38 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
     each_block(recording, c, [&](std::vector<View>& views) {
       for (View& view : views)
         if ((view.frame - recording.first) % stride == 0) samples[c].frames.push_back(std::move(view));
-      tell("background", views.size());
+      tell("samples", views.size());
     });
-    const std::vector<Picture> pictures = samples[c].pictures();
-    const Rest resting = rest(recording, chain, samples[c]);
-    const math::VectorX straight = math::VectorX::Zero(chain.angles());
-    const auto learn = [&](Look& look, const Picture& picture, double time) {
-      const math::Pose base = scene.base.pose(time);
-      const Tube seed = tube(chain, base, straight, scene.cameras[c], kSeedFrom * chain.diameter,
-                             kSeedTo * chain.diameter, kAboutPixels);
-      count_colors(look, picture, seed, reach(chain, base, scene.cameras[c]), chain, false);
-    };
-    for (const View& view : samples[c].frames) learn(looks[c], picture_of(view), view.time);
-    Background median = median_background(pictures, {}, 1);
-    if (resting.share > kOftenCovered) {
-      // The median shows the rope too: there is no background yet, and the rope's end may have other colors.
-      open_end[c] = kOpenEnd * chain.diameter;
-      if (resting.share > kMostlyCovered) {  // at the grasp it shows nothing that passes by: its colors are better
-        Look still;
-        const Picture picture{median.rgb.data(), scene.cameras[c].width, scene.cameras[c].height, 3};
-        learn(still, picture, resting.time);
-        looks[c].near.object = still.near.object;
-      }
-    } else {
-      looks[c].background = std::move(median);
-    }
-    looks[c].far = looks[c].near;
-    settle(looks[c]);
   }
-
+  std::vector<Look> looks(cameras);
+  const auto learn = [&](const chain::States& states, const std::vector<View>* masks) {
+    for (int c = 0; c < cameras; ++c) {
+      looks[c] = {};
+      std::vector<Tube> tubes;
+      for (const View& view : samples[c].frames) {
+        const math::Pose base = scene.base.pose(view.time);
+        tubes.push_back(tube(chain, base, at(states, view.time), pinholes[c], 0.0, chain.length, kAboutPixels));
+        const View* mask = nullptr;
+        if (masks)
+          mask = &*std::find_if(masks->begin(), masks->end(),
+                                [&](const View& m) { return m.camera == c && m.frame == view.frame; });
+        count_colors(looks[c], picture_of(view), tubes.back(), reach(chain, base, pinholes[c]), chain, true, mask);
+      }
+      settle(looks[c]);
+      looks[c].background = median_background(
+          samples[c].pictures(), tubes, std::max(kLeastSamples, static_cast<int>(kLeastUncovered * tubes.size())));
+    }
+  };
   Summary summary;
-  chain::States states;
-  const auto masks_by = [&](bool placed, const char* note, const std::function<void(std::vector<View>&)>& take) {
+  chain::States states = grow_moments(recording, chain, pinholes, samples);
+  learn(states, nullptr);
+  const auto masks_by = [&](double place, const char* note, const std::function<void(std::vector<View>&)>& take) {
     for (int c = 0; c < cameras; ++c)
       each_block(recording, c, [&](std::vector<View>& views) {
         core::parallel_for(static_cast<std::int64_t>(views.size()), [&](std::int64_t i) {
           View& view = views[i];
-          std::optional<math::VectorX> theta;
-          if (placed) theta = chain::interpolate(states, view.time);
-          View masked =
-              cut(looks[c], picture_of(view), scene.cameras[c], chain, scene.base.pose(view.time), theta, open_end[c]);
+          View masked = cut(looks[c], picture_of(view), pinholes[c], chain, scene.base.pose(view.time),
+                            at(states, view.time), place);
           masked.camera = c, masked.frame = view.frame, masked.time = view.time;
           view = std::move(masked);
         });
@@ -220,7 +258,7 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
   for (int round = 0; round < kRounds; ++round) {
     capture::Capture masked = scene;
     masked.views.clear();
-    masks_by(round > 0, round ? "cut" : "rough masks", [&](std::vector<View>& views) {
+    masks_by(round ? 1.0 : kRoughPlace, round ? "cut" : "rough masks", [&](std::vector<View>& views) {
       for (View& view : views) masked.views.push_back(std::move(view));
     });
     const bool anything = std::any_of(masked.views.begin(), masked.views.end(), [](const View& v) { return v.width; });
@@ -233,27 +271,10 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
       throw InputError(path.string(), "nothing like the rope is found at the grasp",
                        "check cameras, base, length and direction (chainsplat check), or use --command");
     states = fit.states;
-    for (int c = 0; c < cameras; ++c) {
-      looks[c] = {};
-      if (round > 0) open_end[c] = 0.0;  // seen by now
-      std::vector<Tube> tubes;
-      for (const View& view : samples[c].frames) {
-        const math::Pose base = scene.base.pose(view.time);
-        tubes.push_back(tube(chain, base, chain::interpolate(states, view.time), scene.cameras[c], 0.0,
-                             chain.length + open_end[c], kAboutPixels));
-        const auto mask = std::find_if(masked.views.begin(), masked.views.end(),
-                                       [&](const View& m) { return m.camera == c && m.frame == view.frame; });
-        count_colors(looks[c], picture_of(view), tubes.back(), reach(chain, base, scene.cameras[c]), chain, true,
-                     &*mask, open_end[c]);
-      }
-      settle(looks[c]);
-      const int count = static_cast<int>(tubes.size());
-      looks[c].background = median_background(samples[c].pictures(), tubes,
-                                              std::max(kLeastSamples, static_cast<int>(kLeastUncovered * count)));
-    }
+    learn(states, &masked.views);
   }
   summary.inside = 0.0;
-  masks_by(true, "cut", [&](std::vector<View>& views) {
+  masks_by(1.0, "cut", [&](std::vector<View>& views) {
     for (const View& view : views) {
       ++summary.frames;
       summary.inside += share_inside(chain, scene.base.pose(view.time), chain::interpolate(states, view.time),

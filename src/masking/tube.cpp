@@ -33,6 +33,7 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
     if (arclengths[i] > chain.length) line.col(i) = motions.back() * Vector3(arclengths[i] * chain.direction);
   const math::Pose camera_from_world = camera.world_from_camera.inverse();
   std::vector<Sample> samples;
+  double bulge = 0.0;  // of the free end's disc, seen at an angle, in radii
   double x0 = 1e9, y0 = 1e9, x1 = -1e9, y1 = -1e9;
   for (int i = 0; i < count; ++i) {
     const Vector3 p = camera_from_world * Vector3(line.col(i));
@@ -43,6 +44,10 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
     y0 = std::min(y0, s.at.y() - around), y1 = std::max(y1, s.at.y() + around);
     out.radius += s.radius;
     samples.push_back(s);
+    if (i > 0) {
+      const Vector3 along = camera_from_world.rotation * Vector3(line.col(i) - line.col(i - 1));
+      bulge = std::abs(along.normalized().dot(p.normalized()));
+    }
   }
   if (samples.size() < 2) return out;
   out.radius /= static_cast<double>(samples.size());
@@ -52,6 +57,11 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
   if (out.box.empty()) return out;
   out.outside.assign(static_cast<std::size_t>(out.box.width()) * out.box.height(), Tube::kFar);
   out.along.assign(out.outside.size(), 0.0f);
+  // px by which the disc reaches beyond its center, at `d` from that
+  const auto disc = [&](const Vector2& d, const Vector2& along, bool free_end, double radius) {
+    const double share = (d.x() * along.y() - d.y() * along.x()) / radius;
+    return free_end ? bulge * radius * std::sqrt(std::max(0.0, 1.0 - share * share)) : 0.0;
+  };
   for (std::size_t i = 0; i + 1 < samples.size(); ++i) {
     const Vector2 a = samples[i].at, step = samples[i + 1].at - a;
     const double length = step.norm();
@@ -67,7 +77,7 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
       for (int x = left; x < right; ++x) {
         const Vector2 d = Vector2(x + 0.5, y + 0.5) - a;
         const double t = d.dot(along);
-        // ends are flat: beyond them the distance is along the rope; between segments round joints close the gaps
+        // beyond an end the distance is along the rope; between segments round joints close the gaps
         double distance;
         const double share = std::clamp(t / length, 0.0, 1.0);
         const double radius = samples[i].radius + share * (samples[i + 1].radius - samples[i].radius);
@@ -76,7 +86,8 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
         if (beyond <= 0.0)
           distance = across;
         else if ((begins && t < 0.0) || (ends && t > length))
-          distance = across > 0.0 ? std::hypot(across, beyond) : beyond;
+          distance =
+              across > 0.0 ? std::hypot(across, beyond) : std::max(across, beyond - disc(d, along, t > 0.0, radius));
         else
           distance = std::hypot(across + radius, beyond) - radius;
         if (distance > reach) continue;
@@ -87,9 +98,9 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
             static_cast<float>(samples[i].arclength + share * (samples[i + 1].arclength - samples[i].arclength));
       }
   }
-  // near a flat end the inside is as deep as the end is near, and what lies beyond it is at least that far outside,
-  // though the round joint of the segment before reaches there
-  const auto cap = [&](const Sample& end, const Vector2& outward) {
+  // near an end the inside is as deep as the end is near, and what lies beyond it is at least that far outside, though
+  // the round joint of the segment before reaches there
+  const auto cap = [&](const Sample& end, const Vector2& outward, bool free_end) {
     const double around = end.radius + reach;
     const double near = 2.0 * around * (samples.back().arclength - samples.front().arclength) /
                         std::max(1.0, (samples.back().at - samples.front().at).norm());  // m
@@ -102,14 +113,14 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
         float& value = out.outside[at];
         if (value == Tube::kFar || std::abs(out.along[at] - end.arclength) > near) continue;
         const Vector2 d = Vector2(x + 0.5, y + 0.5) - end.at;
-        const double depth = d.dot(outward);
-        const bool inside = value < 0.0f && depth < 0.0 && (d - depth * outward).norm() < end.radius;
+        const double depth = d.dot(outward) - disc(d, outward, free_end, end.radius);
+        const bool inside = value < 0.0f && depth < 0.0 && (d - d.dot(outward) * outward).norm() < end.radius;
         if (inside || depth >= 0.0) value = std::max(value, static_cast<float>(depth));
       }
   };
   const std::size_t last = samples.size() - 1;
-  cap(samples[0], (samples[0].at - samples[1].at).normalized());
-  cap(samples[last], (samples[last].at - samples[last - 1].at).normalized());
+  cap(samples[0], (samples[0].at - samples[1].at).normalized(), false);
+  cap(samples[last], (samples[last].at - samples[last - 1].at).normalized(), true);
   return out;
 }
 

@@ -29,8 +29,8 @@ struct Tube {
   static constexpr float kFar = 1e6f;
 };
 
-// Flat at both ends. `from`, `to`: arclengths, m; beyond the free end it goes on straight. `reach`: px beyond the
-// outline. The camera has no distortion.
+// A cylinder bent along the chain: flat where it begins, with the ellipse of its end disc where it ends. `from`, `to`:
+// arclengths, m; beyond the free end it goes on straight. `reach`: px beyond the outline. The camera has no distortion.
 Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta, const capture::Camera& camera,
           double from, double to, double reach);
 
