@@ -123,6 +123,40 @@ TEST_CASE("the parameters of a simulated hanging rope are found again through no
   CHECK(e.held[0].first == "total_mass");
 }
 
+TEST_CASE("how friction rolls a rope on a table is found again through noise, and carries over to another motion") {
+  constexpr double kLever = 0.006;  // m
+  Scene s = scene(true, chain::Bending::planar, 0.0);
+  s.truth.roll_lever.assign(6, kLever);
+  const dynamics::Model model = dynamics::make_model(s.chain, s.truth);
+  const dynamics::InitialState start{0.0, s.clean.theta[0], VectorX::Zero(6)};
+  s.seen = dynamics::rollout(model, s.base, start, frames(100));
+  core::Random random(13);
+  for (VectorX& angles : s.seen.theta)
+    for (double& angle : angles) angle += 0.2 * kDegree * random.normal();
+  Options options;
+  options.tabletop = true;
+  options.mass = 0.06;
+  const Result found = identify(s.chain, s.base, s.seen, {}, options);
+  double mean = 0.0;
+  for (int k = 1; k < 6; ++k) mean += found.parameters.roll_lever[k] / 5.0;
+  CHECK(mean == doctest::Approx(kLever).epsilon(0.25));
+  std::vector<trajectory::Sample> samples;
+  for (int k = 0; k <= 240; ++k) {
+    const double t = k / 120.0;
+    samples.push_back({t, {math::exp_so3({0, 0, 0.3 * t * t}), Vector3(-0.1 * t * t, 0.02 * t * t, 0.5)}});
+  }
+  const trajectory::Trajectory other = trajectory::fit(samples, "test");
+  const auto times = frames(55);
+  const chain::States truth = dynamics::rollout(model, other, start, times);
+  const auto error = [&](const dynamics::Parameters& p) {
+    return node_rms(s.chain, dynamics::rollout(dynamics::make_model(s.chain, p), other, start, times), truth);
+  };
+  dynamics::Parameters without = s.truth;
+  without.roll_lever.clear();
+  CHECK(error(without) > 5e-4);
+  CHECK(error(found.parameters) < 0.5 * error(without));
+}
+
 TEST_CASE("Coulomb friction of a rope on a table is found again through noise") {
   const Scene s = scene(true, chain::Bending::planar, 0.5 * kDegree);
   Options options;

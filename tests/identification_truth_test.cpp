@@ -72,6 +72,7 @@ Truth make_truth(const Case& what) {
   if (what.table) {
     p.table_normal = Vector3(0, 0, 1);
     p.coulomb_friction = fill(kCoulomb);
+    p.roll_lever = fill(0.0);
     for (int j = 1; j <= 8; ++j) v["log_coulomb_friction_link_" + std::to_string(j)] = std::log(kCoulomb);
   } else {
     p.air_quadratic = fill(kDrag * kLength / 8.0);

@@ -33,13 +33,18 @@ struct Parameters {
   std::vector<double> stiffness;         // N m/rad an angle
   std::vector<double> rest_angle;        // rad
   std::vector<double> damping;           // N m s/rad
-  double tip_mass = 0.0;                 // kg, point mass at the free end
-  double radius = 0.0;                   // m, of the cylinder that gives the links' inertia; 0 allowed
-  Vector3 gravity{0, 0, -9.81};          // m/s^2, world
-  std::optional<Vector3> table_normal;   // unit, world; none: no table
-  bool table_carries_weight = true;      // gravity has no part along table_normal: the table holds the rope up
-  double coulomb_speed = 0.002;          // v_s, m/s
-  double drag_speed = 0.001;             // v_eps, m/s
+  // m, an angle, planar chains on a table only; empty: 0. Friction grips a rope at its underside and rolls it, and what
+  // it is naturally curved out of the table's plane turns into the plane: torque -roll_lever_k sum_j share_kj f_j, f_j
+  // the friction across link j (along bending axis x link), share_kj = min(s_k, middle of j) / L. It is k r L B/C for a
+  // natural curvature k out of the plane, radius r, bending stiffness B and torsional stiffness C.
+  std::vector<double> roll_lever;
+  double tip_mass = 0.0;                // kg, point mass at the free end
+  double radius = 0.0;                  // m, of the cylinder that gives the links' inertia; 0 allowed
+  Vector3 gravity{0, 0, -9.81};         // m/s^2, world
+  std::optional<Vector3> table_normal;  // unit, world; none: no table
+  bool table_carries_weight = true;     // gravity has no part along table_normal: the table holds the rope up
+  double coulomb_speed = 0.002;         // v_s, m/s
+  double drag_speed = 0.001;            // v_eps, m/s
   Integrator integrator = Integrator::rodas3;
   int substeps = 4;  // a frame of 1/30 s
 };
@@ -181,12 +186,12 @@ BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<d
 // One unknown's derivative: d(Parameters) and d(initial state). Empty arrays mean zeros.
 struct Tangent {
   std::vector<double> link_mass, viscous_friction, coulomb_friction, air_linear, air_quadratic;  // a link
-  std::vector<double> stiffness, rest_angle, damping;                                            // an angle
+  std::vector<double> stiffness, rest_angle, damping, roll_lever;                                // an angle
   double tip_mass = 0.0;
   VectorX theta, thetadot;
 };
 // `parameters` after the numbers that identification calls `names` (Estimates) have changed by `change`: an addition to
-// a log or logit, or to a rest angle. The total mass stays. Names of initial states change nothing.
+// a log or logit, to a rest angle or a lever. The total mass stays. Names of initial states change nothing.
 Parameters moved(const chain::Chain& chain, const Parameters& parameters, std::span<const std::string> names,
                  const VectorX& change);
 // The derivatives of that, and of the initial state for names theta_k and thetadot_k.

@@ -5,7 +5,7 @@
 //   chain           scenario ("free", "tabletop"); length, diameter; gravity (world); on a table
 //                   table { point, normal }
 //     joints        one an angle, base to tip: axis [w, v] (base frame, home, space form), parent_link, child_link,
-//                   stiffness*, rest_angle*, damping*
+//                   stiffness*, rest_angle*, damping*, and on a table, planar bending, roll_lever* (m)
 //     links         n_l + 1, number 0 is the base link: length; mass*, inertia* [Ixx Iyy Izz Ixy Ixz Iyz] about the
 //                   center of mass, axes of the base frame at home, without the tip mass; center_of_mass* from the
 //                   link's joint; viscous_friction* (N s/m), coulomb_friction*. Link 0 is held: its are written as 0

@@ -6,10 +6,11 @@
 namespace chainsplat::adaptation {
 namespace {
 
-constexpr double kRestSpread = 0.2;  // rad of a rest angle a unit of `spread`
-constexpr double kRateSd = 1.0;      // rad/s, of the first frame's rates
-constexpr int kMaxRejected = 5;      // frames in a row, after which the state starts anew
-constexpr double kMaxStep = 0.3;     // of a log in one frame: beyond, the linearization is worthless
+constexpr double kRestSpread = 0.2;   // rad of a rest angle a unit of `spread`
+constexpr double kRollSpread = 0.01;  // m of a lever
+constexpr double kRateSd = 1.0;       // rad/s, of the first frame's rates
+constexpr int kMaxRejected = 5;       // frames in a row, after which the state starts anew
+constexpr double kMaxStep = 0.3;      // of a log in one frame: beyond, the linearization is worthless
 
 MatrixX symmetric(const MatrixX& m) { return 0.5 * (m + m.transpose()); }
 
@@ -35,7 +36,10 @@ Adaptation::Adaptation(const chain::Chain& chain, const dynamics::Parameters& pa
   change_ = VectorX::Zero(count);
   expected_.resize(count);
   for (Eigen::Index i = 0; i < count; ++i) {
-    const double sd = options.spread * (names_[i].rfind("rest_angle", 0) == 0 ? kRestSpread : 1.0);
+    const double unit = names_[i].rfind("rest_angle", 0) == 0   ? kRestSpread
+                        : names_[i].rfind("roll_lever", 0) == 0 ? kRollSpread
+                                                                : 1.0;
+    const double sd = options.spread * unit;
     expected_[i] = sd * sd;
   }
   covariance_ = MatrixX::Zero(2 * n + count, 2 * n + count);

@@ -1,5 +1,6 @@
 // The stacked matrices of SPEC 3.5 and 3.6, written as they are printed: to be read beside the paper, and a formulation
 // of its own to check the recursions against.
+#include <algorithm>
 #include <cmath>
 
 #include "chainsplat/dynamics.h"
@@ -11,15 +12,19 @@ using math::hat;
 using math::Matrix6;
 
 // W_i and dW_i/dV_i of SPEC 3.3 in {i}, for link j (from 1) with body twist v; `normal` is N, zero without a table.
+// `across`, and its slope by v: the friction across the link of the velocity in the plane of bending.
 void link_wrench(const Model& model, int j, const Vector6& v, const Vector3& normal, double normal_gravity,
-                 Vector6& wrench, Matrix6& slope) {
+                 Vector6& wrench, Matrix6& slope, double& across_friction, Vector6& across_slope) {
   const Parameters& p = model.parameters;
   const Vector3 d = model.chain.direction;
   const double l = model.chain.link_end(j) - model.chain.link_start(j);
   const Matrix3 eye = Matrix3::Identity(), across = eye - d * d.transpose();
   const Matrix3 tangent = normal.isZero() ? Matrix3::Zero().eval() : Matrix3(eye - normal * normal.transpose());
   const double x[3] = {0.5 * (1.0 - std::sqrt(0.6)), 0.5, 0.5 * (1.0 + std::sqrt(0.6))}, weight[3] = {5, 8, 5};
-  wrench.setZero(), slope.setZero();
+  const Vector3 a = model.chain.bending_axis;
+  const Matrix3 plane = eye - a * a.transpose();
+  wrench.setZero(), slope.setZero(), across_slope.setZero();
+  across_friction = 0.0;
   for (int i = 0; i < 3; ++i) {
     const double w = weight[i] / 18.0;
     const Vector3 c = x[i] * l * d;
@@ -36,6 +41,11 @@ void link_wrench(const Model& model, int j, const Vector6& v, const Vector3& nor
                        w;
     wrench += z * f;
     slope += z * df * z.transpose();
+    const Vector3 vp = plane * velocity;
+    const double sp = std::sqrt(vp.squaredNorm() + p.coulomb_speed * p.coulomb_speed);
+    across_friction -= w * (mu + coulomb / sp) * a.cross(d).dot(vp);
+    across_slope -=
+        w * z * plane * ((mu + coulomb / sp) * eye - coulomb / (sp * sp * sp) * vp * vp.transpose()) * a.cross(d);
   }
 }
 
@@ -91,6 +101,9 @@ ClosedForm closed_form(const Model& model, const trajectory::BaseMotion& base, c
 
   VectorX wrenches = VectorX::Zero(size);
   MatrixX wrench_slope = MatrixX::Zero(size, size);
+  const bool rolls = p.table_normal && !p.roll_lever.empty();
+  VectorX across = VectorX::Zero(n);
+  MatrixX across_slope = MatrixX::Zero(n, size), roll = MatrixX::Zero(n, n);
   Matrix3 rotation = base.pose.rotation;
   for (int i = 0; i < n; ++i) {
     rotation = rotation * math::exp_so3(model.axis[i].head<3>() * theta[i]);
@@ -100,11 +113,20 @@ ClosedForm closed_form(const Model& model, const trajectory::BaseMotion& base, c
     const double normal_gravity = p.table_normal ? std::abs(p.gravity.dot(*p.table_normal)) : 0.0;
     Vector6 wrench;
     Matrix6 link_slope;
-    link_wrench(model, link, v.segment<6>(6 * i), normal, normal_gravity, wrench, link_slope);
+    Vector6 roll_slope;
+    link_wrench(model, link, v.segment<6>(6 * i), normal, normal_gravity, wrench, link_slope, across[i], roll_slope);
+    across_slope.block<1, 6>(i, 6 * i) = roll_slope.transpose();
     wrenches.segment<6>(6 * i) = wrench;
     wrench_slope.block<6, 6>(6 * i, 6 * i) = link_slope;
   }
-  out.friction = projection * wrenches;
+  for (int k = 0; rolls && k < n; ++k)
+    for (int i = 0; i < n; ++i) {
+      const int link = model.chain.child_link[i];
+      const double middle = 0.5 * (model.chain.link_start(link) + model.chain.link_end(link));
+      roll(k, i) =
+          p.roll_lever[k] * std::min(model.chain.link_start(model.chain.child_link[k]), middle) / model.chain.length;
+    }
+  out.friction = projection * wrenches - roll * across;
 
   MatrixX ad_v = MatrixX::Zero(size, size), coadjoint = MatrixX::Zero(size, size);
   for (int i = 0; i < n; ++i) {
@@ -113,6 +135,7 @@ ClosedForm closed_form(const Model& model, const trajectory::BaseMotion& base, c
     coadjoint.block<6, 6>(6 * i, 6 * i) = math::coadjoint(model.inertia[i] * twist);
   }
   MatrixX slope = projection * (wrench_slope * la + q * la - g * l * ad_v * a + coadjoint * la);
+  slope -= roll * across_slope * la;
   for (int i = 0; i < n; ++i) slope(i, i) -= p.damping[i];
   out.velocity_jacobian = out.mass.ldlt().solve(slope);
   return out;

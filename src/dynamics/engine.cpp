@@ -1,5 +1,6 @@
 #include "engine.h"
 
+#include <algorithm>
 #include <cmath>
 
 namespace chainsplat::dynamics {
@@ -62,6 +63,20 @@ Engine::Engine(const Model& m) : model(m), angles(m.chain.angles()), link_count(
     link.end_angle = k;
     links.push_back(link);
   }
+  rolls = table_ && !p.roll_lever.empty();
+  if (rolls) {
+    for (VectorX* v : {&roll_friction, &roll_by_time, &roll_by_viscous, &roll_by_coulomb}) v->setZero(link_count);
+    roll_torque.setZero(angles);
+    roll_share.setZero(angles, link_count);
+    for (MatrixX* m : {&roll_by_angle, &roll_by_rate}) m->setZero(link_count, angles);
+    for (int a = 0; a < angles; ++a)
+      for (int j = 0; j < link_count; ++j) {
+        const double middle = 0.5 * (model.chain.link_start(j + 1) + model.chain.link_end(j + 1));
+        roll_share(a, j) = std::min(model.chain.link_start(model.chain.child_link[a]), middle) / model.chain.length;
+      }
+    roll_map = Eigen::Map<const VectorX>(p.roll_lever.data(), angles).asDiagonal() * roll_share;
+    roll_slope_.resize(link_count);
+  }
   for (const Vector6& a : model.axis) local_axis_.push_back(a.head<3>());
   for (VectorX* v : {&torque, &bias, &force, &acceleration, &inverse, &drive_rate, &theta_, &thetadot_})
     v->setZero(angles);
@@ -79,6 +94,7 @@ void Engine::friction(int j, bool slopes) {
   const LinkConstants& link = links[j];
   wrench[j].setZero();
   if (slopes) turning_[j].setZero();
+  if (rolls) roll_friction[j] = 0.0, roll_slope_[j].setZero();
   const bool table = link.viscous > 0.0 || link.coulomb > 0.0;
   const bool air = link.air_linear > 0.0 || link.air_quadratic > 0.0;
   if (!table && !air) return;
@@ -107,6 +123,18 @@ void Engine::friction(int j, bool slopes) {
         Matrix3 skew = Matrix3::Zero();
         add_skew(skew, 1.0, normal_);
         turning = -slope * (normal_ * v.cross(normal_).transpose() + along * skew);
+      }
+      if (rolls) {  // of the velocity in the plane of bending
+        const Vector3 across = bending_axis_.cross(d), vp = v - bending_axis_.dot(v) * bending_axis_;
+        const double inverse = 1.0 / std::sqrt(vp.squaredNorm() + vs2);
+        const double drag = (link.viscous + link.coulomb * inverse) * kGaussWeight[g];
+        roll_friction[j] -= drag * across.dot(v);
+        if (slopes) {
+          const double bend = link.coulomb * inverse * inverse * inverse * kGaussWeight[g];
+          const Vector3 slope = bend * across.dot(v) * vp - drag * across;
+          roll_slope_[j].head<3>() += c.cross(slope);
+          roll_slope_[j].tail<3>() += slope;
+        }
       }
     }
     if (air) {
@@ -145,6 +173,19 @@ void Engine::set_state(const VectorX& theta, const VectorX& thetadot) {
     torque[k] = -p.stiffness[k] * (theta[k] - p.rest_angle[k]) - p.damping[k] * thetadot[k];
 }
 
+void Engine::add_roll() {
+  if (!rolls) return;
+  roll_torque.noalias() = roll_map * roll_friction;
+  bias += roll_torque;
+}
+
+void Engine::linearize_roll() {
+  if (!rolls) return;
+  stiffness += roll_map.lazyProduct(roll_by_angle);
+  damping += roll_map.lazyProduct(roll_by_rate);
+  drive_rate -= roll_map.lazyProduct(roll_by_time);
+}
+
 void Engine::joint_forces(const Tangent& d, Eigen::Ref<VectorX> column) const {
   const Parameters& p = model.parameters;
   column.setZero();
@@ -154,11 +195,23 @@ void Engine::joint_forces(const Tangent& d, Eigen::Ref<VectorX> column) const {
     for (int k = 0; k < angles; ++k) column[k] += p.stiffness[k] * d.rest_angle[k];
   if (!d.damping.empty())
     for (int k = 0; k < angles; ++k) column[k] -= d.damping[k] * thetadot_[k];
+  if (!rolls) return;
+  if (!d.roll_lever.empty())
+    for (int k = 0; k < angles; ++k) column[k] -= d.roll_lever[k] * roll_share.row(k).dot(roll_friction);
+  for (int j = 0; j < link_count; ++j) {
+    double change = 0.0;
+    if (!d.link_mass.empty()) change += d.link_mass[j] * links[j].coulomb_per_mass * roll_by_coulomb[j];
+    if (!d.coulomb_friction.empty())
+      change += d.coulomb_friction[j] * links[j].coulomb_per_coefficient * roll_by_coulomb[j];
+    if (!d.viscous_friction.empty()) change += d.viscous_friction[j] * roll_by_viscous[j];
+    if (change != 0.0) column -= change * roll_map.col(j);
+  }
 }
 
 void Engine::place(const trajectory::BaseMotion& base, const VectorX& theta, const VectorX& thetadot, bool slopes) {
   const Matrix3& r0 = base.pose.rotation;
   base_rotation_ = r0;
+  bending_axis_ = r0 * model.chain.bending_axis;
   base_velocity_ << r0 * base.velocity.head<3>(), r0 * base.velocity.tail<3>();
   base_turn_ << r0 * base.acceleration.head<3>(), r0 * base.acceleration.tail<3>();
   base_acceleration_ << base_turn_.head<3>(), base_turn_.tail<3>() - gravity_;
@@ -228,6 +281,7 @@ void Engine::place(const trajectory::BaseMotion& base, const VectorX& theta, con
   }
   for (int k = 0; k < angles; ++k)
     for (int i = 0; i < k; ++i) mass(i, k) = mass(k, i);
+  add_roll();
   force = torque - bias;
 }
 
@@ -278,6 +332,7 @@ void Engine::inverse_torque() {
     if (j + 1 < link_count) body_force[j] += body_force[j + 1];
     for (int k = links[j].first_angle; k < links[j].end_angle; ++k) inverse[k] = dot(axis[k], body_force[j]);
   }
+  if (rolls) inverse += roll_torque;
 }
 
 void Engine::linearize(const Vector6& base_jerk) {
@@ -316,6 +371,12 @@ void Engine::linearize(const Vector6& base_jerk) {
       damping(k, k) += p.damping[k];
     }
   }
+  for (int j = 0; rolls && j < link_count; ++j) {
+    roll_by_time[j] = dot(roll_slope_[j], base_turn);
+    for (int i = 0; i < links[j].end_angle; ++i)
+      roll_by_angle(j, i) = dot(roll_slope_[j], turn[i]), roll_by_rate(j, i) = dot(roll_slope_[j], axis[i]);
+  }
+  linearize_roll();
 }
 
 void Engine::base_slopes(BaseSlopes& slopes) const {
@@ -331,6 +392,8 @@ void Engine::base_slopes(BaseSlopes& slopes) const {
         slopes.acceleration(k, c) = dot(inertia_row, unit);
         // E u has the acceleration I (u x V) of bodies that carry the base's own velocity along; here dV_0 stays
         slopes.velocity(k, c) = dot(velocity_row, unit) + dot(inertia_row, cross(base_velocity_, unit));
+        for (int link = 0; rolls && link < link_count; ++link)
+          slopes.velocity(k, c) += roll_map(k, link) * dot(roll_slope_[link], unit);
       }
       for (int c = 0; c < 3; ++c) {
         // with everything turned but gravity and the table
@@ -355,6 +418,7 @@ void Engine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces) 
         inertial(world_inertia(1.0, 0.5 * l, l * l / 12.0 + 0.25 * r * r, 0.5 * r * r, origin[j], direction[j]));
     if (j + 1 == link_count) unit_tip_ = inertial(world_inertia(1.0, l, 0.0, 0.0, origin[j], direction[j]));
     for (Vector6* w : {&unit.viscous, &unit.coulomb, &unit.air_linear, &unit.air_quadratic}) w->setZero();
+    if (rolls) roll_by_viscous[j] = roll_by_coulomb[j] = 0.0;
     for (int g = 0; g < 3; ++g) {
       const Vector3 c = origin[j] + kGaussPoint[g] * l * direction[j];
       const Vector3 v = velocity[j].tail<3>() + velocity[j].head<3>().cross(c);
@@ -362,6 +426,13 @@ void Engine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces) 
         w.head<3>() += scale * kGaussWeight[g] * c.cross(f);
         w.tail<3>() += scale * kGaussWeight[g] * f;
       };
+      if (rolls) {
+        const double across = kGaussWeight[g] * bending_axis_.cross(direction[j]).dot(v);
+        const double along = bending_axis_.dot(v);
+        roll_by_viscous[j] -= across;
+        roll_by_coulomb[j] -=
+            across / std::sqrt(v.squaredNorm() - along * along + parameters.coulomb_speed * parameters.coulomb_speed);
+      }
       if (table_) {
         const Vector3 vt = v - normal_.dot(v) * normal_;
         add(unit.viscous, 1.0, vt);
@@ -416,7 +487,7 @@ bool Engine::articulated_acceleration() {
         singular_angle = k;
         return false;
       }
-      u[k] = torque[k] - dot(axis[k], bias_force);
+      u[k] = torque[k] - (rolls ? roll_torque[k] : 0.0) - dot(axis[k], bias_force);
       articulated -= u_vector[k] * u_vector[k].transpose() / pivot[k];
       bias_force += articulated * (turn[k] * thetadot_[k]) + u_vector[k] * (u[k] / pivot[k]);
     }

@@ -99,6 +99,12 @@ class Engine {
   std::vector<Vector6> inner_velocity, inner_acceleration;  // V_{k-1}, dV_{k-1}
   std::vector<Vector6> turn;                                // u_k
   std::vector<Matrix3> rotation;                            // of the body moved by angle k
+  // What friction does by rolling the rope (Parameters::roll_lever); all empty where it does not.
+  bool rolls = false;
+  MatrixX roll_share, roll_map;                            // share_kj, and times the lever of angle k
+  VectorX roll_friction, roll_torque;                      // a link: f_j; an angle: its part of tau_ID
+  MatrixX roll_by_angle, roll_by_rate;                     // df_j / d theta_i, df_j / d thetadot_i: links x angles
+  VectorX roll_by_time, roll_by_viscous, roll_by_coulomb;  // df_j through the base's motion; by a unit of mu, of mu^C
   // per link
   std::vector<Vector3> origin, direction;
   std::vector<Vector6> velocity, link_acceleration, wrench, body_force;  // the last: of all outer bodies
@@ -109,7 +115,9 @@ class Engine {
   const Vector3& normal() const { return normal_; }    // world
   bool has_table() const { return table_; }
   void set_state(const VectorX& theta, const VectorX& thetadot);  // and the joint law's torque
-  // A tangent's part in the joint law.
+  void add_roll();                                                // to the bias, from roll_friction
+  void linearize_roll();  // to stiffness, damping and drive_rate, from the slopes of roll_friction
+  // A tangent's part in the joint law and in the rolling (after roll_by_viscous and roll_by_coulomb).
   void joint_forces(const Tangent& unknown, Eigen::Ref<VectorX> column) const;
 
  private:
@@ -124,6 +132,8 @@ class Engine {
   double normal_gravity_ = 0.0;
   bool table_ = false;
   VectorX theta_, thetadot_;
+  Vector3 bending_axis_;             // world
+  std::vector<Vector6> roll_slope_;  // df_j / dV_j
   std::vector<Vector3> local_axis_;
   std::vector<RigidInertia> composite_inertia_;
   std::vector<Vector6> psi_;

@@ -59,6 +59,8 @@ Parameters moved(const chain::Chain& chain, const Parameters& parameters, std::s
       p.tip_mass = mass * odds / (1.0 + odds);
     }
     if (const int k = index_of(name, "rest_angle"); k >= 0 && k < chain.angles()) p.rest_angle[k] += by;
+    if (const int k = index_of(name, "roll_lever"); k >= 0 && k < static_cast<int>(p.roll_lever.size()))
+      p.roll_lever[k] += by;
   }
   // the total mass is held
   const double scale = (mass - p.tip_mass) / sum(p.link_mass);
@@ -88,6 +90,7 @@ std::vector<Tangent> tangents(const chain::Chain& chain, const Parameters& param
     slope(d.stiffness, up.stiffness, down.stiffness);
     slope(d.rest_angle, up.rest_angle, down.rest_angle);
     slope(d.damping, up.damping, down.damping);
+    slope(d.roll_lever, up.roll_lever, down.roll_lever);
     d.tip_mass = (up.tip_mass - down.tip_mass) / (2.0 * kStep);
     if (const int k = index_of(names[i], "theta"); k >= 0 && k < n) d.theta = VectorX::Unit(n, k);
     if (const int k = index_of(names[i], "thetadot"); k >= 0 && k < n) d.thetadot = VectorX::Unit(n, k);
@@ -97,7 +100,7 @@ std::vector<Tangent> tangents(const chain::Chain& chain, const Parameters& param
 
 bool is_parameter(const Tangent& d) {
   for (const auto* values : {&d.link_mass, &d.viscous_friction, &d.coulomb_friction, &d.air_linear, &d.air_quadratic,
-                             &d.stiffness, &d.rest_angle, &d.damping})
+                             &d.stiffness, &d.rest_angle, &d.damping, &d.roll_lever})
     if (!values->empty()) return true;
   return d.tip_mass != 0.0;
 }

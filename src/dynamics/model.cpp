@@ -1,7 +1,7 @@
 #include <cmath>
 #include <functional>
 
-#include "engine.h"
+#include "planar.h"
 
 namespace chainsplat::dynamics {
 namespace {
@@ -35,6 +35,10 @@ Model make_model(const chain::Chain& chain, const Parameters& p) {
   check_array(p.stiffness, angles, "stiffness");
   check_array(p.rest_angle, angles, "rest_angle", true);
   check_array(p.damping, angles, "damping");
+  if (!p.roll_lever.empty()) {
+    check_array(p.roll_lever, angles, "roll_lever", true);
+    require(is_planar(chain), "roll_lever is given for a chain that bends in more than one plane", "leave it empty");
+  }
   check_array({p.tip_mass, p.radius}, 2, "tip_mass or radius");
   check_array({p.coulomb_speed, p.drag_speed}, 2, "coulomb_speed or drag_speed");
   require(p.coulomb_speed > 0.0 && p.drag_speed > 0.0, "a regularization speed is 0", "give a number > 0");

@@ -44,7 +44,7 @@ PlanarEngine::PlanarEngine(const Model& m) : Engine(m) {
   const std::size_t n = static_cast<std::size_t>(angles);
   for (auto* v : {&cos_, &sin_, &px_, &py_, &lift_}) v->resize(n);
   for (auto* v : {&inner_v_, &inner_a_, &v_, &a_, &turn_k_, &wrench_, &force_}) v->resize(n);
-  body_.resize(n), composite_.resize(n), slope_sum_.resize(n), units_.resize(n);
+  body_.resize(n), composite_.resize(n), slope_sum_.resize(n), units_.resize(n), roll_slope_.resize(n);
   for (const LinkConstants& link : links) {
     first_moment_.push_back(link.mass * link.center);
     across_.push_back(0.5 * link.axial);  // m r^2 / 4
@@ -75,6 +75,7 @@ void PlanarEngine::friction(int j, bool slopes) {
   const bool table = link.viscous > 0.0 || link.coulomb > 0.0;
   const bool air = link.air_linear > 0.0 || link.air_quadratic > 0.0;
   if (slopes) s.turn_back = s.z = s.zx = s.zy = s.drive = {};
+  if (rolls) roll_friction[j] = 0.0, roll_slope_[j] = {};
   if (!table && !air) return;
   const double vs2 = model.parameters.coulomb_speed * model.parameters.coulomb_speed;
   const double ve2 = model.parameters.drag_speed * model.parameters.drag_speed;
@@ -107,6 +108,16 @@ void PlanarEngine::friction(int j, bool slopes) {
         add(s.turn_back, by_normal(ny, -nx, 0.0));
         const Vector3 rate_of_normal = normal_here_.cross(spin_);
         add(s.drive, by_normal(rate_of_normal.x(), rate_of_normal.y(), rate_of_normal.z()));
+      }
+      if (rolls) {  // of the velocity in the plane
+        const double inverse = 1.0 / std::sqrt(ux * ux + uy * uy + vs2), across = c * uy - si * ux;
+        const double drag = (link.viscous + link.coulomb * inverse) * kGaussWeight[g];
+        roll_friction[j] -= drag * across;
+        if (slopes) {
+          const double turn = link.coulomb * inverse * inverse * inverse * kGaussWeight[g] * across;
+          const double by_x = drag * si + turn * ux, by_y = turn * uy - drag * c;
+          add(roll_slope_[j], wrench_at(x, y, by_x, by_y));
+        }
       }
     }
     if (air) {
@@ -203,6 +214,7 @@ void PlanarEngine::place(const trajectory::BaseMotion& base, const VectorX& thet
   }
   for (int j = 0; j < angles; ++j)
     for (int i = 0; i < j; ++i) mass(j, i) = mass(i, j);
+  add_roll();
   for (int k = 0; k < angles; ++k) force[k] = torque[k] - bias[k];
   if (slopes)
     for (int j = angles - 2; j >= 0; --j) {
@@ -232,6 +244,7 @@ void PlanarEngine::linearize(const Vector6& base_jerk) {
     if (j + 1 < angles) add(f, force_[j + 1]);
     inverse[j] = f.turn + py_[j] * f.x - px_[j] * f.y;
   }
+  if (rolls) inverse += roll_torque;
 
   // the base's own change in time
   const Matrix3 back = plane_.transpose();
@@ -305,6 +318,13 @@ void PlanarEngine::linearize(const Vector6& base_jerk) {
     stiffness(j, j) += p.stiffness[j];
     damping(j, j) += p.damping[j];
   }
+  for (int j = 0; rolls && j < angles; ++j) {
+    const Planar& e = roll_slope_[j];
+    roll_by_time[j] = dot(e, base_u);
+    for (int i = 0; i <= j; ++i)
+      roll_by_angle(j, i) = dot(e, turn_k_[i]), roll_by_rate(j, i) = dot(e, axis_at(px_[i], py_[i]));
+  }
+  linearize_roll();
 }
 
 void PlanarEngine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces) {
@@ -329,6 +349,7 @@ void PlanarEngine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& fo
     unit.mass = of(0.5 * l, l * l / 3.0, 0.25 * r * r);
     if (j + 1 == angles) unit_tip_planar_ = of(l, l * l, 0.0);
     unit.viscous = unit.coulomb = unit.air_linear = unit.air_quadratic = {};
+    if (rolls) roll_by_viscous[j] = roll_by_coulomb[j] = 0.0;
     for (int g = 0; g < 3; ++g) {
       const double x = x0 + kGaussPoint[g] * l * c, y = y0 + kGaussPoint[g] * l * si, w = kGaussWeight[g];
       const double ux = v_[j].x - v_[j].turn * y, uy = v_[j].y + v_[j].turn * x;
@@ -341,6 +362,12 @@ void PlanarEngine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& fo
         add(unit.viscous, f);
         add(unit.coulomb, f,
             1.0 / std::sqrt(tx * tx + ty * ty + tz * tz + parameters.coulomb_speed * parameters.coulomb_speed));
+        if (rolls) {
+          const double across = w * (c * uy - si * ux);
+          roll_by_viscous[j] -= across;
+          roll_by_coulomb[j] -=
+              across / std::sqrt(ux * ux + uy * uy + parameters.coulomb_speed * parameters.coulomb_speed);
+        }
       }
       const double slide = c * ux + si * uy, tx = ux - slide * c, ty = uy - slide * si;
       const Planar f = wrench_at(x, y, w * tx, w * ty);

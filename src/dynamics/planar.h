@@ -58,6 +58,7 @@ class PlanarEngine : public Engine {
   std::vector<Planar> inner_v_, inner_a_, v_, a_, turn_k_, wrench_, force_;
   std::vector<Body> body_, composite_;
   std::vector<Slope> slope_sum_;
+  std::vector<Planar> roll_slope_;  // of the friction across a link, by its twist
   std::vector<Unit> units_;
   Planar unit_tip_planar_;
   std::vector<double> lift_;  // a joint: the z velocity's change at the base origin where the fields turn back about it

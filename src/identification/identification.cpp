@@ -21,6 +21,7 @@ constexpr double kHuber = 1.75;      // times the usual root mean square of a gr
 constexpr double kLeastUsual = 0.1;  // of the standard deviation expected: a closer fit does not make outliers
 constexpr double kMedianRms = 0.9;   // median of the root mean square of a few unit normals
 constexpr double kThetaSd = 0.02;    // rad, initial angles about the recognized ones without covariances
+constexpr double kAtRestSd = 0.05;   // rad/s, of a rope on a table under a base at rest
 constexpr int kLag = 10;             // frames over which residuals are taken to be correlated (SPEC 5)
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
@@ -396,7 +397,12 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
   initial_motion({part.times, part.theta, {}}, theta, thetadot);
   if (options.paper) theta = recognized.theta[0];
   if (!covariances.empty()) theta_sd = (covariances[0].diagonal().array() + 0.25 * kThetaSd * kThetaSd).sqrt();
-  part.unknowns = make_unknowns(chain, options, theta, thetadot, theta_sd);
+  // friction soon stops a rope on a table: under a base at rest it is at rest, and what looks like motion is noise
+  constexpr double kBaseAtRest = 0.01, kRopeAtRest = 0.5;  // m/s and rad/s; rad/s
+  const bool at_rest = options.tabletop && !options.paper && base.at(part.times[0]).velocity.norm() < kBaseAtRest &&
+                       thetadot.cwiseAbs().maxCoeff() < kRopeAtRest;
+  if (at_rest) thetadot.setZero();
+  part.unknowns = make_unknowns(chain, options, theta, thetadot, theta_sd, at_rest ? kAtRestSd : kRateSd);
   const int substeps = part.unknowns.fixed.substeps;
   for (bool fine : {false, true}) {
     BaseGrid& grid = part.grids[fine];

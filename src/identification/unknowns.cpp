@@ -6,18 +6,19 @@ namespace chainsplat::identification {
 namespace {
 
 // Prior standard deviations; logs unless said otherwise.
-constexpr double kSharedSd = 2.0;         // one stiffness, damping, drag: an order of magnitude either way
-constexpr double kTipSd = 1.0;            // logit of the tip's part of the mass
-constexpr double kJointSd = 0.5;          // stiffness and damping of one joint about the shared value
-constexpr double kMassSd = 0.15;          // mass of one link about the mean
-constexpr double kSmoothSd = 0.3;         // between neighbors, of those
-constexpr double kGraspSd = 0.5;          // the second axis over the first, where the rope leaves the fingers
-constexpr double kCoulombSd = 1.5;        // coefficient of one link
-constexpr double kCoulombSmoothSd = 1.0;  // between neighbors: a lifted link next to one that carries is usual
-constexpr double kSameSd = 1e-4;          // between neighbors that are to be the same
+constexpr double kSharedSd = 2.0;       // one stiffness, damping, drag: an order of magnitude either way
+constexpr double kTipSd = 1.0;          // logit of the tip's part of the mass
+constexpr double kJointSd = 0.5;        // stiffness and damping of one joint about the shared value
+constexpr double kMassSd = 0.15;        // mass of one link about the mean
+constexpr double kSmoothSd = 0.3;       // between neighbors, of those
+constexpr double kGraspSd = 0.5;        // the second axis over the first, where the rope leaves the fingers
+constexpr double kCoulombSd = 0.5;      // coefficient of the rope: 0.2 to 0.6 on most tables
+constexpr double kLinkCoulombSd = 0.3;  // one link about that
+constexpr double kHeldCoulombSd = 1.5;  // the same where the fingers lift the rope or press it on
+constexpr double kHeldDiameters = 3.0;  // from the grasp
+constexpr double kSameSd = 1e-4;        // of a link's own part where all links are to have one coefficient
 constexpr double kViscousSd = 1.0;
 constexpr double kRestSd = 0.3;  // rad
-constexpr double kRateSd = 0.5;  // rad/s, initial velocity about the differences of the recognized angles
 
 // Centers of the priors, and starts. Stiffness is relative to M g L.
 constexpr double kStiffnessPart = 0.1;
@@ -34,7 +35,7 @@ std::string numbered(const char* name, int index) { return std::string(name) + "
 }  // namespace
 
 Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const VectorX& theta, const VectorX& thetadot,
-                       const VectorX& theta_sd) {
+                       const VectorX& theta_sd, double rate_sd) {
   const int n = chain.angles(), links = chain.links() - 1;
   Unknowns u;
   u.total_mass = options.mass.value_or(1.0);
@@ -113,8 +114,7 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
       u.held.emplace_back("link_mass", "uniform along the rope");
     }
     if (options.tabletop) {
-      u.coulomb = add_many("log_coulomb_friction_link", links, std::log(kCoulombMean), kCoulombSd,
-                           options.friction_per_link ? kCoulombSmoothSd : kSameSd);
+      u.coulomb = add_many("log_coulomb_friction_link", links, std::log(kCoulombMean), kCoulombSd, 0.0);
       u.held.emplace_back("tip_mass", "0: not observable on a table beside the friction");
       u.held.emplace_back("drag", "0 on a table");
     } else {
@@ -126,10 +126,17 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
       u.rest = add_many("rest_angle", n, 0.0, kRestSd, 0.0);
     else
       u.held.emplace_back("rest_angle", "has no effect without stiffness");
+    // a natural curvature out of the plane of kRestSd a joint, torsion as stiff as bending
+    if (stiff && options.tabletop && n == links) {
+      u.first_roll = chain.link_start(1) > 0.0 ? 0 : 1;  // at the grasp nothing rolls
+      u.roll = u.size();
+      for (int k = u.first_roll; k < n; ++k)
+        add(numbered("roll_lever", k), 0.0, kRestSd * 0.5 * chain.diameter * chain.length / reference);
+    }
     u.theta = u.size();
     for (int k = 0; k < n; ++k) add(numbered("theta", k), theta[k], theta_sd[k]);
     u.thetadot = u.size();
-    for (int k = 0; k < n; ++k) add(numbered("thetadot", k), thetadot[k], kRateSd);
+    for (int k = 0; k < n; ++k) add(numbered("thetadot", k), thetadot[k], rate_sd);
   }
 
   const int size = u.size();
@@ -142,6 +149,19 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
       u.precision(i, i) += weight, u.precision(i + 1, i + 1) += weight;
       u.precision(i, i + 1) -= weight, u.precision(i + 1, i) -= weight;
     }
+  if (u.coulomb >= 0) {
+    // a rope that lies flat presses on the table with its weight: one coefficient, but where the fingers hold
+    MatrixX covariance = MatrixX::Zero(links, links);
+    const auto given = [&](int j) { return sds[u.coulomb + j] != kCoulombSd; };  // in options.priors
+    for (int i = 0; i < links; ++i) {
+      const bool held = chain.link_start(i + 1) < kHeldDiameters * chain.diameter;
+      const double own = !options.friction_per_link ? kSameSd : held ? kHeldCoulombSd : kLinkCoulombSd;
+      covariance(i, i) = given(i) ? sds[u.coulomb + i] * sds[u.coulomb + i] : own * own;
+      for (int j = 0; j < links; ++j)
+        if (!given(i) && !given(j)) covariance(i, j) += kCoulombSd * kCoulombSd;
+    }
+    u.precision.block(u.coulomb, u.coulomb, links, links) = covariance.ldlt().solve(MatrixX::Identity(links, links));
+  }
   return u;
 }
 
@@ -170,6 +190,7 @@ State apply(const chain::Chain& chain, const Unknowns& u, const VectorX& p) {
     q.damping[k] = u.compliance[k] * std::exp((u.damping < 0 ? 0.0 : p[u.damping]) +
                                               (u.joint_damping < 0 ? 0.0 : p[u.joint_damping + joint]));
     if (u.rest >= 0) q.rest_angle[k] = p[u.rest + k];
+    if (u.roll >= 0) q.roll_lever.push_back(k < u.first_roll ? 0.0 : p[u.roll + k - u.first_roll]);
   }
   s.theta = u.theta < 0 ? u.first_theta : p.segment(u.theta, n).eval();
   s.thetadot = u.thetadot < 0 ? u.first_thetadot : p.segment(u.thetadot, n).eval();
@@ -213,6 +234,7 @@ std::vector<dynamics::Tangent> tangents(const chain::Chain& chain, const Unknown
     if (u.joint_stiffness >= 0) out[u.joint_stiffness + joint].stiffness[k] = q.stiffness[k];
     if (u.joint_damping >= 0) out[u.joint_damping + joint].damping[k] = q.damping[k];
     if (u.rest >= 0) (out[u.rest + k].rest_angle = zeros(n))[k] = 1.0;
+    if (u.roll >= 0 && k >= u.first_roll) (out[u.roll + k - u.first_roll].roll_lever = zeros(n))[k] = 1.0;
     if (u.theta >= 0) out[u.theta + k].theta = VectorX::Unit(n, k);
     if (u.thetadot >= 0) out[u.thetadot + k].thetadot = VectorX::Unit(n, k);
   }

@@ -20,7 +20,8 @@ struct Unknowns {
   // first index of each group in p, -1 where the group is held
   int stiffness = -1, twist_stiffness = -1, grasp_stiffness = -1, damping = -1, drag = -1, tip = -1, coulomb = -1,
       viscous = -1;
-  int joint_stiffness = -1, joint_damping = -1, link_mass = -1, rest = -1, theta = -1, thetadot = -1;
+  int joint_stiffness = -1, joint_damping = -1, link_mass = -1, rest = -1, roll = -1, theta = -1, thetadot = -1;
+  int first_roll = 0;  // the angle of unknown `roll`
   double total_mass = 1.0;
   std::vector<double> compliance;  // an angle: reference over tributary length, times the shared stiffness and damping
   std::vector<bool> twist;         // an angle: turns about the rope
@@ -30,9 +31,11 @@ struct Unknowns {
   int size() const { return static_cast<int>(names.size()); }
 };
 
-// Priors follow SPEC 5. `theta_sd` per angle, rad.
+inline constexpr double kRateSd = 0.5;  // rad/s, initial velocity about the differences of the recognized angles
+
+// Priors follow SPEC 5. `theta_sd` per angle, rad; `rate_sd` of the initial velocities, rad/s.
 Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const VectorX& theta, const VectorX& thetadot,
-                       const VectorX& theta_sd);
+                       const VectorX& theta_sd, double rate_sd = kRateSd);
 
 struct State {
   dynamics::Parameters parameters;

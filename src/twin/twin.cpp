@@ -113,6 +113,7 @@ Json chain_json(const Twin& twin) {
       joint["stiffness"] = p->stiffness[k];
       joint["rest_angle"] = p->rest_angle[k];
       joint["damping"] = p->damping[k];
+      if (!p->roll_lever.empty()) joint["roll_lever"] = p->roll_lever[k];
     }
     out["joints"].push_back(std::move(joint));
   }
@@ -345,7 +346,12 @@ dynamics::Parameters read_parameters(const Node& node, const Twin& twin) {
     p.stiffness.push_back(joint["stiffness"].not_negative());
     p.rest_angle.push_back(joint["rest_angle"].number());
     p.damping.push_back(joint["damping"].not_negative());
+    if (joint.has("roll_lever")) p.roll_lever.push_back(joint["roll_lever"].number());
   }
+  if (!p.roll_lever.empty() && p.roll_lever.size() != p.damping.size())
+    node["joints"].fail(
+        "has roll_lever for " + std::to_string(p.roll_lever.size()) + " joints of " + std::to_string(p.damping.size()),
+        "give it for all or none");
   const double linear = node["air_drag"]["linear"].not_negative(),
                quadratic = node["air_drag"]["quadratic"].not_negative();
   for (int j = 1; j < twin.chain.links(); ++j) {
