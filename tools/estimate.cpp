@@ -176,6 +176,11 @@ void estimate(const Globals& globals, EstimateRequest& request) {
       const splat::ViewSpec spec{&source.cameras.at(view.camera), view.x0, view.y0, view.width, view.height, motions};
       return std::move(engine->draw(twin.gaussians, {&spec, 1}, true).front());
     };
+    // the device's kernels are made at their first use, which no frame shall wait for
+    capture::View whole;
+    whole.width = source.cameras[0].width;
+    whole.height = source.cameras[0].height;
+    filter.draw(whole, chain::link_motions(twin.chain, filter.rest, filter.base(base.start()).pose));
   }
   Follower follower;
   follower.update = [&](std::span<const capture::View* const> views) { return estimation::update(filter, views); };
