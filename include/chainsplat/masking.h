@@ -23,7 +23,7 @@ namespace chainsplat::masking {
 struct Colors {
   std::vector<double> object, surroundings;  // pixels counted, 32^3; empty: nothing known
   std::vector<float> log_odds;               // 32^3, from the counts by settle()
-  double separation = 0.0;                   // mean log odds of the object's pixels less that of the surroundings'
+  double usual = 0.0, separation = 0.0;      // mean log odds of the object's pixels; less that of the surroundings'
 };
 // Makes log_odds from the counts, smoothed, so that near colors speak for each other.
 void settle(Colors& colors);

@@ -19,7 +19,7 @@ constexpr double kContour = 2.0;                             // cost of a contou
 constexpr double kInsideFrom = 0.3, kBesideTo = 1.5;         // radii from the outline: not the outline, still near
 constexpr double kHiddenStep = 0.25;                         // diameters along the rope
 constexpr int kHiddenSteps = 2;                              // on either side that are looked at together
-constexpr double kSeen = 0.4;                                // of the usual separation in color: less is hidden
+constexpr double kSeen = 0.4;                                // of the usual log odds and of their usual change: less is hidden
 constexpr double kSurelyHidden = 6.0;                        // log odds
 constexpr double kSpeck = 0.02;                              // share of the largest part under which a part is noise
 constexpr double kLeastShare = 0.1;                          // of the tube's area: less is not the rope
@@ -80,8 +80,8 @@ const Colors& colors_at(const Look& look, const chain::Chain& chain, double arcl
   return arclength < 0.5 * chain.length ? look.near : look.far;
 }
 
-// Where a hand hides the rope the picture does not change at the tube's outline as it does elsewhere: log odds by
-// arclength, in steps of `step` m, 0 or less.
+// Where a hand hides the rope the tube has not the rope's colors, and the picture does not change at its outline as it
+// does elsewhere: log odds by arclength, in steps of `step` m, 0 or less.
 std::vector<double> hidden_odds(const Look& look, const Picture& picture, const Tube& place, const chain::Chain& chain,
                                 double step) {
   struct Sum {
@@ -104,10 +104,13 @@ std::vector<double> hidden_odds(const Look& look, const Picture& picture, const 
     }
   std::vector<double> out(steps, 0.0);
   for (int k = 0; k < steps; ++k) {
-    const double usual = colors_at(look, chain, k * step).separation;
-    if (inside[k].pixels == 0 || beside[k].pixels == 0 || usual <= 0.0) continue;
-    const double separation = inside[k].odds / inside[k].pixels - beside[k].odds / beside[k].pixels;
-    out[k] = std::clamp((separation / usual - kSeen) / kSeen * kSurelyHidden, -kSurelyHidden, 0.0);
+    const Colors& colors = colors_at(look, chain, k * step);
+    if (inside[k].pixels == 0 || beside[k].pixels == 0 || colors.usual <= 0.0) continue;
+    const double mean = inside[k].odds / inside[k].pixels;
+    const double separation = mean - beside[k].odds / beside[k].pixels;
+    // a hand beside the rope has the second low, but not the first
+    const double seen = std::max(mean / colors.usual, separation / colors.separation);
+    out[k] = std::clamp((seen / kSeen - 1.0) * kSurelyHidden, -kSurelyHidden, 0.0);
   }
   return out;
 }

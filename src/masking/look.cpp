@@ -59,14 +59,16 @@ void settle(Colors& colors) {
   blur(surroundings);
   colors.log_odds.resize(kColorBins);
   const double floor = kUnheardOf / kColorBins;
-  colors.separation = 0.0;
+  colors.usual = colors.separation = 0.0;
   for (int i = 0; i < kColorBins; ++i)
     colors.log_odds[i] = static_cast<float>(
         std::clamp(std::log((object[i] / object_sum + floor) / (surroundings[i] / surroundings_sum + floor)),
                    -kSurestNot, kSurest));
-  for (int i = 0; i < kColorBins; ++i)
-    colors.separation +=
-        colors.log_odds[i] * (colors.object[i] / object_sum - colors.surroundings[i] / surroundings_sum);
+  for (int i = 0; i < kColorBins; ++i) {
+    colors.usual += colors.log_odds[i] * colors.object[i] / object_sum;
+    colors.separation -= colors.log_odds[i] * colors.surroundings[i] / surroundings_sum;
+  }
+  colors.separation += colors.usual;
 }
 
 Reach reach(const chain::Chain& chain, const math::Pose& base, const capture::Camera& camera) {
