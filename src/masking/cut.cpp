@@ -19,11 +19,11 @@ constexpr double kContour = 2.0;                             // cost of a contou
 constexpr double kInsideFrom = 0.3, kBesideTo = 1.5;         // radii from the outline: not the outline, still near
 constexpr double kHiddenStep = 0.25;                         // diameters along the rope
 constexpr int kHiddenSteps = 2;                              // on either side that are looked at together
-constexpr double kSeen = 0.4;                                // of the usual log odds and of their usual change: less is hidden
-constexpr double kSurelyHidden = 6.0;                        // log odds
-constexpr double kSpeck = 0.02;                              // share of the largest part under which a part is noise
-constexpr double kLeastShare = 0.1;                          // of the tube's area: less is not the rope
-constexpr int kMargin = 24;                                  // px about the mask: what capture::load leaves
+constexpr double kSeen = 0.4;          // of the usual log odds and of their usual change: less is hidden
+constexpr double kSurelyHidden = 6.0;  // log odds
+constexpr double kSpeck = 0.02;        // share of the largest part under which a part is noise
+constexpr double kLeastShare = 0.1;    // of the tube's area: less is not the rope
+constexpr int kMargin = 24;            // px about the mask: what capture::load leaves
 
 double squared_difference(const Picture& picture, int x, int y, int u, int v) {
   const std::uint8_t *a = pixel(picture, x, y), *b = pixel(picture, u, v);

@@ -2,20 +2,23 @@
 #include <algorithm>
 #include <cmath>
 
+#include "src/masking/grow.h"
 #include "src/masking/look.h"
 
 namespace chainsplat::masking {
 
 namespace {
 
-constexpr double kForget = 0.02;       // of the background a frame: some two seconds at 30 Hz
-constexpr int kLeastSeen = 8;          // frames, before a background pixel is believed
-constexpr double kFirstNoise = 4.0;    // gray levels
-constexpr double kGivenPixels = 3e4;   // the given colors count as so many pixels: some ten frames of a rope
-constexpr double kLeastGiven = 0.1;    // share of them that is never forgotten
-constexpr double kAboutPixels = 24.0;  // px about the tube that are told apart from what is far
-constexpr int kColorEvery = 5;         // frames between two lessons in color
-constexpr double kForgetColors = 0.1;  // of the counted colors a lesson
+constexpr double kForget = 0.02;        // of the background a frame: some two seconds at 30 Hz
+constexpr int kLeastSeen = 8;           // frames, before a background pixel is believed
+constexpr double kFirstNoise = 4.0;     // gray levels
+constexpr double kGivenPixels = 3e4;    // the given colors count as so many pixels: some ten frames of a rope
+constexpr double kLeastGiven = 0.1;     // share of them that is never forgotten
+constexpr double kAboutPixels = 24.0;   // px about the tube that are told apart from what is far
+constexpr double kDoubt = 2.0;          // a prediction is not as sure as a fit
+constexpr double kLeastEvidence = 0.1;  // nats a sample: less is no rope
+constexpr int kColorEvery = 5;          // frames between two lessons in color
+constexpr double kForgetColors = 0.1;   // of the counted colors a lesson
 
 // The recorded frame without its lens distortion, in the box; elsewhere black.
 void straighten(const capture::Image8& image, const capture::Camera& camera, const Box& box,
@@ -81,16 +84,24 @@ capture::View mask(Live& live, const capture::Image8& recorded, const math::Pose
     live.look.far.surroundings = live.look.near.surroundings;
     settle(live.look);
   }
-  capture::View view = cut(live.look, picture, camera, live.chain, base, theta);
+  // where the rope is expected, or where it seems to be
+  std::optional<math::VectorX> place = theta;
+  const int joints = live.chain.links() - 1;
+  if (!theta && (live.chain.angles() == joints || live.chain.angles() == 2 * joints)) {  // no twist
+    const Shot shot{picture, &camera, camera.world_from_camera.inverse() * base};
+    const Grown grown = grow(live.chain, {&shot, 1}, {});
+    if (grown.evidence > kLeastEvidence) place = grown.theta;
+  }
+  capture::View view = cut(live.look, picture, camera, live.chain, base, place, kDoubt);
   ++live.frames;
   if (!theta) return view;
 
   // learn: background where the tube is not, colors on either side of its outline
-  const Tube place = tube(live.chain, base, *theta, camera, 0.0, live.chain.length, kAboutPixels);
+  const Tube around = tube(live.chain, base, *theta, camera, 0.0, live.chain.length, kAboutPixels);
   Background& background = live.look.background;
   for (int y = where.box.y0; y < where.box.y1; ++y)
     for (int x = where.box.x0; x < where.box.x1; ++x) {
-      if (place.at(x, y) < place.radius) continue;
+      if (around.at(x, y) < around.radius) continue;
       const std::size_t at = static_cast<std::size_t>(y) * camera.width + x;
       std::uint16_t& seen = live.seen[at];
       if (seen < UINT16_MAX) ++seen;
@@ -114,7 +125,7 @@ capture::View mask(Live& live, const capture::Image8& recorded, const math::Pose
         colors->object[i] = std::max((1.0 - kForgetColors) * colors->object[i], kLeastGiven * live.given[i]);
         colors->surroundings[i] *= 1.0 - kForgetColors;
       }
-    count_colors(live.look, picture, place, where, live.chain, true, &view);
+    count_colors(live.look, picture, around, where, live.chain, true, &view);
     settle(live.look);
   }
   return view;
