@@ -11,6 +11,7 @@
 
 #include "chainsplat/capture.h"
 #include "chainsplat/estimation.h"
+#include "chainsplat/force.h"
 #include "chainsplat/gpu.h"
 #include "chainsplat/masking.h"
 #include "chainsplat/twin.h"
@@ -119,6 +120,23 @@ bool black_about(const capture::Image8& picture) {
   for (std::size_t i = 0; i + 2 < picture.pixels.size(); i += 3)
     black += std::max({picture.pixels[i], picture.pixels[i + 1], picture.pixels[i + 2]}) <= kBlack;
   return 2 * black > picture.pixels.size() / 3;
+}
+
+// As an arrow from the contact; a force as large as the rope's weight is half as long as the rope.
+void show_force(const force::Estimate& f, const twin::Twin& twin, const dynamics::Model& model,
+                const capture::Camera& camera, Shown& shown) {
+  double mass = model.parameters.tip_mass;
+  for (const double m : model.parameters.link_mass) mass += m;
+  const double weight = mass * model.parameters.gravity.norm();
+  // along the force: across it there may be directions that nobody sees
+  const double deviation = f.force.cwiseProduct(f.sigma).norm() / std::max(f.force.norm(), 1e-9);
+  char text[80];
+  std::snprintf(text, sizeof text, "%.3f ± %.3f %s", f.force.norm(), deviation, twin.known_mass ? "N" : "N/kg");
+  shown.force_text = f.touching ? text : "none";
+  if (!f.touching || !(weight > 0.0)) return;
+  math::MatrixX ends(3, 2);
+  ends << f.point, f.point + 0.5 * twin.chain.length / weight * f.force;
+  shown.force = recorded_line(camera, ends);
 }
 
 void estimate(const Globals& globals, EstimateRequest& request) {
@@ -238,6 +256,13 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   // recorded frames are shown at the pace at which they were taken
   const bool recorded = request.source.calibration.empty();
   const double begun = core::seconds_now();
+  std::optional<force::Live> pushed;  // what touches the rope, for the window
+  if (window && twin.parameters) {
+    pushed.emplace();
+    pushed->model = filter.model;
+    pushed->deviations = force::deviations(filter.model, twin.estimates);
+    pushed->base = [&](double time) { return base.at(time); };
+  }
   if (window)
     subscribers.push_back([&](const Followed& followed) {
       const estimation::Estimate& e = followed.estimate;
@@ -246,6 +271,11 @@ void estimate(const Globals& globals, EstimateRequest& request) {
       shown.iou = e.iou, shown.residual = e.residual, shown.seen = e.seen, shown.lost = e.lost;
       shown.line = recorded_line(source.cameras[0],
                                  chain::nodes(twin.chain, chain::link_motions(twin.chain, e.theta, base.pose(e.time))));
+      if (pushed && !e.lost) {
+        const Eigen::Index n = e.theta.size();
+        if (const auto f = force::update(*pushed, e.time, e.theta, e.covariance.topLeftCorner(n, n)))
+          show_force(*f, twin, filter.model, source.cameras[0], shown);
+      }
       if (!followed.frame.picture.pixels.empty()) shown.picture = &followed.frame.picture;
       if (!followed.views.empty()) shown.view = &followed.views[0];
       window->show(shown);

@@ -125,9 +125,9 @@ void Window::show(const Shown& shown) {
       out.push_back({std::round(10.0 * p.x()) / 10.0, std::round(10.0 * p.y()) / 10.0});
     return out;
   };
-  Json state = {{"frame", shown.frame},       {"time", shown.time},          {"iou", shown.iou},
-                {"residual", shown.residual}, {"seen", shown.seen},          {"lost", shown.lost},
-                {"line", points(shown.line)}, {"force", points(shown.force)}};
+  Json state = {{"frame", shown.frame},       {"time", shown.time},           {"iou", shown.iou},
+                {"residual", shown.residual}, {"seen", shown.seen},           {"lost", shown.lost},
+                {"line", points(shown.line)}, {"force", points(shown.force)}, {"force_text", shown.force_text}};
   std::shared_ptr<std::string> rgb;
   if (core::seconds_now() - self.asked < kAsking) {
     if (shown.picture) {

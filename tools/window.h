@@ -19,6 +19,7 @@ struct Shown {
   bool seen = false, lost = false;
   std::vector<math::Vector2> line;           // the chain's joints and ends
   std::vector<math::Vector2> force;          // from the contact to the arrow's head; empty: none known
+  std::string force_text = "unknown";        // its size and standard error, or "none"
   const capture::Image8* picture = nullptr;  // RGB, as recorded; null: none
   const capture::View* view = nullptr;       // drawn where there is no picture; null: none
 };

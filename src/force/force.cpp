@@ -28,7 +28,8 @@ constexpr double kMovingSpeeds =
 constexpr double kUnseenLever = 0.1;  // diameters; angles that move no link's end (twist) are seen on the surface alone
 constexpr double kLeastTorque = 1e-6;      // of weight times length, keeps covariances invertible
 constexpr double kUnknownDeviation = 0.2;  // of a joint's stiffness and damping, where identification says nothing
-constexpr double kLiveWindow = 4.0;        // s of states that a live smoother looks back on
+constexpr double kLiveWindow =
+    1.0;  // s of states that a live smoother looks back on: how calm they are changes with a push
 
 double total_mass(const dynamics::Parameters& parameters) {
   double mass = parameters.tip_mass;

@@ -14,8 +14,8 @@ constexpr double kFirstRate = 10.0, kFirstAcceleration = 100.0;  // rad/s, rad/s
 constexpr double kLeastNoise = 1e-5;                             // rad
 constexpr double kCorrelationTimes = 2.0;  // an angle, as many as are needed to believe half of a correlation
 // What the noise is thought to be before it was seen, and as how many times that counts: the first states of a stream.
-constexpr double kUsualNoise = 2e-3;  // rad
-constexpr double kUsualTimes = 2.0;
+constexpr double kUsualNoise = 5e-3;  // rad
+constexpr double kUsualTimes = 0.5;
 
 // All angles share the gains, which depend on the ratio and the times alone, so that variances are the noise's times
 // one 3 x 3 matrix a time.

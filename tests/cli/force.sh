@@ -30,6 +30,33 @@ wait_for_line() {  # at most ten seconds
 [ "$(cat "$work/early")" -ge 1 ] || fail 'force --live: no line before the stream ended'
 [ "$(wc -l <"$work/live")" -eq 12 ] || fail 'force --live, pipe: not a line a state'
 
+# a twin that rests bent where the rope hangs straight feels a hand: the live window draws its force
+browser=$(command -v chromium || command -v chromium-browser || command -v google-chrome) || browser=
+if [ -n "$browser" ]; then
+  cp -r "$work/twin" "$work/bent"
+  python3 - "$work/bent/twin.json" <<'END'
+import json, sys
+twin = json.load(open(sys.argv[1]))
+for joint in twin["chain"]["joints"][:2]:
+    joint["rest_angle"] += 1.0
+json.dump(twin, open(sys.argv[1], "w"))
+END
+  port=$((40000 + $$ % 20000))
+  (while [ ! -e "$work/enough" ]; do
+    "$program" -q estimate "$work/bent" --camera "$demo:cam0" --solver silhouette --serve "$port" >"$work/lines" 2>/dev/null </dev/null
+  done) &
+  estimator=$!
+  for _ in 1 2 3 4 5 6; do
+    timeout 60 "$browser" --headless --no-sandbox --disable-gpu --user-data-dir="$work/profile" \
+      --virtual-time-budget=1500 --window-size=1000,560 --dump-dom "http://127.0.0.1:$port/" >"$work/dom" 2>/dev/null
+    grep -q 'data-arrows="[1-9]' "$work/dom" && break
+    sleep 0.5
+  done
+  touch "$work/enough"
+  wait "$estimator"
+  grep -q 'data-arrows="[1-9]' "$work/dom" || fail 'the live window drew no arrow of a force'
+fi
+
 # a contact at the free end, and none
 point=$(sed -n '1s/.*"point":\[\([^]]*\)\].*/\1/p' "$work/stdout")
 force --contact "$point"
