@@ -437,3 +437,25 @@ TEST_CASE("feedback on a table copes with another friction and keeps tight limit
   CHECK(seeing.hit.miss < 0.5 * blind.hit.miss);
   CHECK(peaks(seeing.motion, 0.0, 1.5, options.limits, 1e-4).over.empty());
 }
+
+TEST_CASE("a target that moves by centimeters is followed on a table") {
+  // far from the motion so far full steps overshoot by meters
+  Problem problem = problem_of(chain::Bending::planar, true);
+  Options options;
+  options.starts = 8;
+  const dynamics::Model truth = rope(chain::Bending::planar, true, 24);
+  for (const std::uint64_t seed : {1, 4, 8}) {
+    CAPTURE(seed);
+    problem.targets = {random_target(problem, options, seed)};
+    const Plan found = plan(problem, options);
+    REQUIRE(found.reached);
+    LoopOptions loop;
+    loop.target_velocity = {0.02, 0.01, 0.0};
+    loop.feedback = false;
+    const double blind = closed_loop(problem, options, found, truth, loop).hit.miss;
+    loop.feedback = true;
+    const LoopResult seeing = closed_loop(problem, options, found, truth, loop);
+    CHECK(seeing.hit.miss < 0.1 * blind);
+    CHECK(seeing.peaks.over.empty());
+  }
+}

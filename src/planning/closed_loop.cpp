@@ -16,7 +16,10 @@ constexpr double kReplanSharpness = 3e5;    // m^-2
 constexpr double kReplanSmoothness = 1e-8;
 // Two steps: the motion so far is the start, and the next replan goes on. The damping is a part of the curvature's
 // trace, which limits may dominate; where the rope sticks or a limit is near, full steps fail and much shorter ones do.
-constexpr Effort kReplanEffort{.steps = 2, .trials = 3, .damping = 1e-7, .more_damping = 200.0, .hopeful = false};
+// A target that has moved by centimeters asks for a change of that size; where the curvature is nearly singular full
+// steps are of meters.
+constexpr Effort kReplanEffort{
+    .steps = 2, .trials = 5, .damping = 1e-7, .more_damping = 50.0, .longest = 0.1, .hopeful = false};
 constexpr double kShortest = 0.15;    // s before the hit, after which nothing is changed any more
 constexpr double kLimitStep = 0.002;  // s, between tests of the limits
 constexpr double kLimitPart = 0.995;  // of the limits: between the tests no more than 0.2 % is added

@@ -105,6 +105,7 @@ int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, co
       step = -matrix.ldlt().solve(now.gradient);
       for (Eigen::Index i = 0; i < step.size(); ++i)
         if (task.held[i]) step[i] = 0.0;
+      if (const double length = step.norm(); length > effort.longest) step *= effort.longest / length;
       // where the first trial is mostly good it brings the derivatives along
       const bool ahead = effort.hopeful && trial == 0 && !last;
       next = evaluate(task, unknowns + step, sharpness, ahead);

@@ -23,6 +23,7 @@ struct Effort {
   int steps = 10, trials = 8;  // steps taken at most, and lengths tried for each
   double damping = 1e-2;       // of the first step; small near a solution
   double more_damping = 6.0;   // times, after a step that did not help
+  double longest = 1e300;      // m, of a step's weights
   bool hopeful = true;         // evaluate the derivatives with a step's first trial
   double enough = 0.0;         // m; ends where the miss is smaller, limits and obstacles kept, the rope at rest (table)
 };
