@@ -129,7 +129,7 @@ twin::Twin new_twin(const capture::Capture& capture, const Request& request, con
   twin.provenance.capture = capture.name;
   twin.provenance.capture_hash = hash_text(capture.hash);
   twin.provenance.seed = globals.seed;
-  twin.provenance.options = recognition_options(request);
+  for (const auto& [name, value] : recognition_options(request)) twin.provenance.options[name] = value;
   // from the run folder, so that the two can be moved together
   twin.provenance.options["path"] =
       fs::proximate(fs::absolute(request.capture), fs::absolute(request.out)).lexically_normal().generic_string();

@@ -18,6 +18,7 @@ for file in twin.json gaussians.ply states.csv rollout.csv metrics.json log.json
   [ -s "$work/whole/$file" ] || fail "train: no $file"
 done
 [ -e "$work/whole/checkpoint" ] && fail 'train: checkpoint/ is left'
+grep -q 'given: only ratios' "$work/whole/twin.json" || fail "train: the capture's mass is not the twin's"
 [ "$(wc -l <"$work/whole/states.csv")" -eq 13 ] || fail 'train: states.csv has not a row for every frame'
 grep -q '"stage":"recognize"' "$work/log.jsonl" || fail 'train: no record of recognize in --log'
 [ "$(head -c 4 "$work/picture.png" | tail -c 3)" = PNG ] || fail 'train: no picture'
