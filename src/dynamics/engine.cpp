@@ -68,7 +68,7 @@ Engine::Engine(const Model& m) : model(m), angles(m.chain.angles()), link_count(
     for (VectorX* v : {&roll_friction, &roll_by_time, &roll_by_viscous, &roll_by_coulomb}) v->setZero(link_count);
     roll_torque.setZero(angles);
     roll_share.setZero(angles, link_count);
-    for (MatrixX* m : {&roll_by_angle, &roll_by_rate}) m->setZero(link_count, angles);
+    for (MatrixX* by : {&roll_by_angle, &roll_by_rate}) by->setZero(link_count, angles);
     for (int a = 0; a < angles; ++a)
       for (int j = 0; j < link_count; ++j) {
         const double middle = 0.5 * (model.chain.link_start(j + 1) + model.chain.link_end(j + 1));
@@ -126,11 +126,11 @@ void Engine::friction(int j, bool slopes) {
       }
       if (rolls) {  // of the velocity in the plane of bending
         const Vector3 across = bending_axis_.cross(d), vp = v - bending_axis_.dot(v) * bending_axis_;
-        const double inverse = 1.0 / std::sqrt(vp.squaredNorm() + vs2);
-        const double drag = (link.viscous + link.coulomb * inverse) * kGaussWeight[g];
+        const double slowness = 1.0 / std::sqrt(vp.squaredNorm() + vs2);
+        const double drag = (link.viscous + link.coulomb * slowness) * kGaussWeight[g];
         roll_friction[j] -= drag * across.dot(v);
         if (slopes) {
-          const double bend = link.coulomb * inverse * inverse * inverse * kGaussWeight[g];
+          const double bend = link.coulomb * slowness * slowness * slowness * kGaussWeight[g];
           const Vector3 slope = bend * across.dot(v) * vp - drag * across;
           roll_slope_[j].head<3>() += c.cross(slope);
           roll_slope_[j].tail<3>() += slope;

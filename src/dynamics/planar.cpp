@@ -110,12 +110,12 @@ void PlanarEngine::friction(int j, bool slopes) {
         add(s.drive, by_normal(rate_of_normal.x(), rate_of_normal.y(), rate_of_normal.z()));
       }
       if (rolls) {  // of the velocity in the plane
-        const double inverse = 1.0 / std::sqrt(ux * ux + uy * uy + vs2), across = c * uy - si * ux;
-        const double drag = (link.viscous + link.coulomb * inverse) * kGaussWeight[g];
+        const double slowness = 1.0 / std::sqrt(ux * ux + uy * uy + vs2), across = c * uy - si * ux;
+        const double drag = (link.viscous + link.coulomb * slowness) * kGaussWeight[g];
         roll_friction[j] -= drag * across;
         if (slopes) {
-          const double turn = link.coulomb * inverse * inverse * inverse * kGaussWeight[g] * across;
-          const double by_x = drag * si + turn * ux, by_y = turn * uy - drag * c;
+          const double turned = link.coulomb * slowness * slowness * slowness * kGaussWeight[g] * across;
+          const double by_x = drag * si + turned * ux, by_y = turned * uy - drag * c;
           add(roll_slope_[j], wrench_at(x, y, by_x, by_y));
         }
       }
