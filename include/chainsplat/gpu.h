@@ -114,7 +114,8 @@ class Pipeline {
  public:
   Pipeline();
   // Compute pipeline of shaders/<name>.comp with `buffers` storage buffers at set 0, bindings 0.., `push_bytes` of push
-  // constants (at most 128) and specialization constants 0, 1, 2, ... = `constants` (uint).
+  // constants (at most 128) and specialization constants 0, 1, 2, ... = `constants` (uint). Compiled once a device: all
+  // that are made alike share one.
   Pipeline(Device& device, const std::string& name, int buffers, std::size_t push_bytes,
            const std::vector<std::uint32_t>& constants);
   Pipeline(Pipeline&&) noexcept;
@@ -124,7 +125,7 @@ class Pipeline {
   const Handles& handles() const { return *handles_; }
 
  private:
-  std::unique_ptr<Handles> handles_;
+  std::shared_ptr<const Handles> handles_;
 };
 
 struct Timing {

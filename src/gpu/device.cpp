@@ -415,6 +415,7 @@ Device::~Device() {
   vkDeviceWaitIdle(handle);
   staging_commands.reset();
   staging = Buffer();
+  pipelines.clear();
   if (pipelines_made) save_pipeline_cache(handle, pipeline_cache, pipeline_cache_file);
   vkDestroyPipelineCache(handle, pipeline_cache, nullptr);
   vkDestroySemaphore(handle, timeline, nullptr);

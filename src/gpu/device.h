@@ -3,6 +3,7 @@
 #include <vulkan/vulkan.h>
 
 #include <atomic>
+#include <map>
 #include <memory>
 #include <mutex>
 #include <string>
@@ -13,11 +14,11 @@
 namespace chainsplat::gpu {
 
 // What every device that we accept offers (checked by list_devices, relied on by everyone).
-inline constexpr std::uint32_t kMostPushBytes = 128;         // the least maxPushConstantsSize of Vulkan
-inline constexpr std::uint32_t kMostGroups = 65535;          // the least maxComputeWorkGroupCount of Vulkan, an axis
-inline constexpr std::uint32_t kLeastInvocations = 256;      // of a work group; Vulkan itself promises 128
-inline constexpr std::uint32_t kLeastSharedBytes = 16384;    // the least maxComputeSharedMemorySize of Vulkan
-inline constexpr std::uint32_t kLeastStorageBuffers = 16;    // of a kernel; Vulkan itself promises 4
+inline constexpr std::uint32_t kMostPushBytes = 128;       // the least maxPushConstantsSize of Vulkan
+inline constexpr std::uint32_t kMostGroups = 65535;        // the least maxComputeWorkGroupCount of Vulkan, an axis
+inline constexpr std::uint32_t kLeastInvocations = 256;    // of a work group; Vulkan itself promises 128
+inline constexpr std::uint32_t kLeastSharedBytes = 16384;  // the least maxComputeSharedMemorySize of Vulkan
+inline constexpr std::uint32_t kLeastStorageBuffers = 16;  // of a kernel; Vulkan itself promises 4
 
 // A Vulkan struct with its type set and everything else zero.
 template <class T>
@@ -82,8 +83,8 @@ class Device {
   std::uint32_t queue_family = 0;
   std::uint32_t push_descriptors = 0;  // storage buffers that can be pushed; 0: use descriptor sets
   bool fixes_subgroup_size = false;
-  std::uint64_t timestamp_mask = 0;    // 0: no timestamps
-  double timestamp_period = 1.0;       // ns a tick
+  std::uint64_t timestamp_mask = 0;  // 0: no timestamps
+  double timestamp_period = 1.0;     // ns a tick
   bool validation = false;
   std::uint64_t most_bytes = 0, most_submits = 0;      // see DeviceOptions
   mutable std::atomic<std::uint64_t> buffer_bytes{0};  // of all buffers there are
@@ -96,6 +97,9 @@ class Device {
   VkPipelineCache pipeline_cache = VK_NULL_HANDLE;
   Path pipeline_cache_file;
   std::atomic<bool> pipelines_made{false};
+  // compiled, by everything that they depend on; for as long as the device
+  std::mutex pipelines_mutex;
+  std::map<std::string, std::shared_ptr<const Pipeline::Handles>> pipelines;
 
   // upload and download of memory that is not mapped
   std::mutex staging_mutex;

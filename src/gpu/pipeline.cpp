@@ -91,10 +91,14 @@ Pipeline::Handles::~Handles() {
   vkDestroyDescriptorSetLayout(device->handle, set_layout, nullptr);
 }
 
-Pipeline::Pipeline(Device& device, const std::string& name, int buffers, std::size_t push_bytes,
-                   const std::vector<std::uint32_t>& constants)
-    : handles_(std::make_unique<Handles>()) {
-  Handles& h = *handles_;
+namespace {
+
+// Throws as the constructor of Pipeline.
+std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std::string& name, int buffers,
+                                                      std::size_t push_bytes,
+                                                      const std::vector<std::uint32_t>& constants) {
+  auto handles = std::make_shared<Pipeline::Handles>();
+  Pipeline::Handles& h = *handles;
   h.device = &device;
   CHAINSPLAT_CHECK(push_bytes <= kMostPushBytes && push_bytes % 4 == 0, name + ": " + std::to_string(push_bytes));
   CHAINSPLAT_CHECK(buffers >= 0 && buffers <= static_cast<int>(kLeastStorageBuffers),
@@ -156,6 +160,19 @@ Pipeline::Pipeline(Device& device, const std::string& name, int buffers, std::si
   device.check(result, ("compile shader " + name).c_str());
   device.pipelines_made = true;
   device.name(VK_OBJECT_TYPE_PIPELINE, reinterpret_cast<std::uint64_t>(h.pipeline), name.c_str());
+  return handles;
+}
+
+}  // namespace
+
+Pipeline::Pipeline(Device& device, const std::string& name, int buffers, std::size_t push_bytes,
+                   const std::vector<std::uint32_t>& constants) {
+  std::string key = name + ' ' + std::to_string(buffers) + ' ' + std::to_string(push_bytes);
+  for (const std::uint32_t constant : constants) key += ' ' + std::to_string(constant);
+  const std::lock_guard lock(device.pipelines_mutex);
+  std::shared_ptr<const Handles>& shared = device.pipelines[key];
+  if (!shared) shared = make_handles(device, name, buffers, push_bytes, constants);
+  handles_ = shared;
 }
 
 Pipeline::Pipeline() = default;
