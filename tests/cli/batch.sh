@@ -47,11 +47,7 @@ grep -q "^chainsplat: error: --launcher slurm: there is no 'sbatch'.*; " "$work/
 # interrupted at work: the trainings leave checkpoints
 "$program" batch "$work/jobs.toml" -o "$work/batch" >"$work/stdout" 2>"$work/stderr" </dev/null &
 pid=$!
-for _ in $(seq 1200); do
-  [ -s "$work/batch/good-joints_3/checkpoint/recognize.bin" ] && break
-  kill -0 $pid 2>/dev/null || break
-  sleep 0.05
-done
+wait_for_file "$work/batch/good-joints_3/checkpoint/recognize.bin" $pid
 expect_error 2 'another process' batch "$work/jobs.toml" -o "$work/batch"
 kill -INT $pid
 wait $pid

@@ -46,12 +46,7 @@ END
     "$program" -q estimate "$work/bent" --camera "$demo:cam0" --solver silhouette --serve "$port" >"$work/lines" 2>/dev/null </dev/null
   done) &
   estimator=$!
-  for _ in 1 2 3 4 5 6; do
-    timeout 60 "$browser" --headless --no-sandbox --disable-gpu --user-data-dir="$work/profile" \
-      --virtual-time-budget=1500 --window-size=1000,560 --dump-dom "http://127.0.0.1:$port/" >"$work/dom" 2>/dev/null
-    grep -q 'data-arrows="[1-9]' "$work/dom" && break
-    sleep 0.5
-  done
+  browse "$port" 'data-arrows="[1-9]'
   touch "$work/enough"
   wait "$estimator"
   grep -q 'data-arrows="[1-9]' "$work/dom" || fail 'the live window drew no arrow of a force'

@@ -50,11 +50,7 @@ done
 rm -rf "$work/killed"
 "$program" train "$demo" -o "$work/killed" "${options[@]}" >/dev/null 2>&1 </dev/null &
 pid=$!
-for _ in $(seq 1200); do
-  [ -s "$work/killed/checkpoint/recognize.before.bin" ] && break
-  kill -0 $pid 2>/dev/null || break
-  sleep 0.05
-done
+wait_for_file "$work/killed/checkpoint/recognize.before.bin" $pid
 expect_error 2 'another process works in this folder' train "$demo" -o "$work/killed" "${options[@]}" --resume
 expect_error 2 'another process works in this folder' train "$demo" -o "$work/killed" "${options[@]}" --force
 

@@ -38,6 +38,27 @@ expect_output() {  # pattern name
   grep -Eq -- "$1" "$work/stdout" || fail "$2: standard output does not match '$1'"
 }
 
+# Looks at a page of the loopback address with the browser $browser until its document matches; it is left in $work/dom.
+browse() {  # port pattern
+  local look
+  for look in 1 2 3 4 5 6; do
+    timeout 60 "$browser" --headless --no-sandbox --disable-gpu --user-data-dir="$work/profile" \
+      --virtual-time-budget=1500 --window-size=1000,560 --dump-dom "http://127.0.0.1:$1/" >"$work/dom" 2>/dev/null
+    grep -q "$2" "$work/dom" && return
+    sleep 0.5
+  done
+}
+
+# Waits until the process has written a file with something in it, or has ended.
+wait_for_file() {  # file pid
+  local look
+  for look in $(seq 1200); do
+    [ -s "$1" ] && return
+    kill -0 "$2" 2>/dev/null || return
+    sleep 0.05
+  done
+}
+
 finish() {
   [ "$failures" -eq 0 ] && echo "all passed" || echo "$failures failed"
   exit $((failures > 0))

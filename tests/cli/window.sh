@@ -40,12 +40,7 @@ port=$((port + 1))
   echo "$? $(grep -c '"frame":' "$work/lines")" >>"$work/runs"
 done) &
 estimator=$!
-for _ in 1 2 3 4 5 6; do
-  timeout 60 "$browser" --headless --no-sandbox --disable-gpu --user-data-dir="$work/profile" \
-    --virtual-time-budget=1500 --window-size=1000,560 --dump-dom "http://127.0.0.1:$port/" >"$work/dom" 2>/dev/null
-  grep -q 'data-frames="[0-9]' "$work/dom" && break
-  sleep 0.5
-done
+browse "$port" 'data-frames="[0-9]'
 touch "$work/enough"
 wait "$estimator"
 # the estimator comes to its end whether or not somebody looks
