@@ -68,17 +68,59 @@ Planar PlanarEngine::field(const Body& b, double xx, double xy, double yy) const
           xy * b.moment_x + yy * b.moment_y};
 }
 
+// Drag across the link. In the plane it has one direction, n, and the velocity along n and the places are linear in the
+// arc length: sums of three numbers a point are enough.
+void PlanarEngine::air_friction(int j, bool slopes) {
+  const LinkConstants& link = links[j];
+  const double ve2 = model.parameters.drag_speed * model.parameters.drag_speed;
+  const double c = cos_[j], si = sin_[j], jx = px_[j], jy = py_[j];
+  const Planar v = v_[j];
+  // by the twist: n . u = row . v, row = (lever + along, n), which is also the wrench of the force n
+  const double lever = jx * c + jy * si;
+  const double across = v.turn * lever - si * v.x + c * v.y;
+  const double uz0 = slide_.z() - spin_.y() * jx + spin_.x() * jy, uz1 = spin_.x() * si - spin_.y() * c;
+  double force = 0.0, moment = 0.0, by_speed[3] = {}, by_z[3] = {};  // powers of the arc length
+  for (int g = 0; g < 3; ++g) {
+    const double along = kGaussPoint[g] * link.length, w = across + v.turn * along, uz = uz0 + uz1 * along;
+    const double speed = std::sqrt(w * w + uz * uz + ve2);
+    const double rate = (link.air_linear + link.air_quadratic * speed) * kGaussWeight[g];
+    force -= rate * w, moment -= rate * w * along;
+    if (slopes) {
+      const double bend = link.air_quadratic / speed * kGaussWeight[g];
+      const double slope = rate + bend * w * w, slope_z = bend * w * uz;
+      by_speed[0] += slope, by_speed[1] += slope * along, by_speed[2] += slope * along * along;
+      by_z[0] += slope_z, by_z[1] += slope_z * along, by_z[2] += slope_z * along * along;
+    }
+  }
+  add(wrench_[j], {lever * force + moment, -si * force, c * force});
+  if (!slopes) return;
+  Slope& s = slope_sum_[j];
+  const double first = lever * by_speed[0] + by_speed[1];
+  s.e[0][0] += lever * (first + by_speed[1]) + by_speed[2];
+  s.e[0][1] -= si * first, s.e[1][0] -= si * first;
+  s.e[0][2] += c * first, s.e[2][0] += c * first;
+  s.e[1][1] += si * si * by_speed[0], s.e[2][2] += c * c * by_speed[0];
+  s.e[1][2] -= c * si * by_speed[0], s.e[2][1] -= c * si * by_speed[0];
+  if (spin_.x() == 0.0 && spin_.y() == 0.0 && slide_.z() == 0.0) return;  // uz = 0
+  const auto z = [&](double sum0, double sum1) -> Planar { return {lever * sum0 + sum1, -si * sum0, c * sum0}; };
+  const Planar z0 = z(by_z[0], by_z[1]), z1 = z(by_z[1], by_z[2]);
+  add(s.z, z0), add(s.zx, z0, jx), add(s.zx, z1, c), add(s.zy, z0, jy), add(s.zy, z1, si);
+}
+
 void PlanarEngine::friction(int j, bool slopes) {
   const LinkConstants& link = links[j];
   wrench_[j] = {};
   Slope& s = slope_sum_[j];
-  const bool table = link.viscous > 0.0 || link.coulomb > 0.0;
-  const bool air = link.air_linear > 0.0 || link.air_quadratic > 0.0;
   if (slopes) s.turn_back = s.z = s.zx = s.zy = s.drive = {};
   if (rolls) roll_friction[j] = 0.0, roll_slope_[j] = {};
-  if (!table && !air) return;
+  if (link.air_linear > 0.0 || link.air_quadratic > 0.0) air_friction(j, slopes);
+  if (link.viscous > 0.0 || link.coulomb > 0.0) table_friction(j, slopes);
+}
+
+void PlanarEngine::table_friction(int j, bool slopes) {
+  const LinkConstants& link = links[j];
+  Slope& s = slope_sum_[j];
   const double vs2 = model.parameters.coulomb_speed * model.parameters.coulomb_speed;
-  const double ve2 = model.parameters.drag_speed * model.parameters.drag_speed;
   const double nx = normal_here_.x(), ny = normal_here_.y(), nz = normal_here_.z();
   const Planar v = v_[j];
   const double c = cos_[j], si = sin_[j];
@@ -86,51 +128,36 @@ void PlanarEngine::friction(int j, bool slopes) {
     const double along = kGaussPoint[g] * link.length, x = px_[j] + along * c, y = py_[j] + along * si;
     const double ux = v.x - v.turn * y, uy = v.y + v.turn * x;
     const double uz = slide_.z() - spin_.y() * x + spin_.x() * y;
-    double fx = 0.0, fy = 0.0, xx = 0.0, xy = 0.0, yy = 0.0, xz = 0.0, yz = 0.0;
-    if (table) {
-      const double lift = nx * ux + ny * uy + nz * uz;
-      const double tx = ux - lift * nx, ty = uy - lift * ny, tz = uz - lift * nz;
-      const double speed = 1.0 / std::sqrt(tx * tx + ty * ty + tz * tz + vs2);
-      const double rate = (link.viscous + link.coulomb * speed) * kGaussWeight[g];
-      fx -= rate * tx, fy -= rate * ty;
-      if (slopes) {
-        const double bend = link.coulomb * speed * speed * speed * kGaussWeight[g];
-        xx += bend * tx * tx - rate * (1.0 - nx * nx), xy += bend * tx * ty + rate * nx * ny;
-        yy += bend * ty * ty - rate * (1.0 - ny * ny);
-        xz += bend * tx * tz + rate * nx * nz, yz += bend * ty * tz + rate * ny * nz;
-        // f changes with the normal by -S (N (u dN) + (N u) dN), S = bend v_t v_t^T - rate
-        const auto by_normal = [&](double dx, double dy, double dz) {
-          const double turned = ux * dx + uy * dy + uz * dz;
-          const double wx = nx * turned + lift * dx, wy = ny * turned + lift * dy, wz = nz * turned + lift * dz;
-          const double part = bend * (tx * wx + ty * wy + tz * wz);
-          return wrench_at(x, y, part * tx - rate * wx, part * ty - rate * wy);  // minus df
-        };
-        add(s.turn_back, by_normal(ny, -nx, 0.0));
-        const Vector3 rate_of_normal = normal_here_.cross(spin_);
-        add(s.drive, by_normal(rate_of_normal.x(), rate_of_normal.y(), rate_of_normal.z()));
-      }
-      if (rolls) {  // of the velocity in the plane
-        const double slowness = 1.0 / std::sqrt(ux * ux + uy * uy + vs2), across = c * uy - si * ux;
-        const double drag = (link.viscous + link.coulomb * slowness) * kGaussWeight[g];
-        roll_friction[j] -= drag * across;
-        if (slopes) {
-          const double turned = link.coulomb * slowness * slowness * slowness * kGaussWeight[g] * across;
-          const double by_x = drag * si + turned * ux, by_y = turned * uy - drag * c;
-          add(roll_slope_[j], wrench_at(x, y, by_x, by_y));
-        }
-      }
+    double xx = 0.0, xy = 0.0, yy = 0.0, xz = 0.0, yz = 0.0;
+    const double lift = nx * ux + ny * uy + nz * uz;
+    const double tx = ux - lift * nx, ty = uy - lift * ny, tz = uz - lift * nz;
+    const double speed = 1.0 / std::sqrt(tx * tx + ty * ty + tz * tz + vs2);
+    const double rate = (link.viscous + link.coulomb * speed) * kGaussWeight[g];
+    const double fx = -rate * tx, fy = -rate * ty;
+    if (slopes) {
+      const double bend = link.coulomb * speed * speed * speed * kGaussWeight[g];
+      xx = bend * tx * tx - rate * (1.0 - nx * nx), xy = bend * tx * ty + rate * nx * ny;
+      yy = bend * ty * ty - rate * (1.0 - ny * ny);
+      xz = bend * tx * tz + rate * nx * nz, yz = bend * ty * tz + rate * ny * nz;
+      // f changes with the normal by -S (N (u dN) + (N u) dN), S = bend v_t v_t^T - rate
+      const auto by_normal = [&](double dx, double dy, double dz) {
+        const double turned = ux * dx + uy * dy + uz * dz;
+        const double wx = nx * turned + lift * dx, wy = ny * turned + lift * dy, wz = nz * turned + lift * dz;
+        const double part = bend * (tx * wx + ty * wy + tz * wz);
+        return wrench_at(x, y, part * tx - rate * wx, part * ty - rate * wy);  // minus df
+      };
+      add(s.turn_back, by_normal(ny, -nx, 0.0));
+      const Vector3 rate_of_normal = normal_here_.cross(spin_);
+      add(s.drive, by_normal(rate_of_normal.x(), rate_of_normal.y(), rate_of_normal.z()));
     }
-    if (air) {
-      const double slide = c * ux + si * uy;
-      const double tx = ux - slide * c, ty = uy - slide * si;
-      const double speed = std::sqrt(tx * tx + ty * ty + uz * uz + ve2);
-      const double rate = (link.air_linear + link.air_quadratic * speed) * kGaussWeight[g];
-      fx -= rate * tx, fy -= rate * ty;
+    if (rolls) {  // of the velocity in the plane
+      const double slowness = 1.0 / std::sqrt(ux * ux + uy * uy + vs2), across = c * uy - si * ux;
+      const double drag = (link.viscous + link.coulomb * slowness) * kGaussWeight[g];
+      roll_friction[j] -= drag * across;
       if (slopes) {
-        const double bend = link.air_quadratic / speed * kGaussWeight[g];
-        xx -= bend * tx * tx + rate * (1.0 - c * c), xy -= bend * tx * ty - rate * c * si;
-        yy -= bend * ty * ty + rate * (1.0 - si * si);
-        xz -= bend * tx * uz, yz -= bend * ty * uz;
+        const double turned = link.coulomb * slowness * slowness * slowness * kGaussWeight[g] * across;
+        const double by_x = drag * si + turned * ux, by_y = turned * uy - drag * c;
+        add(roll_slope_[j], wrench_at(x, y, by_x, by_y));
       }
     }
     add(wrench_[j], wrench_at(x, y, fx, fy));

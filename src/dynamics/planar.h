@@ -44,6 +44,8 @@ class PlanarEngine : public Engine {
     Planar mass, viscous, coulomb, air_linear, air_quadratic;
   };
   void friction(int link, bool slopes);
+  void air_friction(int link, bool slopes);
+  void table_friction(int link, bool slopes);
   Planar inertial(const Body& body, const Planar& v, const Planar& a) const;
   Planar field(const Body& body, double xx, double xy, double yy) const;  // of the acceleration X r
 
