@@ -29,8 +29,7 @@ const Case kCases[] = {{"free, kappa = 0", false, false, false},  {"free, elasti
                        {"table, Coulomb", true, true, false},     {"free, kappa = 0, few", false, false, true},
                        {"free, elastic, few", false, true, true}, {"table, Coulomb, few", true, true, true}};
 
-// Standard errors: stick and slip make the sum of squares rough, so that a descent ends before its minimum.
-constexpr double kRough = 2.0;
+constexpr double kSameMinimum = 1e-3;  // standard errors between the ends of descents from starts three times off
 
 struct Truth {
   chain::Chain chain;
@@ -108,8 +107,9 @@ Options options_of(const Case& what) {
 // Least standard errors that any estimate with these priors can have.
 std::vector<double> cramer_rao(const Truth& truth, const Case& what, const std::vector<std::string>& names) {
   dynamics::Model model = dynamics::make_model(truth.chain, truth.parameters);
-  const Unknowns unknowns = make_unknowns(truth.chain, options_of(what), truth.states.theta[0], VectorX::Zero(8),
-                                          VectorX::Constant(8, kNoise));
+  const Unknowns unknowns =
+      make_unknowns(truth.chain, options_of(what), truth.states.theta[0], VectorX::Zero(8),
+                    VectorX::Constant(8, std::hypot(kNoise, 0.5 * kThetaSd)), what.table ? kAtRestSd : kRateSd);
   REQUIRE(unknowns.names == names);
   const auto tangents = dynamics::tangents(truth.chain, truth.parameters, names);
   const dynamics::BaseGrid grid = dynamics::sample_base(base_at, 0.0, truth.states.time, 16);
@@ -195,7 +195,7 @@ TEST_CASE("on truth with noise, starts three times off end in one minimum with h
   for (const Case& what : kCases) {
     CAPTURE(what.name);
     const Study s = study(what, 1);
-    CHECK(s.same_minimum < (what.table ? kRough : 1e-6));
+    CHECK(s.same_minimum < kSameMinimum);
     CHECK(s.within >= 0.95 * s.parameters);  // of one seed
     if (!what.stiff || what.table) CHECK(std::abs(s.errors.at("log_damping")[0]) < 0.05);
     if (what.table) CHECK(std::abs(s.errors.at("coulomb")[0]) < 0.05);
@@ -240,7 +240,7 @@ TEST_CASE("study: figures on truth over 20 seeds" * doctest::skip()) {
   for (const Case& what : kCases) {
     const Study s = study(what, 20);
     print(what, s);
-    CHECK(s.same_minimum < (what.table ? 2.0 * kRough : 1e-6));
+    CHECK(s.same_minimum < kSameMinimum);
     CHECK(s.within >= 0.98 * s.parameters);
     // beside its stiffness a rope in the air shows its damping badly, and its standard error says so; so does one that
     // may roll on a table
@@ -252,6 +252,7 @@ TEST_CASE("study: figures on truth over 20 seeds" * doctest::skip()) {
       CHECK(median(s.errors.at("coulomb")) <= 0.015);
       CHECK(largest(s.errors.at("coulomb")) <= 0.05);
     }
-    CHECK(median(s.excess) <= 1.2);
+    // of a log: where few frames tell one link's friction apart, the bound at the truth is not that at the estimate
+    CHECK(largest(s.excess) <= (what.few ? 1.2 : 1.3));
   }
 }

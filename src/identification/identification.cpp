@@ -20,8 +20,6 @@ constexpr double kCorrelated = 9.0;  // model errors of neighbors in space and t
 constexpr double kHuber = 1.75;      // times the usual root mean square of a group of residuals
 constexpr double kLeastUsual = 0.1;  // of the standard deviation expected: a closer fit does not make outliers
 constexpr double kMedianRms = 0.9;   // median of the root mean square of a few unit normals
-constexpr double kThetaSd = 0.02;    // rad, initial angles about the recognized ones without covariances
-constexpr double kAtRestSd = 0.05;   // rad/s, of a rope on a table under a base at rest
 constexpr int kLag = 10;             // frames over which residuals are taken to be correlated (SPEC 5)
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
@@ -158,8 +156,33 @@ double loss_of(const std::vector<MatrixX>& values, double limit) {
 struct Normal {
   MatrixX hessian;   // J^T W J
   VectorX gradient;  // J^T W r
-  MatrixX scores;    // a frame's part of the gradient, unknowns x frames
 };
+
+// Whitened residuals of frame k and their derivatives by the unknowns, with the roots of Huber's weights.
+struct Rows {
+  VectorX right;
+  MatrixX slopes;  // residuals x unknowns
+};
+
+void weighted_rows(const Part& part, const chain::States& states, const dynamics::Sensitivities& slopes,
+                   const std::vector<MatrixX>& values, double limit, std::size_t k, Rows& out) {
+  const Eigen::Index group = values[k].rows(), groups = values[k].cols();
+  const double most = limit * std::sqrt(static_cast<double>(group));
+  MatrixX placed, by_angle(group * groups, part.chain.angles());
+  std::vector<MatrixX> jacobians;
+  out.right.resize(group * groups);
+  if (part.has_markers) place_points(part, states.theta[k], placed, &jacobians);
+  for (Eigen::Index i = 0; i < groups; ++i) {
+    const double r = values[k].col(i).norm();
+    const double weight = std::sqrt(r <= most ? 1.0 : most / r);
+    if (part.has_markers)
+      by_angle.middleRows<3>(3 * i).noalias() = weight * part.whitening[k].middleCols<3>(3 * i) * jacobians[i];
+    else
+      by_angle = weight * part.whitening[k];
+    out.right.segment(group * i, group) = weight * values[k].col(i);
+  }
+  out.slopes.noalias() = by_angle * slopes.theta[k];
+}
 
 Normal normal_equations(const Part& part, const chain::States& states, const dynamics::Sensitivities& slopes,
                         const std::vector<MatrixX>& values, double limit) {
@@ -168,39 +191,49 @@ Normal normal_equations(const Part& part, const chain::States& states, const dyn
   // blocks of frames, summed in fixed order: the result does not depend on the number of threads
   constexpr std::size_t kBlock = 10;
   const std::size_t blocks = (frames + kBlock - 1) / kBlock;
-  std::vector<MatrixX> hessians(blocks);
-  Normal out;
-  out.scores.resize(size, frames);
+  const Normal zero{MatrixX::Zero(size, size), VectorX::Zero(size)};
+  std::vector<Normal> sums(blocks, zero);
   core::parallel_for(static_cast<std::int64_t>(blocks), [&](std::int64_t block) {
-    MatrixX& hessian = hessians[block];
-    hessian = MatrixX::Zero(size, size);
-    MatrixX placed, by_angle, rows;
-    VectorX right;
-    std::vector<MatrixX> jacobians;
+    Rows rows;
     for (std::size_t k = block * kBlock; k < std::min(frames, (block + 1) * kBlock); ++k) {
-      const Eigen::Index group = values[k].rows(), groups = values[k].cols();
-      const double most = limit * std::sqrt(static_cast<double>(group));
-      by_angle.resize(group * groups, part.chain.angles());
-      right.resize(group * groups);
-      if (part.has_markers) place_points(part, states.theta[k], placed, &jacobians);
-      for (Eigen::Index i = 0; i < groups; ++i) {
-        const double r = values[k].col(i).norm();
-        const double weight = std::sqrt(r <= most ? 1.0 : most / r);
-        if (part.has_markers)
-          by_angle.middleRows<3>(3 * i).noalias() = weight * part.whitening[k].middleCols<3>(3 * i) * jacobians[i];
-        else
-          by_angle = weight * part.whitening[k];
-        right.segment(group * i, group) = weight * values[k].col(i);
-      }
-      rows.noalias() = by_angle * slopes.theta[k];
-      hessian.selfadjointView<Eigen::Lower>().rankUpdate(rows.transpose());
-      out.scores.col(k).noalias() = rows.transpose() * right;
+      weighted_rows(part, states, slopes, values, limit, k, rows);
+      sums[block].hessian.selfadjointView<Eigen::Lower>().rankUpdate(rows.slopes.transpose());
+      sums[block].gradient.noalias() += rows.slopes.transpose() * rows.right;
     }
   });
-  out.hessian = MatrixX::Zero(size, size);
-  for (const MatrixX& sum : hessians) out.hessian += sum;
+  Normal out = zero;
+  for (const Normal& sum : sums) out.hessian += sum.hessian, out.gradient += sum.gradient;
   out.hessian = out.hessian.selfadjointView<Eigen::Lower>();
-  out.gradient = out.scores.rowwise().sum();
+  return out;
+}
+
+// J^T G J, G the covariance of the weighted residuals: frames up to kLag apart are correlated (SPEC 5), every residual
+// alike. The autocovariance is that of all residuals together: of one unknown's score alone, which a few frames may
+// decide, it would be mostly chance.
+MatrixX covariance_of_scores(const Part& part, const chain::States& states, const dynamics::Sensitivities& slopes,
+                             const std::vector<MatrixX>& values, double limit) {
+  const std::size_t frames = values.size();
+  const std::size_t window = std::min<std::size_t>(kLag + 1, frames);
+  std::vector<double> sums(window, 0.0);
+  std::vector<Rows> last(window);  // frame k at k % window
+  double seen = 0.0;
+  const Eigen::Index size = part.unknowns.size();
+  std::vector<MatrixX> products(window, MatrixX::Zero(size, size));
+  for (std::size_t k = 0; k < frames; ++k) {
+    Rows& now = last[k % window];
+    weighted_rows(part, states, slopes, values, limit, k, now);
+    seen += static_cast<double>((now.right.array() != 0.0).count());  // no weight where a marker is not seen
+    for (std::size_t lag = 0; lag < window && lag <= k; ++lag) {
+      const Rows& before = last[(k - lag) % window];
+      sums[lag] += now.right.dot(before.right);
+      products[lag].noalias() += now.slopes.transpose() * before.slopes;
+    }
+  }
+  MatrixX out = MatrixX::Zero(size, size);
+  for (std::size_t lag = 0; lag < window; ++lag) {
+    const double weight = (lag == 0 ? 0.5 : 1.0 - lag / (kLag + 1.0)) * sums[lag] / std::max(seen, 1.0);  // Bartlett's
+    out += weight * (products[lag] + products[lag].transpose());
+  }
   return out;
 }
 
@@ -235,21 +268,26 @@ struct Rollouts {
   }
 };
 
-// Sums of all recordings in the order of the unknowns; `scores`, where asked, recording by recording.
-Normal normal_equations(const Problem& problem, const Rollouts& rollouts, double limit,
-                        std::vector<MatrixX>* scores = nullptr) {
+// Adds a matrix about the shared unknowns and those of recording `index` to one about all unknowns.
+void add_part(const Problem& problem, std::size_t index, const MatrixX& part, MatrixX& all) {
+  const Eigen::Index shared = problem.shared, own = problem.own();
+  const Eigen::Index first = shared + static_cast<Eigen::Index>(index) * own;
+  all.topLeftCorner(shared, shared) += part.topLeftCorner(shared, shared);
+  all.block(0, first, shared, own) += part.topRightCorner(shared, own);
+  all.block(first, 0, own, shared) += part.bottomLeftCorner(own, shared);
+  all.block(first, first, own, own) += part.bottomRightCorner(own, own);
+}
+
+// Sums of all recordings in the order of the unknowns.
+Normal normal_equations(const Problem& problem, const Rollouts& rollouts, double limit) {
   const int shared = problem.shared, own = problem.own();
-  Normal out{MatrixX::Zero(problem.mean.size(), problem.mean.size()), VectorX::Zero(problem.mean.size()), {}};
+  Normal out{MatrixX::Zero(problem.mean.size(), problem.mean.size()), VectorX::Zero(problem.mean.size())};
   for (std::size_t i = 0; i < problem.parts.size(); ++i) {
-    Normal part = normal_equations(problem.parts[i], rollouts.states[i], rollouts.slopes[i], rollouts.values[i], limit);
-    const Eigen::Index first = shared + static_cast<Eigen::Index>(i) * own;
-    out.hessian.topLeftCorner(shared, shared) += part.hessian.topLeftCorner(shared, shared);
-    out.hessian.block(0, first, shared, own) = part.hessian.topRightCorner(shared, own);
-    out.hessian.block(first, 0, own, shared) = part.hessian.bottomLeftCorner(own, shared);
-    out.hessian.block(first, first, own, own) = part.hessian.bottomRightCorner(own, own);
+    const Normal part =
+        normal_equations(problem.parts[i], rollouts.states[i], rollouts.slopes[i], rollouts.values[i], limit);
+    add_part(problem, i, part.hessian, out.hessian);
     out.gradient.head(shared) += part.gradient.head(shared);
-    out.gradient.segment(first, own) = part.gradient.tail(own);
-    if (scores) scores->push_back(std::move(part.scores));
+    out.gradient.segment(shared + static_cast<Eigen::Index>(i) * own, own) += part.gradient.tail(own);
   }
   return out;
 }
@@ -262,7 +300,8 @@ struct Fit {
 
 // Levenberg-Marquardt over the first `horizon` seconds of every recording.
 void improve(const Problem& problem, double horizon, bool fine, int iterations, Fit& fit) {
-  constexpr double kProgress = 1e-4;  // relative, below which a horizon is done
+  // relative, below which a horizon is done; on the way to the whole recording a start is enough
+  const double progress = fine ? 1e-9 : 1e-4;
   Rollouts now(problem, horizon, fine), trial = now;
   if (!now.run(problem, fit.p, true)) {
     fit.cost = kInfinity;
@@ -299,13 +338,14 @@ void improve(const Problem& problem, double horizon, bool fine, int iterations, 
       }
       damping = std::max(10.0 * damping, 1e-4);
     }
-    if (!better || gained < kProgress * fit.cost) break;
+    if (!better || gained < progress * fit.cost) break;
     if (!now.run(problem, fit.p, true)) break;
   }
 }
 
-// Local quadratic over the first frames: angle and velocity at the first time.
-void initial_motion(const chain::States& states, VectorX& theta, VectorX& thetadot) {
+// Local quadratic over the first frames: angle and velocity at the first time. Returns the standard deviation of one
+// velocity, rad/s.
+double initial_motion(const chain::States& states, VectorX& theta, VectorX& thetadot) {
   constexpr double kWindow = 0.21;  // s
   std::size_t count = 0;
   while (count < states.time.size() && states.time[count] <= states.time[0] + kWindow) ++count;
@@ -328,6 +368,7 @@ void initial_motion(const chain::States& states, VectorX& theta, VectorX& thetad
   const double noise = residual.squaredNorm() / freedom * unit;
   const double signal = thetadot.squaredNorm();
   if (signal > 0.0) thetadot *= std::max(0.0, signal - noise) / signal;
+  return std::sqrt(noise / static_cast<double>(thetadot.size()));
 }
 
 Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,
@@ -394,13 +435,16 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
   }
 
   VectorX theta, thetadot, theta_sd = VectorX::Constant(chain.angles(), kThetaSd);
-  initial_motion({part.times, part.theta, {}}, theta, thetadot);
+  const double thetadot_sd = initial_motion({part.times, part.theta, {}}, theta, thetadot);
   if (options.paper) theta = recognized.theta[0];
   if (!covariances.empty()) theta_sd = (covariances[0].diagonal().array() + 0.25 * kThetaSd * kThetaSd).sqrt();
-  // friction soon stops a rope on a table: under a base at rest it is at rest, and what looks like motion is noise
-  constexpr double kBaseAtRest = 0.01, kRopeAtRest = 0.5;  // m/s and rad/s; rad/s
+  // Friction soon stops a rope on a table: under a base at rest it is at rest, and what looks like motion is noise. As
+  // an unknown its velocity would be worse than idle: where every link comes to a stop, and so the loss, jumps with it.
+  constexpr double kBaseAtRest = 0.01;  // m/s and rad/s
+  constexpr double kRopeAtRest = 1.0;   // rad/s: dry friction stops that within a frame or two
+  constexpr double kSignificant = 4.0;  // standard deviations of a velocity
   const bool at_rest = options.tabletop && !options.paper && base.at(part.times[0]).velocity.norm() < kBaseAtRest &&
-                       thetadot.cwiseAbs().maxCoeff() < kRopeAtRest;
+                       thetadot.cwiseAbs().maxCoeff() < std::max(kRopeAtRest, kSignificant * thetadot_sd);
   if (at_rest) thetadot.setZero();
   part.unknowns = make_unknowns(chain, options, theta, thetadot, theta_sd, at_rest ? kAtRestSd : kRateSd);
   const int substeps = part.unknowns.fixed.substeps;
@@ -572,26 +616,14 @@ Fit fit_angles(const Problem& problem, const Options& options) {
   return best;
 }
 
-// Sandwich covariance of the estimate in the position metric ([P] included): residuals of frames up to kLag apart are
-// correlated (Newey-West, SPEC 5); recordings are independent.
-MatrixX covariance_of(const Problem& problem, const MatrixX& hessian, const std::vector<MatrixX>& scores) {
+// Sandwich covariance of the estimate in the position metric ([P] included); recordings are independent.
+MatrixX covariance_of(const Problem& problem, const MatrixX& hessian, const Rollouts& rollouts, double limit) {
   const MatrixX& prior = problem.precision;
-  const Eigen::Index shared = problem.shared, own = problem.own();
   MatrixX meat = prior;
-  for (std::size_t i = 0; i < scores.size(); ++i) {
-    const MatrixX& s = scores[i];
-    const Eigen::Index frames = s.cols(), first = shared + static_cast<Eigen::Index>(i) * own;
-    MatrixX part = s * s.transpose();
-    for (int lag = 1; lag <= kLag && lag < frames; ++lag) {
-      const double weight = 1.0 - lag / (kLag + 1.0);
-      const MatrixX lagged = s.rightCols(frames - lag) * s.leftCols(frames - lag).transpose();
-      part += weight * (lagged + lagged.transpose());
-    }
-    meat.topLeftCorner(shared, shared) += part.topLeftCorner(shared, shared);
-    meat.block(0, first, shared, own) += part.topRightCorner(shared, own);
-    meat.block(first, 0, own, shared) += part.bottomLeftCorner(own, shared);
-    meat.block(first, first, own, own) += part.bottomRightCorner(own, own);
-  }
+  for (std::size_t i = 0; i < problem.parts.size(); ++i)
+    add_part(problem, i,
+             covariance_of_scores(problem.parts[i], rollouts.states[i], rollouts.slopes[i], rollouts.values[i], limit),
+             meat);
   const MatrixX bread = (hessian + prior).ldlt().solve(MatrixX::Identity(prior.rows(), prior.cols()));
   const MatrixX out = bread * meat * bread;
   // the sandwich is itself an estimate, of few independent frames: never less than what the weights alone promise
@@ -650,9 +682,8 @@ std::vector<Result> solve(const chain::Chain& chain, std::vector<Part> parts, co
   if (fit.cost == kInfinity || !rollouts.run(problem, fit.p, true))
     throw WorkError("identify", "no parameters gave a rollout that stays finite",
                     "check the base trajectory, the recognized angles and the object's length");
-  std::vector<MatrixX> scores;
-  const Normal normal = normal_equations(problem, rollouts, fit.limit, &scores);
-  const MatrixX covariance = covariance_of(problem, normal.hessian, scores);
+  const Normal normal = normal_equations(problem, rollouts, fit.limit);
+  const MatrixX covariance = covariance_of(problem, normal.hessian, rollouts, fit.limit);
   const Eigen::Index shared = problem.shared, own = problem.own();
 
   std::vector<Result> results(problem.parts.size());
