@@ -1,8 +1,12 @@
 // splat_blend.comp - one group an active tile, kPixels pixels a lane (a column of them): front-to-back blending (SPEC 2.6).
-// A splat loaded once serves all pixels of the lane: what makes it fast where loads cost most (DESIGN).
+// A splat loaded once serves all pixels of the lane: what makes it fast where loads cost most (DESIGN). For the same reason
+// kShare lanes load a splat each, and hand them round, where a load by all lanes of one splat costs as much as of eight.
 // writes image (premultiplied color, alpha), depth where asked, and how many entries of the tile any pixel used.
 #version 460
 #extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
+#extension GL_KHR_shader_subgroup_vote : require
+#extension GL_KHR_shader_subgroup_shuffle : require
 #include "shared/splat.h"
 layout(local_size_x_id = 0) in;  // kTileWidth * kTileHeight / kPixels
 layout(constant_id = 1) const uint kTileWidth = 8u;
@@ -10,6 +14,7 @@ layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(constant_id = 3) const uint kPixels = 8u;
 layout(constant_id = 4) const uint kCutoffs = 1u;
 layout(constant_id = 5) const uint kDepth = 0u;
+layout(constant_id = 6) const uint kShare = 1u;  // lanes of a subgroup that load a splat each; 1: every lane loads all
 layout(push_constant) uniform Push { SplatPush p; };
 layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
 layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
@@ -24,6 +29,7 @@ layout(std430, binding = 9) buffer TileUsed { uint tile_used[]; };
 layout(std430, binding = 10) writeonly buffer DepthImage { float depth_image[]; };
 
 #include "inc/alpha.glsl"
+#include "inc/share.glsl"
 
 void main() {
   uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
@@ -37,39 +43,42 @@ void main() {
 
   vec3 color[kPixels];
   float transmittance[kPixels], depth[kPixels];
-  bool open[kPixels];
-  for (uint k = 0u; k < kPixels; ++k) {
+  [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
     color[k] = vec3(0.0);
     transmittance[k] = 1.0;
     depth[k] = 0.0;
-    open[k] = true;
   }
-  uint entry = 0u;
-  for (; entry < n; ++entry) {
-    uint s = kSplatRows * sorted[start + entry].x;
-    vec4 a = splats[s], b = splats[s + 1u], c = splats[s + 2u];
-    float dx = px - a.x;
-    bool any_open = false;
-    for (uint k = 0u; k < kPixels; ++k) {
-      float dy = py + float(k) - a.y;
-      float alpha = min(gaussian_falloff(b.xyz, dx, dy) * a.z, kAlphaCap);
-      float after = transmittance[k] * (1.0 - alpha);
-      bool seen = alpha >= kAlphaLeast && open[k];
-      open[k] = open[k] && (!seen || after >= kTransmittanceLeast);
-      seen = seen && open[k];
-      float weight = seen ? alpha * transmittance[k] : 0.0;
-      color[k] += weight * c.xyz;
-      if (kDepth != 0u) depth[k] += weight * a.w;
-      transmittance[k] = seen ? after : transmittance[k];
-      any_open = any_open || open[k];
+  uint used = 0u;
+  bool any_open = true;
+  while (used < n && any_open) {
+    uint turns = min(kShare, n - used), own_turn = gl_SubgroupInvocationID % kShare;
+    uint own = kSplatRows * sorted[start + used + min(own_turn, turns - 1u)].x;
+    vec4 own_a = splats[own], own_b = splats[own + 1u], own_c = splats[own + 2u];
+    Falloff own_falloff = falloff_of(own_b.xyz);
+    for (uint turn = 0u; turn < turns; ++turn) {
+      vec3 splat_color = shared_by(own_c.xyz, turn);
+      float splat_depth = kDepth != 0u ? shared_by(own_a.w, turn) : 0.0;
+      Falloff falloff = shared_by(own_falloff, turn);
+      float dx = px - shared_by(own_a.x, turn), dy = py - shared_by(own_a.y, turn) + falloff.slope * dx;
+      float alpha[kPixels];
+      alphas_of(falloff, shared_by(own_a.z, turn), dx, dy, alpha);
+      [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
+        bool seen;
+        float weight = blend_weight(min(alpha[k], kAlphaCap), transmittance[k], seen);
+        color[k] += weight * splat_color;
+        if (kDepth != 0u) depth[k] += weight * splat_depth;
+      }
     }
-    if (!any_open) break;
+    used += turns;
+    any_open = false;
+    [[unroll]] for (uint k = 0u; k < kPixels; ++k) any_open = any_open || transmittance[k] >= 0.0;
+    if (kShare > 1u) any_open = subgroupAny(any_open);  // lanes that are done still load for the others
   }
-  atomicMax(tile_used[tile], min(entry + 1u, n));
-  for (uint k = 0u; k < kPixels; ++k) {
+  atomicMax(tile_used[tile], used);
+  [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
     if (column < view.width && row + k < view.height) {
       uint pixel = view.pixel + (row + k) * view.width + column;
-      float alpha = 1.0 - transmittance[k];
+      float alpha = 1.0 - abs(transmittance[k]);
       image[pixel] = vec4(color[k], alpha);
       if (kDepth != 0u) depth_image[pixel] = alpha > 0.5 ? depth[k] / alpha : 0.0;
     }

@@ -13,6 +13,7 @@ layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(constant_id = 3) const uint kPixels = 8u;
 layout(constant_id = 4) const uint kCutoffs = 1u;
 layout(constant_id = 5) const uint kSubgroup = 8u;  // lanes of a subgroup, fixed by the host
+layout(constant_id = 6) const uint kShare = 1u;     // as in splat_blend.comp
 layout(push_constant) uniform Push { SplatPush p; };
 layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
 layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
@@ -28,6 +29,7 @@ layout(std430, binding = 10) readonly buffer PixelGradient { vec4 pixel_gradient
 layout(std430, binding = 11) writeonly buffer Partials { float partials[]; };  // kPartialRows vec4 a slot
 
 #include "inc/alpha.glsl"
+#include "inc/share.glsl"
 
 // Constant tests, no loop: lavapipe ends all loops of an invocation after 65535 iterations in sum, without a word.
 float subgroup_sum(float x) {
@@ -74,60 +76,61 @@ void main() {
 
   vec4 gamma[kPixels];
   float transmittance[kPixels], behind[kPixels];  // behind: gradient times what lies behind the entries so far
-  bool open[kPixels];
-  for (uint k = 0u; k < kPixels; ++k) {
+  [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
     bool inside = column < view.width && row + k < view.height;
     uint pixel = view.pixel + (row + k) * view.width + column;
     gamma[k] = inside ? pixel_gradient[pixel] : vec4(0.0);
     behind[k] = inside ? dot(gamma[k], image[pixel]) : 0.0;
     transmittance[k] = 1.0;
-    open[k] = inside;
   }
-  for (uint entry = 0u; entry < used; ++entry) {
-    uvec2 item = sorted[start + entry];
-    uint s = kSplatRows * item.x;
-    vec4 a = splats[s], b = splats[s + 1u];
-    vec4 c = vec4(splats[s + 2u].xyz, 1.0);
-    float dx = px - a.x;
-    vec2 grad_u = vec2(0.0);
-    vec3 grad_cov = vec3(0.0), grad_color = vec3(0.0);
-    float grad_opacity = 0.0;
-    for (uint k = 0u; k < kPixels; ++k) {
-      float dy = py + float(k) - a.y;
-      float falloff = gaussian_falloff(b.xyz, dx, dy);
-      float uncapped = falloff * a.z;
-      float alpha = min(uncapped, kAlphaCap);
-      float after = transmittance[k] * (1.0 - alpha);
-      bool seen = alpha >= kAlphaLeast && open[k];
-      open[k] = open[k] && (!seen || after >= kTransmittanceLeast);
-      seen = seen && open[k];
-      float weight = seen ? alpha * transmittance[k] : 0.0;
-      float gamma_color = dot(gamma[k], c);
-      behind[k] -= weight * gamma_color;
-      grad_color += weight * gamma[k].xyz;
-      float grad_alpha = transmittance[k] * gamma_color - behind[k] / max(1.0 - alpha, 1e-6);
-      grad_alpha = seen && uncapped <= kAlphaCap ? grad_alpha : 0.0;
-      grad_opacity += falloff * grad_alpha;
-      float g = uncapped * grad_alpha;
-      vec2 q = vec2(b.x * dx + b.y * dy, b.y * dx + b.z * dy);
-      grad_u += g * q;
-      grad_cov += g * vec3(q.x * q.x, q.x * q.y, q.y * q.y);
-      transmittance[k] = seen ? after : transmittance[k];
-    }
-    uint slot = 4u * kPartialRows * (item.y * p.slots + gl_SubgroupID);
-    float blue = subgroup_sum(grad_color.z);
-    float sums[8] = float[](grad_u.x, grad_u.y, grad_opacity, grad_color.x, grad_cov.x, grad_cov.y, grad_cov.z,
-                            grad_color.y);
-    if (kSubgroup >= 8u) {
-      float sum = subgroup_sums(sums);
-      if (gl_SubgroupInvocationID < 8u) partials[slot + gl_SubgroupInvocationID] = sum;
-    } else {
-      [[unroll]] for (uint k = 0u; k < 8u; ++k) sums[k] = subgroup_sum(sums[k]);
-      if (subgroupElect()) {
-        [[unroll]] for (uint k = 0u; k < 8u; ++k) partials[slot + k] = sums[k];
+  for (uint begin = 0u; begin < used; begin += kShare) {
+    uint turns = min(kShare, used - begin), own_turn = gl_SubgroupInvocationID % kShare;
+    uvec2 own = sorted[start + begin + min(own_turn, turns - 1u)];
+    uint own_slot = 4u * kPartialRows * (own.y * p.slots + gl_SubgroupID), s = kSplatRows * own.x;
+    vec4 own_a = splats[s], own_b = splats[s + 1u], own_c = splats[s + 2u];
+    float own_inverse = own_a.z > 1e-30 ? 1.0 / own_a.z : 0.0, own_blue = 0.0;
+    Falloff own_falloff = falloff_of(own_b.xyz);
+    for (uint turn = 0u; turn < turns; ++turn) {
+      vec4 c = vec4(shared_by(own_c.xyz, turn), 1.0);
+      Falloff falloff = shared_by(own_falloff, turn);
+      float dx = px - shared_by(own_a.x, turn), dy = py - shared_by(own_a.y, turn) + falloff.slope * dx;
+      float uncapped[kPixels];
+      alphas_of(falloff, shared_by(own_a.z, turn), dx, dy, uncapped);
+      vec3 grad_color = vec3(0.0), moments = vec3(0.0);  // moments: of dL/d(exponent), by powers of dy
+      [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
+        float alpha = min(uncapped[k], kAlphaCap), before = transmittance[k];
+        bool seen;
+        float weight = blend_weight(alpha, transmittance[k], seen);
+        float gamma_color = dot(gamma[k], c);
+        behind[k] -= weight * gamma_color;
+        grad_color += weight * gamma[k].xyz;
+        float grad_alpha = before * gamma_color - behind[k] / max(1.0 - alpha, 1e-6);
+        float g = seen && uncapped[k] <= kAlphaCap ? uncapped[k] * grad_alpha : 0.0;
+        float g_dy = g * (dy + float(k));
+        moments += vec3(g, g_dy, g_dy * (dy + float(k)));
+      }
+      // from the column's dx and powers of dy back to those of Q delta = (conic.x dx + conic.y dy, conic.y dx + conic.z dy)
+      const float kMinus2Ln2 = -1.3862944;
+      float across = kMinus2Ln2 * falloff.fall, along = kMinus2Ln2 * falloff.along * dx;
+      float grad_v = across * moments.y, grad_u = falloff.slope * grad_v + along * moments.x;
+      float yy = across * across * moments.z, mixed = along * grad_v, xy = falloff.slope * yy + mixed;
+      float xx = falloff.slope * (xy + mixed) + along * along * moments.x;
+      float blue = subgroup_sum(grad_color.z);
+      own_blue = turn == own_turn ? blue : own_blue;
+      float sums[8] = float[](grad_u, grad_v, shared_by(own_inverse, turn) * moments.x, grad_color.x, xx, xy, yy,
+                              grad_color.y);
+      uint slot = shared_by(own_slot, turn);
+      if (kSubgroup >= 8u) {
+        float sum = subgroup_sums(sums);
+        if (gl_SubgroupInvocationID < 8u) partials[slot + gl_SubgroupInvocationID] = sum;
+      } else {
+        [[unroll]] for (uint k = 0u; k < 8u; ++k) sums[k] = subgroup_sum(sums[k]);
+        if (subgroupElect()) {
+          [[unroll]] for (uint k = 0u; k < 8u; ++k) partials[slot + k] = sums[k];
+        }
       }
     }
-    if (subgroupElect()) partials[slot + 8u] = blue;
+    if (gl_SubgroupInvocationID < turns) partials[own_slot + 8u] = own_blue;
   }
   // entries that no pixel reached, and slots that a wider subgroup left free
   for (uint k = used + lane; k < n; k += gl_WorkGroupSize.x) {

@@ -3,9 +3,12 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
+#extension GL_KHR_shader_subgroup_basic : require
+#extension GL_KHR_shader_subgroup_shuffle : require
 #include "shared/splat.h"
 layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kRankLimit = 256u;  // longest list that is sorted by rank
+layout(constant_id = 2) const uint kShare = 8u;        // lanes of a subgroup
 layout(push_constant) uniform Push { SplatPush p; };
 layout(std430, binding = 0) readonly buffer TilePrefix { uint tile_prefix[]; };
 layout(std430, binding = 1) readonly buffer TileBlock { uint tile_block[]; };
@@ -14,11 +17,6 @@ layout(std430, binding = 3) readonly buffer Entries { uvec4 entries[]; };  // de
 layout(std430, binding = 4) writeonly buffer LongTiles { uint long_tiles[]; };
 layout(std430, binding = 5) writeonly buffer Sorted { uvec2 sorted[]; };   // splat, instance
 layout(std430, binding = 6) buffer Counters { uint counters[]; };
-
-const uint kStep = 8u;  // keys compared in one turn of the loop, whose control costs more than a compare
-
-shared uint depth_key[kRankLimit + kStep];
-shared uint replica_key[kRankLimit];
 
 void main() {
   uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x, lanes = gl_WorkGroupSize.x;
@@ -34,25 +32,27 @@ void main() {
     }
     n = 0u;
   }
-  for (uint k = lane; k < n; k += lanes) {
-    uvec2 key = entries[start + k].xy;
-    depth_key[k] = key.x;
-    replica_key[k] = key.y;
-  }
-  for (uint k = lane; k < kStep; k += lanes) depth_key[n + k] = 0xffffffffu;  // behind everything
-  barrier();
-  for (uint k = lane; k < n; k += lanes) {
-    uint depth = depth_key[k], nearer = 0u, equal = 0u;
-    for (uint first = 0u; first < n; first += kStep) {
-      [[unroll]] for (uint m = 0u; m < kStep; ++m) {
-        uint other = depth_key[first + m];
-        nearer += other < depth ? 1u : 0u;
-        equal += other == depth ? 1u : 0u;
+  uint shared_lane = gl_SubgroupInvocationID % kShare;
+  for (uint first = 0u; first < n; first += lanes) {
+    uint k = first + lane;
+    uvec4 entry = entries[start + min(k, n - 1u)];
+    int depth = int(entry.x), nearer = 0, equal = 0;  // positive floats sort like their bits
+    // kShare lanes load a key each, and hand them round
+    for (uint others = 0u; others < n; others += kShare) {
+      uint other = others + shared_lane;
+      int own_key = other < n ? int(entries[start + other].x) : 0x7fffffff;  // behind everything
+      [[unroll]] for (uint m = 0u; m < kShare; ++m) {
+        int key = subgroupShuffle(own_key, m);
+        nearer += key < depth ? 1 : 0;
+        equal += key == depth ? 1 : 0;
       }
     }
     // equal depths are rare: only then is the replica's number looked at
-    uint replica = replica_key[k], ties = equal > 1u ? n : 0u;
-    for (uint m = 0u; m < ties; ++m) nearer += depth_key[m] == depth && replica_key[m] < replica ? 1u : 0u;
-    sorted[start + nearer] = entries[start + k].zw;
+    uint ties = equal > 1 ? n : 0u;
+    for (uint m = 0u; m < ties; ++m) {
+      uvec2 other = entries[start + m].xy;
+      nearer += other.x == entry.x && other.y < entry.y ? 1 : 0;
+    }
+    if (k < n) sorted[start + uint(nearer)] = entry.zw;
   }
 }

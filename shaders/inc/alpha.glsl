@@ -1,10 +1,53 @@
-// alpha.glsl - what one splat does to one pixel, the same forward and backward (SPEC 2.6). Needs kCutoffs.
+// alpha.glsl - what one splat does to a column of pixels, the same forward and backward (SPEC 2.6). Needs kCutoffs, kPixels.
 
 const float kAlphaCap = kCutoffs != 0u ? 0.99 : 2.0;
 const float kAlphaLeast = kCutoffs != 0u ? 1.0 / 255.0 : -1.0;
 const float kTransmittanceLeast = kCutoffs != 0u ? 1e-4 : -1.0;
 
-// exp(-1/2 delta^T Q delta), Q = [x y; y z]
-float gaussian_falloff(vec3 conic, float dx, float dy) {
-  return exp(-0.5 * (conic.x * dx * dx + conic.z * dy * dy) - conic.y * dx * dy);
+// -1/2 delta^T Q delta, Q = [x y; y z], with the square completed in y: in a column of pixels, dx to the right of the
+// splat's center, it is along dx^2 + fall dy^2, dy from the center + (0, -slope dx). Times log2(e).
+struct Falloff {
+  float slope, along, fall;
+  float change;  // 2^(2 fall)
+};
+
+Falloff falloff_of(vec3 conic) {
+  const float kHalfLog2e = 0.72134752;
+  Falloff f;
+  f.slope = conic.z > 0.0 ? conic.y / conic.z : 0.0;
+  f.along = -kHalfLog2e * (conic.x - conic.y * f.slope);
+  f.fall = -kHalfLog2e * conic.z;
+  f.change = exp2(2.0 * f.fall);
+  return f;
+}
+
+// `opacity` times the falloff at kPixels pixels of a column, the first dy below the column's peak. From a row to the next
+// it changes by a factor that itself changes by a constant factor: three exponentials instead of kPixels. From the middle
+// outward, where nothing that counts is lost to the least float: sigma is at least half a pixel.
+void alphas_of(Falloff f, float opacity, float dx, float dy, out float alpha[kPixels]) {
+  const uint kMiddle = kPixels / 2u;
+  const float kLargest = 100.0;  // beyond it the middle is 0, and the factor has to stay finite
+  float middle = dy + float(kMiddle);
+  alpha[kMiddle] = opacity * exp2(f.along * dx * dx + f.fall * middle * middle);
+  float factor = exp2(min(f.fall * (1.0 + 2.0 * middle), kLargest));
+  [[unroll]] for (uint k = kMiddle + 1u; k < kPixels; ++k) {
+    alpha[k] = alpha[k - 1u] * factor;
+    factor *= f.change;
+  }
+  factor = exp2(min(f.fall * (1.0 - 2.0 * middle), kLargest));
+  [[unroll]] for (uint k = 0u; k < kMiddle; ++k) {
+    alpha[kMiddle - 1u - k] = alpha[kMiddle - k] * factor;
+    factor *= f.change;
+  }
+}
+
+// Front-to-back blending of one pixel: `transmittance` is negative once the pixel is closed, that is, a splat would have
+// taken it below the least; that splat and those behind it are not seen. Returns the splat's weight, 0 if not seen.
+float blend_weight(float alpha, inout float transmittance, out bool seen) {
+  float after = transmittance * (1.0 - alpha);
+  bool reaches = alpha >= kAlphaLeast, stays_open = after >= kTransmittanceLeast;
+  seen = reaches && stays_open;
+  float weight = seen ? alpha * transmittance : 0.0;
+  transmittance = reaches ? (stays_open ? after : -abs(transmittance)) : transmittance;
+  return weight;
 }

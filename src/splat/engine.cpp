@@ -193,13 +193,17 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   bin = gpu::Pipeline(d, "splat_bin", 11, push, {});
   // as many lanes a tile as a subgroup of the device: no lane waits at the barriers for another subgroup
   const std::uint32_t tile_lanes = device_info.software ? 8 : 32;
-  sort = gpu::Pipeline(d, "splat_sort", 7, push, {tile_lanes, kRankLimit});
+  sort = gpu::Pipeline(d, "splat_sort", 7, push,
+                       {tile_lanes, kRankLimit, std::min(tile_lanes, std::max(1u, device_info.subgroup_size))});
   sort_long = gpu::Pipeline(d, "splat_sort_long", 7, push, {tile_lanes});
-  blend = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 0});
-  blend_depth = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 1});
-  blend_backward = gpu::Pipeline(
-      d, "splat_blend_backward", 12, push,
-      {lanes, tile_width, tile_height, pixels_per_lane, cut, std::min(lanes, std::max(1u, device_info.subgroup_size))});
+  const std::uint32_t subgroup = std::min(lanes, std::max(1u, device_info.subgroup_size));
+  // a software device loads lane by lane, so that its lanes share the work; a GPU loads at once what all lanes want
+  const std::uint32_t share = device_info.software ? subgroup : 1;
+  blend = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 0, share});
+  blend_depth =
+      gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 1, share});
+  blend_backward = gpu::Pipeline(d, "splat_blend_backward", 12, push,
+                                 {lanes, tile_width, tile_height, pixels_per_lane, cut, subgroup, share});
   project_backward = gpu::Pipeline(d, "splat_project_backward", 11, push, {});
   gather = gpu::Pipeline(d, "splat_gather", 11, push, {});
   link_twist = gpu::Pipeline(d, "splat_link_twist", 5, push, {});

@@ -1,0 +1,8 @@
+// share.glsl - what lane `turn` of a subgroup loaded, in every lane. Needs alpha.glsl, kShare, GL_KHR_shader_subgroup_shuffle.
+
+float shared_by(float x, uint turn) { return kShare > 1u ? subgroupShuffle(x, turn) : x; }
+uint shared_by(uint x, uint turn) { return kShare > 1u ? subgroupShuffle(x, turn) : x; }
+vec3 shared_by(vec3 x, uint turn) { return vec3(shared_by(x.x, turn), shared_by(x.y, turn), shared_by(x.z, turn)); }
+Falloff shared_by(Falloff f, uint turn) {
+  return Falloff(shared_by(f.slope, turn), shared_by(f.along, turn), shared_by(f.fall, turn), shared_by(f.change, turn));
+}
