@@ -99,34 +99,18 @@ struct ContactPoint {
 };
 
 std::vector<ContactPoint> read_contacts(const std::string& name) {
-  std::istringstream lines(core::read_file(input_path(name)));
-  std::string line;
+  const std::string text = core::read_file(input_path(name));
+  const std::string mend = "leave x, y and z empty when nothing touches";
   std::vector<ContactPoint> out;
-  std::getline(lines, line);  // the head
-  for (int number = 2; std::getline(lines, line); ++number) {
-    if (line.empty() || line == "\r") continue;
-    std::vector<std::string> cells;
-    std::istringstream row(line);
-    for (std::string cell; std::getline(row, cell, ',');) {
-      while (!cell.empty() && (cell.back() == '\r' || cell.back() == ' ')) cell.pop_back();
-      cells.push_back(cell);
-    }
-    cells.resize(std::max<std::size_t>(cells.size(), 4));
-    double values[4] = {};
-    int given = 0;
-    bool good = cells.size() == 4;
-    for (int i = 0; i < 4 && good; ++i) {
-      if (cells[i].empty()) continue;
-      char* end = nullptr;
-      values[i] = std::strtod(cells[i].c_str(), &end);
-      good = *end == '\0' && (i > 0 || std::isfinite(values[i]));
-      given += i > 0 && std::isfinite(values[i]);
-    }
-    if (!good || cells[0].empty() || (given != 0 && given != 3) || (!out.empty() && values[0] <= out.back().time))
-      throw InputError(name + ": line " + std::to_string(number), "is not 'time,x,y,z' with increasing times",
-                       "leave x, y and z empty when nothing touches");
-    out.push_back({values[0], std::nullopt});
-    if (given == 3) out.back().point = math::Vector3(values[1], values[2], values[3]);
+  const std::vector<core::TableLine> lines = core::table_lines(text);
+  for (std::size_t k = 1; k < lines.size(); ++k) {  // below the head
+    const std::vector<double> row = core::table_numbers(name, lines[k], 4, mend, true);
+    const int given =
+        static_cast<int>(std::count_if(row.begin() + 1, row.end(), [](double x) { return !std::isnan(x); }));
+    if (std::isnan(row[0]) || (given != 0 && given != 3) || (!out.empty() && row[0] <= out.back().time))
+      throw InputError(name + ":" + std::to_string(lines[k].number), "is not 'time,x,y,z' with increasing times", mend);
+    out.push_back({row[0], std::nullopt});
+    if (given == 3) out.back().point = math::Vector3(row[1], row[2], row[3]);
   }
   if (out.empty()) throw InputError(name, "has no rows", "give 'time,x,y,z' lines below a head line");
   return out;

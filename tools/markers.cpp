@@ -1,7 +1,7 @@
 #include "markers.h"
 
+#include <algorithm>
 #include <cmath>
-#include <cstdlib>
 #include <limits>
 #include <map>
 #include <sstream>
@@ -26,8 +26,7 @@ std::vector<std::string> cells_of(const std::string& line) {
 }  // namespace
 
 MarkerFile read_markers(const Path& file) {
-  std::istringstream text(core::read_file(file));
-  std::string line;
+  const std::string text = core::read_file(file);
   int number = 0;
   const auto refuse = [&](const std::string& what, const std::string& mend) {
     throw InputError(file.string() + ":" + std::to_string(number), what, mend);
@@ -37,12 +36,10 @@ MarkerFile read_markers(const Path& file) {
   std::vector<std::size_t> base_columns, marker_columns;
   MarkerFile out;
   double next = -std::numeric_limits<double>::infinity();
-  while (std::getline(text, line)) {
-    ++number;
-    if (!line.empty() && line.back() == '\r') line.pop_back();
-    if (line.empty()) continue;
-    if (line[0] == '#') {
-      std::istringstream words(line.substr(1));
+  for (const core::TableLine& line : core::table_lines(text)) {
+    number = line.number;
+    if (line.text[0] == '#') {
+      std::istringstream words(std::string(line.text.substr(1)));
       std::string kind, name;
       double arclength = 0.0;
       if (!(words >> kind) || kind != "marker") continue;
@@ -50,8 +47,8 @@ MarkerFile read_markers(const Path& file) {
       named.emplace_back(name, arclength);
       continue;
     }
-    const std::vector<std::string> cells = cells_of(line);
     if (column.empty()) {
+      const std::vector<std::string> cells = cells_of(std::string(line.text));
       for (std::size_t i = 0; i < cells.size(); ++i) column[cells[i]] = i;
       const auto find = [&](const std::string& name) {
         const auto at = column.find(name);
@@ -67,19 +64,11 @@ MarkerFile read_markers(const Path& file) {
       }
       continue;
     }
-    if (cells.size() != column.size())
-      refuse("has " + std::to_string(cells.size()) + " cells, the header " + std::to_string(column.size()),
-             "give as many");
-    const auto value = [&](std::size_t i, bool may_be_missing) {
-      const std::string& cell = cells[i];
-      char* end = nullptr;
-      const double number_read = std::strtod(cell.c_str(), &end);
-      if (may_be_missing && (cell.empty() || std::isnan(number_read))) return std::nan("");
-      if (cell.empty() || *end != 0 || !std::isfinite(number_read)) refuse("'" + cell + "' is no number", "correct it");
-      return number_read;
-    };
+    const std::vector<double> row = core::table_numbers(file, line, column.size(), "correct it", true);
     double pose[8];
-    for (int i = 0; i < 8; ++i) pose[i] = value(base_columns[i], false);
+    for (int i = 0; i < 8; ++i) pose[i] = row[base_columns[i]];
+    if (std::any_of(pose, pose + 8, [](double x) { return std::isnan(x); }))
+      refuse("has no pose of the base", "give it");
     if (!out.base.empty() && !(pose[0] > out.base.back().time)) refuse("the times do not increase", "sort the rows");
     const Eigen::Quaterniond turn(pose[4], pose[5], pose[6], pose[7]);
     if (std::abs(turn.norm() - 1.0) > 1e-2) refuse("the quaternion is not of unit length", "write bqw,bqx,bqy,bqz");
@@ -89,7 +78,7 @@ MarkerFile read_markers(const Path& file) {
     math::MatrixX world(3, out.markers.arclengths.size());
     bool seen = false;
     for (Eigen::Index i = 0; i < world.cols(); ++i) {
-      for (int axis = 0; axis < 3; ++axis) world(axis, i) = value(marker_columns[3 * i + axis], true);
+      for (int axis = 0; axis < 3; ++axis) world(axis, i) = row[marker_columns[3 * i + axis]];
       seen |= world.col(i).allFinite();
     }
     if (!seen) continue;

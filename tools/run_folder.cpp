@@ -116,32 +116,25 @@ std::string covariance_csv(const chain::States& states, const std::vector<math::
 std::vector<math::MatrixX> read_covariances(const Path& file, const chain::States& states) {
   std::error_code error;
   if (!std::filesystem::exists(file, error)) return {};
-  std::istringstream lines(core::read_file(file));
-  std::string line;
-  std::getline(lines, line);  // the head
+  const std::string text = core::read_file(file);
+  const std::string mend = "remove the file (the weights of the frames are then equal) or recognize again";
   const Eigen::Index angles = states.theta.front().size();
+  const std::size_t columns = static_cast<std::size_t>(1 + angles * (angles + 1) / 2);
   std::vector<math::MatrixX> covariances;
-  while (std::getline(lines, line)) {
+  const std::vector<core::TableLine> lines = core::table_lines(text);
+  for (std::size_t k = 1; k < lines.size(); ++k) {  // below the head
+    const std::vector<double> numbers = core::table_numbers(file, lines[k], columns, mend);
+    if (covariances.size() >= states.time.size() || numbers[0] != states.time[covariances.size()])
+      throw InputError(file.string() + ":" + std::to_string(lines[k].number), "does not fit states.csv", mend);
     math::MatrixX covariance(angles, angles);
-    const char* at = line.c_str();
-    char* end = nullptr;
-    bool good = covariances.size() < states.time.size() && std::strtod(at, &end) == states.time[covariances.size()];
-    for (Eigen::Index row = 0; row < angles && good; ++row)
-      for (Eigen::Index column = 0; column <= row && good; ++column) {
-        good = *end == ',';
-        if (!good) break;
-        at = end + 1;
-        covariance(row, column) = covariance(column, row) = std::strtod(at, &end);
-        good = end != at && std::isfinite(covariance(row, column));
-      }
-    if (!good || *end != '\0')
-      throw InputError(file.string() + ": line " + std::to_string(covariances.size() + 2), "does not fit states.csv",
-                       "remove the file (the weights of the frames are then equal) or recognize again");
+    std::size_t next = 1;
+    for (Eigen::Index row = 0; row < angles; ++row)
+      for (Eigen::Index column = 0; column <= row; ++column)
+        covariance(row, column) = covariance(column, row) = numbers[next++];
     covariances.push_back(std::move(covariance));
   }
   if (covariances.size() != states.time.size())
-    throw InputError(file.string(), "has not as many rows as states.csv",
-                     "remove the file (the weights of the frames are then equal) or recognize again");
+    throw InputError(file.string(), "has not as many rows as states.csv", mend);
   return covariances;
 }
 

@@ -79,6 +79,16 @@ void parallel_for(std::int64_t count, const std::function<void(std::int64_t)>& b
 void write_file(const Path& path, std::string_view bytes);
 // The whole file. Throws InputError naming `path` when it is missing or unreadable.
 std::string read_file(const Path& path);
+// A table of numbers between commas: its lines that are not blank, without line ends and trailing spaces.
+struct TableLine {
+  int number;  // from 1
+  std::string_view text;
+};
+std::vector<TableLine> table_lines(std::string_view text);
+// The cells of a line, `columns` of them; where `may_be_empty`, NaN for an empty one or 'nan'. Throws InputError naming
+// the line for anything else that is no finite number; `mend` is its advice.
+std::vector<double> table_numbers(const Path& file, const TableLine& line, std::size_t columns, const std::string& mend,
+                                  bool may_be_empty = false);
 // A double with the digits that read back exactly ("%.17g", shortest that round-trips).
 std::string exact(double value);
 // Seconds on a steady clock since an arbitrary origin.

@@ -3,6 +3,7 @@
 #include <fcntl.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <atomic>
 #include <cerrno>
 #include <charconv>
@@ -127,6 +128,46 @@ std::string read_file(const Path& path) {
   text << file.rdbuf();
   if (file.bad()) throw InputError(path.string(), "cannot be read", "check the disk");
   return std::move(text).str();
+}
+
+std::vector<TableLine> table_lines(std::string_view text) {
+  std::vector<TableLine> lines;
+  for (int number = 1; !text.empty(); ++number) {
+    const std::size_t end = std::min(text.find('\n'), text.size());
+    std::string_view line = text.substr(0, end);
+    text.remove_prefix(std::min(end + 1, text.size()));
+    while (!line.empty() && (line.back() == '\r' || line.back() == ' ')) line.remove_suffix(1);
+    if (!line.empty()) lines.push_back({number, line});
+  }
+  return lines;
+}
+
+std::vector<double> table_numbers(const Path& file, const TableLine& line, std::size_t columns, const std::string& mend,
+                                  bool may_be_empty) {
+  const auto fail = [&](const std::string& what) {
+    throw InputError(file.string() + ":" + std::to_string(line.number), what, mend);
+  };
+  std::vector<double> numbers;
+  const char* const stop = line.text.data() + line.text.size();
+  for (const char* c = line.text.data(); c <= stop; ++c) {
+    while (c != stop && *c == ' ') ++c;
+    double number = std::nan("");
+    const char* after = c;
+    if (c != stop && *c != ',') {
+      const auto [end, error] = std::from_chars(c, stop, number);
+      after = error == std::errc() && (std::isfinite(number) || (may_be_empty && std::isnan(number))) ? end : nullptr;
+      while (after && after != stop && *after == ' ') ++after;
+    } else if (!may_be_empty) {
+      after = nullptr;
+    }
+    if (!after || (after != stop && *after != ','))
+      fail("column " + std::to_string(numbers.size() + 1) + " is not a finite number");
+    numbers.push_back(number);
+    c = after;
+  }
+  if (numbers.size() != columns)
+    fail(std::to_string(numbers.size()) + " columns instead of " + std::to_string(columns));
+  return numbers;
 }
 
 std::string exact(double value) {

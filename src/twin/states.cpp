@@ -1,7 +1,5 @@
 // States and centerlines as CSV.
 #include <algorithm>
-#include <charconv>
-#include <cmath>
 
 #include "chainsplat/twin.h"
 
@@ -40,22 +38,15 @@ chain::States read_states(const Path& file, int angles) {
   const std::string form = "write '" + header(angles, true) + "' (the second half may be missing)";
   chain::States states;
   std::size_t columns = 0;
-  int line_number = 0;
-  for (std::size_t begin = 0; begin < text.size();) {
-    const std::size_t end = std::min(text.find('\n', begin), text.size());
-    std::string_view line(text.data() + begin, end - begin);
-    begin = end + 1;
-    ++line_number;
-    while (!line.empty() && (line.back() == '\r' || line.back() == ' ')) line.remove_suffix(1);
-    if (line.empty()) continue;
+  for (const core::TableLine& line : core::table_lines(text)) {
     const auto fail = [&](const std::string& what, const std::string& mend) {
-      throw InputError(file.string() + ":" + std::to_string(line_number), what, mend);
+      throw InputError(file.string() + ":" + std::to_string(line.number), what, mend);
     };
     if (columns == 0) {
-      columns = static_cast<std::size_t>(std::count(line.begin(), line.end(), ',')) + 1;
-      if (line != header(angles, true) && line != header(angles, false)) {
-        const bool other = line == header(static_cast<int>(columns) - 1, false) ||
-                           (columns % 2 == 1 && line == header(static_cast<int>(columns) / 2, true));
+      columns = static_cast<std::size_t>(std::count(line.text.begin(), line.text.end(), ',')) + 1;
+      if (line.text != header(angles, true) && line.text != header(angles, false)) {
+        const bool other = line.text == header(static_cast<int>(columns) - 1, false) ||
+                           (columns % 2 == 1 && line.text == header(static_cast<int>(columns) / 2, true));
         if (other)
           fail("is not of this chain, which has " + std::to_string(angles) + " angles",
                "take the states of the same twin");
@@ -63,19 +54,7 @@ chain::States read_states(const Path& file, int angles) {
       }
       continue;
     }
-    std::vector<double> numbers;
-    const char* const stop = line.data() + line.size();
-    for (const char* c = line.data(); c <= stop; ++c) {
-      double number = 0.0;
-      const auto [after, error] = std::from_chars(c, stop, number);
-      if (error != std::errc() || (after != stop && *after != ',') || !std::isfinite(number))
-        fail("column " + std::to_string(numbers.size() + 1) + " is not a finite number", "mend the line or remove it");
-      numbers.push_back(number);
-      c = after;
-    }
-    if (numbers.size() != columns)
-      fail(std::to_string(numbers.size()) + " columns instead of " + std::to_string(columns),
-           "mend the line or remove it");
+    const std::vector<double> numbers = core::table_numbers(file, line, columns, "mend the line or remove it");
     if (!states.time.empty() && !(numbers[0] > states.time.back()))
       fail("its time does not come after the one before it", "sort the rows by time");
     states.time.push_back(numbers[0]);

@@ -82,9 +82,9 @@ before=$(cat "$work/twin/twin.json")
 sed '10{h;d};11{G}' "$work/one.csv" >"$work/wrong.csv"
 refused 'wrong\.csv:[0-9]+: the times do not increase'
 sed '10s/,[^,]*$//' "$work/one.csv" >"$work/wrong.csv"
-refused 'wrong\.csv:10: has 16 cells'
+refused 'wrong\.csv:10: 16 columns instead of 17'
 sed '10s/,[^,]*$/,abc/' "$work/one.csv" >"$work/wrong.csv"
-refused "wrong\.csv:10: 'abc' is no number"
+refused 'wrong\.csv:10: column 17 is not a finite number'
 sed '/^# marker/d' "$work/one.csv" >"$work/wrong.csv"
 refused 'no marker is named'
 sed 's/marker c 0.3/marker c 0.5/' "$work/one.csv" >"$work/wrong.csv"

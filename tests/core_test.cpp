@@ -1,0 +1,62 @@
+#include "chainsplat/core.h"
+
+#include <doctest/doctest.h>
+
+#include <unistd.h>
+
+#include <atomic>
+#include <cmath>
+
+using namespace chainsplat;
+
+TEST_CASE("a table's lines and numbers, and what is refused") {
+  const auto lines = core::table_lines("time,a,b\r\n\n1, -2.5e3 ,\n  \n2,nan,4");
+  REQUIRE(lines.size() == 3);
+  CHECK(lines[0].text == "time,a,b");
+  CHECK(lines[1].number == 3);
+  CHECK(lines[2].number == 5);
+  const auto first = core::table_numbers("t.csv", lines[1], 3, "mend", true);
+  CHECK(first[1] == -2500.0);
+  CHECK(std::isnan(first[2]));
+  CHECK(std::isnan(core::table_numbers("t.csv", lines[2], 3, "mend", true)[1]));
+  for (const int k : {1, 2}) CHECK_THROWS_AS(core::table_numbers("t.csv", lines[k], 3, "mend"), InputError);
+  for (const char* wrong : {"1,2", "1,2,3,4", "1,2,x", "1,2,3x", "1,2,inf", "1 2,3,4"}) {
+    CAPTURE(wrong);
+    CHECK_THROWS_WITH_AS(core::table_numbers("t.csv", {7, wrong}, 3, "mend", true), doctest::Contains("t.csv:7: "),
+                         InputError);
+  }
+}
+
+TEST_CASE("numbers read back exactly, files as they were written") {
+  for (const double value : {0.1, -1.0 / 3.0, 6.02e23, 5e-324}) CHECK(std::stod(core::exact(value)) == value);
+  const Path file = std::filesystem::temp_directory_path() / ("chainsplat_core_test_" + std::to_string(::getpid()));
+  core::write_file(file, std::string_view("a\0b\n", 4));
+  CHECK(core::read_file(file) == std::string("a\0b\n", 4));
+  std::filesystem::remove(file);
+  CHECK_THROWS_AS(core::read_file(file), InputError);
+  CHECK_THROWS_AS(core::write_file(file / "in" / "no" / "folder", "x"), WorkError);
+}
+
+TEST_CASE("work is divided completely, whatever the number of threads, and its exception comes back") {
+  for (const int threads : {1, 2, 7}) {
+    core::set_threads(threads);
+    std::vector<std::atomic<int>> calls(100);
+    core::parallel_for(100, [&](std::int64_t i) { ++calls[static_cast<std::size_t>(i)]; });
+    for (const auto& count : calls) CHECK(count == 1);
+    CHECK_THROWS_AS(core::parallel_for(10,
+                                       [](std::int64_t i) {
+                                         if (i == 3) throw WorkError("a", "b", "c");
+                                       }),
+                    WorkError);
+  }
+  core::set_threads(0);
+}
+
+TEST_CASE("hash and random numbers are the published ones") {
+  CHECK(core::fnv1a("") == 0xcbf29ce484222325ull);
+  CHECK(core::fnv1a("a") == 0xaf63dc4c8601ec8cull);
+  CHECK(core::fnv1a("foobar") == 0x85944171f73967e8ull);
+  core::Random random(1234567);
+  for (const std::uint64_t value : {6457827717110365317ull, 3203168211198807973ull, 9817491932198370423ull})
+    CHECK(random.next() == value);
+}
