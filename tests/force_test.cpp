@@ -391,6 +391,50 @@ TEST_CASE("on a table friction at rest hides forces, and the interval says how m
   }
 }
 
+// A finger that pushes a sliding rope presses it down, one that brakes it lifts it: the rope's roll rubs at the finger.
+TEST_CASE("on a table a push is told with what it presses the rope down") {
+  const chain::Chain rope =
+      chain::make_chain(0.3, 0.02, Vector3::UnitX(), Vector3::UnitZ(), 8, chain::Bending::planar, false);
+  dynamics::Parameters p = uniform(8, 8, 0.06, 0.012, 1e-3, 0.01);
+  p.table_normal = Vector3::UnitZ();
+  p.coulomb_friction.assign(8, 0.35);
+  p.roll_lever = {0.0, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03};
+  dynamics::Model model = dynamics::make_model(rope, p);
+  const auto base = [](double) { return dynamics::at_rest({}); };
+  const VectorX theta = VectorX::LinSpaced(8, 0.25, 0.05), thetadot = VectorX::Constant(8, 0.1);
+  const force::Contact contact{chain::link_at(rope, 0.2), 0.2, 0.2 * rope.direction};
+  const MatrixX axes = chain::world_axes(rope, theta, {});
+  const auto motions = chain::link_motions(rope, theta, {});
+  const MatrixX jacobian = chain::point_jacobian(rope, axes, contact.link, motions[contact.link] * contact.home);
+  const Vector3 slip = (jacobian * thetadot).normalized();
+  const Vector3 across = Vector3::UnitZ().cross(motions[contact.link].rotation * rope.direction);
+  const force::Options options;
+  for (const double push : {0.15, -0.15}) {  // with the slip and, braking it, against
+    CAPTURE(push);
+    const Vector3 force = push * slip;
+    const double pressed = options.pressing * push;
+    // what the rope feels: the push, friction of what presses the rope down, and the roll that is held back
+    VectorX torque = jacobian.transpose() * (force - 0.35 * pressed * slip);
+    for (int k = 0; k < 8; ++k)
+      torque[k] -=
+          p.roll_lever[k] * std::min(rope.link_start(rope.child_link[k]), 0.2) / 0.3 * pressed * slip.dot(across);
+    // the rope's rest angles balance it
+    dynamics::Model bent = model;
+    const VectorX off = force::residual_torque(model, base(0.0), theta, thetadot, VectorX::Zero(8)) - torque;
+    for (int k = 0; k < 8; ++k) bent.parameters.rest_angle[k] += off[k] / p.stiffness[k];
+    force::Motion motion = at_rest(theta, 5);
+    for (VectorX& rates : motion.thetadot) rates = thetadot;
+    const std::vector<std::optional<force::Contact>> contacts(5, contact);
+    for (const force::Estimate& e : force::estimate(bent, {}, base, motion, contacts)) {
+      const Vector3 flat(e.force.x(), e.force.y(), 0.0);
+      CHECK(e.moving);
+      CHECK((flat - force).norm() < 0.1 * std::abs(push));
+      CHECK(e.force.z() == doctest::Approx(-pressed).epsilon(0.1));
+      CHECK(e.observed.z() < 1e-6);  // it is only thought
+    }
+  }
+}
+
 TEST_CASE("the contact is the nearest Gaussian on its most probable link, else the nearest point of the centerline") {
   const chain::Chain rope =
       chain::make_chain(0.3, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 4, chain::Bending::planar, false);

@@ -45,10 +45,11 @@ MatrixX angle_covariance(const chain::Chain& chain, const VectorX& theta, const 
 struct Options {
   double force_scale = 0.5;          // N a 60 g rope is pushed with, in proportion to the mass: the prior's deviation
   double along = 0.3;                // of the force across: the same along the rope, where fingers slip
-  double relative_deviation = 0.1;   // of the joints' stiffness and damping torques: what the joint law lacks
+  double relative_deviation = 0.1;   // of stiffness and damping torques and of friction: what their laws lack
   double gravity_deviation = 0.002;  // of the rope's weight times its length: torque that a chain of few links lacks
   double friction_reach = 0.25;      // of the rope's length, over which friction at rest has about one direction
-  double pressing = 0.5;             // of the force in the table's plane: how hard it may press the rope down besides
+  double pressing = 0.25;            // of the force in the table's plane: how hard it presses the rope down besides, as
+                                     // friction at a finger does (0 to its coefficient, about 0.5), and its deviation
   double error_memory = 0.1;         // s, in which the model's and the states' errors stay the same
   double contact_time = 1.0;         // s, a contact lasts in the mean
   double slide = 0.1;                // lengths of the rope in 1/sqrt(s), a contact wanders along it

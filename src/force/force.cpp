@@ -45,7 +45,8 @@ struct Frame {
   MatrixX axes;
   std::vector<Pose> motions;
   std::vector<double> hidden;  // N a link, friction that may balance a force unseen
-  std::vector<double> speed;   // m/s a link, of its middle, across the table
+  std::vector<double> speed;   // m/s a link, of its middle, over the table
+  std::vector<Vector3> slip;   // its direction, shorter than 1 below the friction's regularization speed
   Contact named;               // what is said to touch; none where it is not
   bool is_named = false;
 };
@@ -99,6 +100,7 @@ Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> de
   // friction at rest balances anything up to its limit; neighboring links were dragged there together
   out.hidden.assign(chain.links(), 0.0);
   out.speed.assign(chain.links(), 0.0);
+  out.slip.assign(chain.links(), Vector3::Zero());
   if (p.table_normal) {
     const Vector3& normal = *p.table_normal;
     const Matrix3 across = Matrix3::Identity() - normal * normal.transpose();
@@ -110,15 +112,39 @@ Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> de
       const MatrixX jacobian = chain::point_jacobian(chain, out.axes, link, x);
       const Vector3 v = across * (jacobian * thetadot + v0 + omega.cross(x - base.pose.translation));
       out.speed[link] = v.norm();
+      out.slip[link] = v / std::hypot(v.norm(), p.coulomb_speed);
       const double limit = p.coulomb_friction[link - 1] * p.link_mass[link - 1] * std::abs(p.gravity.dot(normal));
       out.hidden[link] = limit * p.coulomb_speed / std::hypot(v.norm(), p.coulomb_speed);
-      friction[link] = out.hidden[link] * across * jacobian;
+      const double off = std::hypot(out.hidden[link], options.relative_deviation * limit);
+      friction[link] = off * across * jacobian;
     }
     for (int a = 1; a < chain.links(); ++a)
       for (int b = 1; b < chain.links(); ++b) {
         const double apart = std::abs(chain.link_start(a) - chain.link_start(b)) / chain.length;
         out.covariance.noalias() += std::exp(-apart / options.friction_reach) * friction[a].transpose() * friction[b];
       }
+  }
+  return out;
+}
+
+// Of the contact's point, as the rope feels a force there. A rope that slides over a table rolls, and its side rubs at
+// the finger that pushes it: the finger presses it down (one that brakes it lifts it) by a share of the push
+// (Options::pressing). That adds to the table's friction there and holds the roll back: it turns the rope about itself
+// as a force at the underside along the push would.
+MatrixX felt_jacobian(const dynamics::Model& model, const Frame& frame, const Contact& contact, double pressing) {
+  const chain::Chain& chain = model.chain;
+  const dynamics::Parameters& p = model.parameters;
+  MatrixX out = chain::point_jacobian(chain, frame.axes, contact.link, frame.motions[contact.link] * contact.home);
+  if (!p.table_normal || contact.link == 0) return out;
+  const Vector3& slip = frame.slip[contact.link];
+  const MatrixX dragged = p.coulomb_friction[contact.link - 1] * slip * (slip.transpose() * out);
+  out -= pressing * dragged;
+  if (p.roll_lever.empty()) return out;
+  const Vector3 axis = frame.axes.col(0).head<3>();
+  const Vector3 across = axis.cross(frame.motions[contact.link].rotation * chain.direction);
+  for (int k = 0; k < chain.angles(); ++k) {
+    const double share = std::min(chain.link_start(chain.child_link[k]), contact.arclength) / chain.length;
+    out.col(k) -= pressing * p.roll_lever[k] * share * across;
   }
   return out;
 }
@@ -143,7 +169,7 @@ Touch touch_at(const dynamics::Model& model, const Frame& frame, const Contact& 
   Touch out;
   out.contact = contact;
   out.prior = across * across * Matrix3::Identity() + (along * along - across * across) * tangent * tangent.transpose();
-  out.jacobian = chain::point_jacobian(chain, frame.axes, contact.link, frame.motions[contact.link] * contact.home);
+  out.jacobian = felt_jacobian(model, frame, contact, options.pressing);
   out.fit = solve(out.jacobian, frame.residual, frame.covariance, out.prior);
   return out;
 }
@@ -225,10 +251,13 @@ Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, 
     }
     e.contact = touch.contact;
     if (const auto& normal = p.table_normal) {
-      // what presses the rope onto the table adds to the friction there, and no camera sees it
+      // how hard the finger presses is not seen; the friction is as uncertain as that
       const Matrix3 plane = Matrix3::Identity() - *normal * normal->transpose();
+      const double pressed = track.options.pressing * frame.slip[e.contact.link].dot(force);
+      const double unseen = normal->dot(covariance * *normal) / normal->dot(touch.prior * *normal);
       const double friction = e.contact.link > 0 ? p.coulomb_friction[e.contact.link - 1] : 0.0;
-      covariance += std::pow(friction * track.options.pressing * (plane * force).norm(), 2) * plane;
+      force -= unseen * pressed * *normal;
+      covariance += std::pow(friction * pressed, 2) * plane;
     }
     // a contact that was named is believed
     const double believed = automatic ? e.probability : 1.0;
@@ -242,9 +271,10 @@ Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, 
     const double limit = std::accumulate(frame.hidden.begin(), frame.hidden.end(), 0.0);
     e.low = e.high = e.force;
     if (const auto& normal = p.table_normal) {
+      const Vector3 most = sliding.force + normal->dot(e.force - sliding.force) * *normal;
       const Vector3 reach = limit * (Vector3::Ones() - normal->cwiseProduct(*normal)).cwiseMax(0.0).cwiseSqrt();
-      e.low = e.force.cwiseMin(sliding.force - reach);
-      e.high = e.force.cwiseMax(sliding.force + reach);
+      e.low = e.force.cwiseMin(most - reach);
+      e.high = e.force.cwiseMax(most + reach);
     }
   }
   e.point = frame.motions[e.contact.link] * e.contact.home;
