@@ -79,12 +79,12 @@ void PlanarEngine::air_friction(int j, bool slopes) {
   const double lever = jx * c + jy * si;
   const double across = v.turn * lever - si * v.x + c * v.y;
   const double uz0 = slide_.z() - spin_.y() * jx + spin_.x() * jy, uz1 = spin_.x() * si - spin_.y() * c;
-  double force = 0.0, moment = 0.0, by_speed[3] = {}, by_z[3] = {};  // powers of the arc length
+  double drag = 0.0, moment = 0.0, by_speed[3] = {}, by_z[3] = {};  // powers of the arc length
   for (int g = 0; g < 3; ++g) {
     const double along = kGaussPoint[g] * link.length, w = across + v.turn * along, uz = uz0 + uz1 * along;
     const double speed = std::sqrt(w * w + uz * uz + ve2);
     const double rate = (link.air_linear + link.air_quadratic * speed) * kGaussWeight[g];
-    force -= rate * w, moment -= rate * w * along;
+    drag -= rate * w, moment -= rate * w * along;
     if (slopes) {
       const double bend = link.air_quadratic / speed * kGaussWeight[g];
       const double slope = rate + bend * w * w, slope_z = bend * w * uz;
@@ -92,7 +92,7 @@ void PlanarEngine::air_friction(int j, bool slopes) {
       by_z[0] += slope_z, by_z[1] += slope_z * along, by_z[2] += slope_z * along * along;
     }
   }
-  add(wrench_[j], {lever * force + moment, -si * force, c * force});
+  add(wrench_[j], {lever * drag + moment, -si * drag, c * drag});
   if (!slopes) return;
   Slope& s = slope_sum_[j];
   const double first = lever * by_speed[0] + by_speed[1];
