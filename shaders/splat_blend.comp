@@ -32,7 +32,7 @@ layout(std430, binding = 10) writeonly buffer DepthImage { float depth_image[]; 
 #include "inc/share.glsl"
 
 void main() {
-  uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
+  uint tile = gl_WorkGroupID.x * p.tile_stride % p.tiles, lane = gl_LocalInvocationID.x;
   SplatTile t = tiles[tile];
   SplatView view = views[t.view];
   uint column = t.x * kTileWidth + lane % kTileWidth;

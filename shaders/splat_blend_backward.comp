@@ -64,7 +64,7 @@ float subgroup_sums(float v[8]) {
 }
 
 void main() {
-  uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x;
+  uint tile = gl_WorkGroupID.x * p.tile_stride % p.tiles, lane = gl_LocalInvocationID.x;
   SplatTile t = tiles[tile];
   SplatView view = views[t.view];
   uint column = t.x * kTileWidth + lane % kTileWidth;

@@ -19,7 +19,7 @@ layout(std430, binding = 5) writeonly buffer Sorted { uvec2 sorted[]; };   // sp
 layout(std430, binding = 6) buffer Counters { uint counters[]; };
 
 void main() {
-  uint tile = gl_WorkGroupID.x, lane = gl_LocalInvocationID.x, lanes = gl_WorkGroupSize.x;
+  uint tile = gl_WorkGroupID.x * p.tile_stride % p.tiles, lane = gl_LocalInvocationID.x, lanes = gl_WorkGroupSize.x;
   uint start = tile_prefix[tile] + tile_block[tile / kScanBlock];
   uint n = counters[kCounterOverflow] != 0u ? 0u : tile_count[tile];
   if (n > kRankLimit) {

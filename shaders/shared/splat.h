@@ -31,6 +31,8 @@ struct SplatPush {
   float weight_l1, weight_dssim, weight_mask;  // already divided by what means are taken over
   uint near_tiles;                             // the first so many active tiles have a D-SSIM term
   uint scan_length, scan_per_live, scan_counter, flags;
+  uint tile_stride;                            // group g of a pass over all active tiles takes tile g * tile_stride % tiles
+  uint padding0, padding1, padding2;
 };
 
 const uint kNoTile = 0xffffffffu;
@@ -64,6 +66,6 @@ const uint kGradientRows = 6u;
 const uint kPartialRows = 3u;
 
 #ifdef __cplusplus
-static_assert(sizeof(SplatView) == 80 && sizeof(SplatTile) == 16 && sizeof(SplatPush) == 64);
+static_assert(sizeof(SplatView) == 80 && sizeof(SplatTile) == 16 && sizeof(SplatPush) == 80);
 }  // namespace chainsplat::shared
 #endif

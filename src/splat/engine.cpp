@@ -3,6 +3,7 @@
 #include <bit>
 #include <cmath>
 #include <cstring>
+#include <numeric>
 #include <utility>
 
 #include "chainsplat/splat.h"
@@ -116,6 +117,16 @@ Nearness near_mask(const SceneView& view, const std::vector<std::uint8_t>& rgba,
     }
   }
   return out;
+}
+
+// lavapipe gives every thread one stretch of a pass' groups. Neighbors in the list of tiles have alike work, those far
+// apart do not: so that every stretch has some of all, a pass goes through the list in steps of about its golden
+// section.
+std::uint32_t spreading_stride(std::uint32_t count) {
+  constexpr double kGoldenSection = 0.6180339887;
+  auto stride = static_cast<std::uint32_t>(kGoldenSection * count);
+  while (stride > 1 && std::gcd(stride, count) > 1) --stride;
+  return std::max(1u, stride);
 }
 
 }  // namespace
@@ -471,6 +482,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   push.tiles = tile_total;
   push.slots = slots;
   push.near_tiles = near_total;
+  push.tile_stride = gpu::info(device).software ? spreading_stride(tile_total) : 1;
   push.weight_l1 = static_cast<float>(options.weights.l1 * options.color_scale);
   push.weight_dssim = static_cast<float>(options.weights.dssim * options.color_scale);
   push.weight_mask = static_cast<float>(options.weights.mask * options.mask_scale);
