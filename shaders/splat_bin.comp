@@ -15,7 +15,8 @@ layout(std430, binding = 6) readonly buffer InstanceBlock { uint instance_block[
 layout(std430, binding = 7) readonly buffer TilePrefix { uint tile_prefix[]; };
 layout(std430, binding = 8) readonly buffer TileBlock { uint tile_block[]; };
 layout(std430, binding = 9) buffer TileCursor { uint tile_cursor[]; };
-layout(std430, binding = 10) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica number, splat, instance
+layout(std430, binding = 10) readonly buffer TileHits { uint tile_hits[]; };
+layout(std430, binding = 11) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica number, splat, instance
 
 void main() {
   uint r = gl_GlobalInvocationID.x, v = gl_GlobalInvocationID.y;
@@ -28,10 +29,13 @@ void main() {
   uint depth = floatBitsToUint(splats[kSplatRows * s].w);  // positive floats sort like their bits
   uint instance = instance_prefix[s] + instance_block[s / kScanBlock];
   SplatView view = views[v];
+  uint hits = tile_hits[s], seen = 0u;
   for (uint ty = rows & 0xffffu; ty < rows >> 16u; ++ty) {
     for (uint tx = columns & 0xffffu; tx < columns >> 16u; ++tx) {
       uint tile = tile_map[view.tile_map + ty * view.tiles_x + tx];
-      if (tile != kNoTile) {
+      bool hit = seen >= kTileHits || (hits >> seen & 1u) != 0u;
+      ++seen;
+      if (tile != kNoTile && hit) {
         uint place = tile_prefix[tile] + tile_block[tile / kScanBlock] + atomicAdd(tile_cursor[tile], 1u);
         entries[place] = uvec4(depth, replica, s, instance);
         ++instance;

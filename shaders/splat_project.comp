@@ -1,5 +1,5 @@
-// splat_project.comp - one invocation a (live replica, view): its 2-D splat, the tiles that it may touch, and how many of
-// them are active. A splat reaches as far as its alpha reaches 1/255, not three sigma.
+// splat_project.comp - one invocation a (live replica, view): its 2-D splat, the tiles that it touches, and how many of them
+// are active. A splat reaches as far as its alpha reaches 1/255, not three sigma.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
@@ -20,9 +20,20 @@ layout(std430, binding = 6) readonly buffer Counters { uint counters[]; };
 layout(std430, binding = 7) writeonly buffer Splats { vec4 splats[]; };
 layout(std430, binding = 8) writeonly buffer InstanceCount { uint instance_count[]; };
 layout(std430, binding = 9) buffer TileCount { uint tile_count[]; };
+layout(std430, binding = 10) writeonly buffer TileHits { uint tile_hits[]; };
 
 // exponent below which a Gaussian is 0 in float: the reach when there is no 1/255 cut
 const float kFullReach = 80.0;
+
+// Least delta^T Q delta over the pixel centers' rectangle [low, high], given from the splat's center: where that lies outside,
+// it is on one of the two edges that face the center.
+float least_in(vec3 conic, vec2 low, vec2 high) {
+  vec2 facing = clamp(vec2(0.0), low, high);
+  vec2 a = vec2(facing.x, clamp(-conic.y / conic.z * facing.x, low.y, high.y));
+  vec2 b = vec2(clamp(-conic.y / conic.x * facing.y, low.x, high.x), facing.y);
+  return min(conic.x * a.x * a.x + 2.0 * conic.y * a.x * a.y + conic.z * a.y * a.y,
+             conic.x * b.x * b.x + 2.0 * conic.y * b.x * b.y + conic.z * b.y * b.y);
+}
 
 void main() {
   uint r = gl_GlobalInvocationID.x, v = gl_GlobalInvocationID.y;
@@ -53,16 +64,25 @@ void main() {
   uvec2 t0 = uvec2(max(first, ivec2(0))) / uvec2(kTileWidth, kTileHeight);
   uvec2 t1 = uvec2(max(last, ivec2(0))) / uvec2(kTileWidth, kTileHeight) + 1u;
   if (!seen) t1 = t0;
-  uint count = 0u;
+  float inverse = 1.0 / determinant;
+  vec3 conic = vec3(a.cov.z, -a.cov.y, a.cov.x) * inverse;
+  const float kSlack = 1.001;  // rounding never takes away a tile that a pixel of it would have shown
+  vec2 size = vec2(kTileWidth, kTileHeight);
+  uint count = 0u, place = 0u, hits = 0u;
   for (uint ty = t0.y; ty < t1.y; ++ty) {
     for (uint tx = t0.x; tx < t1.x; ++tx) {
       uint tile = tile_map[view.tile_map + ty * view.tiles_x + tx];
-      if (tile != kNoTile) {
+      vec2 low = vec2(tx, ty) * size + 0.5 - u;
+      bool hit = place >= kTileHits || !(least_in(conic, low, low + size - 1.0) > kSlack * reach);
+      if (tile != kNoTile && hit) {
         atomicAdd(tile_count[tile], 1u);
         ++count;
       }
+      hits |= hit && place < kTileHits ? 1u << place : 0u;
+      ++place;
     }
   }
+  tile_hits[out_index] = hits;
   instance_count[out_index] = count;
   if (count == 0u) t1 = t0;
   vec3 direction = normalize(a.x) * a.link;  // R^T r: the view direction in the home frame
@@ -71,9 +91,8 @@ void main() {
   for (uint l = 0u; l < p.coefficients; ++l) {
     color += sh_basis(l, direction) * vec3(parameters[sh + 3u * l], parameters[sh + 3u * l + 1u], parameters[sh + 3u * l + 2u]);
   }
-  float inverse = 1.0 / determinant;
   splats[kSplatRows * out_index] = vec4(u, opacity, a.x.z);
   splats[kSplatRows * out_index + 1u] =
-      vec4(a.cov.z * inverse, -a.cov.y * inverse, a.cov.x * inverse, uintBitsToFloat(t0.x | t1.x << 16u));
+      vec4(conic, uintBitsToFloat(t0.x | t1.x << 16u));
   splats[kSplatRows * out_index + 2u] = vec4(max(color, vec3(0.0)), uintBitsToFloat(t0.y | t1.y << 16u));
 }

@@ -58,6 +58,8 @@ const uint kFlagAccumulate = 1u;    // gradients of this chunk of views are adde
 // splat record: 3 vec4
 //   0: u (px), opacity, depth (m)   1: conic xx, xy, yy, tile rectangle x0 | x1 << 16   2: color, rectangle y0 | y1 << 16
 const uint kSplatRows = 3u;
+const uint kTileHits = 32u;         // tiles of the rectangle, row by row, of which a bit says whether the splat touches them;
+                                    // those behind them count as touched
 // gradient record of one (replica, view): 6 vec4
 //   0: mean (home), opacity   1: rotation   2: log scale   3: color   4: link moment   5: link force (camera frame)
 const uint kGradientRows = 6u;

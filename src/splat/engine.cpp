@@ -146,7 +146,7 @@ struct Engine::State {
   // work buffers, grown as needed
   Buffer replica_opacity, live_flag, live_prefix, live_block, live, replica_gradient, counters;
   Buffer views, motions, tile_map, tiles;
-  Buffer splats, instance_count, instance_prefix, instance_block, records, link_twists;
+  Buffer splats, instance_count, tile_hits, instance_prefix, instance_block, records, link_twists;
   Buffer tile_count, tile_prefix, tile_block, tile_cursor, tile_used, tile_loss;
   Buffer entries, long_tiles, sort_scratch, sorted, partials;
   Buffer image, depth_image, pixel_gradient, ssim_row_sums, ssim_factors;
@@ -200,8 +200,8 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   compact = gpu::Pipeline(d, "splat_compact", 4, push, {});
   scan_block = gpu::Pipeline(d, "scan_block", 4, push, {});
   scan_sums = gpu::Pipeline(d, "scan_sums", 2, push, {});
-  project = gpu::Pipeline(d, "splat_project", 10, push, {cut, tile_width, tile_height});
-  bin = gpu::Pipeline(d, "splat_bin", 11, push, {});
+  project = gpu::Pipeline(d, "splat_project", 11, push, {cut, tile_width, tile_height});
+  bin = gpu::Pipeline(d, "splat_bin", 12, push, {});
   // as many lanes a tile as a subgroup of the device: no lane waits at the barriers for another subgroup
   const std::uint32_t tile_lanes = device_info.software ? 8 : 32;
   sort = gpu::Pipeline(d, "splat_sort", 7, push,
@@ -241,10 +241,10 @@ void Engine::State::need(Buffer& buffer, std::size_t bytes, const char* name) {
 void Engine::State::release_view_buffers() {
   commands.wait();
   for (Buffer* buffer :
-       {&views,          &motions,       &tile_map,     &tiles,      &splats,      &instance_count, &instance_prefix,
-        &instance_block, &records,       &link_twists,  &tile_count, &tile_prefix, &tile_block,     &tile_cursor,
-        &tile_used,      &tile_loss,     &entries,      &sorted,     &partials,    &image,          &depth_image,
-        &pixel_gradient, &ssim_row_sums, &ssim_factors, &long_tiles, &sort_scratch})
+       {&views,           &motions,        &tile_map,      &tiles,        &splats,     &instance_count, &tile_hits,
+        &instance_prefix, &instance_block, &records,       &link_twists,  &tile_count, &tile_prefix,    &tile_block,
+        &tile_cursor,     &tile_used,      &tile_loss,     &entries,      &sorted,     &partials,       &image,
+        &depth_image,     &pixel_gradient, &ssim_row_sums, &ssim_factors, &long_tiles, &sort_scratch})
     *buffer = Buffer();
   instance_capacity = 0;
 }
@@ -444,6 +444,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   need(live, words(live_capacity), "live");
   need(splats, vectors(shared::kSplatRows * pairs), "splats");
   need(instance_count, words(pairs), "instance count");
+  need(tile_hits, words(pairs), "tile hits");
   need(instance_prefix, words(pairs), "instance prefix");
   need(instance_block, words(blocks(pairs)), "instance block");
   need(tile_count, words(tile_total), "tile count");
@@ -518,7 +519,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
            (replica_groups + kRow - 1) / kRow);
   commands.stamp("replicate");
   dispatch_live(project, {&scene.parameters, &replica_opacity, &live, &views, &motions, &tile_map, &counters, &splats,
-                          &instance_count, &tile_count});
+                          &instance_count, &tile_count, &tile_hits});
   commands.stamp("project");
   SplatPush scan_push = push;
   scan_push.scan_per_live = view_count;
@@ -530,7 +531,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   scan(tile_count, tile_prefix, tile_block, scan_push, tile_total);
   commands.stamp("scan");
   dispatch_live(bin, {&live, &views, &tile_map, &counters, &splats, &instance_prefix, &instance_block, &tile_prefix,
-                      &tile_block, &tile_cursor, &entries});
+                      &tile_block, &tile_cursor, &tile_hits, &entries});
   commands.stamp("bin");
   dispatch(sort, {&tile_prefix, &tile_block, &tile_count, &entries, &long_tiles, &sorted, &counters}, tile_total);
   const std::array long_buffers = {static_cast<const Buffer*>(&tile_prefix), static_cast<const Buffer*>(&tile_block),
