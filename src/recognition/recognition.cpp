@@ -47,7 +47,7 @@ std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain&
                                       const std::vector<int>& selected, int iterations, const AnglePrior& prior,
                                       chain::States& states) {
   // the targets of one part must fit one buffer on the smallest device
-  constexpr std::size_t kPartPixels = 8u << 20;
+  constexpr std::size_t kPartPixels = 2u << 20;
   std::vector<math::MatrixX> covariances;
   engine.set_gaussians(gaussians);
   std::size_t from = 0;

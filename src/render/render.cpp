@@ -9,7 +9,7 @@ using math::Vector2;
 
 namespace {
 
-constexpr std::size_t kBatchPixels = 4u << 20;  // of a batch: 64 MiB of float colors, several dozen frames of a rope
+constexpr std::size_t kBatchPixels = 2u << 20;  // of a batch: 32 MiB of float colors, several dozen frames of a rope
 constexpr int kBorderStep = 8;                  // px between the border points that bound a warped rectangle
 constexpr double kTimeSlack = 1e-9;             // s, rounding of frame times
 constexpr float kSolid = 0.5f;                  // alpha from here on is object (INTERFACE 1)

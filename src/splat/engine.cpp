@@ -668,33 +668,40 @@ std::vector<ViewSums> Engine::State::sums(std::size_t chunk_views) {
 
 std::vector<Picture> Engine::State::pictures(const Scene& scene, std::span<const int> chunk, bool depth) {
   std::vector<Picture> out(chunk.size());
-  for (std::size_t v = 0; v < chunk.size(); ++v) {
+  const auto fetch = [&](std::int64_t v) {
     const SceneView& view = scene.views[chunk[v]];
     Picture& picture = out[v];
     picture.width = view.width;
     picture.height = view.height;
     const std::size_t pixels = static_cast<std::size_t>(view.width) * view.height;
-    picture.rgba.assign(4 * pixels, 0.0f);
-    if (pixels == 0) continue;
+    picture.rgba.resize(4 * pixels);
+    if (pixels == 0) return;
     gpu::download(device, image, picture.rgba.data(), 4 * pixels * sizeof(float), chunk_pixel[v] * sizeof(glm::vec4));
     if (depth) {
       picture.depth.resize(pixels);
       gpu::download(device, depth_image, picture.depth.data(), pixels * sizeof(float), chunk_pixel[v] * sizeof(float));
     }
-    if (view.active.size() == static_cast<std::size_t>(view.tiles_x) * view.tiles_y) continue;
     // what was not drawn holds pixels of an earlier batch
     std::vector<bool> drawn(static_cast<std::size_t>(view.tiles_x) * view.tiles_y, false);
     for (const std::uint32_t cell : view.active) drawn[cell] = true;
-    for (int y = 0; y < view.height; ++y) {
-      for (int x = 0; x < view.width; ++x) {
-        if (drawn[static_cast<std::size_t>(y / static_cast<int>(tile_height)) * view.tiles_x +
-                  x / static_cast<int>(tile_width)])
-          continue;
-        const std::size_t k = static_cast<std::size_t>(y) * view.width + x;
-        std::fill_n(picture.rgba.begin() + 4 * k, 4, 0.0f);
-        if (depth) picture.depth[k] = 0.0f;
+    for (std::size_t cell = 0; cell < drawn.size(); ++cell) {
+      if (drawn[cell]) continue;
+      const int x0 = static_cast<int>(cell % view.tiles_x * tile_width),
+                y0 = static_cast<int>(cell / view.tiles_x * tile_height);
+      const int x1 = std::min(view.width, x0 + static_cast<int>(tile_width)),
+                y1 = std::min(view.height, y0 + static_cast<int>(tile_height));
+      for (int y = y0; y < y1; ++y) {
+        const std::size_t first = static_cast<std::size_t>(y) * view.width + x0;
+        std::fill_n(picture.rgba.begin() + static_cast<std::ptrdiff_t>(4 * first), 4 * (x1 - x0), 0.0f);
+        if (depth) std::fill_n(picture.depth.begin() + static_cast<std::ptrdiff_t>(first), x1 - x0, 0.0f);
       }
     }
+  };
+  const auto count = static_cast<std::int64_t>(chunk.size());
+  if (image.mapped()) {
+    core::parallel_for(count, fetch);
+  } else {  // through one staging buffer
+    for (std::int64_t v = 0; v < count; ++v) fetch(v);
   }
   return out;
 }
