@@ -164,6 +164,23 @@ const std::uint8_t* pixel(const View& view, int x, int y) {
 
 }  // namespace
 
+// load_recorded() gives what load() with these options gives.
+void check_recorded(const Made& made, const std::string& camera) {
+  LoadOptions options;
+  options.camera = camera;
+  const Capture found = capture::load_recorded(made.load(options), made.path(), options);
+  options.undistort = false;
+  options.depth = true;
+  const Capture wanted = made.load(options);
+  REQUIRE(found.views.size() == wanted.views.size());
+  for (std::size_t k = 0; k < wanted.views.size(); ++k) {
+    CHECK(found.views[k].x0 == wanted.views[k].x0);
+    CHECK(found.views[k].width == wanted.views[k].width);
+    CHECK(found.views[k].rgba == wanted.views[k].rgba);
+    CHECK(found.views[k].depth == wanted.views[k].depth);
+  }
+}
+
 TEST_CASE("lens distortion: OpenCV's formula and its inverse") {
   Camera camera;
   camera.width = 640, camera.height = 480;
@@ -348,6 +365,12 @@ TEST_CASE("undistortion: straight pixels, masks, and edges that are not darkened
   for (int y = view.y0; y < view.y0 + view.height; ++y)
     for (int x = view.x0; x < view.x0 + view.width; ++x)
       if (pixel(view, x, y)[3] == 255) CHECK(pixel(view, x, y)[0] == image.pixels[3 * (y * kWidth + x)]);
+  check_recorded(made, "cam0");
+}
+
+TEST_CASE("what evaluation compares with is loaded but once where no lens distorts") {
+  Made made;
+  check_recorded(made, "");
 }
 
 TEST_CASE("videos of images and masks, missing masks, timestamps, empty views") {

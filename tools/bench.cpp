@@ -303,10 +303,7 @@ Json bench_capture(gpu::Device& device, const Path& folder, std::uint64_t seed) 
   identify_stage(twin, capture.base, found.covariances, false, seed);
   lap("identify");
   {
-    capture::LoadOptions recorded_options;
-    recorded_options.depth = true;
-    recorded_options.undistort = false;
-    const capture::Capture recorded = capture::load(folder, recorded_options);
+    const capture::Capture recorded = capture::load_recorded(capture, folder);
     splat::Engine engine(device);
     eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, recorded);
     eval::evaluate(engine, twin.gaussians, twin.chain, twin.rollout, recorded);

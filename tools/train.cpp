@@ -201,7 +201,7 @@ void train(const Globals& globals, const Request& request) {
   capture::LoadOptions load_options;
   load_options.first = first;
   load_options.last = last;
-  const capture::Capture capture = capture::load(request.capture, load_options);
+  capture::Capture capture = capture::load(request.capture, load_options);
   if (stages.recognize) check_views(capture, request);
   const bool continued = request.resume && fs::exists(out / "twin.json");
   twin::Twin twin = continued ? load_twin(out) : new_twin(capture, request, globals);
@@ -268,9 +268,7 @@ void train(const Globals& globals, const Request& request) {
     if (stages.evaluate) {
       const Stopwatch watch(twin, "evaluate");
       core::report({"evaluate", 0, 0, NAN, NAN, "drawing every frame and comparing"});
-      load_options.depth = true;
-      load_options.undistort = false;
-      const capture::Capture recorded = capture::load(request.capture, load_options);
+      const capture::Capture recorded = capture::load_recorded(std::move(capture), request.capture, load_options);
       splat::Engine engine(*device);
       recognized = eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, recorded);
       if (has_rollout) rolled_out = eval::evaluate(engine, twin.gaussians, twin.chain, twin.rollout, recorded);

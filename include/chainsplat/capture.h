@@ -76,6 +76,10 @@ struct LoadOptions {
 // Loads and checks. `path` is the folder or its capture.json. Throws InputError; unknown keys and other doubts warn.
 Capture load(const Path& path, const LoadOptions& options = {});
 
+// What evaluation compares with: recorded pixels, and depth where the capture has it. `loaded` came from the same path and
+// options; where no camera has lens distortion it shows these pixels already, and nothing is decoded again.
+Capture load_recorded(Capture loaded, const Path& path, LoadOptions options = {});
+
 // The text and the verdict of `chainsplat check`. `problems` would make load() throw, `doubts` are warnings.
 struct CheckReport {
   std::vector<std::string> facts, doubts, problems;

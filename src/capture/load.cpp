@@ -1,3 +1,5 @@
+#include <algorithm>
+
 #include "manifest.h"
 
 namespace chainsplat::capture {
@@ -26,6 +28,18 @@ Capture load(const Path& path, const LoadOptions& options) {
   for (const std::string& doubt : findings.doubts) core::warn(doubt);
   throw_first(findings);
   return capture;
+}
+
+Capture load_recorded(Capture loaded, const Path& path, LoadOptions options) {
+  options.undistort = false;
+  options.depth = true;
+  if (std::any_of(loaded.cameras.begin(), loaded.cameras.end(), [](const Camera& c) { return c.distorted(); }))
+    return load(path, options);
+  Findings findings;
+  const Manifest manifest = read_manifest(path, options.camera, options.images && options.masked, findings);
+  throw_first(findings);
+  add_depth(manifest, loaded.views);
+  return loaded;
 }
 
 }  // namespace chainsplat::capture

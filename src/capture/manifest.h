@@ -54,4 +54,7 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
 // Throws InputError for images that cannot be read.
 void load_views(const Manifest& manifest, const LoadOptions& options, Findings& findings, std::vector<View>& views);
 
+// Recorded depth into views that were loaded without; no camera has lens distortion.
+void add_depth(const Manifest& manifest, std::vector<View>& views);
+
 }  // namespace chainsplat::capture

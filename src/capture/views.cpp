@@ -357,4 +357,17 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
   }
 }
 
+void add_depth(const Manifest& manifest, std::vector<View>& views) {
+  for_each_in_parallel(static_cast<std::int64_t>(views.size()), [&](std::int64_t i) {
+    View& view = views[i];
+    const CameraSource& source = manifest.cameras[view.camera];
+    if (!source.depth) return;
+    constexpr bool kUndistorting = false;
+    fill_depth(view, source.camera,
+               read_depth(source.depth->frame_file(view.frame), source.camera.width, source.camera.height,
+                          source.depth_scale),
+               kUndistorting);
+  });
+}
+
 }  // namespace chainsplat::capture
