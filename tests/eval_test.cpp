@@ -7,6 +7,7 @@
 #include <nlohmann/json.hpp>
 
 #include "small_twin.h"
+#include "src/eval/depth_image.h"
 
 using namespace chainsplat;
 using Json = nlohmann::json;
@@ -132,6 +133,33 @@ TEST_CASE("chamfer equals the double loop") {
   CHECK(eval::chamfer(same, same) == 0.0);
   CHECK(eval::chamfer(same, (same.colwise() + Vector3(0, 3, 4)).eval()) == doctest::Approx(5.0));
   CHECK(std::isnan(eval::chamfer(same, math::MatrixX(3, 0))));
+}
+
+TEST_CASE("chamfer of depth images equals that of their points, near and far, straight and through a lens") {
+  core::Random random(6);
+  capture::Camera camera = small_camera();
+  for (const bool lens : {false, true}) {
+    if (lens) camera.distortion[0] = 0.1;
+    for (const int shift : {0, 1, 3, 20}) {  // px
+      eval::DepthImage p{2, 3, 36, 24, std::vector<float>(36 * 24)}, q = p;
+      math::MatrixX clouds[2] = {math::MatrixX(3, 0), math::MatrixX(3, 0)};
+      for (int k = 0; k < 36 * 24; ++k) {
+        const int x = k % 36, y = k / 36;
+        for (int which = 0; which < 2; ++which) {
+          const int left = which * shift;
+          if (x < left || x >= left + 12 || y < 6 || y >= 18 || random.uniform() < 0.2) continue;
+          const auto z = static_cast<float>(2.0 + 0.02 * random.normal() + 0.005 * x);
+          (which == 0 ? p : q).depth[k] = z;
+          math::Vector2 pixel(2 + x + 0.5, 3 + y + 0.5);
+          if (lens) pixel = capture::undistort(camera, pixel);
+          clouds[which].conservativeResize(3, clouds[which].cols() + 1);
+          clouds[which].rightCols<1>() =
+              z * Vector3((pixel.x() - camera.cx) / camera.fx, (pixel.y() - camera.cy) / camera.fy, 1.0);
+        }
+      }
+      CHECK(eval::chamfer(p, q, camera) == doctest::Approx(eval::chamfer(clouds[0], clouds[1])).epsilon(1e-9));
+    }
+  }
 }
 
 TEST_CASE("metrics of a frame, by hand") {

@@ -1,12 +1,15 @@
 #include <algorithm>
 #include <limits>
 #include <numeric>
+#include <optional>
 
 #include "chainsplat/eval.h"
+#include "src/eval/depth_image.h"
 
 namespace chainsplat::eval {
 
 using math::MatrixX;
+using math::Vector2;
 using math::Vector3;
 
 namespace {
@@ -78,7 +81,77 @@ double mean_distance(const MatrixX& from, const Tree& to) {
   return sum / static_cast<double>(from.cols());
 }
 
+constexpr int kFarRings = 4;  // px: where the nearest point is farther away in the image, the tree finds it sooner
+
+// A depth image's points by pixel, camera frame.
+struct PixelCloud {
+  int width = 0, height = 0;
+  std::vector<Vector3> points;  // z = 0: none
+  MatrixX columns;              // those that are there
+
+  PixelCloud(const DepthImage& image, const capture::Camera& camera)
+      : width(image.width), height(image.height), points(image.depth.size(), Vector3::Zero()) {
+    const auto there = std::count_if(image.depth.begin(), image.depth.end(), [](float z) { return z > 0.0f; });
+    columns.resize(3, there);
+    Eigen::Index next = 0;
+    for (std::size_t k = 0; k < image.depth.size(); ++k) {
+      const double z = image.depth[k];
+      if (!(z > 0.0)) continue;
+      Vector2 pixel(image.x0 + static_cast<int>(k) % width + 0.5, image.y0 + static_cast<int>(k) / width + 0.5);
+      if (camera.distorted()) pixel = capture::undistort(camera, pixel);
+      points[k] = {(pixel.x() - camera.cx) / camera.fx * z, (pixel.y() - camera.cy) / camera.fy * z, z};
+      columns.col(next++) = points[k];
+    }
+  }
+};
+
+// The nearest point lies on the ray of a pixel close by: pixels are looked at in growing rings, until no ray farther
+// out can come as close as what was found. Exact for straight rays; through a lens the rays are no grid, and the tree
+// answers.
+double mean_distance(const PixelCloud& from, const PixelCloud& to, const capture::Camera& camera) {
+  std::optional<Tree> tree;
+  int hint = 0;
+  const auto by_tree = [&](const Vector3& x) {
+    if (!tree) tree.emplace(to.columns);
+    return tree->nearest(x, hint);
+  };
+  // least distance from x to the rays of pixels at least `ring` columns or rows away: to the planes before them
+  const auto beyond = [&](const Vector3& x, int ring) {
+    const double u = ring / camera.fx, v = ring / camera.fy;
+    const double far_u = std::abs(x.x()) / x.z() + u, far_v = std::abs(x.y()) / x.z() + v;
+    return x.z() * x.z() * std::min(u * u / (1.0 + far_u * far_u), v * v / (1.0 + far_v * far_v));
+  };
+  double sum = 0.0;
+  for (int py = 0; py < from.height; ++py) {
+    for (int px = 0; px < from.width; ++px) {
+      const Vector3& x = from.points[static_cast<std::size_t>(py) * from.width + px];
+      if (!(x.z() > 0.0)) continue;
+      double best = std::numeric_limits<double>::infinity();
+      int ring = camera.distorted() ? kFarRings : 0;
+      for (; ring < kFarRings && best > beyond(x, ring); ++ring) {
+        for (int y = std::max(0, py - ring); y <= std::min(to.height - 1, py + ring); ++y) {
+          const bool whole_row = std::abs(y - py) == ring;
+          for (int column = px - ring; column <= px + ring; column += whole_row || ring == 0 ? 1 : 2 * ring) {
+            if (column < 0 || column >= to.width) continue;
+            const Vector3& candidate = to.points[static_cast<std::size_t>(y) * to.width + column];
+            if (candidate.z() > 0.0) best = std::min(best, (candidate - x).squaredNorm());
+          }
+        }
+      }
+      if (ring == kFarRings && best > beyond(x, ring)) best = by_tree(x);
+      sum += std::sqrt(best);
+    }
+  }
+  return sum / static_cast<double>(from.columns.cols());
+}
+
 }  // namespace
+
+double chamfer(const DepthImage& p, const DepthImage& q, const capture::Camera& camera) {
+  const PixelCloud a(p, camera), b(q, camera);
+  if (a.columns.cols() == 0 || b.columns.cols() == 0) return std::numeric_limits<double>::quiet_NaN();
+  return 0.5 * (mean_distance(a, b, camera) + mean_distance(b, a, camera));
+}
 
 double chamfer(const MatrixX& p, const MatrixX& q) {
   if (p.cols() == 0 || q.cols() == 0) return std::numeric_limits<double>::quiet_NaN();

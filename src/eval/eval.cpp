@@ -6,11 +6,11 @@
 #include <limits>
 #include <nlohmann/json.hpp>
 
+#include "src/eval/depth_image.h"
+
 namespace chainsplat::eval {
 
 using math::MatrixX;
-using math::Vector2;
-using math::Vector3;
 
 namespace {
 
@@ -38,20 +38,6 @@ Rectangle compared(const Rectangle& a, const Rectangle& b, const capture::Camera
 
 double psnr(double squared_sum, double count) {
   return std::min(kMostPsnr, -10.0 * std::log10(std::max(squared_sum / count, std::numeric_limits<double>::min())));
-}
-
-// World point of a recorded pixel's center at depth z.
-Vector3 back_projected(const capture::Camera& camera, int x, int y, double z) {
-  Vector2 pixel(x + 0.5, y + 0.5);
-  if (camera.distorted()) pixel = capture::undistort(camera, pixel);
-  return camera.world_from_camera *
-         Vector3((pixel.x() - camera.cx) / camera.fx * z, (pixel.y() - camera.cy) / camera.fy * z, z);
-}
-
-MatrixX columns(const std::vector<Vector3>& points) {
-  MatrixX out(3, points.size());
-  for (std::size_t i = 0; i < points.size(); ++i) out.col(static_cast<Eigen::Index>(i)) = points[i];
-  return out;
 }
 
 // True points at a time: a row of the file, else cubic between its rows; none outside.
@@ -140,7 +126,8 @@ FrameMetrics compare(const render::Frame& drawn, const capture::View& view, cons
   std::vector<float> recorded(3u * width * height, 0.0f), rendered(3u * width * height, 0.0f);
   double squared = 0.0, object_squared = 0.0;
   std::int64_t object = 0, both = 0, either = 0;
-  std::vector<Vector3> true_cloud, cloud;
+  DepthImage true_depth{area.x0, area.y0, width, height, std::vector<float>(static_cast<std::size_t>(width) * height)};
+  DepthImage depth = true_depth;
   for (int y = area.y0; y < area.y1; ++y) {
     for (int x = area.x0; x < area.x1; ++x) {
       const int vx = x - view.x0, vy = y - view.y0, px = x - drawn.x0, py = y - drawn.y0;
@@ -165,10 +152,9 @@ FrameMetrics compare(const render::Frame& drawn, const capture::View& view, cons
       object += in_mask;
       both += in_mask && solid;
       either += in_mask || solid;
-      if (in_mask && !view.depth.empty() && view.depth[v] > 0.0f)
-        true_cloud.push_back(back_projected(camera, x, y, view.depth[v]));
+      if (in_mask && !view.depth.empty() && view.depth[v] > 0.0f) true_depth.depth[out / 3] = view.depth[v];
       if (solid && !view.depth.empty() && !picture.depth.empty() && picture.depth[p] > 0.0f)
-        cloud.push_back(back_projected(camera, x, y, picture.depth[p]));
+        depth.depth[out / 3] = picture.depth[p];
     }
   }
   const double full = static_cast<double>(camera.width) * camera.height;
@@ -176,7 +162,7 @@ FrameMetrics compare(const render::Frame& drawn, const capture::View& view, cons
   metrics.psnr_object = object > 0 ? psnr(object_squared, 3.0 * static_cast<double>(object)) : kNone;
   metrics.ssim = ssim(rendered, recorded, width, height, full);
   metrics.iou = either > 0 ? static_cast<double>(both) / static_cast<double>(either) : 1.0;
-  metrics.chamfer = chamfer(columns(cloud), columns(true_cloud));
+  metrics.chamfer = chamfer(depth, true_depth, camera);
   return metrics;
 }
 
