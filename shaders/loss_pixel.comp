@@ -1,5 +1,5 @@
-// loss_pixel.comp - one group an active tile: L1 of the color and of the mask (SPEC 2.7), their gradient with respect to the
-// image, and the tile's sums: |color|, |mask|, squared color error and number of pixels inside the object.
+// loss_pixel.comp - one group an active tile: the tile's sums of |color| and |mask| error (SPEC 2.7), squared color error and
+// number of pixels inside the object. Their gradient: splat_blend_backward.comp.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
@@ -11,8 +11,7 @@ layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
 layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
 layout(std430, binding = 2) readonly buffer Image { vec4 image[]; };
 layout(std430, binding = 3) readonly buffer Target { uint target[]; };
-layout(std430, binding = 4) writeonly buffer PixelGradient { vec4 pixel_gradient[]; };
-layout(std430, binding = 5) writeonly buffer TileLoss { vec4 tile_loss[]; };
+layout(std430, binding = 4) writeonly buffer TileLoss { vec4 tile_loss[]; };
 
 shared vec4 lane_sum[gl_WorkGroupSize.x];
 
@@ -30,7 +29,6 @@ void main() {
       vec3 shown = clamp(image[pixel].xyz, 0.0, 1.0) - wanted.xyz;
       float object = wanted.w >= 128.0 / 255.0 ? 1.0 : 0.0;
       sum += vec4(dot(abs(error.xyz), vec3(1.0)), abs(error.w), object * dot(shown, shown), object);
-      pixel_gradient[pixel] = vec4(p.weight_l1 * sign(error.xyz), p.weight_mask * sign(error.w));
     }
   }
   lane_sum[lane] = sum;

@@ -25,8 +25,9 @@ layout(std430, binding = 6) readonly buffer Splats { vec4 splats[]; };
 layout(std430, binding = 7) readonly buffer Counters { uint counters[]; };
 layout(std430, binding = 8) readonly buffer Image { vec4 image[]; };
 layout(std430, binding = 9) readonly buffer TileUsed { uint tile_used[]; };
-layout(std430, binding = 10) readonly buffer PixelGradient { vec4 pixel_gradient[]; };  // of color and alpha
-layout(std430, binding = 11) writeonly buffer Partials { float partials[]; };  // kPartialRows vec4 a slot
+layout(std430, binding = 10) readonly buffer Target { uint target[]; };
+layout(std430, binding = 11) readonly buffer PixelGradient { vec4 pixel_gradient[]; };  // of D-SSIM, by color
+layout(std430, binding = 12) writeonly buffer Partials { float partials[]; };  // kPartialRows vec4 a slot
 
 #include "inc/alpha.glsl"
 #include "inc/share.glsl"
@@ -74,13 +75,20 @@ void main() {
   uint n = counters[kCounterOverflow] != 0u ? 0u : tile_count[tile];
   uint used = min(tile_used[tile], n);
 
-  vec4 gamma[kPixels];
+  bool dssim = p.weight_dssim > 0.0 && tile < p.near_tiles;
+  vec4 gamma[kPixels];                            // gradient of the loss (SPEC 2.7) by color and alpha
   float transmittance[kPixels], behind[kPixels];  // behind: gradient times what lies behind the entries so far
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
     bool inside = column < view.width && row + k < view.height;
-    uint pixel = view.pixel + (row + k) * view.width + column;
-    gamma[k] = inside ? pixel_gradient[pixel] : vec4(0.0);
-    behind[k] = inside ? dot(gamma[k], image[pixel]) : 0.0;
+    uint offset = (row + k) * view.width + column;
+    gamma[k] = vec4(0.0);
+    behind[k] = 0.0;
+    if (inside) {
+      vec4 shown = image[view.pixel + offset], error = shown - unpackUnorm4x8(target[view.target + offset]);
+      gamma[k] = vec4(p.weight_l1 * sign(error.xyz), p.weight_mask * sign(error.w));
+      if (dssim) gamma[k] += pixel_gradient[view.pixel + offset];
+      behind[k] = dot(gamma[k], shown);
+    }
     transmittance[k] = 1.0;
   }
   for (uint begin = 0u; begin < used; begin += kShare) {

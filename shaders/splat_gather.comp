@@ -32,6 +32,9 @@ void main() {
   if (p.coefficients > 1u && (p.flags & kFlagAccumulate) == 0u) {
     for (uint l = 0u; l < 3u * p.coefficients; ++l) gradient[sh + l] = 0.0;
   }
+  float opacity = 1.0 / (1.0 + exp(-parameters[at_opacity(n, i)]));
+  float mean_gradient = 0.0;  // sum over links of rho_j d/d(sigma rho_j)
+  bool held_links = (p.flags & kFlagHeldLinks) != 0u;
   vec3 mean = vec3(parameters[at_mean(n, i)], parameters[at_mean(n, i) + 1u], parameters[at_mean(n, i) + 2u]);
   for (uint j = 0u; j < p.links; ++j) {
     uint e = j * n + i;
@@ -60,9 +63,10 @@ void main() {
             }
           }
         }
+        mean_gradient += replica_opacity[e] / opacity * grad_opacity;
       }
     }
-    replica_gradient[e] = grad_opacity;
+    if (!held_links) replica_gradient[e] = grad_opacity;
   }
   for (uint k = 0u; k < 3u; ++k) {
     put(at_mean(n, i) + k, grad_mean[k]);
@@ -71,10 +75,8 @@ void main() {
   }
   for (uint k = 0u; k < 4u; ++k) put(at_rotation(n, i) + k, grad_rotation[k]);
   // replica opacity = sigma rho: with w_j = d/d(sigma rho_j), d/dsigma = sum rho_j w_j, d/dlambda_j = sigma rho_j (w_j - that)
-  float opacity = 1.0 / (1.0 + exp(-parameters[at_opacity(n, i)]));
-  float mean_gradient = 0.0;
-  for (uint j = 0u; j < p.links; ++j) mean_gradient += replica_opacity[j * n + i] / opacity * replica_gradient[j * n + i];
   put(at_opacity(n, i), opacity * (1.0 - opacity) * mean_gradient);
+  if (held_links) return;
   uint logits = at_link(n, p.coefficients, p.links, i);
   for (uint j = 0u; j < p.links; ++j) {
     put(logits + j, replica_opacity[j * n + i] * (replica_gradient[j * n + i] - mean_gradient));

@@ -1,5 +1,5 @@
 // ssim_columns_backward.comp - the window along y over what ssim_rows_backward left, a lane a strip of a column, and the
-// gradient of the D-SSIM term added to the pixel's gradient: w*P + 2x (w*Q) + y (w*R) (SPEC 2.7).
+// gradient of the D-SSIM term by the pixel's color: w*P + 2x (w*Q) + y (w*R) (SPEC 2.7).
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -15,7 +15,7 @@ layout(std430, binding = 2) readonly buffer TileMap { uint tile_map[]; };
 layout(std430, binding = 3) readonly buffer Rows { float rows[]; };
 layout(std430, binding = 4) readonly buffer Image { vec4 image[]; };
 layout(std430, binding = 5) readonly buffer Target { uint target[]; };
-layout(std430, binding = 6) buffer PixelGradient { vec4 pixel_gradient[]; };
+layout(std430, binding = 6) writeonly buffer PixelGradient { vec4 pixel_gradient[]; };
 #include "inc/ssim.glsl"
 
 void main() {
@@ -46,7 +46,7 @@ void main() {
       vec3 mean = vec3(sum[9u * k], sum[9u * k + 1u], sum[9u * k + 2u]);
       vec3 square = vec3(sum[9u * k + 3u], sum[9u * k + 4u], sum[9u * k + 5u]);
       vec3 product = vec3(sum[9u * k + 6u], sum[9u * k + 7u], sum[9u * k + 8u]);
-      pixel_gradient[view.pixel + offset] += vec4(mean + 2.0 * shown * square + wanted * product, 0.0);
+      pixel_gradient[view.pixel + offset] = vec4(mean + 2.0 * shown * square + wanted * product, 0.0);
     }
   }
 }

@@ -54,6 +54,7 @@ const uint kCounters = 16u;
 const uint kLongestList = 32768u;   // entries of a tile that sorting and blending get through on every device
 
 const uint kFlagAccumulate = 1u;    // gradients of this chunk of views are added to those before
+const uint kFlagHeldLinks = 2u;     // the gradient by link logits is not asked for
 
 // splat record: 3 vec4
 //   0: u (px), opacity, depth (m)   1: conic xx, xy, yy, tile rectangle x0 | x1 << 16   2: color, rectangle y0 | y1 << 16

@@ -59,7 +59,9 @@ struct RunOptions {
   LossWeights weights;
   double color_scale = 0.0;  // what |I^ - I| sums are divided by
   double mask_scale = 0.0;
-  bool loss = false, backward = false, twists = false, depth = false, accumulate = false;
+  bool loss = false, sums = false;  // targets are known; the tiles' sums are asked for
+  bool backward = false, twists = false, depth = false, accumulate = false;
+  bool held_links = false;  // no gradient by link logits
 };
 
 struct ViewSums {
@@ -213,14 +215,14 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   blend = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 0, share});
   blend_depth =
       gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 1, share});
-  blend_backward = gpu::Pipeline(d, "splat_blend_backward", 12, push,
+  blend_backward = gpu::Pipeline(d, "splat_blend_backward", 13, push,
                                  {lanes, tile_width, tile_height, pixels_per_lane, cut, subgroup, share});
   project_backward = gpu::Pipeline(d, "splat_project_backward", 11, push, {});
   gather = gpu::Pipeline(d, "splat_gather", 11, push, {});
   link_twist = gpu::Pipeline(d, "splat_link_twist", 5, push, {});
   adam = gpu::Pipeline(d, "splat_adam", 5, sizeof(AdamPush), {});
   const std::vector<std::uint32_t> tile_constants{tile_lanes, tile_width, tile_height};
-  loss_pixel = gpu::Pipeline(d, "loss_pixel", 6, push, tile_constants);
+  loss_pixel = gpu::Pipeline(d, "loss_pixel", 5, push, tile_constants);
   const std::vector<std::uint32_t> strip_constants{lanes, tile_width, tile_height, pixels_per_lane};
   ssim_rows = gpu::Pipeline(d, "ssim_rows", 6, push, strip_constants);
   ssim_columns = gpu::Pipeline(d, "ssim_columns", 6, push, strip_constants);
@@ -230,10 +232,11 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
 }
 
 void Engine::State::need(Buffer& buffer, std::size_t bytes, const char* name) {
-  constexpr std::size_t kLeast = 256;
-  if (buffer.bytes() < std::max(bytes, kLeast)) {
+  constexpr std::size_t kLeast = 256, kRow = sizeof(glm::vec4);  // kernels may take its last row as a whole
+  bytes = std::max((bytes + kRow - 1) / kRow * kRow, kLeast);
+  if (buffer.bytes() < bytes) {
     buffer = Buffer();  // the old one goes first
-    buffer = Buffer(device, std::max(bytes, kLeast), Domain::device, name);
+    buffer = Buffer(device, bytes, Domain::device, name);
   }
 }
 
@@ -460,7 +463,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   need(image, vectors(pixels), "image");
   need(depth_image, options.depth ? words(pixels) : 0, "depth image");
   const bool dssim = options.loss && options.weights.dssim > 0.0f;
-  if (options.loss) need(pixel_gradient, vectors(pixels), "pixel gradient");
+  need(pixel_gradient, dssim ? vectors(pixels) : 0, "pixel gradient");
   if (dssim) {
     const std::size_t near_pixels = static_cast<std::size_t>(near_total) * tile_width * tile_height;
     need(ssim_row_sums, 12 * words(near_pixels), "ssim rows");
@@ -487,7 +490,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   push.weight_l1 = static_cast<float>(options.weights.l1 * options.color_scale);
   push.weight_dssim = static_cast<float>(options.weights.dssim * options.color_scale);
   push.weight_mask = static_cast<float>(options.weights.mask * options.mask_scale);
-  push.flags = options.accumulate ? shared::kFlagAccumulate : 0;
+  push.flags = (options.accumulate ? shared::kFlagAccumulate : 0) | (options.held_links ? shared::kFlagHeldLinks : 0);
   const auto dispatch = [&](const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers,
                             std::uint32_t x, std::uint32_t y = 1) {
     commands.dispatch(pipeline, {buffers.begin(), buffers.size()}, &push, sizeof push, x, y);
@@ -545,22 +548,22 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
             &depth_image},
            tile_total);
   commands.stamp("blend");
-  if (options.loss) {
-    dispatch(loss_pixel, {&tiles, &views, &image, &scene.target, &pixel_gradient, &tile_loss}, tile_total);
+  if (options.sums) {
+    dispatch(loss_pixel, {&tiles, &views, &image, &scene.target, &tile_loss}, tile_total);
     commands.stamp("loss");
-    if (dssim) {
-      dispatch(ssim_rows, {&tiles, &views, &tile_map, &image, &scene.target, &ssim_row_sums}, near_total);
-      dispatch(ssim_columns, {&tiles, &views, &tile_map, &ssim_row_sums, &ssim_factors, &tile_loss}, near_total);
-      dispatch(ssim_rows_backward, {&tiles, &views, &tile_map, &ssim_factors, &ssim_row_sums}, near_total);
-      dispatch(ssim_columns_backward,
-               {&tiles, &views, &tile_map, &ssim_row_sums, &image, &scene.target, &pixel_gradient}, near_total);
-      commands.stamp("ssim");
-    }
+  }
+  if (dssim) {
+    dispatch(ssim_rows, {&tiles, &views, &tile_map, &image, &scene.target, &ssim_row_sums}, near_total);
+    dispatch(ssim_columns, {&tiles, &views, &tile_map, &ssim_row_sums, &ssim_factors, &tile_loss}, near_total);
+    dispatch(ssim_rows_backward, {&tiles, &views, &tile_map, &ssim_factors, &ssim_row_sums}, near_total);
+    dispatch(ssim_columns_backward, {&tiles, &views, &tile_map, &ssim_row_sums, &image, &scene.target, &pixel_gradient},
+             near_total);
+    commands.stamp("ssim");
   }
   if (options.backward) {
     dispatch(blend_backward,
              {&tiles, &views, &tile_prefix, &tile_block, &tile_count, &sorted, &splats, &counters, &image, &tile_used,
-              &pixel_gradient, &partials},
+              &scene.target, &pixel_gradient, &partials},
              tile_total);
     commands.stamp("blend backward");
     dispatch_live(project_backward, {&scene.parameters, &live, &views, &motions, &counters, &splats, &instance_count,
@@ -578,7 +581,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
                                static_cast<const Buffer*>(&scene.gradient),
                                static_cast<const Buffer*>(&scene.first_moment),
                                static_cast<const Buffer*>(&scene.second_moment), static_cast<const Buffer*>(&counters)};
-      const std::uint32_t parameter_groups = groups(scene.parameter_count);
+      const std::uint32_t parameter_groups = groups((adam_push->total + 3) / 4);
       commands.dispatch(adam, buffers, adam_push, sizeof *adam_push, std::min(parameter_groups, kRow),
                         (parameter_groups + kRow - 1) / kRow);
       commands.stamp("adam");
@@ -785,7 +788,7 @@ LossValues Engine::loss(const Gaussians& gaussians, std::span<const ViewSpec> vi
     options.weights = weights;
     options.color_scale = 1.0 / (3.0 * pixels);
     options.mask_scale = 1.0 / pixels;
-    options.loss = true;
+    options.loss = options.sums = true;
     options.backward = options.twists = gradients != nullptr;
     s.run_all(s.scratch, batch, options, nullptr, [&](std::span<const int> chunk, std::size_t) {
       append(values, s.sums(chunk.size()), weights, pixels);
@@ -846,6 +849,8 @@ LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, 
   options.mask_scale = 1.0 / (scene.normalizer * static_cast<double>(batch.size()));
   options.color_scale = options.mask_scale / 3.0;
   options.loss = options.backward = true;
+  options.sums = read_losses;
+  options.held_links = rates.link_logits == 0.0f;
   options.twists = twists != nullptr;
   if (twists) twists->clear();
   ++scene.step;
@@ -853,7 +858,8 @@ LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, 
   push.gaussians = static_cast<std::uint32_t>(scene.count);
   push.links = static_cast<std::uint32_t>(scene.links);
   push.coefficients = static_cast<std::uint32_t>(scene.coefficients());
-  push.total = static_cast<std::uint32_t>(scene.parameter_count);
+  push.total = static_cast<std::uint32_t>(
+      scene.parameter_count - (options.held_links ? scene.count * static_cast<std::size_t>(scene.links) : 0));
   push.mean = rates.mean;
   push.rotation = rates.rotation;
   push.log_scale = rates.log_scale;
