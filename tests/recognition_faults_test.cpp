@@ -158,6 +158,10 @@ TEST_CASE("a loss that doubles is a runaway, one that wavers is not; gradients m
   begin_round(watch);
   CHECK(watch_loss(watch, 0.5) == Course::fine);  // of another round
   CHECK(watch_loss(watch, std::numeric_limits<double>::quiet_NaN()) == Course::diverged);
+  StepWatch empty;  // nothing is drawn any more
+  steps = 1;
+  while (watch_loss(empty, steps == 1 ? 0.5 : 0.52) == Course::fine) ++steps;
+  CHECK(steps == 5);
 
   Warnings warnings;
   for (int round = 0; round < 3; ++round) {
