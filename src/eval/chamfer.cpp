@@ -81,7 +81,7 @@ double mean_distance(const MatrixX& from, const Tree& to) {
   return sum / static_cast<double>(from.cols());
 }
 
-constexpr int kFarRings = 4;  // px: where the nearest point is farther away in the image, the tree finds it sooner
+constexpr int kFarRings = 12;  // px: where the nearest point is farther away in the image, the tree finds it sooner
 
 // A depth image's points by pixel, camera frame.
 struct PixelCloud {

@@ -212,13 +212,22 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     }
     return true;
   };
-  const Draw draw_training = [&](std::span<const int> views, std::span<const std::vector<math::Pose>> motions) {
+  // what the angles' refinement drew last of every training view: it shows where Gaussians are missing, too
+  struct LastDrawn {
+    std::vector<math::Pose> motions;
+    splat::Picture picture;
+  };
+  std::vector<LastDrawn> last_drawn(training.views.size());
+  const auto draw_training = [&](std::span<const int> views, std::span<const std::vector<math::Pose>> motions,
+                                 bool keep) {
     std::vector<int> batch;
     for (std::size_t v = 0; v < views.size(); ++v) {
       batch.push_back(training.index_of[views[v]]);
       engine.set_motions(batch.back(), motions[v]);
     }
-    return engine.draw_views(batch, true);
+    std::vector<splat::Picture> pictures = engine.draw_views(batch, true);
+    for (std::size_t v = 0; keep && v < views.size(); ++v) last_drawn[batch[v]] = {motions[v], pictures[v]};
+    return pictures;
   };
   for (int round = first_round; round <= kRounds; ++round) {
     const bool polish = round == kRounds;
@@ -257,17 +266,19 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     RefineOptions refine;
     refine.iterations = kAngleIterations;
     refine.mask_weight = kAngleMaskWeight;
-    refine_angles(chain, capture, frames, training.frames, draw_training, refine, prior, states);
+    const bool adding = round + 1 < kRounds;
+    if (!adding) refine.trusted = kTrustedStep;
+    const Draw draw = [&](std::span<const int> views, std::span<const std::vector<math::Pose>> motions) {
+      return draw_training(views, motions, adding);
+    };
+    refine_angles(chain, capture, frames, training.frames, draw, refine, prior, states);
     pose_views();
     for (std::size_t i = 0; i < specs.size(); ++i) engine.set_motions(static_cast<int>(i), specs[i].motions);
     gaussians = engine.gaussians();
-    if (round + 1 < kRounds) {
-      std::vector<int> all(training.views.size());
-      std::iota(all.begin(), all.end(), 0);
-      const std::vector<splat::Picture> pictures = engine.draw_views(all, false);
+    if (adding) {
       std::vector<Drawn> drawn;
-      for (std::size_t i = 0; i < pictures.size(); ++i)
-        drawn.push_back({&capture.views[training.views[i]], &specs[i].motions, &pictures[i]});
+      for (std::size_t i = 0; i < last_drawn.size(); ++i)
+        drawn.push_back({&capture.views[training.views[i]], &last_drawn[i].motions, &last_drawn[i].picture});
       add_and_prune(gaussians, chain, capture, drawn, budget, added_a_round, random);
       if (round + 1 == kShRound && gaussians.degree == 0) gaussians.resize(gaussians.count, gaussians.links, 1);
     }

@@ -81,6 +81,7 @@ std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain&
     RefineOptions refine;
     refine.iterations = iterations;
     refine.mask_weight = kAngleMaskWeight;
+    refine.trusted = kTrustedStep;
     RefineSummary summary = refine_angles(chain, capture, frames, part, draw, refine, prior, states);
     for (auto& covariance : summary.covariances) covariances.push_back(std::move(covariance));
     from += part.size();

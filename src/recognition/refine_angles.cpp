@@ -220,7 +220,8 @@ RefineSummary refine_angles(const chain::Chain& chain, const capture::Capture& c
         right += pull;
       }
       if (iteration == 0) summary.cost_before += cost;
-      if (cost < state.cost) {
+      const bool better = cost < state.cost;
+      if (better) {
         if (iteration > 0) ++summary.accepted;
         state.theta = state.trial;
         state.cost = cost;
@@ -240,6 +241,11 @@ RefineSummary refine_angles(const chain::Chain& chain, const capture::Capture& c
       const double longest = move.lpNorm<Eigen::Infinity>();
       if (!(longest > kConverged)) state.done = true;
       state.trial = state.theta + move * std::min(1.0, kLongest / std::max(longest, 1e-12));
+      if (better && !state.done && longest <= options.trusted && iteration < options.iterations) {
+        ++summary.accepted;
+        state.theta = state.trial;
+        state.done = true;
+      }
     }
   }
   for (std::size_t f = 0; f < selected.size(); ++f) {

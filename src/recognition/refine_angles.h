@@ -31,6 +31,7 @@ struct RefineOptions {
   int iterations = 3;
   double mask_weight = 1.0;
   double smooth_sigma = 0.15;  // rad, prior on the difference of neighboring joints' same-axis angles
+  double trusted = 0.0;  // rad: a step that changes no angle by more is a frame's last and not drawn to be checked
 };
 
 struct RefineSummary {
