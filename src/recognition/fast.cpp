@@ -226,7 +226,8 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
       engine.set_motions(batch.back(), motions[v]);
     }
     std::vector<splat::Picture> pictures = engine.draw_views(batch, true);
-    for (std::size_t v = 0; keep && v < views.size(); ++v) last_drawn[batch[v]] = {motions[v], pictures[v]};
+    for (std::size_t v = 0; keep && v < views.size(); ++v)
+      last_drawn[batch[v]] = {motions[v], {pictures[v].width, pictures[v].height, pictures[v].rgba, {}}};
     return pictures;
   };
   for (int round = first_round; round <= kRounds; ++round) {
@@ -267,7 +268,10 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     refine.iterations = kAngleIterations;
     refine.mask_weight = kAngleMaskWeight;
     const bool adding = round + 1 < kRounds;
-    if (!adding) refine.trusted = kTrustedStep;
+    if (!adding) {
+      refine.trusted = kTrustedStep;
+      last_drawn = {};
+    }
     const Draw draw = [&](std::span<const int> views, std::span<const std::vector<math::Pose>> motions) {
       return draw_training(views, motions, adding);
     };
