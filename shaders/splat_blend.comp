@@ -28,6 +28,9 @@ layout(std430, binding = 8) writeonly buffer Image { vec4 image[]; };
 layout(std430, binding = 9) buffer TileUsed { uint tile_used[]; };
 layout(std430, binding = 10) writeonly buffer DepthImage { float depth_image[]; };
 
+// entries in one turn of the loop: what a loop carries from turn to turn costs as much as a fifth of an entry
+const uint kTurns = kShare > 1u ? 2u : 1u;
+
 #include "inc/alpha.glsl"
 #include "inc/share.glsl"
 
@@ -55,18 +58,22 @@ void main() {
     uint own = kSplatRows * sorted[start + used + min(own_turn, turns - 1u)].x;
     vec4 own_a = splats[own], own_b = splats[own + 1u], own_c = splats[own + 2u];
     Falloff own_falloff = falloff_of(own_b.xyz);
-    for (uint turn = 0u; turn < turns; ++turn) {
-      vec3 splat_color = shared_by(own_c.xyz, turn);
-      float splat_depth = kDepth != 0u ? shared_by(own_a.w, turn) : 0.0;
-      Falloff falloff = shared_by(own_falloff, turn);
-      float dx = px - shared_by(own_a.x, turn), dy = py - shared_by(own_a.y, turn) + falloff.slope * dx;
-      float alpha[kPixels];
-      alphas_of(falloff, shared_by(own_a.z, turn), dx, dy, alpha);
-      [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
-        bool seen;
-        float weight = blend_weight(min(alpha[k], kAlphaCap), transmittance[k], seen);
-        color[k] += weight * splat_color;
-        if (kDepth != 0u) depth[k] += weight * splat_depth;
+    if (own_turn >= turns) own_a.z = 0.0;
+    for (uint first = 0u; first < turns; first += kTurns) {
+      [[unroll]] for (uint m = 0u; m < kTurns; ++m) {
+        uint turn = first + m;
+        vec3 splat_color = shared_by(own_c.xyz, turn);
+        float splat_depth = kDepth != 0u ? shared_by(own_a.w, turn) : 0.0;
+        Falloff falloff = shared_by(own_falloff, turn);
+        float dx = px - shared_by(own_a.x, turn), dy = py - shared_by(own_a.y, turn) + falloff.slope * dx;
+        float alpha[kPixels];
+        alphas_of(falloff, shared_by(own_a.z, turn), dx, dy, alpha);
+        [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
+          bool seen;
+          float weight = blend_weight(min(alpha[k], kAlphaCap), transmittance[k], seen);
+          color[k] += weight * splat_color;
+          if (kDepth != 0u) depth[k] += weight * splat_depth;
+        }
       }
     }
     used += turns;
