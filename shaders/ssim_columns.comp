@@ -1,5 +1,6 @@
 // ssim_columns.comp - the window along y over what ssim_rows left, a lane a strip of a column; the SSIM map's sum by tile, and
-// the three factors P, Q, R of its gradient (SPEC 2.7), nine floats a pixel.
+// the three factors P, Q, R of its gradient (SPEC 2.7). Three vec4 a pixel, nine floats of them used:
+//   0: P.rgb, Q.r   1: Q.gb, R.rg   2: R.b
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -13,7 +14,7 @@ layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
 layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
 layout(std430, binding = 2) readonly buffer TileMap { uint tile_map[]; };
 layout(std430, binding = 3) readonly buffer Rows { vec4 rows[]; };
-layout(std430, binding = 4) writeonly buffer Factors { float factors[]; };
+layout(std430, binding = 4) writeonly buffer Factors { vec4 factors[]; };
 layout(std430, binding = 5) buffer TileLoss { vec4 tile_loss[]; };
 #include "inc/ssim.glsl"
 
@@ -54,12 +55,10 @@ void main() {
     sum += counts ? dot(1.0 - similarity, vec3(1.0)) : 0.0;
     vec3 mean = g * (2.0 * my * (a2 - a1) / (b1 * b2) - 2.0 * mx * similarity * (1.0 / b1 - 1.0 / b2));
     vec3 square = -g * similarity / b2, product = 2.0 * g * a1 / (b1 * b2);
-    uint at = 9u * ssim_place(tile, column, first + k);
-    [[unroll]] for (uint c = 0u; c < 3u; ++c) {
-      factors[at + c] = mean[c];
-      factors[at + 3u + c] = square[c];
-      factors[at + 6u + c] = product[c];
-    }
+    uint at = 3u * ssim_place(tile, column, first + k);
+    factors[at] = vec4(mean, square.x);
+    factors[at + 1u] = vec4(square.yz, product.xy);
+    factors[at + 2u].x = product.z;
   }
   lane_sum[lane] = sum;
   barrier();

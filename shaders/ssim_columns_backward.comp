@@ -12,7 +12,7 @@ layout(push_constant) uniform Push { SplatPush p; };
 layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
 layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
 layout(std430, binding = 2) readonly buffer TileMap { uint tile_map[]; };
-layout(std430, binding = 3) readonly buffer Rows { float rows[]; };
+layout(std430, binding = 3) readonly buffer Rows { vec4 rows[]; };
 layout(std430, binding = 4) readonly buffer Image { vec4 image[]; };
 layout(std430, binding = 5) readonly buffer Target { uint target[]; };
 layout(std430, binding = 6) writeonly buffer PixelGradient { vec4 pixel_gradient[]; };
@@ -24,17 +24,25 @@ void main() {
   SplatView view = views[t.view];
   uint column = lane % kTileWidth, first = kPixels == kTileHeight ? 0u : lane / kTileWidth * kPixels;
   uint above = ssim_tile(view, int(t.x), int(t.y) - 1), below = ssim_tile(view, int(t.x), int(t.y) + 1);
-  float sum[9u * kPixels];
-  [[unroll]] for (uint k = 0u; k < 9u * kPixels; ++k) sum[k] = 0.0;
+  vec4 s0[kPixels], s1[kPixels];
+  float s2[kPixels];
+  [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
+    s0[k] = s1[k] = vec4(0.0);
+    s2[k] = 0.0;
+  }
   [[unroll]] for (int m = -kReach; m < int(kPixels) + kReach; ++m) {
     int row = int(first) + m;  // in the tile
     uint from = row < 0 ? above : row < int(kTileHeight) ? tile : below;
     bool there = from != kNoTile;
-    uint at = 9u * ssim_place(there ? from : tile, column, uint(row + int(kTileHeight)) % kTileHeight);
-    [[unroll]] for (uint c = 0u; c < 9u; ++c) {
-      float value = there ? rows[at + c] : 0.0;
-      [[unroll]] for (int k = 0; k < int(kPixels); ++k)
-        if (abs(m - k) <= kReach) sum[9u * uint(k) + c] += window(m - k) * value;
+    uint at = 3u * ssim_place(there ? from : tile, column, uint(row + int(kTileHeight)) % kTileHeight);
+    vec4 v0 = there ? rows[at] : vec4(0.0), v1 = there ? rows[at + 1u] : vec4(0.0);
+    float v2 = there ? rows[at + 2u].x : 0.0;
+    [[unroll]] for (int k = 0; k < int(kPixels); ++k) {
+      if (abs(m - k) > kReach) continue;
+      float w = window(m - k);
+      s0[k] += w * v0;
+      s1[k] += w * v1;
+      s2[k] += w * v2;
     }
   }
   uint x = t.x * kTileWidth + column;
@@ -43,9 +51,7 @@ void main() {
     if (x < view.width && y < view.height) {
       uint offset = y * view.width + x;
       vec3 shown = image[view.pixel + offset].xyz, wanted = unpackUnorm4x8(target[view.target + offset]).xyz;
-      vec3 mean = vec3(sum[9u * k], sum[9u * k + 1u], sum[9u * k + 2u]);
-      vec3 square = vec3(sum[9u * k + 3u], sum[9u * k + 4u], sum[9u * k + 5u]);
-      vec3 product = vec3(sum[9u * k + 6u], sum[9u * k + 7u], sum[9u * k + 8u]);
+      vec3 mean = s0[k].xyz, square = vec3(s0[k].w, s1[k].xy), product = vec3(s1[k].zw, s2[k]);
       pixel_gradient[view.pixel + offset] = vec4(mean + 2.0 * shown * square + wanted * product, 0.0);
     }
   }

@@ -1,4 +1,5 @@
-// ssim_rows_backward.comp - the window along x over the gradient factors P, Q, R; a lane a strip of a row.
+// ssim_rows_backward.comp - the window along x over the gradient factors P, Q, R; a lane a strip of a row; layout as
+// ssim_columns.comp leaves it.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -11,8 +12,8 @@ layout(push_constant) uniform Push { SplatPush p; };
 layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
 layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
 layout(std430, binding = 2) readonly buffer TileMap { uint tile_map[]; };
-layout(std430, binding = 3) readonly buffer Factors { float factors[]; };
-layout(std430, binding = 4) writeonly buffer Rows { float rows[]; };
+layout(std430, binding = 3) readonly buffer Factors { vec4 factors[]; };
+layout(std430, binding = 4) writeonly buffer Rows { vec4 rows[]; };
 #include "inc/ssim.glsl"
 
 void main() {
@@ -21,21 +22,31 @@ void main() {
   SplatView view = views[t.view];
   uint row = lane % kTileHeight, first = kPixels == kTileWidth ? 0u : lane / kTileHeight * kPixels;
   uint left = ssim_tile(view, int(t.x) - 1, int(t.y)), right = ssim_tile(view, int(t.x) + 1, int(t.y));
-  float sum[9u * kPixels];
-  [[unroll]] for (uint k = 0u; k < 9u * kPixels; ++k) sum[k] = 0.0;
+  vec4 s0[kPixels], s1[kPixels];
+  float s2[kPixels];
+  [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
+    s0[k] = s1[k] = vec4(0.0);
+    s2[k] = 0.0;
+  }
   [[unroll]] for (int m = -kReach; m < int(kPixels) + kReach; ++m) {
     int column = int(first) + m;  // in the tile
     uint from = column < 0 ? left : column < int(kTileWidth) ? tile : right;
     bool there = from != kNoTile;
-    uint at = 9u * ssim_place(there ? from : tile, uint(column + int(kTileWidth)) % kTileWidth, row);
-    [[unroll]] for (uint c = 0u; c < 9u; ++c) {
-      float value = there ? factors[at + c] : 0.0;
-      [[unroll]] for (int k = 0; k < int(kPixels); ++k)
-        if (abs(m - k) <= kReach) sum[9u * uint(k) + c] += window(m - k) * value;
+    uint at = 3u * ssim_place(there ? from : tile, uint(column + int(kTileWidth)) % kTileWidth, row);
+    vec4 v0 = there ? factors[at] : vec4(0.0), v1 = there ? factors[at + 1u] : vec4(0.0);
+    float v2 = there ? factors[at + 2u].x : 0.0;
+    [[unroll]] for (int k = 0; k < int(kPixels); ++k) {
+      if (abs(m - k) > kReach) continue;
+      float w = window(m - k);
+      s0[k] += w * v0;
+      s1[k] += w * v1;
+      s2[k] += w * v2;
     }
   }
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
-    uint at = 9u * ssim_place(tile, first + k, row);
-    [[unroll]] for (uint c = 0u; c < 9u; ++c) rows[at + c] = sum[9u * k + c];
+    uint at = 3u * ssim_place(tile, first + k, row);
+    rows[at] = s0[k];
+    rows[at + 1u] = s1[k];
+    rows[at + 2u].x = s2[k];
   }
 }

@@ -467,7 +467,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   if (dssim) {
     const std::size_t near_pixels = static_cast<std::size_t>(near_total) * tile_width * tile_height;
     need(ssim_row_sums, 12 * words(near_pixels), "ssim rows");
-    need(ssim_factors, 9 * words(near_pixels), "ssim factors");
+    need(ssim_factors, 12 * words(near_pixels), "ssim factors");
   }
   if (options.backward) {
     need(partials, vectors(static_cast<std::size_t>(shared::kPartialRows) * slots * instance_capacity), "partials");
