@@ -295,10 +295,11 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
     const Pixels mask = read_mask(source.masks->frame_file(frames[i].frame), source.camera.width, source.camera.height);
     cut_mask(view_of(frames[i]), source.camera, mask, ranges[frames[i].camera].undistorting, options.margin);
   });
-  // videos: one camera a task. Fewer cameras than threads: the decoders use the rest (their output does not depend on
-  // it)
+  // videos: one camera a task. Where cameras do not go round evenly, the decoders use the threads that are left (their
+  // output does not depend on it)
   const int cameras = static_cast<int>(manifest.cameras.size());
-  const int decoder_threads = std::max(1, (core::threads() + cameras - 1) / std::max(1, cameras));
+  const int even = cameras % core::threads() == 0 ? 1 : 2;
+  const int decoder_threads = std::max(even, (core::threads() + cameras - 1) / std::max(1, cameras));
   for_each_in_parallel(cameras, [&](std::int64_t c) {
     const CameraSource& source = manifest.cameras[c];
     const Range& range = ranges[c];
