@@ -33,26 +33,28 @@ void main() {
     n = 0u;
   }
   uint shared_lane = gl_SubgroupInvocationID % kShare;
-  for (uint first = 0u; first < n; first += lanes) {
-    uint k = first + lane;
-    uvec4 entry = entries[start + min(k, n - 1u)];
-    int depth = int(entry.x), nearer = 0, equal = 0;  // positive floats sort like their bits
+  // a lane counts the rank of two entries at a time: a key loaded once serves both
+  for (uint first = 0u; first < n; first += 2u * lanes) {
+    uvec2 k = uvec2(first + lane, first + lanes + lane);
+    uvec4 a = entries[start + min(k.x, n - 1u)], b = entries[start + min(k.y, n - 1u)];
+    ivec2 depth = ivec2(a.x, b.x), nearer = ivec2(0), same = ivec2(0);  // positive floats sort like their bits
     // kShare lanes load a key each, and hand them round
     for (uint others = 0u; others < n; others += kShare) {
       uint other = others + shared_lane;
       int own_key = other < n ? int(entries[start + other].x) : 0x7fffffff;  // behind everything
       [[unroll]] for (uint m = 0u; m < kShare; ++m) {
-        int key = subgroupShuffle(own_key, m);
-        nearer += key < depth ? 1 : 0;
-        equal += key == depth ? 1 : 0;
+        ivec2 key = ivec2(subgroupShuffle(own_key, m));
+        nearer += ivec2(lessThan(key, depth));
+        same += ivec2(equal(key, depth));
       }
     }
     // equal depths are rare: only then is the replica's number looked at
-    uint ties = equal > 1 ? n : 0u;
+    uint ties = same.x > 1 || same.y > 1 ? n : 0u;
     for (uint m = 0u; m < ties; ++m) {
       uvec2 other = entries[start + m].xy;
-      nearer += other.x == entry.x && other.y < entry.y ? 1 : 0;
+      nearer += ivec2(other.x == a.x && other.y < a.y, other.x == b.x && other.y < b.y);
     }
-    if (k < n) sorted[start + uint(nearer)] = entry.zw;
+    if (k.x < n) sorted[start + uint(nearer.x)] = a.zw;
+    if (k.y < n) sorted[start + uint(nearer.y)] = b.zw;
   }
 }
