@@ -36,36 +36,37 @@ void main() {
   float mean_gradient = 0.0;  // sum over links of rho_j d/d(sigma rho_j)
   bool held_links = (p.flags & kFlagHeldLinks) != 0u;
   vec3 mean = vec3(parameters[at_mean(n, i)], parameters[at_mean(n, i) + 1u], parameters[at_mean(n, i) + 2u]);
-  for (uint j = 0u; j < p.links; ++j) {
-    uint e = j * n + i;
+  // from one live replica to the next: most have one, and a software device runs the body also where no lane takes it
+  for (uint j = 0u;; ++j) {
+    while (j < p.links && live_flag[j * n + i] == 0u) {
+      if (!held_links) replica_gradient[j * n + i] = 0.0;
+      ++j;
+    }
+    if (j >= p.links) break;
+    uint e = j * n + i, r = live_prefix[e] + live_block[e / kScanBlock];
     float grad_opacity = 0.0;
-    if (live_flag[e] != 0u) {
-      uint r = live_prefix[e] + live_block[e / kScanBlock];
-      if (r < live_count) {
-        for (uint v = 0u; v < p.views; ++v) {
-          uint record = kGradientRows * (v * live_count + r);
-          vec4 a = records[record], c = records[record + 3u];
-          grad_mean += a.xyz;
-          grad_opacity += a.w;
-          grad_rotation += records[record + 1u];
-          grad_scale += records[record + 2u].xyz;
-          grad_dc += c.xyz;
-          if (p.coefficients > 1u) {
-            uint motion = 3u * (views[v].motion + j);
-            mat3 link = transpose(mat3(motions[motion].xyz, motions[motion + 1u].xyz, motions[motion + 2u].xyz));
-            vec3 x = link * mean + vec3(motions[motion].w, motions[motion + 1u].w, motions[motion + 2u].w);
-            vec3 direction = normalize(x) * link;
-            for (uint l = 1u; l < p.coefficients; ++l) {
-              vec3 g = sh_basis(l, direction) * c.xyz;
-              gradient[sh + 3u * l] += g.x;
-              gradient[sh + 3u * l + 1u] += g.y;
-              gradient[sh + 3u * l + 2u] += g.z;
-            }
-          }
+    for (uint v = 0u; v < (r < live_count ? p.views : 0u); ++v) {
+      uint record = kGradientRows * (v * live_count + r);
+      vec4 a = records[record], c = records[record + 3u];
+      grad_mean += a.xyz;
+      grad_opacity += a.w;
+      grad_rotation += records[record + 1u];
+      grad_scale += records[record + 2u].xyz;
+      grad_dc += c.xyz;
+      if (p.coefficients > 1u) {
+        uint motion = 3u * (views[v].motion + j);
+        mat3 link = transpose(mat3(motions[motion].xyz, motions[motion + 1u].xyz, motions[motion + 2u].xyz));
+        vec3 x = link * mean + vec3(motions[motion].w, motions[motion + 1u].w, motions[motion + 2u].w);
+        vec3 direction = normalize(x) * link;
+        for (uint l = 1u; l < p.coefficients; ++l) {
+          vec3 g = sh_basis(l, direction) * c.xyz;
+          gradient[sh + 3u * l] += g.x;
+          gradient[sh + 3u * l + 1u] += g.y;
+          gradient[sh + 3u * l + 2u] += g.z;
         }
-        mean_gradient += replica_opacity[e] / opacity * grad_opacity;
       }
     }
+    mean_gradient += replica_opacity[e] / opacity * grad_opacity;
     if (!held_links) replica_gradient[e] = grad_opacity;
   }
   for (uint k = 0u; k < 3u; ++k) {

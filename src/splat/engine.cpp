@@ -21,12 +21,13 @@ using shared::SplatPush;
 using shared::SplatTile;
 using shared::SplatView;
 
-constexpr double kClampMargin = 1.3;         // of the half image, for the projection's Jacobian (SPEC 2.5)
-constexpr int kActiveMargin = 16;            // px around the mask that training draws and charges
-constexpr int kDssimMargin = 10;             // px around the mask that get the D-SSIM term: SSIM's reach twice
-constexpr std::uint32_t kMostTiles = 60000;  // of one submission: below every device's group count limit (65535)
-constexpr std::uint32_t kRankLimit = 192;    // longest tile list sorted by rank; longer ones by radix
-constexpr double kGrowth = 1.25;             // spare room when a capacity is raised
+constexpr double kClampMargin = 1.3;               // of the half image, for the projection's Jacobian (SPEC 2.5)
+constexpr int kActiveMargin = 16;                  // px around the mask that training draws and charges
+constexpr int kDssimMargin = 10;                   // px around the mask that get the D-SSIM term: SSIM's reach twice
+constexpr std::uint32_t kMostTiles = 60000;        // of one submission: below every device's group count limit (65535)
+constexpr std::uint32_t kRankLimit = 192;          // longest tile list sorted by rank; longer ones by radix
+constexpr std::uint32_t kSoftwareRankLimit = 512;  // the same on a software device, whose barriers make radix dear
+constexpr double kGrowth = 1.25;                   // spare room when a capacity is raised
 constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;  // Adam, as in 3DGS
 
 struct SceneView {
@@ -207,7 +208,8 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   // as many lanes a tile as a subgroup of the device: no lane waits at the barriers for another subgroup
   const std::uint32_t tile_lanes = device_info.software ? 8 : 32;
   sort = gpu::Pipeline(d, "splat_sort", 7, push,
-                       {tile_lanes, kRankLimit, std::min(tile_lanes, std::max(1u, device_info.subgroup_size))});
+                       {tile_lanes, device_info.software ? kSoftwareRankLimit : kRankLimit,
+                        std::min(tile_lanes, std::max(1u, device_info.subgroup_size))});
   sort_long = gpu::Pipeline(d, "splat_sort_long", 7, push, {tile_lanes});
   const std::uint32_t subgroup = std::min(lanes, std::max(1u, device_info.subgroup_size));
   // a software device loads lane by lane, so that its lanes share the work; a GPU loads at once what all lanes want
