@@ -54,7 +54,7 @@ void main() {
   uint used = 0u;
   bool any_open = true;
   while (used < n && any_open) {
-    uint turns = min(kShare, n - used), own_turn = gl_SubgroupInvocationID % kShare;
+    uint turns = kShare > 1u ? min(kShare, n - used) : 1u, own_turn = gl_SubgroupInvocationID % kShare;
     uint own = kSplatRows * sorted[start + used + min(own_turn, turns - 1u)].x;
     vec4 own_a = splats[own], own_b = splats[own + 1u], own_c = splats[own + 2u];
     Falloff own_falloff = falloff_of(own_b.xyz);

@@ -92,7 +92,7 @@ void main() {
     transmittance[k] = 1.0;
   }
   for (uint begin = 0u; begin < used; begin += kShare) {
-    uint turns = min(kShare, used - begin), own_turn = gl_SubgroupInvocationID % kShare;
+    uint turns = kShare > 1u ? min(kShare, used - begin) : 1u, own_turn = gl_SubgroupInvocationID % kShare;
     uvec2 own = sorted[start + begin + min(own_turn, turns - 1u)];
     uint own_slot = 4u * kPartialRows * (own.y * p.slots + gl_SubgroupID), s = kSplatRows * own.x;
     vec4 own_a = splats[s], own_b = splats[s + 1u], own_c = splats[s + 2u];
