@@ -117,7 +117,9 @@ TEST_CASE("refined angles come back to where the picture was drawn") {
   states.time = {0.0};
   states.theta = {truth + (math::VectorX(4) << 0.04, -0.03, 0.03, 0.04).finished()};
   const std::vector<FrameViews> frames{{0.0, both}};
+  int draws = 0;
   const Draw draw = [&](std::span<const int> views, std::span<const std::vector<math::Pose>> motions) {
+    ++draws;
     return engine.draw(g, specs(views, motions), true);
   };
   RefineOptions options;
@@ -127,6 +129,26 @@ TEST_CASE("refined angles come back to where the picture was drawn") {
   const RefineSummary summary = refine_angles(chain, capture, frames, selected, draw, options, {}, states);
   CHECK(summary.cost_after < 0.2 * summary.cost_before);
   CHECK((states.theta[0] - truth).lpNorm<Eigen::Infinity>() < 2e-3);
+
+  // a step within what is trusted is taken as it is, and drawn but for the equations; a longer one is checked
+  const math::VectorX near = truth + math::VectorX::Constant(4, 2e-3);
+  chain::States checked = states, trusted = states;
+  checked.theta[0] = trusted.theta[0] = near;
+  options.iterations = 1;
+  draws = 0;
+  refine_angles(chain, capture, frames, selected, draw, options, {}, checked);
+  CHECK(draws == 2);
+  options.trusted = 0.01;
+  draws = 0;
+  CHECK(refine_angles(chain, capture, frames, selected, draw, options, {}, trusted).accepted == 1);
+  CHECK(draws == 1);
+  CHECK((trusted.theta[0] - truth).norm() < 0.5 * (near - truth).norm());
+  CHECK(trusted.theta[0] == checked.theta[0]);
+  options.trusted = 1e-5;
+  draws = 0;
+  trusted.theta[0] = near;
+  refine_angles(chain, capture, frames, selected, draw, options, {}, trusted);
+  CHECK(draws == 2);
   check_silent();
 }
 
