@@ -9,16 +9,17 @@ namespace chainsplat::masking {
 
 namespace {
 
-constexpr double kForget = 0.02;        // of the background a frame: some two seconds at 30 Hz
-constexpr int kLeastSeen = 8;           // frames, before a background pixel is believed
-constexpr double kFirstNoise = 4.0;     // gray levels
-constexpr double kGivenPixels = 3e4;    // the given colors count as so many pixels: some ten frames of a rope
-constexpr double kLeastGiven = 0.1;     // share of them that is never forgotten
-constexpr double kAboutPixels = 24.0;   // px about the tube that are told apart from what is far
-constexpr double kDoubt = 2.0;          // a prediction is not as sure as a fit
-constexpr double kLeastEvidence = 0.1;  // nats a sample: less is no rope
-constexpr int kColorEvery = 5;          // frames between two lessons in color
-constexpr double kForgetColors = 0.1;   // of the counted colors a lesson
+constexpr double kForget = 0.02;          // of the background a frame: some two seconds at 30 Hz
+constexpr int kLeastSeen = 8;             // frames, before a background pixel is believed
+constexpr double kFirstNoise = 4.0;       // gray levels
+constexpr double kGivenPixels = 3e4;      // the given colors count as so many pixels: some ten frames of a rope
+constexpr double kLeastGiven = 0.1;       // share of them that is never forgotten
+constexpr double kAboutPixels = 24.0;     // px about the tube that are told apart from what is far
+constexpr double kDoubt = 2.0;            // a prediction is not as sure as a fit
+constexpr double kLeastEvidence = 0.1;    // nats a sample: less is no rope
+constexpr double kPredictedMargin = 0.4;  // radii, by which the tube at a prediction may be off
+constexpr int kColorEvery = 5;            // frames between two lessons in color
+constexpr double kForgetColors = 0.1;     // of the counted colors a lesson
 
 // The recorded frame without its lens distortion, in the box; elsewhere black.
 void straighten(const capture::Image8& image, const capture::Camera& camera, const Box& box,
@@ -125,7 +126,7 @@ capture::View mask(Live& live, const capture::Image8& recorded, const math::Pose
         colors->object[i] = std::max((1.0 - kForgetColors) * colors->object[i], kLeastGiven * live.given[i]);
         colors->surroundings[i] *= 1.0 - kForgetColors;
       }
-    count_colors(live.look, picture, around, where, live.chain, true, &view);
+    count_colors(live.look, picture, around, where, live.chain, kPredictedMargin * around.radius, &view);
     settle(live.look);
   }
   return view;

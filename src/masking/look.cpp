@@ -12,9 +12,6 @@ namespace {
 
 constexpr double kReachSlack = 1.1;   // of the length: cameras and lengths are not exact
 constexpr double kNearerShare = 0.5;  // of the length that the free end may be nearer to the camera than the grasp
-constexpr double kCore = 0.35;        // of the radius: deeper inside than this is rope for sure, also when the tube is
-                                      // off by a third of it
-constexpr double kAbout = 0.4;        // radii outside from which a pixel is surroundings for sure
 constexpr double kUnheardOf = 0.003;  // share of either side's colors that is thought to be spread over all colors
 constexpr double kSurest = 3.0, kSurestNot = 9.0;  // log odds, the most that a color can say for and against the rope
 constexpr double kLeastNoise = 1.5;                // gray levels
@@ -92,7 +89,7 @@ Reach reach(const chain::Chain& chain, const math::Pose& base, const capture::Ca
 }
 
 void count_colors(Look& look, const Picture& picture, const Tube& tube, const Reach& where, const chain::Chain& chain,
-                  bool local, const capture::View* mask) {
+                  double margin, const capture::View* mask) {
   const auto masked = [&](int x, int y) {
     x -= mask->x0, y -= mask->y0;
     return x >= 0 && y >= 0 && x < mask->width && y < mask->height &&
@@ -102,16 +99,15 @@ void count_colors(Look& look, const Picture& picture, const Tube& tube, const Re
     if (colors->object.empty()) colors->object.assign(kColorBins, 0.0);
     if (colors->surroundings.empty()) colors->surroundings.assign(kColorBins, 0.0);
   }
-  const float core = static_cast<float>(-kCore * tube.radius), about = static_cast<float>(kAbout * tube.radius);
   for (int y = where.box.y0; y < where.box.y1; ++y)
     for (int x = where.box.x0; x < where.box.x1; ++x) {
       const float outside = tube.at(x, y);
       const int bin = color_bin(pixel(picture, x, y));
-      if (outside < core) {
+      if (outside < -margin) {
         const double s = tube.arclength(x, y);
         if (s > chain.diameter && (!mask || masked(x, y)))
           (s < 0.5 * chain.length ? look.near : look.far).object[bin] += 1.0;
-      } else if (outside > about && (outside < Tube::kFar || !local)) {
+      } else if (outside > margin && outside < Tube::kFar) {
         look.near.surroundings[bin] += 1.0;
         look.far.surroundings[bin] += 1.0;
       }

@@ -27,11 +27,11 @@ struct Reach {
 };
 Reach reach(const chain::Chain& chain, const math::Pose& base, const capture::Camera& camera);
 
-// Adds the pixels of a frame where the tube is known: its core as object, what is about it as surroundings (`local`: as
-// far as the tube's map goes, else all that the rope can reach). `mask`: of
-// the core only what it holds (a hand may hide the rope). Nothing of the rope's first diameter: the gripper hides it.
+// Adds the pixels of a frame where the tube is known: its core as object, what is about it, as far as its map goes, as
+// surroundings. `margin`: px on either side of the tube's outline where that is not sure. `mask`: of the core only
+// what it holds (a hand may hide the rope). Nothing of the rope's first diameter: the gripper hides it.
 void count_colors(Look& look, const Picture& picture, const Tube& tube, const Reach& where, const chain::Chain& chain,
-                  bool local, const capture::View* mask = nullptr);
+                  double margin, const capture::View* mask = nullptr);
 
 // Median of the frames, where at least `least` of them show the background. `covered[i]`: tube of frame i, empty when
 // not known.

@@ -28,9 +28,11 @@ constexpr double kTrusted = 0.75;       // share of the best moment's evidence f
 constexpr double kUsable = 0.5;         // and from which a moment says where the rope is
 constexpr int kKnownSamples = 1000;     // that what other moments say of the colors counts for, on each side
 constexpr double kRoughPlace = 3.0;     // times the usual doubt about the place, before the chain is laid into masks
-constexpr int kRounds = 2;              // of learning, cutting and fitting
-constexpr double kCenter = 0.5;         // of the radius: deeper inside than this counts as the centerline
-constexpr double kLeastInside = 0.4;    // of the centerline within the masks, mean: less was no rope
+constexpr double kGrownMargin = 0.4;    // radii, by which the tube of a grown chain may be off,
+constexpr double kFitMargin = 0.5;    // px, and that of a chain laid into masks: pixels at its outline show both sides
+constexpr int kRounds = 2;            // of learning, cutting and fitting
+constexpr double kCenter = 0.5;       // of the radius: deeper inside than this counts as the centerline
+constexpr double kLeastInside = 0.4;  // of the centerline within the masks, mean: less was no rope
 
 struct Recording {
   const Path& path;
@@ -231,7 +233,8 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
         if (masks)
           mask = &*std::find_if(masks->begin(), masks->end(),
                                 [&](const View& m) { return m.camera == c && m.frame == view.frame; });
-        count_colors(looks[c], picture_of(view), tubes.back(), reach(chain, base, pinholes[c]), chain, true, mask);
+        count_colors(looks[c], picture_of(view), tubes.back(), reach(chain, base, pinholes[c]), chain,
+                     masks ? kFitMargin : kGrownMargin * tubes.back().radius, mask);
       }
       settle(looks[c]);
       looks[c].background = median_background(
