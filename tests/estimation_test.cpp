@@ -257,6 +257,23 @@ TEST_CASE("marks on the rope tell its slope in depth, and the exposure is found"
   CHECK(b.back().centerline_sigma < a.back().centerline_sigma);
 }
 
+TEST_CASE("what has the rope's outline and not its marks is not the rope: lost in time, and found again") {
+  std::vector<capture::View> views = painted_views();
+  for (int f = 8; f < 24; ++f)
+    for (std::size_t k = 0; k < views[f].rgba.size(); ++k)
+      if (k % 4 != 3) views[f].rgba[k] = k / 4 % 7 < 3 ? 150 : 120;  // stripes of its own
+  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  filter.draw = [](const capture::View& view, const std::vector<Pose>& motions) {
+    return painted(shared_twin().chain, motions, view, front_camera());
+  };
+  const auto found = follow(filter, views);
+  for (int f = 0; f < 12; ++f) CHECK_FALSE(found[f].lost);  // it may be a glint
+  for (int f = 16; f < 24; ++f) CHECK(found[f].lost);
+  for (std::size_t f = 26; f < found.size(); ++f) CHECK_FALSE(found[f].lost);
+  CHECK(found[4].likeness.value() > 0.9);
+  CHECK(found[20].likeness.value() < 0.5);
+}
+
 TEST_CASE("Adam on the rendering loss finds the rope from near, and says nothing of its deviations") {
   const chain::Chain& chain = shared_twin().chain;
   const Pose base = moving_base(0.0).pose;

@@ -37,6 +37,10 @@ struct Options {
   silhouette::Options silhouette;    // the prior is set by the filter
 };
 
+// Where masks are made while the rope is followed: their outline errs the same way for long (a contact shadow, a hand's
+// edge), so that less of it is new in every frame, and colors count for more.
+Options options_for_live_masks();
+
 // Gaussian belief about (theta, thetadot, shift of the rest angles): 3 n, rad and rad/s.
 struct Belief {
   double time = 0.0;
@@ -49,17 +53,20 @@ using Draw = std::function<splat::Picture(const capture::View& view, const std::
 
 struct Estimate {
   int frame = 0;
-  double time = 0.0;              // s
-  math::VectorX theta, thetadot;  // rad, rad/s; n
-  math::MatrixX covariance;       // of (theta, thetadot), 2 n x 2 n; empty: not known
-  double centerline_sigma = 0.0;  // m, standard deviation of the centerline, RMS over the rope
-  double iou = 0.0;               // of the chain's tube and the mask
-  double residual = 0.0;          // px, RMS of the mask's outline about the tube's, robust
-  double color_residual = 0.0;    // RMS of drawn against seen colors inside the mask, of 1; 0: not looked at
-  double gain = 1.0, bias = 0.0;  // exposure of the (last) view against the twin's looks
-  double surprise = 0.0;          // squared innovation over its expectation; about 1 as long as the model holds
-  bool seen = false;              // the mask showed something
-  bool lost = false;              // the estimate does not explain the mask, or nothing was seen for long
+  double time = 0.0;               // s
+  math::VectorX theta, thetadot;   // rad, rad/s; n
+  math::MatrixX covariance;        // of (theta, thetadot), 2 n x 2 n; empty: not known
+  double centerline_sigma = 0.0;   // m, standard deviation of the centerline, RMS over the rope
+  double iou = 0.0;                // of the chain's tube and the mask
+  double residual = 0.0;           // px, RMS of the mask's outline about the tube's, robust
+  double color_residual = 0.0;     // RMS of drawn against seen colors inside the mask, of 1; 0: not looked at
+  std::optional<double> likeness;  // correlation of drawn and seen colors, each channel without its mean; the best of
+                                   // the views'; none: not looked at, or a rope without marks
+  double gain = 1.0, bias = 0.0;   // exposure of the (last) view against the twin's looks
+  double surprise = 0.0;           // squared innovation over its expectation; about 1 as long as the model holds
+  bool seen = false;               // the mask showed something
+  bool lost = false;               // the estimate does not explain the mask, nothing was seen for long, or what
+                                   // the mask shows has long not looked like the twin
 };
 
 // The filter between two frames.
@@ -77,6 +84,7 @@ struct Filter {
   double contact_until = 0.0;       // s, until then the motion is thought not to follow the model
   math::VectorX everywhere, place;  // shares of the links' ends in the unknown force: evenly, and as learned in contact
   double last_seen = 0.0;           // s
+  double last_like = 0.0;           // s, the mask looked like the twin inside
   bool lost = false;                // in the last frame
   double edge_offset = 0.0, edge_offset_variance = 0.0;  // px, px^2: how much wider the masks are than the tube
 };

@@ -24,6 +24,8 @@ constexpr double kGainWeight = 10;  // pixels' worth of belief that the gain is 
 constexpr double kBiasWeight = 40;  // and that the bias is 0
 constexpr int kExposurePasses = 2;  // robust weights depend on the exposure
 constexpr float kByte = 1.0f / 255.0f;
+constexpr std::size_t kLeastPixels = 100;  // fewer are not compared,
+constexpr double kLeastContrast = 0.06;    // nor a rope on which less is to see: standard deviation of the drawn colors
 
 // Pixels of the view that count.
 std::vector<int> interior(const capture::View& view, const splat::Picture& drawn) {
@@ -64,6 +66,34 @@ int nearest_link(const std::vector<Placed>& links, const Vector3& point) {
   return best;
 }
 
+struct Pixel {
+  int index, link;
+  Eigen::Matrix<double, 2, 6> flow;  // px a twist of the link
+};
+
+// Of the colors in the pixels, each channel without its mean: whatever the exposure, what has no marks where the twin
+// has them is not the rope.
+std::optional<double> likeness_of(const capture::View& view, const splat::Picture& drawn,
+                                  const std::vector<Pixel>& pixels) {
+  if (pixels.size() < kLeastPixels) return {};
+  const auto count = static_cast<double>(pixels.size());
+  double product = 0.0, shown2 = 0.0, seen2 = 0.0;
+  for (int c = 0; c < 3; ++c) {
+    double shown_mean = 0.0, seen_mean = 0.0;
+    for (const Pixel& pixel : pixels) {
+      shown_mean += drawn.rgba[4 * pixel.index + c] / count;
+      seen_mean += view.rgba[4 * pixel.index + c] * kByte / count;
+    }
+    for (const Pixel& pixel : pixels) {
+      const double shown = drawn.rgba[4 * pixel.index + c] - shown_mean;
+      const double seen = view.rgba[4 * pixel.index + c] * kByte - seen_mean;
+      product += shown * seen, shown2 += shown * shown, seen2 += seen * seen;
+    }
+  }
+  if (shown2 < 3.0 * count * kLeastContrast * kLeastContrast) return {};
+  return product / std::sqrt(shown2 * std::max(seen2, 1e-12));
+}
+
 }  // namespace
 
 ColorEquations color_equations(const chain::Chain& chain, const Pose& base, const VectorX& theta,
@@ -76,10 +106,6 @@ ColorEquations color_equations(const chain::Chain& chain, const Pose& base, cons
                      chain.link_end(j) - chain.link_start(j)});
   const math::Matrix3 camera_from_world = camera.world_from_camera.rotation.transpose();
 
-  struct Pixel {
-    int index, link;
-    Eigen::Matrix<double, 2, 6> flow;  // px a twist of the link
-  };
   std::vector<Pixel> pixels;
   for (const int k : interior(view, drawn)) {
     const double z = drawn.depth[k];
@@ -95,6 +121,7 @@ ColorEquations color_equations(const chain::Chain& chain, const Pose& base, cons
   }
 
   ColorEquations out;
+  out.likeness = likeness_of(view, drawn, pixels);
   const MatrixX axes = chain::world_axes(chain, theta, base);
   const float* const shown = drawn.rgba.data();
   const std::uint8_t* const seen = view.rgba.data();

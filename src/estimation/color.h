@@ -15,6 +15,7 @@ struct ColorEquations {  // of one view; residual r = gain * drawn + bias - seen
   double weight = 0.0;   // sum of the robust weights, one a pixel and channel
   double square = 0.0;   // weighted sum of the squared residuals
   double gain = 1.0, bias = 0.0;
+  std::optional<double> likeness;  // as in Estimate
 };
 
 // `drawn`: the twin at theta in the pixels of `view`, with depth.

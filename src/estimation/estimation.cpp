@@ -55,6 +55,9 @@ constexpr double kNoSmoothness = 1e-9;  // 1/rad^2: the filter's prior replaces 
 constexpr double kOffsetDeviation = 0.5, kLeastOffsetDeviation = 0.05;  // px
 constexpr double kOffsetFrames = 30.0;
 
+constexpr double kUnlike = 0.5;      // likeness of drawn and seen colors: less is not the rope,
+constexpr double kLongUnlike = 0.2;  // s, after which what is followed counts as something else
+
 constexpr double kLeastColorWeight = 100;  // pixels and channels; fewer say nothing
 
 constexpr double kLeastVariance = 1e-12;  // rad^2, keeps covariances invertible
@@ -313,6 +316,7 @@ void look_at_colors(const Filter& filter, std::span<const capture::View* const> 
       const double scale = filter.options.color_share * e.weight / e.square;  // by what this view's residuals are
       information += scale * e.normal;
       right += scale * e.right;
+      if (e.likeness) out.likeness = std::max(out.likeness.value_or(-1.0), *e.likeness);
       weight += e.weight;
       square += e.square;
       out.gain = e.gain;
@@ -332,6 +336,13 @@ void look_at_colors(const Filter& filter, std::span<const capture::View* const> 
 bool explains(const silhouette::FrameFit& fit) { return fit.covered >= kLostShare && fit.theta.allFinite(); }
 
 }  // namespace
+
+Options options_for_live_masks() {
+  Options options;
+  options.new_share = 0.1;
+  options.color_share = 0.01;
+  return options;
+}
 
 Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
              double base_start, const Options& options) {
@@ -498,6 +509,7 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
       filter.last_seen = view.time;
       filter.belief = measured.belief;
       if (filter.draw) look_at_colors(filter, views, *filter.belief, out);
+      if (first || out.likeness.value_or(1.0) >= kUnlike) filter.last_like = view.time;
       learn_force(filter, view.time);
       const double gain = 1.0 / kOffsetFrames;
       filter.edge_offset += gain * (measured.fit.edge_offset - filter.edge_offset);
@@ -508,6 +520,9 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
   if (!out.seen || out.lost) {
     filter.belief = predicted;
     out.lost = out.lost || view.time - filter.last_seen > kLongUnseen;
+  } else if (view.time - filter.last_like > kLongUnlike) {  // sought again where the twin alone would be
+    filter.belief = first_belief(filter, view.time);
+    out.lost = true;
   }
   filter.lost = out.lost;
   out.theta = filter.belief->mean.head(n);
