@@ -493,6 +493,11 @@ TEST_CASE("the planar equations agree with the spatial ones, the base moving and
         CHECK(difference(planar.stiffness, general.stiffness) < 1e-11);
         CHECK(difference(planar.damping, general.damping) < 1e-11);
         CHECK(difference(planar.drive_rate, general.drive_rate) < 1e-11);
+        BaseSlopes planar_slopes, slopes;
+        planar.base_slopes(planar_slopes), general.base_slopes(slopes);
+        CHECK(difference(planar_slopes.acceleration, slopes.acceleration) < 1e-11);
+        CHECK(difference(planar_slopes.velocity, slopes.velocity) < 1e-11);
+        CHECK(difference(planar_slopes.rotation, slopes.rotation) < 1e-11);
         for (int u = 0; u < 8; ++u) {
           if (u == 7 && !table) continue;  // rolls on a table only
           CHECK(difference(planar_forces.col(u), forces.col(u)) < 1e-9);

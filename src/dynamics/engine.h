@@ -74,7 +74,7 @@ class Engine {
   // inverse_torque, then stiffness, damping and drive_rate (needs place with slopes).
   virtual void linearize(const Vector6& base_jerk);
   // What BaseSlopes says, at the linearized state.
-  void base_slopes(BaseSlopes& slopes) const;
+  virtual void base_slopes(BaseSlopes& slopes) const;
   // Column p of `forces`: d(torque - tau_ID)/d(unknown p) at the present state and acceleration.
   virtual void unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces);
   bool articulated_acceleration();  // acceleration by the articulated body algorithm; allocates; false as factor_mass

@@ -209,7 +209,7 @@ BaseSlopes base_slopes(const Model& model, const trajectory::BaseMotion& base, c
   return slopes;
 }
 
-Linearizer::Linearizer(const Model& model) : engine_(std::make_unique<Engine>(model)) {}
+Linearizer::Linearizer(const Model& model) : engine_(make_engine(model)) {}
 Linearizer::~Linearizer() = default;
 
 bool Linearizer::at(const trajectory::BaseMotion& base, const Vector6& base_jerk, const VectorX& theta,

@@ -111,7 +111,7 @@ void PlanarEngine::friction(int j, bool slopes) {
   const LinkConstants& link = links[j];
   wrench_[j] = {};
   Slope& s = slope_sum_[j];
-  if (slopes) s.turn_back = s.z = s.zx = s.zy = s.drive = {};
+  if (slopes) s.turn_back[0] = s.turn_back[1] = s.turn_back[2] = s.z = s.zx = s.zy = {};
   if (rolls) roll_friction[j] = 0.0, roll_slope_[j] = {};
   if (link.air_linear > 0.0 || link.air_quadratic > 0.0) air_friction(j, slopes);
   if (link.viscous > 0.0 || link.coulomb > 0.0) table_friction(j, slopes);
@@ -146,9 +146,9 @@ void PlanarEngine::table_friction(int j, bool slopes) {
         const double part = bend * (tx * wx + ty * wy + tz * wz);
         return wrench_at(x, y, part * tx - rate * wx, part * ty - rate * wy);  // minus df
       };
-      add(s.turn_back, by_normal(ny, -nx, 0.0));
-      const Vector3 rate_of_normal = normal_here_.cross(spin_);
-      add(s.drive, by_normal(rate_of_normal.x(), rate_of_normal.y(), rate_of_normal.z()));
+      add(s.turn_back[0], by_normal(0.0, nz, -ny));
+      add(s.turn_back[1], by_normal(-nz, 0.0, nx));
+      add(s.turn_back[2], by_normal(ny, -nx, 0.0));
     }
     if (rolls) {  // of the velocity in the plane
       const double slowness = 1.0 / std::sqrt(ux * ux + uy * uy + vs2), across = c * uy - si * ux;
@@ -249,9 +249,22 @@ void PlanarEngine::place(const trajectory::BaseMotion& base, const VectorX& thet
       const Slope& out = slope_sum_[j + 1];
       for (int i = 0; i < 3; ++i)
         for (int k = 0; k < 3; ++k) sum.e[i][k] += out.e[i][k];
-      add(sum.turn_back, out.turn_back), add(sum.drive, out.drive);
+      for (int i = 0; i < 3; ++i) add(sum.turn_back[i], out.turn_back[i]);
       add(sum.z, out.z), add(sum.zx, out.zx), add(sum.zy, out.zy);
     }
+}
+
+PlanarEngine::Planar PlanarEngine::inertia_row_of(int j) const {
+  const Body& b = composite_[j];
+  const double x = px_[j], y = py_[j];
+  return {b.xx + b.yy - b.moment_x * x - b.moment_y * y, b.mass * y - b.moment_y, b.moment_x - b.mass * x};
+}
+
+PlanarEngine::Planar PlanarEngine::velocity_row_of(int j) const {
+  const auto& e = slope_sum_[j].e;
+  const double x = px_[j], y = py_[j];
+  return {e[0][0] + y * e[1][0] - x * e[2][0], e[0][1] + y * e[1][1] - x * e[2][1],
+          e[0][2] + y * e[1][2] - x * e[2][2]};
 }
 
 void PlanarEngine::linearize(const Vector6& base_jerk) {
@@ -304,17 +317,15 @@ void PlanarEngine::linearize(const Vector6& base_jerk) {
     const Slope& e = slope_sum_[j];
     const double x = px_[j], y = py_[j];
     const Planar s = axis_at(x, y), u = turn_k_[j], psi = inner_a_[j];
-    const Planar inertia_row{b.xx + b.yy - b.moment_x * x - b.moment_y * y, b.mass * y - b.moment_y,
-                             b.moment_x - b.mass * x};
-    const Planar velocity_row{e.e[0][0] + y * e.e[1][0] - x * e.e[2][0], e.e[0][1] + y * e.e[1][1] - x * e.e[2][1],
-                              e.e[0][2] + y * e.e[1][2] - x * e.e[2][2]};
+    const Planar inertia_row = inertia_row_of(j), velocity_row = velocity_row_of(j);
     // what is the same for every inner angle: all fields turned back about the base origin
-    Planar turned = e.turn_back;
+    Planar turned = e.turn_back[2];
     add(turned, field(b, back_xx, back_xy, -back_xx));
     add(turned, e.zx, wx), add(turned, e.zy, wy);  // g J = (w_x, w_y)
     const double turned_row = dot(s, turned), z_row = dot(s, e.z);
 
-    Planar driven = e.drive;
+    Planar driven;
+    for (int i = 0; i < 3; ++i) add(driven, e.turn_back[i], spin_[i]);  // the normal's own rate
     add(driven, field(b, rate_xx, rate_xy, rate_yy));
     add(driven, e.z, vz_rate), add(driven, e.zx, -wy_rate), add(driven, e.zy, wx_rate);
     drive_rate[j] = -(dot(inertia_row, base_psi) + dot(velocity_row, base_u) + dot(s, driven));
@@ -352,6 +363,39 @@ void PlanarEngine::linearize(const Vector6& base_jerk) {
       roll_by_angle(j, i) = dot(e, turn_k_[i]), roll_by_rate(j, i) = dot(e, axis_at(px_[i], py_[i]));
   }
   linearize_roll();
+}
+
+void PlanarEngine::base_slopes(BaseSlopes& slopes) const {
+  slopes.acceleration.setZero(angles, 6), slopes.velocity.setZero(angles, 6), slopes.rotation.setZero(angles, 3);
+  const double wx = spin_.x(), wy = spin_.y(), vz = slide_.z();
+  const Planar base_v{spin_.z(), slide_.x(), slide_.y()};
+  const Planar in_plane[3] = {{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}};
+  constexpr int kComponent[3] = {2, 3, 4};  // of a twist in the plane's frame: turn about z, velocity along x and y
+  for (int j = 0; j < angles; ++j) {
+    const Body& b = composite_[j];
+    const Slope& e = slope_sum_[j];
+    const Planar s = axis_at(px_[j], py_[j]), inertia_row = inertia_row_of(j), velocity_row = velocity_row_of(j);
+    for (int i = 0; i < 3; ++i) {
+      slopes.acceleration(j, kComponent[i]) = dot(inertia_row, in_plane[i]);
+      // see Engine::base_slopes
+      double& by_velocity = slopes.velocity(j, kComponent[i]);
+      by_velocity = dot(velocity_row, in_plane[i]) + dot(inertia_row, cross(base_v, in_plane[i]));
+      for (int link = 0; rolls && link < angles; ++link)
+        by_velocity += roll_map(j, link) * dot(roll_slope_[link], in_plane[i]);
+    }
+    // w_x, w_y and v_z: the fields o, X and g
+    slopes.velocity(j, 0) = -inertia_row.y * vz + dot(s, field(b, 0.0, wy, -2.0 * wx)) + dot(s, e.zy);
+    slopes.velocity(j, 1) = inertia_row.x * vz + dot(s, field(b, -2.0 * wy, wx, 0.0)) - dot(s, e.zx);
+    slopes.velocity(j, 5) = inertia_row.x * wy - inertia_row.y * wx + dot(s, e.z);
+    for (int c = 0; c < 3; ++c) {
+      const Vector3 pull = Vector3::Unit(c).cross(gravity_here_);
+      slopes.rotation(j, c) = inertia_row.x * pull.x() + inertia_row.y * pull.y() + dot(s, e.turn_back[c]);
+    }
+  }
+  const Matrix3 back = plane_.transpose();
+  for (MatrixX* m : {&slopes.acceleration, &slopes.velocity})
+    for (int half : {0, 3}) m->middleCols<3>(half) *= back;
+  slopes.rotation *= back;
 }
 
 void PlanarEngine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces) {

@@ -24,6 +24,7 @@ class PlanarEngine : public Engine {
   explicit PlanarEngine(const Model& model);
   void place(const trajectory::BaseMotion& base, const VectorX& theta, const VectorX& thetadot, bool slopes) override;
   void linearize(const Vector6& base_jerk) override;
+  void base_slopes(BaseSlopes& slopes) const override;
   void unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces) override;
 
   struct Planar {  // twist or wrench
@@ -34,11 +35,10 @@ class PlanarEngine : public Engine {
   struct Body {                                   // about the base origin; composite ones: of all outer links
     double mass, moment_x, moment_y, xx, xy, yy;  // second moments; about z: xx + yy
   };
-  struct Slope {       // minus dW/d(...), as it enters the body force
-    double e[3][3];    // by the link's twist, with the inertial part
-    Planar turn_back;  // by the normal, turned back by a unit
-    Planar z, zx, zy;  // by the z velocity 1, x, y
-    Planar drive;      // by the normal's own rate
+  struct Slope {          // minus dW/d(...), as it enters the body force
+    double e[3][3];       // by the link's twist, with the inertial part
+    Planar turn_back[3];  // by the normal, turned back by a unit about x, y, z
+    Planar z, zx, zy;     // by the z velocity 1, x, y
   };
   struct Unit {  // wrenches of a unit of a parameter, as they enter the body force
     Planar mass, viscous, coulomb, air_linear, air_quadratic;
@@ -48,6 +48,9 @@ class PlanarEngine : public Engine {
   void table_friction(int link, bool slopes);
   Planar inertial(const Body& body, const Planar& v, const Planar& a) const;
   Planar field(const Body& body, double xx, double xy, double yy) const;  // of the acceleration X r
+  // What a twist of all links outside of joint j does there, as an acceleration and as a velocity.
+  Planar inertia_row_of(int j) const;
+  Planar velocity_row_of(int j) const;
 
   Matrix3 plane_;                   // columns x, y, z in the base frame
   Vector3 spin_, slide_;            // w and v of the base
