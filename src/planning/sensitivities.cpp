@@ -114,6 +114,7 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
   out.theta_slope.resize(derivatives ? nodes : 0), out.thetadot_slope.resize(derivatives ? nodes : 0);
 
   const Eigen::Index p = derivatives ? columns : 0;
+  const bool stages = derivatives && exact;  // the derivative goes through the stages
   Point now(model, motion, p), other(model, motion, p);
   VectorX theta = initial.theta, rate = initial.thetadot;
   MatrixX slope = MatrixX::Zero(n, p), rate_slope = MatrixX::Zero(n, p);
@@ -124,22 +125,38 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
   MatrixX matrix(n, n);
   const double h = grid.step, g = 0.5 * h;
   constexpr double kTimeWeight[4] = {0.5, 1.5, 0.0, 0.0};  // gamma_i
+  constexpr double kOfThird = 8.0 / 3.0;                   // what stage 4 takes back of stage 3
 
   for (int k = 0; k < nodes; ++k) {
     if (!bounded(theta, rate)) return false;
     out.theta[k] = theta, out.thetadot[k] = rate;
-    if (derivatives) out.theta_slope[k] = slope, out.thetadot_slope[k] = rate_slope;
-    if (k + 1 == nodes) break;
-    const Coordinates &base = out.base[k], &next = out.base[k + 1];
-    if (!now.place(base, theta, rate, true)) return false;
+    const bool last = k + 1 == nodes;
+    const Coordinates& base = out.base[k];
     const dynamics::Linearization& here = now.now;
-    matrix = here.mass + g * here.damping + (g * g) * here.stiffness;
-    factor.compute(matrix);
-    if (derivatives) {
-      now.tangent_forces(base, grid.basis[k], slope, rate_slope);
-      now_rate = now.forces;
-      now.linearizer.solve_mass(now_rate);
+    if (!last || derivatives) {
+      if (!now.place(base, theta, rate, true)) return false;
+      matrix = here.mass + g * here.damping + (g * g) * here.stiffness;
+      factor.compute(matrix);
     }
+    if (derivatives) {
+      if (exact || k == 0) {
+        now.tangent_forces(base, grid.basis[k], slope, rate_slope);
+        now_rate = now.forces;
+        now.linearizer.solve_mass(now_rate);
+      } else {
+        // trapezoidal rule from the last node: what it had, then what the acceleration's slope here adds
+        slope += g * rate_slope;
+        rate_slope += g * now_rate;
+        slope += g * rate_slope;
+        now.tangent_forces(base, grid.basis[k], slope, rate_slope);
+        now_rate = factor.solve(now.forces);
+        slope += (g * g) * now_rate;
+        rate_slope += g * now_rate;
+      }
+      out.theta_slope[k] = slope, out.thetadot_slope[k] = rate_slope;
+    }
+    if (last) break;
+    const Coordinates& next = out.base[k + 1];
 
     // (1/G - J) k = (right, M^-1 work), the same for the tangents
     const auto solve = [&](int i) {
@@ -150,14 +167,12 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
     };
     // d_work holds M^-1 times the change of `work`, without the second derivatives
     const auto solve_tangents = [&](int i) {
-      if (exact) {
-        for (const double e : {kProbe, -kProbe}) {
-          const double shift = e * h * kTimeWeight[i];
-          if (!other.place(shifted(base, shift), theta + e * k_theta[i], rate + e * k_rate[i], true)) return false;
-          other.tangent_forces(shifted(base, shift), shifted(grid.basis[k], shift), slope, rate_slope);
-          other.linearizer.solve_mass(other.forces);
-          d_work += other.forces / (2.0 * e);
-        }
+      for (const double e : {kProbe, -kProbe}) {
+        const double shift = e * h * kTimeWeight[i];
+        if (!other.place(shifted(base, shift), theta + e * k_theta[i], rate + e * k_rate[i], true)) return false;
+        other.tangent_forces(shifted(base, shift), shifted(grid.basis[k], shift), slope, rate_slope);
+        other.linearizer.solve_mass(other.forces);
+        d_work += other.forces / (2.0 * e);
       }
       dk_rate[i].noalias() = here.mass * d_work;
       dk_rate[i].noalias() -= g * (here.stiffness * d_right);
@@ -170,7 +185,7 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
     work.noalias() = here.mass * here.acceleration;
     work += (0.5 * h) * here.drive_rate;
     solve(0);
-    if (derivatives) {
+    if (stages) {
       d_right = rate_slope;
       d_work = now_rate;
       if (!solve_tangents(0)) return false;
@@ -180,33 +195,32 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
     work += (1.5 * h) * here.drive_rate;
     work.noalias() += (4.0 / h) * (here.mass * k_rate[0]);
     solve(1);
-    if (derivatives) {
+    if (stages) {
       d_right = rate_slope + (4.0 / h) * dk_theta[0];
       d_work = now_rate + (4.0 / h) * dk_rate[0];
       if (!solve_tangents(1)) return false;
     }
     stage_theta = theta + 2.0 * k_theta[0];
     stage_rate = rate + 2.0 * k_rate[0];
-    if (derivatives) {
+    if (stages) {
       stage_slope = slope + 2.0 * dk_theta[0];
       stage_rate_slope = rate_slope + 2.0 * dk_rate[0];
     }
     for (int i = 2; i < 4; ++i) {
-      const double last = i == 3 ? -8.0 / 3.0 : 0.0;
       if (!bounded(stage_theta, stage_rate)) return false;
-      if (!other.place(next, stage_theta, stage_rate, derivatives)) return false;
+      if (!other.place(next, stage_theta, stage_rate, stages)) return false;
       right = stage_rate + (k_theta[0] - k_theta[1]) / h;
       work = other.now.acceleration + (k_rate[0] - k_rate[1]) / h;
-      if (i == 3) right += (last / h) * k_theta[2], work += (last / h) * k_rate[2];
+      if (i == 3) right -= (kOfThird / h) * k_theta[2], work -= (kOfThird / h) * k_rate[2];
       work = (here.mass * work).eval();
       solve(i);
-      if (derivatives) {
+      if (stages) {
         other.tangent_forces(next, grid.basis[k + 1], stage_slope, stage_rate_slope);
         d_work = other.forces;
         other.linearizer.solve_mass(d_work);
         d_work += (dk_rate[0] - dk_rate[1]) / h;
         d_right = stage_rate_slope + (dk_theta[0] - dk_theta[1]) / h;
-        if (i == 3) d_right += (last / h) * dk_theta[2], d_work += (last / h) * dk_rate[2];
+        if (i == 3) d_right -= (kOfThird / h) * dk_theta[2], d_work -= (kOfThird / h) * dk_rate[2];
         if (!solve_tangents(i)) return false;
         stage_slope += dk_theta[i];
         stage_rate_slope += dk_rate[i];
@@ -215,7 +229,7 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
       stage_rate += k_rate[i];
     }
     theta = stage_theta, rate = stage_rate;
-    if (derivatives) slope = stage_slope, rate_slope = stage_rate_slope;
+    if (stages) slope = stage_slope, rate_slope = stage_rate_slope;
   }
   return true;
 }
