@@ -257,7 +257,7 @@ dynamics::Model read_truth(const std::string& file, const Path& run) {
   }
 }
 
-Json loop_json(const planning::LoopResult& loop) {
+Json loop_json(const planning::LoopResult& loop, double tolerance) {
   Json out{{"miss", loop.hit.miss},
            {"miss_time", loop.hit.time},
            {"miss_point", json_of(loop.hit.point)},
@@ -265,10 +265,12 @@ Json loop_json(const planning::LoopResult& loop) {
            {"peak_acceleration", loop.peaks.acceleration},
            {"peak_jerk", loop.peaks.jerk}};
   if (!loop.peaks.over.empty()) out["over_limit"] = loop.peaks.over;
+  if (loop.out_of_reach > tolerance) out["out_of_reach"] = loop.out_of_reach;
   if (loop.replans > 0) {
     out["replans"] = loop.replans;
     out["mean_replan_seconds"] = loop.mean_replan;
     out["longest_replan_seconds"] = loop.longest_replan;
+    out["foretold_miss"] = loop.foretold;
   }
   return out;
 }
@@ -339,11 +341,12 @@ void plan(const Globals& globals, PlanRequest& request) {
   Json simulated;
   if (truth) {
     request.loop.feedback = false;
-    simulated["without_feedback"] = loop_json(planning::closed_loop(problem, options, plan, *truth, request.loop));
+    simulated["without_feedback"] =
+        loop_json(planning::closed_loop(problem, options, plan, *truth, request.loop), options.tolerance);
     if (request.mpc) {
       request.loop.feedback = true;
       const planning::LoopResult loop = planning::closed_loop(problem, options, plan, *truth, request.loop);
-      simulated["with_feedback"] = loop_json(loop);
+      simulated["with_feedback"] = loop_json(loop, options.tolerance);
       played = loop.motion;
     }
   }
@@ -370,6 +373,10 @@ void plan(const Globals& globals, PlanRequest& request) {
   if (!plan.reached) say(plan.reason);
   for (const auto& [name, loop] : simulated.items()) {
     std::snprintf(text, sizeof text, "%s: miss %.2f mm", name.c_str(), 1e3 * loop["miss"].get<double>());
+    say(text);
+    if (!loop.contains("out_of_reach")) continue;
+    std::snprintf(text, sizeof text, "%s: the target moves at least %.1f mm out of reach", name.c_str(),
+                  1e3 * loop["out_of_reach"].get<double>());
     say(text);
   }
 }

@@ -158,6 +158,8 @@ struct LoopResult {
   Peaks peaks;
   int replans = 0;
   double longest_replan = 0.0, mean_replan = 0.0;  // s of one core
+  double foretold = 0.0;                           // m, miss as the last replan expected it
+  double out_of_reach = 0.0;                       // m, unreachable_distance() of the target as it moves, at best
 };
 // Plays `plan` (of one target) on `truth`, from rest: in free space in its own equilibrium, on a table with the shape
 // of the problem's initial state.

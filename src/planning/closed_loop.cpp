@@ -18,10 +18,19 @@ constexpr double kReplanSmoothness = 1e-8;
 // trace, which limits may dominate; where the rope sticks or a limit is near, full steps fail and much shorter ones do.
 // A target that has moved by centimeters asks for a change of that size; where the curvature is nearly singular full
 // steps are of meters.
-constexpr Effort kReplanEffort{
-    .steps = 2, .trials = 5, .damping = 1e-7, .more_damping = 50.0, .longest = 0.1, .hopeful = false};
+constexpr Effort kReplanEffort{.steps = 2, .evaluations = 9, .damping = 1e-7, .longest = 0.1, .hopeful = false};
+// Where that leads to no hit the rest may need another motion altogether: each replan tries one more, the best of a
+// few.
+constexpr double kStuck = 0.003;        // m, a foretold miss
+constexpr double kProgress = 0.8;       // of the miss that the replan before foretold: less progress is none
+constexpr int kOthers = 6;              // motions tried
+constexpr double kLeastOther = 0.4;     // s before the hit
+constexpr double kClearlyBetter = 0.5;  // of the miss, for which the motion is changed altogether
+constexpr double kOtherSharpness = 1e4, kOtherSmoothness = 1e-7;
+constexpr Effort kOtherEffort{.steps = 4, .evaluations = 6, .longest = 0.3};
 constexpr double kShortest = 0.15;    // s before the hit, after which nothing is changed any more
 constexpr double kLimitStep = 0.002;  // s, between tests of the limits
+constexpr int kLimitParts = 250;      // of a correction at least: a short one has a fast jerk
 constexpr double kLimitPart = 0.995;  // of the limits: between the tests no more than 0.2 % is added
 constexpr double kLeastPiece = 0.35;  // s, of a correction
 constexpr double kPieceMargin = 1.6;  // its length over the time to the hit, in free space
@@ -138,6 +147,8 @@ class Samples {
     alone.pieces = {last};
     alone.origin.translation.setZero();
     for (double time : jumps(last)) watch(others, time);
+    if (const double step = last.duration / kLimitParts; step < kLimitStep)
+      for (int i = 1; i < kLimitParts; ++i) watch(others, last.start + i * step);
     std::vector<Coordinates> change;
     double part = 1.0;
     const bool smooth = motion.window == Window::smooth;
@@ -217,6 +228,9 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
 
   double hit_time = plan.hits.front().time;
   Samples samples(out.motion);
+  core::Random random(options.seed + 3);
+  double foretold = std::numeric_limits<double>::infinity();  // miss, by the last replan
+  bool elsewhere = false;
   Adaptation adaptation = start_adaptation(problem.model);
   dynamics::InitialState last_seen = problem.initial;
   last_seen.time = 0.0;
@@ -253,15 +267,50 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
       task.target_time = now;
       if (options.terminal)
         for (std::size_t a = 0; a < motion.axes.size(); ++a) task.held[a * kPerAxis + kBasisCount] = true;
-      VectorX q = VectorX::Zero(static_cast<Eigen::Index>(motion.axes.size()) * kPerAxis);
-      minimize(task, q, {kReplanSharpness, kReplanSmoothness}, kReplanEffort);
-      // a correction that asks too much of the arm is taken in part
-      set_unknowns(motion, q);
-      samples.take_within(motion, options.limits);
-      Rollout rollout;
-      if (roll_out(adaptation.model, task.motion, task.grid, unknowns_of(motion), estimate, false, rollout))
-        hit_time = measure(task, adaptation.model, rollout).time;
-      out.motion = std::move(motion);
+      struct Correction {
+        Motion motion;
+        Samples samples;
+        double miss, time;
+      };
+      const auto correction = [&](VectorX q, const Effort& effort) {
+        if (effort.steps > 0) minimize(task, q, {kReplanSharpness, kReplanSmoothness}, effort);
+        Correction c{motion, samples, std::numeric_limits<double>::infinity(), hit_time};
+        set_unknowns(c.motion, q);
+        // what asks too much of the arm is taken in part
+        c.samples.take_within(c.motion, options.limits);
+        Rollout rollout;
+        if (roll_out(adaptation.model, task.motion, task.grid, unknowns_of(c.motion), estimate, false, rollout)) {
+          const Hit hit = measure(task, adaptation.model, rollout);
+          c.miss = hit.miss, c.time = hit.time;
+        }
+        return c;
+      };
+      Correction best =
+          correction(VectorX::Zero(static_cast<Eigen::Index>(motion.axes.size()) * kPerAxis), kReplanEffort);
+      if (elsewhere) {
+        Task other = task;
+        if (problem.tabletop && k % 2 == 0) other.first_link = chain.links() - 1;
+        std::vector<VectorX> starts = carried(other);
+        while (starts.size() < kOthers)
+          starts.push_back(random_unknowns(other, random, random.uniform(kLeastLoad, kMostLoad)));
+        const Sharpness soft{kOtherSharpness, kOtherSmoothness};
+        double least = std::numeric_limits<double>::infinity();
+        VectorX q;
+        for (const VectorX& start : starts)
+          if (const Evaluation e = evaluate(other, start, soft, false); e.good && e.value < least)
+            least = e.value, q = start;
+        if (q.size() > 0) {
+          minimize(other, q, soft, kOtherEffort);
+          Correction c = correction(std::move(q), {.steps = 0});
+          if (c.miss < kClearlyBetter * best.miss) best = std::move(c);
+        }
+      }
+      out.motion = std::move(best.motion);
+      samples = std::move(best.samples);
+      hit_time = best.time;
+      // the next one looks elsewhere where this one, with all its steps, did not help
+      elsewhere = best.miss > kStuck && best.miss > kProgress * foretold && left > kLeastOther;
+      foretold = best.miss;
       const double seconds = core_time() - begin;
       ++out.replans;
       out.longest_replan = std::max(out.longest_replan, seconds);
@@ -302,6 +351,10 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
       if (miss < out.hit.miss) out.hit.miss = miss, out.hit.time = time, out.hit.point = nearest;
     }
   out.hit.mean_miss = out.hit.worst_miss = out.hit.miss;
+  out.foretold = out.replans > 0 ? foretold : plan.hits.front().miss;
+  out.out_of_reach = std::numeric_limits<double>::infinity();
+  for (double part = problem.tabletop ? 1.0 : 0.0; part <= 1.0; part += 0.01)
+    out.out_of_reach = std::min(out.out_of_reach, unreachable_distance(problem, options, target_at(part * end)));
   out.peaks = peaks(out.motion, 0.0, end, options.limits);
   return out;
 }

@@ -106,7 +106,7 @@ Soft soft_minimum(const Task& task, const dynamics::Model& model, const Rollout&
       soft.candidates.push_back({node, nearest(chain, motions, false, target)});
       continue;
     }
-    for (int link = 1; link < chain.links(); ++link) {
+    for (int link = task.first_link; link < chain.links(); ++link) {
       const Vector3 a = motions[link] * (chain.link_start(link) * chain.direction);
       const Vector3 b = motions[link] * (chain.link_end(link) * chain.direction);
       const double part = std::clamp((target - a).dot(b - a) / (b - a).squaredNorm(), 0.0, 1.0);
@@ -225,10 +225,8 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
   // smoothness and limits of the base, the same for all samples
   const auto& base = rollouts.front().base;
   const double length = task.models.front()->chain.length;
-  const auto limit = [&](int node, int derivative, double most, bool yaw) {
-    const Basis& b = task.grid.basis[node];
-    const auto vector = base[node].col(derivative).head<3>();
-    const double value = yaw ? std::abs(base[node](3, derivative)) : vector.norm();
+  const auto limit = [&](const Basis& b, const Coordinates& c, int derivative, double most, bool yaw) {
+    const double value = yaw ? std::abs(c(3, derivative)) : c.col(derivative).head<3>().norm();
     const double residual = value / most - kLimitMargin;
     if (residual <= 0.0) return;
     if (!derivatives) {
@@ -239,7 +237,7 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
     for (std::size_t a = 0; a < task.motion.axes.size(); ++a) {
       const Axis axis = task.motion.axes[a];
       if ((axis == Axis::yaw) != yaw) continue;
-      const double direction = base[node](static_cast<int>(axis), derivative) / value;
+      const double direction = c(static_cast<int>(axis), derivative) / value;
       slope.segment(static_cast<Eigen::Index>(a) * kPerAxis, kPerAxis) = direction / most * b.col(derivative);
     }
     add(sum, task.limit_weight * kLimitWeight, residual, slope);
@@ -247,12 +245,18 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
   const Limits& limits = options.limits;
   const bool smooth = task.motion.window == Window::smooth;
   for (int node = 0; node < nodes; node += stride) {
-    limit(node, 1, limits.velocity, false);
-    limit(node, 2, limits.acceleration, false);
-    if (smooth) limit(node, 3, limits.jerk, false);
-    limit(node, 1, limits.yaw_velocity, true);
-    limit(node, 2, limits.yaw_acceleration, true);
-    if (smooth) limit(node, 3, limits.yaw_jerk, true);
+    const Basis& b = task.grid.basis[node];
+    limit(b, base[node], 1, limits.velocity, false);
+    limit(b, base[node], 2, limits.acceleration, false);
+    if (smooth) limit(b, base[node], 3, limits.jerk, false);
+    limit(b, base[node], 1, limits.yaw_velocity, true);
+    limit(b, base[node], 2, limits.yaw_acceleration, true);
+    if (smooth) limit(b, base[node], 3, limits.yaw_jerk, true);
+  }
+  if (smooth) {
+    const Coordinates end = moved(task.motion, unknowns, task.grid.end_basis, task.grid.end_fixed);
+    limit(task.grid.end_basis, end, 3, limits.jerk, false);
+    limit(task.grid.end_basis, end, 3, limits.yaw_jerk, true);
   }
   for (std::size_t a = 0; a < task.motion.axes.size(); ++a) {
     const int row = static_cast<int>(task.motion.axes[a]);

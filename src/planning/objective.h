@@ -18,6 +18,7 @@ struct Task {
   std::vector<bool> held;     // unknowns that keep their value
   bool exact = true;          // derivatives of the discrete map
   double limit_weight = 1.0;  // of limits and obstacles, against the usual
+  int first_link = 1;         // on a table: only points from this link on are drawn to the target
 
   Vector3 target_at(double time) const { return target + (time - target_time) * target_velocity; }
 };

@@ -12,18 +12,23 @@ namespace {
 // Annealing of the soft minimum (SPEC 8), with the steps for each.
 constexpr struct {
   double sharpness, smoothness;
-  int steps;
-} kCoarse[] = {{1e3, 1e-6, 4}, {1e4, 1e-7, 5}};
+  int steps, evaluations;
+} kCoarse[] = {{1e3, 1e-6, 4, 10}, {1e4, 1e-7, 5, 14}};
 constexpr double kFinalSharpness = 1e5, kSharpest = 1e6;  // m^-2
 constexpr double kFinalSmoothness = 3e-9;
-constexpr int kFinalSteps = 9;
-constexpr double kEnough = 0.1;             // of the tolerance: no further iteration is made
-constexpr double kGoodMiss = 0.3;           // of the tolerance: no further start is tried
-constexpr double kStrictLimits = 100.0;     // times the usual weight
-constexpr int kGroups[] = {1, 1, 2, 4, 4};  // starts optimized side by side; the next group only where the last failed
-constexpr double kPromising = 10.0;         // of the tolerance: a coarse miss from which it is worth to go on at once
-constexpr int kLastTries = 2;               // of the nearest others, where no start was good
-constexpr double kLeastLoad = 0.25, kMostLoad = 0.95;           // of the limits, of random motions
+constexpr int kFinalSteps = 9, kFinalEvaluations = 20;
+constexpr int kPolishSteps = 4;          // with exact derivatives, each as dear as seven others
+constexpr double kWorthPolish = 2.0;     // of the tolerance
+constexpr double kEnough = 0.1;          // of the tolerance: no further iteration is made
+constexpr int kFineCost = 2;             // evaluations with coarse steps that one with full steps costs
+constexpr int kMostSpent = 160;          // of them, after which nothing further is tried
+constexpr double kGoodMiss = 0.3;        // of the tolerance: no further start is tried
+constexpr double kStrictLimits = 100.0;  // times the usual weight
+// Starts optimized side by side; the next group only where the last failed.
+constexpr int kGroups[] = {1, 1, 2, 2, 2, 2, 2};
+constexpr double kPromising = 10.0;  // of the tolerance: a coarse miss from which it is worth to go on at once
+constexpr int kOutOfReach = 2;       // groups where geometry says that no motion reaches the target
+constexpr int kLastTries = 2;        // of the nearest others, where no start was good
 constexpr std::uint64_t kTargetStream = 0x7461726765740001ull;  // random numbers of random_target
 constexpr double kHorizons[] = {0.25, 0.35, 0.5, 0.7, 1.0};     // of the longest, for a free one
 constexpr double kTableSlack = 1e-6;                            // m, a target may lie in the table's plane
@@ -166,58 +171,45 @@ Found approach(const Task& coarse, VectorX unknowns) {
   Found found;
   found.unknowns = std::move(unknowns);
   for (const auto& stage : kCoarse)
-    found.iterations += minimize(coarse, found.unknowns, {stage.sharpness, stage.smoothness}, {.steps = stage.steps});
+    found.iterations += minimize(coarse, found.unknowns, {stage.sharpness, stage.smoothness},
+                                 {.steps = stage.steps, .evaluations = stage.evaluations});
   judge(coarse, found);
   return found;
 }
 
 // With full steps from what approach() left.
 void finish(const Task& fine, Found& found) {
+  const Options& options = *fine.options;
   Task quick = fine;
   quick.exact = false;
-  const Effort effort{.steps = kFinalSteps, .enough = kEnough * fine.options->tolerance};
   const Sharpness last{kFinalSharpness, kFinalSmoothness};
-  found.iterations += minimize(quick, found.unknowns, last, effort);
+  const double enough = kEnough * options.tolerance;
+  found.iterations +=
+      minimize(quick, found.unknowns, last, {.steps = kFinalSteps, .evaluations = kFinalEvaluations, .enough = enough});
   judge(fine, found);
-  if (found.good && merit(found, *fine.options) <= kGoodMiss * fine.options->tolerance) return;
-  // what is left: the soft minimum likes to stay near for long, and derivatives of lower order end too early
-  const Sharpness sharpest{kSharpest, kFinalSmoothness};
-  found.iterations += minimize(fine, found.unknowns, sharpest, effort);
-  judge(fine, found);
-  if (found.good || !std::isfinite(found.hit.miss)) return;
-  // a far target pulls harder than the limits push: once more with limits that count more
-  Task strict = fine;
-  strict.limit_weight = kStrictLimits;
-  found.iterations += minimize(strict, found.unknowns, last, {.steps = kFinalSteps});
-  judge(fine, found);
-}
-
-// Motions that carry a point of the resting rope to the target, as far as the limits allow.
-std::vector<VectorX> carried(const Task& task) {
-  std::vector<VectorX> out;
-  const chain::Chain& chain = task.models.front()->chain;
-  math::Pose base{task.motion.origin.rotation, task.grid.fixed[0].col(0).head<3>()};
-  const auto motions = chain::link_motions(chain, task.initial.theta, base);
-  for (const double part : task.tabletop ? std::vector<double>{0.35, 0.65, 1.0} : std::vector<double>{1.0}) {
-    const double s = part * chain.length;
-    const Vector3 point = motions[chain::link_at(chain, std::min(s, 0.999 * chain.length))] * (s * chain.direction);
-    VectorX q = VectorX::Zero(static_cast<Eigen::Index>(task.motion.axes.size()) * kPerAxis);
-    for (std::size_t a = 0; a < task.motion.axes.size(); ++a) {
-      const Eigen::Index i = static_cast<Eigen::Index>(a) * kPerAxis + kBasisCount;
-      if (task.motion.axes[a] != Axis::yaw && !task.held[i])
-        q[i] = (task.target - point)[static_cast<int>(task.motion.axes[a])];
-    }
-    const double most = load(task, q);
-    if (most > kMostLoad) q *= kMostLoad / most;
-    out.push_back(q);
+  if (!std::isfinite(found.hit.miss)) return;
+  if (!found.good) {  // a far target pulls harder than the limits push: once more with limits that count more
+    quick.limit_weight = kStrictLimits;
+    found.iterations += minimize(quick, found.unknowns, last, {.steps = kFinalSteps, .evaluations = kFinalEvaluations});
+    judge(fine, found);
   }
-  return out;
+  if (found.good && merit(found, options) <= kGoodMiss * options.tolerance) return;
+  if (!(merit(found, options) <= kWorthPolish * options.tolerance)) return;
+  // what is left: the soft minimum likes to stay near for long, and derivatives of lower order end too early
+  Task exact = fine;
+  exact.limit_weight = quick.limit_weight;
+  Found polished = found;
+  const Effort dear{.steps = kPolishSteps, .evaluations = 3 * kPolishSteps, .hopeful = false, .enough = enough};
+  polished.iterations += minimize(exact, polished.unknowns, {kSharpest, kFinalSmoothness}, dear);
+  judge(fine, polished);
+  found.iterations = polished.iterations;
+  if (better(polished, found, options)) found = std::move(polished);
 }
 
 // The best motion of one stretch; `tried` and `iterations` are added to.
 Found solve(const Problem& problem, const Options& options, const std::vector<const dynamics::Model*>& models,
             const Motion& motion, const dynamics::InitialState& initial, const Vector3& target,
-            const std::optional<VectorX>& terminal, int& tried, int& iterations) {
+            const std::optional<VectorX>& terminal, bool out_of_reach, int& tried, int& iterations) {
   const int substeps = problem.model.parameters.substeps;
   Task fine = make_task(problem, options, models, motion, initial, target, substeps);
   Task coarse = make_task(problem, options, models, motion, initial, target, std::max(1, substeps / 2));
@@ -236,17 +228,27 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
   for (int i = 0; i < options.starts; ++i)
     starts.push_back(random_unknowns(coarse, random, random.uniform(kLeastLoad, kMostLoad)));
   for (VectorX& q : starts) q += rest;
-  Task screening = coarse;
-  screening.models = {models.front()};
-  std::vector<double> value(starts.size());
-  core::parallel_for(static_cast<std::int64_t>(starts.size()), [&](std::int64_t i) {
-    const Evaluation e = evaluate(screening, starts[i], {kFinalSharpness, kCoarse[0].smoothness}, false);
-    value[i] = e.good ? e.value : std::numeric_limits<double>::infinity();
-  });
-  std::vector<int> order(starts.size());
-  std::iota(order.begin(), order.end(), 0);
-  std::stable_sort(order.begin(), order.end(), [&](int a, int b) { return value[a] < value[b]; });
   tried += static_cast<int>(starts.size());
+  // the best first, as they come near with the links that count; rolled out with the identified parameters only
+  const auto ranked = [&](const Task& task) {
+    Task screening = task;
+    screening.models = {models.front()};
+    std::vector<double> value(starts.size());
+    core::parallel_for(static_cast<std::int64_t>(starts.size()), [&](std::int64_t i) {
+      const Evaluation e = evaluate(screening, starts[i], {kFinalSharpness, kCoarse[0].smoothness}, false);
+      value[i] = e.good ? e.value : std::numeric_limits<double>::infinity();
+    });
+    std::vector<int> order(starts.size());
+    std::iota(order.begin(), order.end(), 0);
+    std::stable_sort(order.begin(), order.end(), [&](int a, int b) { return value[a] < value[b]; });
+    return order;
+  };
+  // The point of a rope on a table that is nearest at first is not always one that can be brought to the target: where
+  // that failed every other start draws the free end alone.
+  Task tip = coarse;
+  tip.first_link = problem.model.chain.links() - 1;
+  const std::vector<int> order = ranked(coarse);
+  std::vector<int> tip_order;
 
   // samples have a spread that no motion removes
   const double enough = models.size() > 1 ? options.tolerance : kGoodMiss * options.tolerance;
@@ -254,22 +256,32 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
   const auto by_merit = [&](const Found& a, const Found& b) { return better(a, b, options); };
   std::vector<Found> near;  // where a start led with coarse steps, not gone further
   std::optional<Found> best;
+  int spent = 0;  // evaluations with coarse steps, or what costs as much
   const auto go_further = [&](Found found) {
     found.iterations = 0;
     finish(fine, found);
     iterations += found.iterations;
+    spent += kFineCost * found.iterations;
     if (!best || better(found, *best, options)) best = std::move(found);
   };
-  std::size_t next = 0;
+  std::size_t next = 0, next_tip = 0;
+  int groups = 0;
   for (const int group : kGroups) {
-    const std::size_t count = std::min<std::size_t>(group, order.size() - next);
-    std::vector<Found> found(count);
-    core::parallel_for(static_cast<std::int64_t>(count), [&](std::int64_t i) {
-      found[i] = approach(coarse, starts[order[next + static_cast<std::size_t>(i)]]);
-    });
-    next += count;
+    if (spent > kMostSpent || (out_of_reach && groups == kOutOfReach)) break;
+    ++groups;
+    std::vector<std::pair<const Task*, int>> chosen;  // with the start
+    if (group > 1 && problem.tabletop && tip_order.empty()) tip_order = ranked(tip);
+    for (int i = 0; i < group; ++i)
+      if (i % 2 == 1 && next_tip < tip_order.size())
+        chosen.emplace_back(&tip, tip_order[next_tip++]);
+      else if (next < order.size())
+        chosen.emplace_back(&coarse, order[next++]);
+    std::vector<Found> found(chosen.size());
+    core::parallel_for(static_cast<std::int64_t>(chosen.size()),
+                       [&](std::int64_t i) { found[i] = approach(*chosen[i].first, starts[chosen[i].second]); });
     for (Found& f : found) {
       iterations += f.iterations;
+      spent += f.iterations;
       near.push_back(std::move(f));
     }
     std::stable_sort(near.begin(), near.end(), by_merit);
@@ -281,7 +293,7 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
     if (best && good(*best)) return *best;
     if (best && best->good && models.size() > 1 && group > 1) return *best;
   }
-  for (int i = 0; i < kLastTries && !near.empty() && !(best && good(*best)); ++i) {
+  for (int i = 0; i < kLastTries && !near.empty() && !(best && (good(*best) || spent > kMostSpent)); ++i) {
     go_further(near.front());
     near.erase(near.begin());
   }
@@ -343,6 +355,7 @@ Plan plan(const Problem& problem, const Options& options) {
       for (const Piece& piece : plan.motion.pieces) *terminal -= piece.terminal;
     }
     const double start = plan.motion.end();
+    const double bound = unreachable_distance(problem, options, problem.targets[t]);
     Found best;
     Motion motion;
     bool first = true;
@@ -350,8 +363,8 @@ Plan plan(const Problem& problem, const Options& options) {
       if (!options.free_horizon && part != 1.0) continue;
       Motion trial = plan.motion;
       append_piece(trial, start, part * options.horizon);
-      Found found =
-          solve(problem, options, models, trial, state, problem.targets[t], terminal, plan.starts, plan.iterations);
+      Found found = solve(problem, options, models, trial, state, problem.targets[t], terminal,
+                          bound > options.tolerance, plan.starts, plan.iterations);
       if (first || better(found, best, options)) best = std::move(found), motion = std::move(trial);
       first = false;
       if (best.good && merit(best, options) <= options.tolerance) break;
@@ -363,7 +376,6 @@ Plan plan(const Problem& problem, const Options& options) {
     plan.hits.push_back(best.hit);
     if (!best.good || !(best.hit.miss <= options.tolerance)) {
       plan.reached = false;
-      const double bound = unreachable_distance(problem, options, problem.targets[t]);
       const std::string which = problem.targets.size() > 1 ? "target " + std::to_string(t + 1) + ": " : "";
       if (!plan.reason.empty()) plan.reason += "; ";
       if (bound > options.tolerance)

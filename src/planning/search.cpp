@@ -7,7 +7,9 @@ namespace chainsplat::planning {
 namespace {
 
 constexpr double kLeastDamping = 1e-9;
-constexpr double kLessDamping = 0.15;
+constexpr double kLessDamping = 0.1, kLeastMore = 4.0, kMostMore = 50.0;  // factors of the damping
+constexpr double kIdle = 0.03;       // of the squared miss: steps that decrease less are idle
+constexpr int kIdleSteps = 3;        // so many end it
 constexpr double kConverged = 1e-4;  // relative decrease of the objective
 constexpr double kNothing = 1e-11;   // m^2, (3 um)^2: a smaller decrease does not count
 
@@ -91,14 +93,15 @@ int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, co
     if (task.held[i]) metric.row(i).setZero(), metric.col(i).setZero(), metric(i, i) = 1.0;
   metric /= metric.trace();
   double damping = effort.damping;
-  int count = 1;
+  int count = 1, idle = 0;
   for (int taken = 0; taken < effort.steps; ++taken) {
     const bool last = taken + 1 == effort.steps;
     const double scale = now.curvature.trace();
     VectorX step;
     Evaluation next;
-    for (int trial = 0;; ++trial, damping *= effort.more_damping) {
-      if (trial == effort.trials) return count;
+    double foretold = 0.0;
+    for (int trial = 0;; ++trial) {
+      if (count >= effort.evaluations) return count;
       MatrixX matrix = now.curvature + damping * scale * metric;
       // the metric has no part in directions without acceleration; held unknowns have no row
       matrix.diagonal().array() += 1e-12 * scale;
@@ -106,19 +109,26 @@ int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, co
       for (Eigen::Index i = 0; i < step.size(); ++i)
         if (task.held[i]) step[i] = 0.0;
       if (const double length = step.norm(); length > effort.longest) step *= effort.longest / length;
+      foretold = -step.dot(now.gradient + 0.5 * (now.curvature * step));
       // where the first trial is mostly good it brings the derivatives along
       const bool ahead = effort.hopeful && trial == 0 && !last;
       next = evaluate(task, unknowns + step, sharpness, ahead);
       ++count;
-      if (!(next.good && next.value < now.value)) continue;
-      if (!ahead && !last) next = evaluate(task, unknowns + step, sharpness, true);
-      break;
+      if (next.good && next.value < now.value) {
+        if (!ahead && !last) next = evaluate(task, unknowns + step, sharpness, true);
+        break;
+      }
+      if (!(foretold > kNothing)) return count;
+      // the further off, the much shorter the next one
+      const double excess = next.good ? (next.value - now.value) / foretold : kMostMore;
+      damping *= std::clamp(2.0 * (1.0 + excess), kLeastMore, kMostMore);
     }
     const double decrease = now.value - next.value;
+    idle = decrease < kIdle * (next.miss * next.miss + next.violation) ? idle + 1 : 0;
     unknowns += step;
     now = std::move(next);
-    damping = std::max(kLeastDamping, kLessDamping * damping);
-    if (done(now) || decrease < kNothing || decrease < kConverged * std::abs(now.value)) break;
+    damping = std::max(kLeastDamping, damping * std::clamp(1.0 - decrease / foretold, kLessDamping, 1.0));
+    if (done(now) || decrease < kNothing || decrease < kConverged * std::abs(now.value) || idle == kIdleSteps) break;
   }
   return count;
 }
@@ -126,19 +136,39 @@ int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, co
 double load(const Task& task, const VectorX& unknowns) {
   const Limits& limits = task.options->limits;
   double most = 0.0;
-  for (int node = 0; node < task.grid.nodes(); ++node) {
-    Coordinates c = task.grid.fixed[node];
-    for (std::size_t a = 0; a < task.motion.axes.size(); ++a)
-      c.row(static_cast<int>(task.motion.axes[a])) +=
-          unknowns.segment(static_cast<Eigen::Index>(a) * kPerAxis, kPerAxis).transpose() * task.grid.basis[node];
+  const auto look = [&](const Coordinates& c) {
     const Vector3 offset = c.col(0).head<3>() - task.motion.origin.translation;
     most = std::max({most, c.col(1).head<3>().norm() / limits.velocity, c.col(2).head<3>().norm() / limits.acceleration,
                      offset.cwiseAbs().maxCoeff() / limits.stroke, std::abs(c(3, 1)) / limits.yaw_velocity,
                      std::abs(c(3, 2)) / limits.yaw_acceleration, std::abs(c(3, 0)) / limits.turn});
     if (task.motion.window == Window::smooth)
       most = std::max({most, c.col(3).head<3>().norm() / limits.jerk, std::abs(c(3, 3)) / limits.yaw_jerk});
-  }
+  };
+  for (int node = 0; node < task.grid.nodes(); ++node)
+    look(moved(task.motion, unknowns, task.grid.basis[node], task.grid.fixed[node]));
+  look(moved(task.motion, unknowns, task.grid.end_basis, task.grid.end_fixed));
   return most;
+}
+
+std::vector<VectorX> carried(const Task& task) {
+  std::vector<VectorX> out;
+  const chain::Chain& chain = task.models.front()->chain;
+  math::Pose base{task.motion.origin.rotation, task.grid.fixed[0].col(0).head<3>()};
+  const auto motions = chain::link_motions(chain, task.initial.theta, base);
+  for (const double part : task.tabletop ? std::vector<double>{0.35, 0.65, 1.0} : std::vector<double>{1.0}) {
+    const double s = part * chain.length;
+    const Vector3 point = motions[chain::link_at(chain, std::min(s, 0.999 * chain.length))] * (s * chain.direction);
+    VectorX q = VectorX::Zero(static_cast<Eigen::Index>(task.motion.axes.size()) * kPerAxis);
+    for (std::size_t a = 0; a < task.motion.axes.size(); ++a) {
+      const Eigen::Index i = static_cast<Eigen::Index>(a) * kPerAxis + kBasisCount;
+      if (task.motion.axes[a] != Axis::yaw && !task.held[i])
+        q[i] = (task.target - point)[static_cast<int>(task.motion.axes[a])];
+    }
+    const double most = load(task, q);
+    if (most > kMostLoad) q *= kMostLoad / most;
+    out.push_back(q);
+  }
+  return out;
 }
 
 VectorX random_unknowns(const Task& task, core::Random& random, double fraction) {

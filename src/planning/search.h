@@ -20,18 +20,20 @@ VectorX unknowns_of(const Motion& motion);
 
 // What one call of minimize() may cost. Damping is a part of the curvature's trace.
 struct Effort {
-  int steps = 10, trials = 8;  // steps taken at most, and lengths tried for each
-  double damping = 1e-2;       // of the first step; small near a solution
-  double more_damping = 6.0;   // times, after a step that did not help
-  double longest = 1e300;      // m, of a step's weights
-  bool hopeful = true;         // evaluate the derivatives with a step's first trial
-  double enough = 0.0;         // m; ends where the miss is smaller, limits and obstacles kept, the rope at rest (table)
+  int steps = 10, evaluations = 80;  // steps taken at most, and rollouts for them
+  double damping = 1e-2;             // of the first step; small near a solution
+  double longest = 1e300;            // m, of a step's weights
+  bool hopeful = true;               // evaluate the derivatives with a step's first trial
+  double enough = 0.0;  // m; ends where the miss is smaller, limits and obstacles kept, the rope at rest (table)
 };
 // Damped Gauss-Newton; ends where nothing changes any more. Returns the evaluations.
 int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, const Effort& effort);
 
 // A random motion whose largest peak is `fraction` of its limit.
 VectorX random_unknowns(const Task& task, core::Random& random, double fraction);
+// Motions that carry a point of the rope as it lies at first to the target, as far as the limits allow.
+std::vector<VectorX> carried(const Task& task);
+inline constexpr double kLeastLoad = 0.25, kMostLoad = 0.95;  // of the limits, of motions to start from
 // The largest peak as a part of its limit, over the grid's nodes.
 double load(const Task& task, const VectorX& unknowns);
 

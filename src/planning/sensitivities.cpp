@@ -96,7 +96,19 @@ Grid make_grid(const Motion& motion, int substeps) {
     grid.basis.push_back(basis(motion.window, last.start, last.duration, grid.time(k)));
     grid.fixed.push_back(coordinates(others, grid.time(k)));
   }
+  constexpr double kBefore = 1e-9;  // s
+  const double before = last.start + last.duration - kBefore;
+  grid.end_basis = basis(motion.window, last.start, last.duration, before);
+  grid.end_fixed = coordinates(others, before);
   return grid;
+}
+
+Coordinates moved(const Motion& motion, const VectorX& unknowns, const Basis& basis, const Coordinates& fixed) {
+  Coordinates out = fixed;
+  for (std::size_t a = 0; a < motion.axes.size(); ++a)
+    out.row(static_cast<int>(motion.axes[a])) +=
+        unknowns.segment(static_cast<Eigen::Index>(a) * kPerAxis, kPerAxis).transpose() * basis;
+  return out;
 }
 
 bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& grid, const VectorX& unknowns,
@@ -105,12 +117,7 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
   const auto columns = static_cast<Eigen::Index>(motion.axes.size()) * kPerAxis;
   CHAINSPLAT_CHECK(unknowns.size() == columns, std::to_string(unknowns.size()));
   out.base.resize(nodes), out.theta.resize(nodes), out.thetadot.resize(nodes);
-  for (int k = 0; k < nodes; ++k) {
-    out.base[k] = grid.fixed[k];
-    for (std::size_t a = 0; a < motion.axes.size(); ++a)
-      out.base[k].row(static_cast<int>(motion.axes[a])) +=
-          unknowns.segment(static_cast<Eigen::Index>(a) * kPerAxis, kPerAxis).transpose() * grid.basis[k];
-  }
+  for (int k = 0; k < nodes; ++k) out.base[k] = moved(motion, unknowns, grid.basis[k], grid.fixed[k]);
   out.theta_slope.resize(derivatives ? nodes : 0), out.thetadot_slope.resize(derivatives ? nodes : 0);
 
   const Eigen::Index p = derivatives ? columns : 0;

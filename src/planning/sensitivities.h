@@ -13,9 +13,13 @@ struct Grid {
   double start = 0.0, step = 0.0;  // s
   std::vector<Basis> basis;        // at every node, of the last piece
   std::vector<Coordinates> fixed;  // of all other pieces
+  Basis end_basis;                 // just before the end, where the jerk jumps
+  Coordinates end_fixed;
   int nodes() const { return static_cast<int>(basis.size()); }
   double time(int node) const { return start + node * step; }
 };
+// What all pieces do together where the last one has these unknowns.
+Coordinates moved(const Motion& motion, const VectorX& unknowns, const Basis& basis, const Coordinates& fixed);
 // `substeps` a 1/30 s.
 Grid make_grid(const Motion& motion, int substeps);
 
