@@ -17,7 +17,7 @@ constexpr double kLeastGiven = 0.1;       // share of them that is never forgott
 constexpr double kAboutPixels = 24.0;     // px about the tube that are told apart from what is far
 constexpr double kDoubt = 2.0;            // a prediction is not as sure as a fit
 constexpr double kLeastEvidence = 0.1;    // nats a sample: less is no rope
-constexpr double kPredictedMargin = 0.4;  // radii, by which the tube at a prediction may be off
+constexpr double kPredictedMargin = 0.7;  // px, by which the tube at a prediction may be off
 constexpr int kColorEvery = 5;            // frames between two lessons in color
 constexpr double kForgetColors = 0.1;     // of the counted colors a lesson
 
@@ -126,7 +126,7 @@ capture::View mask(Live& live, const capture::Image8& recorded, const math::Pose
         colors->object[i] = std::max((1.0 - kForgetColors) * colors->object[i], kLeastGiven * live.given[i]);
         colors->surroundings[i] *= 1.0 - kForgetColors;
       }
-    count_colors(live.look, picture, around, where, live.chain, kPredictedMargin * around.radius, &view);
+    count_colors(live.look, picture, around, where, live.chain, kPredictedMargin, &view);
     settle(live.look);
   }
   return view;
