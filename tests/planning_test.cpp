@@ -326,6 +326,16 @@ TEST_CASE("fixed end, two targets in sequence and a keep-out sphere are kept to"
   }
 }
 
+TEST_CASE("a target behind a keep-out sphere is reached around it") {
+  Problem problem = problem_of(chain::Bending::planar, false);
+  Options options;
+  options.axes = {Axis::x, Axis::z};
+  const Vector3 p = problem.base.translation;
+  problem.targets = {p + Vector3(0.3, 0, -0.25)};
+  options.spheres = {{p + Vector3(0.18, 0, -0.27), 0.03}};
+  CHECK(plan(problem, options).reached);
+}
+
 TEST_CASE("a horizon of its own is the shortest that reaches; samples of the parameters spread the miss") {
   Problem problem = problem_of(chain::Bending::planar, false);
   Options options;

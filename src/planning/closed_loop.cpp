@@ -18,7 +18,8 @@ constexpr double kReplanSmoothness = 1e-8;
 // trace, which limits may dominate; where the rope sticks or a limit is near, full steps fail and much shorter ones do.
 // A target that has moved by centimeters asks for a change of that size; where the curvature is nearly singular full
 // steps are of meters.
-constexpr Effort kReplanEffort{.steps = 2, .evaluations = 9, .damping = 1e-7, .longest = 0.1, .hopeful = false};
+constexpr Effort kReplanEffort{
+    .steps = 2, .evaluations = 9, .damping = 1e-7, .more_damping = 50.0, .longest = 0.1, .hopeful = false};
 // Where that leads to no hit the rest may need another motion altogether: each replan tries one more, the best of a
 // few.
 constexpr double kStuck = 0.003;        // m, a foretold miss

@@ -22,6 +22,7 @@ constexpr double kWorthPolish = 2.0;     // of the tolerance
 constexpr double kEnough = 0.1;          // of the tolerance: no further iteration is made
 constexpr int kFineCost = 2;             // evaluations with coarse steps that one with full steps costs
 constexpr int kMostSpent = 160;          // of them, after which nothing further is tried
+constexpr int kGenerous = 4;             // times as many where there are obstacles, around which few starts lead
 constexpr double kGoodMiss = 0.3;        // of the tolerance: no further start is tried
 constexpr double kStrictLimits = 100.0;  // times the usual weight
 // Starts optimized side by side; the next group only where the last failed.
@@ -166,13 +167,15 @@ bool better(const Found& a, const Found& b, const Options& options) {
   return merit(a, options) < merit(b, options);
 }
 
+int generous(const Task& task) { return task.options->spheres.empty() && task.options->boxes.empty() ? 1 : kGenerous; }
+
 // With coarse steps and a soft minimum that is sharpened.
 Found approach(const Task& coarse, VectorX unknowns) {
   Found found;
   found.unknowns = std::move(unknowns);
   for (const auto& stage : kCoarse)
     found.iterations += minimize(coarse, found.unknowns, {stage.sharpness, stage.smoothness},
-                                 {.steps = stage.steps, .evaluations = stage.evaluations});
+                                 {.steps = stage.steps, .evaluations = generous(coarse) * stage.evaluations});
   judge(coarse, found);
   return found;
 }
@@ -185,16 +188,18 @@ void finish(const Task& fine, Found& found) {
   const Sharpness last{kFinalSharpness, kFinalSmoothness};
   const double enough = kEnough * options.tolerance;
   found.iterations +=
-      minimize(quick, found.unknowns, last, {.steps = kFinalSteps, .evaluations = kFinalEvaluations, .enough = enough});
+      minimize(quick, found.unknowns, last,
+               {.steps = kFinalSteps, .evaluations = generous(fine) * kFinalEvaluations, .enough = enough});
   judge(fine, found);
   if (!std::isfinite(found.hit.miss)) return;
   if (!found.good) {  // a far target pulls harder than the limits push: once more with limits that count more
     quick.limit_weight = kStrictLimits;
-    found.iterations += minimize(quick, found.unknowns, last, {.steps = kFinalSteps, .evaluations = kFinalEvaluations});
+    found.iterations += minimize(quick, found.unknowns, last,
+                                 {.steps = kFinalSteps, .evaluations = generous(fine) * kFinalEvaluations});
     judge(fine, found);
   }
   if (found.good && merit(found, options) <= kGoodMiss * options.tolerance) return;
-  if (!(merit(found, options) <= kWorthPolish * options.tolerance)) return;
+  if (generous(fine) == 1 && !(merit(found, options) <= kWorthPolish * options.tolerance)) return;
   // what is left: the soft minimum likes to stay near for long, and derivatives of lower order end too early
   Task exact = fine;
   exact.limit_weight = quick.limit_weight;
@@ -257,6 +262,7 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
   std::vector<Found> near;  // where a start led with coarse steps, not gone further
   std::optional<Found> best;
   int spent = 0;  // evaluations with coarse steps, or what costs as much
+  const int most_spent = generous(coarse) * kMostSpent;
   const auto go_further = [&](Found found) {
     found.iterations = 0;
     finish(fine, found);
@@ -267,7 +273,7 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
   std::size_t next = 0, next_tip = 0;
   int groups = 0;
   for (const int group : kGroups) {
-    if (spent > kMostSpent || (out_of_reach && groups == kOutOfReach)) break;
+    if (spent > most_spent || (out_of_reach && groups == kOutOfReach)) break;
     ++groups;
     std::vector<std::pair<const Task*, int>> chosen;  // with the start
     if (group > 1 && problem.tabletop && tip_order.empty()) tip_order = ranked(tip);
@@ -293,7 +299,7 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
     if (best && good(*best)) return *best;
     if (best && best->good && models.size() > 1 && group > 1) return *best;
   }
-  for (int i = 0; i < kLastTries && !near.empty() && !(best && (good(*best) || spent > kMostSpent)); ++i) {
+  for (int i = 0; i < kLastTries && !near.empty() && !(best && (good(*best) || spent > most_spent)); ++i) {
     go_further(near.front());
     near.erase(near.begin());
   }

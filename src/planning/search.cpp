@@ -7,7 +7,7 @@ namespace chainsplat::planning {
 namespace {
 
 constexpr double kLeastDamping = 1e-9;
-constexpr double kLessDamping = 0.1, kLeastMore = 4.0, kMostMore = 50.0;  // factors of the damping
+constexpr double kLessDamping = 0.15;
 constexpr double kIdle = 0.03;       // of the squared miss: steps that decrease less are idle
 constexpr int kIdleSteps = 3;        // so many end it
 constexpr double kConverged = 1e-4;  // relative decrease of the objective
@@ -94,6 +94,7 @@ int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, co
   metric /= metric.trace();
   double damping = effort.damping;
   int count = 1, idle = 0;
+  const bool around = !task.options->spheres.empty() || !task.options->boxes.empty();
   for (int taken = 0; taken < effort.steps; ++taken) {
     const bool last = taken + 1 == effort.steps;
     const double scale = now.curvature.trace();
@@ -119,16 +120,16 @@ int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, co
         break;
       }
       if (!(foretold > kNothing)) return count;
-      // the further off, the much shorter the next one
-      const double excess = next.good ? (next.value - now.value) / foretold : kMostMore;
-      damping *= std::clamp(2.0 * (1.0 + excess), kLeastMore, kMostMore);
+      damping *= effort.more_damping;
     }
     const double decrease = now.value - next.value;
     idle = decrease < kIdle * (next.miss * next.miss + next.violation) ? idle + 1 : 0;
     unknowns += step;
     now = std::move(next);
-    damping = std::max(kLeastDamping, damping * std::clamp(1.0 - decrease / foretold, kLessDamping, 1.0));
-    if (done(now) || decrease < kNothing || decrease < kConverged * std::abs(now.value) || idle == kIdleSteps) break;
+    damping = std::max(kLeastDamping, kLessDamping * damping);
+    if (done(now) || decrease < kNothing || decrease < kConverged * std::abs(now.value) ||
+        idle == (around ? effort.steps : kIdleSteps))
+      break;
   }
   return count;
 }

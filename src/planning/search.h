@@ -22,6 +22,7 @@ VectorX unknowns_of(const Motion& motion);
 struct Effort {
   int steps = 10, evaluations = 80;  // steps taken at most, and rollouts for them
   double damping = 1e-2;             // of the first step; small near a solution
+  double more_damping = 6.0;         // times, after a step that did not help
   double longest = 1e300;            // m, of a step's weights
   bool hopeful = true;               // evaluate the derivatives with a step's first trial
   double enough = 0.0;  // m; ends where the miss is smaller, limits and obstacles kept, the rope at rest (table)
