@@ -301,7 +301,7 @@ struct Fit {
 // Levenberg-Marquardt over the first `horizon` seconds of every recording.
 void improve(const Problem& problem, double horizon, bool fine, int iterations, Fit& fit) {
   // relative, below which a horizon is done; on the way to the whole recording a start is enough
-  const double progress = fine ? 1e-9 : 1e-4;
+  const double progress = fine ? 1e-6 : 1e-4;
   Rollouts now(problem, horizon, fine), trial = now;
   if (!now.run(problem, fit.p, true)) {
     fit.cost = kInfinity;
