@@ -1,4 +1,6 @@
 // chainsplat.cpp - the program: global options, commands, and what becomes of an error.
+#include <malloc.h>
+
 #include <CLI/CLI.hpp>
 #include <csignal>
 #include <cstdio>
@@ -107,7 +109,16 @@ int run(int argc, char** argv) {
 
 }  // namespace
 
+// Memory that short-lived threads have freed stays in their arenas: 0.8 MiB more a training in one process with glibc's
+// eight a core, 0.1 MiB with one.
+static void keep_memory_together() {
+#ifdef __GLIBC__
+  mallopt(M_ARENA_MAX, 1);
+#endif
+}
+
 int main(int argc, char** argv) {
+  keep_memory_together();
   std::signal(SIGXFSZ, SIG_IGN);  // a file size limit is an error of write(), not an end without a word
   try {
     return run(argc, argv);
