@@ -155,7 +155,6 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
                                   static_cast<int>(kFirstShare * budget), random);
   }
 
-  const int batch_size = std::min<int>(kBatch, static_cast<int>(training.views.size()));
   double loss = NAN, psnr = NAN;
   const auto checkpoint = [&](int round, int step) {
     if (options.checkpoint.empty()) return;
@@ -179,18 +178,9 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   const auto adam = [&](int round, int first_step, core::Random& random) {
     const std::string note =
         round < kRounds ? "round " + std::to_string(round + 1) + " of " + std::to_string(kRounds) : "last polish";
-    std::vector<int> order(training.views.size());
-    std::iota(order.begin(), order.end(), 0);
-    std::size_t next = order.size();
+    ViewDeck deck;
     for (int step = 0; step < (round < kRounds ? kSteps : kFinalSteps); ++step) {
-      std::vector<int> batch;
-      while (static_cast<int>(batch.size()) < batch_size) {
-        if (next == order.size()) {
-          for (std::size_t i = order.size() - 1; i > 0; --i) std::swap(order[i], order[random.next() % (i + 1)]);
-          next = 0;
-        }
-        batch.push_back(order[next++]);
-      }
+      const std::vector<int> batch = draw_batch(deck, kBatch, static_cast<int>(training.views.size()), random);
       if (step < first_step) continue;
       if (const int signal = core::stop_requested()) {
         checkpoint(round, step);

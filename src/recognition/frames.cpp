@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numeric>
 
 namespace chainsplat::recognition {
 
@@ -39,6 +40,27 @@ std::vector<math::Pose> view_motions(const chain::Chain& chain, const capture::C
   if (std::abs(view.time - frame.time) > kSameTime)
     at_view += chain::interpolate(states, view.time) - states.theta[frame_index];
   return chain::link_motions(chain, at_view, capture.base.pose(view.time));
+}
+
+void shuffle(std::vector<int>& order, core::Random& random) {
+  for (std::size_t i = order.size(); i-- > 1;) std::swap(order[i], order[random.next() % (i + 1)]);
+}
+
+std::vector<int> draw_batch(ViewDeck& deck, int size, int count, core::Random& random) {
+  if (deck.order.empty()) {
+    deck.order.resize(count);
+    std::iota(deck.order.begin(), deck.order.end(), 0);
+    deck.next = deck.order.size();
+  }
+  std::vector<int> batch;
+  while (static_cast<int>(batch.size()) < std::min(size, count)) {
+    if (deck.next == deck.order.size()) {
+      shuffle(deck.order, random);
+      deck.next = 0;
+    }
+    batch.push_back(deck.order[deck.next++]);
+  }
+  return batch;
 }
 
 splat::ViewSpec view_spec(const capture::Capture& capture, const capture::View& view, std::vector<math::Pose> motions) {

@@ -4,6 +4,7 @@
 
 #include "chainsplat/capture.h"
 #include "chainsplat/chain.h"
+#include "chainsplat/core.h"
 #include "chainsplat/splat.h"
 
 namespace chainsplat::recognition {
@@ -21,6 +22,16 @@ std::vector<FrameViews> assign_views(const capture::Capture& capture, const std:
 std::vector<math::Pose> view_motions(const chain::Chain& chain, const capture::Capture& capture,
                                      const chain::States& states, const FrameViews& frame, int frame_index,
                                      const math::VectorX& theta, const capture::View& view);
+
+void shuffle(std::vector<int>& order, core::Random& random);
+
+// Draws views without repetition until all were used, then anew in another order.
+struct ViewDeck {
+  std::vector<int> order;
+  std::size_t next = 0;
+};
+// `size` of `count` views; fewer where there are not so many.
+std::vector<int> draw_batch(ViewDeck& deck, int size, int count, core::Random& random);
 
 splat::ViewSpec view_spec(const capture::Capture& capture, const capture::View& view, std::vector<math::Pose> motions);
 

@@ -208,7 +208,7 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
     }
     save_checkpoint(c, options.checkpoint);
   };
-  std::vector<std::size_t> order;
+  std::vector<int> order;
   for (int iteration = first; iteration < options.paper_iterations; ++iteration) {
     if (const int signal = core::stop_requested()) {
       checkpoint(iteration);
@@ -218,12 +218,12 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
     // draws the same ones
     const std::size_t count = views.size(), place = static_cast<std::size_t>(iteration) % count;
     if (place == 0 || order.empty()) {
-      core::Random shuffle(options.seed * 1000003 + 17 + static_cast<std::uint64_t>(iteration) / count * 7919);
+      core::Random random_order(options.seed * 1000003 + 17 + static_cast<std::uint64_t>(iteration) / count * 7919);
       order.resize(count);
       std::iota(order.begin(), order.end(), 0);
-      for (std::size_t i = count - 1; i > 0; --i) std::swap(order[i], order[shuffle.next() % (i + 1)]);
+      shuffle(order, random_order);
     }
-    const std::size_t v = order[place];
+    const auto v = static_cast<std::size_t>(order[place]);
     const double fraction = static_cast<double>(iteration) / options.paper_iterations;
     splat::AdamRates rates;
     rates.mean = static_cast<float>(extent * kMeanRateFirst * std::pow(kMeanRateLast / kMeanRateFirst, fraction));

@@ -1,7 +1,6 @@
 // proceed.cpp - the halves of a round of `fast` by themselves, each from a recognized twin's values.
 #include <algorithm>
 #include <cmath>
-#include <numeric>
 
 #include "src/recognition/modes.h"
 
@@ -52,20 +51,10 @@ void polish(gpu::Device& device, const capture::Capture& capture, const chain::C
   engine.set_views(specs, targets);
   engine.set_gaussians(gaussians);
   core::Random random(seed * 1000003 + 7001);
-  std::vector<int> order(specs.size());
-  std::iota(order.begin(), order.end(), 0);
-  std::size_t next = order.size();
-  const std::size_t batch_size = std::min<std::size_t>(kBatch, specs.size());
+  ViewDeck deck;
   for (int step = 0; step < steps; ++step) {
     if (const int signal = core::stop_requested()) throw Interrupted(signal);
-    std::vector<int> batch;
-    while (batch.size() < batch_size) {
-      if (next == order.size()) {
-        for (std::size_t i = order.size() - 1; i > 0; --i) std::swap(order[i], order[random.next() % (i + 1)]);
-        next = 0;
-      }
-      batch.push_back(order[next++]);
-    }
+    const std::vector<int> batch = draw_batch(deck, kBatch, static_cast<int>(specs.size()), random);
     engine.step(batch, kLossWeights, rates(static_cast<double>(step) / steps, 1.0), false);
   }
   gaussians = engine.gaussians();
