@@ -1,6 +1,5 @@
 // bench.cpp - fixed benchmarks of drawing and training, defined here and seeded, so that two machines measure the same
 // work.
-#include <malloc.h>
 #include <sys/resource.h>
 #include <unistd.h>
 
@@ -25,6 +24,7 @@
 #include "chainsplat/splat.h"
 #include "cli.h"
 #include "identify.h"
+#include "memory.h"
 #include "run_folder.h"
 
 namespace chainsplat::tools {
@@ -173,9 +173,7 @@ double peak_memory_mib() {
 // What the process holds now, MiB; 0 where the system does not say. What was freed is handed back first: how much of it
 // malloc keeps for later changes from time to time.
 double memory_mib() {
-#ifdef __GLIBC__
-  malloc_trim(0);
-#endif
+  trim_memory();
   std::ifstream file("/proc/self/statm");
   double all = 0.0, resident = 0.0;
   file >> all >> resident;

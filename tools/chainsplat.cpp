@@ -1,6 +1,4 @@
 // chainsplat.cpp - the program: global options, commands, and what becomes of an error.
-#include <malloc.h>
-
 #include <CLI/CLI.hpp>
 #include <csignal>
 #include <cstdio>
@@ -8,6 +6,7 @@
 #include <iostream>
 
 #include "cli.h"
+#include "memory.h"
 
 using namespace chainsplat;
 
@@ -109,16 +108,8 @@ int run(int argc, char** argv) {
 
 }  // namespace
 
-// Memory that short-lived threads have freed stays in their arenas: 0.8 MiB more a training in one process with glibc's
-// eight a core, 0.1 MiB with one.
-static void keep_memory_together() {
-#ifdef __GLIBC__
-  mallopt(M_ARENA_MAX, 1);
-#endif
-}
-
 int main(int argc, char** argv) {
-  keep_memory_together();
+  tools::keep_memory_together();
   std::signal(SIGXFSZ, SIG_IGN);  // a file size limit is an error of write(), not an end without a word
   try {
     return run(argc, argv);

@@ -1,6 +1,4 @@
 // train.cpp - train, recognize: load -> recognize -> identify -> roll out -> evaluate -> save.
-#include <malloc.h>
-
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <array>
@@ -18,6 +16,7 @@
 #include "cli.h"
 #include "identify.h"
 #include "joint.h"
+#include "memory.h"
 #include "picture.h"
 #include "run_folder.h"
 
@@ -65,13 +64,6 @@ std::map<std::string, std::string> recognition_options(const Request& request) {
   return {
       {"joints", std::to_string(request.joints)}, {"bending", request.bending}, {"twist", request.twist ? "yes" : "no"},
       {"every", std::to_string(request.every)},   {"frames", request.frames},   {"mode", request.mode}};
-}
-
-// Gives back to the system what a stage has freed, so that the next one's need does not come on top of it.
-void trim_memory() {
-#ifdef __GLIBC__
-  malloc_trim(0);
-#endif
 }
 
 void stop_if_asked() {
@@ -252,7 +244,7 @@ void train(const Globals& globals, const Request& request) {
     core::write_file(out / kBaseFile, trajectory::write_tum(capture.base.samples()));
     if (recognize) {
       recognize_stage(twin, covariances, *device, capture, request, globals);
-      trim_memory();
+      trim_memory();  // or the next stage's need comes on top
       if (!covariances.empty()) core::write_file(out / kCovarianceFile, covariance_csv(twin.states, covariances));
       twin::save(twin, out);  // what comes later can fail without losing this
       stop_if_asked();
