@@ -54,7 +54,8 @@ struct Follower {
 
 struct FollowOptions {
   int drop = 1;
-  double base_end = std::numeric_limits<double>::infinity();  // s, until when the base's motion is known
+  double base_start = -std::numeric_limits<double>::infinity();  // s, from when the base's motion is known
+  double base_end = std::numeric_limits<double>::infinity();     // s, and until when
   std::string base_name;
 };
 
@@ -66,7 +67,10 @@ void follow(FrameSource& source, const Follower& follower, const dynamics::BaseF
   for (int read = 0; source.next(frame); ++read) {
     if (core::stop_requested()) throw Interrupted(core::stop_requested());
     if (read % options.drop != 0) continue;
-    constexpr double kSlack = 1.0 / 30.0;  // s, a frame beyond the last sample
+    constexpr double kSlack = 1.0 / 30.0;  // s, a frame beyond the first or last sample
+    if (read == 0 && frame.time < options.base_start - kSlack)
+      core::warn(options.base_name + ": the base motion begins " + core::exact(options.base_start - frame.time) +
+                 " s after the first frame; until then the base is assumed to rest where it begins");
     if (frame.time > options.base_end + kSlack)
       throw WorkError(options.base_name,
                       "the base motion ends at " + core::exact(options.base_end) + " s, before frame " +
@@ -152,6 +156,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
     core::warn(request.run + ": its dynamics are not identified; angles are assumed to go on at constant rate");
 
   request.source.pictures = request.serve > 0;
+  watch_signals();  // a camera never ends by itself
   FrameSource source = open_frames(request.source);
   std::optional<Window> window;
   if (request.serve > 0) {
@@ -172,7 +177,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   FollowOptions options;
   options.drop = request.drop;
   options.base_name = request.base.empty() ? request.source.camera : request.base;
-  if (base.samples().size() > 1) options.base_end = base.end();
+  if (base.samples().size() > 1) options.base_start = base.start(), options.base_end = base.end();
   estimation::Filter filter = estimation::start(
       twin, source.cameras, [&](double time) { return base.at(time); }, base.start());
   gpu::DevicePtr device;
@@ -333,6 +338,12 @@ void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("FILE.json");
   command->add_option("--rate", request->source.rate, "Frames a second (default: the calibration's, else the video's)")
       ->type_name("HZ");
+  command
+      ->add_option(
+          "--start", request->source.start,
+          "Time of the first frame by the base motion's clock (default: the calibration's, else 0); 'unix': a\n"
+          "device's own time stamps in Unix time, for a base motion that is stamped so")
+      ->type_name("SECONDS|unix");
   command->add_option("--base", request->base, "Base motion (default: the capture's; with --calibration at rest)")
       ->type_name("FILE.tum");
   command

@@ -1,8 +1,14 @@
 #include "frame_source.h"
 
+#include <poll.h>
+#include <unistd.h>
+
 #include <algorithm>
+#include <cerrno>
+#include <chrono>
 #include <cmath>
-#include <cstdio>
+#include <cstdlib>
+#include <cstring>
 #include <nlohmann/json.hpp>
 
 #include "cli.h"
@@ -63,16 +69,44 @@ capture::Camera read_calibration(const std::string& file, double& rate, double& 
   return camera;
 }
 
-// Raw RGB24 from standard input; an incomplete last frame ends the work.
+double seconds(const std::string& text) {
+  char* end = nullptr;
+  const double value = std::strtod(text.c_str(), &end);
+  if (text.empty() || *end || !std::isfinite(value))
+    throw InputError("--start", "'" + text + "' is no time", "give seconds, or 'unix' for a device");
+  return value;
+}
+
+// Raw RGB24 from standard input; an incomplete last frame ends the work. Throws Interrupted where it waits.
 bool read_raw(const capture::Camera& camera, capture::Image8& image) {
+  constexpr int kAttention = 50;  // ms, to a request to stop
   image.width = camera.width, image.height = camera.height, image.channels = 3;
   image.pixels.resize(3 * static_cast<std::size_t>(camera.width) * camera.height);
-  const std::size_t got = std::fread(image.pixels.data(), 1, image.pixels.size(), stdin);
+  std::size_t got = 0;
+  while (got < image.pixels.size()) {
+    if (const int signal = core::stop_requested()) throw Interrupted(signal);
+    pollfd input{STDIN_FILENO, POLLIN, 0};
+    if (::poll(&input, 1, kAttention) <= 0) continue;
+    const ssize_t count = ::read(STDIN_FILENO, &image.pixels[got], image.pixels.size() - got);
+    if (count < 0 && errno != EINTR && errno != EAGAIN)
+      throw WorkError("standard input", std::string("cannot be read (") + std::strerror(errno) + ")",
+                      "the states so far are kept");
+    if (count == 0) break;
+    got += static_cast<std::size_t>(std::max<ssize_t>(0, count));
+  }
   if (got == image.pixels.size()) return true;
   if (got != 0)
     throw WorkError("standard input", "ends within a frame",
                     "send whole frames of the calibration's size; the states so far are kept");
   return false;
+}
+
+// What to add to a device's time stamp to have it in Unix time. Most drivers stamp by the monotonic clock, some in Unix
+// time already.
+double until_unix(double stamp) {
+  const auto seconds = [](auto time) { return std::chrono::duration<double>(time.time_since_epoch()).count(); };
+  const double monotonic = seconds(std::chrono::steady_clock::now()), unix = seconds(std::chrono::system_clock::now());
+  return std::abs(stamp - monotonic) < std::abs(stamp - unix) ? unix - monotonic : 0.0;
 }
 
 // A capture, loaded and checked as a whole.
@@ -137,25 +171,32 @@ FrameSource open_stream(const SourceRequest& request) {
         request.camera, 1, capture::DeviceFormat{.width = camera.width, .height = camera.height, .rate = rate});
     if (rate <= 0.0) rate = reader->rate();
   }
-  const bool own_clock = reader && reader->device();  // frames that were dropped leave a gap in time
-  if (!own_clock && (!(rate > 0.0) || !std::isfinite(rate)))
+  const bool device = reader && reader->device();
+  if (!device && (!(rate > 0.0) || !std::isfinite(rate)))
     throw InputError("--rate", "is needed to know the frames' times", "give frames a second, for example 30");
+  const bool unix = request.start == "unix";
+  if (unix && !device) throw InputError("--start", "only a device stamps its frames", "give seconds");
+  if (!request.start.empty() && !unix) start = seconds(request.start);
   const std::string where = request.camera == "-" ? "standard input" : request.camera;
-  source.next = [camera = source.cameras[0], request, reader, rate, start, where, own_clock, count = 0,
-                 begun = 0.0](LiveFrame& frame) mutable {
+  // a device has a clock of its own, so that frames which were passed over leave a gap in time
+  std::optional<double> offset;  // from that clock to ours
+  source.next = [camera = source.cameras[0], request, reader, rate, start, where, device, unix, offset,
+                 count = 0](LiveFrame& frame) mutable {
     do {
       if (request.last >= 0 && count >= request.last) return false;
       if (!(reader ? reader->next(frame.picture) : read_raw(camera, frame.picture))) return false;
+      frame.frame = device ? reader->frames() - 1 : count;
+      if (request.last >= 0 && frame.frame >= request.last) return false;
       if (frame.picture.width != camera.width || frame.picture.height != camera.height)
         throw WorkError(where,
-                        "frame " + std::to_string(count) + " has " + std::to_string(frame.picture.width) + "x" +
+                        "frame " + std::to_string(frame.frame) + " has " + std::to_string(frame.picture.width) + "x" +
                             std::to_string(frame.picture.height) + " pixels, the calibration says " +
                             std::to_string(camera.width) + "x" + std::to_string(camera.height),
                         "give the calibration of this camera; the states so far are kept");
-    } while (count++ < request.first);
-    frame.frame = count - 1;
-    if (own_clock && frame.frame == request.first) begun = reader->time();
-    frame.time = own_clock ? start + reader->time() - begun : start + frame.frame / rate;
+      count = frame.frame + 1;
+    } while (frame.frame < request.first);
+    if (device && !offset) offset = unix ? until_unix(reader->time()) : start - reader->time();
+    frame.time = device ? reader->time() + *offset : start + frame.frame / rate;
     frame.views.clear();
     frame.arrived = core::seconds_now();
     return true;
@@ -166,6 +207,8 @@ FrameSource open_stream(const SourceRequest& request) {
 }  // namespace
 
 FrameSource open_frames(const SourceRequest& request) {
+  if (request.calibration.empty() && !request.start.empty())
+    throw InputError("--start", "a capture has times of its own", "leave it out");
   return request.calibration.empty() ? open_capture(request) : open_stream(request);
 }
 

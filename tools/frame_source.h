@@ -24,6 +24,7 @@ struct SourceRequest {
   std::string camera;       // CAPTURE, CAPTURE:NAME; with `calibration` a video file, a device under /dev or "-"
   std::string calibration;  // camera object as in capture.json
   double rate = 0.0;        // frames a second; 0: the calibration's, else the video's
+  std::string start;        // s, of the first frame, or "unix": a device's stamps in Unix time; "": the calibration's
   int first = 0, last = -1;
   bool pictures = false;  // whole frames of a capture too (its first camera)
 };

@@ -76,8 +76,8 @@ struct LoadOptions {
 // Loads and checks. `path` is the folder or its capture.json. Throws InputError; unknown keys and other doubts warn.
 Capture load(const Path& path, const LoadOptions& options = {});
 
-// What evaluation compares with: recorded pixels, and depth where the capture has it. `loaded` came from the same path and
-// options; where no camera has lens distortion it shows these pixels already, and nothing is decoded again.
+// What evaluation compares with: recorded pixels, and depth where the capture has it. `loaded` came from the same path
+// and options; where no camera has lens distortion it shows these pixels already, and nothing is decoded again.
 Capture load_recorded(Capture loaded, const Path& path, LoadOptions options = {});
 
 // The text and the verdict of `chainsplat check`. `problems` would make load() throw, `doubts` are warnings.
@@ -117,8 +117,9 @@ struct DeviceFormat {  // asked of a camera; 0: its own choice
 
 class VideoReader {
  public:
-  // A file, a pipe, or the camera behind a character device (V4L2): then `format` is asked for, and a camera that
-  // disappears is a frame that cannot be decoded.
+  // A file, a pipe, or the camera behind a character device (V4L2), of which `format` is asked. Of a camera every frame
+  // is the newest: those that came meanwhile are passed over, and so are damaged ones. next() throws WorkError when it
+  // disappears or is silent for 5 s, Interrupted when a stop is requested while it waits.
   explicit VideoReader(const Path& file, int threads = 1, const DeviceFormat& format = {});
   ~VideoReader();
   VideoReader(VideoReader&&) noexcept;
@@ -126,6 +127,7 @@ class VideoReader {
   bool next(Image8& rgb);  // false at the end; reuses the memory of `rgb`
   bool skip();             // the same without the conversion to RGB
   bool device() const;     // a camera, not a recording
+  int frames() const;      // that came so far, with those that were passed over
   double rate() const;     // mean frames a second that the stream claims, 0 when unknown
   double time() const;     // s, of the last frame by the stream's clock; NaN when it has none
 

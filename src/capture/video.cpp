@@ -9,11 +9,15 @@ extern "C" {
 
 #include <unistd.h>
 
+#include <atomic>
+#include <chrono>
 #include <cmath>
+#include <condition_variable>
 #include <cstring>
 #include <limits>
 #include <mutex>
 #include <new>
+#include <thread>
 
 #include "chainsplat/capture.h"
 
@@ -68,30 +72,68 @@ bool is_device(const Path& file) {
   return std::filesystem::is_character_file(file, error);
 }
 
+// `encoding` as libavcodec calls it; empty: the first of libavdevice's list that the camera has. It begins with raw
+// ones.
+Opened open_camera(const Path& file, const DeviceFormat& format, const char* encoding = "") {
+  avdevice_register_all();
+  AVDictionary* asked = nullptr;
+  if (format.width > 0 && format.height > 0)
+    av_dict_set(&asked, "video_size", (std::to_string(format.width) + "x" + std::to_string(format.height)).c_str(), 0);
+  if (format.rate > 0.0) av_dict_set(&asked, "framerate", core::exact(format.rate).c_str(), 0);
+  if (*encoding) av_dict_set(&asked, "input_format", encoding, 0);
+  AVFormatContext* raw = avformat_alloc_context();
+  if (!raw) throw std::bad_alloc();
+  raw->flags |= AVFMT_FLAG_NONBLOCK;  // a camera may fall silent, and whoever waits for it must be able to leave
+  const int code = avformat_open_input(&raw, file.c_str(), av_find_input_format("video4linux2"), &asked);
+  av_dict_free(&asked);
+  if (code < 0)
+    throw InputError(file.string(), "is no camera that V4L2 can read in this format (" + error_text(code) + ")",
+                     "'v4l2-ctl --list-devices' and '--list-formats-ext' show what there is");
+  return {Owned<AVFormatContext>(raw), 0};
+}
+
+double claimed_rate(const AVStream& video) {
+  const AVRational rate = video.avg_frame_rate;
+  return rate.num > 0 && rate.den > 0 ? av_q2d(rate) : 0.0;
+}
+
+// Raw frames where the camera has them in the size and at the rate that were asked for. On USB 2 it often has them
+// small or slow only, and larger or faster ones as JPEG.
+Opened open_camera_as_asked(const Path& file, const DeviceFormat& format) {
+  constexpr double kEnough = 0.95;  // of the rate
+  const auto merit = [&](const Opened& opened) {
+    const AVCodecParameters& is = *opened.video().codecpar;
+    const bool sized = format.width <= 0 || (is.width == format.width && is.height == format.height);
+    return std::pair(sized, std::min(format.rate, claimed_rate(opened.video())));
+  };
+  Opened opened = open_camera(file, format);
+  if (const auto raw = merit(opened); raw < std::pair(true, kEnough * format.rate)) {
+    opened.format.reset();  // a camera has one reader at a time
+    try {
+      opened = open_camera(file, format, "mjpeg");
+    } catch (const InputError&) {
+    }
+    if (!opened.format || merit(opened) <= raw) {
+      opened.format.reset();
+      opened = open_camera(file, format);
+    }
+  }
+  if (const auto [sized, rate] = merit(opened); sized && rate > 0.0 && rate < kEnough * format.rate)
+    core::warn(file.string() + ": gives " + core::exact(rate) + " frames a second in this size instead of " +
+               core::exact(format.rate));
+  return opened;
+}
+
 Opened open_video(const Path& file, const DeviceFormat& format = {}) {
   silence();
   std::error_code error;
   if (!std::filesystem::exists(file, error)) throw InputError(file.string(), "does not exist", "check the path");
+  if (is_device(file)) return open_camera_as_asked(file, format);
   AVFormatContext* raw = nullptr;
-  int code = 0;
-  if (is_device(file)) {
-    avdevice_register_all();
-    AVDictionary* asked = nullptr;
-    if (format.width > 0 && format.height > 0)
-      av_dict_set(&asked, "video_size", (std::to_string(format.width) + "x" + std::to_string(format.height)).c_str(),
-                  0);
-    if (format.rate > 0.0) av_dict_set(&asked, "framerate", core::exact(format.rate).c_str(), 0);
-    code = avformat_open_input(&raw, file.c_str(), av_find_input_format("video4linux2"), &asked);
-    av_dict_free(&asked);
-    if (code < 0)
-      throw InputError(file.string(), "is no camera that V4L2 can read in this format (" + error_text(code) + ")",
-                       "'v4l2-ctl --list-devices' and '--list-formats-ext' show what there is");
-  } else {
-    code = avformat_open_input(&raw, file.c_str(), nullptr, nullptr);
-    if (code < 0)
-      throw InputError(file.string(), "is not a readable video (" + error_text(code) + ")",
-                       "write it again, or name an image pattern like cam0/%06d.png");
-  }
+  int code = avformat_open_input(&raw, file.c_str(), nullptr, nullptr);
+  if (code < 0)
+    throw InputError(file.string(), "is not a readable video (" + error_text(code) + ")",
+                     "write it again, or name an image pattern like cam0/%06d.png");
   Opened opened{Owned<AVFormatContext>(raw), 0};
   code = avformat_find_stream_info(raw, nullptr);
   if (code >= 0) code = av_find_best_stream(raw, AVMEDIA_TYPE_VIDEO, -1, -1, nullptr, 0);
@@ -99,6 +141,79 @@ Opened open_video(const Path& file, const DeviceFormat& format = {}) {
   opened.stream = code;
   return opened;
 }
+
+// Fetches a camera's frames as they come and keeps the newest. Whoever is slower than the camera misses frames; in the
+// driver's queue they would grow old instead, up to 32 of them.
+class NewestFrame {
+ public:
+  explicit NewestFrame(AVFormatContext& camera) : thread_([this, &camera] { fetch(camera); }) {}
+  ~NewestFrame() {
+    stop_ = true;
+    thread_.join();
+  }
+
+  // The newest frame that was not taken before, into `packet`, and how many came until then. Waits for it as long as a
+  // camera may be silent; a libav code below 0 when it does not come any more. Throws Interrupted.
+  int take(AVPacket& packet, int& received) {
+    constexpr double kSilence = 5.0;                     // s
+    constexpr std::chrono::milliseconds kAttention{50};  // to a request to stop
+    const double begun = core::seconds_now();
+    std::unique_lock lock(mutex_);
+    while (!fresh_) {
+      if (code_ < 0) return code_;
+      if (const int signal = core::stop_requested()) throw Interrupted(signal);
+      if (core::seconds_now() - begun > kSilence) return AVERROR(ETIMEDOUT);
+      came_.wait_for(lock, kAttention);
+    }
+    fresh_ = false;
+    received = received_;
+    av_packet_unref(&packet);
+    av_packet_move_ref(&packet, newest_.get());
+    return 0;
+  }
+
+ private:
+  void fetch(AVFormatContext& camera) {
+    constexpr std::chrono::milliseconds kPause{1};  // well below the time between two frames
+    const Owned<AVPacket> packet(av_packet_alloc()), last(av_packet_alloc());
+    int count = 0, last_count = 0;
+    while (!stop_) {
+      const int code = av_read_frame(&camera, packet.get());
+      if (code >= 0) {
+        ++count;
+        if (packet->size > 0) {  // else it was damaged on its way
+          av_packet_unref(last.get());
+          av_packet_move_ref(last.get(), packet.get());
+          last_count = count;
+        }
+        av_packet_unref(packet.get());
+        continue;
+      }
+      // all that had queued has been read
+      if (last->size > 0 || code != AVERROR(EAGAIN)) {
+        const std::lock_guard lock(mutex_);
+        if (last->size > 0) {
+          av_packet_unref(newest_.get());
+          av_packet_move_ref(newest_.get(), last.get());
+          received_ = last_count;
+          fresh_ = true;
+        }
+        if (code != AVERROR(EAGAIN)) code_ = code;
+        came_.notify_one();
+      }
+      if (code_ < 0) return;
+      std::this_thread::sleep_for(kPause);
+    }
+  }
+
+  std::mutex mutex_;
+  std::condition_variable came_;
+  std::atomic<bool> stop_{false};
+  bool fresh_ = false;
+  int received_ = 0, code_ = 0;
+  Owned<AVPacket> newest_{av_packet_alloc()};
+  std::thread thread_;  // last: it uses all others
+};
 
 bool full_range(const AVFrame& frame) {
   switch (frame.format) {
@@ -137,10 +252,12 @@ struct VideoReader::Implementation {
   Owned<SwsContext> scaler;
   Owned<AVFrame> converted;
   int scaler_width = 0, scaler_height = 0, scaler_format = -1, scaler_matrix = -1;
-  bool scaler_full = false, at_end = false, device = false;
+  bool scaler_full = false, at_end = false;
   int frames = 0;
+  std::unique_ptr<NewestFrame> camera;  // none: a recording
 
   bool decode();
+  void decode_newest();
   void convert(Image8& rgb);
 };
 
@@ -148,7 +265,6 @@ VideoReader::VideoReader(const Path& file, int threads, const DeviceFormat& form
     : implementation_(std::make_unique<Implementation>()) {
   Implementation& self = *implementation_;
   self.file = file;
-  self.device = is_device(file);
   self.input = open_video(file, format);
   const AVCodecParameters& parameters = *self.input.video().codecpar;
   const AVCodec* codec = avcodec_find_decoder(parameters.codec_id);
@@ -161,6 +277,14 @@ VideoReader::VideoReader(const Path& file, int threads, const DeviceFormat& form
   self.decoder->pkt_timebase = self.input.video().time_base;
   const int code = avcodec_open2(self.decoder.get(), codec, nullptr);
   if (code < 0) throw InputError(file.string(), "cannot be decoded (" + error_text(code) + ")", "write it as H.264");
+  if (!is_device(file)) return;
+  const AVCodecDescriptor* kind = avcodec_descriptor_get(parameters.codec_id);
+  if (!kind || !(kind->props & AV_CODEC_PROP_INTRA_ONLY))
+    throw InputError(file.string(),
+                     std::string("sends ") + avcodec_get_name(parameters.codec_id) +
+                         ", whose frames cannot be read without the ones before",
+                     "set it to raw frames or MJPEG");
+  self.camera = std::make_unique<NewestFrame>(*self.input.format);
 }
 
 VideoReader::~VideoReader() = default;
@@ -169,6 +293,10 @@ VideoReader& VideoReader::operator=(VideoReader&&) noexcept = default;
 
 // Decodes the next frame in display order into `frame`; false at the end.
 bool VideoReader::Implementation::decode() {
+  if (camera) {
+    decode_newest();
+    return true;
+  }
   for (;;) {
     int code = avcodec_receive_frame(decoder.get(), frame.get());
     if (code >= 0) return true;
@@ -186,10 +314,25 @@ bool VideoReader::Implementation::decode() {
       }
     }
     if (code < 0)
-      throw InputError(
-          file.string() + ": frame " + std::to_string(frames),
-          device ? "cannot be read (" + error_text(code) + ")" : "cannot be decoded (" + error_text(code) + ")",
-          device ? "check the camera and its cable" : "write the video again");
+      throw InputError(file.string() + ": frame " + std::to_string(frames),
+                       "cannot be decoded (" + error_text(code) + ")", "write the video again");
+  }
+}
+
+// The newest frame of a camera that can be decoded, into `frame`.
+void VideoReader::Implementation::decode_newest() {
+  for (;;) {
+    int code = camera->take(*packet, frames);
+    if (code < 0)
+      throw WorkError(file.string(),
+                      "gives no more frames after " + std::to_string(frames) + " (" +
+                          (code == AVERROR(ETIMEDOUT) ? "silent" : error_text(code)) + ")",
+                      "check the camera and its cable");
+    code = avcodec_send_packet(decoder.get(), packet.get());
+    av_packet_unref(packet.get());
+    if (code >= 0) code = avcodec_receive_frame(decoder.get(), frame.get());
+    if (code >= 0) return;
+    avcodec_flush_buffers(decoder.get());  // damaged on its way: the next one will do
   }
 }
 
@@ -231,22 +374,21 @@ void VideoReader::Implementation::convert(Image8& rgb) {
 bool VideoReader::next(Image8& rgb) {
   if (!implementation_->decode()) return false;
   implementation_->convert(rgb);
-  ++implementation_->frames;
+  if (!device()) ++implementation_->frames;
   return true;
 }
 
 bool VideoReader::skip() {
   if (!implementation_->decode()) return false;
-  ++implementation_->frames;
+  if (!device()) ++implementation_->frames;
   return true;
 }
 
-bool VideoReader::device() const { return implementation_->device; }
+bool VideoReader::device() const { return implementation_->camera != nullptr; }
 
-double VideoReader::rate() const {
-  const AVRational rate = implementation_->input.video().avg_frame_rate;
-  return rate.num > 0 && rate.den > 0 ? av_q2d(rate) : 0.0;
-}
+int VideoReader::frames() const { return implementation_->frames; }
+
+double VideoReader::rate() const { return claimed_rate(implementation_->input.video()); }
 
 double VideoReader::time() const {
   const std::int64_t stamp = implementation_->frame->best_effort_timestamp;
@@ -260,8 +402,7 @@ VideoFacts video_facts(const Path& file) {
   VideoFacts facts;
   facts.width = video.codecpar->width;
   facts.height = video.codecpar->height;
-  const AVRational rate = video.avg_frame_rate;
-  facts.rate = rate.num > 0 && rate.den > 0 ? av_q2d(rate) : 0.0;
+  facts.rate = claimed_rate(video);
   Owned<AVPacket> packet(av_packet_alloc());
   while (av_read_frame(input.format.get(), packet.get()) >= 0) {
     if (packet->stream_index == input.stream && !(packet->flags & AV_PKT_FLAG_DISCARD)) ++facts.frames;
