@@ -263,6 +263,42 @@ TEST_CASE("empty masks, false blobs, occluders and wide masks") {
   CHECK(blind.covered == 0.0);
 }
 
+TEST_CASE("a mask that is shifted in the image is told from a rope that is elsewhere, by the grasp") {
+  const Chain chain = rope(Bending::planar);
+  const int n = chain.angles();
+  const VectorX theta = bent(chain, 1.0), zero = VectorX::Zero(n);
+  const Scene scene(chain, theta);
+  const MatrixX truth = points(chain, theta, scene.base);
+  constexpr double kDeviation = 0.5;  // px, of the shift a priori
+  for (const math::Vector2& shift : {math::Vector2(0.0, 0.0), math::Vector2(0.6, 0.8)}) {
+    CAPTURE(shift.x());
+    Scene shifted = scene;
+    // a camera whose optical axis is elsewhere draws the rope elsewhere
+    shifted.cameras[0].cx += shift.x();
+    shifted.cameras[0].cy += shift.y();
+    shifted.views[0] = draw(chain, theta, scene.base, shifted.cameras[0], 0, 0, 0.0);
+    shifted.cameras[0] = scene.cameras[0];
+    silhouette::Options in_place, free;
+    in_place.prior.mean = zero;
+    in_place.prior.information = MatrixX::Identity(n, n);
+    free.prior.mean = VectorX::Zero(n + 2);
+    free.prior.information = MatrixX::Identity(n + 2, n + 2);
+    free.prior.information.bottomRightCorner(2, 2) /= kDeviation * kDeviation;
+    const silhouette::FrameFit held = shifted.fit(chain, theta, true, {0}, in_place);
+    const silhouette::FrameFit found = shifted.fit(chain, theta, true, {0}, free);
+    CHECK(held.mask_shift.size() == 0);
+    REQUIRE(found.mask_shift.size() == 2);
+    REQUIRE(found.covariance.rows() == n + 2);
+    for (const int axis : {0, 1}) {
+      const double deviation = std::sqrt(found.covariance(n + axis, n + axis));
+      CHECK(std::abs(found.mask_shift[axis] - shift[axis]) < 3.0 * deviation);
+      CHECK(deviation < kDeviation);
+    }
+    const double error = rms(points(chain, found.theta, scene.base), truth);
+    if (shift.norm() > 0.0) CHECK(error < 0.7 * rms(points(chain, held.theta, scene.base), truth));
+  }
+}
+
 TEST_CASE("twist is held") {
   const Chain chain = rope(Bending::spatial, true);
   VectorX theta = VectorX::Zero(chain.angles());

@@ -41,7 +41,8 @@ struct Options {
 // edge), so that less of it is new in every frame, and colors count for more.
 Options options_for_live_masks();
 
-// Gaussian belief about (theta, thetadot, shift of the rest angles): 3 n, rad and rad/s.
+// Gaussian belief about (theta, thetadot, shift of the rest angles), 3 n, rad and rad/s; on a table, where ropes have
+// contact shadows, also about the shift of each camera's masks (silhouette::Prior), px in x and y.
 struct Belief {
   double time = 0.0;
   math::VectorX mean;
@@ -74,6 +75,7 @@ struct Filter {
   dynamics::Model model;
   bool identified = false;  // the twin has dynamics; else angles go on at constant rate
   bool shifts = false;      // the unknown force is a part of the state
+  bool tabletop = false;    // the masks' shift too
   std::vector<capture::Camera> cameras;
   dynamics::BaseFunction base;
   Options options;

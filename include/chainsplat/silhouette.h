@@ -13,10 +13,12 @@
 
 namespace chainsplat::silhouette {
 
-// A Gaussian belief about theta, e.g. a filter's prediction. Both empty: none.
+// A Gaussian belief about theta, e.g. a filter's prediction. Both empty: none. Where it goes on with two numbers a
+// view, these are the mask's shift in the image, px in x and y, which is then estimated too: a contact shadow that was
+// taken for rope, all on one side, shifts the mask by half its width (and widens it by as much, see edge_offset).
 struct Prior {
-  math::VectorX mean;         // rad, n
-  math::MatrixX information;  // 1/rad^2, n x n
+  math::VectorX mean;         // rad, n; or rad and px, n + 2 views
+  math::MatrixX information;  // its inverse covariance
 };
 
 struct Options {
@@ -37,7 +39,8 @@ struct FrameFit {
   double covered = 0.0;          // share of mask pixels within the tube's half width + 2 px of the projected centerline
   double inside = 0.0;           // share of the projected centerline that lies in the masks (occluders lower it)
   double edge_offset = 0.0;      // px by which the masks are wider than the tube on each side
-  math::MatrixX covariance;      // n x n of theta, rad^2; directions that the views do not fix have their prior's
+  math::VectorX mask_shift;      // px, x and y of each view; empty where the prior says nothing about it
+  math::MatrixX covariance;  // of theta, rad^2, then mask_shift; directions that the views do not fix have the prior's
 };
 
 // One frame: all views taken at (nearly) one time. `views` must be undistorted crops with masks, which may be empty.

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 
 #include "src/estimation/color.h"
 #include "src/estimation/start.h"
@@ -54,6 +55,11 @@ constexpr double kNoSmoothness = 1e-9;  // 1/rad^2: the filter's prior replaces 
 // of the masks' edge offset: how sure it is at first, at best, and after how many frames
 constexpr double kOffsetDeviation = 0.5, kLeastOffsetDeviation = 0.05;  // px
 constexpr double kOffsetFrames = 30.0;
+
+// Of the masks' shift on a table, where a contact shadow may count as rope: it is half a pixel to one and a half wide
+// and shifts the mask by half of that. As one camera sees it, it hardly changes while the rope lies there in one light.
+constexpr double kMaskShift = 0.3;         // px, standard deviation
+constexpr double kMaskShiftMemory = 20.0;  // s
 
 constexpr double kUnlike = 0.5;      // likeness of drawn and seen colors: less is not the rope,
 constexpr double kLongUnlike = 0.2;  // s, after which what is followed counts as something else
@@ -113,7 +119,7 @@ FoundForce found_force(const Filter& filter, const Belief& belief) {
   const int n = filter.model.chain.angles();
   const std::vector<MatrixX> jacobians =
       link_end_jacobians(filter.model.chain, filter.base(belief.time).pose, belief.mean.head(n));
-  VectorX torque = belief.mean.tail(n);
+  VectorX torque = belief.mean.segment(2 * n, n);
   for (int k = 0; k < n; ++k) torque[k] *= filter.model.parameters.stiffness[k];
   MatrixX covariance = torque_covariance(jacobians, filter.place);
   covariance.diagonal().array() += kPlaceRidge * covariance.trace() / n;
@@ -266,11 +272,17 @@ Measured measure(const Filter& filter, const Belief& predicted, std::span<const 
                  bool warm) {
   const int n = filter.model.chain.angles();
   const double share = filter.options.new_share;
-  const MatrixX prior = predicted.covariance.topLeftCorner(n, n);
-  const MatrixX information = prior.llt().solve(MatrixX::Identity(n, n));
+  // the angles, and the shifts of these views' masks
+  std::vector<int> fitted(n);
+  std::iota(fitted.begin(), fitted.end(), 0);
+  for (std::size_t v = 0; predicted.mean.size() > 3 * n && v < views.size(); ++v)
+    for (const int axis : {0, 1}) fitted.push_back(3 * n + 2 * views[v]->camera + axis);
+  const VectorX expected = predicted.mean(fitted);
+  const MatrixX prior = predicted.covariance(fitted, fitted);
+  const MatrixX information = prior.llt().solve(MatrixX::Identity(prior.rows(), prior.rows()));
   silhouette::Options options = filter.options.silhouette;
   options.joint_smoothness = kNoSmoothness;
-  options.prior.mean = predicted.mean.head(n);
+  options.prior.mean = expected;
   options.prior.information = information / share;
   options.edge_offset = filter.edge_offset;
   options.edge_offset_deviation = std::sqrt(filter.edge_offset_variance);
@@ -281,15 +293,18 @@ Measured measure(const Filter& filter, const Belief& predicted, std::span<const 
                                   predicted.mean.head(n), warm, options);
   MatrixX posterior = out.fit.covariance / share;
   symmetrize(posterior);
-  const VectorX change = out.fit.theta - predicted.mean.head(n);
-  const double expected = n - (information * posterior).trace();
-  out.surprise = change.dot(information * change) / std::max(1.0, expected);
+  VectorX found = expected;
+  found.head(n) = out.fit.theta;
+  found.tail(out.fit.mask_shift.size()) = out.fit.mask_shift;
+  const VectorX change = found - expected;
+  const double freedom = static_cast<double>(change.size()) - (information * posterior).trace();
+  out.surprise = change.dot(information * change) / std::max(1.0, freedom);
 
-  // rates and shifts follow by what ties them to the angles
-  const MatrixX gain = predicted.covariance.leftCols(n) * information;  // 3 n x n, identity on top
+  // rates and rest angles follow by what ties them to what was fitted
+  const MatrixX gain = predicted.covariance(Eigen::all, fitted) * information;
   out.belief.time = time;
   out.belief.mean = predicted.mean + gain * change;
-  out.belief.mean.head(n) = out.fit.theta;
+  out.belief.mean(fitted) = found;
   out.belief.covariance = predicted.covariance - gain * (prior - posterior) * gain.transpose();
   symmetrize(out.belief.covariance);
   out.belief.covariance.diagonal().array() += kLeastVariance;
@@ -362,6 +377,7 @@ Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras
   filter.base = std::move(base);
   filter.base_start = base_start;
   filter.options = options;
+  filter.tabletop = twin.tabletop;
   filter.edge_offset_variance = kOffsetDeviation * kOffsetDeviation;
   if (twin.tabletop || !filter.identified) {
     filter.rest = twin.initial                ? twin.initial->theta
@@ -375,9 +391,10 @@ Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras
 
 Belief first_belief(const Filter& filter, double time) {
   const int n = filter.model.chain.angles();
+  const int size = 3 * n + (filter.tabletop ? 2 * static_cast<int>(filter.cameras.size()) : 0);
   Belief belief;
   belief.time = time;
-  belief.mean = VectorX::Zero(3 * n);
+  belief.mean = VectorX::Zero(size);
   belief.mean.head(n) = filter.rest;
   if (filter.identified && filter.base_start < time) {
     const dynamics::BaseGrid grid =
@@ -388,13 +405,14 @@ Belief first_belief(const Filter& filter, double time) {
       belief.mean.segment(n, n) = states.thetadot.back();
     }
   }
-  belief.covariance = MatrixX::Zero(3 * n, 3 * n);
+  belief.covariance = MatrixX::Zero(size, size);
   belief.covariance.diagonal().head(n).setConstant(kFirstAngle * kFirstAngle);
   belief.covariance.diagonal().segment(n, n).setConstant(kFirstRate * kFirstRate);
   if (filter.shifts)
-    belief.covariance.bottomRightCorner(n, n) =
+    belief.covariance.block(2 * n, 2 * n, n, n) =
         shift_covariance(filter, filter.base(time).pose, belief.mean.head(n),
                          kFirstForce * total_mass(filter.model.parameters), filter.everywhere);
+  belief.covariance.diagonal().tail(size - 3 * n).setConstant(kMaskShift * kMaskShift);
   belief.covariance.diagonal().array() += kLeastVariance;
   return belief;
 }
@@ -413,30 +431,37 @@ Belief predict(const Filter& filter, const Belief& belief, double time, Contact 
   const Motion motion = move(filter, belief, time);
   const double keep = std::exp(-h / filter.options.force_memory);
 
-  MatrixX transition = MatrixX::Zero(3 * n, 3 * n);
-  transition.topRows(n) = motion.theta_by_state;
-  transition.middleRows(n, n) = motion.thetadot_by_state;
-  transition.bottomRightCorner(n, n) = keep * MatrixX::Identity(n, n);
+  const double keep_mask_shift = std::exp(-h / kMaskShiftMemory);
+
+  const Eigen::Index size = belief.mean.size();
+  MatrixX transition = MatrixX::Zero(size, size);
+  transition.topLeftCorner(n, 3 * n) = motion.theta_by_state;
+  transition.block(n, 0, n, 3 * n) = motion.thetadot_by_state;
+  transition.diagonal().segment(2 * n, n).setConstant(keep);
+  transition.diagonal().tail(size - 3 * n).setConstant(keep_mask_shift);
   Belief out;
   out.time = time;
-  out.mean.resize(3 * n);
-  out.mean << motion.theta, motion.thetadot, keep * belief.mean.tail(n);
+  out.mean.resize(size);
+  out.mean << motion.theta, motion.thetadot, keep * belief.mean.segment(2 * n, n),
+      keep_mask_shift * belief.mean.tail(size - 3 * n);
   out.covariance = transition * belief.covariance * transition.transpose();
+  out.covariance.diagonal().tail(size - 3 * n).array() +=
+      kMaskShift * kMaskShift * (1.0 - keep_mask_shift * keep_mask_shift);
   if (filter.shifts) {
     const double force = (touched ? filter.options.contact_force : filter.options.model_force) *
                          total_mass(filter.model.parameters) * std::sqrt(h);
     const MatrixX shift = shift_covariance(filter, filter.base(time).pose, motion.theta, force,
                                            touched ? filter.place : filter.everywhere);
     // the force changes during the step: a third of the change acts all along in the mean square
-    MatrixX noise = transition.rightCols(n);
+    MatrixX noise = transition.middleCols(2 * n, n);
     noise.topRows(2 * n) *= std::sqrt(1.0 / 3.0);
-    noise.bottomRows(n).setIdentity();
+    noise.middleRows(2 * n, n).setIdentity();
     out.covariance += noise * shift * noise.transpose();
     if (contact == Contact::struck) {
       const std::vector<VectorX> stops = stopping_shifts(filter, filter.base(time), motion.theta, motion.thetadot,
                                                          motion.thetadot_by_state.rightCols(n));
       for (std::size_t i = 0; i < stops.size(); ++i) {
-        VectorX blow = std::sqrt(filter.place[i]) * (transition.topRows(2 * n).rightCols(n) * stops[i]);
+        VectorX blow = std::sqrt(filter.place[i]) * (transition.block(0, 2 * n, 2 * n, n) * stops[i]);
         out.covariance.topLeftCorner(2 * n, 2 * n) += blow * blow.transpose();
         // it came at any time of the step: its effect on the angles is h/2 of that on the rates, give or take
         blow.head(n) *= std::sqrt(1.0 / 3.0);

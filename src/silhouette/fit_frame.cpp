@@ -68,16 +68,17 @@ MatrixX joint_prior(const chain::Chain& chain, const Options& options) {
   return information;
 }
 
-// One step from `theta` (and `offset`, when it has a weight) for the equations and priors. Returns the largest change.
+// One step from `theta` and the masks' shifts (and `offset`, when it has a weight) for the equations and priors.
+// Returns the largest change of an angle.
 double step(Problem& problem, const MatrixX& prior, const VectorX& prior_pull, double variance, double offset_weight,
             double offset_pull, VectorX& theta, double& offset) {
-  const int n = static_cast<int>(theta.size());
-  problem.normal.topLeftCorner(n, n) += variance * prior;
-  problem.right.head(n) += variance * prior_pull;
-  problem.normal(n, n) += offset_weight;
-  problem.right[n] += offset_pull;
-  for (int k = 0; k <= n; ++k) {
-    if (k < n ? !problem.held[k] : offset_weight > 0.0) continue;
+  const int n = static_cast<int>(theta.size()), last = problem.unknowns() - 1;
+  problem.normal.topLeftCorner(last, last) += variance * prior;
+  problem.right.head(last) += variance * prior_pull;
+  problem.normal(last, last) += offset_weight;
+  problem.right[last] += offset_pull;
+  for (int k = 0; k <= last; ++k) {
+    if (k < n ? !problem.held[k] : k < last || offset_weight > 0.0) continue;
     problem.normal.row(k).setZero();
     problem.normal.col(k).setZero();
     problem.normal(k, k) = 1.0;
@@ -88,7 +89,9 @@ double step(Problem& problem, const MatrixX& prior, const VectorX& prior_pull, d
   const double largest = change.head(n).cwiseAbs().maxCoeff();
   const double scale = largest > kLongestStep ? kLongestStep / largest : 1.0;
   theta += scale * change.head(n);
-  offset += scale * change[n];
+  offset += scale * change[last];
+  for (std::size_t v = 0; problem.shifts && v < problem.views.size(); ++v)
+    problem.views[v].shift += scale * change.segment<2>(n + 2 * static_cast<int>(v));
   return largest;
 }
 
@@ -97,8 +100,17 @@ struct Belief {
   MatrixX joints;         // between neighbors, and that angles are small
   MatrixX all;            // with the frame before or the caller's prior
   VectorX weighted_mean;  // sum of each part's information times its mean
-  VectorX pull(const VectorX& theta) const { return weighted_mean - all * theta; }
+  VectorX pull(const VectorX& state) const { return weighted_mean - all * state; }
 };
+
+// The angles, and what else has a prior: the masks' shifts.
+VectorX state_of(const Problem& problem, const VectorX& theta) {
+  VectorX state(problem.unknowns() - 1);
+  state.head(theta.size()) = theta;
+  for (std::size_t v = 0; problem.shifts && v < problem.views.size(); ++v)
+    state.segment<2>(theta.size() + 2 * static_cast<int>(v)) = problem.views[v].shift;
+  return state;
+}
 
 void coarse_stage(Problem& problem, const Belief& belief, int iterations, bool choose, const Options& options,
                   VectorX& theta) {
@@ -108,7 +120,8 @@ void coarse_stage(Problem& problem, const Belief& belief, int iterations, bool c
     if (choose) choose_blobs(problem, i == 0 ? kReach : kReach + (kLastReach - kReach) * i / iterations);
     const double cut = i < kFarShare * iterations ? kFarHuber : options.huber_pixels;
     coarse_equations(problem, cut);
-    if (step(problem, belief.all, belief.pull(theta), kCoarseVariance, 0.0, 0.0, theta, offset) < kCoarseStep &&
+    if (step(problem, belief.all, belief.pull(state_of(problem, theta)), kCoarseVariance, 0.0, 0.0, theta, offset) <
+            kCoarseStep &&
         cut == options.huber_pixels)
       break;
   }
@@ -167,25 +180,34 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
     problem.views.push_back(std::move(work));
   }
 
+  const int with_shifts = n + 2 * static_cast<int>(views.size());
+  problem.shifts = options.prior.mean.size() == with_shifts;
+  const int last = problem.unknowns() - 1;  // the edge offset's
+  const bool given_prior = options.prior.mean.size() == last && options.prior.information.rows() == last;
   Belief belief;
-  belief.joints = joint_prior(chain, options);
+  belief.joints = MatrixX::Zero(last, last);
+  belief.joints.topLeftCorner(n, n) = joint_prior(chain, options);
   belief.all = belief.joints;
-  belief.weighted_mean = VectorX::Zero(n);
-  const bool given_prior = options.prior.mean.size() == n && options.prior.information.rows() == n;
+  belief.weighted_mean = VectorX::Zero(last);
   if (given_prior) {
     belief.all += options.prior.information;
     belief.weighted_mean += options.prior.information * options.prior.mean;
   } else if (warm) {
     const double weight = 1.0 / (kWarmChange * kWarmChange);
-    belief.all.diagonal().array() += weight;
-    belief.weighted_mean += weight * start;
+    belief.all.diagonal().head(n).array() += weight;
+    belief.weighted_mean.head(n) += weight * start;
   }
 
   const double offset_weight = 1.0 / (options.edge_offset_deviation * options.edge_offset_deviation);
   const double variance = kEdgeDeviation * kEdgeDeviation;
   double offset = 0.0, cut = kFirstCut;
   FineSums total;
+  const auto expected_shifts = [&] {
+    for (std::size_t v = 0; problem.shifts && v < views.size(); ++v)
+      problem.views[v].shift = options.prior.mean.segment<2>(n + 2 * static_cast<int>(v));
+  };
   const auto fine_stage = [&](VectorX& theta) {  // leaves the equations at its result in `problem`
+    expected_shifts();
     pose(problem, theta);
     choose_blobs(problem, kLastReach);
     offset = options.edge_offset;
@@ -194,7 +216,7 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
       pose(problem, theta);
       fine_equations(problem, offset, cut);
       cut = next_cut(problem, cut);
-      if (step(problem, belief.all, belief.pull(theta), variance, offset_weight,
+      if (step(problem, belief.all, belief.pull(state_of(problem, theta)), variance, offset_weight,
                offset_weight * (options.edge_offset - offset), theta, offset) < kFineStep)
         break;
     }
@@ -206,6 +228,7 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
 
   FrameSolution out;
   VectorX theta = start;
+  expected_shifts();
   if (warm) {
     coarse_stage(problem, belief, std::max(1, options.iterations / 2), true, options, theta);
   } else {
@@ -236,11 +259,12 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
   }
   fine_stage(theta);
 
-  const double offset_normal = problem.normal(n, n) + offset_weight;
-  const double offset_right = problem.right[n] + offset_weight * (options.edge_offset - offset);
-  const VectorX coupling = problem.normal.col(n).head(n);
-  out.information = (problem.normal.topLeftCorner(n, n) - coupling * coupling.transpose() / offset_normal) / variance;
-  out.gradient = (problem.right.head(n) - coupling * (offset_right / offset_normal)) / variance;
+  const double offset_normal = problem.normal(last, last) + offset_weight;
+  const double offset_right = problem.right[last] + offset_weight * (options.edge_offset - offset);
+  const VectorX coupling = problem.normal.col(last).head(last);
+  out.information =
+      (problem.normal.topLeftCorner(last, last) - coupling * coupling.transpose() / offset_normal) / variance;
+  out.gradient = (problem.right.head(last) - coupling * (offset_right / offset_normal)) / variance;
   for (int k = 0; k < n; ++k) {
     if (!problem.held[k]) continue;
     out.information.row(k).setZero();
@@ -248,13 +272,14 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
     out.gradient[k] = 0.0;
   }
   out.information += belief.joints;
-  out.gradient -= belief.joints * theta;
+  out.gradient -= belief.joints * state_of(problem, theta);
   MatrixX posterior = out.information;
   for (int k = 0; k < n; ++k)
     if (problem.held[k]) posterior(k, k) += 1.0 / (kTwist * kTwist);
   if (given_prior) posterior += options.prior.information;
   out.fit.theta = theta;
-  out.fit.covariance = posterior.ldlt().solve(MatrixX::Identity(n, n));
+  if (problem.shifts) out.fit.mask_shift = state_of(problem, theta).tail(last - n);
+  out.fit.covariance = posterior.ldlt().solve(MatrixX::Identity(last, last));
   out.fit.edge_offset = offset;
   out.fit.residual_pixels = total.weight > 0 ? std::sqrt(total.weighted_square / total.weight) : 0.0;
   judge(problem, out);

@@ -15,7 +15,8 @@ struct FrameView {
 
 struct FrameSolution {
   FrameFit fit;
-  // Data and joint priors: with x = theta - fit.theta the log likelihood is -x^T information x / 2 + gradient^T x.
+  // Data and joint priors: with x = theta - fit.theta (and what the prior knows of the masks' shifts likewise) the log
+  // likelihood is -x^T information x / 2 + gradient^T x.
   math::MatrixX information;  // 1/rad^2, calibrated
   math::VectorX gradient;
   double cost = 0.0;    // px^2, mask outside the tube and centerline outside the mask: compares fits of one frame

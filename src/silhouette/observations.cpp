@@ -58,9 +58,11 @@ Vector3 point_at(const Segment& s, double t) {
   return s.a + from / (from + to) * (s.b - s.a);
 }
 
-void add(LinkSums& sums, int link, const Vector3& x, const Vector3& g, double offset, double residual, double weight) {
-  Vector7 row;
-  row << x.cross(g), g, offset;
+// `outward`: of an outline, whose place depends on the edge offset and the mask's shift; zero: of something else.
+void add(LinkSums& sums, int link, const Vector3& x, const Vector3& g, const Vector2& outward, double residual,
+         double weight) {
+  Vector9 row;
+  row << x.cross(g), g, outward.squaredNorm(), outward;
   sums.normal[link].noalias() += (weight * row) * row.transpose();
   sums.right[link] += (weight * residual) * row;
 }
@@ -117,8 +119,8 @@ void choose_anchor(ViewWork& work, double straight_area) {
 }
 
 void clear(LinkSums& sums) {
-  std::fill(sums.normal.begin(), sums.normal.end(), Matrix7::Zero());
-  std::fill(sums.right.begin(), sums.right.end(), Vector7::Zero());
+  std::fill(sums.normal.begin(), sums.normal.end(), Matrix9::Zero());
+  std::fill(sums.right.begin(), sums.right.end(), Vector9::Zero());
 }
 
 // Nearest sampled pixel of the active blobs.
@@ -172,9 +174,10 @@ void add_coarse(ViewWork& work, double cut) {
       const Vector2 offset = mask.pixels[i] - (s.from + at.t * s.step);
       const Vector3 x = point_at(s, at.t);
       const double weight = huber_weight(std::sqrt(at.distance2), cut);
-      add(work.sums, s.link, x, projected_gradient(camera, x, s.normal), 0.0, s.normal.dot(offset), weight);
+      add(work.sums, s.link, x, projected_gradient(camera, x, s.normal), Vector2::Zero(), s.normal.dot(offset), weight);
       if (past_end(work, at))
-        add(work.sums, s.link, x, projected_gradient(camera, x, s.tangent), 0.0, s.tangent.dot(offset), weight);
+        add(work.sums, s.link, x, projected_gradient(camera, x, s.tangent), Vector2::Zero(), s.tangent.dot(offset),
+            weight);
     }
   }
   if (count == 0) return;
@@ -186,7 +189,7 @@ void add_coarse(ViewWork& work, double cut) {
     const double weight = share * huber_weight(size, cut);
     const Vector3 x = point_at(s, t);
     for (const Vector2& m : {s.normal, s.tangent})
-      add(work.sums, s.link, x, projected_gradient(camera, x, m), 0.0, m.dot(offset), weight);
+      add(work.sums, s.link, x, projected_gradient(camera, x, m), Vector2::Zero(), m.dot(offset), weight);
   });
 }
 
@@ -202,12 +205,14 @@ void add_fine(Problem& problem, ViewWork& work, double offset, double cut, FineS
   // the end is a flat disk, seen as an ellipse: this is its half axis along the rope
   const double end_depth = end_radius * std::abs((last.b - last.a).normalized().dot(last.b.normalized()));
   constexpr double kWorst = kLargestCut * kLargestCut;
-  const auto observe = [&](const Segment& s, const Vector3& x, const Vector3& g, double residual, double length) {
+  const auto observe = [&](const Segment& s, const Vector3& x, const Vector3& g, const Vector2& outward,
+                           double distance, double length) {
+    const double residual = distance - offset - outward.dot(work.shift);
     const double weight = length * tukey_weight(residual, cut);
     problem.sizes.push_back(std::abs(residual));
     total.capped_square += length * (std::min(residual * residual, kWorst) - kWorst);
     if (weight == 0.0) return;
-    add(work.sums, s.link, x, g, 1.0, residual, weight);
+    add(work.sums, s.link, x, g, outward, residual, weight);
     total.weighted_square += weight * residual * residual;
     total.weight += weight;
   };
@@ -221,8 +226,8 @@ void add_fine(Problem& problem, ViewWork& work, double offset, double cut, FineS
       if (has_end && from_end.norm() < kEndReach * end_radius && edge.outward.dot(last.tangent) > kAligned) {
         const double side = last.normal.dot(from_end) / end_radius;
         const double bulge = end_depth * std::sqrt(std::max(0.0, 1.0 - side * side));
-        observe(last, last.b, projected_gradient(camera, last.b, last.tangent),
-                last.tangent.dot(from_end) - bulge - offset, edge.weight);
+        observe(last, last.b, projected_gradient(camera, last.b, last.tangent), last.tangent,
+                last.tangent.dot(from_end) - bulge, edge.weight);
         continue;
       }
       const Nearest at = nearest(work.segments, edge.point);
@@ -239,7 +244,7 @@ void add_fine(Problem& problem, ViewWork& work, double offset, double cut, FineS
       Vector3 g = projected_gradient(camera, x, m);
       const double half_width = radius * g.norm();
       g.z() -= half_width / x.z();  // farther is thinner
-      observe(s, x, g, m.dot(from_center) - half_width - offset, edge.weight);
+      observe(s, x, g, m, m.dot(from_center) - half_width, edge.weight);
     }
   }
 }
@@ -249,8 +254,8 @@ void add_fine(Problem& problem, ViewWork& work, double offset, double cut, FineS
 void eliminate_link_offsets(LinkSums& sums) {
   constexpr double kPrior = 1.0 / (kLinkOffsetDeviation * kLinkOffsetDeviation);
   for (std::size_t link = 0; link < sums.normal.size(); ++link) {
-    Matrix7& normal = sums.normal[link];
-    const Vector7 coupling = normal.col(6) / std::sqrt(normal(6, 6) + kPrior);
+    Matrix9& normal = sums.normal[link];
+    const Vector9 coupling = normal.col(6) / std::sqrt(normal(6, 6) + kPrior);
     sums.right[link] -= coupling * (sums.right[link][6] / std::sqrt(normal(6, 6) + kPrior));
     normal -= coupling * coupling.transpose();
   }
@@ -260,14 +265,14 @@ void eliminate_link_offsets(LinkSums& sums) {
 void assemble(Problem& problem) {
   const chain::Chain& chain = *problem.chain;
   const int n = chain.angles();
-  problem.normal.setZero(n + 1, n + 1);
-  problem.right.setZero(n + 1);
-  MatrixX columns(7, n);  // of one view: the axes in camera coordinates, and 0 for the offset
+  const int unknowns = problem.unknowns(), offset = unknowns - 1;
+  problem.normal.setZero(unknowns, unknowns);
+  problem.right.setZero(unknowns);
+  MatrixX columns = MatrixX::Zero(9, n);  // of one view: the axes in camera coordinates, and 0 for offset and shift
+  int shift = n;                          // of the view
   for (ViewWork& work : problem.views) {
-    for (int k = 0; k < n; ++k) {
+    for (int k = 0; k < n; ++k)
       columns.col(k).head<6>() = math::transform_twist(work.camera_from_base, problem.axes.col(k));
-      columns(6, k) = 0.0;
-    }
     LinkSums& sums = work.sums;
     for (int link = chain.links() - 2; link >= 0; --link) {
       sums.normal[link] += sums.normal[link + 1];
@@ -275,13 +280,19 @@ void assemble(Problem& problem) {
     }
     for (int k = 0; k < n; ++k) {
       const int link = chain.child_link[k];
-      const Vector7 moved = sums.normal[link] * columns.col(k);
+      const Vector9 moved = sums.normal[link] * columns.col(k);
       for (int l = 0; l <= k; ++l) problem.normal(l, k) += moved.dot(columns.col(l));
-      problem.normal(k, n) += moved[6];
+      problem.normal(k, offset) += moved[6];
+      if (problem.shifts) problem.normal.block<1, 2>(k, shift) += moved.tail<2>().transpose();
       problem.right[k] += sums.right[link].dot(columns.col(k));
     }
-    problem.normal(n, n) += sums.normal[0](6, 6);
-    problem.right[n] += sums.right[0][6];
+    problem.normal(offset, offset) += sums.normal[0](6, 6);
+    problem.right[offset] += sums.right[0][6];
+    if (!problem.shifts) continue;
+    problem.normal.block<2, 2>(shift, shift) += sums.normal[0].bottomRightCorner<2, 2>();
+    problem.normal.block<2, 1>(shift, offset) += sums.normal[0].block<2, 1>(7, 6);
+    problem.right.segment<2>(shift) += sums.right[0].tail<2>();
+    shift += 2;
   }
   problem.normal.triangularView<Eigen::StrictlyLower>() = problem.normal.transpose();
 }

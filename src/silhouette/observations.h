@@ -9,8 +9,8 @@ namespace chainsplat::silhouette {
 constexpr double kNear = 0.01;        // m, nothing nearer than this is in front of a camera (SPEC 2.5)
 constexpr double kLargestCut = 12.0;  // px, no outline point farther from the tube counts
 
-using Vector7 = Eigen::Matrix<double, 7, 1>;
-using Matrix7 = Eigen::Matrix<double, 7, 7>;
+using Vector9 = Eigen::Matrix<double, 9, 1>;
+using Matrix9 = Eigen::Matrix<double, 9, 9>;
 
 // One link's segment seen by one camera.
 struct Segment {
@@ -21,10 +21,11 @@ struct Segment {
   double per_length2;       // 1 / |step|^2
 };
 
-// Normal equations of one view by link, in camera coordinates: a row is (x cross g, g, offset derivative), SPEC 2.3.
+// Normal equations of one view by link, in camera coordinates: a row is (x cross g, g, derivatives by the edge offset
+// and by the mask's shift in x and y), SPEC 2.3.
 struct LinkSums {
-  std::vector<Matrix7> normal;
-  std::vector<Vector7> right;
+  std::vector<Matrix9> normal;
+  std::vector<Vector9> right;
 };
 
 struct ViewWork {
@@ -32,8 +33,9 @@ struct ViewWork {
   math::Pose camera_from_base;
   std::vector<Segment> segments;
   LinkSums sums;
-  std::vector<char> active;  // by blob
-  double diameter = 0.0;     // px, at the depth of the base
+  std::vector<char> active;         // by blob
+  Vector2 shift = Vector2::Zero();  // px, by which the mask is thought to be shifted
+  double diameter = 0.0;            // px, at the depth of the base
 };
 
 struct Problem {
@@ -41,7 +43,10 @@ struct Problem {
   std::vector<ViewWork> views;
   std::vector<char> held;  // by angle: twist, which silhouettes do not show
   math::MatrixX axes;      // 6 x n in the base frame, at the angles of the last pose()
-  math::MatrixX normal;    // (n + 1) x (n + 1), the last row is the edge offset's
+  bool shifts = false;     // the masks' shifts are unknowns too
+  // Unknowns: the angles, with `shifts` two a view, the edge offset.
+  int unknowns() const { return chain->angles() + (shifts ? 2 * static_cast<int>(views.size()) : 0) + 1; }
+  math::MatrixX normal;
   math::VectorX right;
   std::vector<double> sizes;  // work space; after fine_equations the residuals' absolute values, px
 };
