@@ -36,8 +36,6 @@ void main() {
         total = p.live_capacity;
       }
       counters[kCounterDispatch] = (total + kGroup - 1u) / kGroup;
-      counters[kCounterDispatch + 1u] = p.views;
-      counters[kCounterDispatch + 2u] = 1u;
     } else {
       counters[kCounterWantInstances] = max(counters[kCounterWantInstances], total);
       if (total > p.instance_capacity) counters[kCounterOverflow] = 1u;

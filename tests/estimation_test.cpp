@@ -7,6 +7,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/gpu.h"
+#include "reference_colors.h"
 
 namespace {
 
@@ -232,13 +233,25 @@ std::vector<capture::View> painted_views() {
   return views;
 }
 
+// What a device would say of the painted rope.
+std::vector<splat::ColorSums> compare_painted(std::span<const capture::View* const> views,
+                                              std::span<const std::vector<Pose>> motions) {
+  const capture::Camera camera = front_camera();
+  const chain::Chain& chain = shared_twin().chain;
+  std::vector<splat::ColorSums> out;
+  for (std::size_t v = 0; v < views.size(); ++v) {
+    const capture::View& view = *views[v];
+    const splat::ViewSpec spec{&camera, view.x0, view.y0, view.width, view.height, motions[v]};
+    out.push_back(reference::color_sums(chain, spec, view.rgba, painted(chain, motions[v], view, camera)));
+  }
+  return out;
+}
+
 TEST_CASE("marks on the rope tell its slope in depth, and the exposure is found") {
   const std::vector<capture::View> views = painted_views();
   estimation::Filter outlines = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
   estimation::Filter colors = outlines;
-  colors.draw = [](const capture::View& view, const std::vector<Pose>& motions) {
-    return painted(shared_twin().chain, motions, view, front_camera());
-  };
+  colors.compare_colors = compare_painted;
   const auto a = follow(outlines, views), b = follow(colors, views);
   double without = 0.0, with = 0.0;
   int honest = 0;
@@ -263,9 +276,7 @@ TEST_CASE("what has the rope's outline and not its marks is not the rope: lost i
     for (std::size_t k = 0; k < views[f].rgba.size(); ++k)
       if (k % 4 != 3) views[f].rgba[k] = k / 4 % 7 < 3 ? 150 : 120;  // stripes of its own
   estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
-  filter.draw = [](const capture::View& view, const std::vector<Pose>& motions) {
-    return painted(shared_twin().chain, motions, view, front_camera());
-  };
+  filter.compare_colors = compare_painted;
   const auto found = follow(filter, views);
   for (int f = 0; f < 12; ++f) CHECK_FALSE(found[f].lost);  // it may be a glint
   for (int f = 16; f < 24; ++f) CHECK(found[f].lost);

@@ -195,15 +195,31 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   if (by_adam && !engine)
     throw InputError("--solver", "adam draws the twin, and " + request.run + " has no Gaussians", "train it first");
   if (engine && !by_adam) {
-    filter.draw = [&](const capture::View& view, const std::vector<math::Pose>& motions) {
-      const splat::ViewSpec spec{&source.cameras.at(view.camera), view.x0, view.y0, view.width, view.height, motions};
-      return std::move(engine->draw(twin.gaussians, {&spec, 1}, true).front());
+    engine->set_gaussians(twin.gaussians);
+    filter.compare_colors = [&](std::span<const capture::View* const> views,
+                                std::span<const std::vector<math::Pose>> motions) {
+      std::vector<splat::ViewSpec> specs;
+      std::vector<const std::vector<std::uint8_t>*> seen;
+      for (std::size_t v = 0; v < views.size(); ++v) {
+        const capture::View& view = *views[v];
+        specs.push_back({&source.cameras.at(view.camera), view.x0, view.y0, view.width, view.height, motions[v]});
+        seen.push_back(&view.rgba);
+      }
+      return engine->color_sums(twin.chain, specs, seen);
     };
-    // the device's kernels are made at their first use, which no frame shall wait for
-    capture::View whole;
-    whole.width = source.cameras[0].width;
-    whole.height = source.cameras[0].height;
-    filter.draw(whole, chain::link_motions(twin.chain, filter.rest, filter.base(base.start()).pose));
+    // the device's kernels are made at their first use, and buffers grow, which no frame shall wait for
+    std::vector<capture::View> whole(source.cameras.size());
+    std::vector<const capture::View*> pointers;
+    for (std::size_t c = 0; c < whole.size(); ++c) {
+      whole[c].camera = static_cast<int>(c);
+      whole[c].width = source.cameras[c].width;
+      whole[c].height = source.cameras[c].height;
+      whole[c].rgba.assign(4 * static_cast<std::size_t>(whole[c].width) * whole[c].height, 255);
+      pointers.push_back(&whole[c]);
+    }
+    const std::vector<std::vector<math::Pose>> motions(
+        whole.size(), chain::link_motions(twin.chain, filter.rest, filter.base(base.start()).pose));
+    filter.compare_colors(pointers, motions);
   }
   Follower follower;
   follower.update = [&](std::span<const capture::View* const> views) { return estimation::update(filter, views); };

@@ -49,8 +49,9 @@ struct Belief {
   math::MatrixX covariance;
 };
 
-// The twin at these link motions in the pixels of a view, with depth. Throws WorkError.
-using Draw = std::function<splat::Picture(const capture::View& view, const std::vector<math::Pose>& motions)>;
+// The twin, its links moved so, compared with what the views show inside their masks: one a view. Throws WorkError.
+using CompareColors = std::function<std::vector<splat::ColorSums>(std::span<const capture::View* const> views,
+                                                                  std::span<const std::vector<math::Pose>> motions)>;
 
 struct Estimate {
   int frame = 0;
@@ -79,7 +80,7 @@ struct Filter {
   std::vector<capture::Camera> cameras;
   dynamics::BaseFunction base;
   Options options;
-  Draw draw;                        // empty: silhouettes alone
+  CompareColors compare_colors;     // empty: silhouettes alone
   std::optional<Belief> belief;     // none before the first frame
   double base_start = 0.0;          // s, from here on the base's motion is known: the rope is thought at rest there
   math::VectorX rest;               // rad, how the rope rests (or lies) at that time

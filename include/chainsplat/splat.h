@@ -62,6 +62,21 @@ struct LossValues {
   int not_finite = 0;                  // step() only: parameters left alone because their gradient was NaN or infinite
 };
 
+// The normal equations of the colors inside a view's mask, for second-order refinement (SPEC 6): of the residual
+// r = gain * drawn + bias - seen, colors 0..1, over the channels of the pixels away from the mask's and the drawn
+// rope's edge, with Huber's weights w. A pixel that shows the surface point x moves with the link whose axis is nearest
+// to x: dr/d(twist) = -grad . d(pixel)/d(twist), grad the mean of the slopes of gain * drawn and of seen (Malis' ESM).
+struct ColorSums {
+  using Vector8 = Eigen::Matrix<double, 8, 1>;  // world twist about the world origin (SPEC 2.3), gain, bias
+  using Matrix8 = Eigen::Matrix<double, 8, 8>;
+  std::vector<Matrix8> normal;        // one a link: sum of w J^T J
+  std::vector<Vector8> right;         // one a link: sum of w J^T r
+  double weight = 0.0, square = 0.0;  // sums of w and of w r^2
+  double gain = 1.0, bias = 0.0;      // at which all that was formed: one robust step from 1 and 0
+  int pixels = 0;                     // that count; sums over them of the colors, each channel about its mean:
+  double covariance = 0.0, drawn_variance = 0.0, seen_variance = 0.0;
+};
+
 struct Settings {
   int tile = 0;                  // px, 8 or 16; 0: chosen for the device
   int pixels_per_lane = 0;       // 0: chosen for the device
@@ -104,6 +119,12 @@ class Engine {
   LossValues step(std::span<const int> batch, const LossWeights& weights, const AdamRates& rates, bool read_losses,
                   std::vector<math::MatrixX>* twists = nullptr);
   std::vector<Picture> draw_views(std::span<const int> batch, bool depth = false);
+
+  // --- colors as a measurement: the Gaussians of set_gaussians() stay on the device, a call uploads motions and crops
+  // in one submission and reads back sums, no picture. `seen`: RGBA8 of the crops, A = mask. `chain` has the Gaussians'
+  // links. Takes the place of set_views().
+  std::vector<ColorSums> color_sums(const chain::Chain& chain, std::span<const ViewSpec> views,
+                                    std::span<const std::vector<std::uint8_t>* const> seen);
 
   // The paper's resets: opacity to at most `largest`, link probabilities to uniform; Adam's moments of that section to
   // zero.

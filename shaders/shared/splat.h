@@ -39,14 +39,15 @@ const uint kNoTile = 0xffffffffu;
 const uint kScanBlock = 1024u;      // elements one group scans
 const uint kGroup = 64u;            // invocations of the passes that run one invocation an item
 
-// counters[]: filled by scan_sums
+// counters[]: filled by scan_sums. The first kCounterKept stay as long as the Gaussians do.
 const uint kCounterLive = 0u;       // live replicas R
-const uint kCounterInstances = 1u;  // (view, replica, tile) triples
-const uint kCounterTiles = 2u;      // the same sum, counted by tile
-const uint kCounterOverflow = 3u;   // not 0: a capacity was exceeded; nothing of this batch may be used
-const uint kCounterDispatch = 4u;   // 3 uints: groups of the passes over (replica, view)
-const uint kCounterWantLive = 7u;   // what the capacities would have to be
-const uint kCounterWantInstances = 8u;
+const uint kCounterWantLive = 1u;   // what their capacity would have to be
+const uint kCounterDispatch = 2u;   // 3 uints: groups of the passes over (replica, view); the host sets the last two
+const uint kCounterKept = 3u;
+const uint kCounterInstances = 5u;  // (view, replica, tile) triples
+const uint kCounterTiles = 6u;      // the same sum, counted by tile
+const uint kCounterWantInstances = 7u;
+const uint kCounterOverflow = 8u;   // not 0: a capacity was exceeded; nothing of this batch may be used
 const uint kCounterTooLong = 9u;    // not 0: a tile's list is longer than kLongestList
 const uint kCounterLongTiles = 10u; // 3 uints: groups of splat_sort_long; the host sets the last two
 const uint kCounterNotFinite = 13u; // gradients that Adam left alone

@@ -1,9 +1,8 @@
 // color.h - the rope's colors as a measurement of its angles: what a picture of the twin tells beside its outline.
 //
 // Only pixels inside the mask count, away from its edge and from the drawn rope's: the silhouette has told the rest,
-// and what hides the rope is not in the mask. A pixel that shows the surface point x of link j moves with that link, so
-// dI^/dtheta = -grad I^ . dpi/dx J_j(x), with the mean of the drawn and the seen gradient (second order in the step:
-// Malis' ESM). The frame's exposure, a gain and a bias, is solved for and eliminated. DESIGN, 'Recognition'.
+// and what hides the rope is not in the mask. The frame's exposure, a gain and a bias, is solved for and eliminated.
+// DESIGN, 'Recognition'.
 #pragma once
 #include "chainsplat/estimation.h"
 
@@ -18,8 +17,8 @@ struct ColorEquations {  // of one view; residual r = gain * drawn + bias - seen
   std::optional<double> likeness;  // as in Estimate
 };
 
-// `drawn`: the twin at theta in the pixels of `view`, with depth.
+// `sums`: of the view, the twin at theta.
 ColorEquations color_equations(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta,
-                               const capture::Camera& camera, const capture::View& view, const splat::Picture& drawn);
+                               const splat::ColorSums& sums);
 
 }  // namespace chainsplat::estimation

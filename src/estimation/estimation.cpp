@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <numeric>
 
 #include "src/estimation/color.h"
@@ -313,20 +314,24 @@ Measured measure(const Filter& filter, const Belief& predicted, std::span<const 
 
 // The belief with the colors inside the masks. The drawn rope must be near: a stripe's width.
 void look_at_colors(const Filter& filter, std::span<const capture::View* const> views, Belief& belief, Estimate& out) {
-  const int n = filter.model.chain.angles();
+  const chain::Chain& chain = filter.model.chain;
+  const int n = chain.angles();
   const Belief before = belief;
   const MatrixX by_angles = before.covariance.leftCols(n);
+  std::vector<const capture::View*> shown;
+  std::copy_if(views.begin(), views.end(), std::back_inserter(shown),
+               [](const capture::View* view) { return view->width > 0 && view->height > 0; });
   for (int step = 0; step < filter.options.color_steps; ++step) {
     const VectorX theta = belief.mean.head(n);
     MatrixX information = MatrixX::Zero(n, n);
     VectorX right = VectorX::Zero(n);
     double weight = 0.0, square = 0.0;
-    for (const capture::View* const view : views) {
-      if (view->width <= 0 || view->height <= 0) continue;
-      const Pose base = filter.base(view->time).pose;
-      const splat::Picture drawn = filter.draw(*view, chain::link_motions(filter.model.chain, theta, base));
-      const ColorEquations e =
-          color_equations(filter.model.chain, base, theta, filter.cameras.at(view->camera), *view, drawn);
+    std::vector<std::vector<Pose>> motions;
+    for (const capture::View* const view : shown)
+      motions.push_back(chain::link_motions(chain, theta, filter.base(view->time).pose));
+    const std::vector<splat::ColorSums> sums = filter.compare_colors(shown, motions);
+    for (std::size_t v = 0; v < shown.size(); ++v) {
+      const ColorEquations e = color_equations(chain, filter.base(shown[v]->time).pose, theta, sums[v]);
       if (e.weight < kLeastColorWeight || !(e.square > 0.0)) continue;
       const double scale = filter.options.color_share * e.weight / e.square;  // by what this view's residuals are
       information += scale * e.normal;
@@ -533,7 +538,7 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
     if (!out.lost) {
       filter.last_seen = view.time;
       filter.belief = measured.belief;
-      if (filter.draw) look_at_colors(filter, views, *filter.belief, out);
+      if (filter.compare_colors) look_at_colors(filter, views, *filter.belief, out);
       if (first || out.likeness.value_or(1.0) >= kUnlike) filter.last_like = view.time;
       learn_force(filter, view.time);
       const double gain = 1.0 / kOffsetFrames;

@@ -8,6 +8,7 @@
 
 #include "chainsplat/splat.h"
 #include "shaders/shared/adam.h"
+#include "shaders/shared/color.h"
 #include "shaders/shared/splat.h"
 
 namespace chainsplat::splat {
@@ -17,6 +18,8 @@ namespace {
 using gpu::Buffer;
 using gpu::Domain;
 using shared::AdamPush;
+using shared::ColorPush;
+using shared::ColorView;
 using shared::SplatPush;
 using shared::SplatTile;
 using shared::SplatView;
@@ -27,8 +30,10 @@ constexpr int kDssimMargin = 10;                   // px around the mask that ge
 constexpr std::uint32_t kMostTiles = 60000;        // of one submission: below every device's group count limit (65535)
 constexpr std::uint32_t kRankLimit = 192;          // longest tile list sorted by rank; longer ones by radix
 constexpr std::uint32_t kSoftwareRankLimit = 512;  // the same on a software device, whose barriers make radix dear
-constexpr double kGrowth = 1.25;                   // spare room when a capacity is raised
-constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;  // Adam, as in 3DGS
+constexpr std::uint32_t kTilesAPixelSlice = 4, kMostPixelSlices = 256;  // of color_pixels: enough groups for a GPU,
+constexpr std::uint32_t kTilesAnEquationSlice = 16, kMostEquationSlices = 64;  // few sums to read back
+constexpr double kGrowth = 1.25;                                               // spare room when a capacity is raised
+constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;             // Adam, as in 3DGS
 
 struct SceneView {
   double fx = 0, fy = 0, cx = 0, cy = 0;  // px, of the crop
@@ -50,11 +55,12 @@ struct Scene {
   std::size_t target_pixels = 0;
   double normalizer = 1.0;
   int step = 0;
+  std::uint64_t version = 0;  // of the parameters, of all scenes of an engine
   int coefficients() const { return (degree + 1) * (degree + 1); }
 };
 
 // Which tiles of a view are drawn and charged.
-enum class Active { near_mask, everywhere, everywhere_dssim_near_mask };
+enum class Active { in_mask, near_mask, everywhere, everywhere_dssim_near_mask };
 
 struct RunOptions {
   LossWeights weights;
@@ -62,7 +68,8 @@ struct RunOptions {
   double mask_scale = 0.0;
   bool loss = false, sums = false;  // targets are known; the tiles' sums are asked for
   bool backward = false, twists = false, depth = false, accumulate = false;
-  bool held_links = false;  // no gradient by link logits
+  bool held_links = false;              // no gradient by link logits
+  const chain::Chain* chain = nullptr;  // not null: the normal equations of the colors, by its links; needs `depth`
 };
 
 struct ViewSums {
@@ -122,6 +129,25 @@ Nearness near_mask(const SceneView& view, const std::vector<std::uint8_t>& rgba,
   return out;
 }
 
+// For every grid cell whether it has a mask pixel.
+std::vector<bool> in_mask(const SceneView& view, const std::vector<std::uint8_t>& rgba, int tile_width,
+                          int tile_height) {
+  std::vector<bool> out(static_cast<std::size_t>(view.tiles_x) * view.tiles_y, false);
+  std::vector<std::uint8_t> any(static_cast<std::size_t>(view.tiles_x) * tile_width);
+  for (int ty = 0; ty < view.tiles_y; ++ty) {
+    std::fill(any.begin(), any.end(), 0);
+    const int end = std::min(view.height, (ty + 1) * tile_height);
+    for (int y = ty * tile_height; y < end; ++y) {
+      const std::uint8_t* const row = &rgba[4 * static_cast<std::size_t>(y) * view.width];
+      for (int x = 0; x < view.width; ++x) any[x] |= row[4 * x + 3];
+    }
+    for (int tx = 0; tx < view.tiles_x; ++tx)
+      out[static_cast<std::size_t>(ty) * view.tiles_x + tx] =
+          std::any_of(&any[tx * tile_width], &any[tx * tile_width] + tile_width, [](std::uint8_t a) { return a > 0; });
+  }
+  return out;
+}
+
 // lavapipe gives every thread one stretch of a pass' groups. Neighbors in the list of tiles have alike work, those far
 // apart do not: so that every stretch has some of all, a pass goes through the list in steps of about its golden
 // section.
@@ -137,14 +163,25 @@ std::uint32_t spreading_stride(std::uint32_t count) {
 struct Engine::State {
   gpu::Device& device;
   std::uint32_t tile_width, tile_height, pixels_per_lane, slots;
+  std::uint32_t color_lanes;  // of the passes over colors: a subgroup
   bool cutoffs;
   double clamp_margin;      // of the half image
   std::size_t range_limit;  // bytes of one storage buffer
 
   gpu::Pipeline replicate, compact, scan_block, scan_sums, project, bin, sort, sort_long, blend, blend_depth,
       blend_backward, project_backward, gather, link_twist, adam, loss_pixel, ssim_rows, ssim_columns,
-      ssim_rows_backward, ssim_columns_backward;
+      ssim_rows_backward, ssim_columns_backward, color_pixels, color_equations;
   gpu::Commands commands;
+
+  // Small transfers are a part of the submission that they belong to. Where the device's memory is not mapped, they go
+  // through these.
+  Buffer to_device, to_host;
+  struct Upload {
+    Buffer* to = nullptr;
+    std::vector<std::byte> data;
+  };
+  std::vector<Upload> uploads;  // for the next submission
+  std::size_t to_host_bytes = 0;
 
   // work buffers, grown as needed
   Buffer replica_opacity, live_flag, live_prefix, live_block, live, replica_gradient, counters;
@@ -153,8 +190,14 @@ struct Engine::State {
   Buffer tile_count, tile_prefix, tile_block, tile_cursor, tile_used, tile_loss;
   Buffer entries, long_tiles, sort_scratch, sorted, partials;
   Buffer image, depth_image, pixel_gradient, ssim_row_sums, ssim_factors;
+  Buffer color_views, segments, tile_pixels, tile_summary, pixel_sums, link_sums;
+  ColorPush color_push{};
+  std::size_t pixel_sum_bytes = 0, link_sum_bytes = 0;
+  const std::byte *read_pixel_sums = nullptr, *read_link_sums = nullptr;  // of the last run
   std::uint32_t live_capacity = 0, instance_capacity = 0;
-  int not_finite = 0;        // gradients of the last run that Adam left alone
+  std::uint64_t versions = 0;                            // of parameters so far, of all scenes
+  std::pair<std::uint64_t, std::uint32_t> replicated{};  // version and live capacity that the live replicas are of
+  int not_finite = 0;                                    // gradients of the last run that Adam left alone
   int most_views = 1 << 20;  // of one submission, lowered when a buffer would pass the device's limit
   std::vector<gpu::Timing> timings;
 
@@ -168,6 +211,9 @@ struct Engine::State {
   void need(Buffer& buffer, std::size_t bytes, const char* name);
   void release_view_buffers();
   void write(Buffer& buffer, const void* data, std::size_t bytes, const char* name);
+  void stage(Buffer& buffer, const void* data, std::size_t bytes, const char* name);
+  void record_uploads();
+  const std::byte* record_download(const Buffer& buffer, std::size_t bytes);
   void load_gaussians(Scene& scene, const Gaussians& gaussians);
   void load_views(Scene& scene, std::span<const ViewSpec> specs,
                   std::span<const std::vector<std::uint8_t>* const> targets, Active active);
@@ -180,6 +226,7 @@ struct Engine::State {
   std::vector<ViewSums> sums(std::size_t chunk_views);
   std::vector<Picture> pictures(const Scene& scene, std::span<const int> chunk, bool depth);
   std::vector<math::MatrixX> twists(const Scene& scene, std::span<const int> chunk);
+  std::vector<ColorSums> colors(const Scene& scene, std::span<const int> chunk, const chain::Chain& chain);
 };
 
 Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), commands(d) {
@@ -230,6 +277,14 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   ssim_columns = gpu::Pipeline(d, "ssim_columns", 6, push, strip_constants);
   ssim_rows_backward = gpu::Pipeline(d, "ssim_rows_backward", 5, push, strip_constants);
   ssim_columns_backward = gpu::Pipeline(d, "ssim_columns_backward", 7, push, strip_constants);
+  const std::uint32_t tile_area = tile_width * tile_height;
+  color_lanes = std::min(std::max(1u, device_info.subgroup_size), tile_area);
+  const std::uint32_t columns = std::max(1u, tile_width / color_lanes);  // of a lane
+  color_pixels =
+      gpu::Pipeline(d, "color_pixels", 10, sizeof(ColorPush),
+                    {color_lanes, tile_width, tile_height, color_lanes, columns, tile_area / (color_lanes * columns)});
+  color_equations =
+      gpu::Pipeline(d, "color_equations", 11, sizeof(ColorPush), {color_lanes, tile_width, tile_height, color_lanes});
   need(counters, shared::kCounters * sizeof(std::uint32_t), "counters");
 }
 
@@ -249,7 +304,8 @@ void Engine::State::release_view_buffers() {
        {&views,           &motions,        &tile_map,      &tiles,        &splats,     &instance_count, &tile_hits,
         &instance_prefix, &instance_block, &records,       &link_twists,  &tile_count, &tile_prefix,    &tile_block,
         &tile_cursor,     &tile_used,      &tile_loss,     &entries,      &sorted,     &partials,       &image,
-        &depth_image,     &pixel_gradient, &ssim_row_sums, &ssim_factors, &long_tiles, &sort_scratch})
+        &depth_image,     &pixel_gradient, &ssim_row_sums, &ssim_factors, &long_tiles, &sort_scratch,   &color_views,
+        &segments,        &tile_pixels,    &tile_summary,  &pixel_sums,   &link_sums})
     *buffer = Buffer();
   instance_capacity = 0;
 }
@@ -264,6 +320,47 @@ void Engine::State::write(Buffer& buffer, const void* data, std::size_t bytes, c
   }
 }
 
+// As write(), but in the next submission.
+void Engine::State::stage(Buffer& buffer, const void* data, std::size_t bytes, const char* name) {
+  need(buffer, bytes, name);
+  if (buffer.mapped()) {
+    if (bytes > 0) std::memcpy(buffer.mapped(), data, bytes);
+    return;
+  }
+  const auto same = std::find_if(uploads.begin(), uploads.end(), [&](const Upload& u) { return u.to == &buffer; });
+  Upload& upload = same != uploads.end() ? *same : uploads.emplace_back();
+  const auto* const first = static_cast<const std::byte*>(data);
+  upload.to = &buffer;
+  upload.data.assign(first, first + bytes);
+}
+
+void Engine::State::record_uploads() {
+  std::size_t total = 0;
+  for (const Upload& upload : uploads) total += upload.data.size();
+  if (to_device.bytes() < total) {
+    to_device = Buffer();
+    to_device = Buffer(device, static_cast<std::size_t>(kGrowth * total), Domain::host, "to device");
+  }
+  std::size_t at = 0;
+  for (const Upload& upload : uploads) {
+    if (upload.data.empty()) continue;
+    std::memcpy(static_cast<std::byte*>(to_device.mapped()) + at, upload.data.data(), upload.data.size());
+    commands.copy(to_device, at, *upload.to, 0, upload.data.size());
+    commands.no_barrier();
+    at += upload.data.size();
+  }
+  uploads.clear();
+}
+
+// Where `bytes` of a buffer can be read once the submission is done. Room in `to_host` has been made.
+const std::byte* Engine::State::record_download(const Buffer& buffer, std::size_t bytes) {
+  if (buffer.mapped()) return static_cast<const std::byte*>(buffer.mapped());
+  const std::size_t at = to_host_bytes;
+  commands.copy(buffer, 0, to_host, at, bytes);
+  to_host_bytes += bytes;
+  return static_cast<const std::byte*>(to_host.mapped()) + at;
+}
+
 void Engine::State::load_gaussians(Scene& scene, const Gaussians& gaussians) {
   scene.count = gaussians.count;
   scene.links = gaussians.links;
@@ -271,6 +368,7 @@ void Engine::State::load_gaussians(Scene& scene, const Gaussians& gaussians) {
   const std::vector<float> all = packed(gaussians);
   scene.parameter_count = all.size();
   scene.step = 0;
+  scene.version = ++versions;
   write(scene.parameters, all.data(), all.size() * sizeof(float), "parameters");
   need(scene.gradient, all.size() * sizeof(float), "gradient");
 }
@@ -301,11 +399,14 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
       CHAINSPLAT_CHECK(target.size() == 4u * spec.width * spec.height, std::to_string(target.size()));
       view.target = all_targets.size() / 4;
       all_targets.insert(all_targets.end(), target.begin(), target.end());
-      for (std::size_t k = 3; k < target.size(); k += 4) object_pixels += target[k] >= 128 ? 1.0 : 0.0;
+      if (active != Active::in_mask)
+        for (std::size_t k = 3; k < target.size(); k += 4) object_pixels += target[k] >= 128 ? 1.0 : 0.0;
     }
     const auto cells = static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
     Nearness near{std::vector<bool>(cells, true), std::vector<bool>(cells, true)};
-    if (!targets.empty() && active != Active::everywhere) {
+    if (active == Active::in_mask) {
+      near.inner = near.outer = in_mask(view, *targets[v], static_cast<int>(tile_width), static_cast<int>(tile_height));
+    } else if (!targets.empty() && active != Active::everywhere) {
       near = near_mask(view, *targets[v], static_cast<int>(tile_width), static_cast<int>(tile_height), kDssimMargin,
                        kActiveMargin);
       if (active == Active::everywhere_dssim_near_mask) near.outer.assign(cells, true);
@@ -319,7 +420,10 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
   }
   scene.target_pixels = all_targets.size() / 4;
   scene.normalizer = std::max(1.0, object_pixels / std::max<std::size_t>(1, specs.size()));
-  write(scene.target, all_targets.data(), all_targets.size(), "target");
+  if (active == Active::in_mask)
+    stage(scene.target, all_targets.data(), all_targets.size(), "target");
+  else
+    write(scene.target, all_targets.data(), all_targets.size(), "target");
 }
 
 // Views that go into one submission: bounded by buffer ranges and group counts of the device, never by time.
@@ -372,6 +476,8 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   std::vector<glm::vec4> rows(static_cast<std::size_t>(view_count) * links * 3);
   std::vector<std::uint32_t> map;
   std::vector<SplatTile> active;
+  std::vector<ColorView> colored;
+  std::vector<glm::vec4> axes;
   chunk_tile_view.clear();
   chunk_pixel.assign(view_count, 0);
   std::size_t pixels = 0;
@@ -401,6 +507,17 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
         rows[3 * (out.motion + j) + r] = {pose.rotation(r, 0), pose.rotation(r, 1), pose.rotation(r, 2),
                                           pose.translation[r]};
     }
+    if (!options.chain) continue;
+    const chain::Chain& chain = *options.chain;
+    const std::uint32_t first_tile = colored.empty() ? 0 : colored.back().first_tile + colored.back().tiles;
+    colored.push_back({first_tile, static_cast<std::uint32_t>(view.active.size()), v * links, 0});
+    for (std::uint32_t j = 0; j < links; ++j) {
+      const math::Pose pose = view.camera_from_world * view.motions[j];
+      const math::Vector3 start = pose * math::Vector3(chain.link_start(j) * chain.direction);
+      const math::Vector3 along = pose.rotation * chain.direction;
+      axes.emplace_back(start.x(), start.y(), start.z(), chain.link_end(j) - chain.link_start(j));
+      axes.emplace_back(along.x(), along.y(), along.z(), 0.0);
+    }
   }
   // tiles with a D-SSIM term first, so that its passes run over a prefix of the list
   std::uint32_t near_total = 0;
@@ -417,10 +534,14 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
     if (near) near_total = static_cast<std::uint32_t>(active.size());
   }
   const auto tile_total = static_cast<std::uint32_t>(active.size());
-  write(views, gpu_views.data(), gpu_views.size() * sizeof(SplatView), "views");
-  write(motions, rows.data(), rows.size() * sizeof(glm::vec4), "motions");
-  write(tile_map, map.data(), map.size() * sizeof(std::uint32_t), "tile map");
-  write(tiles, active.data(), active.size() * sizeof(SplatTile), "tiles");
+  stage(views, gpu_views.data(), gpu_views.size() * sizeof(SplatView), "views");
+  stage(motions, rows.data(), rows.size() * sizeof(glm::vec4), "motions");
+  stage(tile_map, map.data(), map.size() * sizeof(std::uint32_t), "tile map");
+  stage(tiles, active.data(), active.size() * sizeof(SplatTile), "tiles");
+  if (options.chain) {
+    stage(color_views, colored.data(), colored.size() * sizeof(ColorView), "color views");
+    stage(segments, axes.data(), axes.size() * sizeof(glm::vec4), "segments");
+  }
 
   // room
   if (live_capacity == 0 || live_capacity > replicas)
@@ -478,6 +599,28 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
     if (options.twists) need(link_twists, 2 * vectors(static_cast<std::size_t>(view_count) * links), "link twists");
   }
 
+  if (options.chain) {
+    std::uint32_t most_tiles = 1;
+    for (const ColorView& view : colored) most_tiles = std::max(most_tiles, view.tiles);
+    const auto slices = [&](std::uint32_t tiles_a_slice, std::uint32_t most) {
+      return std::min(most, (most_tiles + tiles_a_slice - 1) / tiles_a_slice);
+    };
+    color_push.links = links;
+    color_push.pixel_slices = slices(kTilesAPixelSlice, kMostPixelSlices);
+    color_push.equation_slices = slices(kTilesAnEquationSlice, kMostEquationSlices);
+    need(tile_pixels, words(static_cast<std::size_t>(tile_total) * tile_width * tile_height), "tile pixels");
+    need(tile_summary, 2 * words(tile_total), "tile summary");
+    pixel_sum_bytes = vectors(shared::kColorPixelRows * color_push.pixel_slices * view_count);
+    link_sum_bytes = vectors(shared::kColorRows * color_push.equation_slices * view_count * links);
+    need(pixel_sums, pixel_sum_bytes, "pixel sums");
+    need(link_sums, link_sum_bytes, "link sums");
+  }
+  const std::size_t downloads = words(shared::kCounters) + (options.chain ? pixel_sum_bytes + link_sum_bytes : 0);
+  if (!counters.mapped() && to_host.bytes() < downloads) {
+    to_host = Buffer();
+    to_host = Buffer(device, static_cast<std::size_t>(kGrowth * downloads), Domain::host, "to host");
+  }
+
   SplatPush push{};
   push.gaussians = count;
   push.links = links;
@@ -506,23 +649,39 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   };
 
   commands.begin();
-  commands.fill(counters, 0, 0, words(shared::kCounters));
-  commands.fill(counters, 1, words(shared::kCounterLongTiles + 1), words(2));
+  to_host_bytes = 0;
+  record_uploads();
+  // what is live is known for as long as the Gaussians stay
+  const std::pair now{scene.version, live_capacity};
+  const bool replicas_kept = replicated == now;
+  replicated = now;
+  const auto set_counters = [&](std::uint32_t from, std::uint32_t to, std::uint32_t value) {
+    commands.fill(counters, value, words(from), words(to - from));
+    commands.no_barrier();
+  };
+  if (!replicas_kept) set_counters(0, shared::kCounterKept, 0);
+  set_counters(shared::kCounterDispatch + 1, shared::kCounterDispatch + 2, view_count);
+  set_counters(shared::kCounterDispatch + 2, shared::kCounterInstances, 1);
+  set_counters(shared::kCounterInstances, shared::kCounterLongTiles + 1, 0);
+  set_counters(shared::kCounterLongTiles + 1, shared::kCounterLongTiles + 3, 1);
+  set_counters(shared::kCounterNotFinite, shared::kCounters, 0);
   commands.fill(tile_count, 0, 0, words(std::max(1u, tile_total)));
   commands.no_barrier();
   commands.fill(tile_cursor, 0, 0, words(std::max(1u, tile_total)));
   commands.no_barrier();
   commands.fill(tile_used, 0, 0, words(std::max(1u, tile_total)));
   commands.stamp("clear");
-  dispatch(replicate, {&scene.parameters, &replica_opacity, &live_flag}, groups(count));
-  push.scan_length = static_cast<std::uint32_t>(replicas);
-  push.scan_counter = shared::kCounterLive;
-  scan(live_flag, live_prefix, live_block, push, replicas);
   constexpr std::uint32_t kRow = 32768;  // groups in x of a two-dimensional dispatch
-  const std::uint32_t replica_groups = groups(replicas);
-  dispatch(compact, {&live_flag, &live_prefix, &live_block, &live}, std::min(replica_groups, kRow),
-           (replica_groups + kRow - 1) / kRow);
-  commands.stamp("replicate");
+  if (!replicas_kept) {
+    dispatch(replicate, {&scene.parameters, &replica_opacity, &live_flag}, groups(count));
+    push.scan_length = static_cast<std::uint32_t>(replicas);
+    push.scan_counter = shared::kCounterLive;
+    scan(live_flag, live_prefix, live_block, push, replicas);
+    const std::uint32_t replica_groups = groups(replicas);
+    dispatch(compact, {&live_flag, &live_prefix, &live_block, &live}, std::min(replica_groups, kRow),
+             (replica_groups + kRow - 1) / kRow);
+    commands.stamp("replicate");
+  }
   dispatch_live(project, {&scene.parameters, &replica_opacity, &live, &views, &motions, &tile_map, &counters, &splats,
                           &instance_count, &tile_count, &tile_hits});
   commands.stamp("project");
@@ -587,8 +746,28 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
       commands.dispatch(adam, buffers, adam_push, sizeof *adam_push, std::min(parameter_groups, kRow),
                         (parameter_groups + kRow - 1) / kRow);
       commands.stamp("adam");
+      scene.version = ++versions;
     }
   }
+  if (options.chain) {
+    const auto dispatch_colors = [&](const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers,
+                                     std::uint32_t x, std::uint32_t y, std::uint32_t z) {
+      commands.dispatch(pipeline, {buffers.begin(), buffers.size()}, &color_push, sizeof color_push, x, y, z);
+    };
+    dispatch_colors(color_pixels,
+                    {&tiles, &views, &color_views, &segments, &image, &depth_image, &scene.target, &tile_pixels,
+                     &tile_summary, &pixel_sums},
+                    color_push.pixel_slices, view_count, 1);
+    commands.stamp("color pixels");
+    dispatch_colors(color_equations,
+                    {&tiles, &views, &color_views, &segments, &image, &depth_image, &scene.target, &tile_pixels,
+                     &tile_summary, &pixel_sums, &link_sums},
+                    links, color_push.equation_slices, view_count);
+    commands.stamp("color equations");
+    read_pixel_sums = record_download(pixel_sums, pixel_sum_bytes);
+    read_link_sums = record_download(link_sums, link_sum_bytes);
+  }
+  const std::byte* const read_counters = record_download(counters, words(shared::kCounters));
   commands.submit();
   commands.wait();
   for (const gpu::Timing& timing : commands.timings()) {
@@ -602,7 +781,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   }
 
   std::array<std::uint32_t, shared::kCounters> read{};
-  gpu::download(device, counters, read.data(), words(shared::kCounters));
+  std::memcpy(read.data(), read_counters, words(shared::kCounters));
   if (read[shared::kCounterTooLong] != 0)
     throw WorkError("splat", "more than " + std::to_string(shared::kLongestList) + " Gaussians cover one tile",
                     "use fewer or smaller Gaussians");
@@ -728,6 +907,66 @@ std::vector<math::MatrixX> Engine::State::twists(const Scene& scene, std::span<c
       twist.col(j).tail<3>() = force;
     }
     out.push_back(std::move(twist));
+  }
+  return out;
+}
+
+// Device: rows about the links' starts, camera frame. Out: world twists about the world origin.
+std::vector<ColorSums> Engine::State::colors(const Scene& scene, std::span<const int> chunk,
+                                             const chain::Chain& chain) {
+  const auto floats = [](const std::byte* bytes, std::size_t size) {
+    std::vector<float> values(size / sizeof(float));
+    std::memcpy(values.data(), bytes, size);
+    return values;
+  };
+  const std::vector<float> of_pixels = floats(read_pixel_sums, pixel_sum_bytes);
+  const std::vector<float> of_links = floats(read_link_sums, link_sum_bytes);
+  const auto sum = [](const std::vector<float>& all, std::size_t at, std::size_t slices, std::size_t rows) {
+    math::VectorX total = math::VectorX::Zero(static_cast<Eigen::Index>(4 * rows));
+    for (std::size_t k = 0; k < slices; ++k)
+      total += Eigen::Map<const Eigen::VectorXf>(&all[(at * slices + k) * 4 * rows], total.size()).cast<double>();
+    return total;
+  };
+  std::vector<ColorSums> out;
+  for (std::size_t v = 0; v < chunk.size(); ++v) {
+    const SceneView& view = scene.views[chunk[v]];
+    ColorSums sums;
+    const math::VectorX p = sum(of_pixels, v, color_push.pixel_slices, shared::kColorPixelRows);
+    sums.pixels = static_cast<int>(p[5]);
+    if (sums.pixels > 0) {
+      const math::Vector3 drawn = p.segment<3>(8), seen = p.segment<3>(12);
+      sums.covariance = p[6] - drawn.dot(seen) / sums.pixels;
+      sums.drawn_variance = p[7] - drawn.squaredNorm() / sums.pixels;
+      sums.seen_variance = p[11] - seen.squaredNorm() / sums.pixels;
+    }
+    const math::Matrix3 world_from_camera = view.camera_from_world.rotation.transpose();
+    for (int j = 0; j < scene.links; ++j) {
+      const std::size_t at = v * scene.links + j;
+      const math::VectorX s = sum(of_links, at, color_push.equation_slices, shared::kColorRows);
+      const float* const exposure = &of_links[4 * shared::kColorRows * color_push.equation_slices * at];
+      sums.gain = exposure[shared::kColorExposure];
+      sums.bias = exposure[shared::kColorExposure + 1];
+      ColorSums::Matrix8 normal;
+      ColorSums::Vector8 right;
+      for (int row = 0, k = shared::kColorTwist; row < 6; ++row)
+        for (int column = row; column < 6; ++column, ++k) normal(row, column) = normal(column, row) = s[k];
+      normal.block<6, 1>(0, 6) = s.segment<6>(shared::kColorByGain);
+      normal.block<6, 1>(0, 7) = s.segment<6>(shared::kColorByBias);
+      normal.block<2, 6>(6, 0) = normal.block<6, 2>(0, 6).transpose();
+      const math::Vector6 e = s.segment<6>(shared::kColorGain2);
+      normal.bottomRightCorner<2, 2>() << e[0], e[1], e[1], e[2];
+      right << s.segment<6>(shared::kColorRight), e[3], e[4];
+      sums.weight += e[2];
+      sums.square += e[5];
+      // about the world origin: moment + start x force
+      const math::Vector3 start = view.motions[j] * math::Vector3(chain.link_start(j) * chain.direction);
+      ColorSums::Matrix8 world = ColorSums::Matrix8::Identity();
+      world.block<3, 3>(0, 0) = world.block<3, 3>(3, 3) = world_from_camera;
+      world.block<3, 3>(0, 3) = math::hat(start) * world_from_camera;
+      sums.normal.emplace_back(world * normal * world.transpose());
+      sums.right.emplace_back(world * right);
+    }
+    out.push_back(std::move(sums));
   }
   return out;
 }
@@ -891,6 +1130,22 @@ std::vector<Picture> Engine::draw_views(std::span<const int> batch, bool depth) 
   std::vector<Picture> out;
   s.run_all(s.training, batch, options, nullptr, [&](std::span<const int> chunk, std::size_t) {
     for (Picture& picture : s.pictures(s.training, chunk, depth)) out.push_back(std::move(picture));
+  });
+  return out;
+}
+
+std::vector<ColorSums> Engine::color_sums(const chain::Chain& chain, std::span<const ViewSpec> views,
+                                          std::span<const std::vector<std::uint8_t>* const> seen) {
+  State& s = *state_;
+  CHAINSPLAT_CHECK(chain.links() == s.training.links,
+                   std::to_string(chain.links()) + " " + std::to_string(s.training.links));
+  s.load_views(s.training, views, seen, Active::in_mask);
+  RunOptions options;
+  options.depth = true;
+  options.chain = &chain;
+  std::vector<ColorSums> out;
+  s.run_all(s.training, everything(views.size()), options, nullptr, [&](std::span<const int> chunk, std::size_t) {
+    for (ColorSums& sums : s.colors(s.training, chunk, chain)) out.push_back(std::move(sums));
   });
   return out;
 }

@@ -1,0 +1,350 @@
+// The device's normal equations of the colors inside a mask against a host's in double (reference_colors.h), against
+// differences of the drawn loss, and as what they are for: a step that finds a small motion.
+#include <doctest/doctest.h>
+
+#include <array>
+#include <cmath>
+#include <cstring>
+#include <string>
+
+#include "chainsplat/splat.h"
+#include "gpu/device.h"
+#include "reference_colors.h"
+
+using namespace chainsplat;
+using math::MatrixX;
+using math::Pose;
+using math::Vector3;
+using math::Vector6;
+using math::VectorX;
+using splat::ColorSums;
+
+namespace {
+
+gpu::Device& device(bool least = false) {
+  static const auto open = [](bool with) {
+    gpu::DeviceOptions options;
+    options.validation = true;
+    options.least = with;
+    return gpu::open_device(options);
+  };
+  static const gpu::DevicePtr best = open(false), poor = open(true);
+  return least ? *poor : *best;
+}
+
+// Every test case ends with it.
+void check_silent() {
+  for (const bool least : {false, true}) {
+    const std::vector<std::string> texts = gpu::validation_texts(device(least));
+    CHECK_MESSAGE(texts.empty(), (texts.empty() ? std::string() : texts.front()));
+  }
+}
+
+// A rope of 0.3 m and 2 cm in colors that change along it and about it, bent, before cameras on three sides; what they
+// see is the rope a little further on, in another exposure, with noise, a hand before its middle.
+struct Scene {
+  chain::Chain chain;
+  splat::Gaussians gaussians;
+  std::vector<capture::Camera> cameras;
+  VectorX theta;
+  Pose base;
+  std::vector<splat::ViewSpec> views;  // of the twin; they point into `cameras`
+  std::vector<std::vector<std::uint8_t>> seen;
+
+  std::vector<const std::vector<std::uint8_t>*> seen_pointers() const {
+    std::vector<const std::vector<std::uint8_t>*> out;
+    for (const auto& s : seen) out.push_back(&s);
+    return out;
+  }
+};
+
+struct Exposure {
+  double gain = 1.0, bias = 0.0, noise = 0.0;
+};
+
+std::vector<std::uint8_t> looked_at(const splat::Picture& picture, const Exposure& exposure, core::Random& random) {
+  std::vector<std::uint8_t> rgba(picture.rgba.size());
+  for (std::size_t k = 0; k < rgba.size(); ++k) {
+    const double alpha = picture.rgba[k / 4 * 4 + 3];
+    const double value = k % 4 == 3
+                             ? (alpha >= 0.5 ? 1.0 : 0.0)
+                             : exposure.gain * picture.rgba[k] + exposure.bias + exposure.noise * random.normal();
+    rgba[k] = static_cast<std::uint8_t>(std::lround(255.0 * std::clamp(value, 0.0, 1.0)));
+  }
+  return rgba;
+}
+
+Scene make_scene() {
+  Scene scene;
+  scene.chain =
+      chain::make_chain(0.3, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 6, chain::Bending::spatial, false, 0.02);
+  const int rows = 75, around = 8, links = scene.chain.links();
+  constexpr float kSh0 = 0.28209479f;
+  scene.gaussians.resize(rows * around, links, 0);
+  for (int i = 0; i < scene.gaussians.count; ++i) {
+    const double s = (i / around + 0.5) / rows * scene.chain.length, angle = 2.0 * M_PI * (i % around) / around;
+    const double place[3] = {0.008 * std::cos(angle), 0.008 * std::sin(angle), -s};
+    for (int c = 0; c < 3; ++c) {
+      scene.gaussians.mean[3 * i + c] = static_cast<float>(place[c]);
+      scene.gaussians.log_scale[3 * i + c] = std::log(0.0035f);
+      const double color = 0.5 + 0.2 * std::sin((110.0 + 30.0 * c) * s + c) + 0.12 * std::sin(angle + 40.0 * s + c);
+      scene.gaussians.sh[3 * i + c] = static_cast<float>(color - 0.5) / kSh0;
+    }
+    scene.gaussians.opacity_logit[i] = 3.0f;
+    scene.gaussians.link_logits[links * i + chain::link_at(scene.chain, s)] = 12.0f;
+  }
+  scene.theta = VectorX::Zero(scene.chain.angles());
+  for (int k = 0; k < scene.theta.size(); ++k) scene.theta[k] = 0.25 * std::sin(1.3 * k + 0.4);
+  scene.base.translation = Vector3(0.3, -0.2, 0.6);  // the world's origin is elsewhere
+  for (const double side : {-0.9, 0.0, 1.1}) {
+    capture::Camera c;
+    c.width = 200;
+    c.height = 240;
+    c.fx = 420.0;
+    c.fy = 425.0;
+    c.cx = 101.0;
+    c.cy = 118.0;
+    const Vector3 middle = scene.base * Vector3(0, 0, -0.14);
+    const Vector3 forward = Vector3(std::sin(side), std::cos(side), 0.1).normalized();
+    const Vector3 right = forward.cross(Vector3::UnitZ()).normalized();
+    c.world_from_camera.rotation << right, forward.cross(right), forward;
+    c.world_from_camera.translation = middle - 0.6 * forward;
+    scene.cameras.push_back(c);
+  }
+  return scene;
+}
+
+// Crops of different sizes; the third is small and cuts the rope off.
+void look(Scene& scene, splat::Engine& engine, const VectorX& theta_seen, const Exposure& exposure) {
+  const std::array<std::array<int, 4>, 3> crops{{{0, 0, 200, 240}, {30, 5, 141, 223}, {60, 60, 77, 101}}};
+  core::Random random(5);
+  scene.views.clear();
+  scene.seen.clear();
+  for (std::size_t v = 0; v < crops.size(); ++v) {
+    const auto [x0, y0, width, height] = crops[v];
+    splat::ViewSpec spec{
+        &scene.cameras[v], x0, y0, width, height, chain::link_motions(scene.chain, theta_seen, scene.base)};
+    scene.seen.push_back(looked_at(engine.draw(scene.gaussians, {&spec, 1})[0], exposure, random));
+    spec.motions = chain::link_motions(scene.chain, scene.theta, scene.base);
+    scene.views.push_back(spec);
+  }
+}
+
+void hide_middle(Scene& scene) {
+  for (std::size_t v = 0; v < scene.views.size(); ++v)
+    for (int y = scene.views[v].height / 2; y < scene.views[v].height / 2 + 25; ++y)
+      for (int x = 0; x < scene.views[v].width; ++x) scene.seen[v][4 * (y * scene.views[v].width + x) + 3] = 0;
+}
+
+// Largest difference of two sums, of what the wanted ones have of that kind: twists about the links' starts, where
+// moments and forces are of one size each.
+double worst_difference(const Scene& scene, const splat::ViewSpec& view, const ColorSums& got,
+                        const ColorSums& wanted) {
+  double worst = 0.0;
+  std::array<double, 9> scales{};
+  const auto each = [&](const auto& use) {
+    for (int j = 0; j < scene.chain.links(); ++j) {
+      ColorSums::Matrix8 local = ColorSums::Matrix8::Identity();
+      local.block<3, 3>(0, 3) =
+          -math::hat(view.motions[j] * Vector3(scene.chain.link_start(j) * scene.chain.direction));
+      const ColorSums::Matrix8 a = local * got.normal[j] * local.transpose();
+      const ColorSums::Matrix8 b = local * wanted.normal[j] * local.transpose();
+      const ColorSums::Vector8 c = local * got.right[j], d = local * wanted.right[j];
+      const auto kind = [](int row) { return row < 3 ? 0 : row < 6 ? 1 : 2; };
+      for (int r = 0; r < 8; ++r) {
+        use(kind(r) * 3, 0.0, 0.0);
+        for (int k = r; k < 8; ++k) use(kind(r) * 3 + kind(k), a(r, k), b(r, k));
+        use(kind(r) == 0 ? 3 : kind(r) == 1 ? 6 : 7, c[r], d[r]);
+      }
+    }
+  };
+  each([&](int kind, double, double b) { scales[kind] = std::max(scales[kind], std::abs(b)); });
+  each([&](int kind, double a, double b) { worst = std::max(worst, std::abs(a - b) / std::max(scales[kind], 1e-12)); });
+  return worst;
+}
+
+void check_sums(const Scene& scene, const splat::ViewSpec& view, const ColorSums& got, const ColorSums& wanted) {
+  constexpr double kSums = 2e-5;  // some thousand floats, and an exposure that comes of such sums
+  CHECK(got.pixels == wanted.pixels);
+  CHECK(got.gain == doctest::Approx(wanted.gain).epsilon(kSums));
+  CHECK(std::abs(got.bias - wanted.bias) <= kSums);
+  CHECK(got.weight == doctest::Approx(wanted.weight).epsilon(kSums));
+  CHECK(got.square == doctest::Approx(wanted.square).epsilon(10 * kSums));
+  CHECK(got.covariance == doctest::Approx(wanted.covariance).epsilon(10 * kSums));
+  CHECK(got.drawn_variance == doctest::Approx(wanted.drawn_variance).epsilon(10 * kSums));
+  CHECK(got.seen_variance == doctest::Approx(wanted.seen_variance).epsilon(10 * kSums));
+  REQUIRE(got.normal.size() == wanted.normal.size());
+  REQUIRE(got.right.size() == wanted.right.size());
+  CHECK(worst_difference(scene, view, got, wanted) <= 1e-4);
+}
+
+bool same_bits(const ColorSums& a, const ColorSums& b) {
+  return a.normal == b.normal && a.right == b.right && a.weight == b.weight && a.square == b.square &&
+         a.gain == b.gain && a.bias == b.bias && a.pixels == b.pixels && a.covariance == b.covariance &&
+         a.drawn_variance == b.drawn_variance && a.seen_variance == b.seen_variance;
+}
+
+TEST_CASE("the device's color sums are those of a host in double") {
+  Scene scene = make_scene();
+  splat::Engine engine(device());
+  VectorX moved = scene.theta;
+  for (int k = 0; k < moved.size(); ++k) moved[k] += 0.01 * std::sin(2.1 * k);
+  look(scene, engine, moved, {1.2, -0.04, 0.02});
+  hide_middle(scene);
+  const auto pictures = engine.draw(scene.gaussians, scene.views, true);
+  std::vector<ColorSums> wanted;
+  for (std::size_t v = 0; v < scene.views.size(); ++v) {
+    wanted.push_back(reference::color_sums(scene.chain, scene.views[v], scene.seen[v], pictures[v]));
+    REQUIRE(wanted[v].pixels > 300);
+    CHECK(wanted[v].gain == doctest::Approx(1.2).epsilon(0.1));
+  }
+  struct Variant {
+    int tile, pixels_per_lane;
+    bool least;
+  };
+  for (const Variant& variant :
+       {Variant{0, 0, false}, Variant{0, 0, true}, Variant{8, 2, false}, Variant{16, 8, false}}) {
+    CAPTURE(variant.tile);
+    CAPTURE(variant.least);
+    splat::Settings settings;
+    settings.tile = variant.tile;
+    settings.pixels_per_lane = variant.pixels_per_lane;
+    splat::Engine other(device(variant.least), settings);
+    other.set_gaussians(scene.gaussians);
+    const auto got = other.color_sums(scene.chain, scene.views, scene.seen_pointers());
+    REQUIRE(got.size() == scene.views.size());
+    for (std::size_t v = 0; v < got.size(); ++v) {
+      CAPTURE(v);
+      check_sums(scene, scene.views[v], got[v], wanted[v]);
+    }
+    // one seed, one device, same bits; also after other pictures
+    other.draw(scene.gaussians, {&scene.views[1], 1});
+    const auto again = other.color_sums(scene.chain, scene.views, scene.seen_pointers());
+    for (std::size_t v = 0; v < got.size(); ++v) CHECK(same_bits(got[v], again[v]));
+  }
+  check_silent();
+}
+
+TEST_CASE("the right side is the slope of the drawn loss") {
+  Scene scene = make_scene();
+  splat::Engine engine(device());
+  VectorX moved = scene.theta;
+  for (int k = 0; k < moved.size(); ++k) moved[k] += 0.004 * std::sin(2.1 * k);
+  look(scene, engine, moved, {});
+  engine.set_gaussians(scene.gaussians);
+  const auto sums = engine.color_sums(scene.chain, scene.views, scene.seen_pointers());
+  for (std::size_t v = 0; v < 2; ++v) {
+    CAPTURE(v);
+    const splat::ViewSpec& view = scene.views[v];
+    const auto pictures = engine.draw(scene.gaussians, {&view, 1}, true);
+    // Huber's loss over the same pixels at the same exposure; which pixels, says a weight that is not 0
+    std::vector<bool> counts(static_cast<std::size_t>(view.width) * view.height, false);
+    for (int y = 2; y < view.height - 2; ++y)
+      for (int x = 2; x < view.width - 2; ++x) {
+        bool all = pictures[0].rgba[4 * (y * view.width + x) + 3] >= 0.95f;
+        for (int i = 0; all && i < 25; ++i)
+          all = scene.seen[v][4 * ((y + i / 5 - 2) * view.width + x + i % 5 - 2) + 3] >= 128;
+        counts[y * view.width + x] = all;
+      }
+    const auto loss = [&](const Vector6& twist) {
+      splat::ViewSpec other = view;
+      for (Pose& motion : other.motions) motion = math::exp_se3(twist) * motion;
+      const splat::Picture picture = engine.draw(scene.gaussians, {&other, 1})[0];
+      double sum = 0.0;
+      for (std::size_t k = 0; k < picture.rgba.size(); ++k) {
+        if (k % 4 == 3 || !counts[k / 4]) continue;
+        const double r = std::abs(sums[v].gain * picture.rgba[k] + sums[v].bias - scene.seen[v][k] / 255.0);
+        sum += r <= 0.05 ? 0.5 * r * r : 0.05 * (r - 0.025);
+      }
+      return sum;
+    };
+    Vector6 right = Vector6::Zero();
+    for (const auto& part : sums[v].right) right += part.head<6>();
+    // Motions in the picture's plane, about the rope's middle. Of others it matters how deep the Gaussians lie of which
+    // a pixel's color is mixed.
+    const Pose about{view.camera->world_from_camera.rotation, scene.base * Vector3(0, 0, -0.14)};
+    const Vector6 found = math::adjoint(about).transpose() * right;
+    Vector3 slope, looked_up;  // by 10 cm of lever, so that they are of one size
+    for (const int k : {2, 3, 4}) {
+      const double lever = k < 3 ? 10.0 : 1.0, step = 2e-4 * lever;  // a fifth of a pixel
+      const Vector6 twist = math::transform_twist(about, step * Vector6::Unit(k));
+      slope[k - 2] = lever * (loss(twist) - loss(-twist)) / (2.0 * step);
+      looked_up[k - 2] = lever * found[k];
+    }
+    CHECK((looked_up - slope).norm() <= 0.05 * slope.norm());
+  }
+  check_silent();
+}
+
+TEST_CASE("a step on the colors finds a small motion of the rope") {
+  Scene scene = make_scene();
+  splat::Engine engine(device());
+  VectorX moved = scene.theta;
+  for (int k = 0; k < moved.size(); ++k) moved[k] += 0.006 * std::sin(1.7 * k + 0.5);  // up to 2 px
+  look(scene, engine, moved, {0.9, 0.05, 0.0});
+  engine.set_gaussians(scene.gaussians);
+  const int n = scene.chain.angles();
+  std::vector<double> errors{(scene.theta - moved).norm()};
+  for (int step = 0; step < 2; ++step) {
+    for (splat::ViewSpec& view : scene.views) view.motions = chain::link_motions(scene.chain, scene.theta, scene.base);
+    const MatrixX axes = chain::world_axes(scene.chain, scene.theta, scene.base);
+    MatrixX normal = MatrixX::Zero(n + 2, n + 2);
+    VectorX right = VectorX::Zero(n + 2);
+    for (const ColorSums& sums : engine.color_sums(scene.chain, scene.views, scene.seen_pointers()))
+      for (int j = 0; j < scene.chain.links(); ++j) {
+        MatrixX columns = MatrixX::Zero(8, n + 2);
+        const int count = scene.chain.last_angle(j) + 1;
+        columns.topLeftCorner(6, count) = axes.leftCols(count);
+        columns(6, n) = columns(7, n + 1) = 1.0;
+        normal += columns.transpose() * sums.normal[j] * columns;
+        right += columns.transpose() * sums.right[j];
+      }
+    scene.theta -= normal.ldlt().solve(right).head(n);
+    errors.push_back((scene.theta - moved).norm());
+  }
+  CHECK(errors[1] < 0.3 * errors[0]);
+  CHECK(errors[2] < 0.12 * errors[0]);
+  check_silent();
+}
+
+TEST_CASE("following needs no new memory, whatever the crops' sizes, and nothing shown gives nothing") {
+  Scene scene = make_scene();
+  for (const bool least : {false, true}) {
+    splat::Engine engine(device(least));
+    look(scene, engine, scene.theta, {});
+    engine.set_gaussians(scene.gaussians);
+    engine.color_sums(scene.chain, {scene.views.data(), 1}, {scene.seen_pointers().data(), 1});  // the largest
+    const std::uint64_t bytes = device(least).buffer_bytes, submitted = device(least).submitted;
+    int calls = 0;
+    for (int cut = 0; cut < 60; cut += 7, ++calls) {
+      splat::ViewSpec view = scene.views[0];
+      view.width -= cut;
+      view.height -= 2 * cut;
+      std::vector<std::uint8_t> part;
+      for (int y = 0; y < view.height; ++y)
+        part.insert(part.end(), scene.seen[0].begin() + 4 * y * 200,
+                    scene.seen[0].begin() + 4 * (y * 200 + view.width));
+      const std::vector<std::uint8_t>* const one = &part;
+      CHECK(engine.color_sums(scene.chain, {&view, 1}, {&one, 1})[0].pixels > 100);
+      CHECK(device(least).buffer_bytes == bytes);
+    }
+    CHECK(device(least).submitted == submitted + calls);  // one submission a frame, transfers included
+
+    std::vector<std::uint8_t> no_mask(4u * 200 * 240, 0);
+    const splat::ViewSpec empty{&scene.cameras[0], 3, 4, 0, 0, scene.views[0].motions};
+    const std::vector<std::uint8_t> no_pixels;
+    const std::array views{scene.views[0], empty};
+    const std::array<const std::vector<std::uint8_t>*, 2> seen{&no_mask, &no_pixels};
+    for (const ColorSums& sums : engine.color_sums(scene.chain, views, seen)) {
+      CHECK(sums.pixels == 0);
+      CHECK(sums.weight == 0.0);
+      CHECK(sums.gain == 1.0);
+      CHECK(sums.bias == 0.0);
+      for (const auto& normal : sums.normal) CHECK(normal.isZero(0.0));
+    }
+    CHECK(engine.color_sums(scene.chain, {}, {}).empty());
+  }
+  check_silent();
+}
+
+}  // namespace
