@@ -428,3 +428,53 @@ TEST_CASE("other programs' splats are read; damaged ones are refused") {
   core::write_file(file, bad);
   CHECK(contains(message_of([&] { twin::read_ply(file); }), "link_5 of Gaussian 19"));
 }
+
+TEST_CASE("point clouds of other programs are read") {
+  const test::TemporaryFolder folder("points");
+  const Path file = folder.path / "hand.ply";
+  const math::Vector3 first(0.25, -1.5, 3.0), second(1e-3, 2.0, -0.125);
+  const auto read = [&](const std::string& bytes) {
+    core::write_file(file, bytes);
+    const math::MatrixX points = twin::read_points(file);
+    REQUIRE(points.cols() == 2);
+    CHECK((points.col(0) - first).norm() < 1e-7);
+    CHECK((points.col(1) - second).norm() < 1e-7);
+  };
+  read(
+      "ply\nformat ascii 1.0\ncomment a hand\nelement vertex 3\nproperty uchar red\nproperty float x\n"
+      "property float y\nproperty float z\nend_header\n255 0.25 -1.5 3\n0 nan nan nan\n7 1e-3 2.0 -0.125");
+  for (const bool big : {false, true})
+    for (const bool doubles : {false, true}) {
+      const std::string type = doubles ? "double" : "float";
+      std::string bytes = std::string("ply\nformat binary_") + (big ? "big" : "little") +
+                          "_endian 1.0\nelement vertex 2\nproperty " + type + " z\nproperty uchar red\nproperty " +
+                          type + " y\nproperty " + type + " x\nelement face 0\nend_header\n";
+      const auto add = [&](double value) {
+        const auto single = static_cast<float>(value);
+        std::string number = doubles ? std::string(reinterpret_cast<const char*>(&value), sizeof value)
+                                     : std::string(reinterpret_cast<const char*>(&single), sizeof single);
+        if (big) std::reverse(number.begin(), number.end());
+        bytes += number;
+      };
+      for (const math::Vector3& point : {first, second}) {
+        add(point.z());
+        bytes += '\x7f';
+        add(point.y());
+        add(point.x());
+      }
+      read(bytes);
+      for (std::size_t size = 0; size < bytes.size(); ++size) {
+        core::write_file(file, bytes.substr(0, size));
+        CHECK(contains(message_of([&] { twin::read_points(file); }), "hand.ply"));
+      }
+    }
+  const auto refused = [&](const std::string& bytes) {
+    core::write_file(file, bytes);
+    return message_of([&] { twin::read_points(file); });
+  };
+  const std::string head = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n";
+  CHECK(contains(refused(head + "end_header\n1 2\n3 4\n"), "'z'"));
+  CHECK(contains(refused(head + "property float z\nend_header\n1 2 3\n4 five 6\n"), "point 1"));
+  CHECK(contains(refused(head + "property float z\nend_header\n1 2 3\n"), "ends before its 2 points"));
+  CHECK(contains(refused("ply\nformat binary 1.0\nelement vertex 0\nproperty float x\nend_header\n"), "'binary'"));
+}

@@ -61,6 +61,8 @@ void check_output_folder(const Path& folder, bool overwrite, const std::string& 
 void check_output_file(const std::string& file);
 // Makes a folder and those above it. Throws WorkError.
 void make_folder(const Path& folder);
+// What an input's fault is once work has begun: exit code 1, and `kept` says what there is.
+WorkError broken_off(const InputError& error, const std::string& kept);
 // CAPTURE[:camera] as the two; the second is empty for all cameras. A folder whose own name has a colon is taken as it
 // is.
 std::pair<std::string, std::string> split_camera(const std::string& text);

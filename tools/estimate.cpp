@@ -187,7 +187,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
       device = gpu::open_device({.selector = globals.device});
       engine.emplace(*device);
     } catch (const InputError& error) {
-      if (!request.solver.empty()) throw;  // asked for
+      if (!request.solver.empty() || !globals.device.empty()) throw;  // asked for
       core::warn(std::string(error.what()) + "; the rope is followed by its outline alone");
     }
   }
@@ -322,10 +322,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   } catch (const InputError& error) {
     write();
     if (states.time.empty()) throw;
-    // work has begun: what exists is kept, and the exit code says so
-    const std::string text = error.what();
-    const std::size_t colon = std::min(text.find(": "), text.size() - 2);
-    throw WorkError(text.substr(0, colon), text.substr(colon + 2), "the states so far are kept");
+    throw broken_off(error, "the states so far are kept");
   } catch (...) {
     write();
     throw;

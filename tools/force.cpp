@@ -48,11 +48,12 @@ std::optional<State> read_estimate(const std::string& line, const std::string& w
     const auto theta = object.at("theta").get<std::vector<double>>();
     const auto deviation = object.at("sigma").get<std::vector<double>>();
     out.time = object.at("time").get<double>();
-    if (static_cast<int>(theta.size()) != angles || deviation.size() != theta.size())
+    if (static_cast<int>(theta.size()) != angles || (!deviation.empty() && deviation.size() != theta.size()))
       throw InputError(where, "has not the twin's " + std::to_string(angles) + " angles",
                        "give estimates of this twin");
     if (!(out.time > before)) throw InputError(where, "its time does not increase", "give the lines in order");
     out.theta = Eigen::Map<const math::VectorX>(theta.data(), angles);
+    if (deviation.empty()) return out;  // as estimate's solver adam writes it
     if (!object.contains("covariance")) {
       out.standing =
           force::angle_covariance(chain, out.theta, Eigen::Map<const math::VectorX>(deviation.data(), angles));
@@ -124,11 +125,8 @@ ContactAt contact_of(const ForceRequest& request,
                      const std::function<force::Contact(double, const math::VectorX&, const math::MatrixX&)>& nearest,
                      double apart) {
   if (!request.hand.empty()) {
-    const splat::Gaussians cloud = twin::read_ply(request.hand);
-    if (cloud.count == 0) throw InputError(request.hand, "has no point", "give a point cloud of the hand");
-    math::MatrixX points(3, cloud.count);
-    for (int i = 0; i < cloud.count; ++i)
-      points.col(i) << cloud.mean[3 * i], cloud.mean[3 * i + 1], cloud.mean[3 * i + 2];
+    const math::MatrixX points = twin::read_points(request.hand);
+    if (points.cols() == 0) throw InputError(request.hand, "has no point", "give a point cloud of the hand");
     return [=](double time, const math::VectorX& theta) { return nearest(time, theta, points); };
   }
   if (request.contact.ends_with(".csv") || request.contact == "-") {
@@ -210,11 +208,16 @@ void force(const Globals& globals, const ForceRequest& request) {
     live.base = base_at;
     live.contact = with_near(contact_of(request, nearest, kLiveApart));
     double first = std::numeric_limits<double>::infinity();
-    each_state(request, twin.chain, [&](const State& state) {
-      first = std::min(first, state.time);
-      check_time(first, state.time);
-      if (const auto line = force::update(live, state.time, state.theta, state.standing)) write(*line);
-    });
+    try {
+      each_state(request, twin.chain, [&](const State& state) {
+        first = std::min(first, state.time);
+        check_time(first, state.time);
+        if (const auto line = force::update(live, state.time, state.theta, state.standing)) write(*line);
+      });
+    } catch (const InputError& error) {
+      if (lines == 0) throw;
+      throw broken_off(error, "the lines so far are kept");
+    }
     if (live.taken < 3) throw InputError(source, few, more);
     for (const force::Estimate& line : force::finish(live)) write(line);
     if (live.contact) check_near();
@@ -258,6 +261,7 @@ void add_force_commands(CLI::App& app, const Globals& globals, Job& job) {
                    "Points farther than three diameters from the rope do not touch it")
       ->type_name("X,Y,Z|FILE.csv|auto");
   command->add_option("--hand", request->hand, "Point cloud of the hand; the nearest Gaussian is touched")
+      ->excludes("--contact")
       ->type_name("FILE.ply");
   command->add_flag("--live", request->live,
                     "While states come in: a line is written two states after its own, from these and earlier ones");

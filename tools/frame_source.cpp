@@ -207,8 +207,16 @@ FrameSource open_stream(const SourceRequest& request) {
 }  // namespace
 
 FrameSource open_frames(const SourceRequest& request) {
-  if (request.calibration.empty() && !request.start.empty())
-    throw InputError("--start", "a capture has times of its own", "leave it out");
+  if (request.calibration.empty()) {
+    std::error_code error;
+    const Path file = request.camera;
+    const bool none = request.camera == "-" || std::filesystem::is_character_file(file, error) ||
+                      (std::filesystem::is_regular_file(file, error) && file.extension() != ".json");
+    if (none)
+      throw InputError("--calibration", "is needed with " + request.camera + ", which is no capture",
+                       "give a camera object as in capture.json");
+    if (!request.start.empty()) throw InputError("--start", "a capture has times of its own", "leave it out");
+  }
   return request.calibration.empty() ? open_capture(request) : open_stream(request);
 }
 

@@ -59,6 +59,12 @@ void make_folder(const Path& folder) {
                     "make room or choose a folder that can be written");
 }
 
+WorkError broken_off(const InputError& error, const std::string& kept) {
+  const std::string text = error.what();
+  const std::size_t colon = std::min(text.find(": "), text.size() - 2);
+  return WorkError(text.substr(0, colon), text.substr(colon + 2), kept);
+}
+
 std::pair<std::string, std::string> split_camera(const std::string& text) {
   std::error_code error;
   const std::size_t colon = text.rfind(':');

@@ -69,5 +69,8 @@ std::string centerline_csv(const chain::Chain& chain, const chain::States& state
 std::string gaussians_ply(const splat::Gaussians& gaussians);
 // Also reads other programs' 3DGS files: properties in any order, unknown ones skipped, no link_*: `links` is 0.
 splat::Gaussians read_ply(const Path& file);
+// x, y, z of a point cloud as other programs write it: PLY, ASCII or binary of either byte order, float or double; what
+// is not finite is left out. 3 x count.
+math::MatrixX read_points(const Path& file);
 
 }  // namespace chainsplat::twin

@@ -1,4 +1,5 @@
 // Gaussians in the PLY layout of 3DGS, with the link logits behind.
+#include <algorithm>
 #include <array>
 #include <bit>
 #include <charconv>
@@ -40,19 +41,29 @@ int scalar_bytes(const std::string& type) {
   return found == sizes.end() ? 0 : found->second;
 }
 
-struct Header {
-  std::size_t count = 0, stride = 0, data = 0;  // vertices; bytes a vertex; where they start
-  std::map<std::string, std::size_t> floats;    // byte offset of every float property
+struct Property {
+  std::size_t offset = 0;  // byte of a vertex
+  int index = 0;           // number of a vertex
+  int bytes = 0;
+  bool real = false;
 };
 
-Header read_header(const std::string& bytes, const std::string& file) {
-  const auto fail = [&](const std::string& what) {
-    throw InputError(file, what, "write it again as binary little-endian 3DGS PLY");
-  };
+struct Header {
+  std::string format;
+  std::size_t count = 0, stride = 0, data = 0;  // vertices; bytes a vertex; where they start
+  std::map<std::string, Property> properties;   // of a vertex
+  bool has_float(const std::string& name) const {
+    const auto found = properties.find(name);
+    return found != properties.end() && found->second.real && found->second.bytes == sizeof(float);
+  }
+};
+
+// `things` are what the vertices are meant to be, `mend` how the file should be written.
+Header read_header(const std::string& bytes, const std::string& file, const char* things, const char* mend) {
+  const auto fail = [&](const std::string& what) { throw InputError(file, what, mend); };
   Header header;
   std::size_t at = 0;
-  int properties = 0;
-  bool little = false, in_vertex = false, seen_vertex = false;
+  bool in_vertex = false, seen_vertex = false;
   for (int number = 0;; ++number) {
     const std::size_t end = bytes.find('\n', at);
     if (end == std::string::npos) fail(number == 0 ? "is not a PLY file" : "its header has no end");
@@ -68,9 +79,7 @@ Header read_header(const std::string& bytes, const std::string& file) {
     words >> word;
     if (word == "end_header") break;
     if (word == "format") {
-      words >> word;
-      little = word == "binary_little_endian";
-      if (!little) fail("is in the format '" + word.substr(0, 30) + "'");
+      words >> header.format;
     } else if (word == "element") {
       std::string name;
       long long count = -1;
@@ -86,16 +95,19 @@ Header read_header(const std::string& bytes, const std::string& file) {
       std::string type, name;
       words >> type >> name;
       const int size = scalar_bytes(type);
-      if (size == 0 || name.empty() || ++properties > kMostProperties)
+      const int index = static_cast<int>(header.properties.size());
+      if (size == 0 || name.empty() || index >= kMostProperties || header.properties.contains(name))
         fail("its property line '" + line.substr(0, 60) + "' is not understood");
-      if (type == "float" || type == "float32") header.floats[name] = header.stride;
+      header.properties[name] = {header.stride, index, size, type.starts_with("float") || type.starts_with("double")};
       header.stride += static_cast<std::size_t>(size);
     }
   }
-  if (!little || !seen_vertex) fail("its header names no format or no vertices");
+  if (header.format.empty() || !seen_vertex) fail("its header names no format or no vertices");
   header.data = at;
-  if (header.stride == 0 || header.count > (bytes.size() - at) / header.stride)
-    fail("ends before its " + std::to_string(header.count) + " Gaussians");
+  const bool ascii = header.format == "ascii";  // a digit and a space for every number, and the last line may be open
+  const std::size_t least = ascii ? 2 * header.properties.size() : header.stride;
+  if (header.stride == 0 || header.count > (bytes.size() - at + (ascii ? 1 : 0)) / least)
+    fail("ends before its " + std::to_string(header.count) + " " + things);
   return header;
 }
 
@@ -133,11 +145,14 @@ std::string gaussians_ply(const splat::Gaussians& g) {
 splat::Gaussians read_ply(const Path& path) {
   const std::string file = path.string();
   const std::string bytes = core::read_file(path);
-  const Header header = read_header(bytes, file);
+  const char* const mend = "write it again as binary little-endian 3DGS PLY";
+  const Header header = read_header(bytes, file, "Gaussians", mend);
+  if (header.format != "binary_little_endian")
+    throw InputError(file, "is in the format '" + header.format.substr(0, 30) + "'", mend);
 
   int rest = 0, links = 0;
-  while (header.floats.contains("f_rest_" + std::to_string(rest))) ++rest;
-  while (header.floats.contains("link_" + std::to_string(links))) ++links;
+  while (header.has_float("f_rest_" + std::to_string(rest))) ++rest;
+  while (header.has_float("link_" + std::to_string(links))) ++links;
   int degree = 0;
   while (degree < 3 && 3 * ((degree + 1) * (degree + 1) - 1) < rest) ++degree;
   const int coefficients = (degree + 1) * (degree + 1);
@@ -148,10 +163,9 @@ splat::Gaussians read_ply(const Path& path) {
   std::vector<std::size_t> offsets;
   for (const std::string& name : names) {
     const bool normal = name == "nx" || name == "ny" || name == "nz";
-    const auto found = header.floats.find(name);
-    if (found == header.floats.end() && !normal)
+    if (!header.has_float(name) && !normal)
       throw InputError(file, "has no float property '" + name + "'", "write it with the properties of 3DGS");
-    offsets.push_back(normal ? 0 : found->second);
+    offsets.push_back(normal ? 0 : header.properties.at(name).offset);
   }
 
   splat::Gaussians g;
@@ -183,6 +197,55 @@ splat::Gaussians read_ply(const Path& path) {
     for (int j = 0; j < links; ++j) g.link_logits[static_cast<std::size_t>(links) * i + j] = take();
   }
   return g;
+}
+
+math::MatrixX read_points(const Path& path) {
+  const std::string file = path.string();
+  const char* const mend = "write a PLY point cloud with x, y and z, ASCII or binary";
+  const std::string bytes = core::read_file(path);
+  const Header header = read_header(bytes, file, "points", mend);
+  const bool ascii = header.format == "ascii", big = header.format == "binary_big_endian";
+  if (!ascii && !big && header.format != "binary_little_endian")
+    throw InputError(file, "is in the format '" + header.format.substr(0, 30) + "'", mend);
+  std::array<Property, 3> axes;
+  for (int d = 0; d < 3; ++d) {
+    const std::string name(1, "xyz"[d]);
+    const auto found = header.properties.find(name);
+    if (found == header.properties.end() || !found->second.real)
+      throw InputError(file, "has no float or double property '" + name + "'", mend);
+    axes[d] = found->second;
+  }
+
+  math::MatrixX points(3, static_cast<Eigen::Index>(header.count));
+  Eigen::Index kept = 0;
+  std::istringstream words(ascii ? bytes.substr(header.data) : std::string());
+  std::vector<double> numbers(header.properties.size());
+  std::string word;
+  for (std::size_t k = 0; k < header.count; ++k) {
+    math::Vector3 point;
+    if (ascii) {
+      for (double& number : numbers) {
+        words >> word;
+        // not by the stream, which reads no nan
+        if (!words || std::from_chars(word.data(), word.data() + word.size(), number).ec != std::errc())
+          throw InputError(file, "point " + std::to_string(k) + " is not written in full", mend);
+      }
+      for (int d = 0; d < 3; ++d) point[d] = numbers[axes[d].index];
+    } else {
+      for (int d = 0; d < 3; ++d) {
+        std::array<char, sizeof(double)> number{};
+        const char* const from = bytes.data() + header.data + header.stride * k + axes[d].offset;
+        std::copy_n(from, axes[d].bytes, number.begin());
+        if (big) std::reverse(number.begin(), number.begin() + axes[d].bytes);
+        float single = 0.0f;
+        std::memcpy(&single, number.data(), sizeof single);
+        std::memcpy(&point[d], number.data(), sizeof(double));
+        if (axes[d].bytes == sizeof single) point[d] = static_cast<double>(single);
+      }
+    }
+    if (point.allFinite()) points.col(kept++) = point;  // a depth camera's clouds have holes
+  }
+  return points.leftCols(kept);
 }
 
 }  // namespace chainsplat::twin

@@ -82,6 +82,9 @@ expect_error 2 '/dev/null: is no camera that V4L2 can read' estimate "$twin" --c
   --calibration "$work/camera.json"
 expect_error 2 '/dev/video97: does not exist' estimate "$twin" --camera /dev/video97 --calibration "$work/camera.json"
 
+expect_error 2 '--calibration: is needed with' estimate "$twin" --camera "$demo/cam0.mp4"
+expect_error 2 '--calibration: is needed with' estimate "$twin" --camera -
+expect_error 2 '--calibration: is needed with' estimate "$twin" --camera /dev/null
 expect_error 2 'adam draws the twin' estimate "$twin" --camera "$demo:cam0" --solver adam
 expect_error 2 'does not exist' estimate "$twin" --camera "$work/none.mp4" --calibration "$work/camera.json"
 expect_error 2 '--drop' estimate "$twin" --camera "$demo:cam0" --drop 0

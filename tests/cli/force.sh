@@ -60,6 +60,26 @@ printf 'time,x,y,z\n0,%s\n0.1,,,\n' "$point" >"$work/contact.csv"
 force --contact "$work/contact.csv"
 expect_code 0 'force --contact FILE.csv'
 
+# a hand as a depth camera's program writes it
+{ printf 'ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\nend_header\n'
+  echo 'nan nan nan'; echo "${point//,/ }"; } >"$work/hand.ply"
+force --hand "$work/hand.ply"
+expect_code 0 'force --hand'
+[ "$(wc -l <"$work/stdout")" -eq 12 ] || fail 'force --hand: not a line a state'
+expect_error 2 'excludes' force "$work/twin" --states "$states" --hand "$work/hand.ply" --contact "$point"
+
+# live, and the input breaks off: what was written is kept
+{ estimates 1 8; echo '{"time":'; } |
+  "$program" force "$work/twin" --estimate - --base "$demo/base.tum" --live >"$work/stdout" 2>"$work/stderr"
+code=${PIPESTATUS[1]}
+expect_code 1 'force --live, a line that is cut off'
+[ "$(wc -l <"$work/stdout")" -eq 6 ] || fail 'force --live, a line that is cut off: not the lines before'
+grep -q '^chainsplat: error: -: line 9: .*; the lines so far are kept$' "$work/stderr" || fail 'force --live: which line?'
+# estimates without deviations
+estimates 1 12 | sed 's/"sigma":[^]]*]/"sigma":[]/' >"$work/plain.jsonl"
+run force "$work/twin" --estimate "$work/plain.jsonl" --base "$demo/base.tum"
+expect_code 0 'force of estimates without deviations'
+
 printf 'time,x,y,z\n0,,,\n' >"$work/none.csv"
 expect_error 2 'no contact' force "$work/twin" --states "$states" --base "$demo/base.tum" --contact "$work/none.csv"
 expect_error 2 'never comes nearer' force "$work/twin" --states "$states" --base "$demo/base.tum" --contact 100,0,0
@@ -69,4 +89,6 @@ expect_error 2 'base motion covers' force "$work/twin" --states "$work/late.csv"
 printf 'time,theta_1\n0,0\n1,0\n2,0\n' >"$work/other.csv"
 expect_error 2 'other.csv' force "$work/twin" --states "$work/other.csv" --base "$demo/base.tum"
 expect_error 2 'one of the two' force "$work/twin"
+# a device that is asked for and not there is no reason to go on without one
+expect_error 2 "no device is 'none'" estimate "$work/twin" --camera "$demo:cam0" --device none
 finish
