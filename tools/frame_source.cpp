@@ -195,7 +195,7 @@ FrameSource open_stream(const SourceRequest& request) {
                         "give the calibration of this camera; the states so far are kept");
       count = frame.frame + 1;
     } while (frame.frame < request.first);
-    if (device && !offset) offset = unix ? until_unix(reader->time()) : start - reader->time();
+    if (device && !offset) offset = unix ? until_unix(reader->time()) : start - reader->first_time();
     frame.time = device ? reader->time() + *offset : start + frame.frame / rate;
     frame.views.clear();
     frame.arrived = core::seconds_now();

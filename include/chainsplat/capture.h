@@ -124,12 +124,13 @@ class VideoReader {
   ~VideoReader();
   VideoReader(VideoReader&&) noexcept;
   VideoReader& operator=(VideoReader&&) noexcept;
-  bool next(Image8& rgb);  // false at the end; reuses the memory of `rgb`
-  bool skip();             // the same without the conversion to RGB
-  bool device() const;     // a camera, not a recording
-  int frames() const;      // that came so far, with those that were passed over
-  double rate() const;     // mean frames a second that the stream claims, 0 when unknown
-  double time() const;     // s, of the last frame by the stream's clock; NaN when it has none
+  bool next(Image8& rgb);     // false at the end; reuses the memory of `rgb`
+  bool skip();                // the same without the conversion to RGB
+  bool device() const;        // a camera, not a recording
+  int frames() const;         // that came so far, with those that were passed over
+  double rate() const;        // mean frames a second that the stream claims, 0 when unknown
+  double time() const;        // s, of the last frame by the stream's clock; NaN when it has none
+  double first_time() const;  // s, of a camera's first frame, which may have been passed over
 
  private:
   struct Implementation;

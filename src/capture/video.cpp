@@ -152,9 +152,10 @@ class NewestFrame {
     thread_.join();
   }
 
-  // The newest frame that was not taken before, into `packet`, and how many came until then. Waits for it as long as a
-  // camera may be silent; a libav code below 0 when it does not come any more. Throws Interrupted.
-  int take(AVPacket& packet, int& received) {
+  // The newest frame that was not taken before, into `packet`, how many came until then, and the stamp of the first of
+  // them. Waits for it as long as a camera may be silent; a libav code below 0 when it does not come any more. Throws
+  // Interrupted.
+  int take(AVPacket& packet, int& received, std::int64_t& first_stamp) {
     constexpr double kSilence = 5.0;                     // s
     constexpr std::chrono::milliseconds kAttention{50};  // to a request to stop
     const double begun = core::seconds_now();
@@ -167,6 +168,7 @@ class NewestFrame {
     }
     fresh_ = false;
     received = received_;
+    first_stamp = first_stamp_;
     av_packet_unref(&packet);
     av_packet_move_ref(&packet, newest_.get());
     return 0;
@@ -180,7 +182,10 @@ class NewestFrame {
     while (!stop_) {
       const int code = av_read_frame(&camera, packet.get());
       if (code >= 0) {
-        ++count;
+        if (count++ == 0) {
+          const std::lock_guard lock(mutex_);
+          first_stamp_ = packet->pts;
+        }
         if (packet->size > 0) {  // else it was damaged on its way
           av_packet_unref(last.get());
           av_packet_move_ref(last.get(), packet.get());
@@ -211,6 +216,7 @@ class NewestFrame {
   std::atomic<bool> stop_{false};
   bool fresh_ = false;
   int received_ = 0, code_ = 0;
+  std::int64_t first_stamp_ = AV_NOPTS_VALUE;
   Owned<AVPacket> newest_{av_packet_alloc()};
   std::thread thread_;  // last: it uses all others
 };
@@ -254,8 +260,13 @@ struct VideoReader::Implementation {
   int scaler_width = 0, scaler_height = 0, scaler_format = -1, scaler_matrix = -1;
   bool scaler_full = false, at_end = false;
   int frames = 0;
-  std::unique_ptr<NewestFrame> camera;  // none: a recording
+  std::int64_t first_stamp = AV_NOPTS_VALUE;  // of a camera
+  std::unique_ptr<NewestFrame> camera;        // none: a recording
 
+  double seconds(std::int64_t stamp) const {
+    if (stamp == AV_NOPTS_VALUE) return std::numeric_limits<double>::quiet_NaN();
+    return static_cast<double>(stamp) * av_q2d(input.video().time_base);
+  }
   bool decode();
   void decode_newest();
   void convert(Image8& rgb);
@@ -322,7 +333,7 @@ bool VideoReader::Implementation::decode() {
 // The newest frame of a camera that can be decoded, into `frame`.
 void VideoReader::Implementation::decode_newest() {
   for (;;) {
-    int code = camera->take(*packet, frames);
+    int code = camera->take(*packet, frames, first_stamp);
     if (code < 0)
       throw WorkError(file.string(),
                       "gives no more frames after " + std::to_string(frames) + " (" +
@@ -390,11 +401,9 @@ int VideoReader::frames() const { return implementation_->frames; }
 
 double VideoReader::rate() const { return claimed_rate(implementation_->input.video()); }
 
-double VideoReader::time() const {
-  const std::int64_t stamp = implementation_->frame->best_effort_timestamp;
-  if (stamp == AV_NOPTS_VALUE) return std::numeric_limits<double>::quiet_NaN();
-  return static_cast<double>(stamp) * av_q2d(implementation_->input.video().time_base);
-}
+double VideoReader::time() const { return implementation_->seconds(implementation_->frame->best_effort_timestamp); }
+
+double VideoReader::first_time() const { return implementation_->seconds(implementation_->first_stamp); }
 
 VideoFacts video_facts(const Path& file) {
   Opened input = open_video(file);

@@ -102,6 +102,8 @@ said 1 '/dev/video97: frame 0 has 320x240 pixels, the calibration says 322x240; 
 # times: from the first frame on, or by a clock that the robot has too
 live "${yuyv[@]}" "${step[@]}" GONE=3 "${moving[@]}" --start 0.5
 expect_output '"frame":0,"time":0\.5,' '--start 0.5'
+live "${yuyv[@]}" "${step[@]}" EARLY=2 GONE=4 "${moving[@]}"
+expect_output '"frame":2,"time":0\.0666' 'a camera that was there before the program was ready'
 before=$(date +%s)
 live "${yuyv[@]}" "${step[@]}" GONE=3 "${calibration[@]}" --start unix
 time=$(sed -n '1s/.*"time":\([0-9]*\).*/\1/p' "$work/stdout")

@@ -8,6 +8,7 @@
 //   FAKE_CAMERA_STRIDE   frames that it takes while the program works on one: then its clock is the lines that the
 //   program
 //                        flushes to standard output, and no result depends on the machine's load. Without: real time
+//   FAKE_CAMERA_EARLY    frames that it takes before the program looks for the first time
 //   FAKE_CAMERA_GONE     it disappears after so many frames
 //   FAKE_CAMERA_SILENT   it sends nothing any more after so many frames
 //   FAKE_CAMERA_DAMAGED  the frame of this number is damaged on its way
@@ -113,8 +114,9 @@ void read_settings() {
 // Frames that have been taken until now.
 int due() {
   const int stride = static_cast<int>(setting("FAKE_CAMERA_STRIDE", 0));
-  const int count = stride > 0 ? 1 + stride * (lines + camera.damaged)
-                               : 1 + static_cast<int>((now() - camera.begun) * camera.format->rate);
+  const int count = stride > 0
+                        ? 1 + static_cast<int>(setting("FAKE_CAMERA_EARLY", 0)) + stride * (lines + camera.damaged)
+                        : 1 + static_cast<int>((now() - camera.begun) * camera.format->rate);
   return static_cast<int>(std::min(
       {static_cast<double>(count), setting("FAKE_CAMERA_GONE", INT_MAX), setting("FAKE_CAMERA_SILENT", INT_MAX)}));
 }
