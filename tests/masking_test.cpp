@@ -85,6 +85,56 @@ TEST_CASE("a shadow is background, another color is not") {
   CHECK(masking::difference_odds(background, picture, 2, 0) == 0.0);  // not known there
 }
 
+TEST_CASE("what hides the rope has not its marks, though its colors are thought to be the rope's") {
+  // 160 px by 16 px, from column 20 to 180, about row 75; striped, on gray, with a finger from above to the rope's
+  // middle
+  const chain::Chain rope =
+      chain::make_chain(0.2, 0.02, Vector3::UnitX(), Vector3::UnitY(), 4, chain::Bending::planar, false);
+  math::Pose base;
+  base.translation = Vector3(-0.1, 0.0, 0.25);
+  const VectorX straight = VectorX::Zero(4);
+  const capture::Camera camera = front_camera();
+  const std::uint8_t red[] = {160, 40, 40}, white[] = {200, 200, 200}, gray[] = {80, 80, 80}, skin[] = {160, 120, 96};
+  const auto is_rope = [](int x, int y) { return x >= 20 && x < 180 && y >= 67 && y < 83; };
+  const auto is_finger = [](int x, int y) { return x >= 90 && x < 115 && y < 90; };
+  std::vector<std::uint8_t> clean, hidden;
+  masking::Look look;
+  for (masking::Colors* const colors : {&look.near, &look.far}) {
+    colors->object.assign(masking::kColorBins, 0.0);
+    colors->surroundings.assign(masking::kColorBins, 0.0);
+    for (const std::uint8_t* const color : {red, white, skin}) colors->object[masking::color_bin(color)] = 500;
+    colors->surroundings[masking::color_bin(gray)] = 1000;
+    colors->surroundings[masking::color_bin(skin)] = 300;
+    masking::settle(*colors);
+  }
+  for (int y = 0; y < camera.height; ++y)
+    for (int x = 0; x < camera.width; ++x) {
+      const std::uint8_t* const color = !is_rope(x, y) ? gray : (x / 10) % 2 ? red : white;
+      for (int c = 0; c < 3; ++c) clean.push_back(static_cast<std::uint8_t>(color[c] * 10 / 8));  // in more light
+      const std::uint8_t* const seen = is_finger(x, y) ? skin : color;
+      hidden.insert(hidden.end(), seen, seen + 3);
+    }
+  const masking::Picture before{clean.data(), 200, 150, 3}, now{hidden.data(), 200, 150, 3};
+  const auto finger_share = [&] {  // of the finger over the rope that counts as rope, and of the rest of the rope
+    const capture::View mask = masking::cut(look, now, camera, rope, base, straight);
+    double finger = 0.0, fingers = 0.0, seen = 0.0, rest = 0.0;
+    for (int y = 70; y < 80; ++y)
+      for (int x = 25; x < 175; ++x) {
+        const int u = x - mask.x0, v = y - mask.y0;
+        const bool inside =
+            u >= 0 && v >= 0 && u < mask.width && v < mask.height && mask.rgba[4 * (v * mask.width + u) + 3];
+        (is_finger(x, y) ? finger : seen) += inside, (is_finger(x, y) ? fingers : rest) += 1.0;
+      }
+    return std::pair(finger / fingers, seen / rest);
+  };
+  CHECK(finger_share().first > 0.8);
+  const masking::Tube tube = masking::tube(rope, base, straight, camera, 0.0, rope.length, 8.0);
+  CHECK(tube.is_left(100, 70) != tube.is_left(100, 80));
+  look.marks = masking::marks({&before, 1}, {&tube, 1}, rope);
+  CHECK(finger_share().first < 0.2);
+  CHECK(finger_share().second > 0.9);
+}
+
 TEST_CASE("masks of the demo capture without a prompt") {
   double sum = 0.0, least = 1.0;
   int frames = 0;

@@ -1,6 +1,7 @@
 // estimate.cpp - a rope followed frame by frame: one JSON line a frame on standard output, flushed.
 #include <CLI/CLI.hpp>
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdio>
 #include <functional>
@@ -115,6 +116,20 @@ std::vector<std::uint8_t> twin_colors(const twin::Twin& twin) {
     }
   }
   return rgb;
+}
+
+// The twin drawn into a crop (x0, y0, width, height; without size the whole picture).
+capture::View drawn_view(splat::Engine& engine, const twin::Twin& twin, const capture::Camera& camera,
+                         const math::Pose& base, const math::VectorX& theta, const std::array<int, 4>& crop) {
+  capture::View view;
+  view.width = camera.width, view.height = camera.height;
+  if (crop[2] > 0 && crop[3] > 0) view.x0 = crop[0], view.y0 = crop[1], view.width = crop[2], view.height = crop[3];
+  const splat::ViewSpec spec{&camera,    view.x0,     view.y0,
+                             view.width, view.height, chain::link_motions(twin.chain, theta, base)};
+  const splat::Picture drawn = std::move(engine.draw(twin.gaussians, {&spec, 1}, false).front());
+  for (const float value : drawn.rgba)
+    view.rgba.push_back(static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(value, 0.0f, 1.0f))));
+  return view;
 }
 
 // Whether a picture was masked before: most of it is black.
@@ -242,12 +257,12 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   }
   std::optional<bool> masked_before;  // by the first picture
   std::optional<masking::Live> live;
+  std::array<int, 4> masked = {0, 0, 0, 0};  // crop of the last mask: x0, y0, width, height
   const MaskMaker mask = [&](const capture::Image8& picture, const math::Pose& pose,
                              const std::optional<math::VectorX>& theta) {
     if (!masked_before) {
       masked_before = black_about(picture);
       if (!*masked_before) {
-        filter.options = estimation::options_for_live_masks();
         const std::vector<std::uint8_t> colors = twin_colors(twin);
         if (colors.empty())
           core::warn(request.source.camera +
@@ -257,7 +272,13 @@ void estimate(const Globals& globals, EstimateRequest& request) {
           live = masking::start(source.cameras[0], twin.chain, colors);
       }
     }
-    return live ? masking::mask(*live, picture, pose, theta) : bright_view(picture, source.cameras[0]);
+    if (!live) return bright_view(picture, source.cameras[0]);
+    constexpr int kMarksEvery = 10;  // frames; the rope shows nearly the same side
+    if (engine && theta && live->frames % kMarksEvery == 1)
+      masking::learn_marks(*live, drawn_view(*engine, twin, source.cameras[0], pose, *theta, masked), pose, *theta);
+    capture::View view = masking::mask(*live, picture, pose, theta);
+    masked = {view.x0, view.y0, view.width, view.height};
+    return view;
   };
 
   chain::States states;

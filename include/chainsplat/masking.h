@@ -34,10 +34,20 @@ struct Background {
   std::vector<std::uint8_t> noise;  // width * height: standard deviation, gray levels; 0: not known here
 };
 
+// What the rope looks like along and across, as one camera sees it: while it does not turn about itself every mark
+// stays at its arclength and side.
+struct Marks {
+  int along = 0, across = 0;      // cells; 0: nothing known
+  double step = 0.0;              // m, of a cell along
+  std::vector<std::uint8_t> rgb;  // 3 * along * across
+  std::vector<char> known;        // along * across
+};
+
 // How one camera tells the rope from the rest.
 struct Look {
   Colors near, far;  // the rope's half at the grasp and that at the free end, whose tip may look different
   Background background;
+  Marks marks;
 };
 
 // The mask of one picture, 255 or 0: RGB or RGBA pixels of the camera's size, row-major. With `theta` the chain is
@@ -83,6 +93,9 @@ struct Live {
 
 // `object_rgb`: colors of the rope, 0..255, three a sample (of a twin: its Gaussians', of a capture: its masks').
 Live start(const capture::Camera& camera, const chain::Chain& chain, const std::vector<std::uint8_t>& object_rgb);
+// The rope's marks as a drawn picture of it at these angles shows them (an undistorted crop with its coverage): what
+// hides the rope has not these.
+void learn_marks(Live& live, const capture::View& drawn, const math::Pose& base, const math::VectorX& theta);
 // A recorded frame -> the undistorted crop with its mask. `theta`: where the rope is expected; none when that is not
 // known (the first frame, or lost).
 capture::View mask(Live& live, const capture::Image8& recorded_rgb, const math::Pose& base,

@@ -19,11 +19,16 @@ constexpr double kContour = 2.0;                             // cost of a contou
 constexpr double kInsideFrom = 0.3, kBesideTo = 1.5;         // radii from the outline: not the outline, still near
 constexpr double kHiddenStep = 0.25;                         // diameters along the rope
 constexpr int kHiddenSteps = 2;                              // on either side that are looked at together
-constexpr double kSeen = 0.4;          // of the usual log odds and of their usual change: less is hidden
-constexpr double kSurelyHidden = 6.0;  // log odds
-constexpr double kSpeck = 0.02;        // share of the largest part under which a part is noise
-constexpr double kLeastShare = 0.1;    // of the tube's area: less is not the rope
-constexpr int kMargin = 24;            // px about the mask: what capture::load leaves
+constexpr double kSeen = 0.4;            // of the usual log odds and of their usual change: less is hidden
+constexpr double kSurelyHidden = 6.0;    // log odds
+constexpr int kUnusualWindow = 5;        // px, whose share of pixels without the rope's marks counts:
+constexpr double kFewUnusual = 0.5;      // up to this the chain may only be a little off,
+constexpr double kMostUnusual = 0.75;    // and where so much of the tube is, the marks themselves are wrong
+constexpr double kSurelyUnusual = 12.0;  // log odds, outvote place and color
+constexpr double kSurelyRope = 2.0;      // log odds of a color
+constexpr double kSpeck = 0.02;          // share of the largest part under which a part is noise
+constexpr double kLeastShare = 0.1;      // of the tube's area: less is not the rope
+constexpr int kMargin = 24;              // px about the mask: what capture::load leaves
 
 double squared_difference(const Picture& picture, int x, int y, int u, int v) {
   const std::uint8_t *a = pixel(picture, x, y), *b = pixel(picture, u, v);
@@ -115,6 +120,35 @@ std::vector<double> hidden_odds(const Look& look, const Picture& picture, const 
   return out;
 }
 
+// Where the tube does not have the rope's marks something may hide it: log odds of the box's pixels, 0 or less. Colors
+// that are surely the rope's are not hidden, whatever the marks (it may have turned about itself).
+cv::Mat unusual_odds(const Look& look, const Picture& picture, const Tube& place, const chain::Chain& chain) {
+  const Box& box = place.box;
+  cv::Mat seen(box.height(), box.width(), CV_32F, cv::Scalar(0)), other = seen.clone();
+  int pixels = 0, unusual = 0;
+  for (int y = box.y0; y < box.y1; ++y)
+    for (int x = box.x0; x < box.x1; ++x) {
+      if (place.at(x, y) >= 0.0f) continue;
+      const Colors& colors = colors_at(look, chain, place.arclength(x, y));
+      const bool is_other =
+          !usual(look.marks, place, picture, x, y) && color_odds(colors, pixel(picture, x, y)) < kSurelyRope;
+      seen.at<float>(y - box.y0, x - box.x0) = 1.0f;
+      other.at<float>(y - box.y0, x - box.x0) = is_other;
+      ++pixels, unusual += is_other;
+    }
+  if (unusual > kMostUnusual * pixels) return {};
+  const cv::Size window(kUnusualWindow, kUnusualWindow);
+  cv::boxFilter(seen, seen, -1, window);
+  cv::boxFilter(other, other, -1, window);
+  for (int y = 0; y < box.height(); ++y)
+    for (int x = 0; x < box.width(); ++x) {
+      float& odds = other.at<float>(y, x);
+      const double share = odds / std::max(1e-6f, seen.at<float>(y, x));
+      odds = static_cast<float>(-kSurelyUnusual * std::clamp((share - kFewUnusual) / (1.0 - kFewUnusual), 0.0, 1.0));
+    }
+  return other;
+}
+
 // Takes small parts out; returns the area that stays.
 int without_specks(cv::Mat& labels) {
   cv::Mat parts, facts, centers;
@@ -144,6 +178,8 @@ capture::View cut(const Look& look, const Picture& picture, const capture::Camer
   const double step = kHiddenStep * chain.diameter;
   std::vector<double> hidden;
   if (theta) hidden = hidden_odds(look, picture, place, chain, step);
+  cv::Mat unusual;
+  if (theta && look.marks.along > 0) unusual = unusual_odds(look, picture, place, chain);
   double tube_area = 0.0;
   for (int y = box.y0; y < box.y1; ++y)
     for (int x = box.x0; x < box.x1; ++x) {
@@ -161,6 +197,7 @@ capture::View cut(const Look& look, const Picture& picture, const capture::Camer
         const double arclength = place.arclength(x, y);
         sum += color_odds(colors_at(look, chain, arclength), rgb) +
                hidden[static_cast<std::size_t>(std::min(arclength, chain.length) / step)];
+        if (!unusual.empty()) sum += unusual.at<float>(y - box.y0, x - box.x0);
       } else {
         sum += std::max(color_odds(look.near, rgb), color_odds(look.far, rgb));
       }

@@ -66,6 +66,13 @@ Live start(const capture::Camera& camera, const chain::Chain& chain, const std::
   return live;
 }
 
+void learn_marks(Live& live, const capture::View& drawn, const math::Pose& base, const math::VectorX& theta) {
+  capture::Camera camera = live.camera;
+  camera.distortion = {};
+  const Tube place = tube(live.chain, base, theta, camera, 0.0, live.chain.length, 0.0);
+  live.look.marks = marks(drawn, place, live.chain);
+}
+
 capture::View mask(Live& live, const capture::Image8& recorded, const math::Pose& base,
                    const std::optional<math::VectorX>& theta) {
   capture::Camera camera = live.camera;

@@ -24,6 +24,11 @@ constexpr double kOddsPerDifference = 0.25;
 constexpr double kSurelySame = -2.0,
                  kSurelyOther = 0.5;  // log odds; other can be a shadow or a hand, same hardly a rope
 
+constexpr double kMarkStep = 0.25;  // diameters
+constexpr int kMarksAcross = 6;
+constexpr double kLeastLight = 0.6, kMostLight = 1.3;  // of the usual: the rope's own shading moves, a hand's shadow
+constexpr double kUsual = 24.0;  // gray levels, RMS of the channels: what looks otherwise is not the rope
+
 // [1 2 1] / 4 along each of the three axes.
 void blur(std::vector<double>& counts) {
   for (const int stride : {1, 32, 32 * 32}) {
@@ -88,6 +93,78 @@ Reach reach(const chain::Chain& chain, const math::Pose& base, const capture::Ca
   return out;
 }
 
+int cell(const Marks& marks, const Tube& tube, int x, int y) {
+  const int row = std::clamp(static_cast<int>(tube.arclength(x, y) / marks.step), 0, marks.along - 1);
+  // 0 at the left outline, 1 at the right one
+  const double half = std::clamp(0.5 * (-tube.at(x, y) / tube.radius), 0.0, 0.5);
+  const double side = tube.is_left(x, y) ? half : 1.0 - half;
+  return row * marks.across + std::min(marks.across - 1, static_cast<int>(side * marks.across));
+}
+
+bool usual(const Marks& marks, const Tube& tube, const Picture& picture, int x, int y) {
+  if (marks.along == 0) return true;
+  const int at = cell(marks, tube, x, y);
+  if (!marks.known[at]) return true;
+  const std::uint8_t *const now = pixel(picture, x, y), *const then = &marks.rgb[3 * at];
+  double product = 0.0, square = 1.0, difference = 0.0;
+  for (int c = 0; c < 3; ++c) product += now[c] * then[c], square += then[c] * then[c];
+  const double light = std::clamp(product / square, kLeastLight, kMostLight);
+  for (int c = 0; c < 3; ++c) difference += (now[c] - light * then[c]) * (now[c] - light * then[c]);
+  return difference <= 3.0 * kUsual * kUsual;
+}
+
+namespace {
+
+// Colors by cell of the marks.
+struct Cells {
+  explicit Cells(const chain::Chain& chain) {
+    marks.step = kMarkStep * chain.diameter;
+    marks.along = static_cast<int>(std::ceil(chain.length / marks.step));
+    marks.across = kMarksAcross;
+    values.resize(static_cast<std::size_t>(3) * marks.along * marks.across);
+  }
+  void add(const Tube& tube, int x, int y, const std::uint8_t* rgb) {
+    if (tube.at(x, y) >= 0.0f) return;
+    const int at = cell(marks, tube, x, y);
+    for (int c = 0; c < 3; ++c) values[3 * at + c].push_back(rgb[c]);
+  }
+  Marks medians() {
+    marks.rgb.assign(values.size(), 0);
+    marks.known.assign(values.size() / 3, 0);
+    for (std::size_t i = 0; i < values.size(); ++i) {
+      if (values[i].empty()) continue;
+      marks.rgb[i] = median(values[i]);
+      marks.known[i / 3] = 1;
+    }
+    return marks;
+  }
+  Marks marks;
+  std::vector<std::vector<std::uint8_t>> values;
+};
+
+}  // namespace
+
+Marks marks(std::span<const Picture> frames, std::span<const Tube> tubes, const chain::Chain& chain) {
+  Cells cells(chain);
+  for (std::size_t i = 0; i < frames.size(); ++i) {
+    const Box& box = tubes[i].box;
+    for (int y = box.y0; y < box.y1; ++y)
+      for (int x = box.x0; x < box.x1; ++x) cells.add(tubes[i], x, y, pixel(frames[i], x, y));
+  }
+  return cells.medians();
+}
+
+Marks marks(const capture::View& drawn, const Tube& tube, const chain::Chain& chain) {
+  constexpr std::uint8_t kOpaque = 242;  // 0.95
+  Cells cells(chain);
+  for (int y = 0; y < drawn.height; ++y)
+    for (int x = 0; x < drawn.width; ++x) {
+      const std::uint8_t* const rgba = &drawn.rgba[4 * (static_cast<std::size_t>(y) * drawn.width + x)];
+      if (rgba[3] >= kOpaque) cells.add(tube, drawn.x0 + x, drawn.y0 + y, rgba);
+    }
+  return cells.medians();
+}
+
 void count_colors(Look& look, const Picture& picture, const Tube& tube, const Reach& where, const chain::Chain& chain,
                   double margin, const capture::View* mask) {
   const auto masked = [&](int x, int y) {
@@ -105,7 +182,7 @@ void count_colors(Look& look, const Picture& picture, const Tube& tube, const Re
       const int bin = color_bin(pixel(picture, x, y));
       if (outside < -margin) {
         const double s = tube.arclength(x, y);
-        if (s > chain.diameter && (!mask || masked(x, y)))
+        if (s > chain.diameter && (!mask || masked(x, y)) && usual(look.marks, tube, picture, x, y))
           (s < 0.5 * chain.length ? look.near : look.far).object[bin] += 1.0;
       } else if (outside > margin && outside < Tube::kFar) {
         look.near.surroundings[bin] += 1.0;

@@ -27,9 +27,19 @@ struct Reach {
 };
 Reach reach(const chain::Chain& chain, const math::Pose& base, const capture::Camera& camera);
 
+// The rope's marks: medians of the frames' colors, so that what hides the rope for less than half of them does not
+// count.
+Marks marks(std::span<const Picture> frames, std::span<const Tube> tubes, const chain::Chain& chain);
+// Those of one picture, where it shows something (alpha).
+Marks marks(const capture::View& drawn, const Tube& tube, const chain::Chain& chain);
+// Whether a pixel inside the tube has the color that is usual there, in more or less light; true where that is not
+// known.
+bool usual(const Marks& marks, const Tube& tube, const Picture& picture, int x, int y);
+
 // Adds the pixels of a frame where the tube is known: its core as object, what is about it, as far as its map goes, as
 // surroundings. `margin`: px on either side of the tube's outline where that is not sure. `mask`: of the core only
-// what it holds (a hand may hide the rope). Nothing of the rope's first diameter: the gripper hides it.
+// what it holds; of that what has the rope's marks, where they are known (a hand may hide the rope). Nothing of the
+// rope's first diameter: the gripper hides it.
 void count_colors(Look& look, const Picture& picture, const Tube& tube, const Reach& where, const chain::Chain& chain,
                   double margin, const capture::View* mask = nullptr);
 

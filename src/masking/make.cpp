@@ -225,20 +225,24 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
   const auto learn = [&](const chain::States& states, const std::vector<View>* masks) {
     for (int c = 0; c < cameras; ++c) {
       looks[c] = {};
+      const std::vector<Picture> pictures = samples[c].pictures();
       std::vector<Tube> tubes;
-      for (const View& view : samples[c].frames) {
-        const math::Pose base = scene.base.pose(view.time);
-        tubes.push_back(tube(chain, base, at(states, view.time), pinholes[c], 0.0, chain.length, kAboutPixels));
+      for (const View& view : samples[c].frames)
+        tubes.push_back(tube(chain, scene.base.pose(view.time), at(states, view.time), pinholes[c], 0.0, chain.length,
+                             kAboutPixels));
+      if (masks) looks[c].marks = marks(pictures, tubes, chain);  // a grown chain is too rough for these
+      for (std::size_t i = 0; i < tubes.size(); ++i) {
+        const View& view = samples[c].frames[i];
         const View* mask = nullptr;
         if (masks)
           mask = &*std::find_if(masks->begin(), masks->end(),
                                 [&](const View& m) { return m.camera == c && m.frame == view.frame; });
-        count_colors(looks[c], picture_of(view), tubes.back(), reach(chain, base, pinholes[c]), chain,
-                     masks ? kFitMargin : kGrownMargin * tubes.back().radius, mask);
+        count_colors(looks[c], pictures[i], tubes[i], reach(chain, scene.base.pose(view.time), pinholes[c]), chain,
+                     masks ? kFitMargin : kGrownMargin * tubes[i].radius, mask);
       }
       settle(looks[c]);
-      looks[c].background = median_background(
-          samples[c].pictures(), tubes, std::max(kLeastSamples, static_cast<int>(kLeastUncovered * tubes.size())));
+      looks[c].background =
+          median_background(pictures, tubes, std::max(kLeastSamples, static_cast<int>(kLeastUncovered * tubes.size())));
     }
   };
   Summary summary;

@@ -57,6 +57,7 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
   if (out.box.empty()) return out;
   out.outside.assign(static_cast<std::size_t>(out.box.width()) * out.box.height(), Tube::kFar);
   out.along.assign(out.outside.size(), 0.0f);
+  out.left.assign(out.outside.size(), 0);
   // px by which the disc reaches beyond its center, at `d` from that
   const auto disc = [&](const Vector2& d, const Vector2& along, bool free_end, double radius) {
     const double share = (d.x() * along.y() - d.y() * along.x()) / radius;
@@ -94,6 +95,7 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
         const std::size_t at = static_cast<std::size_t>(y - out.box.y0) * out.box.width() + (x - out.box.x0);
         if (distance >= out.outside[at]) continue;
         out.outside[at] = static_cast<float>(distance);
+        out.left[at] = d.x() * along.y() > d.y() * along.x();
         out.along[at] =
             static_cast<float>(samples[i].arclength + share * (samples[i + 1].arclength - samples[i].arclength));
       }

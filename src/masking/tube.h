@@ -18,6 +18,7 @@ struct Tube {
   Box box;
   std::vector<float> outside;  // px to the outline, negative inside; kFar where farther than the reach asked for
   std::vector<float> along;    // m, arclength of the nearest point of the centerline
+  std::vector<char> left;      // of the centerline, as it goes in the picture
   double radius = 0.0;         // px, mean along the rope
   float at(int x, int y) const {
     if (x < box.x0 || y < box.y0 || x >= box.x1 || y >= box.y1) return kFar;
@@ -25,6 +26,9 @@ struct Tube {
   }
   float arclength(int x, int y) const {  // of pixels in the box
     return along[static_cast<std::size_t>(y - box.y0) * box.width() + (x - box.x0)];
+  }
+  bool is_left(int x, int y) const {  // of pixels in the box
+    return left[static_cast<std::size_t>(y - box.y0) * box.width() + (x - box.x0)] != 0;
   }
   static constexpr float kFar = 1e6f;
 };
