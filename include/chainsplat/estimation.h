@@ -37,10 +37,6 @@ struct Options {
   silhouette::Options silhouette;    // the prior is set by the filter
 };
 
-// Where masks are made while the rope is followed: their outline errs the same way for long (a contact shadow, a hand's
-// edge), so that less of it is new in every frame, and colors count for more.
-Options options_for_live_masks();
-
 // Gaussian belief about (theta, thetadot, shift of the rest angles), 3 n, rad and rad/s; on a table, where ropes have
 // contact shadows, also about the shift of each camera's masks (silhouette::Prior), px in x and y.
 struct Belief {

@@ -57,10 +57,11 @@ constexpr double kNoSmoothness = 1e-9;  // 1/rad^2: the filter's prior replaces 
 constexpr double kOffsetDeviation = 0.5, kLeastOffsetDeviation = 0.05;  // px
 constexpr double kOffsetFrames = 30.0;
 
-// Of the masks' shift on a table, where a contact shadow may count as rope: it is half a pixel to one and a half wide
-// and shifts the mask by half of that. As one camera sees it, it hardly changes while the rope lies there in one light.
-constexpr double kMaskShift = 0.3;         // px, standard deviation
-constexpr double kMaskShiftMemory = 20.0;  // s
+// Of the masks' shift on a table, where a contact shadow may count as rope: a strip of about a pixel, which shifts the
+// mask by half of that. As one camera sees it, it changes slowly while the rope lies there in one light.
+constexpr double kMaskShift = 0.2;        // px, standard deviation about what the edge offset lets expect,
+constexpr double kLowerSide = 0.8;        // which is this share of it, down: the rest is alike on all sides
+constexpr double kMaskShiftMemory = 5.0;  // s
 
 constexpr double kUnlike = 0.5;      // likeness of drawn and seen colors: less is not the rope,
 constexpr double kLongUnlike = 0.2;  // s, after which what is followed counts as something else
@@ -214,6 +215,27 @@ std::vector<VectorX> stopping_shifts(const Filter& filter, const trajectory::Bas
   return shifts;
 }
 
+// Where the cameras expect their masks to be shifted, px in x and y each: a camera above the table sees the rope's
+// contact with it, and the shadow there, on the rope's lower side, so that a mask that is too wide is so on that side.
+VectorX expected_mask_shifts(const Filter& filter, double time) {
+  VectorX out(2 * filter.cameras.size());
+  const Pose base = filter.base(time).pose;
+  const double step = filter.model.chain.diameter;
+  const Vector3 axis = base.rotation * filter.model.chain.bending_axis;  // the table's normal, to either side
+  for (std::size_t c = 0; c < filter.cameras.size(); ++c) {
+    const capture::Camera& camera = filter.cameras[c];
+    const Vector3 to_camera = camera.world_from_camera.translation - base.translation;
+    const Vector3 below = base.translation - step * (axis.dot(to_camera) > 0.0 ? axis : Vector3(-axis));
+    const Pose camera_from_world = camera.world_from_camera.inverse();
+    const Vector3 a = camera_from_world * base.translation, b = camera_from_world * below;
+    Vector2 down = Vector2::Zero();
+    if (std::min(a.z(), b.z()) > 0.0) down = capture::project(camera, b) - capture::project(camera, a);
+    const double radius = 0.5 * step * camera.fx / std::max(a.z(), step);  // px; a camera right above sees no side
+    out.segment<2>(2 * c) = kLowerSide * filter.edge_offset * down / std::max(down.norm(), radius);
+  }
+  return out;
+}
+
 void symmetrize(MatrixX& matrix) { matrix = (0.5 * (matrix + matrix.transpose())).eval(); }
 
 // The mean of a belief moved in time, and the derivative of that with respect to it (empty where it is constant rate).
@@ -357,13 +379,6 @@ bool explains(const silhouette::FrameFit& fit) { return fit.covered >= kLostShar
 
 }  // namespace
 
-Options options_for_live_masks() {
-  Options options;
-  options.new_share = 0.1;
-  options.color_share = 0.01;
-  return options;
-}
-
 Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
              double base_start, const Options& options) {
   Filter filter;
@@ -449,6 +464,7 @@ Belief predict(const Filter& filter, const Belief& belief, double time, Contact 
   out.mean.resize(size);
   out.mean << motion.theta, motion.thetadot, keep * belief.mean.segment(2 * n, n),
       keep_mask_shift * belief.mean.tail(size - 3 * n);
+  if (size > 3 * n) out.mean.tail(size - 3 * n) += (1.0 - keep_mask_shift) * expected_mask_shifts(filter, time);
   out.covariance = transition * belief.covariance * transition.transpose();
   out.covariance.diagonal().tail(size - 3 * n).array() +=
       kMaskShift * kMaskShift * (1.0 - keep_mask_shift * keep_mask_shift);
