@@ -65,10 +65,10 @@ void main() {
     // a software device runs the body also where no lane takes it
     while (t < color_view.tiles && !shows(color_view.first_tile + t, link)) t += p.equation_slices;
     if (t >= color_view.tiles) break;
-    uint tile = color_view.first_tile + t, count = tile_summary[tile].x;
+    uint tile = color_view.first_tile + t, count = tile_summary[tile].x, first = tile * kTileWidth * kTileHeight;
     uvec2 corner = uvec2(tiles[tile].x * kTileWidth, tiles[tile].y * kTileHeight);
     for (uint k = lane; k < count; k += kSubgroup) {
-      uint entry = tile_pixels[tile * kTileWidth * kTileHeight + k], place = entry & 0xffu;
+      uint entry = tile_pixels[first + k], place = entry & 0xffu;
       if (entry >> 8u != link) continue;
       uvec2 pixel = corner + uvec2(place % kTileWidth, place / kTileWidth);
       uint offset = pixel.y * view.width + pixel.x, shown = view.pixel + offset, looked = view.target + offset;

@@ -1,5 +1,6 @@
 // splat_project.comp - one invocation a (live replica, view): its 2-D splat, the tiles that it touches, and how many of them
-// are active. A splat reaches as far as its alpha reaches 1/255, not three sigma.
+// are active. A splat reaches as far as its alpha reaches 1/255, not three sigma. Where the tiles' lists have their places
+// (tile_capacity) it also enters the splat into them: few splats are drawn sooner without prefix sums and splat_bin.comp.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
@@ -16,11 +17,12 @@ layout(std430, binding = 2) readonly buffer Live { uint live[]; };
 layout(std430, binding = 3) readonly buffer Views { SplatView views[]; };
 layout(std430, binding = 4) readonly buffer Motions { vec4 motions[]; };
 layout(std430, binding = 5) readonly buffer TileMap { uint tile_map[]; };
-layout(std430, binding = 6) readonly buffer Counters { uint counters[]; };
+layout(std430, binding = 6) buffer Counters { uint counters[]; };
 layout(std430, binding = 7) writeonly buffer Splats { vec4 splats[]; };
 layout(std430, binding = 8) writeonly buffer InstanceCount { uint instance_count[]; };
 layout(std430, binding = 9) buffer TileCount { uint tile_count[]; };
 layout(std430, binding = 10) writeonly buffer TileHits { uint tile_hits[]; };
+layout(std430, binding = 11) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica number, splat, -
 
 // exponent below which a Gaussian is 0 in float: the reach when there is no 1/255 cut
 const float kFullReach = 80.0;
@@ -40,6 +42,7 @@ void main() {
   uint live_count = counters[kCounterLive];
   if (r >= live_count) return;
   uint e = live[r], n = p.gaussians, i = e % n, link = e / n;
+  uint replica = i * p.links + link;  // SPEC's index, breaks ties of depth
   uint out_index = v * live_count + r;
   SplatView view = views[v];
   uint motion = 3u * (view.motion + link);
@@ -75,8 +78,14 @@ void main() {
       vec2 low = vec2(tx, ty) * size + 0.5 - u;
       bool hit = place >= kTileHits || !(least_in(conic, low, low + size - 1.0) > kSlack * reach);
       if (tile != kNoTile && hit) {
-        atomicAdd(tile_count[tile], 1u);
+        uint entry = atomicAdd(tile_count[tile], 1u);
         ++count;
+        if (entry < p.tile_capacity) {
+          entries[tile * p.tile_capacity + entry] = uvec4(floatBitsToUint(a.x.z), replica, out_index, 0u);
+        } else if (p.tile_capacity > 0u) {
+          counters[kCounterOverflow] = 1u;
+          atomicMax(counters[kCounterWantTile], entry + 1u);
+        }
       }
       hits |= hit && place < kTileHits ? 1u << place : 0u;
       ++place;

@@ -225,6 +225,40 @@ TEST_CASE("the device's color sums are those of a host in double") {
   check_silent();
 }
 
+TEST_CASE("tiles with more Gaussians than their lists first have room for") {
+  Scene scene = make_scene();
+  splat::Engine engine(device());
+  look(scene, engine, scene.theta, {1.1, 0.02, 0.02});
+  // every Gaussian twenty times, a little apart, fainter
+  const splat::Gaussians once = scene.gaussians;
+  constexpr int kTimes = 20;
+  scene.gaussians = {};
+  scene.gaussians.resize(kTimes * once.count, once.links, 0);
+  for (int i = 0; i < scene.gaussians.count; ++i) {
+    const int from = i / kTimes;
+    for (int c = 0; c < 3; ++c) {
+      scene.gaussians.mean[3 * i + c] = once.mean[3 * from + c] + 1e-5f * static_cast<float>(i % kTimes);
+      scene.gaussians.log_scale[3 * i + c] = once.log_scale[3 * from + c];
+      scene.gaussians.sh[3 * i + c] = once.sh[3 * from + c];
+    }
+    scene.gaussians.opacity_logit[i] = -1.5f;
+    for (int j = 0; j < once.links; ++j)
+      scene.gaussians.link_logits[once.links * i + j] = once.link_logits[once.links * from + j];
+  }
+  engine.set_gaussians(scene.gaussians);
+  const std::uint64_t submitted = device().submitted;
+  const auto got = engine.color_sums(scene.chain, scene.views, scene.seen_pointers());
+  CHECK(device().submitted > submitted + 1);  // there was no room, and room was made
+  const auto pictures = engine.draw(scene.gaussians, scene.views, true);
+  for (std::size_t v = 0; v < got.size(); ++v) {
+    CAPTURE(v);
+    check_sums(scene, scene.views[v], got[v],
+               reference::color_sums(scene.chain, scene.views[v], scene.seen[v], pictures[v]));
+    CHECK(got[v].pixels > 300);
+  }
+  check_silent();
+}
+
 TEST_CASE("the right side is the slope of the drawn loss") {
   Scene scene = make_scene();
   splat::Engine engine(device());

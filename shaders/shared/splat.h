@@ -32,7 +32,9 @@ struct SplatPush {
   uint near_tiles;                             // the first so many active tiles have a D-SSIM term
   uint scan_length, scan_per_live, scan_counter, flags;
   uint tile_stride;                            // group g of a pass over all active tiles takes tile g * tile_stride % tiles
-  uint padding0, padding1, padding2;
+  uint tile_capacity;                          // entries that each tile's list has room for, which project then fills; 0: the
+                                               // lists lie side by side, found by prefix sums
+  uint padding0, padding1;
 };
 
 const uint kNoTile = 0xffffffffu;
@@ -51,6 +53,7 @@ const uint kCounterOverflow = 8u;   // not 0: a capacity was exceeded; nothing o
 const uint kCounterTooLong = 9u;    // not 0: a tile's list is longer than kLongestList
 const uint kCounterLongTiles = 10u; // 3 uints: groups of splat_sort_long; the host sets the last two
 const uint kCounterNotFinite = 13u; // gradients that Adam left alone
+const uint kCounterWantTile = 14u;  // what the tile capacity would have to be
 const uint kCounters = 16u;
 const uint kLongestList = 32768u;   // entries of a tile that sorting and blending get through on every device
 

@@ -32,8 +32,9 @@ constexpr std::uint32_t kRankLimit = 192;          // longest tile list sorted b
 constexpr std::uint32_t kSoftwareRankLimit = 512;  // the same on a software device, whose barriers make radix dear
 constexpr std::uint32_t kTilesAPixelSlice = 4, kMostPixelSlices = 256;  // of color_pixels: enough groups for a GPU,
 constexpr std::uint32_t kTilesAnEquationSlice = 16, kMostEquationSlices = 64;  // few sums to read back
-constexpr double kGrowth = 1.25;                                               // spare room when a capacity is raised
-constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;             // Adam, as in 3DGS
+constexpr std::uint32_t kListEntries = 1 << 20, kTileCapacity = 512;  // of all tiles' lists with places of their own
+constexpr double kGrowth = 1.25;                                      // spare room when a capacity is raised
+constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;    // Adam, as in 3DGS
 
 struct SceneView {
   double fx = 0, fy = 0, cx = 0, cy = 0;  // px, of the crop
@@ -194,7 +195,9 @@ struct Engine::State {
   ColorPush color_push{};
   std::size_t pixel_sum_bytes = 0, link_sum_bytes = 0;
   const std::byte *read_pixel_sums = nullptr, *read_link_sums = nullptr;  // of the last run
-  std::uint32_t live_capacity = 0, instance_capacity = 0;
+  Buffer list_starts,
+      list_blocks;  // stand for tile_prefix and tile_block where every tile's list has a place of its own
+  std::uint32_t live_capacity = 0, instance_capacity = 0, tile_capacity = 0;
   std::uint64_t versions = 0;                            // of parameters so far, of all scenes
   std::pair<std::uint64_t, std::uint32_t> replicated{};  // version and live capacity that the live replicas are of
   int not_finite = 0;                                    // gradients of the last run that Adam left alone
@@ -223,6 +226,7 @@ struct Engine::State {
   void run_all(Scene& scene, std::span<const int> batch, const RunOptions& options, const AdamPush* adam_push,
                AfterChunk after);
   void scan(const Buffer& values, const Buffer& prefix, const Buffer& block, SplatPush push, std::size_t most);
+  void set_tile_capacity(std::uint32_t capacity);
   std::vector<ViewSums> sums(std::size_t chunk_views);
   std::vector<Picture> pictures(const Scene& scene, std::span<const int> chunk, bool depth);
   std::vector<math::MatrixX> twists(const Scene& scene, std::span<const int> chunk);
@@ -250,7 +254,7 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   compact = gpu::Pipeline(d, "splat_compact", 4, push, {});
   scan_block = gpu::Pipeline(d, "scan_block", 4, push, {});
   scan_sums = gpu::Pipeline(d, "scan_sums", 2, push, {});
-  project = gpu::Pipeline(d, "splat_project", 11, push, {cut, tile_width, tile_height});
+  project = gpu::Pipeline(d, "splat_project", 12, push, {cut, tile_width, tile_height});
   bin = gpu::Pipeline(d, "splat_bin", 12, push, {});
   // as many lanes a tile as a subgroup of the device: no lane waits at the barriers for another subgroup
   const std::uint32_t tile_lanes = device_info.software ? 8 : 32;
@@ -464,6 +468,15 @@ void Engine::State::scan(const Buffer& values, const Buffer& prefix, const Buffe
   commands.dispatch(scan_sums, sum_buffers, &push, sizeof push, 1);
 }
 
+void Engine::State::set_tile_capacity(std::uint32_t capacity) {
+  tile_capacity = capacity;
+  std::vector<std::uint32_t> starts(kListEntries / capacity + 1);
+  for (std::size_t tile = 0; tile < starts.size(); ++tile) starts[tile] = static_cast<std::uint32_t>(tile * capacity);
+  const std::vector<std::uint32_t> blocks(starts.size() / shared::kScanBlock + 1, 0);
+  write(list_starts, starts.data(), starts.size() * sizeof(std::uint32_t), "list starts");
+  write(list_blocks, blocks.data(), blocks.size() * sizeof(std::uint32_t), "list blocks");
+}
+
 // Records and runs all passes for one chunk. False: a capacity was too small; it has been raised, run again.
 bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptions& options,
                         const AdamPush* adam_push) {
@@ -579,10 +592,15 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   need(tile_cursor, words(tile_total), "tile cursor");
   need(tile_used, words(tile_total), "tile used");
   need(tile_loss, 2 * vectors(tile_total), "tile loss");
-  need(entries, vectors(instance_capacity), "entries");
+  // a list at a place of its own needs no instances, which only gradients are summed by
+  if (options.chain && tile_capacity == 0) set_tile_capacity(kTileCapacity);
+  const bool own_places = options.chain && static_cast<std::size_t>(tile_total) * tile_capacity <= kListEntries;
+  const std::uint32_t list_entries = own_places ? std::max(kListEntries, instance_capacity) : instance_capacity;
+  need(entries, vectors(list_entries), "entries");
   need(long_tiles, words(tile_total), "long tiles");
-  need(sort_scratch, 4 * words(instance_capacity), "sort scratch");
-  need(sorted, 2 * words(instance_capacity), "sorted");
+  need(sort_scratch, 4 * words(list_entries), "sort scratch");
+  need(sorted, 2 * words(list_entries), "sorted");
+  const Buffer &starts = own_places ? list_starts : tile_prefix, &blocks_before = own_places ? list_blocks : tile_block;
   need(image, vectors(pixels), "image");
   need(depth_image, options.depth ? words(pixels) : 0, "depth image");
   const bool dssim = options.loss && options.weights.dssim > 0.0f;
@@ -631,6 +649,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   push.tiles = tile_total;
   push.slots = slots;
   push.near_tiles = near_total;
+  push.tile_capacity = own_places ? tile_capacity : 0;
   push.tile_stride = gpu::info(device).software ? spreading_stride(tile_total) : 1;
   push.weight_l1 = static_cast<float>(options.weights.l1 * options.color_scale);
   push.weight_dssim = static_cast<float>(options.weights.dssim * options.color_scale);
@@ -683,29 +702,31 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
     commands.stamp("replicate");
   }
   dispatch_live(project, {&scene.parameters, &replica_opacity, &live, &views, &motions, &tile_map, &counters, &splats,
-                          &instance_count, &tile_count, &tile_hits});
+                          &instance_count, &tile_count, &tile_hits, &entries});
   commands.stamp("project");
-  SplatPush scan_push = push;
-  scan_push.scan_per_live = view_count;
-  scan_push.scan_counter = shared::kCounterInstances;
-  scan(instance_count, instance_prefix, instance_block, scan_push, pairs);
-  scan_push.scan_per_live = 0;
-  scan_push.scan_length = tile_total;
-  scan_push.scan_counter = shared::kCounterTiles;
-  scan(tile_count, tile_prefix, tile_block, scan_push, tile_total);
-  commands.stamp("scan");
-  dispatch_live(bin, {&live, &views, &tile_map, &counters, &splats, &instance_prefix, &instance_block, &tile_prefix,
-                      &tile_block, &tile_cursor, &tile_hits, &entries});
-  commands.stamp("bin");
-  dispatch(sort, {&tile_prefix, &tile_block, &tile_count, &entries, &long_tiles, &sorted, &counters}, tile_total);
-  const std::array long_buffers = {static_cast<const Buffer*>(&tile_prefix), static_cast<const Buffer*>(&tile_block),
-                                   static_cast<const Buffer*>(&tile_count),  static_cast<const Buffer*>(&entries),
-                                   static_cast<const Buffer*>(&long_tiles),  static_cast<const Buffer*>(&sort_scratch),
+  if (!own_places) {
+    SplatPush scan_push = push;
+    scan_push.scan_per_live = view_count;
+    scan_push.scan_counter = shared::kCounterInstances;
+    scan(instance_count, instance_prefix, instance_block, scan_push, pairs);
+    scan_push.scan_per_live = 0;
+    scan_push.scan_length = tile_total;
+    scan_push.scan_counter = shared::kCounterTiles;
+    scan(tile_count, tile_prefix, tile_block, scan_push, tile_total);
+    commands.stamp("scan");
+    dispatch_live(bin, {&live, &views, &tile_map, &counters, &splats, &instance_prefix, &instance_block, &tile_prefix,
+                        &tile_block, &tile_cursor, &tile_hits, &entries});
+    commands.stamp("bin");
+  }
+  dispatch(sort, {&starts, &blocks_before, &tile_count, &entries, &long_tiles, &sorted, &counters}, tile_total);
+  const std::array long_buffers = {static_cast<const Buffer*>(&starts),     static_cast<const Buffer*>(&blocks_before),
+                                   static_cast<const Buffer*>(&tile_count), static_cast<const Buffer*>(&entries),
+                                   static_cast<const Buffer*>(&long_tiles), static_cast<const Buffer*>(&sort_scratch),
                                    static_cast<const Buffer*>(&sorted)};
   commands.dispatch_indirect(sort_long, long_buffers, &push, sizeof push, counters, words(shared::kCounterLongTiles));
   commands.stamp("sort");
   dispatch(options.depth ? blend_depth : blend,
-           {&tiles, &views, &tile_prefix, &tile_block, &tile_count, &sorted, &splats, &counters, &image, &tile_used,
+           {&tiles, &views, &starts, &blocks_before, &tile_count, &sorted, &splats, &counters, &image, &tile_used,
             &depth_image},
            tile_total);
   commands.stamp("blend");
@@ -792,6 +813,8 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   const std::size_t want_instances = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantInstances]) + 1024;
   if (read[shared::kCounterWantLive] > live_capacity)
     live_capacity = static_cast<std::uint32_t>(std::min<std::size_t>(want_live, replicas));
+  if (read[shared::kCounterWantTile] > tile_capacity)
+    set_tile_capacity(static_cast<std::uint32_t>(kGrowth * read[shared::kCounterWantTile]));
   if (read[shared::kCounterWantInstances] > instance_capacity)
     instance_capacity = static_cast<std::uint32_t>(want_instances);
   const std::size_t partial_bytes = vectors(static_cast<std::size_t>(shared::kPartialRows) * slots * instance_capacity);
