@@ -29,17 +29,17 @@ void main() {
   uint depth = floatBitsToUint(splats[kSplatRows * s].w);  // positive floats sort like their bits
   uint instance = instance_prefix[s] + instance_block[s / kScanBlock];
   SplatView view = views[v];
-  uint hits = tile_hits[s], seen = 0u;
-  for (uint ty = rows & 0xffffu; ty < rows >> 16u; ++ty) {
-    for (uint tx = columns & 0xffffu; tx < columns >> 16u; ++tx) {
-      uint tile = tile_map[view.tile_map + ty * view.tiles_x + tx];
-      bool hit = seen >= kTileHits || (hits >> seen & 1u) != 0u;
-      ++seen;
-      if (tile != kNoTile && hit) {
-        uint place = tile_prefix[tile] + tile_block[tile / kScanBlock] + atomicAdd(tile_cursor[tile], 1u);
-        entries[place] = uvec4(depth, replica, s, instance);
-        ++instance;
-      }
+  uint hits = tile_hits[s];
+  uvec2 t0 = uvec2(columns, rows) & 0xffffu, t1 = uvec2(columns, rows) >> 16u, t = t0;
+  uint places = (t1.x - t0.x) * (t1.y - t0.y);  // one loop: see splat_project.comp
+  for (uint k = 0u; k < places; ++k) {
+    uint tile = tile_map[view.tile_map + t.y * view.tiles_x + t.x];
+    bool hit = k >= kTileHits || (hits >> k & 1u) != 0u;
+    if (tile != kNoTile && hit) {
+      uint place = tile_prefix[tile] + tile_block[tile / kScanBlock] + atomicAdd(tile_cursor[tile], 1u);
+      entries[place] = uvec4(depth, replica, s, instance);
+      ++instance;
     }
+    t = t.x + 1u < t1.x ? uvec2(t.x + 1u, t.y) : uvec2(t0.x, t.y + 1u);
   }
 }

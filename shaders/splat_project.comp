@@ -17,7 +17,7 @@ layout(std430, binding = 2) readonly buffer Live { uint live[]; };
 layout(std430, binding = 3) readonly buffer Views { SplatView views[]; };
 layout(std430, binding = 4) readonly buffer Motions { vec4 motions[]; };
 layout(std430, binding = 5) readonly buffer TileMap { uint tile_map[]; };
-layout(std430, binding = 6) buffer Counters { uint counters[]; };
+layout(std430, binding = 6) readonly buffer Counters { uint counters[]; };
 layout(std430, binding = 7) writeonly buffer Splats { vec4 splats[]; };
 layout(std430, binding = 8) writeonly buffer InstanceCount { uint instance_count[]; };
 layout(std430, binding = 9) buffer TileCount { uint tile_count[]; };
@@ -71,25 +71,22 @@ void main() {
   vec3 conic = vec3(a.cov.z, -a.cov.y, a.cov.x) * inverse;
   const float kSlack = 1.001;  // rounding never takes away a tile that a pixel of it would have shown
   vec2 size = vec2(kTileWidth, kTileHeight);
-  uint count = 0u, place = 0u, hits = 0u;
-  for (uint ty = t0.y; ty < t1.y; ++ty) {
-    for (uint tx = t0.x; tx < t1.x; ++tx) {
-      uint tile = tile_map[view.tile_map + ty * view.tiles_x + tx];
-      vec2 low = vec2(tx, ty) * size + 0.5 - u;
-      bool hit = place >= kTileHits || !(least_in(conic, low, low + size - 1.0) > kSlack * reach);
-      if (tile != kNoTile && hit) {
-        uint entry = atomicAdd(tile_count[tile], 1u);
-        ++count;
-        if (entry < p.tile_capacity) {
-          entries[tile * p.tile_capacity + entry] = uvec4(floatBitsToUint(a.x.z), replica, out_index, 0u);
-        } else if (p.tile_capacity > 0u) {
-          counters[kCounterOverflow] = 1u;
-          atomicMax(counters[kCounterWantTile], entry + 1u);
-        }
-      }
-      hits |= hit && place < kTileHits ? 1u << place : 0u;
-      ++place;
+  uint count = 0u, hits = 0u;
+  // one loop over the rectangle, not one over its rows and one in them: lanes with other rectangles wait for its area only
+  uint places = (t1.x - t0.x) * (t1.y - t0.y);
+  uvec2 t = t0;
+  for (uint place = 0u; place < places; ++place) {
+    uint tile = tile_map[view.tile_map + t.y * view.tiles_x + t.x];
+    vec2 low = vec2(t) * size + 0.5 - u;
+    bool hit = place >= kTileHits || !(least_in(conic, low, low + size - 1.0) > kSlack * reach);
+    if (tile != kNoTile && hit) {
+      uint entry = atomicAdd(tile_count[tile], 1u);
+      ++count;
+      if (entry < p.tile_capacity)
+        entries[tile * p.tile_capacity + entry] = uvec4(floatBitsToUint(a.x.z), replica, out_index, 0u);
     }
+    hits |= hit && place < kTileHits ? 1u << place : 0u;
+    t = t.x + 1u < t1.x ? uvec2(t.x + 1u, t.y) : uvec2(t0.x, t.y + 1u);
   }
   tile_hits[out_index] = hits;
   instance_count[out_index] = count;

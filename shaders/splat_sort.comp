@@ -21,10 +21,15 @@ layout(std430, binding = 6) buffer Counters { uint counters[]; };
 void main() {
   uint tile = gl_WorkGroupID.x * p.tile_stride % p.tiles, lane = gl_LocalInvocationID.x, lanes = gl_WorkGroupSize.x;
   uint start = tile_prefix[tile] + tile_block[tile / kScanBlock];
-  uint n = counters[kCounterOverflow] != 0u ? 0u : tile_count[tile];
-  if (n > kRankLimit) {
+  bool own_places = p.tile_capacity > 0u;
+  uint n = !own_places && counters[kCounterOverflow] != 0u ? 0u : tile_count[tile];
+  bool no_place = own_places && n > p.tile_capacity;  // it could not be entered whole
+  if (n > kRankLimit || no_place) {
     if (lane == 0u) {
-      if (n > kLongestList) {
+      if (no_place) {
+        counters[kCounterOverflow] = 1u;
+        atomicMax(counters[kCounterWantTile], n);
+      } else if (n > kLongestList) {
         counters[kCounterTooLong] = 1u;
       } else {
         long_tiles[atomicAdd(counters[kCounterLongTiles], 1u)] = tile;
