@@ -158,6 +158,29 @@ void show_force(const force::Estimate& f, const twin::Twin& twin, const dynamics
   shown.force = recorded_line(camera, ends);
 }
 
+// The device's kernels are made at their first use, and its buffers grow, which no frame shall wait for: it is shown
+// masks that fill the pictures, which no frame does, and masks of a size that a rope's may have.
+void warm_up(const estimation::Filter& filter, double start) {
+  constexpr int kMostWidth = 2048, kMostHeight = 1536;  // px; larger masks can be more than the device takes at once
+  const std::vector<math::Pose> rest = chain::link_motions(filter.model.chain, filter.rest, filter.base(start).pose);
+  for (const int share : {1, 4}) {
+    std::vector<capture::View> views;
+    std::vector<const capture::View*> pointers;
+    for (const capture::Camera& camera : filter.cameras) {
+      capture::View& view = views.emplace_back();
+      view.camera = static_cast<int>(views.size()) - 1;
+      view.width = std::min(camera.width, kMostWidth);
+      view.height = std::min(camera.height, kMostHeight);
+      view.rgba.assign(4 * static_cast<std::size_t>(view.width) * view.height, 0);
+      const int wide = view.width / share, left = (view.width - wide) / 2;
+      for (int y = 0; y < view.height; ++y)
+        std::fill_n(&view.rgba[4 * (static_cast<std::size_t>(y) * view.width + left)], 4 * wide, std::uint8_t{255});
+    }
+    for (const capture::View& view : views) pointers.push_back(&view);
+    filter.compare_colors(pointers, std::vector<std::vector<math::Pose>>(views.size(), rest));
+  }
+}
+
 void estimate(const Globals& globals, EstimateRequest& request) {
   if (globals.json)
     throw InputError("--json", "estimate writes one JSON line a frame, not one document", "leave it out");
@@ -222,19 +245,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
       }
       return engine->color_sums(twin.chain, specs, seen);
     };
-    // the device's kernels are made at their first use, and buffers grow, which no frame shall wait for
-    std::vector<capture::View> whole(source.cameras.size());
-    std::vector<const capture::View*> pointers;
-    for (std::size_t c = 0; c < whole.size(); ++c) {
-      whole[c].camera = static_cast<int>(c);
-      whole[c].width = source.cameras[c].width;
-      whole[c].height = source.cameras[c].height;
-      whole[c].rgba.assign(4 * static_cast<std::size_t>(whole[c].width) * whole[c].height, 255);
-      pointers.push_back(&whole[c]);
-    }
-    const std::vector<std::vector<math::Pose>> motions(
-        whole.size(), chain::link_motions(twin.chain, filter.rest, filter.base(base.start()).pose));
-    filter.compare_colors(pointers, motions);
+    warm_up(filter, base.start());
   }
   Follower follower;
   follower.update = [&](std::span<const capture::View* const> views) { return estimation::update(filter, views); };
