@@ -70,9 +70,9 @@ struct Estimate {
 // The filter between two frames.
 struct Filter {
   dynamics::Model model;
-  bool identified = false;  // the twin has dynamics; else angles go on at constant rate
-  bool shifts = false;      // the unknown force is a part of the state
-  bool tabletop = false;    // the masks' shift too
+  bool identified = false;                    // the twin has dynamics; else angles go on at constant rate
+  bool shifts = false;                        // the unknown force is a part of the state
+  std::optional<math::Vector3> table_normal;  // unit, world; on a table the masks' shift is a part of the state too
   std::vector<capture::Camera> cameras;
   dynamics::BaseFunction base;
   Options options;

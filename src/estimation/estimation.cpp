@@ -221,11 +221,9 @@ VectorX expected_mask_shifts(const Filter& filter, double time) {
   VectorX out(2 * filter.cameras.size());
   const Pose base = filter.base(time).pose;
   const double step = filter.model.chain.diameter;
-  const Vector3 axis = base.rotation * filter.model.chain.bending_axis;  // the table's normal, to either side
   for (std::size_t c = 0; c < filter.cameras.size(); ++c) {
     const capture::Camera& camera = filter.cameras[c];
-    const Vector3 to_camera = camera.world_from_camera.translation - base.translation;
-    const Vector3 below = base.translation - step * (axis.dot(to_camera) > 0.0 ? axis : Vector3(-axis));
+    const Vector3 below = base.translation - step * *filter.table_normal;
     const Pose camera_from_world = camera.world_from_camera.inverse();
     const Vector3 a = camera_from_world * base.translation, b = camera_from_world * below;
     Vector2 down = Vector2::Zero();
@@ -397,7 +395,7 @@ Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras
   filter.base = std::move(base);
   filter.base_start = base_start;
   filter.options = options;
-  filter.tabletop = twin.tabletop;
+  if (twin.tabletop) filter.table_normal = twin.table_normal.value_or(Vector3::UnitZ()).normalized();
   filter.edge_offset_variance = kOffsetDeviation * kOffsetDeviation;
   if (twin.tabletop || !filter.identified) {
     filter.rest = twin.initial                ? twin.initial->theta
@@ -411,7 +409,7 @@ Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras
 
 Belief first_belief(const Filter& filter, double time) {
   const int n = filter.model.chain.angles();
-  const int size = 3 * n + (filter.tabletop ? 2 * static_cast<int>(filter.cameras.size()) : 0);
+  const int size = 3 * n + (filter.table_normal ? 2 * static_cast<int>(filter.cameras.size()) : 0);
   Belief belief;
   belief.time = time;
   belief.mean = VectorX::Zero(size);
