@@ -285,8 +285,10 @@ void estimate(const Globals& globals, EstimateRequest& request) {
     }
     if (!live) return bright_view(picture, source.cameras[0]);
     constexpr int kMarksEvery = 10;  // frames; the rope shows nearly the same side
-    if (engine && theta && live->frames % kMarksEvery == 1)
-      masking::learn_marks(*live, drawn_view(*engine, twin, source.cameras[0], pose, *theta, masked), pose, *theta);
+    if (engine && live->frames % kMarksEvery == 0) {
+      const math::VectorX near = theta.value_or(filter.rest);  // marks stay on the rope wherever it lies
+      masking::learn_marks(*live, drawn_view(*engine, twin, source.cameras[0], pose, near, masked), pose, near);
+    }
     capture::View view = masking::mask(*live, picture, pose, theta);
     masked = {view.x0, view.y0, view.width, view.height};
     return view;

@@ -21,7 +21,8 @@ constexpr double kHiddenStep = 0.25;                         // diameters along 
 constexpr int kHiddenSteps = 2;                              // on either side that are looked at together
 constexpr double kSeen = 0.4;            // of the usual log odds and of their usual change: less is hidden
 constexpr double kSurelyHidden = 6.0;    // log odds
-constexpr int kUnusualWindow = 5;        // px, whose share of pixels without the rope's marks counts:
+constexpr int kUnusualWindow = 5;        // px, whose share of pixels without the rope's marks counts,
+constexpr int kBesideWindow = 11;        // and the same beside the tube:
 constexpr double kFewUnusual = 0.5;      // up to this the chain may only be a little off,
 constexpr double kMostUnusual = 0.75;    // and where so much of the tube is, the marks themselves are wrong
 constexpr double kSurelyUnusual = 12.0;  // log odds, outvote place and color
@@ -137,16 +138,24 @@ cv::Mat unusual_odds(const Look& look, const Picture& picture, const Tube& place
       ++pixels, unusual += is_other;
     }
   if (unusual > kMostUnusual * pixels) return {};
-  const cv::Size window(kUnusualWindow, kUnusualWindow);
-  cv::boxFilter(seen, seen, -1, window);
-  cv::boxFilter(other, other, -1, window);
+  const auto mean_about = [](const cv::Mat& values, int window) {
+    cv::Mat mean;
+    cv::boxFilter(values, mean, -1, cv::Size(window, window));
+    return mean;
+  };
+  // what lies beside a hidden piece of the tube hides it, too
+  const cv::Mat near_seen = mean_about(seen, kUnusualWindow), near_other = mean_about(other, kUnusualWindow);
+  const cv::Mat far_seen = mean_about(seen, kBesideWindow), far_other = mean_about(other, kBesideWindow);
+  cv::Mat odds(box.height(), box.width(), CV_32F);
   for (int y = 0; y < box.height(); ++y)
     for (int x = 0; x < box.width(); ++x) {
-      float& odds = other.at<float>(y, x);
-      const double share = odds / std::max(1e-6f, seen.at<float>(y, x));
-      odds = static_cast<float>(-kSurelyUnusual * std::clamp((share - kFewUnusual) / (1.0 - kFewUnusual), 0.0, 1.0));
+      const bool inside = seen.at<float>(y, x) > 0.0f;
+      const float all = (inside ? near_seen : far_seen).at<float>(y, x);
+      const double share = (inside ? near_other : far_other).at<float>(y, x) / std::max(1e-6f, all);
+      odds.at<float>(y, x) =
+          static_cast<float>(-kSurelyUnusual * std::clamp((share - kFewUnusual) / (1.0 - kFewUnusual), 0.0, 1.0));
     }
-  return other;
+  return odds;
 }
 
 // Takes small parts out; returns the area that stays.

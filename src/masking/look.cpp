@@ -27,7 +27,7 @@ constexpr double kSurelySame = -2.0,
 constexpr double kMarkStep = 0.25;  // diameters
 constexpr int kMarksAcross = 6;
 constexpr double kLeastLight = 0.6, kMostLight = 1.3;  // of the usual: the rope's own shading moves, a hand's shadow
-constexpr double kUsual = 24.0;  // gray levels, RMS of the channels: what looks otherwise is not the rope
+constexpr double kUsual = 16.0;  // gray levels, RMS of the channels: what looks otherwise is not the rope
 
 // [1 2 1] / 4 along each of the three axes.
 void blur(std::vector<double>& counts) {
