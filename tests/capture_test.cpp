@@ -494,6 +494,7 @@ TEST_CASE("everything that can be wrong with capture.json is refused in one line
   CHECK(contains(with("/cameras/0/width", 64.5), "cameras[0].width"));
   CHECK(contains(with("/cameras/0/width", 65), "000000.png: is 64x48 pixels, the camera has 65x48"));
   CHECK(contains(with("/cameras/0/fx", 0), "cameras[0].fx"));
+  CHECK(contains(with("/cameras/0/fy", 1e300), "cameras[0].fy: 1e+300 is beyond every camera"));
   CHECK(contains(with("/cameras/0/cx", "left"), "cameras[0].cx: is not a number"));
   CHECK(contains(with("/cameras/0/distortion", {0, 0, 0, 0}), "4 entries instead of 5"));
   CHECK(contains(with("/cameras/0/distortion", {-30, 0, 0, 0, 0}), "cannot be undone"));
@@ -604,6 +605,44 @@ TEST_CASE("warnings name unknown keys, missing numbers and single cameras") {
   made.json["cameras"].erase(1);
   made.load();
   CHECK(warnings.mention("only one"));
+}
+
+TEST_CASE("a calibration is checked as a camera of a capture is") {
+  Made made;
+  Warnings warnings;
+  const Json good = made.json["cameras"][0];
+  const auto read = [&](const Json& camera) {
+    made.write("camera.json", camera.dump());
+    return capture::read_calibration(made.path() / "camera.json");
+  };
+  const auto refused = [&](const std::string& key, const Json& value) {
+    Json camera = good;
+    camera[key] = value;
+    try {
+      read(camera);
+      return std::string();
+    } catch (const InputError& error) {
+      return std::string(error.what());
+    }
+  };
+  Json camera = good;
+  camera.erase("name");
+  camera["start"] = 2.5;
+  const capture::Calibration calibration = read(camera);
+  CHECK(calibration.camera.fx == good["fx"].get<double>());
+  CHECK(calibration.rate == good["rate"].get<double>());
+  CHECK(calibration.start == 2.5);
+  CHECK(read(Json{{"cameras", {good}}}).camera.name == "cam0");  // a whole capture.json
+  CHECK(refused("fx", 600.0).empty());
+  CHECK(contains(refused("width", 64.5), "camera.json: width"));
+  CHECK(contains(refused("fx", 1e300), "camera.json: fx"));
+  CHECK(contains(refused("rate", -30), "camera.json: rate"));
+  CHECK(contains(refused("world_from_camera", std::vector<double>(16, 0.0)), "world_from_camera"));
+  Json mirrored = good["world_from_camera"];
+  for (int c = 0; c < 3; ++c) mirrored[c] = -mirrored[c].get<double>();
+  CHECK(contains(refused("world_from_camera", mirrored), "reflection"));
+  refused("distorsion", {0.1, 0, 0, 0, 0});
+  CHECK(warnings.mention("distorsion: unknown key, ignored; is 'distortion' meant?"));
 }
 
 TEST_CASE("truncated and garbled capture.json never do worse than an error") {

@@ -384,6 +384,7 @@ void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job) {
   command->add_option("--calibration", request->source.calibration, "Camera object as in capture.json")
       ->type_name("FILE.json");
   command->add_option("--rate", request->source.rate, "Frames a second (default: the calibration's, else the video's)")
+      ->check(CLI::Range(1e-3, 1e6))
       ->type_name("HZ");
   command
       ->add_option(

@@ -9,7 +9,6 @@
 #include <cmath>
 #include <cstdlib>
 #include <cstring>
-#include <nlohmann/json.hpp>
 
 #include "cli.h"
 
@@ -17,57 +16,9 @@ namespace chainsplat::tools {
 
 namespace {
 
-using Json = nlohmann::json;
-
 constexpr int kBlack = 16;         // brightness up to which a pixel of a masked video is background (lossy coding)
 constexpr int kMargin = 24;        // px about what a frame shows
 constexpr double kTogether = 0.5;  // of a frame's interval: frames of several cameras nearer than that are one moment
-
-// A camera object as in capture.json.
-capture::Camera read_calibration(const std::string& file, double& rate, double& start) {
-  Json object;
-  try {
-    object = Json::parse(core::read_file(file));
-  } catch (const Json::exception&) {
-    throw InputError(file, "is no JSON document", "give a camera object as in capture.json");
-  }
-  if (object.contains("cameras") && object["cameras"].is_array() && object["cameras"].size() == 1)
-    object = object["cameras"][0];
-  capture::Camera camera;
-  const auto number = [&](const char* key) {
-    if (!object.contains(key) || !object[key].is_number())
-      throw InputError(file + ": " + key, "is missing or no number", "give a camera object as in capture.json");
-    return object[key].get<double>();
-  };
-  camera.name = object.value("name", std::string("camera"));
-  camera.width = static_cast<int>(number("width"));
-  camera.height = static_cast<int>(number("height"));
-  camera.fx = number("fx"), camera.fy = number("fy"), camera.cx = number("cx"), camera.cy = number("cy");
-  if (camera.width <= 0 || camera.height <= 0 || !(camera.fx > 0.0) || !(camera.fy > 0.0))
-    throw InputError(file, "width, height, fx and fy must be above 0", "correct them");
-  const auto list = [&](const char* key, std::size_t size) {
-    const bool good = object.contains(key) && object[key].is_array() && object[key].size() == size &&
-                      std::all_of(object[key].begin(), object[key].end(), [](const Json& x) { return x.is_number(); });
-    if (!good)
-      throw InputError(file + ": " + key, "is no list of " + std::to_string(size) + " numbers",
-                       "give a camera object as in capture.json");
-    return object[key].get<std::vector<double>>();
-  };
-  if (object.contains("distortion")) {
-    const std::vector<double> distortion = list("distortion", 5);
-    std::copy(distortion.begin(), distortion.end(), camera.distortion.begin());
-  }
-  const std::vector<double> pose = list("world_from_camera", 16);
-  math::Matrix3 rotation;
-  for (int r = 0; r < 3; ++r) {
-    for (int c = 0; c < 3; ++c) rotation(r, c) = pose[4 * r + c];
-    camera.world_from_camera.translation[r] = pose[4 * r + 3];
-  }
-  camera.world_from_camera.rotation = math::orthonormalized(rotation);
-  if (object.contains("rate")) rate = number("rate");
-  if (object.contains("start")) start = number("start");
-  return camera;
-}
 
 double seconds(const std::string& text) {
   char* end = nullptr;
@@ -160,10 +111,10 @@ FrameSource open_capture(const SourceRequest& request) {
 
 // Frames of one camera whose calibration is given: from a file, a device or standard input.
 FrameSource open_stream(const SourceRequest& request) {
-  double rate = request.rate, start = 0.0, own_rate = 0.0;
+  const capture::Calibration calibration = capture::read_calibration(request.calibration);
+  double rate = request.rate > 0.0 ? request.rate : calibration.rate, start = calibration.start;
   FrameSource source;
-  source.cameras = {read_calibration(request.calibration, own_rate, start)};
-  if (rate <= 0.0) rate = own_rate;
+  source.cameras = {calibration.camera};
   std::shared_ptr<capture::VideoReader> reader;
   if (request.camera != "-") {
     const capture::Camera& camera = source.cameras[0];
@@ -172,7 +123,7 @@ FrameSource open_stream(const SourceRequest& request) {
     if (rate <= 0.0) rate = reader->rate();
   }
   const bool device = reader && reader->device();
-  if (!device && (!(rate > 0.0) || !std::isfinite(rate)))
+  if (!device && rate <= 0.0)
     throw InputError("--rate", "is needed to know the frames' times", "give frames a second, for example 30");
   const bool unix = request.start == "unix";
   if (unix && !device) throw InputError("--start", "only a device stamps its frames", "give seconds");

@@ -76,6 +76,15 @@ struct LoadOptions {
 // Loads and checks. `path` is the folder or its capture.json. Throws InputError; unknown keys and other doubts warn.
 Capture load(const Path& path, const LoadOptions& options = {});
 
+// One camera object as in capture.json, alone in a file: what is needed of a camera whose frames come from elsewhere.
+struct Calibration {
+  Camera camera;
+  double rate = 0.0;   // frames a second; 0: not given
+  double start = 0.0;  // s, of the first frame
+};
+// Throws InputError; unknown keys and other doubts warn.
+Calibration read_calibration(const Path& file);
+
 // What evaluation compares with: recorded pixels, and depth where the capture has it. `loaded` came from the same path
 // and options; where no camera has lens distortion it shows these pixels already, and nothing is decoded again.
 Capture load_recorded(Capture loaded, const Path& path, LoadOptions options = {});

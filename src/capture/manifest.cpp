@@ -22,6 +22,7 @@ Path ImageSource::frame_file(int frame) const {
 namespace {
 
 constexpr int kLargestSide = 1 << 15;        // px, of an image
+constexpr double kMostFocal = 1e6;           // px, of a focal length and the principal point: parallel rays
 constexpr double kRotationTolerance = 1e-3;  // |R R^T - I|: three digits pass
 constexpr double kUnitTolerance = 1e-3;      // of a direction's length before we doubt it
 constexpr double kPerpendicular = 1e-3;      // rad
@@ -373,21 +374,20 @@ bool good_name(const std::string& name) {
                      [](unsigned char c) { return std::isalnum(c) || c == '_' || c == '-' || c == '.'; });
 }
 
-CameraSource read_camera(const Reader& reader, const std::string& where, const Path& folder) {
-  CameraSource source;
-  source.where = where;
-  Camera& camera = source.camera;
+// All of a camera but where its frames are.
+Camera read_optics(const Reader& reader) {
   reader.know({"name", "width", "height", "fx", "fy", "cx", "cy", "distortion", "world_from_camera", "images", "masks",
                "depth", "depth_scale", "rate", "start", "timestamps"});
-  camera.name = reader.text("name", true, "a short name like cam0").value_or("");
-  if (reader.has("name") && !good_name(camera.name))
-    reader.problem("name", in_quotes(camera.name) + " cannot name a folder", "use letters, digits, - and _");
+  Camera camera;
   camera.width = reader.pixels("width");
   camera.height = reader.pixels("height");
   camera.fx = reader.positive("fx", "the focal length in pixels");
   camera.fy = reader.positive("fy", "the focal length in pixels");
   camera.cx = reader.number("cx", true, "the principal point in pixels").value_or(0.0);
   camera.cy = reader.number("cy", true, "the principal point in pixels").value_or(0.0);
+  for (const auto& [key, value] : {std::pair("fx", camera.fx), {"fy", camera.fy}, {"cx", camera.cx}, {"cy", camera.cy}})
+    if (std::abs(value) > kMostFocal)
+      reader.problem(key, core::exact(value) + " is beyond every camera", "write it in pixels");
   if (camera.width > 0 && camera.height > 0 &&
       (camera.cx < 0 || camera.cx > camera.width || camera.cy < 0 || camera.cy > camera.height))
     reader.doubt("cx", "the principal point lies outside the image");
@@ -395,6 +395,16 @@ CameraSource read_camera(const Reader& reader, const std::string& where, const P
     std::copy(values->begin(), values->end(), camera.distortion.begin());
   if (camera.width > 0 && camera.height > 0 && camera.fx > 0 && camera.fy > 0) check_lens(reader, camera);
   read_pose(reader, camera);
+  return camera;
+}
+
+CameraSource read_camera(const Reader& reader, const std::string& where, const Path& folder) {
+  CameraSource source;
+  source.where = where;
+  source.camera = read_optics(reader);
+  source.camera.name = reader.text("name", true, "a short name like cam0").value_or("");
+  if (reader.has("name") && !good_name(source.camera.name))
+    reader.problem("name", in_quotes(source.camera.name) + " cannot name a folder", "use letters, digits, - and _");
 
   if (const auto images = image_source(reader, "images", folder, true)) source.images = *images;
   source.masks = image_source(reader, "masks", folder, false);
@@ -416,6 +426,22 @@ CameraSource read_camera(const Reader& reader, const std::string& where, const P
 std::string line_of(const std::string& text, std::size_t byte) {
   const std::size_t end = std::min(byte, text.size());
   return std::to_string(1 + std::count(text.begin(), text.begin() + static_cast<std::ptrdiff_t>(end), '\n'));
+}
+
+// The object in a file.
+Json parse(const std::string& text, const std::string& file, const char* expected) {
+  Json json;
+  try {
+    json = Json::parse(text);
+  } catch (const Json::parse_error& failure) {
+    throw InputError(file + ":" + line_of(text, failure.byte),
+                     "is not JSON (a comma, bracket or quote is missing, or the file is cut off)",
+                     "correct this line or the one before");
+  } catch (const Json::exception&) {  // a number beyond double
+    throw InputError(file, "has a number that is too large", "write finite numbers");
+  }
+  if (!json.is_object()) throw InputError(file, "is not a JSON object", std::string("write ") + expected);
+  return json;
 }
 
 void survey(Manifest& manifest, bool masked, Findings& findings) {
@@ -492,18 +518,7 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
   capture.folder = manifest.file.has_parent_path() ? manifest.file.parent_path() : Path(".");
   const std::string text = core::read_file(manifest.file);
   const std::string file = manifest.file.string();
-  Json json;
-  try {
-    json = Json::parse(text);
-  } catch (const Json::parse_error& failure) {
-    throw InputError(file + ":" + line_of(text, failure.byte),
-                     "is not JSON (a comma, bracket or quote is missing, or the file is cut off)",
-                     "correct this line or the one before");
-  } catch (const Json::exception&) {  // a number beyond double
-    throw InputError(file, "has a number that is too large", "write finite numbers");
-  }
-  if (!json.is_object())
-    throw InputError(file, "is not a JSON object", "write { \"format\": \"chainsplat-capture/1\", ... }");
+  const Json json = parse(text, file, "{ \"format\": \"chainsplat-capture/1\", ... }");
 
   const Reader top(&json, file + ": ", findings);
   const auto format = top.text("format", true, "\"chainsplat-capture/1\"");
@@ -600,6 +615,26 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
   }
   capture.hash = capture_hash(text, manifest, base ? capture.folder / *base : Path());
   return manifest;
+}
+
+Calibration read_calibration(const Path& path) {
+  const std::string file = path.string();
+  const Json json = parse(core::read_file(path), file, "a camera object as in capture.json");
+  const auto cameras = json.find("cameras");  // or a whole capture.json of one camera
+  const bool whole = cameras != json.end() && cameras->is_array() && cameras->size() == 1 && (*cameras)[0].is_object();
+  Findings findings;
+  const Reader reader(whole ? &(*cameras)[0] : &json, file + ": ", findings);
+  Calibration calibration;
+  calibration.camera = read_optics(reader);
+  calibration.camera.name = reader.text("name", false, "a short name like cam0").value_or("camera");
+  if (reader.has("rate")) calibration.rate = reader.positive("rate", "frames a second");
+  calibration.start = reader.number("start", false, "the first frame's time in seconds").value_or(0.0);
+  if (!findings.problems.empty()) {
+    const Problem& first = findings.problems.front();
+    throw InputError(first.where, first.what, first.mend);
+  }
+  for (const std::string& doubt : findings.doubts) core::warn(doubt);
+  return calibration;
 }
 
 }  // namespace chainsplat::capture
