@@ -1,0 +1,88 @@
+// buffers.cpp - room on the device, and what goes there and back.
+#include <algorithm>
+#include <cstring>
+
+#include "src/splat/engine.h"
+
+namespace chainsplat::splat {
+
+void Engine::State::need(Buffer& buffer, std::size_t bytes, const char* name) {
+  constexpr std::size_t kLeast = 256, kRow = sizeof(glm::vec4);  // kernels may take its last row as a whole
+  bytes = std::max((bytes + kRow - 1) / kRow * kRow, kLeast);
+  if (buffer.bytes() < bytes) {
+    buffer = Buffer();  // the old one goes first
+    buffer = Buffer(device, bytes, Domain::device, name);
+  }
+}
+
+void Engine::State::release_view_buffers() {
+  commands.wait();
+  for (Buffer* buffer :
+       {&views,           &motions,        &tile_map,      &tiles,        &splats,     &instance_count, &tile_hits,
+        &instance_prefix, &instance_block, &records,       &link_twists,  &tile_count, &tile_prefix,    &tile_block,
+        &tile_cursor,     &tile_used,      &tile_loss,     &entries,      &sorted,     &partials,       &image,
+        &depth_image,     &pixel_gradient, &ssim_row_sums, &ssim_factors, &long_tiles, &sort_scratch,   &color_views,
+        &segments,        &tile_pixels,    &tile_summary,  &pixel_sums,   &link_sums})
+    *buffer = Buffer();
+  instance_capacity = 0;
+}
+
+void Engine::State::write(Buffer& buffer, const void* data, std::size_t bytes, const char* name) {
+  need(buffer, bytes, name);
+  if (bytes == 0) return;
+  if (buffer.mapped()) {
+    std::memcpy(buffer.mapped(), data, bytes);
+  } else {
+    gpu::upload(device, buffer, data, bytes);
+  }
+}
+
+void Engine::State::stage(Buffer& buffer, const void* data, std::size_t bytes, const char* name) {
+  need(buffer, bytes, name);
+  if (buffer.mapped()) {
+    if (bytes > 0) std::memcpy(buffer.mapped(), data, bytes);
+    return;
+  }
+  const auto same = std::find_if(uploads.begin(), uploads.end(), [&](const Upload& u) { return u.to == &buffer; });
+  Upload& upload = same != uploads.end() ? *same : uploads.emplace_back();
+  const auto* const first = static_cast<const std::byte*>(data);
+  upload.to = &buffer;
+  upload.data.assign(first, first + bytes);
+}
+
+void Engine::State::record_uploads() {
+  std::size_t total = 0;
+  for (const Upload& upload : uploads) total += upload.data.size();
+  if (to_device.bytes() < total) {
+    to_device = Buffer();
+    to_device = Buffer(device, static_cast<std::size_t>(kGrowth * total), Domain::host, "to device");
+  }
+  std::size_t at = 0;
+  for (const Upload& upload : uploads) {
+    if (upload.data.empty()) continue;
+    std::memcpy(static_cast<std::byte*>(to_device.mapped()) + at, upload.data.data(), upload.data.size());
+    commands.copy(to_device, at, *upload.to, 0, upload.data.size());
+    commands.no_barrier();
+    at += upload.data.size();
+  }
+  uploads.clear();
+}
+
+const std::byte* Engine::State::record_download(const Buffer& buffer, std::size_t bytes) {
+  if (buffer.mapped()) return static_cast<const std::byte*>(buffer.mapped());
+  const std::size_t at = to_host_bytes;
+  commands.copy(buffer, 0, to_host, at, bytes);
+  to_host_bytes += bytes;
+  return static_cast<const std::byte*>(to_host.mapped()) + at;
+}
+
+void Engine::State::set_tile_capacity(std::uint32_t capacity) {
+  tile_capacity = capacity;
+  std::vector<std::uint32_t> starts(kListEntries / capacity + 1);
+  for (std::size_t tile = 0; tile < starts.size(); ++tile) starts[tile] = static_cast<std::uint32_t>(tile * capacity);
+  const std::vector<std::uint32_t> blocks(starts.size() / shared::kScanBlock + 1, 0);
+  write(list_starts, starts.data(), starts.size() * sizeof(std::uint32_t), "list starts");
+  write(list_blocks, blocks.data(), blocks.size() * sizeof(std::uint32_t), "list blocks");
+}
+
+}  // namespace chainsplat::splat

@@ -1,0 +1,427 @@
+// passes.cpp - one submission: its views laid out, room made, all passes recorded and run.
+#include <algorithm>
+#include <array>
+#include <cstring>
+#include <numeric>
+
+#include "src/splat/engine.h"
+
+namespace chainsplat::splat {
+
+namespace {
+
+constexpr std::uint32_t kTilesAPixelSlice = 4, kMostPixelSlices = 256;  // of color_pixels: enough groups for a GPU,
+constexpr std::uint32_t kTilesAnEquationSlice = 16, kMostEquationSlices = 64;  // few sums to read back
+constexpr std::uint32_t kFirstInstances = 8;                                   // tiles a splat touches, first guess
+constexpr std::uint32_t kRow = 32768;  // groups in x of a two-dimensional dispatch
+
+// lavapipe gives every thread one stretch of a pass' groups. Neighbors in the list of tiles have alike work, those far
+// apart do not: so that every stretch has some of all, a pass goes through the list in steps of about its golden
+// section.
+std::uint32_t spreading_stride(std::uint32_t count) {
+  constexpr double kGoldenSection = 0.6180339887;
+  auto stride = static_cast<std::uint32_t>(kGoldenSection * count);
+  while (stride > 1 && std::gcd(stride, count) > 1) --stride;
+  return std::max(1u, stride);
+}
+
+std::size_t words(std::size_t n) { return n * sizeof(std::uint32_t); }
+std::size_t vectors(std::size_t n) { return n * sizeof(glm::vec4); }
+std::uint32_t groups(std::size_t n) { return static_cast<std::uint32_t>((n + shared::kGroup - 1) / shared::kGroup); }
+
+}  // namespace
+
+void Engine::State::scan(const Buffer& values, const Buffer& prefix, const Buffer& block, SplatPush push,
+                         std::size_t most) {
+  const auto groups = static_cast<std::uint32_t>((most + shared::kScanBlock - 1) / shared::kScanBlock);
+  const std::array block_buffers{&values, &prefix, &block, static_cast<const Buffer*>(&counters)};
+  commands.dispatch(scan_block, block_buffers, &push, sizeof push, groups);
+  const std::array sum_buffers{&block, static_cast<const Buffer*>(&counters)};
+  commands.dispatch(scan_sums, sum_buffers, &push, sizeof push, 1);
+}
+
+void Engine::State::dispatch(const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers,
+                             const SplatPush& push, std::uint32_t x, std::uint32_t y) {
+  commands.dispatch(pipeline, {buffers.begin(), buffers.size()}, &push, sizeof push, x, y);
+}
+
+void Engine::State::dispatch_live(const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers,
+                                  const SplatPush& push) {
+  commands.dispatch_indirect(pipeline, {buffers.begin(), buffers.size()}, &push, sizeof push, counters,
+                             words(shared::kCounterDispatch));
+}
+
+Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, const RunOptions& options) {
+  const auto links = static_cast<std::uint32_t>(scene.links);
+  Submission out{scene, options};
+  out.views = static_cast<std::uint32_t>(chunk.size());
+  out.replicas = static_cast<std::size_t>(scene.count) * links;
+  out.dssim = options.loss && options.weights.dssim > 0.0f;
+  std::vector<SplatView> gpu_views(out.views);
+  std::vector<glm::vec4> rows(static_cast<std::size_t>(out.views) * links * 3);
+  std::vector<std::uint32_t> map;
+  std::vector<SplatTile> active;
+  std::vector<ColorView> colored;
+  std::vector<glm::vec4> axes;
+  chunk_tile_view.clear();
+  chunk_pixel.assign(out.views, 0);
+  for (std::uint32_t v = 0; v < out.views; ++v) {
+    const SceneView& view = scene.views[chunk[v]];
+    CHAINSPLAT_CHECK(view.motions.size() == links || scene.count == 0, std::to_string(view.motions.size()));
+    SplatView& placed = gpu_views[v];
+    placed.intrinsics = {view.fx, view.fy, view.cx, view.cy};
+    placed.limits = {view.limit_x, view.limit_y, 0, 0};
+    const math::Vector3 base =
+        view.motions.empty() ? math::Vector3::Zero() : view.camera_from_world * view.motions[0].translation;
+    placed.moment_point = {base.x(), base.y(), base.z(), 0};
+    placed.width = static_cast<std::uint32_t>(view.width);
+    placed.height = static_cast<std::uint32_t>(view.height);
+    placed.tiles_x = static_cast<std::uint32_t>(view.tiles_x);
+    placed.tiles_y = static_cast<std::uint32_t>(view.tiles_y);
+    placed.tile_map = static_cast<std::uint32_t>(map.size());
+    placed.pixel = static_cast<std::uint32_t>(out.pixels);
+    placed.target = static_cast<std::uint32_t>(view.target);
+    placed.motion = v * links;
+    chunk_pixel[v] = out.pixels;
+    out.pixels += static_cast<std::size_t>(view.width) * view.height;
+    map.resize(map.size() + static_cast<std::size_t>(view.tiles_x) * view.tiles_y, shared::kNoTile);
+    for (std::uint32_t j = 0; j < std::min<std::size_t>(links, view.motions.size()); ++j) {
+      const math::Pose pose = view.camera_from_world * view.motions[j];
+      for (int r = 0; r < 3; ++r)
+        rows[3 * (placed.motion + j) + r] = {pose.rotation(r, 0), pose.rotation(r, 1), pose.rotation(r, 2),
+                                             pose.translation[r]};
+    }
+    out.most_tiles = std::max(out.most_tiles, static_cast<std::uint32_t>(view.active.size()));
+    if (!options.chain) continue;
+    const chain::Chain& chain = *options.chain;
+    const std::uint32_t first_tile = colored.empty() ? 0 : colored.back().first_tile + colored.back().tiles;
+    colored.push_back({first_tile, static_cast<std::uint32_t>(view.active.size()), v * links, 0});
+    for (std::uint32_t j = 0; j < links; ++j) {
+      const math::Pose pose = view.camera_from_world * view.motions[j];
+      const math::Vector3 start = pose * math::Vector3(chain.link_start(j) * chain.direction);
+      const math::Vector3 along = pose.rotation * chain.direction;
+      axes.emplace_back(start.x(), start.y(), start.z(), chain.link_end(j) - chain.link_start(j));
+      axes.emplace_back(along.x(), along.y(), along.z(), 0.0);
+    }
+  }
+  // tiles with a D-SSIM term first, so that its passes run over a prefix of the list
+  for (const bool near : {true, false}) {
+    for (std::uint32_t v = 0; v < out.views; ++v) {
+      const SceneView& view = scene.views[chunk[v]];
+      for (std::size_t k = near ? 0 : view.near; k < (near ? view.near : view.active.size()); ++k) {
+        const std::uint32_t cell = view.active[k];
+        map[gpu_views[v].tile_map + cell] = static_cast<std::uint32_t>(active.size());
+        active.push_back({v, cell % gpu_views[v].tiles_x, cell / gpu_views[v].tiles_x, 0});
+        chunk_tile_view.push_back(v);
+      }
+    }
+    if (near) out.near_tiles = static_cast<std::uint32_t>(active.size());
+  }
+  out.tiles = static_cast<std::uint32_t>(active.size());
+  stage(views, gpu_views.data(), gpu_views.size() * sizeof(SplatView), "views");
+  stage(motions, rows.data(), rows.size() * sizeof(glm::vec4), "motions");
+  stage(tile_map, map.data(), map.size() * sizeof(std::uint32_t), "tile map");
+  stage(tiles, active.data(), active.size() * sizeof(SplatTile), "tiles");
+  if (options.chain) {
+    stage(color_views, colored.data(), colored.size() * sizeof(ColorView), "color views");
+    stage(segments, axes.data(), axes.size() * sizeof(glm::vec4), "segments");
+  }
+  return out;
+}
+
+bool Engine::State::make_room(Submission& s) {
+  const RunOptions& options = s.options;
+  if (live_capacity == 0 || live_capacity > s.replicas)
+    live_capacity = static_cast<std::uint32_t>(
+        std::max<std::size_t>(1, std::min<std::size_t>(s.replicas, 2 * static_cast<std::size_t>(s.scene.count) + 256)));
+  s.pairs = static_cast<std::size_t>(live_capacity) * s.views;
+  const std::size_t pair_bytes = (options.backward ? shared::kGradientRows : shared::kSplatRows) * sizeof(glm::vec4);
+  if (s.pairs * pair_bytes > range_limit && s.views > 1) {
+    most_views = static_cast<int>(std::max<std::size_t>(1, range_limit / (pair_bytes * live_capacity)));
+    return false;
+  }
+  if (instance_capacity == 0)
+    instance_capacity = static_cast<std::uint32_t>(std::max<std::size_t>(1024, kFirstInstances * s.pairs / 2));
+  // what drawing had grown can be more than gradients have room for; an overflow then takes fewer views
+  if (options.backward)
+    instance_capacity = static_cast<std::uint32_t>(
+        std::min<std::size_t>(instance_capacity, range_limit / (sizeof(glm::vec4) * shared::kPartialRows * slots)));
+  const auto blocks = [](std::size_t n) { return n / shared::kScanBlock + 1; };
+  need(replica_opacity, words(s.replicas), "replica opacity");
+  need(live_flag, words(s.replicas), "live flag");
+  need(live_prefix, words(s.replicas), "live prefix");
+  need(live_block, words(blocks(s.replicas)), "live block");
+  need(live, words(live_capacity), "live");
+  need(splats, vectors(shared::kSplatRows * s.pairs), "splats");
+  need(instance_count, words(s.pairs), "instance count");
+  need(tile_hits, words(s.pairs), "tile hits");
+  need(instance_prefix, words(s.pairs), "instance prefix");
+  need(instance_block, words(blocks(s.pairs)), "instance block");
+  need(tile_count, words(s.tiles), "tile count");
+  need(tile_prefix, words(s.tiles), "tile prefix");
+  need(tile_block, words(blocks(s.tiles)), "tile block");
+  need(tile_cursor, words(s.tiles), "tile cursor");
+  need(tile_used, words(s.tiles), "tile used");
+  need(tile_loss, 2 * vectors(s.tiles), "tile loss");
+  // a list at a place of its own needs no instances, which only gradients are summed by
+  if (options.chain && tile_capacity == 0) set_tile_capacity(kTileCapacity);
+  s.own_places = options.chain && static_cast<std::size_t>(s.tiles) * tile_capacity <= kListEntries;
+  const std::uint32_t list_entries = s.own_places ? std::max(kListEntries, instance_capacity) : instance_capacity;
+  need(entries, vectors(list_entries), "entries");
+  need(long_tiles, words(s.tiles), "long tiles");
+  need(sort_scratch, 4 * words(list_entries), "sort scratch");
+  need(sorted, 2 * words(list_entries), "sorted");
+  need(image, vectors(s.pixels), "image");
+  need(depth_image, options.depth ? words(s.pixels) : 0, "depth image");
+  need(pixel_gradient, s.dssim ? vectors(s.pixels) : 0, "pixel gradient");
+  if (s.dssim) {
+    const std::size_t near_pixels = static_cast<std::size_t>(s.near_tiles) * tile_width * tile_height;
+    need(ssim_row_sums, 12 * words(near_pixels), "ssim rows");
+    need(ssim_factors, 12 * words(near_pixels), "ssim factors");
+  }
+  if (options.backward) {
+    need(partials, vectors(static_cast<std::size_t>(shared::kPartialRows) * slots * instance_capacity), "partials");
+    need(records, vectors(shared::kGradientRows * s.pairs), "records");
+    need(replica_gradient, words(s.replicas), "replica gradient");
+    if (options.twists)
+      need(link_twists, 2 * vectors(static_cast<std::size_t>(s.views) * s.scene.links), "link twists");
+  }
+
+  if (options.chain) {
+    const auto slices = [&](std::uint32_t tiles_a_slice, std::uint32_t most) {
+      return std::min(most, (std::max(1u, s.most_tiles) + tiles_a_slice - 1) / tiles_a_slice);
+    };
+    color_push.links = s.scene.links;
+    color_push.pixel_slices = slices(kTilesAPixelSlice, kMostPixelSlices);
+    color_push.equation_slices = slices(kTilesAnEquationSlice, kMostEquationSlices);
+    need(tile_pixels, words(static_cast<std::size_t>(s.tiles) * tile_width * tile_height), "tile pixels");
+    need(tile_summary, 2 * words(s.tiles), "tile summary");
+    pixel_sum_bytes = vectors(shared::kColorPixelRows * color_push.pixel_slices * s.views);
+    link_sum_bytes = vectors(shared::kColorRows * color_push.equation_slices * s.views * s.scene.links);
+    need(pixel_sums, pixel_sum_bytes, "pixel sums");
+    need(link_sums, link_sum_bytes, "link sums");
+  }
+  const std::size_t downloads = words(shared::kCounters) + (options.chain ? pixel_sum_bytes + link_sum_bytes : 0);
+  if (!counters.mapped() && to_host.bytes() < downloads) {
+    to_host = Buffer();
+    to_host = Buffer(device, static_cast<std::size_t>(kGrowth * downloads), Domain::host, "to host");
+  }
+
+  SplatPush& push = s.push;
+  push.gaussians = static_cast<std::uint32_t>(s.scene.count);
+  push.links = static_cast<std::uint32_t>(s.scene.links);
+  push.coefficients = static_cast<std::uint32_t>(s.scene.coefficients());
+  push.views = s.views;
+  push.live_capacity = live_capacity;
+  push.instance_capacity = instance_capacity;
+  push.tiles = s.tiles;
+  push.slots = slots;
+  push.near_tiles = s.near_tiles;
+  push.tile_capacity = s.own_places ? tile_capacity : 0;
+  push.tile_stride = gpu::info(device).software ? spreading_stride(s.tiles) : 1;
+  push.weight_l1 = static_cast<float>(options.weights.l1 * options.color_scale);
+  push.weight_dssim = static_cast<float>(options.weights.dssim * options.color_scale);
+  push.weight_mask = static_cast<float>(options.weights.mask * options.mask_scale);
+  push.flags = (options.accumulate ? shared::kFlagAccumulate : 0) | (options.held_links ? shared::kFlagHeldLinks : 0);
+  return true;
+}
+
+void Engine::State::record_lists(const Submission& s) {
+  const Scene& scene = s.scene;
+  // what is live is known for as long as the Gaussians stay
+  const std::pair now{scene.version, live_capacity};
+  const bool replicas_kept = replicated == now;
+  replicated = now;
+  const auto set_counters = [&](std::uint32_t from, std::uint32_t to, std::uint32_t value) {
+    commands.fill(counters, value, words(from), words(to - from));
+    commands.no_barrier();
+  };
+  if (!replicas_kept) set_counters(0, shared::kCounterKept, 0);
+  set_counters(shared::kCounterDispatch + 1, shared::kCounterDispatch + 2, s.views);
+  set_counters(shared::kCounterDispatch + 2, shared::kCounterInstances, 1);
+  set_counters(shared::kCounterInstances, shared::kCounterLongTiles + 1, 0);
+  set_counters(shared::kCounterLongTiles + 1, shared::kCounterLongTiles + 3, 1);
+  set_counters(shared::kCounterNotFinite, shared::kCounters, 0);
+  commands.fill(tile_count, 0, 0, words(std::max(1u, s.tiles)));
+  commands.no_barrier();
+  commands.fill(tile_cursor, 0, 0, words(std::max(1u, s.tiles)));
+  commands.no_barrier();
+  commands.fill(tile_used, 0, 0, words(std::max(1u, s.tiles)));
+  commands.stamp("clear");
+  if (!replicas_kept) {
+    SplatPush push = s.push;
+    dispatch(replicate, {&scene.parameters, &replica_opacity, &live_flag}, push, groups(scene.count));
+    push.scan_length = static_cast<std::uint32_t>(s.replicas);
+    push.scan_counter = shared::kCounterLive;
+    scan(live_flag, live_prefix, live_block, push, s.replicas);
+    const std::uint32_t replica_groups = groups(s.replicas);
+    dispatch(compact, {&live_flag, &live_prefix, &live_block, &live}, push, std::min(replica_groups, kRow),
+             (replica_groups + kRow - 1) / kRow);
+    commands.stamp("replicate");
+  }
+  dispatch_live(project,
+                {&scene.parameters, &replica_opacity, &live, &views, &motions, &tile_map, &counters, &splats,
+                 &instance_count, &tile_count, &tile_hits, &entries},
+                s.push);
+  commands.stamp("project");
+  if (!s.own_places) {
+    SplatPush scan_push = s.push;
+    scan_push.scan_per_live = s.views;
+    scan_push.scan_counter = shared::kCounterInstances;
+    scan(instance_count, instance_prefix, instance_block, scan_push, s.pairs);
+    scan_push.scan_per_live = 0;
+    scan_push.scan_length = s.tiles;
+    scan_push.scan_counter = shared::kCounterTiles;
+    scan(tile_count, tile_prefix, tile_block, scan_push, s.tiles);
+    commands.stamp("scan");
+    dispatch_live(bin,
+                  {&live, &views, &tile_map, &counters, &splats, &instance_prefix, &instance_block, &tile_prefix,
+                   &tile_block, &tile_cursor, &tile_hits, &entries},
+                  s.push);
+    commands.stamp("bin");
+  }
+  const Buffer &starts = s.own_places ? list_starts : tile_prefix, &blocks = s.own_places ? list_blocks : tile_block;
+  dispatch(sort, {&starts, &blocks, &tile_count, &entries, &long_tiles, &sorted, &counters}, s.push, s.tiles);
+  const std::array long_buffers = {static_cast<const Buffer*>(&starts),     static_cast<const Buffer*>(&blocks),
+                                   static_cast<const Buffer*>(&tile_count), static_cast<const Buffer*>(&entries),
+                                   static_cast<const Buffer*>(&long_tiles), static_cast<const Buffer*>(&sort_scratch),
+                                   static_cast<const Buffer*>(&sorted)};
+  commands.dispatch_indirect(sort_long, long_buffers, &s.push, sizeof s.push, counters,
+                             words(shared::kCounterLongTiles));
+  commands.stamp("sort");
+}
+
+void Engine::State::record_picture(const Submission& s) {
+  const Buffer &starts = s.own_places ? list_starts : tile_prefix, &blocks = s.own_places ? list_blocks : tile_block;
+  dispatch(
+      s.options.depth ? blend_depth : blend,
+      {&tiles, &views, &starts, &blocks, &tile_count, &sorted, &splats, &counters, &image, &tile_used, &depth_image},
+      s.push, s.tiles);
+  commands.stamp("blend");
+  if (s.options.sums) {
+    dispatch(loss_pixel, {&tiles, &views, &image, &s.scene.target, &tile_loss}, s.push, s.tiles);
+    commands.stamp("loss");
+  }
+  if (s.dssim) {
+    dispatch(ssim_rows, {&tiles, &views, &tile_map, &image, &s.scene.target, &ssim_row_sums}, s.push, s.near_tiles);
+    dispatch(ssim_columns, {&tiles, &views, &tile_map, &ssim_row_sums, &ssim_factors, &tile_loss}, s.push,
+             s.near_tiles);
+    dispatch(ssim_rows_backward, {&tiles, &views, &tile_map, &ssim_factors, &ssim_row_sums}, s.push, s.near_tiles);
+    dispatch(ssim_columns_backward,
+             {&tiles, &views, &tile_map, &ssim_row_sums, &image, &s.scene.target, &pixel_gradient}, s.push,
+             s.near_tiles);
+    commands.stamp("ssim");
+  }
+}
+
+void Engine::State::record_gradients(const Submission& s) {
+  const Scene& scene = s.scene;
+  dispatch(blend_backward,
+           {&tiles, &views, &tile_prefix, &tile_block, &tile_count, &sorted, &splats, &counters, &image, &tile_used,
+            &scene.target, &pixel_gradient, &partials},
+           s.push, s.tiles);
+  commands.stamp("blend backward");
+  dispatch_live(project_backward,
+                {&scene.parameters, &live, &views, &motions, &counters, &splats, &instance_count, &instance_prefix,
+                 &instance_block, &partials, &records},
+                s.push);
+  commands.stamp("project backward");
+  dispatch(gather,
+           {&scene.parameters, &replica_opacity, &live_flag, &live_prefix, &live_block, &views, &motions, &counters,
+            &records, &scene.gradient, &replica_gradient},
+           s.push, groups(scene.count));
+  if (s.options.twists && scene.count > 0)
+    dispatch(link_twist, {&live_prefix, &live_block, &counters, &records, &link_twists}, s.push,
+             static_cast<std::uint32_t>(scene.links), s.views);
+  commands.stamp("gather");
+}
+
+void Engine::State::record_adam(const Submission& s, const AdamPush& push) {
+  Scene& scene = s.scene;
+  const std::array buffers{static_cast<const Buffer*>(&scene.parameters), static_cast<const Buffer*>(&scene.gradient),
+                           static_cast<const Buffer*>(&scene.first_moment),
+                           static_cast<const Buffer*>(&scene.second_moment), static_cast<const Buffer*>(&counters)};
+  const std::uint32_t parameter_groups = groups((push.total + 3) / 4);
+  commands.dispatch(adam, buffers, &push, sizeof push, std::min(parameter_groups, kRow),
+                    (parameter_groups + kRow - 1) / kRow);
+  commands.stamp("adam");
+  scene.version = ++versions;
+}
+
+void Engine::State::record_colors(const Submission& s) {
+  const auto dispatch_colors = [&](const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers,
+                                   std::uint32_t x, std::uint32_t y, std::uint32_t z) {
+    commands.dispatch(pipeline, {buffers.begin(), buffers.size()}, &color_push, sizeof color_push, x, y, z);
+  };
+  dispatch_colors(color_pixels,
+                  {&tiles, &views, &color_views, &segments, &image, &depth_image, &s.scene.target, &tile_pixels,
+                   &tile_summary, &pixel_sums},
+                  color_push.pixel_slices, s.views, 1);
+  commands.stamp("color pixels");
+  dispatch_colors(color_equations,
+                  {&tiles, &views, &color_views, &segments, &image, &depth_image, &s.scene.target, &tile_pixels,
+                   &tile_summary, &pixel_sums, &link_sums},
+                  color_push.links, color_push.equation_slices, s.views);
+  commands.stamp("color equations");
+  read_pixel_sums = record_download(pixel_sums, pixel_sum_bytes);
+  read_link_sums = record_download(link_sums, link_sum_bytes);
+}
+
+bool Engine::State::has_fitted(const Submission& s, const std::byte* read_counters) {
+  std::array<std::uint32_t, shared::kCounters> read{};
+  std::memcpy(read.data(), read_counters, words(shared::kCounters));
+  if (read[shared::kCounterTooLong] != 0)
+    throw WorkError("splat", "more than " + std::to_string(shared::kLongestList) + " Gaussians cover one tile",
+                    "use fewer or smaller Gaussians");
+  not_finite = static_cast<int>(read[shared::kCounterNotFinite]);
+  if (read[shared::kCounterOverflow] == 0) return true;
+  // raise what was too small, as far as one buffer may reach
+  const std::size_t want_live = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantLive]) + 64;
+  const std::size_t want_instances = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantInstances]) + 1024;
+  if (read[shared::kCounterWantLive] > live_capacity)
+    live_capacity = static_cast<std::uint32_t>(std::min<std::size_t>(want_live, s.replicas));
+  if (read[shared::kCounterWantTile] > tile_capacity)
+    set_tile_capacity(static_cast<std::uint32_t>(kGrowth * read[shared::kCounterWantTile]));
+  if (read[shared::kCounterWantInstances] > instance_capacity)
+    instance_capacity = static_cast<std::uint32_t>(want_instances);
+  const std::size_t partial_bytes = vectors(static_cast<std::size_t>(shared::kPartialRows) * slots * instance_capacity);
+  if (partial_bytes > range_limit) {
+    if (s.views == 1)
+      throw WorkError(
+          "splat",
+          "one view needs " + std::to_string(instance_capacity) + " tile entries, more than this device's buffers hold",
+          "use fewer or smaller Gaussians");
+    most_views = static_cast<int>(s.views) / 2;
+    instance_capacity = 0;
+  }
+  return false;
+}
+
+bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptions& options,
+                        const AdamPush* adam_push) {
+  Submission s = lay_out(scene, chunk, options);
+  if (!make_room(s)) return false;
+  commands.begin();
+  to_host_bytes = 0;
+  record_uploads();
+  record_lists(s);
+  record_picture(s);
+  if (options.backward) record_gradients(s);
+  if (options.backward && adam_push) record_adam(s, *adam_push);
+  if (options.chain) record_colors(s);
+  const std::byte* const read_counters = record_download(counters, words(shared::kCounters));
+  commands.submit();
+  commands.wait();
+  for (const gpu::Timing& timing : commands.timings()) {
+    const auto same =
+        std::find_if(timings.begin(), timings.end(), [&](const auto& t) { return t.label == timing.label; });
+    if (same == timings.end()) {
+      timings.push_back(timing);
+    } else {
+      same->milliseconds += timing.milliseconds;
+    }
+  }
+  return has_fitted(s, read_counters);
+}
+
+}  // namespace chainsplat::splat

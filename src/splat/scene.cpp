@@ -1,0 +1,181 @@
+// scene.cpp - Gaussians and views on their way to the device: which tiles are drawn, and which views go together.
+#include <algorithm>
+
+#include "src/splat/engine.h"
+
+namespace chainsplat::splat {
+
+namespace {
+
+constexpr int kActiveMargin = 16;            // px around the mask that training draws and charges
+constexpr int kDssimMargin = 10;             // px around the mask that get the D-SSIM term: SSIM's reach twice
+constexpr std::uint32_t kMostTiles = 60000;  // of one submission: below every device's group count limit (65535)
+
+// For every grid cell whether a mask pixel is within each of two margins (px) of it; `inner` <= `outer`.
+struct Nearness {
+  std::vector<bool> inner, outer;
+};
+
+Nearness near_mask(const SceneView& view, const std::vector<std::uint8_t>& rgba, int tile_width, int tile_height,
+                   int inner, int outer) {
+  std::vector<std::uint32_t> sum(static_cast<std::size_t>(view.width + 1) * (view.height + 1), 0);
+  const auto at = [&](int x, int y) -> std::uint32_t& {
+    return sum[static_cast<std::size_t>(y) * (view.width + 1) + x];
+  };
+  for (int y = 0; y < view.height; ++y) {
+    for (int x = 0; x < view.width; ++x) {
+      const std::uint32_t object = rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] > 0 ? 1 : 0;
+      at(x + 1, y + 1) = object + at(x, y + 1) + at(x + 1, y) - at(x, y);
+    }
+  }
+  const auto within = [&](int tx, int ty, int margin) {
+    const int x0 = std::max(0, tx * tile_width - margin), y0 = std::max(0, ty * tile_height - margin);
+    const int x1 = std::min(view.width, (tx + 1) * tile_width + margin);
+    const int y1 = std::min(view.height, (ty + 1) * tile_height + margin);
+    return at(x1, y1) - at(x0, y1) - at(x1, y0) + at(x0, y0) > 0;
+  };
+  Nearness out;
+  for (int ty = 0; ty < view.tiles_y; ++ty) {
+    for (int tx = 0; tx < view.tiles_x; ++tx) {
+      out.inner.push_back(within(tx, ty, inner));
+      out.outer.push_back(within(tx, ty, outer));
+    }
+  }
+  return out;
+}
+
+// For every grid cell whether it has a mask pixel.
+std::vector<bool> in_mask(const SceneView& view, const std::vector<std::uint8_t>& rgba, int tile_width,
+                          int tile_height) {
+  std::vector<bool> out(static_cast<std::size_t>(view.tiles_x) * view.tiles_y, false);
+  std::vector<std::uint8_t> any(static_cast<std::size_t>(view.tiles_x) * tile_width);
+  for (int ty = 0; ty < view.tiles_y; ++ty) {
+    std::fill(any.begin(), any.end(), 0);
+    const int end = std::min(view.height, (ty + 1) * tile_height);
+    for (int y = ty * tile_height; y < end; ++y) {
+      const std::uint8_t* const row = &rgba[4 * static_cast<std::size_t>(y) * view.width];
+      for (int x = 0; x < view.width; ++x) any[x] |= row[4 * x + 3];
+    }
+    for (int tx = 0; tx < view.tiles_x; ++tx)
+      out[static_cast<std::size_t>(ty) * view.tiles_x + tx] =
+          std::any_of(&any[tx * tile_width], &any[tx * tile_width] + tile_width, [](std::uint8_t a) { return a > 0; });
+  }
+  return out;
+}
+
+}  // namespace
+
+std::vector<float> packed(const Gaussians& g) {
+  std::vector<float> all;
+  all.reserve(g.mean.size() + g.rotation.size() + g.log_scale.size() + g.opacity_logit.size() + g.sh.size() +
+              g.link_logits.size());
+  for (const auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
+    all.insert(all.end(), part->begin(), part->end());
+  return all;
+}
+
+Gaussians unpacked(const std::vector<float>& all, int count, int links, int degree) {
+  Gaussians g;
+  g.resize(count, links, degree);
+  auto from = all.begin();
+  for (auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits}) {
+    std::copy_n(from, part->size(), part->begin());
+    from += static_cast<std::ptrdiff_t>(part->size());
+  }
+  return g;
+}
+
+void Engine::State::load_gaussians(Scene& scene, const Gaussians& gaussians) {
+  scene.count = gaussians.count;
+  scene.links = gaussians.links;
+  scene.degree = gaussians.degree;
+  const std::vector<float> all = packed(gaussians);
+  scene.parameter_count = all.size();
+  scene.step = 0;
+  scene.version = ++versions;
+  write(scene.parameters, all.data(), all.size() * sizeof(float), "parameters");
+  need(scene.gradient, all.size() * sizeof(float), "gradient");
+}
+
+void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
+                               std::span<const std::vector<std::uint8_t>* const> targets, Active active) {
+  scene.views.clear();
+  scene.target_pixels = 0;
+  double object_pixels = 0.0;
+  std::vector<std::uint8_t> all_targets;
+  for (std::size_t v = 0; v < specs.size(); ++v) {
+    const ViewSpec& spec = specs[v];
+    SceneView view;
+    view.fx = spec.camera->fx;
+    view.fy = spec.camera->fy;
+    view.cx = spec.camera->cx - spec.x0;
+    view.cy = spec.camera->cy - spec.y0;
+    view.limit_x = clamp_margin * 0.5 * spec.camera->width / view.fx;
+    view.limit_y = clamp_margin * 0.5 * spec.camera->height / view.fy;
+    view.width = spec.width;
+    view.height = spec.height;
+    view.tiles_x = (spec.width + static_cast<int>(tile_width) - 1) / static_cast<int>(tile_width);
+    view.tiles_y = (spec.height + static_cast<int>(tile_height) - 1) / static_cast<int>(tile_height);
+    view.camera_from_world = spec.camera->world_from_camera.inverse();
+    view.motions = spec.motions;
+    if (!targets.empty()) {
+      const std::vector<std::uint8_t>& target = *targets[v];
+      CHAINSPLAT_CHECK(target.size() == 4u * spec.width * spec.height, std::to_string(target.size()));
+      view.target = all_targets.size() / 4;
+      all_targets.insert(all_targets.end(), target.begin(), target.end());
+      if (active != Active::in_mask)
+        for (std::size_t k = 3; k < target.size(); k += 4) object_pixels += target[k] >= 128 ? 1.0 : 0.0;
+    }
+    const auto cells = static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
+    Nearness near{std::vector<bool>(cells, true), std::vector<bool>(cells, true)};
+    if (active == Active::in_mask) {
+      near.inner = near.outer = in_mask(view, *targets[v], static_cast<int>(tile_width), static_cast<int>(tile_height));
+    } else if (!targets.empty() && active != Active::everywhere) {
+      near = near_mask(view, *targets[v], static_cast<int>(tile_width), static_cast<int>(tile_height), kDssimMargin,
+                       kActiveMargin);
+      if (active == Active::everywhere_dssim_near_mask) near.outer.assign(cells, true);
+    }
+    for (std::size_t cell = 0; cell < cells; ++cell)
+      if (near.inner[cell]) view.active.push_back(static_cast<std::uint32_t>(cell));
+    view.near = view.active.size();
+    for (std::size_t cell = 0; cell < cells; ++cell)
+      if (near.outer[cell] && !near.inner[cell]) view.active.push_back(static_cast<std::uint32_t>(cell));
+    scene.views.push_back(std::move(view));
+  }
+  scene.target_pixels = all_targets.size() / 4;
+  scene.normalizer = std::max(1.0, object_pixels / std::max<std::size_t>(1, specs.size()));
+  if (active == Active::in_mask)
+    stage(scene.target, all_targets.data(), all_targets.size(), "target");
+  else
+    write(scene.target, all_targets.data(), all_targets.size(), "target");
+}
+
+std::vector<std::vector<int>> Engine::State::chunks(const Scene& scene, std::span<const int> batch, bool dssim) const {
+  const std::size_t most_pixels = range_limit / sizeof(glm::vec4);
+  // the row sums of D-SSIM are the largest of what lies tile by tile
+  const std::size_t most_tiles =
+      dssim ? std::min<std::size_t>(kMostTiles, range_limit / (12 * sizeof(float) * tile_width * tile_height))
+            : kMostTiles;
+  std::vector<std::vector<int>> out;
+  std::size_t pixels = 0, tile_total = 0;
+  for (const int v : batch) {
+    const SceneView& view = scene.views[v];
+    const std::size_t view_pixels = static_cast<std::size_t>(view.width) * view.height;
+    if (view_pixels > most_pixels || view.active.size() > most_tiles)
+      throw WorkError("splat",
+                      "an image of " + std::to_string(view.width) + "x" + std::to_string(view.height) +
+                          " pixels does not fit this device's buffers",
+                      "use smaller images or another device");
+    if (out.empty() || pixels + view_pixels > most_pixels || tile_total + view.active.size() > most_tiles ||
+        static_cast<int>(out.back().size()) >= most_views) {
+      out.emplace_back();
+      pixels = tile_total = 0;
+    }
+    out.back().push_back(v);
+    pixels += view_pixels;
+    tile_total += view.active.size();
+  }
+  return out;
+}
+
+}  // namespace chainsplat::splat
