@@ -274,6 +274,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
     if (!masked_before) {
       masked_before = black_about(picture);
       if (!*masked_before) {
+        filter.options = estimation::options_for_live_masks(twin.tabletop);
         const std::vector<std::uint8_t> colors = twin_colors(twin);
         if (colors.empty())
           core::warn(request.source.camera +

@@ -37,6 +37,11 @@ struct Options {
   silhouette::Options silhouette;    // the prior is set by the filter
 };
 
+// Where the masks of a rope in space are made while it is followed: their outline errs the same way for long (a hand's
+// edge, the rope's dark side), so that less of it is new in every frame, and colors count for more. On a table what
+// lasts is a part of the belief instead: the masks' shift.
+Options options_for_live_masks(bool tabletop);
+
 // Gaussian belief about (theta, thetadot, shift of the rest angles), 3 n, rad and rad/s; on a table, where ropes have
 // contact shadows, also about the shift of each camera's masks (silhouette::Prior), px in x and y.
 struct Belief {

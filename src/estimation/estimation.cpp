@@ -377,6 +377,14 @@ bool explains(const silhouette::FrameFit& fit) { return fit.covered >= kLostShar
 
 }  // namespace
 
+Options options_for_live_masks(bool tabletop) {
+  Options options;
+  if (tabletop) return options;
+  options.new_share = 0.1;
+  options.color_share = 0.01;
+  return options;
+}
+
 Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
              double base_start, const Options& options) {
   Filter filter;
