@@ -21,7 +21,7 @@ namespace fs = std::filesystem;
 using Json = nlohmann::ordered_json;
 
 constexpr std::uint8_t kInside = 128;  // mask values from here on are object (INTERFACE 2)
-constexpr double kDoubtful = 0.85;  // share of the chain's centerline in the masks under which they may be wrong
+constexpr double kDoubtful = 0.85;     // share of the chain's centerline in the masks under which they may be wrong
 
 struct Request {
   std::string capture, out, command, frames;

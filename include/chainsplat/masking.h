@@ -87,7 +87,9 @@ struct Live {
   std::vector<float> mean, variance;   // of the background, by channel and by pixel
   std::vector<std::uint16_t> seen;     // frames in which the background was seen, by pixel
   std::vector<double> given;           // counts of the colors given at the start
-  std::vector<std::uint8_t> straight;  // work space: the frame without its lens distortion
+  std::vector<std::uint8_t> straight;  // work space: the frame without its lens distortion, and by pixel
+  std::vector<std::int16_t> from;      // where that comes from: column and row of the recorded frame,
+  std::vector<std::uint16_t> part;     // and the share of the next ones, as cv::remap has it
   int frames = 0;
 };
 

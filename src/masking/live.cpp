@@ -1,6 +1,8 @@
 // Masks of a stream: the same votes, learned as the frames come.
 #include <algorithm>
 #include <cmath>
+#include <opencv2/core.hpp>
+#include <opencv2/imgproc.hpp>
 
 #include "src/masking/grow.h"
 #include "src/masking/look.h"
@@ -21,26 +23,33 @@ constexpr double kPredictedMargin = 0.7;  // px, by which the tube at a predicti
 constexpr int kColorEvery = 5;            // frames between two lessons in color
 constexpr double kForgetColors = 0.1;     // of the counted colors a lesson
 
-// The recorded frame without its lens distortion, in the box; elsewhere black.
-void straighten(const capture::Image8& image, const capture::Camera& camera, const Box& box,
-                std::vector<std::uint8_t>& out) {
-  out.assign(image.pixels.size(), 0);
-  for (int y = box.y0; y < box.y1; ++y)
-    for (int x = box.x0; x < box.x1; ++x) {
+// For cv::remap, made once: where every pixel without lens distortion comes from.
+void map_straight(Live& live) {
+  const capture::Camera& camera = live.camera;
+  cv::Mat wanted(camera.height, camera.width, CV_32FC2);
+  for (int y = 0; y < camera.height; ++y)
+    for (int x = 0; x < camera.width; ++x) {
       const math::Vector2 p = capture::distort(camera, math::Vector2(x + 0.5, y + 0.5)) - math::Vector2(0.5, 0.5);
-      const double column = std::clamp(p.x(), 0.0, camera.width - 1.0),
-                   row = std::clamp(p.y(), 0.0, camera.height - 1.0);
-      const int u = static_cast<int>(column), v = static_cast<int>(row);
-      const int right = std::min(u + 1, camera.width - 1), below = std::min(v + 1, camera.height - 1);
-      const double a = column - u, b = row - v;
-      const auto at = [&](int i, int j, int c) {
-        return static_cast<double>(image.pixels[3 * (static_cast<std::size_t>(j) * camera.width + i) + c]);
-      };
-      for (int c = 0; c < 3; ++c)
-        out[3 * (static_cast<std::size_t>(y) * camera.width + x) + c] =
-            static_cast<std::uint8_t>(std::lround((1 - b) * ((1 - a) * at(u, v, c) + a * at(right, v, c)) +
-                                                  b * ((1 - a) * at(u, below, c) + a * at(right, below, c))));
+      wanted.at<cv::Vec2f>(y, x) = {static_cast<float>(p.x()), static_cast<float>(p.y())};
     }
+  const std::size_t pixels = static_cast<std::size_t>(camera.width) * camera.height;
+  live.from.resize(2 * pixels);
+  live.part.resize(pixels);
+  cv::Mat from(camera.height, camera.width, CV_16SC2, live.from.data());
+  cv::Mat part(camera.height, camera.width, CV_16UC1, live.part.data());
+  cv::convertMaps(wanted, cv::noArray(), from, part, CV_16SC2);
+}
+
+// The recorded frame without its lens distortion, in the box.
+void straighten(const capture::Image8& image, const Box& box, Live& live) {
+  live.straight.resize(image.pixels.size());
+  const cv::Rect rect(box.x0, box.y0, box.width(), box.height());
+  const int width = live.camera.width, height = live.camera.height;
+  const cv::Mat recorded(height, width, CV_8UC3, const_cast<std::uint8_t*>(image.pixels.data()));
+  cv::Mat out(height, width, CV_8UC3, live.straight.data());
+  const cv::Mat from(height, width, CV_16SC2, live.from.data()), part(height, width, CV_16UC1, live.part.data());
+  cv::Mat in_box = out(rect);
+  cv::remap(recorded, in_box, from(rect), part(rect), cv::INTER_LINEAR, cv::BORDER_REPLICATE);
 }
 
 }  // namespace
@@ -63,6 +72,7 @@ Live start(const capture::Camera& camera, const chain::Chain& chain, const std::
   live.mean.assign(3 * pixels, 0.0f);
   live.variance.assign(pixels, 0.0f);
   live.seen.assign(pixels, 0);
+  if (camera.distorted()) map_straight(live);
   return live;
 }
 
@@ -81,7 +91,7 @@ capture::View mask(Live& live, const capture::Image8& recorded, const math::Pose
   if (where.box.empty()) return {};
   const std::vector<std::uint8_t>* pixels = &recorded.pixels;
   if (live.camera.distorted()) {
-    straighten(recorded, live.camera, where.box, live.straight);
+    straighten(recorded, where.box, live);
     pixels = &live.straight;
   }
   const Picture picture{pixels->data(), camera.width, camera.height, 3};
@@ -120,7 +130,7 @@ capture::View mask(Live& live, const capture::Image8& recorded, const math::Pose
         const float d = pixel(picture, x, y)[c] - mean;
         mean += share * d;
         square += d * d / 3.0f;
-        background.rgb[3 * at + c] = static_cast<std::uint8_t>(std::lround(mean));
+        background.rgb[3 * at + c] = static_cast<std::uint8_t>(mean + 0.5f);
       }
       float& variance = live.variance[at];
       if (seen == 1) square = static_cast<float>(kFirstNoise * kFirstNoise);

@@ -224,7 +224,7 @@ Background median_background(std::span<const Picture> frames, std::span<const Tu
 }
 
 std::uint8_t noise_level(double deviation) {
-  return static_cast<std::uint8_t>(std::lround(std::clamp(deviation, kLeastNoise, kMostNoise)));
+  return static_cast<std::uint8_t>(std::clamp(deviation, kLeastNoise, kMostNoise) + 0.5);
 }
 
 double difference_odds(const Background& background, const Picture& picture, int x, int y) {

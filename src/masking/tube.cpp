@@ -63,6 +63,12 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
     const double share = (d.x() * along.y() - d.y() * along.x()) / radius;
     return free_end ? bulge * radius * std::sqrt(std::max(0.0, 1.0 - share * share)) : 0.0;
   };
+  // px along a segment beyond its end, up to which it is as near as the next one, on the outer side of the bend there
+  const auto wedge = [&](std::size_t joint, double around) {
+    const Vector2 before = samples[joint].at - samples[joint - 1].at, after = samples[joint + 1].at - samples[joint].at;
+    const double cosine = before.dot(after) / std::max(1e-9, before.norm() * after.norm());
+    return 1.0 + around * std::sqrt(0.5 * std::max(0.0, 1.0 - cosine));
+  };
   for (std::size_t i = 0; i + 1 < samples.size(); ++i) {
     const Vector2 a = samples[i].at, step = samples[i + 1].at - a;
     const double length = step.norm();
@@ -74,8 +80,17 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
     const int right = std::min(out.box.x1, static_cast<int>(std::max(a.x(), a.x() + step.x()) + around) + 1);
     const int top = std::max(out.box.y0, static_cast<int>(std::min(a.y(), a.y() + step.y()) - around));
     const int bottom = std::min(out.box.y1, static_cast<int>(std::max(a.y(), a.y() + step.y()) + around) + 1);
-    for (int y = top; y < bottom; ++y)
-      for (int x = left; x < right; ++x) {
+    const double first = begins ? -around : -wedge(i, around), last = length + (ends ? around : wedge(i + 1, around));
+    for (int y = top; y < bottom; ++y) {
+      // only from `first` to `last` along the segment
+      int x_begin = left, x_end = right;
+      if (std::abs(along.x()) > 1e-6) {
+        const double in_row = (y + 0.5 - a.y()) * along.y();
+        const double u = a.x() + (first - in_row) / along.x(), v = a.x() + (last - in_row) / along.x();
+        x_begin = static_cast<int>(std::max<double>(left, std::floor(std::min(u, v))));
+        x_end = static_cast<int>(std::min<double>(right, std::ceil(std::max(u, v)) + 1.0));
+      }
+      for (int x = x_begin; x < x_end; ++x) {
         const Vector2 d = Vector2(x + 0.5, y + 0.5) - a;
         const double t = d.dot(along);
         // beyond an end the distance is along the rope; between segments round joints close the gaps
@@ -87,10 +102,10 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
         if (beyond <= 0.0)
           distance = across;
         else if ((begins && t < 0.0) || (ends && t > length))
-          distance =
-              across > 0.0 ? std::hypot(across, beyond) : std::max(across, beyond - disc(d, along, t > 0.0, radius));
+          distance = across > 0.0 ? std::sqrt(across * across + beyond * beyond)
+                                  : std::max(across, beyond - disc(d, along, t > 0.0, radius));
         else
-          distance = std::hypot(across + radius, beyond) - radius;
+          distance = std::sqrt((across + radius) * (across + radius) + beyond * beyond) - radius;
         if (distance > reach) continue;
         const std::size_t at = static_cast<std::size_t>(y - out.box.y0) * out.box.width() + (x - out.box.x0);
         if (distance >= out.outside[at]) continue;
@@ -99,6 +114,7 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
         out.along[at] =
             static_cast<float>(samples[i].arclength + share * (samples[i + 1].arclength - samples[i].arclength));
       }
+    }
   }
   // near an end the inside is as deep as the end is near, and what lies beyond it is at least that far outside, though
   // the round joint of the segment before reaches there
