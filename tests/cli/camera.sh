@@ -8,13 +8,7 @@ twin=$work/twin
 export VK_DRIVER_FILES=/nonexistent VK_ICD_FILENAMES=/nonexistent
 export ASAN_OPTIONS="$ASAN_OPTIONS:verify_asan_link_order=0"
 
-# a twin without dynamics that has been recognized once, hanging straight
-run new --length 0.3 --joints 8 --bending spatial -o "$twin"
-expect_code 0 new
-sed -i '$d' "$twin/twin.json"
-echo ', "states": "states.csv"}' >>"$twin/twin.json"
-{ echo "time$(seq -f ',theta_%g' -s '' 16)"; echo "0$(printf ',0%.0s' {1..16})"; } >"$twin/states.csv"
-cp "$demo/base.tum" "$twin/"
+make_straight_twin "$twin" "$demo"
 "$3" "$demo" cam0 "$work" || { echo 'FAILED: no frames'; exit 1; }
 python3 - "$demo/capture.json" "$work" <<'END'
 import json, sys

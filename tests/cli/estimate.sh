@@ -5,13 +5,7 @@ export VK_DRIVER_FILES=/nonexistent VK_ICD_FILENAMES=/nonexistent
 demo=$source_dir/assets/demo_free_30
 twin=$work/twin
 
-# a twin without dynamics that has been recognized once, hanging straight
-run new --length 0.3 --joints 8 --bending spatial -o "$twin"
-expect_code 0 new
-sed -i '$d' "$twin/twin.json"
-echo ', "states": "states.csv"}' >>"$twin/twin.json"
-{ echo "time$(seq -f ',theta_%g' -s '' 16)"; echo "0$(printf ',0%.0s' {1..16})"; } >"$twin/states.csv"
-cp "$demo/base.tum" "$twin/"
+make_straight_twin "$twin" "$demo"
 
 lines() {  # count name
   [ "$(wc -l <"$work/stdout")" -eq "$1" ] || fail "$2: $(wc -l <"$work/stdout") lines instead of $1"

@@ -59,6 +59,16 @@ wait_for_file() {  # file pid
   done
 }
 
+# A twin without dynamics that has been recognized once, hanging straight.
+make_straight_twin() {  # twin capture
+  run new --length 0.3 --joints 8 --bending spatial -o "$1"
+  expect_code 0 new
+  sed -i '$d' "$1/twin.json"
+  echo ', "states": "states.csv"}' >>"$1/twin.json"
+  { echo "time$(seq -f ',theta_%g' -s '' 16)"; echo "0$(printf ',0%.0s' {1..16})"; } >"$1/states.csv"
+  cp "$2/base.tum" "$1/"
+}
+
 finish() {
   [ "$failures" -eq 0 ] && echo "all passed" || echo "$failures failed"
   exit $((failures > 0))
