@@ -6,6 +6,7 @@
 
 #include <atomic>
 #include <cmath>
+#include <nlohmann/json.hpp>
 
 using namespace chainsplat;
 
@@ -59,4 +60,25 @@ TEST_CASE("hash and random numbers are the published ones") {
   core::Random random(1234567);
   for (const std::uint64_t value : {6457827717110365317ull, 3203168211198807973ull, 9817491932198370423ull})
     CHECK(random.next() == value);
+}
+
+TEST_CASE("JSON is read up to a depth, and brackets in strings do not count") {
+  const auto nested = [](int depth) { return std::string(depth, '[') + std::string(depth, ']'); };
+  CHECK(core::parse_json(nested(core::kDeepestJson)).is_array());
+  CHECK_THROWS_AS(core::parse_json(nested(core::kDeepestJson + 1)), nlohmann::json::parse_error);
+  CHECK(core::parse_json_or_discard(nested(200000)).is_discarded());
+  CHECK(core::parse_json_or_discard(std::string(200000, '[')).is_discarded());
+  const std::string quoted = "[\"" + std::string(500, '{') + "\\\"" + std::string(500, '[') + "\"]";
+  CHECK(core::parse_json(quoted)[0].get<std::string>().size() == 1001);
+}
+
+TEST_CASE("an error's line holds no control character and no broken UTF-8, and keeps what is readable") {
+  CHECK(core::printable("rope é 縄 \\") == "rope é 縄 \\");
+  CHECK(core::printable(std::string_view("a\0b\nc\x1b[31m", 10)) == "a\\x00b\\x0ac\\x1b[31m");
+  CHECK(core::printable("\xff\xc3 \xe2\x82 \xc2\x9b") == "\\xff\\xc3 \\xe2\\x82 \\xc2\\x9b");
+  CHECK(std::string(InputError("f\n", "has\r", "mend\x7f").what()) == "f\\x0a: has\\x0d; mend\\x7f");
+}
+
+TEST_CASE("a file without end is refused instead of filling the memory") {
+  CHECK_THROWS_WITH_AS(core::read_file("/dev/zero"), doctest::Contains("larger than 1 GiB"), InputError);
 }

@@ -122,7 +122,7 @@ Row read_row(const BatchJob& job, const Path& folder) {
   const Path run = folder / job.name;
   std::error_code error;
   if (row.state.kind != Kind::done) return row;
-  const Json twin = Json::parse(core::read_file(run / "twin.json"), nullptr, false);
+  const Json twin = core::parse_json_or_discard(core::read_file(run / "twin.json"));
   if (twin.is_object()) {
     row.scenario = twin["chain"].value("scenario", "");
     row.length = twin["chain"].value("length", static_cast<double>(NAN));
@@ -130,7 +130,7 @@ Row read_row(const BatchJob& job, const Path& folder) {
     row.device = twin["provenance"].value("device", "");
   }
   if (!fs::exists(run / kMetricsFile, error)) return row;  // --stages without evaluate
-  const Json metrics = Json::parse(core::read_file(run / kMetricsFile), nullptr, false);
+  const Json metrics = core::parse_json_or_discard(core::read_file(run / kMetricsFile));
   if (!metrics.is_object()) return row;
   for (std::size_t p = 0; p < kParts.size(); ++p)
     for (std::size_t c = 0; c < kColumns.size(); ++c)

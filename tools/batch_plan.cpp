@@ -271,7 +271,7 @@ BatchPlan load_plan(const Path& folder) {
     throw InputError(folder.string(), "is not the folder of a batch", "run 'chainsplat batch JOBS.toml -o' it first");
   BatchPlan plan;
   try {
-    const Json document = Json::parse(core::read_file(file));
+    const Json document = core::parse_json(core::read_file(file));
     for (const Json& entry : document.at("jobs"))
       plan.jobs.push_back({entry.at("name"), entry.at("capture"), entry.at("settings"), entry.at("seed"),
                            entry.at("arguments").get<std::vector<std::string>>()});

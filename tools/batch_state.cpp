@@ -38,7 +38,7 @@ std::string progress_of(const Path& run) {
   if (end == std::string::npos) return "";
   const std::size_t begin = end == 0 ? std::string::npos : tail.rfind('\n', end - 1);
   const std::string line = tail.substr(begin == std::string::npos ? 0 : begin + 1, end);
-  const Json record = Json::parse(line, nullptr, false);
+  const Json record = core::parse_json_or_discard(line);
   if (!record.is_object() || !record.contains("stage")) return "";
   std::string text = record["stage"];
   const std::int64_t step = record.value("iteration", 0), total = record.value("total", 0);
@@ -58,7 +58,7 @@ void save_end(const Path& folder, const BatchJob& job, const JobEnd& end) {
 bool load_end(const Path& folder, const BatchJob& job, JobEnd& end) {
   std::error_code error;
   if (!fs::exists(end_file(folder, job), error)) return false;
-  const Json document = Json::parse(core::read_file(end_file(folder, job)), nullptr, false);
+  const Json document = core::parse_json_or_discard(core::read_file(end_file(folder, job)));
   try {
     end = {document.at("arguments").get<std::vector<std::string>>(), document.at("code"), document.at("stopped"),
            document.at("seconds"), document.at("error")};

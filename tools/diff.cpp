@@ -121,7 +121,7 @@ void compare_chain(Comparison& out, const twin::Twin& a, const twin::Twin& b) {
 Json mean_metrics(const Path& run) {
   std::error_code error;
   if (!fs::exists(run / kMetricsFile, error)) return Json::object();
-  const Json document = Json::parse(core::read_file(run / kMetricsFile), nullptr, false);
+  const Json document = core::parse_json_or_discard(core::read_file(run / kMetricsFile));
   if (!document.is_object())
     throw InputError((run / kMetricsFile).string(), "is not JSON or is cut off", "run 'chainsplat eval' again");
   Json means = Json::object();

@@ -20,7 +20,7 @@ namespace chainsplat::tools {
 
 namespace {
 
-using Json = nlohmann::json;
+using Json = nlohmann::ordered_json;
 
 constexpr double kNear = 3.0;       // diameters from the rope within which something may touch it
 constexpr double kLiveApart = 0.1;  // s, how far from a state a line of a contact file may be, where states come in
@@ -43,7 +43,7 @@ std::optional<State> read_estimate(const std::string& line, const std::string& w
   const int angles = chain.angles();
   State out;
   try {
-    const Json object = Json::parse(line);
+    const Json object = core::parse_json(line);
     if (object.value("lost", false)) return {};
     const auto theta = object.at("theta").get<std::vector<double>>();
     const auto deviation = object.at("sigma").get<std::vector<double>>();

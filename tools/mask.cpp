@@ -152,7 +152,7 @@ void make_masks(const Globals& globals, const Request& request) {
   std::error_code error;
   const Path file =
       fs::is_directory(request.capture, error) ? Path(request.capture) / "capture.json" : Path(request.capture);
-  Json json = Json::parse(core::read_file(file));
+  Json json = core::parse_json(core::read_file(file));
 
   std::vector<Pattern> given, wanted;  // masks that the capture names (empty text: none); where ours go
   for (std::size_t c = 0; c < scene.cameras.size(); ++c) {

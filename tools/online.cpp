@@ -27,7 +27,7 @@ math::VectorX numbers(const Json& record, const char* key) {
 // False for a frame that says nothing: lost, or without a state.
 bool read_line(const std::string& line, const std::string& where, adaptation::Observation& seen) {
   try {
-    const Json record = Json::parse(line);
+    const Json record = core::parse_json(line);
     if (record.value("lost", false) || !record.contains("theta") || record["theta"].is_null()) return false;
     seen.time = record.at("time").get<double>();
     seen.theta = numbers(record, "theta");

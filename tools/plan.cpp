@@ -223,12 +223,12 @@ Json plan_json(const planning::Problem& problem, const planning::Options& option
 dynamics::Model read_truth(const std::string& file, const Path& run) {
   Json chain;
   try {
-    chain = Json::parse(core::read_file(input_path(file)));
+    chain = core::parse_json(core::read_file(input_path(file)));
   } catch (const Json::exception&) {
     throw InputError(file, "is not JSON", "give the 'chain' object of a twin.json");
   }
   if (chain.is_object() && chain.contains("chain")) chain = chain["chain"];  // a whole twin.json does too
-  Json document = Json::parse(core::read_file(run / "twin.json"));
+  Json document = core::parse_json(core::read_file(run / "twin.json"));
   document["chain"] = std::move(chain);
   for (const char* key : {"gaussians", "states", "rollout"}) document.erase(key);
   const Path folder = std::filesystem::temp_directory_path() / ("chainsplat_simulate_" + std::to_string(::getpid()));

@@ -8,6 +8,7 @@
 #include <cstdint>
 #include <filesystem>
 #include <functional>
+#include <nlohmann/json_fwd.hpp>
 #include <stdexcept>
 #include <string>
 #include <string_view>
@@ -17,16 +18,22 @@ namespace chainsplat {
 
 using Path = std::filesystem::path;
 
-// One line for the user: WHERE: WHAT; HOW TO MEND.
+namespace core {
+// The text with control characters and bytes that are not UTF-8 written as \xNN: what comes from a file or a command
+// line can then stand in a line for the user.
+std::string printable(std::string_view text);
+}  // namespace core
+
+// One line for the user: WHERE: WHAT; HOW TO MEND. Bytes that cannot be printed are escaped.
 struct InputError : std::runtime_error {
   InputError(const std::string& where, const std::string& what, const std::string& mend)
-      : std::runtime_error(where + ": " + what + "; " + mend) {}
+      : std::runtime_error(core::printable(where + ": " + what + "; " + mend)) {}
 };
 
 // The work failed half-way (device lost, disk full, diverged). Same form.
 struct WorkError : std::runtime_error {
   WorkError(const std::string& where, const std::string& what, const std::string& mend)
-      : std::runtime_error(where + ": " + what + "; " + mend) {}
+      : std::runtime_error(core::printable(where + ": " + what + "; " + mend)) {}
 };
 
 // Thrown by long work when stop_requested() turns true, after it has left a checkpoint.
@@ -77,8 +84,16 @@ void parallel_for(std::int64_t count, const std::function<void(std::int64_t)>& b
 // Writes `bytes` as `path` in one step (temporary file in the same folder, fsync, rename). Throws WorkError (disk full,
 // ...).
 void write_file(const Path& path, std::string_view bytes);
-// The whole file. Throws InputError naming `path` when it is missing or unreadable.
+// The whole file. Throws InputError naming `path` when it is missing, unreadable or larger than 1 GiB (a pipe or device
+// may never end).
 std::string read_file(const Path& path);
+// JSON from outside, with a bound on its nesting: the library that parses it frees, copies and prints a document by
+// recursion, so a file of brackets alone would overflow the stack. Throws nlohmann::json::exception where the text is no
+// JSON, has a number beyond double, or is nested deeper than kDeepestJson.
+constexpr int kDeepestJson = 64;
+nlohmann::ordered_json parse_json(std::string_view text);
+// The same without exceptions: is_discarded() where the text cannot be read.
+nlohmann::ordered_json parse_json_or_discard(std::string_view text);
 // A table of numbers between commas: its lines that are not blank, without line ends and trailing spaces.
 struct TableLine {
   int number;  // from 1

@@ -9,7 +9,7 @@
 
 namespace chainsplat::capture {
 
-using Json = nlohmann::json;
+using Json = nlohmann::ordered_json;
 using math::Matrix3;
 using math::Vector3;
 
@@ -432,7 +432,7 @@ std::string line_of(const std::string& text, std::size_t byte) {
 Json parse(const std::string& text, const std::string& file, const char* expected) {
   Json json;
   try {
-    json = Json::parse(text);
+    json = core::parse_json(text);
   } catch (const Json::parse_error& failure) {
     throw InputError(file + ":" + line_of(text, failure.byte),
                      "is not JSON (a comma, bracket or quote is missing, or the file is cut off)",

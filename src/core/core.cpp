@@ -9,6 +9,7 @@
 #include <charconv>
 #include <chrono>
 #include <cmath>
+#include <cstdio>
 #include <cstring>
 #include <exception>
 #include <fstream>
@@ -25,7 +26,42 @@ Listener current_listener;
 std::atomic<int> stop_signal{0};
 std::atomic<int> thread_count{0};
 
+constexpr std::size_t kLargestFile = std::size_t{1} << 30;  // bytes; a twin of a million Gaussians has a quarter
+
+// Length in bytes of the UTF-8 character that `text` begins with; 0 where it begins with none.
+std::size_t utf8_length(std::string_view text) {
+  const auto byte = [&](std::size_t i) { return static_cast<unsigned char>(text[i]); };
+  const std::size_t length = byte(0) < 0x80                      ? 1
+                             : byte(0) >= 0xc2 && byte(0) < 0xe0 ? 2
+                             : byte(0) >= 0xe0 && byte(0) < 0xf0 ? 3
+                             : byte(0) >= 0xf0 && byte(0) < 0xf5 ? 4
+                                                                 : 0;
+  if (length == 0 || length > text.size()) return 0;
+  for (std::size_t i = 1; i < length; ++i)
+    if ((byte(i) & 0xc0) != 0x80) return 0;
+  return length;
+}
+
 }  // namespace
+
+std::string printable(std::string_view text) {
+  std::string out;
+  while (!text.empty()) {
+    const std::size_t length = utf8_length(text);
+    const auto first = static_cast<unsigned char>(text[0]);
+    const bool c1_control = length == 2 && first == 0xc2 && static_cast<unsigned char>(text[1]) < 0xa0;
+    if (length == 0 || first < 0x20 || first == 0x7f || c1_control) {
+      char escaped[8];
+      std::snprintf(escaped, sizeof escaped, "\\x%02x", first);
+      out += escaped;
+      text.remove_prefix(1);
+    } else {
+      out += text.substr(0, length);
+      text.remove_prefix(length);
+    }
+  }
+  return out;
+}
 
 void check_failed(const char* condition, const char* file, int line, const std::string& values) {
   std::ostringstream text;
@@ -124,10 +160,18 @@ std::string read_file(const Path& path) {
     throw InputError(path.string(), "is a folder, not a file", "name a file");
   std::ifstream file(path, std::ios::binary);
   if (!file) throw InputError(path.string(), std::strerror(errno), "check the path and its permissions");
-  std::ostringstream text;
-  text << file.rdbuf();
+  std::string bytes;
+  constexpr std::size_t kBlock = 1 << 16;
+  while (file) {
+    const std::size_t had = bytes.size();
+    if (had > kLargestFile)
+      throw InputError(path.string(), "is larger than 1 GiB", "name the file that is meant; none that is read is so large");
+    bytes.resize(had + std::max(kBlock, had));  // twice the size, so that the time is linear
+    file.read(bytes.data() + had, static_cast<std::streamsize>(bytes.size() - had));
+    bytes.resize(had + static_cast<std::size_t>(file.gcount()));
+  }
   if (file.bad()) throw InputError(path.string(), "cannot be read", "check the disk");
-  return std::move(text).str();
+  return bytes;
 }
 
 std::vector<TableLine> table_lines(std::string_view text) {

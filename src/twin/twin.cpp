@@ -470,7 +470,7 @@ Twin load(const Path& run) {
   if (!std::filesystem::exists(path, error))
     throw InputError(path.string(), "does not exist", "name the folder of a trained twin");
   const std::string file = path.string();
-  const Json document = Json::parse(core::read_file(path), nullptr, false);
+  const Json document = core::parse_json_or_discard(core::read_file(path));
   if (document.is_discarded()) throw InputError(file, "is not JSON or is cut off", "restore it or train again");
   const Node top(document, file, "");
   if (top["format"].text() != kFormat)

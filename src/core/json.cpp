@@ -1,0 +1,49 @@
+#include <nlohmann/json.hpp>
+
+#include "chainsplat/core.h"
+
+namespace chainsplat::core {
+
+namespace {
+
+// Byte at which the nesting passes the bound; npos where it never does. Brackets inside strings do not count.
+std::size_t too_deep(std::string_view text) {
+  int depth = 0;
+  bool in_string = false;
+  for (std::size_t i = 0; i < text.size(); ++i) {
+    const char c = text[i];
+    if (in_string) {
+      if (c == '\\')
+        ++i;
+      else if (c == '"')
+        in_string = false;
+    } else if (c == '"') {
+      in_string = true;
+    } else if (c == '[' || c == '{') {
+      if (++depth > kDeepestJson) return i;
+    } else if (c == ']' || c == '}') {
+      --depth;
+    }
+  }
+  return std::string_view::npos;
+}
+
+}  // namespace
+
+nlohmann::ordered_json parse_json(std::string_view text) {
+  using Json = nlohmann::ordered_json;
+  if (const std::size_t at = too_deep(text); at != std::string_view::npos)
+    throw nlohmann::json::parse_error::create(
+        101, at, "nested deeper than " + std::to_string(kDeepestJson) + " brackets", nullptr);
+  return Json::parse(text);
+}
+
+nlohmann::ordered_json parse_json_or_discard(std::string_view text) {
+  try {
+    return parse_json(text);
+  } catch (const nlohmann::json::exception&) {
+    return nlohmann::ordered_json(nlohmann::ordered_json::value_t::discarded);
+  }
+}
+
+}  // namespace chainsplat::core
