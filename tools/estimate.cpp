@@ -329,7 +329,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
       shown.line = recorded_line(source.cameras[0],
                                  chain::nodes(twin.chain, chain::link_motions(twin.chain, e.theta, base.pose(e.time))));
       if (pushed && !e.lost) {
-        const Eigen::Index n = e.theta.size();
+        const Eigen::Index n = std::min(e.theta.size(), e.covariance.rows());  // 0: no covariance
         if (const auto f = force::update(*pushed, e.time, e.theta, e.covariance.topLeftCorner(n, n)))
           show_force(*f, twin, filter.model, source.cameras[0], shown);
       }
