@@ -40,7 +40,7 @@ struct Followed {
   const estimation::Estimate& estimate;
   double latency;  // s, from the decoded frame until now
 };
-// Called after every frame, in the order given: the JSON line first.
+// Called after every frame, in the order given.
 using Subscriber = std::function<void(const Followed&)>;
 
 // The mask of a picture; `theta` is where the rope is expected, none when that is not known.
@@ -299,8 +299,8 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   std::vector<double> latencies;
   int lost = 0;
   const Subscriber print = [&](const Followed& followed) {
-    std::cout << estimation::to_json(followed.estimate, followed.latency, request.covariance) << "\n" << std::flush;
-    if (!std::cout) throw WorkError("standard output", "writing failed", "make room or read on");
+    std::cout << estimation::to_json(followed.estimate, followed.latency, request.covariance) << "\n";
+    flush_output();
   };
   const Subscriber keep = [&](const Followed& followed) {
     states.time.push_back(followed.estimate.time);
@@ -309,7 +309,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
     latencies.push_back(followed.latency);
     lost += followed.estimate.lost;
   };
-  std::vector<Subscriber> subscribers{print, keep};
+  std::vector<Subscriber> subscribers{keep, print};  // what cannot be printed is kept nevertheless
   // recorded frames are shown at the pace at which they were taken
   const bool recorded = request.source.calibration.empty();
   const double begun = core::seconds_now();

@@ -193,7 +193,8 @@ void force(const Globals& globals, const ForceRequest& request) {
   };
   std::size_t lines = 0, touching = 0;
   const auto write = [&](const force::Estimate& e) {
-    std::cout << force::to_json(e, twin.known_mass) << "\n" << std::flush;
+    std::cout << force::to_json(e, twin.known_mass) << "\n";
+    flush_output();
     ++lines;
     touching += e.touching;
   };
