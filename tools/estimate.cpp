@@ -194,14 +194,8 @@ void estimate(const Globals& globals, EstimateRequest& request) {
     core::warn(request.run + ": its dynamics are not identified; angles are assumed to go on at constant rate");
 
   request.source.pictures = request.serve > 0;
-  watch_signals();  // a camera never ends by itself
+  watch_signals(true);
   FrameSource source = open_frames(request.source);
-  std::optional<Window> window;
-  if (request.serve > 0) {
-    const capture::Camera& camera = source.cameras[0];
-    window.emplace(request.serve, camera.width, camera.height, request.run + ", " + request.source.camera);
-    say("Live window: http://127.0.0.1:" + std::to_string(request.serve) + "/");
-  }
   trajectory::Trajectory base;
   if (!request.base.empty()) {
     base = read_base(request.base);
@@ -218,6 +212,12 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   if (base.samples().size() > 1) options.base_start = base.start(), options.base_end = base.end();
   estimation::Filter filter = estimation::start(
       twin, source.cameras, [&](double time) { return base.at(time); }, base.start());
+  std::optional<Window> window;
+  if (request.serve > 0) {
+    const capture::Camera& camera = source.cameras[0];
+    window.emplace(request.serve, camera.width, camera.height, request.run + ", " + request.source.camera);
+    say("Live window: http://127.0.0.1:" + std::to_string(request.serve) + "/");
+  }
   gpu::DevicePtr device;
   std::optional<splat::Engine> engine;
   if (request.solver != "silhouette" && twin.gaussians.count > 0) {
@@ -348,6 +348,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
       say(std::to_string(states.time.size()) + " frames" + (lost ? ", lost in " + std::to_string(lost) : "") + "; " +
           latency_text(latencies) + ".");
   };
+  watch_signals();  // a camera never ends by itself
   try {
     follow(source, follower, filter.base, mask, options, subscribers);
   } catch (const Interrupted&) {
