@@ -57,7 +57,7 @@ struct FollowOptions {
   int drop = 1;
   double base_start = -std::numeric_limits<double>::infinity();  // s, from when the base's motion is known
   double base_end = std::numeric_limits<double>::infinity();     // s, and until when
-  std::string base_name;
+  std::string base_name, source_name;
 };
 
 // Frame by frame until the source ends.
@@ -65,8 +65,16 @@ void follow(FrameSource& source, const Follower& follower, const dynamics::BaseF
             const FollowOptions& options, const std::vector<Subscriber>& subscribers) {
   LiveFrame frame;
   std::vector<capture::View> made;
+  double last = -std::numeric_limits<double>::infinity();  // s
   for (int read = 0; source.next(frame); ++read) {
     if (core::stop_requested()) throw Interrupted(core::stop_requested());
+    if (!(frame.time > last))
+      throw WorkError(options.source_name,
+                      "frame " + std::to_string(frame.frame) + " is at " + core::exact(frame.time) +
+                          " s, not after the one before",
+                      "give times that increase, and near enough to 0 that a frame's interval is told; the states so "
+                      "far are kept");
+    last = frame.time;
     if (read % options.drop != 0) continue;
     constexpr double kSlack = 1.0 / 30.0;  // s, a frame beyond the first or last sample
     if (read == 0 && frame.time < options.base_start - kSlack)
@@ -188,6 +196,8 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   if (!request.centerline.empty()) check_output_file(request.centerline);
   if (request.centerline == "-")
     throw InputError("--centerline", "standard output is for the estimates", "name a file");
+  if (request.base == "-" && request.source.camera == "-")
+    throw InputError("--base", "standard input is for the frames", "name a file");
   std::tie(request.source.first, request.source.last) = parse_frames(request.frames);
   const twin::Twin twin = load_twin(request.run);
   if (!twin.parameters)
@@ -208,6 +218,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   }
   FollowOptions options;
   options.drop = request.drop;
+  options.source_name = request.source.camera;
   options.base_name = request.base.empty() ? request.source.camera : request.base;
   if (base.samples().size() > 1) options.base_start = base.start(), options.base_end = base.end();
   estimation::Filter filter = estimation::start(

@@ -71,6 +71,10 @@ broken 32 '.*base\.tum: the base motion ends at [0-9.]+ s, before frame 32; ' --
   --centerline "$work/stopped.csv"
 [ "$(wc -l <"$work/stopped.csv")" -eq 33 ] || fail 'a base motion that stops: the centerline was not kept'
 
+# times that do not increase
+broken 1 '.*cam0\.mp4: frame 1 is at 1e\+22 s, not after the one before; ' --camera "$demo/cam0.mp4" \
+  --calibration "$work/camera.json" --start 1e22
+
 # whoever reads the lines has seen enough: what is to be kept is kept
 { "$program" estimate "$twin" --camera "$demo:cam0" --centerline "$work/read.csv" --covariance 2>"$work/stderr"
   echo $? >"$work/code"; } | head -2 >"$work/stdout"
