@@ -2,6 +2,7 @@
 #pragma once
 #include <cstdint>
 #include <functional>
+#include <iosfwd>
 #include <string>
 
 #include "chainsplat/core.h"
@@ -59,6 +60,9 @@ void flush_output();
 // --- results.cpp --------------------------------------------------------------------------------
 // "-" is standard input.
 Path input_path(const std::string& name);
+// The next line; false at the end. Throws InputError where it is longer than any that is meant (a device may never end
+// one).
+bool next_line(std::istream& in, std::string& line, const std::string& where);
 // Writes `bytes` to standard output ("-"), into a device or pipe that exists, else as a file in one step.
 void write_result(const std::string& name, const std::string& bytes);
 // Throws InputError unless `folder` can be filled: it is absent or empty, or `overwrite`. Makes nothing.
