@@ -44,6 +44,14 @@ expect_error 2 '--online' identify "$work/none" --memory 3
 expect_error 2 'folder does not exist' rollout "$work/none" -o "$work/none/states.csv"
 [ "$(ls "$work")" = "$(printf 'stderr\nstdout')" ] || fail 'something was written'
 
+# a base that is beyond all numbers is none
+cp -r "$source_dir/assets/demo_free_30" "$work/beyond"
+awk '!/^#/ && n++ % 2 { $2 = 1e300 } { print }' "$source_dir/assets/demo_free_30/base.tum" >"$work/beyond/base.tum"
+run check "$work/beyond"
+expect_code 2 'a base beyond all numbers'
+expect_output '^problem: .*base' 'a base beyond all numbers'
+rm -r "$work/beyond"
+
 # a full disk under standard output, and none at all
 for arguments in doctor --version --help 'estimate --help'; do
   "$program" $arguments >/dev/full 2>"$work/stderr"
@@ -62,6 +70,16 @@ for arguments in doctor --version --help; do
   [ "$(cat "$work/code")" -eq 141 ] || fail "$arguments, and nobody reads: exit code $(cat "$work/code")"
   [ -s "$work/stderr" ] && fail "$arguments, and nobody reads: it says something"
 done
+
+# a limit on the address space: a line, not an abort in a library (sanitizers need more than any limit)
+if (ulimit -v 4000000 && exec "$program" --version) >/dev/null 2>&1; then
+  for limit in 470000 500000; do
+    (ulimit -v $limit && exec "$program" --version) >"$work/stdout" 2>"$work/stderr"
+    code=$?
+    expect_code 1 "ulimit -v $limit"
+    grep -q '^chainsplat: error: address space: .*; raise it' "$work/stderr" || fail "ulimit -v $limit: no error line"
+  done
+fi
 
 # with a stream closed, the program's own files do not become that stream
 run new --length 0.3 --joints 2 --bending planar -o "$work/twin"
