@@ -82,9 +82,8 @@ grep -q '^chainsplat: error: -: line 9: .*; the lines so far are kept$' "$work/s
 grep -q error "$work/stderr" && fail 'force --live, one line read: it complains'
 
 # lines that no estimate printed, whole or live
-strange() {  # code pattern name; the lines come by standard input
+strange() {  # code pattern name; the lines are in $work/strange.jsonl
   local live
-  cat >"$work/strange.jsonl"
   for live in '' --live; do
     run force "$work/twin" --estimate "$work/strange.jsonl" --base "$demo/base.tum" $live
     expect_code "$1" "$3 $live"
@@ -92,9 +91,12 @@ strange() {  # code pattern name; the lines come by standard input
     grep -q nan "$work/stdout" && fail "$3 $live: nan"
   done
 }
-estimates 1 12 | sed '1s/"sigma":[^]]*]/"sigma":[]/' | strange 2 'line 2: has deviations' 'deviations in some lines'
-estimates 1 12 | sed '2s/"sigma":[^]]*]/"sigma":[]/' | strange 2 'line 2: has no deviations' 'no deviations in some lines'
-head -c 80000000 /dev/zero | strange 2 'a line of more than 64 MiB' 'a line without end'
+estimates 1 12 | sed '1s/"sigma":[^]]*]/"sigma":[]/' >"$work/strange.jsonl"
+strange 2 'line 2: has deviations' 'deviations in some lines'
+estimates 1 12 | sed '2s/"sigma":[^]]*]/"sigma":[]/' >"$work/strange.jsonl"
+strange 2 'line 2: has no deviations' 'no deviations in some lines'
+head -c 80000000 /dev/zero >"$work/strange.jsonl"
+strange 2 'a line of more than 64 MiB' 'a line without end'
 run force "$work/twin" --estimate "$work" --base "$demo/base.tum"
 expect_code 2 'estimates from a folder'
 
