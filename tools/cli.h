@@ -2,6 +2,7 @@
 #pragma once
 #include <cstdint>
 #include <functional>
+#include <iosfwd>
 #include <string>
 
 #include "chainsplat/core.h"
@@ -47,12 +48,21 @@ void log_to(const Path& file);
 void end_progress();                     // leaves the redrawn line
 void say(const std::string& line);       // a message on standard error, unless -q
 void say_more(const std::string& line);  // only with -v
-// SIGINT, SIGTERM and SIGUSR1 ask long work to stop; a second SIGINT quits at once.
-void watch_signals();
+// SIGINT, SIGTERM and SIGUSR1 ask long work to stop; a second SIGINT or SIGTERM quits at once, and so does the first
+// as long as there is nothing to keep.
+void watch_signals(bool nothing_to_keep = false);
+// Standard input, output and error as the program needs them: none of them is closed, and a pipe that nobody reads is
+// an error of writing, not an end without a word.
+void prepare_output();
+// What was printed is out. Throws Interrupted (SIGPIPE) where nobody reads it any more, else WorkError.
+void flush_output();
 
 // --- results.cpp --------------------------------------------------------------------------------
 // "-" is standard input.
 Path input_path(const std::string& name);
+// The next line; false at the end. Throws InputError where it is longer than any that is meant (a device may never end
+// one).
+bool next_line(std::istream& in, std::string& line, const std::string& where);
 // Writes `bytes` to standard output ("-"), into a device or pipe that exists, else as a file in one step.
 void write_result(const std::string& name, const std::string& bytes);
 // Throws InputError unless `folder` can be filled: it is absent or empty, or `overwrite`. Makes nothing.

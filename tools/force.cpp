@@ -83,12 +83,18 @@ void each_state(const ForceRequest& request, const chain::Chain& chain, const st
   std::ifstream in(input_path(request.estimate));
   if (!in) throw InputError(request.estimate, "cannot be read", "give the output of estimate, or - for standard input");
   double before = -std::numeric_limits<double>::infinity();
+  std::optional<bool> known;  // whether the lines have deviations
   std::string line;
-  for (int number = 1; std::getline(in, line); ++number) {
+  for (int number = 1; next_line(in, line, request.estimate); ++number) {
     if (line.empty()) continue;
     const auto state = read_estimate(line, request.estimate + ": line " + std::to_string(number), chain, before);
     if (!state) continue;
     before = state->time;
+    if (!known) known = state->standing.size() > 0;
+    if (*known != (state->standing.size() > 0))
+      throw InputError(request.estimate + ": line " + std::to_string(number),
+                       *known ? "has no deviations, unlike the lines before" : "has deviations, unlike the lines before",
+                       "give the output of one run of estimate");
     take(*state);
   }
 }
@@ -193,7 +199,8 @@ void force(const Globals& globals, const ForceRequest& request) {
   };
   std::size_t lines = 0, touching = 0;
   const auto write = [&](const force::Estimate& e) {
-    std::cout << force::to_json(e, twin.known_mass) << "\n" << std::flush;
+    std::cout << force::to_json(e, twin.known_mass) << "\n";
+    flush_output();
     ++lines;
     touching += e.touching;
   };

@@ -62,7 +62,7 @@ void identify_online(const Globals& globals, const OnlineRequest& request) {
   double first = NAN, last = NAN;
   int row = 0;
   // a stream that is stopped by Ctrl-C has still taught what it has
-  while (!core::stop_requested() && std::getline(in, line)) {
+  while (!core::stop_requested() && next_line(in, line, request.file)) {
     ++row;
     if (line.find_first_not_of(" \t\r") == std::string::npos) continue;
     const std::string where = request.file + ":" + std::to_string(row);

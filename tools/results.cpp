@@ -13,6 +13,19 @@ namespace fs = std::filesystem;
 
 Path input_path(const std::string& name) { return name == "-" ? Path("/dev/stdin") : Path(name); }
 
+bool next_line(std::istream& in, std::string& line, const std::string& where) {
+  constexpr std::size_t kLongest = 64 << 20;  // bytes; an estimate of a thousand angles, with covariance, has half of it
+  line.clear();
+  for (char letter = 0; in.get(letter);) {
+    if (letter == '\n') return true;
+    if (line.size() == kLongest)
+      throw InputError(where, "has a line of more than 64 MiB", "give the output of 'chainsplat estimate'");
+    line += letter;
+  }
+  if (in.bad()) throw InputError(where, "cannot be read", "give the output of 'chainsplat estimate'");
+  return !line.empty();
+}
+
 void write_result(const std::string& name, const std::string& bytes) {
   std::error_code error;
   if (name == "-") {

@@ -135,6 +135,9 @@ void check_base(const Manifest& manifest, CheckReport& report) {
            "%.2f m/s^2, %.2f rad/s; position noise %.2g m",
            samples.size(), capture.base.start(), capture.base.end(), rate, travel.x(), travel.y(), travel.z(), speed,
            acceleration, turning, capture.base.noise()));
+  if (!std::isfinite(speed + acceleration + turning))
+    report.problems.push_back(
+        "base: its speed is beyond all numbers: poses lie too far apart for their times; write meters and seconds");
   if (travel.norm() < kStill && turning * seconds < kStill)
     report.doubts.push_back(
         "base: it stays at rest; masses, damping and friction are hardly observable from such a capture");

@@ -75,6 +75,31 @@ code=${PIPESTATUS[1]}
 expect_code 1 'force --live, a line that is cut off'
 [ "$(wc -l <"$work/stdout")" -eq 6 ] || fail 'force --live, a line that is cut off: not the lines before'
 grep -q '^chainsplat: error: -: line 9: .*; the lines so far are kept$' "$work/stderr" || fail 'force --live: which line?'
+# nobody reads on
+{ estimates 1 8; sleep 1; estimates 9 12; } |
+  { "$program" force "$work/twin" --estimate - --base "$demo/base.tum" --live 2>"$work/stderr"; echo $? >"$work/code"; } | head -1 >"$work/stdout"
+[ "$(cat "$work/code")" -eq 141 ] || fail "force --live, one line read: exit code $(cat "$work/code")"
+grep -q error "$work/stderr" && fail 'force --live, one line read: it complains'
+
+# lines that no estimate printed, whole or live
+strange() {  # code pattern name; the lines are in $work/strange.jsonl
+  local live
+  for live in '' --live; do
+    run force "$work/twin" --estimate "$work/strange.jsonl" --base "$demo/base.tum" $live
+    expect_code "$1" "$3 $live"
+    grep -Eq "^chainsplat: error: .*$2" "$work/stderr" || fail "$3 $live: no line like '$2'"
+    grep -q nan "$work/stdout" && fail "$3 $live: nan"
+  done
+}
+estimates 1 12 | sed '1s/"sigma":[^]]*]/"sigma":[]/' >"$work/strange.jsonl"
+strange 2 'line 2: has deviations' 'deviations in some lines'
+estimates 1 12 | sed '2s/"sigma":[^]]*]/"sigma":[]/' >"$work/strange.jsonl"
+strange 2 'line 2: has no deviations' 'no deviations in some lines'
+head -c 80000000 /dev/zero >"$work/strange.jsonl"
+strange 2 'a line of more than 64 MiB' 'a line without end'
+run force "$work/twin" --estimate "$work" --base "$demo/base.tum"
+expect_code 2 'estimates from a folder'
+
 # estimates without deviations
 estimates 1 12 | sed 's/"sigma":[^]]*]/"sigma":[]/' >"$work/plain.jsonl"
 run force "$work/twin" --estimate "$work/plain.jsonl" --base "$demo/base.tum"

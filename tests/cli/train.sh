@@ -51,6 +51,11 @@ for file in gaussians.ply states.csv rollout.csv; do
   cmp -s "$work/whole/$file" "$work/stopped/$file" || fail "train --resume: $file is not that of an uninterrupted run"
 done
 
+# followed by Adam, which knows no deviations, in the live window, which asks for the force on the rope
+run estimate "$work/whole" --camera "$demo:cam0" --frames 0:6 --solver adam --covariance --serve $((20000 + $$ % 20000))
+expect_code 0 'estimate --solver adam --serve'
+[ "$(grep -c '"sigma":\[\],.*"covariance":\[\],' "$work/stdout")" -eq 6 ] || fail 'estimate --solver adam --serve: not six lines'
+
 # what was made can be used
 run rollout "$work/whole" -o - --rate 60
 expect_code 0 rollout
