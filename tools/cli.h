@@ -67,16 +67,18 @@ bool next_line(std::istream& in, std::string& line, const std::string& where);
 void write_result(const std::string& name, const std::string& bytes);
 // Throws InputError unless `folder` can be filled: it is absent or empty, or `overwrite`. Makes nothing.
 void check_output_folder(const Path& folder, bool overwrite, const std::string& mend);
+// Throws InputError where `folder`, that results go to, is the folder of the capture they are made from.
+void check_not_capture(const Path& folder, const Path& capture);
 // Throws InputError unless `file` can be made: its folder exists and it is no folder itself.
 void check_output_file(const std::string& file);
 // Makes a folder and those above it. Throws WorkError.
 void make_folder(const Path& folder);
-// What an input's fault is once work has begun: exit code 1, and `kept` says what there is.
-WorkError broken_off(const InputError& error, const std::string& kept);
+// What an error is once work has begun, an input's fault too: exit code 1, and `kept` says what there is.
+WorkError broken_off(const std::runtime_error& error, const std::string& kept);
 // CAPTURE[:camera] as the two; the second is empty for all cameras. A folder whose own name has a colon is taken as it
 // is.
 std::pair<std::string, std::string> split_camera(const std::string& text);
-// "A:B", "A:" or ":B" as [first, last); last = -1: to the end. Throws InputError.
-std::pair<int, int> parse_frames(const std::string& text);
+// "A:B", "A:" or ":B" as [first, last); last = -1: to the end. Throws InputError; `where` says whose text it is.
+std::pair<int, int> parse_frames(const std::string& text, const std::string& where = "--frames");
 
 }  // namespace chainsplat::tools

@@ -45,12 +45,20 @@ void check_output_folder(const Path& folder, bool overwrite, const std::string& 
   std::error_code error;
   if (fs::exists(folder, error) && !fs::is_directory(folder, error))
     throw InputError(folder.string(), "is a file, not a folder", "name another folder");
+  if (fs::is_symlink(folder, error) && !fs::exists(folder, error))
+    throw InputError(folder.string(), "is a link to nothing", "name another folder");
   if (fs::is_directory(folder, error) && !fs::is_empty(folder, error) && !overwrite)
     throw InputError(folder.string(), "is there already and not empty", mend);
   Path above = fs::absolute(folder).lexically_normal();
   while (!fs::exists(above, error) && above.has_relative_path()) above = above.parent_path();
   if (!fs::is_directory(above, error) || ::access(above.c_str(), W_OK | X_OK) != 0)
     throw InputError(folder.string(), "cannot be made in " + above.string(), "name a folder that can be written");
+}
+
+void check_not_capture(const Path& folder, const Path& capture) {
+  std::error_code error;
+  if (fs::equivalent(folder, capture, error))
+    throw InputError(folder.string(), "is the capture's own folder", "name another folder");
 }
 
 void check_output_file(const std::string& file) {
@@ -72,7 +80,7 @@ void make_folder(const Path& folder) {
                     "make room or choose a folder that can be written");
 }
 
-WorkError broken_off(const InputError& error, const std::string& kept) {
+WorkError broken_off(const std::runtime_error& error, const std::string& kept) {
   const std::string text = error.what();
   const std::size_t colon = std::min(text.find(": "), text.size() - 2);
   return WorkError(text.substr(0, colon), text.substr(colon + 2), kept);
@@ -85,10 +93,10 @@ std::pair<std::string, std::string> split_camera(const std::string& text) {
   return {text.substr(0, colon), text.substr(colon + 1)};
 }
 
-std::pair<int, int> parse_frames(const std::string& text) {
+std::pair<int, int> parse_frames(const std::string& text, const std::string& where) {
   if (text.empty()) return {0, -1};
   const auto fail = [&] {
-    return InputError("--frames", "'" + text + "' is no range of frames",
+    return InputError(where, "'" + text + "' is no range of frames",
                       "give A:B, for example 0:60 for the first 60");
   };
   const std::size_t colon = text.find(':');

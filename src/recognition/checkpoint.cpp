@@ -1,14 +1,18 @@
 #include "src/recognition/checkpoint.h"
 
 #include <cstring>
+#include <sstream>
+
+#include "chainsplat/recognition.h"
 
 namespace chainsplat::recognition {
 
 namespace {
 
-constexpr char kMagic[] = "chainsplat-checkpoint/3\n";
+constexpr char kMagic[] = "chainsplat-checkpoint/4\n";
 constexpr char kFile[] = "recognize.bin";
 constexpr char kFileBefore[] = "recognize.before.bin";
+constexpr const char* kFiles[] = {kFile, kFileBefore};  // the newest first
 
 struct Writer {
   std::string bytes;
@@ -114,6 +118,18 @@ std::optional<Checkpoint> parse(const std::string& bytes) {
   }
 }
 
+// The first line in which two jobs differ: 'NAME VALUE, not VALUE'.
+std::string difference(const std::string& had, const std::string& asked) {
+  std::istringstream had_lines(had), asked_lines(asked);
+  std::string before, now;
+  do {
+    std::getline(had_lines, before);
+    std::getline(asked_lines, now);
+  } while (before == now && had_lines && asked_lines);
+  const std::size_t value = now.rfind(' ') + 1;
+  return before + ", not " + (before.compare(0, value, now, 0, value) == 0 ? now.substr(value) : now);
+}
+
 }  // namespace
 
 void save_checkpoint(const Checkpoint& c, const Path& folder) {
@@ -151,20 +167,28 @@ void save_checkpoint(const Checkpoint& c, const Path& folder) {
 
 std::optional<Checkpoint> load_checkpoint(const Path& folder, const std::string& job) {
   bool damaged = false;
-  for (const char* name : {kFile, kFileBefore}) {
+  for (const char* name : kFiles) {
     const Path file = folder / name;
     std::error_code error;
     if (!std::filesystem::exists(file, error)) continue;
     std::optional<Checkpoint> found = parse(core::read_file(file));
     if (found && found->job != job)
-      throw InputError(file.string(), "the checkpoint is of another job (" + found->job + ")",
-                       "resume with the options that it was started with, or start anew with --force");
+      throw InputError(file.string(), "the checkpoint is of another job (" + difference(found->job, job) + ")",
+                       "resume with the capture, the frames and the options that it was begun with, or begin again "
+                       "with --force");
     if (found) return found;
     damaged = true;
     core::warn(file.string() + ": the checkpoint is damaged or of another version and is passed over");
   }
   if (damaged) core::warn(folder.string() + ": no checkpoint is whole, recognition begins anew");
   return std::nullopt;
+}
+
+bool is_checkpoint(const std::string& file_name) { return file_name == kFile || file_name == kFileBefore; }
+
+void remove_checkpoint(const Path& folder) {
+  std::error_code ignored;
+  for (const char* name : kFiles) std::filesystem::remove(folder / name, ignored);
 }
 
 }  // namespace chainsplat::recognition

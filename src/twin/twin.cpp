@@ -1,6 +1,7 @@
 // twin.json in and out; the run folder as a whole. The keys are documented in twin.h.
 #include <algorithm>
 #include <array>
+#include <charconv>
 #include <cmath>
 #include <limits>
 #include <nlohmann/json.hpp>
@@ -409,12 +410,37 @@ dynamics::Estimates read_estimates(const Node& node) {
   return e;
 }
 
+// Options are texts; those that later work reads as numbers or as a choice are refused here where they are neither.
+void check_option(const std::string& name, const Node& node) {
+  const std::string text = node.text();
+  const auto refuse = [&](const std::string& what) {
+    constexpr std::size_t kShown = 40;  // characters
+    node.fail("'" + text.substr(0, kShown) + "' is " + what, "correct it, or train again");
+  };
+  const char* const end = text.data() + text.size();
+  if (name == "mass") {
+    double mass = 0.0;
+    const auto [after, error] = std::from_chars(text.data(), end, mass);
+    if (error != std::errc() || after != end || !std::isfinite(mass) || mass <= 0.0)
+      refuse("not a positive number, the mass in kg");
+  } else if (name == "every") {
+    int every = 0;
+    const auto [after, error] = std::from_chars(text.data(), end, every);
+    if (error != std::errc() || after != end || every < 1) refuse("not a whole number >= 1");
+  } else if (name == "mode" && text != "fast" && text != "paper") {
+    refuse("neither fast nor paper");
+  }
+}
+
 Provenance read_provenance(const Node& node) {
   Provenance p;
   p.version = node["version"].text();
   p.capture = node["capture"].text();
   p.capture_hash = node["capture_hash"].text();
-  for (const auto& [name, value] : node["options"].members()) p.options[name] = value.text();
+  for (const auto& [name, value] : node["options"].members()) {
+    check_option(name, value);
+    p.options[name] = value.text();
+  }
   p.seed = node["seed"].unsigned_number();
   p.device = node["device"].text();
   p.driver = node["driver"].text();

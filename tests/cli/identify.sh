@@ -94,4 +94,20 @@ refused 'from the grasp.*another rope'
 head -6 "$work/one.csv" >"$work/wrong.csv"
 refused 'fewer than 3 rows'
 [ "$before" = "$(cat "$work/twin/twin.json")" ] || fail 'a refused file changed the twin'
+
+# run folders that are wrong in one way each: one clear line, and the twin is left as it is
+run identify "$work/run_one"
+expect_code 0 'identify'
+damaged() { rm -rf "$work/damaged"; cp -r "$work/run_one" "$work/damaged"; }
+damaged; sed -i 's/"mass": "0.06"/"mass": "abc"/' "$work/damaged/twin.json"
+expect_error 2 "twin\.json: provenance\.options\.mass: 'abc' is not a positive number" identify "$work/damaged"
+damaged; awk -F, 'NR == 4 { sub($2, "-1e-4") } { print }' "$work/run_one/covariance.csv" >"$work/damaged/covariance.csv"
+expect_error 2 'covariance\.csv:4: is no covariance' identify "$work/damaged"
+damaged; head -20 "$work/run_one/base.tum" >"$work/damaged/base.tum"
+expect_error 2 'base\.tum: covers 0 to' identify "$work/damaged"
+cmp -s "$work/run_one/twin.json" "$work/damaged/twin.json" || fail 'a damaged run: twin.json changed'
+for text in '[1]' '{"recognized": 3}' '{"recognized": {"mean": 4}}' '{"recognized": {"mean": {"psnr": "x"}}}' '{"rollout": {}}'; do
+  damaged; echo "$text" >"$work/damaged/metrics.json"
+  expect_error 2 'metrics\.json: ' diff "$work/run_one" "$work/damaged"
+done
 finish
