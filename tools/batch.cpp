@@ -125,7 +125,7 @@ class Board {
     }
     std::fprintf(stderr, "%s\n", line.c_str());
     for (const auto& [pid, child] : children)
-      std::fprintf(stderr, "  %.60s  %.60s\n", child.job->name.c_str(), progress_of(folder_ / child.job->name).c_str());
+      std::fprintf(stderr, "  %.60s  %.60s\n", core::printable(child.job->name).c_str(), core::printable(progress_of(folder_ / child.job->name)).c_str());
     lines_ = 1 + children.size();
   }
   void begin(std::size_t already) { first_ = already; }

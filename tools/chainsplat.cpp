@@ -19,7 +19,7 @@ int fail(int code, std::string text) {
   for (char& letter : text)
     if (letter == '\n' || letter == '\r') letter = ' ';
   tools::end_progress();
-  std::fprintf(stderr, "chainsplat: error: %s\n", text.c_str());
+  std::fprintf(stderr, "chainsplat: error: %s\n", core::printable(text).c_str());
   return code;
 }
 

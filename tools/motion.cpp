@@ -7,6 +7,7 @@
 #include <memory>
 #include <nlohmann/json.hpp>
 
+#include "base_motion_files.h"
 #include "chainsplat/capture.h"
 #include "chainsplat/dynamics.h"
 #include "chainsplat/render.h"
@@ -63,8 +64,8 @@ dynamics::InitialState start_of(const RolloutRequest& request, const twin::Twin&
 }
 
 void rollout(const Globals& globals, const RolloutRequest& request) {
-  if (!(request.rate > 0.0) || !std::isfinite(request.rate))
-    throw InputError("--rate", "must be above 0", "give frames a second, for example 30");
+  constexpr const char* kExample = "give rows a second, for example 30";
+  check_rate(request.rate, 0.0, kExample);
   if (globals.json && (request.out == "-" || request.centerline == "-"))
     throw InputError("--json", "standard output is wanted by '-' too", "name a file");
   check_output_file(request.out);
@@ -73,6 +74,7 @@ void rollout(const Globals& globals, const RolloutRequest& request) {
   const dynamics::Model model = model_of(twin, request.run);
   const trajectory::Trajectory base = request.base.empty() ? own_base(request.run) : read_base(request.base);
   const dynamics::InitialState initial = start_of(request, twin, model, base);
+  check_rate(request.rate, base.end() - initial.time, kExample);
   std::vector<double> times;
   for (int k = 0; initial.time + k / request.rate <= base.end() + kTimeSlack; ++k)
     times.push_back(initial.time + k / request.rate);

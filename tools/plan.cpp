@@ -276,8 +276,6 @@ Json loop_json(const planning::LoopResult& loop, double tolerance) {
 }
 
 void plan(const Globals& globals, PlanRequest& request) {
-  if (!(request.rate > 0.0) || !std::isfinite(request.rate))
-    throw InputError("--rate", "must be above 0", "give rows a second, for example 100");
   planning::Options& options = request.options;
   options.seed = globals.seed;
   if (!request.axes.empty()) options.axes = parse_axes(request.axes);
@@ -289,6 +287,19 @@ void plan(const Globals& globals, PlanRequest& request) {
   } else {
     options.horizon = numbers(request.horizon, "--horizon", 1)[0];
   }
+  constexpr double kLongest = 120.0, kMostReplans = 1000.0;  // s; a second
+  if (options.horizon > kLongest)
+    throw InputError("--horizon",
+                     core::exact(options.horizon) + " s are more than " + core::exact(kLongest) +
+                         " s, and the motion is computed in steps of milliseconds, many times",
+                     "give seconds, for example 3");
+  if (request.loop.rate > kMostReplans)
+    throw InputError("--mpc-rate",
+                     core::exact(request.loop.rate) + " replans a second are more than " + core::exact(kMostReplans) +
+                         ", and each is an optimization",
+                     "give for example 10");
+  check_rate(request.rate, options.horizon * static_cast<double>(request.targets.size()),
+             "give rows a second, for example 100");
   if (!request.terminal.empty()) {
     const std::vector<double> values = numbers(request.terminal, "--terminal", 0);
     options.terminal = Eigen::Map<const math::VectorX>(values.data(), static_cast<Eigen::Index>(values.size()));

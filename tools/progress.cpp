@@ -122,7 +122,7 @@ void log(const core::Progress& progress, double now, bool last) {
   record["loss"] = progress.loss;  // NaN is written as null
   record["psnr"] = progress.psnr;
   record["seconds"] = std::round((now - screen.origin) * 1e3) / 1e3;
-  for (std::ofstream& file : screen.logs) file << record.dump() << std::endl;
+  for (std::ofstream& file : screen.logs) file << record.dump(-1, ' ', false, nlohmann::json::error_handler_t::replace) << std::endl;
 }
 
 void on_progress(const core::Progress& progress) {
@@ -177,7 +177,7 @@ void start_listening(const Globals& globals) {
       if (!told.insert(line).second) return;
     }
     clear_line();
-    std::fprintf(stderr, "chainsplat: warning: %s\n", line.c_str());
+    std::fprintf(stderr, "chainsplat: warning: %s\n", core::printable(line).c_str());
   };
   listener.progress = on_progress;
   core::set_listener(std::move(listener));
@@ -198,7 +198,7 @@ void end_progress() {
 void say(const std::string& line) {
   if (screen.quiet) return;
   end_progress();
-  std::fprintf(stderr, "%s\n", line.c_str());
+  std::fprintf(stderr, "%s\n", core::printable(line).c_str());
 }
 
 void say_more(const std::string& line) {

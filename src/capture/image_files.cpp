@@ -15,6 +15,8 @@ namespace chainsplat::capture {
 
 namespace {
 
+constexpr int kMostChannels = 8;  // colors, alpha, depth: a damaged header claims any number
+
 // A PNG that ends before its last chunk. Found here, because libpng prints a line of its own about it.
 bool cut_off_png(const Path& file) {
   std::ifstream stream(file, std::ios::binary);
@@ -31,18 +33,51 @@ bool cut_off_png(const Path& file) {
   }
 }
 
+// The reader of OpenImageIO for the format that the file begins as; none: another format. Left to itself it tries all
+// that it has, and some hand the file to libraries that open whatever other file or address it names.
+const char* format_of(const Path& file) {
+  struct Start {
+    std::string_view bytes;
+    const char* format;
+  };
+  using namespace std::string_view_literals;
+  constexpr Start kStarts[] = {{"\x89PNG\r\n\x1a\n"sv, "png"}, {"\xff\xd8\xff"sv, "jpeg"},   {"BM"sv, "bmp"},
+                               {"II\x2a\0"sv, "tiff"},          {"MM\0\x2a"sv, "tiff"},      {"II\x2b\0"sv, "tiff"},
+                               {"MM\0\x2b"sv, "tiff"},          {"\x76\x2f\x31\x01"sv, "openexr"},
+                               {"P2"sv, "pnm"},                 {"P3"sv, "pnm"},             {"P5"sv, "pnm"},
+                               {"P6"sv, "pnm"},                 {"RIFF"sv, "webp"}};
+  char bytes[8] = {};
+  std::ifstream stream(file, std::ios::binary);
+  stream.read(bytes, sizeof bytes);
+  const std::string_view begin(bytes, static_cast<std::size_t>(stream.gcount()));
+  for (const Start& start : kStarts)
+    if (begin.starts_with(start.bytes)) return start.format;
+  return nullptr;
+}
+
 std::unique_ptr<OIIO::ImageInput> open_image(const Path& file) {
   std::error_code error;
   if (!std::filesystem::exists(file, error))
     throw InputError(file.string(), "does not exist", "check the path and the frame numbers");
+  if (!std::filesystem::is_regular_file(file, error))  // a pipe might never end
+    throw InputError(file.string(), "is not a file", "check the path and the frame numbers");
   if (cut_off_png(file)) throw InputError(file.string(), "is cut off", "write it again");
   OIIO::ImageSpec options;
   options.attribute("oiio:UnassociatedAlpha", 1);  // colors as stored, not multiplied by alpha
-  auto input = OIIO::ImageInput::open(file.string(), &options);
-  if (!input) {
+  const char* const format = format_of(file);
+  auto input = format ? OIIO::ImageInput::create(format) : nullptr;
+  OIIO::ImageSpec spec;
+  if (!input || !input->open(file.string(), spec, options)) {
     OIIO::geterror();  // its text names plugins and internals, not the user's mistake
+    if (input) input->geterror();
     throw InputError(file.string(), "is not a readable image", "write it again as PNG");
   }
+  if (spec.width < 1 || spec.height < 1 || spec.depth > 1 || spec.deep || spec.nchannels < 1 ||
+      spec.nchannels > kMostChannels || static_cast<std::int64_t>(spec.width) * spec.height > kMostPixels)
+    throw InputError(file.string(),
+                     "claims " + std::to_string(spec.width) + "x" + std::to_string(spec.height) + "x" +
+                         std::to_string(spec.depth) + " pixels of " + std::to_string(spec.nchannels) + " channels",
+                     "write it again as PNG of at most " + std::to_string(kMostPixels >> 20) + " million pixels");
   input->threads(1);  // files are read in parallel already
   return input;
 }
