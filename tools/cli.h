@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <functional>
 #include <string>
+#include <vector>
 
 #include "chainsplat/core.h"
 
@@ -53,6 +54,8 @@ void watch_signals();
 // --- results.cpp --------------------------------------------------------------------------------
 // "-" is standard input.
 Path input_path(const std::string& name);
+// "X,Y,Z": numbers between commas, `count` of them (0: one or more). Throws InputError with `where`.
+std::vector<double> numbers(const std::string& text, const std::string& where, std::size_t count);
 // Writes `bytes` to standard output ("-"), into a device or pipe that exists, else as a file in one step.
 void write_result(const std::string& name, const std::string& bytes);
 // Throws InputError unless `folder` can be filled: it is absent or empty, or `overwrite`. Makes nothing.

@@ -70,7 +70,8 @@ class Reader {
   // Unknown keys are doubts that name the nearest known key.
   void know(std::initializer_list<const char*> known) const {
     if (!object_) return;
-    for (const auto& [key, value] : object_->items()) {
+    for (const auto& item : object_->items()) {
+      const std::string& key = item.key();
       if (std::any_of(known.begin(), known.end(), [&](const char* k) { return key == k; })) continue;
       const char* nearest = *std::min_element(known.begin(), known.end(), [&](const char* a, const char* b) {
         return edit_distance(key, a) < edit_distance(key, b);
