@@ -4,6 +4,7 @@
 
 #include <unistd.h>
 
+#include <array>
 #include <cmath>
 #include <filesystem>
 #include <fstream>
@@ -15,19 +16,53 @@ namespace chainsplat::capture {
 
 namespace {
 
-// A PNG that ends before its last chunk. Found here, because libpng prints a line of its own about it.
-bool cut_off_png(const Path& file) {
+// PNG's CRC-32 goes on with `bytes`.
+std::uint32_t crc(std::uint32_t before, const std::vector<char>& bytes) {
+  static const std::array<std::uint32_t, 256> table = [] {
+    constexpr std::uint32_t kPolynomial = 0xedb88320u;
+    std::array<std::uint32_t, 256> made{};
+    for (std::uint32_t n = 0; n < made.size(); ++n) {
+      std::uint32_t value = n;
+      for (int bit = 0; bit < 8; ++bit) value = value & 1u ? kPolynomial ^ (value >> 1) : value >> 1;
+      made[n] = value;
+    }
+    return made;
+  }();
+  for (const char byte : bytes) before = table[(before ^ static_cast<unsigned char>(byte)) & 0xffu] ^ (before >> 8);
+  return before;
+}
+
+// What is wrong with a PNG; empty where it is whole, or none. Found here, because libpng prints a line of its own.
+std::string damage_of_png(const Path& file) {
   std::ifstream stream(file, std::ios::binary);
   constexpr std::string_view kSignature = "\x89PNG\r\n\x1a\n";
+  constexpr std::uint32_t kLargestSide = 1u << 15;  // px, as capture.json's
+  constexpr const char* kCutOff = "is cut off";
   char start[8] = {};
-  if (!stream.read(start, sizeof start) || std::string_view(start, sizeof start) != kSignature) return false;
-  for (;;) {  // chunks: length, name, data, checksum
-    unsigned char head[8];
-    if (!stream.read(reinterpret_cast<char*>(head), sizeof head)) return true;
-    const std::streamoff length = (head[0] << 24u) | (head[1] << 16) | (head[2] << 8) | head[3];
-    if (std::string_view(reinterpret_cast<const char*>(head) + 4, 4) == "IEND") return false;
-    if (length < 0) return true;
-    stream.seekg(length + 4, std::ios::cur);
+  if (!stream.read(start, sizeof start) || std::string_view(start, sizeof start) != kSignature) return "";
+  const auto number = [&stream] {
+    unsigned char b[4] = {};
+    stream.read(reinterpret_cast<char*>(b), sizeof b);
+    return std::uint32_t{b[0]} << 24u | std::uint32_t{b[1]} << 16u | std::uint32_t{b[2]} << 8u | b[3];
+  };
+  std::error_code error;
+  const std::uintmax_t at_most = std::filesystem::file_size(file, error);
+  for (std::vector<char> chunk;;) {  // length, name, data, checksum of the last two
+    const std::uint32_t length = number();
+    if (!stream || length > at_most) return kCutOff;
+    chunk.resize(length + 4);
+    if (!stream.read(chunk.data(), static_cast<std::streamsize>(chunk.size()))) return kCutOff;
+    const std::uint32_t sum = number();
+    if (!stream) return kCutOff;
+    if (~crc(~0u, chunk) != sum) return "is damaged";
+    const std::string_view name(chunk.data(), 4);
+    if (name == "IHDR" && length >= 8)
+      for (const std::size_t at : {4u, 8u}) {
+        std::uint32_t side = 0;
+        for (std::size_t i = 0; i < 4; ++i) side = side << 8u | static_cast<unsigned char>(chunk[at + i]);
+        if (side == 0 || side > kLargestSide) return "claims a side of " + std::to_string(side) + " pixels";
+      }
+    if (name == "IEND") return "";
   }
 }
 
@@ -35,7 +70,8 @@ std::unique_ptr<OIIO::ImageInput> open_image(const Path& file) {
   std::error_code error;
   if (!std::filesystem::exists(file, error))
     throw InputError(file.string(), "does not exist", "check the path and the frame numbers");
-  if (cut_off_png(file)) throw InputError(file.string(), "is cut off", "write it again");
+  if (const std::string damage = damage_of_png(file); !damage.empty())
+    throw InputError(file.string(), damage, "write it again");
   OIIO::ImageSpec options;
   options.attribute("oiio:UnassociatedAlpha", 1);  // colors as stored, not multiplied by alpha
   auto input = OIIO::ImageInput::open(file.string(), &options);
