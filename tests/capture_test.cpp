@@ -743,7 +743,15 @@ TEST_CASE("files that are missing, cut off or of another kind") {
     std::filesystem::remove_all(made.path() / "cam0");
     CHECK(contains(made.refused(), "cam0/000000.png: is missing"));
   }
-  SUBCASE("a cut-off image, an empty one, a text") {
+  SUBCASE("a cut-off image, an empty one, a text, one with a bit turned in each of its parts") {
+    const std::string whole = core::read_file(made.path() / numbered("cam0", 2));
+    for (std::size_t at = 8; at < whole.size(); at += 5) {
+      std::string damaged = whole;
+      damaged[at] ^= 4;
+      made.write(numbered("cam0", 2), damaged);
+      const std::string error = made.refused();
+      CHECK_MESSAGE((contains(error, "000002.png: is damaged; ") || contains(error, "000002.png: is cut off; ")), at);
+    }
     spoil(numbered("cam0", 2), 60);
     CHECK(contains(made.refused(), "cam0/000002.png"));
     spoil(numbered("cam0", 2), 0);

@@ -18,6 +18,7 @@ constexpr int kDone = 0, kWorkFailed = 1, kWrongRequest = 2;
 int fail(int code, std::string text) {
   for (char& letter : text)
     if (letter == '\n' || letter == '\r') letter = ' ';
+  if (text.starts_with(": ")) text.insert(0, "''");  // an empty file name
   tools::end_progress();
   std::fprintf(stderr, "chainsplat: error: %s\n", core::printable(text).c_str());
   return code;

@@ -4,6 +4,7 @@
 #include <functional>
 #include <iosfwd>
 #include <string>
+#include <vector>
 
 #include "chainsplat/core.h"
 
@@ -63,6 +64,8 @@ Path input_path(const std::string& name);
 // The next line; false at the end. Throws InputError where it is longer than any that is meant (a device may never end
 // one).
 bool next_line(std::istream& in, std::string& line, const std::string& where);
+// "X,Y,Z": numbers between commas, `count` of them (0: one or more). Throws InputError with `where`.
+std::vector<double> numbers(const std::string& text, const std::string& where, std::size_t count);
 // Writes `bytes` to standard output ("-"), into a device or pipe that exists, else as a file in one step.
 void write_result(const std::string& name, const std::string& bytes);
 // Throws InputError unless `folder` can be filled: it is absent or empty, or `overwrite`. Makes nothing.

@@ -2,6 +2,7 @@
 #include <unistd.h>
 
 #include <charconv>
+#include <cstdlib>
 #include <fstream>
 #include <iostream>
 
@@ -112,6 +113,24 @@ std::pair<int, int> parse_frames(const std::string& text, const std::string& whe
   const int last = parse(std::string_view(text).substr(colon + 1), -1);
   if (last >= 0 && last <= first) throw fail();
   return {first, last};
+}
+
+std::vector<double> numbers(const std::string& text, const std::string& where, std::size_t count) {
+  std::vector<double> out;
+  const char* at = text.c_str();
+  for (;;) {
+    char* end = nullptr;
+    const double value = std::strtod(at, &end);
+    if (end == at) break;
+    out.push_back(value);
+    at = end;
+    if (*at != ',' || at[1] == '\0') break;
+    ++at;
+  }
+  if (*at != '\0' || (count && out.size() != count) || out.empty())
+    throw InputError(where, "'" + text + "' is not " + (count ? std::to_string(count) + " numbers" : "numbers"),
+                     "give them with commas between, for example 0.1,0,0.3");
+  return out;
 }
 
 }  // namespace chainsplat::tools

@@ -84,8 +84,8 @@ class Reader {
   void know(std::initializer_list<const char*> known) const {
     if (!object_) return;
     int unknown = 0;
-    for (const auto& [whole_key, value] : object_->items()) {
-      const std::string key = whole_key.substr(0, 40);  // longer than any that is known
+    for (const auto& item : object_->items()) {
+      const std::string key = item.key().substr(0, 40);  // longer than any that is known
       if (std::any_of(known.begin(), known.end(), [&](const char* k) { return key == k; })) continue;
       if (++unknown > kMostUnknown) continue;
       const char* nearest = *std::min_element(known.begin(), known.end(), [&](const char* a, const char* b) {

@@ -63,6 +63,15 @@ splat::Gaussians get_gaussians(Reader& r) {
   g.degree = r.get<int>();
   for (auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
     *part = r.get_all<float>();
+  constexpr int kHighestDegree = 3;
+  const auto holds = [&](const std::vector<float>& part, std::size_t a_gaussian) {
+    return part.size() == a_gaussian * static_cast<std::size_t>(g.count);
+  };
+  if (g.count < 0 || g.links < 0 || g.degree < 0 || g.degree > kHighestDegree || !holds(g.mean, 3) ||
+      !holds(g.rotation, 4) || !holds(g.log_scale, 3) || !holds(g.opacity_logit, 1) ||
+      !holds(g.sh, 3 * static_cast<std::size_t>(g.sh_coefficients())) ||
+      !holds(g.link_logits, static_cast<std::size_t>(g.links)))
+    throw std::out_of_range("checkpoint");
   return g;
 }
 
@@ -74,6 +83,7 @@ std::vector<double> flat(const std::vector<math::VectorX>& rows) {
 
 std::vector<math::VectorX> rows_of(const std::vector<double>& all, std::size_t count) {
   std::vector<math::VectorX> rows;
+  if (count == 0 ? !all.empty() : all.size() % count != 0) throw std::out_of_range("checkpoint");
   const std::size_t width = count == 0 ? 0 : all.size() / count;
   for (std::size_t k = 0; width > 0 && k < count; ++k)
     rows.push_back(Eigen::Map<const math::VectorX>(all.data() + width * k, static_cast<Eigen::Index>(width)));
@@ -100,7 +110,7 @@ std::optional<Checkpoint> parse(const std::string& bytes) {
     c.watch.bad_steps = r.get<int>();
     c.watch.bad_in_a_row = r.get<int>();
     c.watch.restarts = r.get<int>();
-    c.spatial = r.get<bool>();
+    c.spatial = r.get<std::uint8_t>() != 0;
     c.out_of_plane_rms = r.get<double>();
     c.deviation = r.get<double>();
     c.states.time = r.get_all<double>();

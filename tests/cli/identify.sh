@@ -85,6 +85,8 @@ sed '10s/,[^,]*$//' "$work/one.csv" >"$work/wrong.csv"
 refused 'wrong\.csv:10: 16 columns instead of 17'
 sed '10s/,[^,]*$/,abc/' "$work/one.csv" >"$work/wrong.csv"
 refused 'wrong\.csv:10: column 17 is not a finite number'
+sed 's/,c_y,c_z$/,c_y,c_z,c_z/; /^[0-9]/s/$/,0/' "$work/one.csv" >"$work/wrong.csv"
+refused "wrong\.csv:4: there are two columns 'c_z'"
 sed '/^# marker/d' "$work/one.csv" >"$work/wrong.csv"
 refused 'no marker is named'
 sed 's/marker c 0.3/marker c 0.5/' "$work/one.csv" >"$work/wrong.csv"

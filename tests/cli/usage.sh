@@ -37,6 +37,7 @@ expect_error 2 '--frames' train capture -o run --frames 5:5
 expect_error 2 '--frames' train capture -o run --frames some
 expect_error 2 'twin.json' rollout "$work/none" -o "$work/states.csv"
 expect_error 2 'ending' export "$work/none" -o "$work/twin.obj"
+expect_error 2 "error: '': its ending" export "$work/none" -o ''
 expect_error 2 'twin.json' excite "$work/none" -o "$work/motion"
 expect_error 2 '--output' excite "$work/none"
 expect_error 2 'twin.json' identify "$work/none" --online "$work/none.jsonl"
