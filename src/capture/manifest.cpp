@@ -70,7 +70,8 @@ class Reader {
   // Unknown keys are doubts that name the nearest known key.
   void know(std::initializer_list<const char*> known) const {
     if (!object_) return;
-    for (const auto& [key, value] : object_->items()) {
+    for (const auto& item : object_->items()) {
+      const std::string& key = item.key();
       if (std::any_of(known.begin(), known.end(), [&](const char* k) { return key == k; })) continue;
       const char* nearest = *std::min_element(known.begin(), known.end(), [&](const char* a, const char* b) {
         return edit_distance(key, a) < edit_distance(key, b);
@@ -167,7 +168,7 @@ class Reader {
 
   // A path inside the folder.
   std::optional<std::string> path(const std::string& key, bool required, const char* expected) const {
-    const auto value = text(key, required, expected);
+    auto value = text(key, required, expected);
     if (!value) return std::nullopt;
     const Path normal = Path(*value).lexically_normal();
     if (value->empty() || value->find('\0') != std::string::npos || normal.is_absolute() || normal == "." ||
