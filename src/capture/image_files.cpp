@@ -125,7 +125,7 @@ std::vector<Value> read_pixels(OIIO::ImageInput& input, const Path& file, OIIO::
 }
 
 // Opens `create` under a temporary name, writes, and renames: a reader never sees half a file.
-void write_image(const Path& file, const std::string& format, const OIIO::ImageSpec& spec, OIIO::TypeDesc type,
+void write_image(const Path& file, const std::string& format, const OIIO::ImageSpec& spec, const OIIO::TypeDesc& type,
                  const void* pixels) {
   const Path temporary = file.string() + ".tmp" + std::to_string(::getpid());
   auto output = OIIO::ImageOutput::create(format);
