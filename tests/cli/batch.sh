@@ -74,6 +74,14 @@ code=$?
 expect_code 2 'slurm where there is none'
 grep -q "^chainsplat: error: --launcher slurm: there is no 'sbatch'.*; " "$work/stderr" || fail 'slurm where there is none: no error line'
 
+# a folder whose name Slurm would fill in
+mkdir "$work/bin"
+printf '#!/bin/bash\nprintf "%%s\\n" "$@" >"%s/sbatch"; echo 7\n' "$work" >"$work/bin/sbatch"
+chmod +x "$work/bin/sbatch"
+PATH="$work/bin:$PATH" run batch "$work/jobs.toml" -o "$work/100%j" --launcher slurm
+expect_code 0 'slurm, a folder with a percent sign'
+grep -q '^--output=.*/100%%j/logs/slurm-%a\.txt$' "$work/sbatch" || fail 'slurm: the folder of the logs is filled in'
+
 # interrupted at work: the trainings leave checkpoints
 "$program" batch "$work/jobs.toml" -o "$work/batch" >"$work/stdout" 2>"$work/stderr" </dev/null &
 pid=$!
