@@ -131,6 +131,9 @@ std::vector<math::MatrixX> read_covariances(const Path& file, const chain::State
     for (Eigen::Index row = 0; row < angles; ++row)
       for (Eigen::Index column = 0; column <= row; ++column)
         covariance(row, column) = covariance(column, row) = numbers[next++];
+    if (!math::is_covariance(covariance))
+      throw InputError(file.string() + ":" + std::to_string(lines[k].number),
+                       "its numbers are no covariance: not positive semidefinite", mend);
     covariances.push_back(std::move(covariance));
   }
   if (covariances.size() != states.time.size())
