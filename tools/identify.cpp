@@ -221,7 +221,7 @@ void identify(const Globals& globals, const Request& request) {
       for (const auto& [name, component] : weak.parts) direction[name] = component;
       document["weak"].push_back({{"singular_value", weak.singular_value}, {"direction", direction}});
     }
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
     return;
   }
   if (!found.names.empty()) std::cout << "parameter                        estimate   standard error\n";

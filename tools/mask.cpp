@@ -243,7 +243,7 @@ void make_masks(const Globals& globals, const Request& request) {
   for (std::size_t c = 0; c < cameras; ++c)
     if (agreement.frames[c] > 0) document["iou"][scene.cameras[c].name] = agreement.sum[c] / agreement.frames[c];
   if (globals.json) {
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
     return;
   }
   std::cout << "masks: " << summary.frames << " in " << into << "\n";
