@@ -376,7 +376,7 @@ Contact nearest_contact(const chain::Chain& chain, const splat::Gaussians& gauss
                         const VectorX& theta, const MatrixX& points) {
   const std::vector<Pose> motions = chain::link_motions(chain, theta, base);
   Contact best;
-  double least = 1e300;
+  double least = best.distance = std::numeric_limits<double>::infinity();
   const auto offer = [&](int link, double arclength, const Vector3& home) {
     const Vector3 x = motions[link] * home;
     for (Eigen::Index i = 0; i < points.cols(); ++i) {

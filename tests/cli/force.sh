@@ -83,6 +83,7 @@ expect_code 0 'force of estimates without deviations'
 printf 'time,x,y,z\n0,,,\n' >"$work/none.csv"
 expect_error 2 'no contact' force "$work/twin" --states "$states" --base "$demo/base.tum" --contact "$work/none.csv"
 expect_error 2 'never comes nearer' force "$work/twin" --states "$states" --base "$demo/base.tum" --contact 100,0,0
+expect_error 2 'names no contact' force "$work/twin" --states "$states" --base "$demo/base.tum" --contact 1e200,0,0
 expect_error 2 'is no point' force "$work/twin" --states "$states" --base "$demo/base.tum" --contact 1,2
 sed '1!s/^[^,]*/9&/' "$states" >"$work/late.csv"
 expect_error 2 'base motion covers' force "$work/twin" --states "$work/late.csv" --base "$demo/base.tum"
