@@ -2,6 +2,8 @@
 #include "identify.h"
 
 #include <CLI/CLI.hpp>
+#include <charconv>
+#include <cmath>
 #include <cstdio>
 #include <iostream>
 #include <limits>
@@ -22,7 +24,14 @@ identification::Options identification_options(const twin::Twin& twin, bool pape
   options.gravity = twin.gravity;
   if (twin.table_normal) options.table_normal = *twin.table_normal;
   const auto mass = twin.provenance.options.find("mass");
-  if (mass != twin.provenance.options.end()) options.mass = std::stod(mass->second);
+  if (mass != twin.provenance.options.end()) {
+    const std::string& text = mass->second;
+    double value = 0.0;
+    const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), value);
+    if (error != std::errc() || end != text.data() + text.size() || !(value > 0.0) || !std::isfinite(value))
+      throw InputError("twin.json: provenance.options.mass", "'" + text + "' is no mass", "write kilograms above 0");
+    options.mass = value;
+  }
   options.paper = paper;
   if (paper) {
     options.fit_stiffness = false;

@@ -99,6 +99,13 @@ sed '10s/^[^,]*/1e300/;11,$d' "$work/one.csv" >"$work/wrong.csv"
 refused '; '
 [ "$before" = "$(cat "$work/twin/twin.json")" ] || fail 'a refused file changed the twin'
 
+# a twin whose mass is none
+for mass in none nan -1 '' 1e999 '0.06 kg'; do
+  rm -rf "$work/heavy" && cp -r "$work/run_one" "$work/heavy"
+  sed -i "s/\"mass\": \"[^\"]*\"/\"mass\": \"$mass\"/" "$work/heavy/twin.json"
+  expect_error 2 "options.mass: '$mass' is no mass" identify "$work/heavy"
+done
+
 # covariances of the angles that are none
 cp "$work/kept/covariance.csv" "$work/run_one/covariance.csv"
 cp "$work/run_one/covariance.csv" "$work/good.csv"
