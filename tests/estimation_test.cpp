@@ -635,6 +635,11 @@ TEST_CASE("a line of JSON holds what INTERFACE 5 names") {
   CHECK(line["residual"] == 0.25);
   CHECK(line["lost"] == false);
   CHECK(line["latency_ms"].get<double>() == doctest::Approx(7.9));
+  e.theta[1] = NAN;  // JSON knows no such number
+  e.covariance(1, 0) = INFINITY;
+  const auto broken = nlohmann::json::parse(estimation::to_json(e, 0.0079));
+  CHECK(broken["theta"][1].is_null());
+  CHECK(broken["covariance"][1].is_null());
 }
 
 }  // namespace

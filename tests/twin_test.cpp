@@ -275,6 +275,8 @@ TEST_CASE("damage to twin.json is named by file and key") {
       {"/grasp/direction/0", 3.0, "grasp.direction"},
       {"/grasp/bending_axis", Json::array({0, 0, 1}), "grasp.bending_axis"},
       {"/identification/estimates", Json::array({1}), "identification.estimates"},
+      {"/identification/covariance/0/0", -0.1, "identification.covariance"},
+      {"/identification/covariance/0/1", 0.1, "identification.covariance"},
       {"/identification/held/0/reason", removed, "identification.held[0].reason"},
       {"/provenance/seed", -1, "provenance.seed"},
       {"/provenance/options/mass", "abc", "provenance.options.mass"},

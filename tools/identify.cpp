@@ -2,6 +2,7 @@
 #include "identify.h"
 
 #include <CLI/CLI.hpp>
+#include <cmath>
 #include <cstdio>
 #include <iostream>
 #include <limits>
@@ -22,7 +23,7 @@ identification::Options identification_options(const twin::Twin& twin, bool pape
   options.gravity = twin.gravity;
   if (twin.table_normal) options.table_normal = *twin.table_normal;
   const auto mass = twin.provenance.options.find("mass");
-  if (mass != twin.provenance.options.end()) options.mass = std::stod(mass->second);
+  if (mass != twin.provenance.options.end()) options.mass = std::stod(mass->second);  // checked when it was read
   options.paper = paper;
   if (paper) {
     options.fit_stiffness = false;
@@ -230,7 +231,7 @@ void identify(const Globals& globals, const Request& request) {
       for (const auto& [name, component] : weak.parts) direction[name] = component;
       document["weak"].push_back({{"singular_value", weak.singular_value}, {"direction", direction}});
     }
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
     return;
   }
   if (!found.names.empty()) std::cout << "parameter                        estimate   standard error\n";

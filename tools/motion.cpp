@@ -94,7 +94,7 @@ void rollout(const Globals& globals, const RolloutRequest& request) {
   document["rows"] = states.time.size();
   document["start"] = states.time.front();
   document["end"] = states.time.back();
-  std::cout << document.dump(1) << "\n";
+  std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
 }
 
 struct RenderRequest {
@@ -203,7 +203,7 @@ void render(const Globals& globals, const RenderRequest& request) {
     document["cameras"][camera.name] = frames.size();
   }
   if (globals.json)
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
   else
     say(std::to_string(total) + " frames: " + request.out);
 }

@@ -354,7 +354,7 @@ void plan(const Globals& globals, PlanRequest& request) {
   if (truth) document["simulated"] = simulated;
   core::write_file(out / "plan.json", document.dump(1) + "\n");
   if (globals.json) {
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
     return;
   }
   char text[256];

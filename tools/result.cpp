@@ -104,7 +104,9 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
       request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
   exports::write(twin, motion, request.base.empty() ? own_base(request.run) : read_base(request.base), request.out);
   if (globals.json)
-    std::cout << nlohmann::ordered_json{{"output", request.out}}.dump() << "\n";
+    std::cout << nlohmann::ordered_json{{"output", request.out}}.dump(-1, ' ', false,
+                                                                      nlohmann::ordered_json::error_handler_t::replace)
+              << "\n";
   else
     say("written: " + request.out);
 }
@@ -144,7 +146,9 @@ void synthesize(const Globals& globals, const SynthRequest& request) {
   options.video = !request.images;
   synth::write(engine, twin, states, scene, out, options);
   if (globals.json)
-    std::cout << nlohmann::ordered_json{{"capture", request.out}}.dump() << "\n";
+    std::cout << nlohmann::ordered_json{{"capture", request.out}}.dump(-1, ' ', false,
+                                                                       nlohmann::ordered_json::error_handler_t::replace)
+              << "\n";
   else
     say("capture: " + request.out);
 }

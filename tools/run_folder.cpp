@@ -160,15 +160,6 @@ std::string covariance_csv(const chain::States& states, const std::vector<math::
   return text;
 }
 
-// But for rounding; 0 is one, too.
-static bool is_covariance(const math::MatrixX& matrix) {
-  constexpr double kRounding = 1e-9, kLeast = 1e-15;  // of the largest variance; rad^2
-  const double largest = matrix.diagonal().maxCoeff();
-  const Eigen::Index n = matrix.rows();
-  return (matrix + (kRounding * std::max(largest, 0.0) + kLeast) * math::MatrixX::Identity(n, n)).llt().info() ==
-         Eigen::Success;
-}
-
 std::vector<math::MatrixX> read_covariances(const Path& file, const chain::States& states) {
   std::error_code error;
   if (!std::filesystem::exists(file, error)) return {};
@@ -187,9 +178,9 @@ std::vector<math::MatrixX> read_covariances(const Path& file, const chain::State
     for (Eigen::Index row = 0; row < angles; ++row)
       for (Eigen::Index column = 0; column <= row; ++column)
         covariance(row, column) = covariance(column, row) = numbers[next++];
-    if (!is_covariance(covariance))
-      throw InputError(file.string() + ":" + std::to_string(lines[k].number), "is no covariance: a variance is negative",
-                       mend);
+    if (!math::is_covariance(covariance))
+      throw InputError(file.string() + ":" + std::to_string(lines[k].number),
+                       "its numbers are no covariance: not positive semidefinite", mend);
     covariances.push_back(std::move(covariance));
   }
   if (covariances.size() != states.time.size())

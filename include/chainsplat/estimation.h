@@ -145,8 +145,8 @@ bool has_mask(const capture::View& view);
 double tube_iou(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta,
                 const capture::View& view, const capture::Camera& camera);
 
-// The line of INTERFACE 5, without line feed. `latency`: s. "covariance" is the lower triangle, row by row, of theta's;
-// with `rates` of (theta, thetadot)'s, which begins with it.
+// The line of INTERFACE 5, without line feed; what is not finite is null. `latency`: s. "covariance" is the lower
+// triangle, row by row, of theta's; with `rates` of (theta, thetadot)'s, which begins with it.
 std::string to_json(const Estimate& estimate, double latency, bool rates = false);
 
 }  // namespace chainsplat::estimation

@@ -59,18 +59,21 @@ Json list(const Vector& values) {
 
 Json list(const math::VectorX& values) { return list(std::vector<double>(values.begin(), values.end())); }
 
+// Bytes of file names that are not UTF-8 are replaced: JSON has no place for them.
+std::string text_of(const Json& value) { return value.dump(-1, ' ', false, Json::error_handler_t::replace); }
+
 // Objects and lists of objects or lists over several lines, lists of numbers on one.
 void print(const Json& value, const std::string& indent, std::string& out) {
   const bool object = value.is_object();
   if (!object && !(value.is_array() && !value.empty() && value[0].is_structured())) {
-    out += value.dump();
+    out += text_of(value);
     return;
   }
   out += object ? "{" : "[";
   bool first = true;
   for (const auto& [key, entry] : value.items()) {
     out.append(first ? "\n" : ",\n").append(indent).append(1, ' ');
-    if (object) out.append(Json(key).dump()).append(": ");
+    if (object) out.append(text_of(key)).append(": ");
     print(entry, indent + " ", out);
     first = false;
   }
@@ -400,6 +403,9 @@ dynamics::Estimates read_estimates(const Node& node) {
     for (int column = 0; column < count; ++column)
       e.covariance(static_cast<Eigen::Index>(row), column) = values[column];
   }
+  const std::vector<Eigen::Index> known = math::known_part(e.covariance);
+  if (!math::is_covariance(e.covariance(known, known)))
+    node["covariance"].fail("is not symmetric and positive semidefinite", "restore it or identify again");
   for (const Node& held : node["held"].entries()) e.held.emplace_back(held["name"].text(), held["reason"].text());
   if (node.has("weak"))  // absent in files of older versions
     for (const Node& weak : node["weak"].entries()) {
