@@ -37,6 +37,15 @@ std::string command_line_error(const CLI::App& app, const CLI::ParseError& error
   return "chainsplat " + command + ": " + what + "; see 'chainsplat " + command + " --help'";
 }
 
+// An empty name, as of a variable that a script has not set, would mean the folder one stands in, or nothing.
+void refuse_empty_output(const CLI::App& app) {
+  for (const CLI::App* command : app.get_subcommands()) {
+    const CLI::Option* output = command->get_option_no_throw("--output");
+    if (output && output->count() > 0 && output->as<std::string>().empty())
+      throw InputError("--output", "is empty", "name the file or folder to write");
+  }
+}
+
 int run(int argc, char** argv) {
   tools::Globals globals;
   tools::Job job;
@@ -94,6 +103,7 @@ int run(int argc, char** argv) {
   } catch (const CLI::ParseError& error) {
     return fail(kWrongRequest, command_line_error(app, error));
   }
+  refuse_empty_output(app);
   tools::start_listening(globals);
   core::set_threads(globals.threads);
   // the CPU driver of Mesa has threads of its own

@@ -37,7 +37,12 @@ expect_error 2 '--frames' train capture -o run --frames 5:5
 expect_error 2 '--frames' train capture -o run --frames some
 expect_error 2 'twin.json' rollout "$work/none" -o "$work/states.csv"
 expect_error 2 'ending' export "$work/none" -o "$work/twin.obj"
-expect_error 2 "error: '': its ending" export "$work/none" -o ''
+run check ''
+expect_code 2 "check ''"
+grep -q "^chainsplat: error: '': " "$work/stderr" || fail "check '': the error line has an empty place"
+for command in 'rollout none' 'render none --camera none' 'export none' 'train none' 'mask none' 'eval none none'; do
+  expect_error 2 '--output: is empty' $command -o ''
+done
 expect_error 2 'twin.json' excite "$work/none" -o "$work/motion"
 expect_error 2 '--output' excite "$work/none"
 expect_error 2 'twin.json' identify "$work/none" --online "$work/none.jsonl"
