@@ -50,4 +50,13 @@ for ((i = 1; i <= kills; ++i)); do
   same "$work/killed" "killed at $at ms"
   [ $failures -eq "$before" ] && echo "kill $i of $kills at $at ms of $milliseconds: the same bytes"
 done
+
+# a training that has not ended yet when the batch is run again, as after a kill: its job waits for it
+busy=$(dirname "$(ls "$work"/killed/*/twin.json | head -1)")
+rm -rf "$busy" && mkdir -p "$busy/checkpoint"
+flock "$busy/checkpoint/lock" sleep 2 &
+sleep 0.2
+run batch "$work/jobs.toml" -o "$work/killed"
+expect_code 0 'a batch of which a training has not ended yet'
+same "$work/killed" 'a batch of which a training has not ended yet'
 finish
