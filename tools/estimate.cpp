@@ -99,11 +99,30 @@ void follow(FrameSource& source, const Follower& follower, const dynamics::BaseF
   }
 }
 
+// What a stream has come to so far, in the same memory however long it lasts.
+struct Tally {
+  static constexpr double kShortest = 1e-6;  // s, latency of the first bin
+  static constexpr double kGrowth = 1.01;    // from bin to bin: latencies are told to 1 %
+  std::array<std::int64_t, 2100> bins{};     // up to 1,000 s
+  std::int64_t frames = 0, lost = 0;
+  double first_time = 0.0;  // s, of the first frame
+};
+
+void count(Tally& tally, const estimation::Estimate& estimate, double latency) {
+  if (tally.frames++ == 0) tally.first_time = estimate.time;
+  tally.lost += estimate.lost;
+  const double bin = std::log(std::max(latency, Tally::kShortest) / Tally::kShortest) / std::log(Tally::kGrowth);
+  ++tally.bins[static_cast<std::size_t>(std::min(bin, static_cast<double>(tally.bins.size() - 1)))];
+}
+
 // "p50 0.71 ms, p99 4.90 ms"
-std::string latency_text(std::vector<double> latencies) {
-  std::sort(latencies.begin(), latencies.end());
-  const auto at = [&](double share) {
-    return latencies[std::min(latencies.size() - 1, static_cast<std::size_t>(share * latencies.size()))];
+std::string latency_text(const Tally& tally) {
+  const auto at = [&](double share) {  // the middle of the bin in which this share of the frames is reached
+    std::size_t bin = 0;
+    for (auto within = static_cast<double>(tally.bins[0]);
+         within < share * static_cast<double>(tally.frames) && bin + 1 < tally.bins.size();)
+      within += static_cast<double>(tally.bins[++bin]);
+    return Tally::kShortest * std::pow(Tally::kGrowth, static_cast<double>(bin) + 0.5);
   };
   char text[64];
   std::snprintf(text, sizeof text, "p50 %.2f ms, p99 %.2f ms", 1e3 * at(0.5), 1e3 * at(0.99));
@@ -306,19 +325,17 @@ void estimate(const Globals& globals, EstimateRequest& request) {
     return view;
   };
 
-  chain::States states;
-  std::vector<double> latencies;
-  int lost = 0;
+  chain::States states;  // of all frames, where a centerline is to be written
+  Tally tally;
   const Subscriber print = [&](const Followed& followed) {
     std::cout << estimation::to_json(followed.estimate, followed.latency, request.covariance) << "\n";
     flush_output();
   };
   const Subscriber keep = [&](const Followed& followed) {
+    count(tally, followed.estimate, followed.latency);
+    if (request.centerline.empty()) return;
     states.time.push_back(followed.estimate.time);
     states.theta.push_back(followed.estimate.theta);
-    states.thetadot.push_back(followed.estimate.thetadot);
-    latencies.push_back(followed.latency);
-    lost += followed.estimate.lost;
   };
   std::vector<Subscriber> subscribers{keep, print};  // what cannot be printed is kept nevertheless
   // recorded frames are shown at the pace at which they were taken
@@ -347,7 +364,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
       if (!followed.frame.picture.pixels.empty()) shown.picture = &followed.frame.picture;
       if (!followed.views.empty()) shown.view = &followed.views[0];
       window->show(shown);
-      while (recorded && !core::stop_requested() && core::seconds_now() - begun < e.time - states.time.front())
+      while (recorded && !core::stop_requested() && core::seconds_now() - begun < e.time - tally.first_time)
         std::this_thread::sleep_for(std::chrono::milliseconds(1));
     });
   const auto write = [&] {
@@ -355,9 +372,9 @@ void estimate(const Globals& globals, EstimateRequest& request) {
       write_result(request.centerline, twin::centerline_csv(twin.chain, states, base));
   };
   const auto summarize = [&] {
-    if (!states.time.empty())
-      say(std::to_string(states.time.size()) + " frames" + (lost ? ", lost in " + std::to_string(lost) : "") + "; " +
-          latency_text(latencies) + ".");
+    if (tally.frames > 0)
+      say(std::to_string(tally.frames) + " frames" + (tally.lost ? ", lost in " + std::to_string(tally.lost) : "") + "; " +
+          latency_text(tally) + ".");
   };
   watch_signals();  // a camera never ends by itself
   try {
@@ -368,7 +385,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
     throw;
   } catch (const InputError& error) {
     write();
-    if (states.time.empty()) throw;
+    if (tally.frames == 0) throw;
     throw broken_off(error, "the states so far are kept");
   } catch (...) {
     write();
@@ -376,7 +393,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   }
   write();
   summarize();
-  if (states.time.empty())
+  if (tally.frames == 0)
     throw InputError(request.source.camera, "has no frame", "name a camera that recorded something");
 }
 
