@@ -104,6 +104,7 @@ expect_error 2 '--frames: identification needs 3 frames of cam0 or more, and the
 expect_error 2 'Vulkan' recognize "$demo" -o "$out" --frames 0:2
 
 # results never go into the capture itself
+fresh
 before=$(cd "$capture" && find . -type f | sort)
 expect_error 2 "is the capture's own folder" train "$capture" -o "$capture" --frames 0:12 --force
 [ "$before" = "$(cd "$capture" && find . -type f | sort)" ] || fail 'train into the capture: its files changed'
@@ -188,16 +189,20 @@ run check "$capture"
 expect_code 2 'check, control characters'
 expect_output 'problem: .*c.x1b\[31m.x00' 'check, control characters'
 expect_output "^capture 'red .x1b\[31m bell .x07 null " 'check, control characters'
-python3 - "$demo/capture.json" "$capture/capture.json" <<'E1'
+fresh
+python3 - "$capture/capture.json" <<'E1'
 import json, sys
 capture = json.load(open(sys.argv[1]))
 capture["k\x1b[2J\x00"] = 1
-json.dump(capture, open(sys.argv[2], "w"))
+json.dump(capture, open(sys.argv[1], "w"))
 E1
 refused 'Vulkan'
 grep -q 'warning: .*k.x1b\[2J.x00: unknown key' "$work/stderr" || fail 'a key with control characters: no warning that shows them'
 grep -q "$(printf '\033')" "$work/stdout" "$work/stderr" && fail 'control characters: they reach the terminal'
-expect_error 2 'x1b' check "$work/$(printf 'no\033[31m\377folder')"
+run check "$work/$(printf 'no\033[31m\377folder')"
+expect_code 2 'check of a name with control characters'
+expect_output 'no.x1b\[31m.xfffolder' 'check of a name with control characters'
+grep -q "$(printf '\033')" "$work/stdout" "$work/stderr" && fail 'check of a name with control characters: they reach the terminal'
 run check "$work/$(printf 'no\377folder')" --json
 expect_code 2 'check --json of a name that is no text'
 [ "$(head -c 1 "$work/stdout")" = '{' ] || fail 'check --json of a name that is no text: no document'

@@ -46,9 +46,11 @@ int read_all(const std::vector<fs::path>& files) {
 
 int main(int count, char** arguments) {
   std::set<std::string> readers;
-  for (int i = 1; i < count; ++i)
+  for (int i = 1; i < count; ++i) {
+    if (!fs::is_directory(arguments[i])) continue;  // there may be no crashes
     for (const auto& entry : fs::directory_iterator(arguments[i]))
       if (entry.is_directory()) readers.insert(entry.path().filename());
+  }
   int failures = 0;
   for (const std::string& reader : readers) {
     std::vector<fs::path> files;
