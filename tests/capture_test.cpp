@@ -743,7 +743,15 @@ TEST_CASE("files that are missing, cut off or of another kind") {
     std::filesystem::remove_all(made.path() / "cam0");
     CHECK(contains(made.refused(), "cam0/000000.png: is missing"));
   }
-  SUBCASE("a cut-off image, an empty one, a text") {
+  SUBCASE("a cut-off image, an empty one, a text, one with a bit turned in each of its parts") {
+    const std::string whole = core::read_file(made.path() / numbered("cam0", 2));
+    for (std::size_t at = 8; at < whole.size(); at += 5) {
+      std::string damaged = whole;
+      damaged[at] ^= 4;
+      made.write(numbered("cam0", 2), damaged);
+      const std::string error = made.refused();
+      CHECK_MESSAGE((contains(error, "000002.png: is damaged; ") || contains(error, "000002.png: is cut off; ")), at);
+    }
     spoil(numbered("cam0", 2), 60);
     CHECK(contains(made.refused(), "cam0/000002.png"));
     spoil(numbered("cam0", 2), 0);
@@ -962,6 +970,26 @@ TEST_CASE("the truth of a capture: refused when it is not one, absent without it
   std::filesystem::create_directories(made.path() / "truth");
   made.write("truth/centreline.csv", "frame,time,x0,y0,z0\n0,0.0,1,2,3\n1,0.1,1,2,oops\n");
   CHECK(contains(error_of([&] { capture::load_true_centerline(made.path()); }), "centreline.csv:3: column 5"));
+  const std::pair<const char*, const char*> wrong[] = {
+      {"", "centreline.csv: has no row"},
+      {"frame,time,x0,y0,z0\n", "centreline.csv: has no row"},
+      {"t,x,y,z\n0,1,2,3\n", "centreline.csv:1: is not the header"},
+      {"frame,time,x0,y0,z0,x1,y1\n0,0,1,2,3,4,5\n", "centreline.csv:1: is not the header"},
+      {"frame,time,x0,y0,z0,z1,y1,x1\n0,0,1,2,3,4,5,6\n", "centreline.csv:1: is not the header"},
+      {"frame,time,x0,y0,z0\n0,0,1,2,inf\n", "centreline.csv:2: column 5"},
+      {"frame,time,x0,y0,z0\n0,0,1,2\n", "centreline.csv:2: 4 columns"},
+      {"frame,time,x0,y0,z0\n0,0.1,1,2,3\n1,0.1,1,2,3\n", "centreline.csv:3: its time does not come after"},
+  };
+  for (const auto& [text, expected] : wrong) {
+    made.write("truth/centreline.csv", text);
+    INFO(text);
+    CHECK(contains(error_of([&] { capture::load_true_centerline(made.path()); }), expected));
+    CHECK(any_contains(capture::check(made.path()).problems, expected));
+    CHECK(error_of([&] { capture::load(made.path()); }).empty());  // training never opens it
+  }
+  made.write("truth/centreline.csv", "frame,time,x0,y0,z0\n0,77,1,2,3\n1,78,1,2,3\n");
+  CHECK(any_contains(capture::check(made.path()).doubts, "says nothing of the times of"));
+  CHECK(capture::check(made.path()).problems.empty());
 }
 
 TEST_CASE("written images and videos come back") {

@@ -129,7 +129,7 @@ void excite(const Globals& globals, Request& request) {
     core::write_file(out / "excite.json", document.dump(1) + "\n");
   }
   if (globals.json) {
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
     return;
   }
   const excitation::Prediction& p = result.prediction;

@@ -71,7 +71,7 @@ void doctor(const Globals& globals) {
   document["missing"] = found.missing;
   document["validation_layer"] = found.validation_layer;
   document["pipeline_cache"] = found.pipeline_cache;
-  std::cout << document.dump(1) << "\n";
+  std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
 }
 
 }  // namespace

@@ -180,8 +180,9 @@ void make_masks(const Globals& globals, const Request& request) {
       throw InputError(file.string() + ": cameras[" + std::to_string(c) + "].masks", "is a video: " + own,
                        "give -o FOLDER, or remove the key");
     wanted.push_back({files ? own : "masks/" + name + "/%06d.png", scene.folder});
-    if (!request.force && (!own.empty() || fs::exists(wanted.back().file(0), error)))
-      throw InputError(wanted.back().file(0).parent_path().string(), name + " has masks already",
+    const Path into = wanted.back().file(0).parent_path();
+    if (!request.force && (!own.empty() || (fs::is_directory(into, error) && !fs::is_empty(into, error))))
+      throw InputError(into.string(), name + " has masks already",
                        "use --force to replace them, or -o FOLDER");
   }
   if (in_place && ::access(scene.folder.c_str(), W_OK) != 0)

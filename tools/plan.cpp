@@ -34,24 +34,6 @@ struct PlanRequest {
   planning::Options options;
 };
 
-std::vector<double> numbers(const std::string& text, const std::string& where, std::size_t count) {
-  std::vector<double> out;
-  const char* at = text.c_str();
-  for (;;) {
-    char* end = nullptr;
-    const double value = std::strtod(at, &end);
-    if (end == at) break;
-    out.push_back(value);
-    if (*end == '\0') at = end;
-    if (*end != ',') break;
-    at = end + 1;
-  }
-  if (*at != '\0' || (count && out.size() != count) || out.empty())
-    throw InputError(where, "'" + text + "' is not " + (count ? std::to_string(count) + " numbers" : "numbers"),
-                     "give them with commas between, for example 0.1,0,0.3");
-  return out;
-}
-
 constexpr const char* kAssumed =
     "mass, stiffness, damping and friction are assumed, and the rope may miss by centimeters";
 
@@ -372,7 +354,7 @@ void plan(const Globals& globals, PlanRequest& request) {
   if (truth) document["simulated"] = simulated;
   core::write_file(out / "plan.json", document.dump(1) + "\n");
   if (globals.json) {
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
     return;
   }
   char text[256];

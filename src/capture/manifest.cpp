@@ -84,8 +84,8 @@ class Reader {
   void know(std::initializer_list<const char*> known) const {
     if (!object_) return;
     int unknown = 0;
-    for (const auto& [whole_key, value] : object_->items()) {
-      const std::string key = whole_key.substr(0, 40);  // longer than any that is known
+    for (const auto& item : object_->items()) {
+      const std::string key = item.key().substr(0, 40);  // longer than any that is known
       if (std::any_of(known.begin(), known.end(), [&](const char* k) { return key == k; })) continue;
       if (++unknown > kMostUnknown) continue;
       const char* nearest = *std::min_element(known.begin(), known.end(), [&](const char* a, const char* b) {
@@ -211,7 +211,7 @@ class Reader {
 
   // A path inside the folder.
   std::optional<std::string> path(const std::string& key, bool required, const char* expected) const {
-    const auto value = text(key, required, expected);
+    auto value = text(key, required, expected);
     if (!value) return std::nullopt;
     const Path normal = Path(*value).lexically_normal();
     if (value->empty() || value->find('\0') != std::string::npos || normal.is_absolute() || normal == "." ||

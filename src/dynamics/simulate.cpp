@@ -8,6 +8,7 @@ namespace {
 
 constexpr double kFrame = 1.0 / 30.0;  // s, what `substeps` counts in
 constexpr int kMaxRefinement = 32;     // of the steps of a diverging rollout
+constexpr double kMostSteps = 1e6;     // from one output time to the next: hours of a rope's motion
 constexpr double kJerkStep = 0.01;     // of a step, for the one-sided difference of the base acceleration
 
 // S' = J S + b by the trapezoidal rule; X = d theta / d unknowns, Y = X', acceleration = Y'.
@@ -64,6 +65,9 @@ BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<d
       throw InputError("rollout", "output times do not increase at " + core::exact(times[i]) + " s",
                        "give increasing times from the initial state's time on");
     const double wanted = interval / kFrame * substeps;
+    if (!(wanted < kMostSteps))
+      throw InputError("rollout", "from " + core::exact(now) + " to " + core::exact(times[i]) + " s are too many steps",
+                       "give times nearer to each other");
     const int steps = std::max(1, static_cast<int>(std::ceil(wanted - 1e-6)));  // 1e-6: times are rounded in files
     for (int s = 1; s <= steps; ++s) {
       BaseGrid::Node& last = grid.nodes.back();

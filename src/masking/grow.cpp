@@ -10,7 +10,6 @@ namespace chainsplat::masking {
 
 using math::Matrix3;
 using math::MatrixX;
-using math::Pose;
 using math::Vector2;
 using math::Vector3;
 using math::VectorX;

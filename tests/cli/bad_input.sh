@@ -82,6 +82,38 @@ refused 'fx'
 fresh; sed -i 's|"base": "base.tum"|"base": "../base.tum"|' "$capture/capture.json"
 refused 'base'
 
+# what only evaluation reads: found before the work, and no matter where nothing is evaluated
+fresh; cp -r "$demo/truth" "$capture/"
+refused 'Vulkan'
+sed -i '1s/.*/t,x,y,z/' "$capture/truth/centreline.csv"
+refused 'truth/centreline\.csv:1: is not the header'
+expect_error 2 'Vulkan' recognize "$capture" -o "$out" --frames 0:12
+run check "$capture"
+expect_code 2 'check, a wrong truth'
+expect_output '^problem: .*centreline\.csv:1' 'check, a wrong truth'
+cp "$demo/truth/centreline.csv" "$capture/truth/"
+sed -i '5s/.*/3,nan,1/' "$capture/truth/centreline.csv"
+refused 'centreline\.csv:5'
+rm -r "$capture"; cp -r "$demo" "$capture"
+black_8x8 >"$capture/depth/cam1/000007.png"
+refused 'depth/cam1/000007\.png: is 8x8 pixels'
+
+# too few frames for identification, not for recognition
+expect_error 2 '--frames: identification needs 3 frames of cam0 or more, and there are 2' train "$demo" -o "$out" --frames 0:2
+[ -e "$out" ] && fail 'too few frames: something was written'
+expect_error 2 'Vulkan' recognize "$demo" -o "$out" --frames 0:2
+
+# results never go into the capture itself
+before=$(cd "$capture" && find . -type f | sort)
+expect_error 2 "is the capture's own folder" train "$capture" -o "$capture" --frames 0:12 --force
+[ "$before" = "$(cd "$capture" && find . -type f | sort)" ] || fail 'train into the capture: its files changed'
+
+# nothing to resume, but files of somebody else
+mkdir "$out" && echo mine >"$out/base.tum"
+expect_error 2 'holds no run to resume' train "$demo" -o "$out" --frames 0:12 --resume
+[ "$(cat "$out/base.tum")" = mine ] || fail 'train --resume: wrote over a file that is not its own'
+rm -r "$out"
+
 # frames that are not there
 expect_error 2 'frames' train "$demo" -o "$out" --frames 400:500
 

@@ -29,6 +29,11 @@ expect_error 2 'cam0 has masks already.*--force' mask "$demo"
 expect_error 2 '--frames.*-o' mask "$capture" --frames 0:8
 expect_error 2 'no frame' mask "$demo" -o "$work/none" --frames 400:410
 [ -e "$work/none" ] && fail 'no frame: something was written'
+# masks that lie there, though capture.json does not name them, are not written over
+mkdir -p "$capture/masks/cam1"
+echo drawn by hand >"$capture/masks/cam1/000031.png"
+expect_error 2 'cam1 has masks already.*--force' mask "$capture"
+rm -r "$capture/masks"
 
 # an outside program, whose arguments may hold anything
 segmenter="$work/it's a segmenter.sh"
