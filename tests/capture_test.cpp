@@ -966,6 +966,7 @@ TEST_CASE("check: nothing to complain about in the demo; wrong poses, clocks and
 
 TEST_CASE("the truth of a capture: refused when it is not one, absent without it") {
   const Made made;
+  made.load();  // writes capture.json
   CHECK_FALSE(capture::load_true_centerline(made.path()).has_value());
   std::filesystem::create_directories(made.path() / "truth");
   made.write("truth/centreline.csv", "frame,time,x0,y0,z0\n0,0.0,1,2,3\n1,0.1,1,2,oops\n");

@@ -104,6 +104,7 @@ expect_error 2 '--frames: identification needs 3 frames of cam0 or more, and the
 expect_error 2 'Vulkan' recognize "$demo" -o "$out" --frames 0:2
 
 # results never go into the capture itself
+fresh
 before=$(cd "$capture" && find . -type f | sort)
 expect_error 2 "is the capture's own folder" train "$capture" -o "$capture" --frames 0:12 --force
 [ "$before" = "$(cd "$capture" && find . -type f | sort)" ] || fail 'train into the capture: its files changed'
