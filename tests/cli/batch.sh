@@ -30,9 +30,9 @@ seeds = [-1]'
 refused 'settings.output: is chosen by the batch' <<<'captures = "captures/good"
 settings = { output = "x" }'
 # lists in lists, tables in tables and JSON without end are refused in a line, long before the stack is full
-{ printf 'captures = '; head -c 200000 /dev/zero | tr '\0' '['; } | refused 'jobs.toml: line 1: .*depth'
-{ printf 'a'; printf '.a%.0s' $(seq 100000); echo ' = 1'; } | refused 'jobs.toml: line 1: has more than 100 dots'
-{ printf '[a'; printf '.a%.0s' $(seq 100000); echo ']'; } | refused 'jobs.toml: line 1: has more than 100 dots'
+refused 'jobs.toml: line 1: .*depth' < <(printf 'captures = '; head -c 200000 /dev/zero | tr '\0' '[')
+refused 'jobs.toml: line 1: has more than 100 dots' < <(printf 'a'; yes .a | head -n 400000 | tr -d '\n'; echo ' = 1')
+refused 'jobs.toml: line 1: has more than 100 dots' < <(printf '[a'; yes .a | head -n 400000 | tr -d '\n'; echo ']')
 mkdir -p "$work/deep/logs"
 head -c 200000 /dev/zero | tr '\0' '[' >"$work/deep/batch.json"
 expect_error 2 'batch\.json: is damaged' batch status "$work/deep"
