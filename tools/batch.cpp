@@ -125,7 +125,7 @@ class Board {
     }
     std::fprintf(stderr, "%s\n", line.c_str());
     for (const auto& [pid, child] : children)
-      std::fprintf(stderr, "  %.60s  %.60s\n", child.job->name.c_str(), progress_of(folder_ / child.job->name).c_str());
+      std::fprintf(stderr, "  %.60s  %.60s\n", core::printable(child.job->name).c_str(), core::printable(progress_of(folder_ / child.job->name)).c_str());
     lines_ = 1 + children.size();
   }
   void begin(std::size_t already) { first_ = already; }
@@ -231,6 +231,13 @@ std::string quoted(const std::string& text) {
   return out + "'";
 }
 
+// For a name in which Slurm fills in what follows a percent sign.
+std::string plain(const std::string& text) {
+  std::string out;
+  for (const char letter : text) out.append(letter == '%' ? 2 : 1, letter);
+  return out;
+}
+
 std::vector<std::string> words_of(const std::string& text) {
   std::istringstream stream(text);
   std::vector<std::string> words;
@@ -262,7 +269,7 @@ void submit(const BatchPlan& plan, const Path& folder, const std::vector<const B
   std::string command = "sbatch --parsable --job-name=chainsplat --requeue --open-mode=append --array=" + indices +
                         " --time=" + quoted(request.time_limit) + " --signal=B:USR1@" +
                         std::to_string(request.warn_seconds) +
-                        " --output=" + quoted((folder / "logs/slurm-%a.txt").string());
+                        " --output=" + quoted(plain((folder / "logs").string()) + "/slurm-%a.txt");
   for (const std::string& word : words_of(request.sbatch)) command += " " + quoted(word);
   command += " " + quoted((folder / "logs/slurm.sh").string());
   say_more(command);

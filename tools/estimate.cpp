@@ -40,7 +40,7 @@ struct Followed {
   const estimation::Estimate& estimate;
   double latency;  // s, from the decoded frame until now
 };
-// Called after every frame, in the order given: the JSON line first.
+// Called after every frame, in the order given.
 using Subscriber = std::function<void(const Followed&)>;
 
 // The mask of a picture; `theta` is where the rope is expected, none when that is not known.
@@ -57,7 +57,7 @@ struct FollowOptions {
   int drop = 1;
   double base_start = -std::numeric_limits<double>::infinity();  // s, from when the base's motion is known
   double base_end = std::numeric_limits<double>::infinity();     // s, and until when
-  std::string base_name;
+  std::string base_name, source_name;
 };
 
 // Frame by frame until the source ends.
@@ -65,8 +65,16 @@ void follow(FrameSource& source, const Follower& follower, const dynamics::BaseF
             const FollowOptions& options, const std::vector<Subscriber>& subscribers) {
   LiveFrame frame;
   std::vector<capture::View> made;
+  double last = -std::numeric_limits<double>::infinity();  // s
   for (int read = 0; source.next(frame); ++read) {
     if (core::stop_requested()) throw Interrupted(core::stop_requested());
+    if (!(frame.time > last))
+      throw WorkError(options.source_name,
+                      "frame " + std::to_string(frame.frame) + " is at " + core::exact(frame.time) +
+                          " s, not after the one before",
+                      "give times that increase, and near enough to 0 that a frame's interval is told; the states so "
+                      "far are kept");
+    last = frame.time;
     if (read % options.drop != 0) continue;
     constexpr double kSlack = 1.0 / 30.0;  // s, a frame beyond the first or last sample
     if (read == 0 && frame.time < options.base_start - kSlack)
@@ -188,20 +196,16 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   if (!request.centerline.empty()) check_output_file(request.centerline);
   if (request.centerline == "-")
     throw InputError("--centerline", "standard output is for the estimates", "name a file");
+  if (request.base == "-" && request.source.camera == "-")
+    throw InputError("--base", "standard input is for the frames", "name a file");
   std::tie(request.source.first, request.source.last) = parse_frames(request.frames);
   const twin::Twin twin = load_twin(request.run);
   if (!twin.parameters)
     core::warn(request.run + ": its dynamics are not identified; angles are assumed to go on at constant rate");
 
   request.source.pictures = request.serve > 0;
-  watch_signals();  // a camera never ends by itself
+  watch_signals(true);
   FrameSource source = open_frames(request.source);
-  std::optional<Window> window;
-  if (request.serve > 0) {
-    const capture::Camera& camera = source.cameras[0];
-    window.emplace(request.serve, camera.width, camera.height, request.run + ", " + request.source.camera);
-    say("Live window: http://127.0.0.1:" + std::to_string(request.serve) + "/");
-  }
   trajectory::Trajectory base;
   if (!request.base.empty()) {
     base = read_base(request.base);
@@ -214,10 +218,17 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   }
   FollowOptions options;
   options.drop = request.drop;
+  options.source_name = request.source.camera;
   options.base_name = request.base.empty() ? request.source.camera : request.base;
   if (base.samples().size() > 1) options.base_start = base.start(), options.base_end = base.end();
   estimation::Filter filter = estimation::start(
       twin, source.cameras, [&](double time) { return base.at(time); }, base.start());
+  std::optional<Window> window;
+  if (request.serve > 0) {
+    const capture::Camera& camera = source.cameras[0];
+    window.emplace(request.serve, camera.width, camera.height, request.run + ", " + request.source.camera);
+    say("Live window: http://127.0.0.1:" + std::to_string(request.serve) + "/");
+  }
   gpu::DevicePtr device;
   std::optional<splat::Engine> engine;
   if (request.solver != "silhouette" && twin.gaussians.count > 0) {
@@ -299,8 +310,8 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   std::vector<double> latencies;
   int lost = 0;
   const Subscriber print = [&](const Followed& followed) {
-    std::cout << estimation::to_json(followed.estimate, followed.latency, request.covariance) << "\n" << std::flush;
-    if (!std::cout) throw WorkError("standard output", "writing failed", "make room or read on");
+    std::cout << estimation::to_json(followed.estimate, followed.latency, request.covariance) << "\n";
+    flush_output();
   };
   const Subscriber keep = [&](const Followed& followed) {
     states.time.push_back(followed.estimate.time);
@@ -309,7 +320,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
     latencies.push_back(followed.latency);
     lost += followed.estimate.lost;
   };
-  std::vector<Subscriber> subscribers{print, keep};
+  std::vector<Subscriber> subscribers{keep, print};  // what cannot be printed is kept nevertheless
   // recorded frames are shown at the pace at which they were taken
   const bool recorded = request.source.calibration.empty();
   const double begun = core::seconds_now();
@@ -329,7 +340,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
       shown.line = recorded_line(source.cameras[0],
                                  chain::nodes(twin.chain, chain::link_motions(twin.chain, e.theta, base.pose(e.time))));
       if (pushed && !e.lost) {
-        const Eigen::Index n = e.theta.size();
+        const Eigen::Index n = std::min(e.theta.size(), e.covariance.rows());  // 0: no covariance
         if (const auto f = force::update(*pushed, e.time, e.theta, e.covariance.topLeftCorner(n, n)))
           show_force(*f, twin, filter.model, source.cameras[0], shown);
       }
@@ -348,6 +359,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
       say(std::to_string(states.time.size()) + " frames" + (lost ? ", lost in " + std::to_string(lost) : "") + "; " +
           latency_text(latencies) + ".");
   };
+  watch_signals();  // a camera never ends by itself
   try {
     follow(source, follower, filter.base, mask, options, subscribers);
   } catch (const Interrupted&) {
