@@ -211,7 +211,7 @@ class Reader {
 
   // A path inside the folder.
   std::optional<std::string> path(const std::string& key, bool required, const char* expected) const {
-    auto value = text(key, required, expected);
+    const auto value = text(key, required, expected);
     if (!value) return std::nullopt;
     const Path normal = Path(*value).lexically_normal();
     if (value->empty() || value->find('\0') != std::string::npos || normal.is_absolute() || normal == "." ||

@@ -179,7 +179,7 @@ Touch touch_at(const dynamics::Model& model, const Frame& frame, const Contact& 
 // radius.
 Touch touch_on_surface(const dynamics::Model& model, const Frame& frame, double arclength, const Options& options) {
   const chain::Chain& chain = model.chain;
-  Touch axis = touch_at(model, frame, contact_at(chain, arclength), options);
+  const Touch axis = touch_at(model, frame, contact_at(chain, arclength), options);
   const Vector3 push = frame.motions[axis.contact.link].rotation.transpose() * axis.fit.force;
   const Vector3 across = push - chain.direction.dot(push) * chain.direction;
   if (across.norm() <= kTouchingWeight * total_mass(model.parameters) * model.parameters.gravity.norm()) return axis;
