@@ -102,11 +102,16 @@ TEST_CASE("frames that do not fit are refused or left out") {
   adaptation::Adaptation online(chain, p, estimates(0.3), {});
   const VectorX rest = VectorX::Zero(3);
   CHECK_THROWS_AS(online.observe({0.0, VectorX::Zero(4), {}, {}}, base_at), InputError);
+  CHECK_THROWS_AS(online.observe({0.0, rest, {}, VectorX::Constant(3, -0.01)}, base_at), InputError);
   CHECK(online.observe({0.0, rest, rest, {}}, base_at));
   CHECK_THROWS_AS(online.observe({0.0, rest, {}, {}}, base_at), InputError);
   CHECK_FALSE(online.observe({1.0 / 30, VectorX::Constant(3, 2.0), {}, {}}, base_at));  // no rope turns that fast
   CHECK(online.left_out() == 1);
   CHECK(online.observe({1.0, rest, {}, {}}, base_at));  // after a gap
   CHECK(online.restarts() == 1);
+  CHECK_THROWS_AS(online.observe({1.0 + 1.0 / 30, rest, {}, VectorX::Constant(3, 1e200)}, base_at), InputError);
   CHECK_THROWS_AS(adaptation::Adaptation(chain, p, {}, {}), InputError);
+  dynamics::Estimates indefinite = estimates(0.3);
+  indefinite.covariance(0, 1) = indefinite.covariance(1, 0) = 1.0;
+  CHECK_THROWS_AS(adaptation::Adaptation(chain, p, indefinite, {}), InputError);
 }

@@ -1,7 +1,9 @@
 // Captures: the demo against its truth, small captures made here with every source of images, and everything that can
 // be wrong with one.
+#include <OpenImageIO/imageio.h>
 #include <doctest/doctest.h>
 
+#include <sys/stat.h>
 #include <unistd.h>
 
 #include <cmath>
@@ -240,8 +242,12 @@ TEST_CASE("the demo: masks, crops and base agree with the truth of the simulatio
 
 TEST_CASE("videos decode to the pixels of another reader, whatever the number of threads") {
   // OpenImageIO reads a video's first frame through its own use of libav
-  const Image8 other = capture::read_image8(kDemo / "cam0.mp4");
+  const auto input = OIIO::ImageInput::open((kDemo / "cam0.mp4").string());
+  REQUIRE(input);
+  Image8 other{input->spec().width, input->spec().height, 3, {}};
   REQUIRE(other.width == 320);
+  other.pixels.resize(static_cast<std::size_t>(3) * other.width * other.height);
+  REQUIRE(input->read_image(0, 0, 0, 3, OIIO::TypeDesc::UINT8, other.pixels.data()));
   for (const int threads : {1, 3}) {
     capture::VideoReader reader(kDemo / "cam0.mp4", threads);
     Image8 image;
@@ -525,6 +531,191 @@ TEST_CASE("everything that can be wrong with capture.json is refused in one line
   CHECK(made.refused() == "");
 }
 
+TEST_CASE("numbers that memory and time follow are bounded, each with its reason") {
+  Made made;
+  const auto with = [&](const std::string& pointer, const Json& value) {
+    const Json before = made.json;
+    made.json[Json::json_pointer(pointer)] = value;
+    const std::string message = made.refused();
+    made.json = before;
+    return message;
+  };
+  CHECK(contains(with("/cameras/0/rate", 1e-7), "cameras[0].rate: 1e-07 is not between 0.1 and 1000000 frames a second"));
+  CHECK(contains(with("/cameras/0/rate", 1e300), "cameras[0].rate: 1e+300 is not between"));
+  Json wide = made.json["cameras"][0];
+  wide["width"] = wide["height"] = 32768;
+  CHECK(contains(with("/cameras/0", wide), "32768x32768 are more than 128 million pixels"));
+  CHECK(contains(with("/cameras/0/fx", 0.9), "0.9 is less than a pixel"));
+  CHECK(contains(with("/cameras/0/world_from_camera/3", 1e200), "world_from_camera: lies more than"));
+  CHECK(contains(with("/object/length", 1e9), "object.length: 1e+09 is more than 100 m"));
+  CHECK(contains(with("/object/diameter", 1e-6), "object.diameter: is less than 1/10000 of the length"));
+  CHECK(contains(with("/object/mass", 1e300), "object.mass"));
+  CHECK(contains(with("/gravity/2", -1e300), "gravity: is more than 1000 m/s^2"));
+  CHECK(contains(with("/base", std::string(5000, 'x')), "is longer than a path can be"));
+  Json crowd = Json::array();
+  for (int c = 0; c < 10000; ++c) {
+    crowd.push_back(made.json["cameras"][0]);
+    crowd.back()["name"] = "cam" + std::to_string(c);
+  }
+  CHECK(contains(with("/cameras", crowd), "capture.json: "));  // 4 MiB are reached first
+  crowd.erase(crowd.begin() + 600, crowd.end());
+  CHECK(contains(with("/cameras", crowd), "cameras: 600 are more than 512"));
+  Json keys = made.json["object"];
+  for (int k = 0; k < 1001; ++k) keys[std::to_string(k)] = k;
+  CHECK(contains(with("/object", keys), "an object has more than 1000 keys"));
+
+  made.write("times.txt", "0\n0.1\n0.2\n1e7\n");
+  CHECK(contains(with("/cameras/0/timestamps", "times.txt"), "timestamps: the frames span 1e+07 s"));
+
+  std::string text = made.json.dump(1);
+  text.replace(text.find("\"length\""), 8, "\"length\": 0.2, \"length\"");
+  made.write("capture.json", text);
+  CHECK(contains(error_of([&] { capture::load(made.path()); }), "the key 'length' stands twice in one object"));
+
+  Warnings warnings;
+  for (int k = 0; k < 900; ++k) made.json["object"]["key" + std::to_string(k) + std::string(1000, 'x')] = k;
+  CHECK(made.refused() == "");
+  CHECK(warnings.mention("object: 900 unknown keys, all ignored"));
+  CHECK(warnings.lines.size() < 10);
+  for (const std::string& line : warnings.lines) CHECK(line.size() < 300);
+}
+
+TEST_CASE("nothing that a capture names is outside its folder, whatever the links") {
+  namespace fs = std::filesystem;
+  Made made;
+  const Path outside = made.path().string() + "_outside";
+  fs::remove_all(outside);
+  fs::create_directories(outside);
+  const auto link = [&](const Path& to, const std::string& name) {
+    fs::remove_all(made.path() / name);
+    fs::create_symlink(to, made.path() / name);
+  };
+  const std::vector<Image8> frames(kFrames, filled(3, [](int x, int y) {
+                                     return std::array<double, 3>{3.0 * x, 4.0 * y, 90};
+                                   }));
+  SUBCASE("a folder that is reached by a link, and links inside") {
+    made.load();
+    fs::create_directory_symlink(made.path(), outside / "way");
+    CHECK(error_of([&] { capture::load(outside / "way"); }) == "");
+    CHECK(error_of([&] { capture::load((outside / "way/").string() + "/capture.json"); }) == "");
+    fs::rename(made.path() / "base.tum", made.path() / "real.tum");
+    link("real.tum", "base.tum");
+    fs::rename(made.path() / "cam0", made.path() / "real");
+    link(made.path() / "real", "cam0");
+    fs::rename(made.path() / numbered("cam1", 2), made.path() / "one.png");
+    link("../one.png", numbered("cam1", 2));
+    CHECK(made.refused() == "");
+  }
+  SUBCASE("the base") {
+    fs::rename(made.path() / "base.tum", outside / "base.tum");
+    link(outside / "base.tum", "base.tum");
+    const std::string message = made.refused();
+    CHECK(contains(message, "base.tum: is a link out of "));
+    CHECK(contains(message, ", to " + fs::canonical(outside / "base.tum").string() + "; copy the file"));
+  }
+  SUBCASE("a video") {
+    capture::write_video(outside / "a.mp4", 10.0, frames);
+    link(outside / "a.mp4", "a.mp4");
+    made.json["cameras"][0]["images"] = "a.mp4";
+    CHECK(contains(made.refused(), "a.mp4: is a link out of "));
+    made.json["cameras"][0]["images"] = "cam0/%06d.png";
+    made.json["cameras"][0]["masks"] = "a.mp4";
+    CHECK(contains(made.refused(), "cameras[0].masks"));
+  }
+  SUBCASE("a folder of images, or one image of it, or a masks' or depth's") {
+    for (const std::string name : {"cam0", "masks/cam0", "depth/cam0"}) {
+      const std::string one = numbered(name, 2);
+      fs::rename(made.path() / one, outside / "one.png");
+      link(outside / "one.png", one);
+      CHECK(contains(made.refused(), one + ": is a link out of "));
+      fs::remove(made.path() / one);
+      fs::rename(outside / "one.png", made.path() / one);
+      fs::rename(made.path() / name, outside / "all");
+      link(outside / "all", name);
+      CHECK(contains(made.refused(), (made.path() / name).string() + ": is a link out of "));
+      CHECK_FALSE(capture::check(made.path()).problems.empty());
+      fs::remove(made.path() / name);
+      fs::rename(outside / "all", made.path() / name);
+      CHECK(made.refused() == "");
+    }
+  }
+  SUBCASE("timestamps, and a way out through a link inside") {
+    std::ofstream(outside / "times.txt") << "0\n0.1\n0.2\n0.3\n";
+    link(outside / "times.txt", "times.txt");
+    made.json["cameras"][0]["timestamps"] = "times.txt";
+    CHECK(contains(made.refused(), "times.txt: is a link out of "));
+    link(".", "here");
+    made.json["cameras"][0]["timestamps"] = "here/../" + outside.filename().string() + "/times.txt";
+    CHECK(contains(made.refused(), "leads out of "));
+  }
+  fs::remove_all(outside);
+}
+
+TEST_CASE("a file that names other files is neither video nor image, whatever it is called") {
+  Made made;
+  const std::vector<Image8> frames(kFrames, filled(3, [](int x, int y) {
+                                     return std::array<double, 3>{3.0 * x, 4.0 * y, 90};
+                                   }));
+  capture::write_video(made.path() / "real.mp4", 10.0, frames);
+  const std::string real = (made.path() / "real.mp4").string();
+  made.json["cameras"][0]["images"] = "cam0.mp4";
+  const std::string playlist = "#EXTM3U\n#EXT-X-VERSION:3\n#EXT-X-TARGETDURATION:1\n#EXTINF:0.4,\nreal.mp4\n#EXT-X-ENDLIST\n";
+  made.write("cam0.mp4", playlist);
+  CHECK(contains(made.refused(), "cam0.mp4: is not a readable video"));
+  made.write("cam0.mp4", "ffconcat version 1.0\nfile 'real.mp4'\n");
+  CHECK(contains(made.refused(), "cam0.mp4: is not a readable video"));
+  // a name that looks like an address is a name
+  std::filesystem::rename(made.path() / "real.mp4", made.path() / "concat:x.mp4");
+  const Path before = std::filesystem::current_path();
+  std::filesystem::current_path(made.path());
+  CHECK(error_of([] { capture::VideoReader reader("concat:x.mp4"); }) == "");
+  std::filesystem::current_path(before);
+  std::filesystem::rename(made.path() / "concat:x.mp4", made.path() / "real.mp4");
+  // OpenImageIO reads videos, too
+  made.json["cameras"][0]["images"] = "cam0/%06d.png";
+  made.write(numbered("cam0", 1), playlist);
+  CHECK(contains(made.refused(), "cam0/000001.png: is not a readable image"));
+  made.write(numbered("cam0", 1), core::read_file(real));
+  CHECK(contains(made.refused(), "cam0/000001.png: is not a readable image"));
+}
+
+TEST_CASE("pipes and folders in place of files end in an error, not in waiting") {
+  Made made;
+  made.load();
+  const auto pipe = [&](const std::string& name) {
+    std::filesystem::remove_all(made.path() / name);
+    REQUIRE(::mkfifo((made.path() / name).c_str(), 0600) == 0);
+  };
+  SUBCASE("the capture") {
+    pipe("capture.json");
+    CHECK(contains(error_of([&] { capture::load(made.path()); }), "capture.json: is a pipe or device, not a file"));
+    CHECK_FALSE(capture::check(made.path()).problems.empty());
+  }
+  SUBCASE("the base") {
+    pipe("base.tum");
+    CHECK(contains(made.refused(), "base.tum: is a pipe or device"));
+    std::filesystem::remove(made.path() / "base.tum");
+    std::filesystem::create_directory(made.path() / "base.tum");
+    CHECK(contains(made.refused(), "base.tum: is a folder"));
+  }
+  SUBCASE("videos and times") {
+    pipe("a.mp4");
+    made.json["cameras"][0]["images"] = "a.mp4";
+    CHECK(contains(made.refused(), "a.mp4: is a pipe or device"));
+    made.json["cameras"][0]["images"] = "cam0";
+    CHECK(contains(made.refused(), "cam0: is a folder"));
+    made.json["cameras"][0]["images"] = "cam0/%06d.png";
+    pipe("times.txt");
+    made.json["cameras"][0]["timestamps"] = "times.txt";
+    CHECK(contains(made.refused(), "times.txt: is a pipe or device"));
+  }
+  SUBCASE("an image") {
+    pipe(numbered("cam0", 0));
+    CHECK(contains(made.refused(), "cam0/000000.png: is missing"));
+    CHECK(contains(error_of([&] { capture::read_image8(made.path() / numbered("cam0", 0)); }), "is not a file"));
+  }
+}
+
 TEST_CASE("files that are missing, cut off or of another kind") {
   Made made;
   const auto spoil = [&](const std::string& name, std::size_t keep) {
@@ -552,7 +743,15 @@ TEST_CASE("files that are missing, cut off or of another kind") {
     std::filesystem::remove_all(made.path() / "cam0");
     CHECK(contains(made.refused(), "cam0/000000.png: is missing"));
   }
-  SUBCASE("a cut-off image, an empty one, a text") {
+  SUBCASE("a cut-off image, an empty one, a text, one with a bit turned in each of its parts") {
+    const std::string whole = core::read_file(made.path() / numbered("cam0", 2));
+    for (std::size_t at = 8; at < whole.size(); at += 5) {
+      std::string damaged = whole;
+      damaged[at] ^= 4;
+      made.write(numbered("cam0", 2), damaged);
+      const std::string error = made.refused();
+      CHECK_MESSAGE((contains(error, "000002.png: is damaged; ") || contains(error, "000002.png: is cut off; ")), at);
+    }
     spoil(numbered("cam0", 2), 60);
     CHECK(contains(made.refused(), "cam0/000002.png"));
     spoil(numbered("cam0", 2), 0);
@@ -637,6 +836,7 @@ TEST_CASE("a calibration is checked as a camera of a capture is") {
   CHECK(contains(refused("width", 64.5), "camera.json: width"));
   CHECK(contains(refused("fx", 1e300), "camera.json: fx"));
   CHECK(contains(refused("rate", -30), "camera.json: rate"));
+  CHECK(contains(refused("rate", 1e-7), "camera.json: rate: 1e-07 is not between 0.1 and 1000000"));
   CHECK(contains(refused("world_from_camera", std::vector<double>(16, 0.0)), "world_from_camera"));
   Json mirrored = good["world_from_camera"];
   for (int c = 0; c < 3; ++c) mirrored[c] = -mirrored[c].get<double>();
@@ -766,10 +966,31 @@ TEST_CASE("check: nothing to complain about in the demo; wrong poses, clocks and
 
 TEST_CASE("the truth of a capture: refused when it is not one, absent without it") {
   const Made made;
+  made.load();  // writes capture.json
   CHECK_FALSE(capture::load_true_centerline(made.path()).has_value());
   std::filesystem::create_directories(made.path() / "truth");
   made.write("truth/centreline.csv", "frame,time,x0,y0,z0\n0,0.0,1,2,3\n1,0.1,1,2,oops\n");
   CHECK(contains(error_of([&] { capture::load_true_centerline(made.path()); }), "centreline.csv:3: column 5"));
+  const std::pair<const char*, const char*> wrong[] = {
+      {"", "centreline.csv: has no row"},
+      {"frame,time,x0,y0,z0\n", "centreline.csv: has no row"},
+      {"t,x,y,z\n0,1,2,3\n", "centreline.csv:1: is not the header"},
+      {"frame,time,x0,y0,z0,x1,y1\n0,0,1,2,3,4,5\n", "centreline.csv:1: is not the header"},
+      {"frame,time,x0,y0,z0,z1,y1,x1\n0,0,1,2,3,4,5,6\n", "centreline.csv:1: is not the header"},
+      {"frame,time,x0,y0,z0\n0,0,1,2,inf\n", "centreline.csv:2: column 5"},
+      {"frame,time,x0,y0,z0\n0,0,1,2\n", "centreline.csv:2: 4 columns"},
+      {"frame,time,x0,y0,z0\n0,0.1,1,2,3\n1,0.1,1,2,3\n", "centreline.csv:3: its time does not come after"},
+  };
+  for (const auto& [text, expected] : wrong) {
+    made.write("truth/centreline.csv", text);
+    INFO(text);
+    CHECK(contains(error_of([&] { capture::load_true_centerline(made.path()); }), expected));
+    CHECK(any_contains(capture::check(made.path()).problems, expected));
+    CHECK(error_of([&] { capture::load(made.path()); }).empty());  // training never opens it
+  }
+  made.write("truth/centreline.csv", "frame,time,x0,y0,z0\n0,77,1,2,3\n1,78,1,2,3\n");
+  CHECK(any_contains(capture::check(made.path()).doubts, "says nothing of the times of"));
+  CHECK(capture::check(made.path()).problems.empty());
 }
 
 TEST_CASE("written images and videos come back") {

@@ -350,6 +350,41 @@ TEST_CASE("Adam on the rendering loss finds the rope from near, and says nothing
   for (int frame = 2; frame <= 5; ++frame) CHECK(errors[frame] < 0.4 * errors[0]);
 }
 
+TEST_CASE("a clock whose zero is elsewhere changes nothing: frames may have negative times") {
+  std::vector<capture::View> views = painted_views();
+  for (int f = 0; f < 3; ++f) std::fill(views[f].rgba.begin(), views[f].rgba.end(), std::uint8_t{0});  // not there yet
+  for (int f = 3; f < 6; ++f)
+    for (std::size_t k = 0; k < views[f].rgba.size(); ++k)
+      if (k % 4 != 3) views[f].rgba[k] = k / 4 % 7 < 3 ? 150 : 120;  // something else
+  views.resize(30);
+  const auto followed = [&](double zero) {
+    estimation::Filter filter = estimation::start(
+        shared_twin(), {front_camera()}, [=](double time) { return moving_base(time - zero); }, zero);
+    filter.compare_colors = compare_painted;
+    std::vector<std::pair<estimation::Estimate, bool>> out;  // and whether it is thought to be touched
+    for (capture::View view : views) {
+      view.time += zero;
+      const capture::View* const one[] = {&view};
+      const estimation::Estimate e = estimation::update(filter, one);
+      out.emplace_back(e, filter.contact_until >= e.time);
+    }
+    return out;
+  };
+  const auto a = followed(5.0), b = followed(-10.0);
+  int lost = 0;
+  for (std::size_t f = 0; f < views.size(); ++f) {
+    CAPTURE(f);
+    CHECK((a[f].first.theta - b[f].first.theta).norm() < 1e-6);
+    CHECK((a[f].first.covariance - b[f].first.covariance).norm() < 1e-6 * a[f].first.covariance.norm());
+    CHECK(a[f].first.lost == b[f].first.lost);
+    CHECK(a[f].second == b[f].second);
+    lost += a[f].first.lost;
+  }
+  CHECK(lost >= 1);
+  CHECK_FALSE(a.back().first.lost);
+  CHECK_FALSE(a.back().second);
+}
+
 TEST_CASE("what hides a part of the rope is not 'no rope'") {
   std::vector<capture::View> views = shared_views();
   for (int f = 12; f < 40; ++f)  // a hand before the middle of the rope
@@ -600,6 +635,11 @@ TEST_CASE("a line of JSON holds what INTERFACE 5 names") {
   CHECK(line["residual"] == 0.25);
   CHECK(line["lost"] == false);
   CHECK(line["latency_ms"].get<double>() == doctest::Approx(7.9));
+  e.theta[1] = NAN;  // JSON knows no such number
+  e.covariance(1, 0) = INFINITY;
+  const auto broken = nlohmann::json::parse(estimation::to_json(e, 0.0079));
+  CHECK(broken["theta"][1].is_null());
+  CHECK(broken["covariance"][1].is_null());
 }
 
 }  // namespace

@@ -454,4 +454,58 @@ TEST_CASE("the contact is the nearest Gaussian on its most probable link, else t
   CHECK(axis.link == 3);
 }
 
+TEST_CASE("a covariance that is none gives an error, never a force") {
+  const Matrix3 prior = Matrix3::Identity();
+  const MatrixX jacobian = MatrixX::Ones(3, 4);
+  const VectorX residual = VectorX::Ones(4);
+  MatrixX covariance = MatrixX::Identity(4, 4);
+  CHECK(force::solve(jacobian, residual, covariance, prior).force.allFinite());
+  for (const double variance : {-1.0, 0.0, static_cast<double>(NAN), static_cast<double>(INFINITY)}) {
+    covariance(1, 1) = variance;
+    CHECK_THROWS_AS(force::solve(jacobian, residual, covariance, prior), InputError);
+  }
+}
+
+TEST_CASE("what is not known of the parameters' covariance is named, and the rest is kept") {
+  const Balanced rope = balance(chain::Bending::planar, bent(8), 0.2, Vector3::Zero());
+  std::vector<std::string> warnings;
+  core::set_listener({[&](const std::string& line) { warnings.push_back(line); }, {}});
+  dynamics::Estimates estimates;
+  estimates.names = {"log_stiffness", "theta_1", "log_damping"};
+  estimates.covariance = 0.01 * MatrixX::Identity(3, 3);
+  CHECK(force::deviations(rope.model, estimates).size() == 2);
+  estimates.covariance.row(1).setConstant(NAN), estimates.covariance.col(1).setConstant(NAN);
+  CHECK(force::deviations(rope.model, estimates).size() == 2);  // an initial angle is no parameter
+  CHECK(warnings.empty());
+  estimates.covariance(2, 2) = NAN;
+  const auto kept = force::deviations(rope.model, estimates);
+  REQUIRE(kept.size() == 1);
+  CHECK(kept[0].parameters.stiffness[0] == doctest::Approx(std::exp(0.1) * rope.model.parameters.stiffness[0]));
+  REQUIRE(warnings.size() == 1);
+  CHECK(warnings[0].find("null for log_damping;") != std::string::npos);
+  estimates.covariance(0, 0) = NAN;
+  CHECK(force::deviations(rope.model, estimates).size() == 16);  // as if nothing had been identified
+  CHECK(warnings.size() == 2);
+  core::set_listener({});
+}
+
+TEST_CASE("a line is JSON, whatever its numbers are") {
+  force::Estimate e;
+  e.time = 0.4;
+  e.contact = {5, 0.18, Vector3::Zero(), 0.0};
+  e.force = Vector3(0.1, -2.0, 1e-5);
+  CHECK(force::is_finite(e));
+  Json line = Json::parse(force::to_json(e, true));
+  CHECK(line["force"] == Json({0.1, -2.0, 1e-5}));
+  CHECK(line["link"] == 5);
+  CHECK(line["unit"] == "N");
+  e.contact.arclength = NAN;
+  e.sigma[1] = INFINITY;
+  CHECK_FALSE(force::is_finite(e));
+  line = Json::parse(force::to_json(e, false));
+  CHECK(line["arclength"].is_null());
+  CHECK(line["sigma"][1].is_null());
+  CHECK(line["unit"] == "N/kg");
+}
+
 }  // namespace

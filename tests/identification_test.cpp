@@ -428,4 +428,17 @@ TEST_CASE("too little or broken data are refused") {
   chain::States broken = s.seen;
   broken.theta[1][0] = NAN;
   CHECK_THROWS_AS(identify(s.chain, s.base, broken, {}, {}), InputError);
+  const Eigen::Index n = s.chain.angles();
+  std::vector<MatrixX> covariances(s.seen.time.size(), 1e-6 * MatrixX::Identity(n, n));
+  for (const double variance : {-1.0, static_cast<double>(NAN), static_cast<double>(INFINITY)}) {
+    covariances[2](1, 1) = variance;
+    CHECK_THROWS_AS(identify(s.chain, s.base, s.seen, covariances, {}), InputError);
+  }
+  // times that no step count can bridge, and times between which nothing moves
+  chain::States apart = s.seen;
+  apart.time.back() = 1e300;
+  CHECK_THROWS_AS(identify(s.chain, s.base, apart, {}, {}), InputError);
+  chain::States near = s.seen;
+  for (std::size_t k = 0; k < near.time.size(); ++k) near.time[k] = 1e-300 * static_cast<double>(k);
+  CHECK_THROWS_AS(identify(s.chain, s.base, near, {}, {}), InputError);
 }

@@ -50,3 +50,53 @@ TEST_CASE("exp, Ad and ad equal the 60-digit vectors") {
     CHECK(error <= 1e-14 * (1.0 + twist.norm()));
   }
 }
+
+TEST_CASE("a covariance is finite, symmetric and positive semidefinite, in any units") {
+  math::MatrixX good(3, 3);
+  good << 4, 2e-6, 0, 2e-6, 1e-12, 0, 0, 0, 0;  // correlated fully, and a number that is known
+  CHECK(math::is_covariance(good));
+  CHECK(math::is_covariance(math::MatrixX()));
+  const auto with = [&](int row, int column, double value) {
+    math::MatrixX m = good;
+    m(row, column) = m(column, row) = value;
+    return m;
+  };
+  CHECK(math::is_covariance(with(0, 1, 2e-6 * (1.0 + 1e-8))));  // rounding
+  CHECK_FALSE(math::is_covariance(with(0, 1, 2.1e-6)));
+  CHECK_FALSE(math::is_covariance(with(1, 1, -1e-30)));
+  CHECK_FALSE(math::is_covariance(with(2, 0, 1e-30)));
+  CHECK_FALSE(math::is_covariance(with(2, 2, NAN)));
+  CHECK_FALSE(math::is_covariance(with(2, 2, INFINITY)));
+  math::MatrixX skew = good;
+  skew(0, 1) = -skew(1, 0);
+  CHECK_FALSE(math::is_covariance(skew));
+  CHECK_FALSE(math::is_covariance(math::MatrixX::Identity(2, 3)));
+  math::MatrixX large = 1e308 * math::MatrixX::Identity(2, 2);
+  CHECK(math::is_covariance(large));
+  large(0, 1) = large(1, 0) = 1.1e308;
+  CHECK_FALSE(math::is_covariance(large));
+}
+
+TEST_CASE("the known part of a covariance has no gap") {
+  math::MatrixX m = math::MatrixX::Identity(4, 4);
+  CHECK(math::known_part(m) == std::vector<Eigen::Index>{0, 1, 2, 3});
+  m.row(1).setConstant(NAN), m.col(1).setConstant(NAN);
+  m(3, 0) = INFINITY;
+  const auto kept = math::known_part(m);
+  CHECK(kept.size() == 2);
+  CHECK(m(kept, kept).allFinite());
+  CHECK(math::known_part(math::MatrixX::Constant(2, 2, NAN)).empty());
+}
+
+TEST_CASE("factors of what is not positive definite are told apart") {
+  math::MatrixX m = math::MatrixX::Identity(2, 2);
+  const auto both = [&](bool positive) {
+    return math::is_positive(Eigen::LLT<math::MatrixX>(m)) == positive &&
+           math::is_positive(Eigen::LDLT<math::MatrixX>(m)) == positive;
+  };
+  CHECK(both(true));
+  for (const double value : {0.0, -1.0, static_cast<double>(NAN), static_cast<double>(INFINITY)}) {
+    m(1, 1) = value;
+    CHECK(both(false));
+  }
+}

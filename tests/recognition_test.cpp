@@ -4,8 +4,10 @@
 #include <unistd.h>
 
 #include <cmath>
+#include <functional>
 
 #include "src/recognition/checkpoint.h"
+#include "src/recognition/modes.h"
 #include "src/recognition/refine_angles.h"
 
 using namespace chainsplat;
@@ -152,6 +154,48 @@ TEST_CASE("refined angles come back to where the picture was drawn") {
   check_silent();
 }
 
+TEST_CASE("a job is another one when anything differs that its result depends on") {
+  capture::Capture capture;
+  for (const int frame : {0, 1, 2}) {
+    capture::View view;
+    view.frame = frame;
+    view.time = 0.1 * frame;
+    view.width = view.height = 1;
+    view.rgba = {9, 9, 9, 255};
+    capture.views.push_back(view);
+  }
+  const std::string job = job_text(capture, {});
+  CHECK(job == job_text(capture, {}));
+  CHECK(job.find("\nframes 0:3\n") != std::string::npos);
+  const auto other_capture = [&](const std::function<void(capture::Capture&)>& change) {
+    capture::Capture changed = capture;
+    change(changed);
+    CHECK(job_text(changed, {}) != job);
+  };
+  other_capture([](auto& c) { c.hash = 1; });
+  other_capture([](auto& c) { c.views[1].time += 1e-3; });
+  other_capture([](auto& c) { c.views[1].x0 = 1; });
+  other_capture([](auto& c) { c.views[1].rgba[3] = 0; });
+  other_capture([](auto& c) {
+    for (capture::View& view : c.views) view.frame += 10;
+  });
+  const auto other_options = [&](const std::function<void(Options&)>& change) {
+    Options changed;
+    change(changed);
+    CHECK(job_text(capture, changed) != job);
+  };
+  other_options([](Options& o) { o.joints = 3; });
+  other_options([](Options& o) { o.bending = chain::Bending::planar; });
+  other_options([](Options& o) { o.twist = true; });
+  other_options([](Options& o) { o.every = 1; });
+  other_options([](Options& o) { o.mode = Mode::paper; });
+  other_options([](Options& o) { o.seed = 1; });
+  other_options([](Options& o) { o.budget = 100; });
+  other_options([](Options& o) { o.step = 0.5; });
+  other_options([](Options& o) { o.paper_gaussians = 100; });
+  other_options([](Options& o) { o.paper_iterations = 100; });
+}
+
 TEST_CASE("a damaged checkpoint gives way to the one before; one of another job is refused") {
   const Path folder = std::filesystem::temp_directory_path() / ("chainsplat_checkpoint_" + std::to_string(getpid()));
   std::filesystem::remove_all(folder);
@@ -175,6 +219,23 @@ TEST_CASE("a damaged checkpoint gives way to the one before; one of another job 
   CHECK(back->snapshot.gaussians.count == 1);
   CHECK(back->watch.least_loss == 0.25);
   CHECK_THROWS_AS(load_checkpoint(folder, "another job"), InputError);
+  c.job = "frames 0:20\n--joints 3\n--seed 0\n";
+  save_checkpoint(c, folder / "other");
+  const auto refusal = [&](const std::string& job) -> std::string {
+    try {
+      load_checkpoint(folder / "other", job);
+    } catch (const InputError& error) {
+      return error.what();
+    }
+    return "";
+  };
+  CHECK(refusal(c.job).empty());
+  CHECK(refusal("frames 0:20\n--joints 4\n--seed 1\n").find("(--joints 3, not 4); ") != std::string::npos);
+  CHECK(refusal("frames 10:30\n--joints 3\n--seed 0\n").find("(frames 0:20, not 10:30); ") != std::string::npos);
+  core::write_file(folder / "other/notes.txt", "somebody else's");
+  remove_checkpoint(folder / "other");
+  CHECK_FALSE(std::filesystem::exists(folder / "other/recognize.bin"));
+  CHECK(std::filesystem::exists(folder / "other/notes.txt"));
   CHECK(warnings.empty());
   const Path last = folder / "recognize.bin", before = folder / "recognize.before.bin";
   const std::string bytes = core::read_file(last), whole = core::read_file(before);

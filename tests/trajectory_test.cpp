@@ -272,4 +272,15 @@ TEST_CASE("TUM files: read, written, refused with file and line") {
   CHECK(contains(error_of([] { trajectory::fit({{0, {}}, {1, {}}, {1, {}}}, "x.tum"); }), "pose 3: its time 1 s"));
   CHECK(contains(error_of([] { trajectory::fit({{0, {}}, {std::nan(""), {}}}, "x.tum"); }), "not finite"));
   CHECK(contains(error_of([] { trajectory::fit({}, "x.tum"); }), "no pose"));
+
+  // what follows the numbers in memory and time is bounded
+  CHECK(contains(error_of([] { trajectory::fit({{0, {}}, {1, {}}, {1e7, {}}}, "x.tum"); }),
+                 "pose 3: comes 1e+07 s after the first and a motion lasts at most 3600 s"));
+  CHECK(error_of([] { trajectory::fit({{1.7e9, {}}, {1.7e9 + 3600, {}}}, "x.tum"); }) == "");
+  Sample far;
+  far.pose.translation.x() = 1e300;
+  CHECK(contains(error_of([&] { trajectory::fit({far}, "x.tum"); }), "pose 1: lies more than 1000000 m"));
+  std::string many;
+  for (int k = 0; k <= 1000000; ++k) many += "0 0 0 0 0 0 0 1\n";
+  CHECK(contains(refused(many), "base.tum:1000001: is beyond the 1000000 poses"));
 }

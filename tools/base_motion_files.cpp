@@ -1,10 +1,21 @@
 #include "base_motion_files.h"
 
+#include <cmath>
 #include <sstream>
 
 namespace chainsplat::tools {
 
 using planning::Axis;
+
+void check_rate(double rate, double seconds, const char* example) {
+  if (!(rate > 0.0) || !std::isfinite(rate)) throw InputError("--rate", "must be above 0", example);
+  constexpr int kMostRows = 1000000;  // some 400 bytes each in memory, more as text
+  if (rate * seconds > kMostRows)
+    throw InputError("--rate",
+                     core::exact(rate) + " rows a second for " + core::exact(seconds) + " s are more than the " +
+                         std::to_string(kMostRows) + " rows that are written at most, since all are held in memory",
+                     example);
+}
 
 std::vector<double> row_times(double end, double rate) {
   constexpr double kSlack = 1e-6;  // s

@@ -7,6 +7,9 @@
 
 namespace chainsplat::tools {
 
+// Throws InputError unless `rate`, the option --rate in rows a second, is above 0 and makes no more rows in `seconds`
+// than memory is meant for. `example`: how to mend it.
+void check_rate(double rate, double seconds, const char* example);
 // k / rate below `end`, then `end`.
 std::vector<double> row_times(double end, double rate);
 std::string motion_tum(const planning::Motion& motion, const std::vector<double>& times);

@@ -31,6 +31,9 @@ using Kind = JobState::Kind;
 constexpr const char* kBatchLock = "logs/lock";
 constexpr double kLookSeconds = 0.2;    // between looks at the children
 constexpr double kRedrawSeconds = 1.0;  // a job's log has a record a second
+// The trainings of a batch that was killed need a moment to leave their checkpoints: a job whose folder is in use lets
+// others go first, at most so long.
+constexpr double kPatienceSeconds = 60.0;
 constexpr double kPlainSeconds = 30.0;  // between lines where standard error is no terminal
 
 struct Request {
@@ -125,7 +128,7 @@ class Board {
     }
     std::fprintf(stderr, "%s\n", line.c_str());
     for (const auto& [pid, child] : children)
-      std::fprintf(stderr, "  %.60s  %.60s\n", child.job->name.c_str(), progress_of(folder_ / child.job->name).c_str());
+      std::fprintf(stderr, "  %.60s  %.60s\n", core::printable(child.job->name).c_str(), core::printable(progress_of(folder_ / child.job->name)).c_str());
     lines_ = 1 + children.size();
   }
   void begin(std::size_t already) { first_ = already; }
@@ -155,6 +158,7 @@ Outcome run_jobs(const Path& folder, const std::vector<const BatchJob*>& todo, s
   std::map<pid_t, Child> children;
   Board board(folder, already + todo.size(), globals);
   board.begin(already);
+  const double begun = core::seconds_now();
   while (!children.empty() || (!queue.empty() && !outcome.signal)) {
     if (const int signal = core::stop_requested(); signal && !outcome.signal) {
       outcome.signal = signal;
@@ -162,8 +166,12 @@ Outcome run_jobs(const Path& folder, const std::vector<const BatchJob*>& todo, s
       for (const auto& [pid, child] : children) ::kill(pid, signal);
     }
     while (!outcome.signal && !queue.empty() && static_cast<int>(children.size()) < parallel) {
-      const BatchJob* job = queue.front();
-      queue.pop_front();
+      const auto at = std::find_if(queue.begin(), queue.end(), [&](const BatchJob* job) {
+        return core::seconds_now() - begun > kPatienceSeconds || !is_locked(folder / job->name / kLockFile);
+      });
+      if (at == queue.end()) break;
+      const BatchJob* const job = *at;
+      queue.erase(at);
       ++attempts[job];
       children[start(folder, *job, globals, threads)] = {job, core::seconds_now()};
     }
@@ -231,6 +239,13 @@ std::string quoted(const std::string& text) {
   return out + "'";
 }
 
+// For a name in which Slurm fills in what follows a percent sign.
+std::string plain(const std::string& text) {
+  std::string out;
+  for (const char letter : text) out.append(letter == '%' ? 2 : 1, letter);
+  return out;
+}
+
 std::vector<std::string> words_of(const std::string& text) {
   std::istringstream stream(text);
   std::vector<std::string> words;
@@ -262,7 +277,7 @@ void submit(const BatchPlan& plan, const Path& folder, const std::vector<const B
   std::string command = "sbatch --parsable --job-name=chainsplat --requeue --open-mode=append --array=" + indices +
                         " --time=" + quoted(request.time_limit) + " --signal=B:USR1@" +
                         std::to_string(request.warn_seconds) +
-                        " --output=" + quoted((folder / "logs/slurm-%a.txt").string());
+                        " --output=" + quoted(plain((folder / "logs").string()) + "/slurm-%a.txt");
   for (const std::string& word : words_of(request.sbatch)) command += " " + quoted(word);
   command += " " + quoted((folder / "logs/slurm.sh").string());
   say_more(command);

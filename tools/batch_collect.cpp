@@ -122,20 +122,23 @@ Row read_row(const BatchJob& job, const Path& folder) {
   const Path run = folder / job.name;
   std::error_code error;
   if (row.state.kind != Kind::done) return row;
-  const Json twin = core::parse_json_or_discard(core::read_file(run / "twin.json"));
-  if (twin.is_object()) {
-    row.scenario = twin["chain"].value("scenario", "");
-    row.length = twin["chain"].value("length", static_cast<double>(NAN));
-    row.version = twin["provenance"].value("version", "");
-    row.device = twin["provenance"].value("device", "");
+  Path file = run / "twin.json";
+  try {
+    const Json twin = core::parse_json(core::read_file(file));
+    row.scenario = twin.at("chain").value("scenario", "");
+    row.length = twin.at("chain").value("length", static_cast<double>(NAN));
+    row.version = twin.at("provenance").value("version", "");
+    row.device = twin.at("provenance").value("device", "");
+    file = run / kMetricsFile;
+    if (!fs::exists(file, error)) return row;  // --stages without evaluate
+    const Json metrics = core::parse_json(core::read_file(file));
+    for (std::size_t p = 0; p < kParts.size(); ++p)
+      for (std::size_t c = 0; c < kColumns.size(); ++c)
+        if (metrics.contains(kParts[p]))
+          row.values[p][c] = metrics.at(kParts[p]).at("mean").value(kColumns[c].key, static_cast<double>(NAN));
+  } catch (const Json::exception&) {
+    core::warn(file.string() + ": is damaged; its numbers are left out");
   }
-  if (!fs::exists(run / kMetricsFile, error)) return row;  // --stages without evaluate
-  const Json metrics = core::parse_json_or_discard(core::read_file(run / kMetricsFile));
-  if (!metrics.is_object()) return row;
-  for (std::size_t p = 0; p < kParts.size(); ++p)
-    for (std::size_t c = 0; c < kColumns.size(); ++c)
-      if (metrics.contains(kParts[p]))
-        row.values[p][c] = metrics[kParts[p]]["mean"].value(kColumns[c].key, static_cast<double>(NAN));
   return row;
 }
 

@@ -1,6 +1,7 @@
 // batch_plan.cpp - a job file becomes a list of jobs, or one line that says what is wrong with it.
 #include <glob.h>
 
+#define TOML_MAX_NESTED_VALUES 16  // lists in lists; a document is freed by recursion
 #include <toml++/toml.h>
 #include <CLI/CLI.hpp>
 #include <algorithm>
@@ -175,13 +176,30 @@ std::vector<std::string> texts_of(const toml::node* node, const std::string& whe
   return texts;
 }
 
+// A key with dots makes a table in a table for each, and these are freed by recursion, too. toml++ bounds lists only.
+void check_dots(std::string_view text, const std::string& name) {
+  constexpr std::size_t kMostText = 1 << 20;  // bytes
+  constexpr int kMostDots = 100;              // in a line
+  if (text.size() > kMostText) throw InputError(name, "is larger than 1 MiB, which no list of jobs is", "shorten it");
+  int line = 1, dots = 0;
+  for (const char letter : text) {
+    line += letter == '\n';
+    dots = letter == '\n' ? 0 : dots + (letter == '.');
+    if (dots > kMostDots)
+      throw InputError(name + ": line " + std::to_string(line), "has more than " + std::to_string(kMostDots) + " dots",
+                       "break the line");
+  }
+}
+
 }  // namespace
 
 BatchPlan read_job_file(const Path& file) {
   const std::string name = file.string();
   toml::table document;
   try {
-    document = toml::parse(core::read_file(file), name);
+    const std::string text = core::read_file(file);
+    check_dots(text, name);
+    document = toml::parse(text, name);
   } catch (const toml::parse_error& error) {
     throw InputError(name + ": line " + std::to_string(error.source().begin.line), std::string(error.description()),
                      "write it as TOML, see 'chainsplat batch --help'");
@@ -275,6 +293,11 @@ BatchPlan load_plan(const Path& folder) {
     for (const Json& entry : document.at("jobs"))
       plan.jobs.push_back({entry.at("name"), entry.at("capture"), entry.at("settings"), entry.at("seed"),
                            entry.at("arguments").get<std::vector<std::string>>()});
+    for (const BatchJob& job : plan.jobs)  // names a folder in this one
+      if (job.name.empty() || job.name.find_first_of(std::string_view("/\0", 2)) != std::string::npos ||
+          job.name == "." || job.name == "..")
+        throw InputError(file.string(), "a job's name is '" + job.name + "', which is no folder's",
+                         "run 'chainsplat batch JOBS.toml -o' again, it is made anew");
   } catch (const Json::exception&) {
     throw InputError(file.string(), "is damaged", "run 'chainsplat batch JOBS.toml -o' again, it is made anew");
   }

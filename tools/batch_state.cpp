@@ -39,11 +39,14 @@ std::string progress_of(const Path& run) {
   const std::size_t begin = end == 0 ? std::string::npos : tail.rfind('\n', end - 1);
   const std::string line = tail.substr(begin == std::string::npos ? 0 : begin + 1, end);
   const Json record = core::parse_json_or_discard(line);
-  if (!record.is_object() || !record.contains("stage")) return "";
-  std::string text = record["stage"];
-  const std::int64_t step = record.value("iteration", 0), total = record.value("total", 0);
-  if (total > 0) text += " " + std::to_string(step) + "/" + std::to_string(total);
-  return text;
+  try {
+    std::string text = record.at("stage");
+    const std::int64_t step = record.value("iteration", 0), total = record.value("total", 0);
+    if (total > 0) text += " " + std::to_string(step) + "/" + std::to_string(total);
+    return text;
+  } catch (const Json::exception&) {  // the line is not of our making
+    return "";
+  }
 }
 
 void save_end(const Path& folder, const BatchJob& job, const JobEnd& end) {
@@ -99,7 +102,7 @@ std::string status_text(const BatchPlan& plan, const Path& folder) {
     ++count[static_cast<std::size_t>(state.kind)];
     char head[96];
     std::snprintf(head, sizeof head, "%-8s %8.1f s  ", kind_name(state.kind), state.seconds);
-    lines += head + job.name + (state.detail.empty() ? "" : "  " + state.detail) + "\n";
+    lines += head + core::printable(job.name + (state.detail.empty() ? "" : "  " + state.detail)) + "\n";
   }
   std::string total = std::to_string(plan.jobs.size()) + " jobs";
   for (std::size_t k = 0; k < count.size(); ++k)

@@ -138,7 +138,8 @@ double median(std::vector<double> values) {
   return values.empty() ? 0.0 : values[values.size() / 2];
 }
 
-std::vector<int> numbers(const std::string& text, const char* option) {
+// `most`: what memory is meant for.
+std::vector<int> numbers(const std::string& text, const char* option, int most) {
   std::vector<int> out;
   std::istringstream words(text);
   std::string word;
@@ -150,6 +151,9 @@ std::vector<int> numbers(const std::string& text, const char* option) {
     }
     if (out.back() < 1)
       throw InputError(option, "'" + word + "' is not a positive number", "give numbers with commas between");
+    if (out.back() > most)
+      throw InputError(option, "'" + word + "' is more than " + std::to_string(most) + ", which would fill the memory",
+                       "give smaller numbers with commas between");
   }
   return out;
 }
@@ -337,12 +341,13 @@ Json bench_capture(gpu::Device& device, const Path& folder, std::uint64_t seed) 
 void bench(const Globals& globals, const Request& request) {
   if (request.scene != "far" && request.scene != "close" && request.scene != "both")
     throw InputError("--scene", "'" + request.scene + "' is not a scene", "name far, close or both");
-  if (request.repeats < 1) throw InputError("--repeats", "is less than 1", "measure at least once");
   std::vector<Case> cases(kCases.begin(), kCases.end());
   if (!request.gaussians.empty() || !request.views.empty()) {
     cases.clear();
-    for (const int count : numbers(request.gaussians.empty() ? "2000" : request.gaussians, "--gaussians"))
-      for (const int views : numbers(request.views.empty() ? "1" : request.views, "--views"))
+    constexpr int kMostGaussians = 2000000, kMostViews = 1000;
+    for (const int count :
+         numbers(request.gaussians.empty() ? "2000" : request.gaussians, "--gaussians", kMostGaussians))
+      for (const int views : numbers(request.views.empty() ? "1" : request.views, "--views", kMostViews))
         for (const bool close : {false, true}) cases.push_back({close, count, views, 8, request.whole});
   }
   if (request.only_capture && request.capture.empty())
@@ -415,7 +420,9 @@ void add_bench_command(CLI::App& app, const Globals& globals, Job& job) {
   command->add_flag("--only-capture", request->only_capture, "Nothing but the capture's work");
   command->add_flag("--whole", request->whole, "Whole images of 640x480 in these, not crops about the rope");
   command->add_option("--scene", request->scene, "far (1 % of the image), close (8 %) or both")->capture_default_str();
-  command->add_option("--repeats", request->repeats, "Measurements of each")->capture_default_str();
+  command->add_option("--repeats", request->repeats, "Measurements of each")
+      ->check(CLI::Range(1, 10000))
+      ->capture_default_str();
   command->callback([&globals, &job, request] { job = [&globals, request] { bench(globals, *request); }; });
 }
 

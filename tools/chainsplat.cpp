@@ -3,7 +3,7 @@
 #include <csignal>
 #include <cstdio>
 #include <cstdlib>
-#include <iostream>
+#include <system_error>
 
 #include "cli.h"
 #include "memory.h"
@@ -18,8 +18,9 @@ constexpr int kDone = 0, kWorkFailed = 1, kWrongRequest = 2;
 int fail(int code, std::string text) {
   for (char& letter : text)
     if (letter == '\n' || letter == '\r') letter = ' ';
+  if (text.starts_with(": ")) text.insert(0, "''");  // an empty file name
   tools::end_progress();
-  std::fprintf(stderr, "chainsplat: error: %s\n", text.c_str());
+  std::fprintf(stderr, "chainsplat: error: %s\n", core::printable(text).c_str());
   return code;
 }
 
@@ -34,6 +35,15 @@ std::string command_line_error(const CLI::App& app, const CLI::ParseError& error
   }
   const std::string command = chosen.front()->get_name();
   return "chainsplat " + command + ": " + what + "; see 'chainsplat " + command + " --help'";
+}
+
+// An empty name, as of a variable that a script has not set, would mean the folder one stands in, or nothing.
+void refuse_empty_output(const CLI::App& app) {
+  for (const CLI::App* command : app.get_subcommands()) {
+    const CLI::Option* output = command->get_option_no_throw("--output");
+    if (output && output->count() > 0 && output->as<std::string>().empty())
+      throw InputError("--output", "is empty", "name the file or folder to write");
+  }
 }
 
 int run(int argc, char** argv) {
@@ -83,14 +93,17 @@ int run(int argc, char** argv) {
       "Lengths in meters, angles in radians, time in seconds, mass in kilograms, forces in newtons.\n"
       "Exit codes: 0 done; 1 the work failed, what exists is kept; 2 the request or its input is wrong, nothing "
       "written;\n"
-      "130, 143 interrupted, a checkpoint was left (SIGUSR1: the same and 0).");
+      "130, 143 interrupted, a checkpoint was left (SIGUSR1: the same and 0); 141 nobody reads the output any more.");
   try {
     app.parse(argc, argv);
   } catch (const CLI::Success& success) {
-    return app.exit(success);
+    const int code = app.exit(success);
+    tools::flush_output();
+    return code;
   } catch (const CLI::ParseError& error) {
     return fail(kWrongRequest, command_line_error(app, error));
   }
+  refuse_empty_output(app);
   tools::start_listening(globals);
   core::set_threads(globals.threads);
   // the CPU driver of Mesa has threads of its own
@@ -101,8 +114,7 @@ int run(int argc, char** argv) {
   }
   job();
   tools::end_progress();
-  std::cout.flush();
-  if (!std::cout) throw WorkError("standard output", "writing failed", "make room or name another file");
+  tools::flush_output();
   return kDone;
 }
 
@@ -110,6 +122,7 @@ int run(int argc, char** argv) {
 
 int main(int argc, char** argv) {
   tools::keep_memory_together();
+  tools::prepare_output();
   std::signal(SIGXFSZ, SIG_IGN);  // a file size limit is an error of write(), not an end without a word
   try {
     return run(argc, argv);
@@ -122,6 +135,8 @@ int main(int argc, char** argv) {
     return interrupted.signal == SIGUSR1 ? kDone : 128 + interrupted.signal;
   } catch (const std::bad_alloc&) {
     return fail(kWorkFailed, "memory: there is not enough of it; use fewer --frames or a machine with more");
+  } catch (const std::system_error& error) {  // of a thread or a file
+    return fail(kWorkFailed, std::string("system: ") + error.what() + "; see what it allows with 'ulimit -a' and df");
   } catch (const std::exception& error) {
     return fail(kWorkFailed,
                 std::string("internal: ") + error.what() + "; this is a defect, please report the command");

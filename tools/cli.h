@@ -2,7 +2,9 @@
 #pragma once
 #include <cstdint>
 #include <functional>
+#include <iosfwd>
 #include <string>
+#include <vector>
 
 #include "chainsplat/core.h"
 
@@ -47,26 +49,39 @@ void log_to(const Path& file);
 void end_progress();                     // leaves the redrawn line
 void say(const std::string& line);       // a message on standard error, unless -q
 void say_more(const std::string& line);  // only with -v
-// SIGINT, SIGTERM and SIGUSR1 ask long work to stop; a second SIGINT quits at once.
-void watch_signals();
+// SIGINT, SIGTERM and SIGUSR1 ask long work to stop; a second SIGINT or SIGTERM quits at once, and so does the first
+// as long as there is nothing to keep.
+void watch_signals(bool nothing_to_keep = false);
+// Standard input, output and error as the program needs them: none of them is closed, and a pipe that nobody reads is
+// an error of writing, not an end without a word.
+void prepare_output();
+// What was printed is out. Throws Interrupted (SIGPIPE) where nobody reads it any more, else WorkError.
+void flush_output();
 
 // --- results.cpp --------------------------------------------------------------------------------
 // "-" is standard input.
 Path input_path(const std::string& name);
+// The next line; false at the end. Throws InputError where it is longer than any that is meant (a device may never end
+// one).
+bool next_line(std::istream& in, std::string& line, const std::string& where);
+// "X,Y,Z": numbers between commas, `count` of them (0: one or more). Throws InputError with `where`.
+std::vector<double> numbers(const std::string& text, const std::string& where, std::size_t count);
 // Writes `bytes` to standard output ("-"), into a device or pipe that exists, else as a file in one step.
 void write_result(const std::string& name, const std::string& bytes);
 // Throws InputError unless `folder` can be filled: it is absent or empty, or `overwrite`. Makes nothing.
 void check_output_folder(const Path& folder, bool overwrite, const std::string& mend);
+// Throws InputError where `folder`, that results go to, is the folder of the capture they are made from.
+void check_not_capture(const Path& folder, const Path& capture);
 // Throws InputError unless `file` can be made: its folder exists and it is no folder itself.
 void check_output_file(const std::string& file);
 // Makes a folder and those above it. Throws WorkError.
 void make_folder(const Path& folder);
-// What an input's fault is once work has begun: exit code 1, and `kept` says what there is.
-WorkError broken_off(const InputError& error, const std::string& kept);
+// What an error is once work has begun, an input's fault too: exit code 1, and `kept` says what there is.
+WorkError broken_off(const std::runtime_error& error, const std::string& kept);
 // CAPTURE[:camera] as the two; the second is empty for all cameras. A folder whose own name has a colon is taken as it
 // is.
 std::pair<std::string, std::string> split_camera(const std::string& text);
-// "A:B", "A:" or ":B" as [first, last); last = -1: to the end. Throws InputError.
-std::pair<int, int> parse_frames(const std::string& text);
+// "A:B", "A:" or ":B" as [first, last); last = -1: to the end. Throws InputError; `where` says whose text it is.
+std::pair<int, int> parse_frames(const std::string& text, const std::string& where = "--frames");
 
 }  // namespace chainsplat::tools

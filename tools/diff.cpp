@@ -122,12 +122,17 @@ Json mean_metrics(const Path& run) {
   std::error_code error;
   if (!fs::exists(run / kMetricsFile, error)) return Json::object();
   const Json document = core::parse_json_or_discard(core::read_file(run / kMetricsFile));
-  if (!document.is_object())
-    throw InputError((run / kMetricsFile).string(), "is not JSON or is cut off", "run 'chainsplat eval' again");
+  const auto require = [&](bool sound, const std::string& what) {
+    if (!sound) throw InputError((run / kMetricsFile).string(), what, "run 'chainsplat eval' again");
+  };
+  require(document.is_object(), "is not JSON or is cut off");
   Json means = Json::object();
   for (const auto& [part, metrics] : document.items()) {
-    const Json mean = metrics.value("mean", Json::object());
-    for (const auto& [key, value] : mean.items()) means[part + " " + key] = value;
+    require(metrics.is_object() && metrics.contains("mean") && metrics["mean"].is_object(), part + ".mean is no object");
+    for (const auto& [key, value] : metrics["mean"].items()) {
+      require(value.is_number(), part + ".mean." + key + " is no number");
+      means[part + " " + key] = value;
+    }
   }
   return means;
 }

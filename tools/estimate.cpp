@@ -40,7 +40,7 @@ struct Followed {
   const estimation::Estimate& estimate;
   double latency;  // s, from the decoded frame until now
 };
-// Called after every frame, in the order given: the JSON line first.
+// Called after every frame, in the order given.
 using Subscriber = std::function<void(const Followed&)>;
 
 // The mask of a picture; `theta` is where the rope is expected, none when that is not known.
@@ -57,7 +57,7 @@ struct FollowOptions {
   int drop = 1;
   double base_start = -std::numeric_limits<double>::infinity();  // s, from when the base's motion is known
   double base_end = std::numeric_limits<double>::infinity();     // s, and until when
-  std::string base_name;
+  std::string base_name, source_name;
 };
 
 // Frame by frame until the source ends.
@@ -65,8 +65,16 @@ void follow(FrameSource& source, const Follower& follower, const dynamics::BaseF
             const FollowOptions& options, const std::vector<Subscriber>& subscribers) {
   LiveFrame frame;
   std::vector<capture::View> made;
+  double last = -std::numeric_limits<double>::infinity();  // s
   for (int read = 0; source.next(frame); ++read) {
     if (core::stop_requested()) throw Interrupted(core::stop_requested());
+    if (!(frame.time > last))
+      throw WorkError(options.source_name,
+                      "frame " + std::to_string(frame.frame) + " is at " + core::exact(frame.time) +
+                          " s, not after the one before",
+                      "give times that increase, and near enough to 0 that a frame's interval is told; the states so "
+                      "far are kept");
+    last = frame.time;
     if (read % options.drop != 0) continue;
     constexpr double kSlack = 1.0 / 30.0;  // s, a frame beyond the first or last sample
     if (read == 0 && frame.time < options.base_start - kSlack)
@@ -91,11 +99,30 @@ void follow(FrameSource& source, const Follower& follower, const dynamics::BaseF
   }
 }
 
+// What a stream has come to so far, in the same memory however long it lasts.
+struct Tally {
+  static constexpr double kShortest = 1e-6;  // s, latency of the first bin
+  static constexpr double kGrowth = 1.01;    // from bin to bin: latencies are told to 1 %
+  std::array<std::int64_t, 2100> bins{};     // up to 1,000 s
+  std::int64_t frames = 0, lost = 0;
+  double first_time = 0.0;  // s, of the first frame
+};
+
+void count(Tally& tally, const estimation::Estimate& estimate, double latency) {
+  if (tally.frames++ == 0) tally.first_time = estimate.time;
+  tally.lost += estimate.lost;
+  const double bin = std::log(std::max(latency, Tally::kShortest) / Tally::kShortest) / std::log(Tally::kGrowth);
+  ++tally.bins[static_cast<std::size_t>(std::min(bin, static_cast<double>(tally.bins.size() - 1)))];
+}
+
 // "p50 0.71 ms, p99 4.90 ms"
-std::string latency_text(std::vector<double> latencies) {
-  std::sort(latencies.begin(), latencies.end());
-  const auto at = [&](double share) {
-    return latencies[std::min(latencies.size() - 1, static_cast<std::size_t>(share * latencies.size()))];
+std::string latency_text(const Tally& tally) {
+  const auto at = [&](double share) {  // the middle of the bin in which this share of the frames is reached
+    std::size_t bin = 0;
+    for (auto within = static_cast<double>(tally.bins[0]);
+         within < share * static_cast<double>(tally.frames) && bin + 1 < tally.bins.size();)
+      within += static_cast<double>(tally.bins[++bin]);
+    return Tally::kShortest * std::pow(Tally::kGrowth, static_cast<double>(bin) + 0.5);
   };
   char text[64];
   std::snprintf(text, sizeof text, "p50 %.2f ms, p99 %.2f ms", 1e3 * at(0.5), 1e3 * at(0.99));
@@ -188,20 +215,16 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   if (!request.centerline.empty()) check_output_file(request.centerline);
   if (request.centerline == "-")
     throw InputError("--centerline", "standard output is for the estimates", "name a file");
+  if (request.base == "-" && request.source.camera == "-")
+    throw InputError("--base", "standard input is for the frames", "name a file");
   std::tie(request.source.first, request.source.last) = parse_frames(request.frames);
   const twin::Twin twin = load_twin(request.run);
   if (!twin.parameters)
     core::warn(request.run + ": its dynamics are not identified; angles are assumed to go on at constant rate");
 
   request.source.pictures = request.serve > 0;
-  watch_signals();  // a camera never ends by itself
+  watch_signals(true);
   FrameSource source = open_frames(request.source);
-  std::optional<Window> window;
-  if (request.serve > 0) {
-    const capture::Camera& camera = source.cameras[0];
-    window.emplace(request.serve, camera.width, camera.height, request.run + ", " + request.source.camera);
-    say("Live window: http://127.0.0.1:" + std::to_string(request.serve) + "/");
-  }
   trajectory::Trajectory base;
   if (!request.base.empty()) {
     base = read_base(request.base);
@@ -214,10 +237,17 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   }
   FollowOptions options;
   options.drop = request.drop;
+  options.source_name = request.source.camera;
   options.base_name = request.base.empty() ? request.source.camera : request.base;
   if (base.samples().size() > 1) options.base_start = base.start(), options.base_end = base.end();
   estimation::Filter filter = estimation::start(
       twin, source.cameras, [&](double time) { return base.at(time); }, base.start());
+  std::optional<Window> window;
+  if (request.serve > 0) {
+    const capture::Camera& camera = source.cameras[0];
+    window.emplace(request.serve, camera.width, camera.height, request.run + ", " + request.source.camera);
+    say("Live window: http://127.0.0.1:" + std::to_string(request.serve) + "/");
+  }
   gpu::DevicePtr device;
   std::optional<splat::Engine> engine;
   if (request.solver != "silhouette" && twin.gaussians.count > 0) {
@@ -295,21 +325,19 @@ void estimate(const Globals& globals, EstimateRequest& request) {
     return view;
   };
 
-  chain::States states;
-  std::vector<double> latencies;
-  int lost = 0;
+  chain::States states;  // of all frames, where a centerline is to be written
+  Tally tally;
   const Subscriber print = [&](const Followed& followed) {
-    std::cout << estimation::to_json(followed.estimate, followed.latency, request.covariance) << "\n" << std::flush;
-    if (!std::cout) throw WorkError("standard output", "writing failed", "make room or read on");
+    std::cout << estimation::to_json(followed.estimate, followed.latency, request.covariance) << "\n";
+    flush_output();
   };
   const Subscriber keep = [&](const Followed& followed) {
+    count(tally, followed.estimate, followed.latency);
+    if (request.centerline.empty()) return;
     states.time.push_back(followed.estimate.time);
     states.theta.push_back(followed.estimate.theta);
-    states.thetadot.push_back(followed.estimate.thetadot);
-    latencies.push_back(followed.latency);
-    lost += followed.estimate.lost;
   };
-  std::vector<Subscriber> subscribers{print, keep};
+  std::vector<Subscriber> subscribers{keep, print};  // what cannot be printed is kept nevertheless
   // recorded frames are shown at the pace at which they were taken
   const bool recorded = request.source.calibration.empty();
   const double begun = core::seconds_now();
@@ -329,14 +357,14 @@ void estimate(const Globals& globals, EstimateRequest& request) {
       shown.line = recorded_line(source.cameras[0],
                                  chain::nodes(twin.chain, chain::link_motions(twin.chain, e.theta, base.pose(e.time))));
       if (pushed && !e.lost) {
-        const Eigen::Index n = e.theta.size();
+        const Eigen::Index n = std::min(e.theta.size(), e.covariance.rows());  // 0: no covariance
         if (const auto f = force::update(*pushed, e.time, e.theta, e.covariance.topLeftCorner(n, n)))
           show_force(*f, twin, filter.model, source.cameras[0], shown);
       }
       if (!followed.frame.picture.pixels.empty()) shown.picture = &followed.frame.picture;
       if (!followed.views.empty()) shown.view = &followed.views[0];
       window->show(shown);
-      while (recorded && !core::stop_requested() && core::seconds_now() - begun < e.time - states.time.front())
+      while (recorded && !core::stop_requested() && core::seconds_now() - begun < e.time - tally.first_time)
         std::this_thread::sleep_for(std::chrono::milliseconds(1));
     });
   const auto write = [&] {
@@ -344,10 +372,11 @@ void estimate(const Globals& globals, EstimateRequest& request) {
       write_result(request.centerline, twin::centerline_csv(twin.chain, states, base));
   };
   const auto summarize = [&] {
-    if (!states.time.empty())
-      say(std::to_string(states.time.size()) + " frames" + (lost ? ", lost in " + std::to_string(lost) : "") + "; " +
-          latency_text(latencies) + ".");
+    if (tally.frames > 0)
+      say(std::to_string(tally.frames) + " frames" + (tally.lost ? ", lost in " + std::to_string(tally.lost) : "") + "; " +
+          latency_text(tally) + ".");
   };
+  watch_signals();  // a camera never ends by itself
   try {
     follow(source, follower, filter.base, mask, options, subscribers);
   } catch (const Interrupted&) {
@@ -356,7 +385,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
     throw;
   } catch (const InputError& error) {
     write();
-    if (states.time.empty()) throw;
+    if (tally.frames == 0) throw;
     throw broken_off(error, "the states so far are kept");
   } catch (...) {
     write();
@@ -364,7 +393,7 @@ void estimate(const Globals& globals, EstimateRequest& request) {
   }
   write();
   summarize();
-  if (states.time.empty())
+  if (tally.frames == 0)
     throw InputError(request.source.camera, "has no frame", "name a camera that recorded something");
 }
 

@@ -1,5 +1,6 @@
 // excite.cpp - excite: the base motion that is to be recorded next.
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <cmath>
 #include <cstdio>
 #include <iostream>
@@ -78,9 +79,8 @@ Json document_of(const excitation::Result& result, const Request& request) {
 
 void excite(const Globals& globals, Request& request) {
   watch_signals();
-  if (!(request.rate > 0.0) || !std::isfinite(request.rate))
-    throw InputError("--rate", "must be above 0", "give rows a second, for example 100");
   excitation::Options& options = request.options;
+  check_rate(request.rate, options.duration, "give rows a second, for example 100");
   options.seed = globals.seed;
   if (!request.axes.empty()) options.axes = parse_axes(request.axes);
   const Path out = request.out;
@@ -105,6 +105,13 @@ void excite(const Globals& globals, Request& request) {
   problem.recorded = [&](double t) { return base.at(t); };
   problem.recorded_start = twin.states.time.front();
   problem.recorded_end = twin.states.time.back();
+  constexpr int kMostFrames = 100000;  // each has the derivatives of all angles by all parameters: some 10 kB
+  if (const double seconds = std::max(options.duration, problem.recorded_end - problem.recorded_start);
+      options.frame_rate * seconds > kMostFrames)
+    throw InputError("--frame-rate",
+                     core::exact(options.frame_rate) + " frames a second for " + core::exact(seconds) +
+                         " s are more than the " + std::to_string(kMostFrames) + " frames that fit into memory",
+                     "give those of the camera, for example 30");
   options.noise = request.noise > 0.0 ? 1e-3 * request.noise : noise_of(twin, base);
 
   const excitation::Result result = excitation::excite(problem, options);
@@ -122,7 +129,7 @@ void excite(const Globals& globals, Request& request) {
     core::write_file(out / "excite.json", document.dump(1) + "\n");
   }
   if (globals.json) {
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
     return;
   }
   const excitation::Prediction& p = result.prediction;

@@ -8,19 +8,17 @@
 #include <iostream>
 #include <limits>
 #include <memory>
-#include <nlohmann/json.hpp>
 #include <sstream>
 
 #include "chainsplat/force.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
+#include "estimate_lines.h"
 #include "run_folder.h"
 
 namespace chainsplat::tools {
 
 namespace {
-
-using Json = nlohmann::ordered_json;
 
 constexpr double kNear = 3.0;       // diameters from the rope within which something may touch it
 constexpr double kLiveApart = 0.1;  // s, how far from a state a line of a contact file may be, where states come in
@@ -38,38 +36,14 @@ struct State {
 };
 
 // A line of `estimate`; none where it is lost. `before`: time of the state before.
-std::optional<State> read_estimate(const std::string& line, const std::string& where, const chain::Chain& chain,
+std::optional<State> read_estimate(const std::string& text, const std::string& where, const chain::Chain& chain,
                                    double before) {
-  const int angles = chain.angles();
-  State out;
-  try {
-    const Json object = core::parse_json(line);
-    if (object.value("lost", false)) return {};
-    const auto theta = object.at("theta").get<std::vector<double>>();
-    const auto deviation = object.at("sigma").get<std::vector<double>>();
-    out.time = object.at("time").get<double>();
-    if (static_cast<int>(theta.size()) != angles || (!deviation.empty() && deviation.size() != theta.size()))
-      throw InputError(where, "has not the twin's " + std::to_string(angles) + " angles",
-                       "give estimates of this twin");
-    if (!(out.time > before)) throw InputError(where, "its time does not increase", "give the lines in order");
-    out.theta = Eigen::Map<const math::VectorX>(theta.data(), angles);
-    if (deviation.empty()) return out;  // as estimate's solver adam writes it
-    if (!object.contains("covariance")) {
-      out.standing =
-          force::angle_covariance(chain, out.theta, Eigen::Map<const math::VectorX>(deviation.data(), angles));
-      return out;
-    }
-    const auto triangle = object.at("covariance").get<std::vector<double>>();
-    const std::size_t all = 2 * static_cast<std::size_t>(angles);  // with the rates: their rows follow
-    if (triangle.size() != angles * (angles + std::size_t{1}) / 2 && triangle.size() != all * (all + 1) / 2)
-      throw InputError(where + ": covariance", "is no lower triangle of the angles", "give the output of estimate");
-    out.standing.resize(angles, angles);
-    for (int row = 0, i = 0; row < angles; ++row)
-      for (int column = 0; column <= row; ++column, ++i)
-        out.standing(row, column) = out.standing(column, row) = triangle[i];
-  } catch (const Json::exception&) {
-    throw InputError(where, "is no line of 'chainsplat estimate'", "give its output");
-  }
+  const std::optional<EstimateLine> line = read_estimate_line(text, where, chain.angles(), before);
+  if (!line) return {};
+  State out{line->time, line->theta, {}};
+  if (line->sigma.size() == 0) return out;  // as estimate's solver adam writes it
+  out.standing =
+      line->covariance.size() > 0 ? line->covariance : force::angle_covariance(chain, line->theta, line->sigma);
   return out;
 }
 
@@ -83,12 +57,18 @@ void each_state(const ForceRequest& request, const chain::Chain& chain, const st
   std::ifstream in(input_path(request.estimate));
   if (!in) throw InputError(request.estimate, "cannot be read", "give the output of estimate, or - for standard input");
   double before = -std::numeric_limits<double>::infinity();
+  std::optional<bool> known;  // whether the lines have deviations
   std::string line;
-  for (int number = 1; std::getline(in, line); ++number) {
+  for (int number = 1; next_line(in, line, request.estimate); ++number) {
     if (line.empty()) continue;
     const auto state = read_estimate(line, request.estimate + ": line " + std::to_string(number), chain, before);
     if (!state) continue;
     before = state->time;
+    if (!known) known = state->standing.size() > 0;
+    if (*known != (state->standing.size() > 0))
+      throw InputError(request.estimate + ": line " + std::to_string(number),
+                       *known ? "has no deviations, unlike the lines before" : "has deviations, unlike the lines before",
+                       "give the output of one run of estimate");
     take(*state);
   }
 }
@@ -192,8 +172,15 @@ void force(const Globals& globals, const ForceRequest& request) {
                        "give the base motion of these states with --base");
   };
   std::size_t lines = 0, touching = 0;
+  const auto check = [&](const force::Estimate& e) {
+    if (!force::is_finite(e))
+      throw InputError(source, "the force at " + core::exact(e.time) + " s is not a finite number",
+                       "check the states about that time and the twin's parameters");
+  };
   const auto write = [&](const force::Estimate& e) {
-    std::cout << force::to_json(e, twin.known_mass) << "\n" << std::flush;
+    check(e);
+    std::cout << force::to_json(e, twin.known_mass) << "\n";
+    flush_output();
     ++lines;
     touching += e.touching;
   };
@@ -214,12 +201,12 @@ void force(const Globals& globals, const ForceRequest& request) {
         check_time(first, state.time);
         if (const auto line = force::update(live, state.time, state.theta, state.standing)) write(*line);
       });
+      if (live.taken < 3) throw InputError(source, few, more);
+      for (const force::Estimate& line : force::finish(live)) write(line);
     } catch (const InputError& error) {
       if (lines == 0) throw;
       throw broken_off(error, "the lines so far are kept");
     }
-    if (live.taken < 3) throw InputError(source, few, more);
-    for (const force::Estimate& line : force::finish(live)) write(line);
     if (live.contact) check_near();
   } else {
     chain::States states;
@@ -238,7 +225,9 @@ void force(const Globals& globals, const ForceRequest& request) {
     std::vector<std::optional<force::Contact>> contacts;
     for (std::size_t f = 0; f < count && contact; ++f) contacts.push_back(contact(motion.time[f], motion.theta[f]));
     if (contact) check_near();
-    for (const force::Estimate& line : force::estimate(model, deviations, base_at, motion, contacts)) write(line);
+    const std::vector<force::Estimate> found = force::estimate(model, deviations, base_at, motion, contacts);
+    std::for_each(found.begin(), found.end(), check);
+    std::for_each(found.begin(), found.end(), write);
   }
   if (!twin.known_mass) core::warn(request.run + ": the rope's mass is not known; forces are per kilogram of rope");
   say(std::to_string(lines) + " time steps, touched in " + std::to_string(touching) + ".");

@@ -9,6 +9,7 @@
 #include <cmath>
 #include <cstdlib>
 #include <cstring>
+#include <limits>
 
 #include "cli.h"
 
@@ -18,6 +19,7 @@ namespace {
 
 constexpr int kBlack = 16;         // brightness up to which a pixel of a masked video is background (lossy coding)
 constexpr int kMargin = 24;        // px about what a frame shows
+constexpr int kMostStale = 30;     // frames of a device in a row whose time stamps do not increase
 constexpr double kTogether = 0.5;  // of a frame's interval: frames of several cameras nearer than that are one moment
 
 double seconds(const std::string& text) {
@@ -131,8 +133,10 @@ FrameSource open_stream(const SourceRequest& request) {
   const std::string where = request.camera == "-" ? "standard input" : request.camera;
   // a device has a clock of its own, so that frames which were passed over leave a gap in time
   std::optional<double> offset;  // from that clock to ours
-  source.next = [camera = source.cameras[0], request, reader, rate, start, where, device, unix, offset,
+  double stamp = -std::numeric_limits<double>::infinity();  // s, the last frame's by that clock
+  source.next = [camera = source.cameras[0], request, reader, rate, start, where, device, unix, offset, stamp,
                  count = 0](LiveFrame& frame) mutable {
+    int stale = 0;  // in a row: some drivers' stamps jitter, others' are none
     do {
       if (request.last >= 0 && count >= request.last) return false;
       if (!(reader ? reader->next(frame.picture) : read_raw(camera, frame.picture))) return false;
@@ -145,7 +149,12 @@ FrameSource open_stream(const SourceRequest& request) {
                             std::to_string(camera.width) + "x" + std::to_string(camera.height),
                         "give the calibration of this camera; the states so far are kept");
       count = frame.frame + 1;
-    } while (frame.frame < request.first);
+      stale = device && !(reader->time() > stamp) ? stale + 1 : 0;
+      if (stale > kMostStale)
+        throw WorkError(where, "its time stamps do not increase, from frame " + std::to_string(frame.frame - stale + 1),
+                        "check the camera and its driver; the states so far are kept");
+    } while (frame.frame < request.first || stale > 0);
+    if (device) stamp = reader->time();
     if (device && !offset) offset = unix ? until_unix(reader->time()) : start - reader->first_time();
     frame.time = device ? reader->time() + *offset : start + frame.frame / rate;
     frame.views.clear();

@@ -2,6 +2,7 @@
 #include "identify.h"
 
 #include <CLI/CLI.hpp>
+#include <cmath>
 #include <cstdio>
 #include <iostream>
 #include <limits>
@@ -22,7 +23,7 @@ identification::Options identification_options(const twin::Twin& twin, bool pape
   options.gravity = twin.gravity;
   if (twin.table_normal) options.table_normal = *twin.table_normal;
   const auto mass = twin.provenance.options.find("mass");
-  if (mass != twin.provenance.options.end()) options.mass = std::stod(mass->second);
+  if (mass != twin.provenance.options.end()) options.mass = std::stod(mass->second);  // checked when it was read
   options.paper = paper;
   if (paper) {
     options.fit_stiffness = false;
@@ -147,7 +148,7 @@ void identify_several(std::vector<twin::Twin>& twins, const std::vector<std::str
     // a mass that one capture knows is that of all
     if (!options.mass) options.mass = identification_options(twin, false, seed).mass;
     recordings.push_back(
-        {own_base(runs[i]), twin.states, read_covariances(Path(runs[i]) / kCovarianceFile, twin.states)});
+        {own_base(runs[i], twin.states), twin.states, read_covariances(Path(runs[i]) / kCovarianceFile, twin.states)});
   }
   std::vector<identification::Result> found;
   {
@@ -187,21 +188,30 @@ void identify(const Globals& globals, const Request& request) {
     if (runs.size() > 1) {
       identify_several(twins, runs, globals.seed);
     } else {
-      const trajectory::Trajectory base = own_base(runs[0]);
-      const std::vector<math::MatrixX> covariances = read_covariances(Path(runs[0]) / kCovarianceFile, twins[0].states);
-      if (request.joint) check_joint(twins[0], covariances, runs[0]);
+      const trajectory::Trajectory base = own_base(runs[0], twins[0].states);
+      const Path covariance_file = Path(runs[0]) / kCovarianceFile;
+      std::vector<math::MatrixX> covariances = read_covariances(covariance_file, twins[0].states);
+      capture::Capture capture;
+      gpu::DevicePtr device;
+      if (request.joint) {
+        check_joint(twins[0], covariances, runs[0]);
+        capture = load_own_capture(twins[0], runs[0]);
+        device = gpu::open_device({.selector = globals.device});
+      }
       identify_stage(twins[0], base, covariances, paper, globals.seed);
-      if (request.joint) joint_stage(twins[0], runs[0], globals);
+      if (request.joint) joint_stage(twins[0], covariances, capture, *device, globals.seed);
       rollout_stage(twins[0], base, runs[0]);
+      // last, when nothing can fail but the disk: covariances and states belong together
+      if (request.joint) core::write_file(covariance_file, covariance_csv(twins[0].states, covariances));
     }
   }
   for (std::size_t i = 0; i < runs.size(); ++i) {
+    twin::save(twins[i], runs[i]);
     std::error_code ignored;
     // what was measured on the old parameters is not true any more
     if (fs::remove(Path(runs[i]) / kMetricsFile, ignored))
       say("metrics.json was of the old parameters and is removed: 'chainsplat eval " + runs[i] + " CAPTURE -o " +
           runs[i] + "/metrics.json' makes it again");
-    twin::save(twins[i], runs[i]);
   }
   end_progress();
   const dynamics::Estimates& found = twins[0].estimates;
@@ -221,7 +231,7 @@ void identify(const Globals& globals, const Request& request) {
       for (const auto& [name, component] : weak.parts) direction[name] = component;
       document["weak"].push_back({{"singular_value", weak.singular_value}, {"direction", direction}});
     }
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
     return;
   }
   if (!found.names.empty()) std::cout << "parameter                        estimate   standard error\n";

@@ -8,6 +8,8 @@
 
 namespace chainsplat::tools {
 
+inline constexpr std::size_t kLeastFrames = 3;  // that identification needs (chainsplat/identification.h)
+
 // Measures its own life and adds it to the stage's seconds.
 class Stopwatch {
  public:

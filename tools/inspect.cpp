@@ -23,11 +23,12 @@ void check(const Globals& globals, const std::string& path) {
     document["doubts"] = report.doubts;
     document["problems"] = report.problems;
     document["usable"] = report.problems.empty();
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
   } else {
-    for (const std::string& line : report.facts) std::cout << line << "\n";
-    for (const std::string& line : report.doubts) std::cout << "doubt: " << line << "\n";
-    for (const std::string& line : report.problems) std::cout << "problem: " << line << "\n";
+    // names come from the files
+    for (const std::string& line : report.facts) std::cout << core::printable(line) << "\n";
+    for (const std::string& line : report.doubts) std::cout << "doubt: " << core::printable(line) << "\n";
+    for (const std::string& line : report.problems) std::cout << "problem: " << core::printable(line) << "\n";
     if (report.problems.empty())
       std::cout << (report.doubts.empty() ? "Nothing is wrong with it.\n" : "It can be used; see the doubts.\n");
   }
@@ -70,7 +71,7 @@ void doctor(const Globals& globals) {
   document["missing"] = found.missing;
   document["validation_layer"] = found.validation_layer;
   document["pipeline_cache"] = found.pipeline_cache;
-  std::cout << document.dump(1) << "\n";
+  std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
 }
 
 }  // namespace

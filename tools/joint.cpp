@@ -45,28 +45,19 @@ void joint_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, cons
   twin.provenance.options["joint"] = "yes";
 }
 
-// The frames that the twin in `run` was made from. Throws InputError where they are gone or have changed.
-static capture::Capture load_own_capture(const twin::Twin& twin, const Path& run) {
+capture::Capture load_own_capture(const twin::Twin& twin, const Path& run) {
   const auto& options = twin.provenance.options;
   const auto path = options.find("path");
   if (path == options.end())
     throw InputError(run.string(), "does not say which capture it was made from", "use 'chainsplat train --joint'");
   capture::LoadOptions load;
   const auto frames = options.find("frames");
-  if (frames != options.end()) std::tie(load.first, load.last) = parse_frames(frames->second);
+  if (frames != options.end()) std::tie(load.first, load.last) =
+        parse_frames(frames->second, (run / "twin.json").string() + ": provenance.options.frames");
   capture::Capture capture = capture::load((run / path->second).lexically_normal(), load);
   if (twin.provenance.capture_hash != hash_text(capture.hash))
     throw InputError(capture.folder.string(), "has changed since " + run.string() + " was made", "train it again");
   return capture;
-}
-
-void joint_stage(twin::Twin& twin, const Path& run, const Globals& globals) {
-  std::vector<math::MatrixX> covariances = read_covariances(run / kCovarianceFile, twin.states);
-  check_joint(twin, covariances, run);
-  const capture::Capture capture = load_own_capture(twin, run);
-  const gpu::DevicePtr device = gpu::open_device({.selector = globals.device});
-  joint_stage(twin, covariances, capture, *device, globals.seed);
-  core::write_file(run / kCovarianceFile, covariance_csv(twin.states, covariances));
 }
 
 }  // namespace chainsplat::tools

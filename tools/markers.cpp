@@ -33,6 +33,7 @@ MarkerFile read_markers(const Path& file) {
   };
   std::vector<std::pair<std::string, double>> named;
   std::map<std::string, std::size_t> column;
+  std::size_t columns = 0;
   std::vector<std::size_t> base_columns, marker_columns;
   MarkerFile out;
   double next = -std::numeric_limits<double>::infinity();
@@ -49,7 +50,10 @@ MarkerFile read_markers(const Path& file) {
     }
     if (column.empty()) {
       const std::vector<std::string> cells = cells_of(std::string(line.text));
-      for (std::size_t i = 0; i < cells.size(); ++i) column[cells[i]] = i;
+      columns = cells.size();
+      for (std::size_t i = 0; i < columns; ++i)
+        if (!column.emplace(cells[i], i).second && !cells[i].empty())
+          refuse("there are two columns '" + cells[i] + "'", "give every column its own name");
       const auto find = [&](const std::string& name) {
         const auto at = column.find(name);
         if (at == column.end()) refuse("there is no column '" + name + "'", "give it in the header, see INTERFACE 7");
@@ -64,7 +68,7 @@ MarkerFile read_markers(const Path& file) {
       }
       continue;
     }
-    const std::vector<double> row = core::table_numbers(file, line, column.size(), "correct it", true);
+    const std::vector<double> row = core::table_numbers(file, line, columns, "correct it", true);
     double pose[8];
     for (int i = 0; i < 8; ++i) pose[i] = row[base_columns[i]];
     if (std::any_of(pose, pose + 8, [](double x) { return std::isnan(x); }))

@@ -21,6 +21,7 @@ namespace fs = std::filesystem;
 using Json = nlohmann::ordered_json;
 
 constexpr std::uint8_t kInside = 128;  // mask values from here on are object (INTERFACE 2)
+constexpr std::string_view kImageName = "{image}", kMaskName = "{mask}";  // in the line of a command
 constexpr double kDoubtful = 0.85;     // share of the chain's centerline in the masks under which they may be wrong
 
 struct Request {
@@ -48,10 +49,22 @@ std::string quoted(const std::string& text) {
   return out + "'";
 }
 
-std::string replaced(std::string text, const std::string& name, const std::string& value) {
-  for (std::size_t at = text.find(name); at != std::string::npos; at = text.find(name, at + value.size()))
-    text.replace(at, name.size(), value);
-  return text;
+// The line with the files in place of {image} and {mask}. In one pass: a file's name may hold these letters, too.
+std::string filled_in(const std::string& line, const Path& image, const Path& mask) {
+  std::string out;
+  for (std::size_t at = 0; at < line.size();) {
+    const std::string_view rest = std::string_view(line).substr(at);
+    if (rest.starts_with(kImageName)) {
+      out += quoted(image.string());
+      at += kImageName.size();
+    } else if (rest.starts_with(kMaskName)) {
+      out += quoted(mask.string());
+      at += kMaskName.size();
+    } else {
+      out += line[at++];
+    }
+  }
+  return out;
 }
 
 // A folder of its own for what goes to and comes from the outside program; gone at the end.
@@ -81,8 +94,7 @@ capture::Image8 mask_by_command(const std::string& command, const capture::View&
   fs::remove(mask, error);
   // its standard output must not mix with ours
   const std::string line =
-      "{ " + replaced(replaced(command, "{image}", quoted(image.string())), "{mask}", quoted(mask.string())) +
-      "\n} 1>&2 </dev/null";
+      "{ " + filled_in(command, image, mask) + "\n} 1>&2 </dev/null";
   const int status = std::system(line.c_str());
   const std::string mend = "try the command by hand on one image; the masks so far are kept";
   if (WIFSIGNALED(status)) {
@@ -142,9 +154,9 @@ void make_masks(const Globals& globals, const Request& request) {
   if (in_place && !request.frames.empty())
     throw InputError("--frames", "a capture needs a mask of every frame", "give -o FOLDER for some of them");
   if (!request.command.empty())
-    for (const char* name : {"{image}", "{mask}"})
+    for (const std::string_view name : {kImageName, kMaskName})
       if (request.command.find(name) == std::string::npos)
-        throw InputError("--command", std::string("does not hold ") + name,
+        throw InputError("--command", "does not hold " + std::string(name),
                          "write the program's line with {image} and {mask} where the file names go");
   capture::LoadOptions headers;
   headers.images = false;
@@ -168,8 +180,9 @@ void make_masks(const Globals& globals, const Request& request) {
       throw InputError(file.string() + ": cameras[" + std::to_string(c) + "].masks", "is a video: " + own,
                        "give -o FOLDER, or remove the key");
     wanted.push_back({files ? own : "masks/" + name + "/%06d.png", scene.folder});
-    if (!request.force && (!own.empty() || fs::exists(wanted.back().file(0), error)))
-      throw InputError(wanted.back().file(0).parent_path().string(), name + " has masks already",
+    const Path into = wanted.back().file(0).parent_path();
+    if (!request.force && (!own.empty() || (fs::is_directory(into, error) && !fs::is_empty(into, error))))
+      throw InputError(into.string(), name + " has masks already",
                        "use --force to replace them, or -o FOLDER");
   }
   if (in_place && ::access(scene.folder.c_str(), W_OK) != 0)
@@ -177,10 +190,21 @@ void make_masks(const Globals& globals, const Request& request) {
   if (!in_place)
     check_output_folder(request.out, request.force, "use --force to write into it, or name another folder");
   const std::size_t cameras = scene.cameras.size();
+  // a link can lead out of the folder, and neither is a mask written there nor read from there
+  const Path into_folder = in_place ? scene.folder : Path(request.out);
+  for (std::size_t c = 0; c < cameras; ++c)
+    for (int k = 0; k < static_cast<int>(scene.times[c].size()); ++k) {
+      const auto require_inside = [](const Path& folder, const Path& mask) {
+        if (const std::string link = capture::link_out_of(folder, mask); !link.empty())
+          throw InputError(mask.string(), link, "remove the link");
+      };
+      require_inside(into_folder, wanted[c].file(k));
+      if (!given[c].text.empty()) require_inside(scene.folder, given[c].file(k));
+    }
   Agreement agreement{std::vector<double>(cameras, 0.0), std::vector<int>(cameras, 0)};
   const auto keep = [&](int camera, int frame, const capture::Image8& mask) {
     const Path target = wanted[camera].file(frame);
-    if (!in_place && !given[camera].text.empty() && fs::exists(given[camera].file(frame), error)) {
+    if (!in_place && !given[camera].text.empty() && fs::is_regular_file(given[camera].file(frame), error)) {
       const capture::Image8 other = capture::read_image8(given[camera].file(frame));
       if (other.width == mask.width && other.height == mask.height) {
         agreement.sum[camera] += iou(mask, other);
@@ -201,15 +225,18 @@ void make_masks(const Globals& globals, const Request& request) {
     const Exchange exchange;
     std::int64_t total = 0;
     for (const std::vector<double>& times : scene.times) total += static_cast<std::int64_t>(times.size());
-    constexpr int kBlock = 64;  // frames held in memory at once
     for (int c = 0; c < static_cast<int>(cameras); ++c) {
       const int all = static_cast<int>(scene.times[c].size()), end = last < 0 ? all : std::min(all, last);
-      for (int begin = first; begin < end; begin += kBlock) {
+      // frames held in memory at once: few, but a block of a video is reached by decoding all before it
+      constexpr double kBlockBytes = 256.0 * 1024 * 1024;
+      const double bytes = 4.0 * scene.cameras[c].width * scene.cameras[c].height;
+      const int most = static_cast<int>(std::clamp(kBlockBytes / bytes, 1.0, 1e6));
+      for (int begin = first; begin < end; begin += most) {
         capture::LoadOptions block;
         block.masked = block.undistort = false;
         block.camera = scene.cameras[c].name;
         block.first = begin;
-        block.last = std::min(end, begin + kBlock);
+        block.last = std::min(end, begin + most);
         for (const capture::View& view : capture::load(request.capture, block).views) {
           if (core::stop_requested()) throw Interrupted(core::stop_requested());
           const std::string where = scene.cameras[c].name + ", frame " + std::to_string(view.frame);
@@ -243,7 +270,7 @@ void make_masks(const Globals& globals, const Request& request) {
   for (std::size_t c = 0; c < cameras; ++c)
     if (agreement.frames[c] > 0) document["iou"][scene.cameras[c].name] = agreement.sum[c] / agreement.frames[c];
   if (globals.json) {
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
     return;
   }
   std::cout << "masks: " << summary.frames << " in " << into << "\n";

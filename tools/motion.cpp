@@ -1,11 +1,13 @@
 // motion.cpp - rollout and render: a twin set in motion, and drawn.
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <cmath>
 #include <cstdio>
 #include <iostream>
 #include <memory>
 #include <nlohmann/json.hpp>
 
+#include "base_motion_files.h"
 #include "chainsplat/capture.h"
 #include "chainsplat/dynamics.h"
 #include "chainsplat/render.h"
@@ -62,8 +64,8 @@ dynamics::InitialState start_of(const RolloutRequest& request, const twin::Twin&
 }
 
 void rollout(const Globals& globals, const RolloutRequest& request) {
-  if (!(request.rate > 0.0) || !std::isfinite(request.rate))
-    throw InputError("--rate", "must be above 0", "give frames a second, for example 30");
+  constexpr const char* kExample = "give rows a second, for example 30";
+  check_rate(request.rate, 0.0, kExample);
   if (globals.json && (request.out == "-" || request.centerline == "-"))
     throw InputError("--json", "standard output is wanted by '-' too", "name a file");
   check_output_file(request.out);
@@ -72,6 +74,7 @@ void rollout(const Globals& globals, const RolloutRequest& request) {
   const dynamics::Model model = model_of(twin, request.run);
   const trajectory::Trajectory base = request.base.empty() ? own_base(request.run) : read_base(request.base);
   const dynamics::InitialState initial = start_of(request, twin, model, base);
+  check_rate(request.rate, base.end() - initial.time, kExample);
   std::vector<double> times;
   for (int k = 0; initial.time + k / request.rate <= base.end() + kTimeSlack; ++k)
     times.push_back(initial.time + k / request.rate);
@@ -91,7 +94,7 @@ void rollout(const Globals& globals, const RolloutRequest& request) {
   document["rows"] = states.time.size();
   document["start"] = states.time.front();
   document["end"] = states.time.back();
-  std::cout << document.dump(1) << "\n";
+  std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
 }
 
 struct RenderRequest {
@@ -135,8 +138,11 @@ void render(const Globals& globals, const RenderRequest& request) {
     if (request.mask || request.depth)
       throw InputError("--mask, --depth", "go with a folder of frames, not with a video",
                        "let -o end in another way than .mp4");
+  } else {
+    check_output_folder(out, request.force, "name another folder or give --force to write into it");
   }
   const twin::Twin twin = load_twin(request.run);
+  check_drawable(twin, request.run);
   const chain::States states =
       request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
   capture::LoadOptions load;
@@ -147,9 +153,19 @@ void render(const Globals& globals, const RenderRequest& request) {
   if (video && capture.cameras.size() != 1)
     throw InputError(request.camera, "has " + std::to_string(capture.cameras.size()) + " cameras and a video shows one",
                      "name it, for example " + folder + ":" + capture.cameras.front().name);
-  if (!video)
+  if (!video) {
+    check_not_capture(out, capture.folder);
     for (const capture::Camera& camera : capture.cameras)
-      check_output_folder(out / camera.name, request.force, "name another folder or give --force to write into it");
+      check_output_folder(out / camera.name, true, "");  // may be a file
+  }
+  // before the first camera's frames are written
+  for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
+    const double interval = render::median_interval(capture.times[c]);
+    if (std::none_of(capture.times[c].begin(), capture.times[c].end(),
+                     [&](double time) { return render::covered(states, time, interval); }))
+      throw InputError(request.states.empty() ? request.run : request.states,
+                       "covers none of the times of " + capture.cameras[c].name, "give states at the camera's times");
+  }
   const gpu::DevicePtr device = gpu::open_device({.selector = globals.device});
   splat::Engine engine(*device);
   render::Options options;
@@ -164,9 +180,6 @@ void render(const Globals& globals, const RenderRequest& request) {
     const std::vector<double>& times = capture.times[c];
     const std::vector<render::Frame> frames =
         render::frames(engine, twin.gaussians, twin.chain, states, base, camera, static_cast<int>(c), times, options);
-    if (frames.empty())
-      throw InputError(request.states.empty() ? request.run : request.states,
-                       "covers none of the times of " + camera.name, "give states at the camera's times");
     if (video) {
       std::vector<capture::Image8> images;
       for (const render::Frame& frame : frames) images.push_back(whole_image(frame, camera));
@@ -190,7 +203,7 @@ void render(const Globals& globals, const RenderRequest& request) {
     document["cameras"][camera.name] = frames.size();
   }
   if (globals.json)
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
   else
     say(std::to_string(total) + " frames: " + request.out);
 }

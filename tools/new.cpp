@@ -86,7 +86,7 @@ void make_new(const Globals& globals, const Request& request) {
     document["run"] = request.out;
     document["joints"] = twin.chain.links() - 1;
     document["angles"] = twin.chain.angles();
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, nlohmann::ordered_json::error_handler_t::replace) << "\n";
   } else {
     std::cout << "twin: " << request.out << "\n";
   }

@@ -5,41 +5,14 @@
 #include <cstdio>
 #include <fstream>
 #include <iostream>
+#include <limits>
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/adaptation.h"
+#include "estimate_lines.h"
 #include "run_folder.h"
 
 namespace chainsplat::tools {
-
-namespace {
-
-using Json = nlohmann::ordered_json;
-
-math::VectorX numbers(const Json& record, const char* key) {
-  const auto found = record.find(key);
-  if (found == record.end() || found->is_null()) return {};
-  math::VectorX out(static_cast<Eigen::Index>(found->size()));
-  for (Eigen::Index i = 0; i < out.size(); ++i) out[i] = (*found)[static_cast<std::size_t>(i)].get<double>();
-  return out;
-}
-
-// False for a frame that says nothing: lost, or without a state.
-bool read_line(const std::string& line, const std::string& where, adaptation::Observation& seen) {
-  try {
-    const Json record = core::parse_json(line);
-    if (record.value("lost", false) || !record.contains("theta") || record["theta"].is_null()) return false;
-    seen.time = record.at("time").get<double>();
-    seen.theta = numbers(record, "theta");
-    seen.thetadot = numbers(record, "thetadot");
-    seen.sigma = numbers(record, "sigma");
-  } catch (const Json::exception&) {
-    throw InputError(where, "is no line of 'estimate'", "give time, theta, thetadot, sigma as JSON, a frame a line");
-  }
-  return true;
-}
-
-}  // namespace
 
 void identify_online(const Globals& globals, const OnlineRequest& request) {
   watch_signals();
@@ -59,15 +32,17 @@ void identify_online(const Globals& globals, const OnlineRequest& request) {
   }
   std::istream& in = request.file == "-" ? std::cin : file;
   std::string line;
-  double first = NAN, last = NAN;
+  double first = NAN, last = NAN, before_line = -std::numeric_limits<double>::infinity();
   int row = 0;
   // a stream that is stopped by Ctrl-C has still taught what it has
-  while (!core::stop_requested() && std::getline(in, line)) {
+  while (!core::stop_requested() && next_line(in, line, request.file)) {
     ++row;
     if (line.find_first_not_of(" \t\r") == std::string::npos) continue;
     const std::string where = request.file + ":" + std::to_string(row);
-    adaptation::Observation seen;
-    if (!read_line(line, where, seen)) continue;
+    const std::optional<EstimateLine> read = read_estimate_line(line, where, twin.chain.angles(), before_line);
+    if (!read) continue;
+    before_line = read->time;
+    const adaptation::Observation seen{read->time, read->theta, read->thetadot, read->sigma};
     try {
       online.observe(seen, base_at);
     } catch (const InputError& error) {
@@ -81,6 +56,9 @@ void identify_online(const Globals& globals, const OnlineRequest& request) {
   if (online.used() == 0)
     throw InputError(request.file, "has no two frames in a row that fit the twin",
                      "check that it is of this rope and of this base motion");
+  if (!math::is_covariance(online.estimates().covariance))
+    throw WorkError(request.file, "leads to parameters whose covariance has no meaning",
+                    "check that it is of this rope; the twin is as it was");
   const dynamics::Estimates before = twin.estimates;
   const dynamics::Integrator integrator = twin.parameters->integrator;
   twin.parameters = online.parameters();
@@ -91,7 +69,7 @@ void identify_online(const Globals& globals, const OnlineRequest& request) {
 
   const dynamics::Estimates& now = twin.estimates;
   if (globals.json) {
-    Json document;
+    nlohmann::ordered_json document;
     document["run"] = request.run;
     document["from"] = first, document["to"] = last;
     document["frames"] = online.used(), document["left_out"] = online.left_out();
@@ -100,7 +78,7 @@ void identify_online(const Globals& globals, const OnlineRequest& request) {
     document["before"] = before.values;
     document["estimates"] = now.values;
     document["standard_errors"] = now.standard_errors;
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, nlohmann::ordered_json::error_handler_t::replace) << "\n";
     return;
   }
   char text[200];

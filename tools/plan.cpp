@@ -34,24 +34,6 @@ struct PlanRequest {
   planning::Options options;
 };
 
-std::vector<double> numbers(const std::string& text, const std::string& where, std::size_t count) {
-  std::vector<double> out;
-  const char* at = text.c_str();
-  for (;;) {
-    char* end = nullptr;
-    const double value = std::strtod(at, &end);
-    if (end == at) break;
-    out.push_back(value);
-    if (*end == '\0') at = end;
-    if (*end != ',') break;
-    at = end + 1;
-  }
-  if (*at != '\0' || (count && out.size() != count) || out.empty())
-    throw InputError(where, "'" + text + "' is not " + (count ? std::to_string(count) + " numbers" : "numbers"),
-                     "give them with commas between, for example 0.1,0,0.3");
-  return out;
-}
-
 constexpr const char* kAssumed =
     "mass, stiffness, damping and friction are assumed, and the rope may miss by centimeters";
 
@@ -276,8 +258,6 @@ Json loop_json(const planning::LoopResult& loop, double tolerance) {
 }
 
 void plan(const Globals& globals, PlanRequest& request) {
-  if (!(request.rate > 0.0) || !std::isfinite(request.rate))
-    throw InputError("--rate", "must be above 0", "give rows a second, for example 100");
   planning::Options& options = request.options;
   options.seed = globals.seed;
   if (!request.axes.empty()) options.axes = parse_axes(request.axes);
@@ -289,6 +269,19 @@ void plan(const Globals& globals, PlanRequest& request) {
   } else {
     options.horizon = numbers(request.horizon, "--horizon", 1)[0];
   }
+  constexpr double kLongest = 120.0, kMostReplans = 1000.0;  // s; a second
+  if (options.horizon > kLongest)
+    throw InputError("--horizon",
+                     core::exact(options.horizon) + " s are more than " + core::exact(kLongest) +
+                         " s, and the motion is computed in steps of milliseconds, many times",
+                     "give seconds, for example 3");
+  if (request.loop.rate > kMostReplans)
+    throw InputError("--mpc-rate",
+                     core::exact(request.loop.rate) + " replans a second are more than " + core::exact(kMostReplans) +
+                         ", and each is an optimization",
+                     "give for example 10");
+  check_rate(request.rate, options.horizon * static_cast<double>(request.targets.size()),
+             "give rows a second, for example 100");
   if (!request.terminal.empty()) {
     const std::vector<double> values = numbers(request.terminal, "--terminal", 0);
     options.terminal = Eigen::Map<const math::VectorX>(values.data(), static_cast<Eigen::Index>(values.size()));
@@ -361,7 +354,7 @@ void plan(const Globals& globals, PlanRequest& request) {
   if (truth) document["simulated"] = simulated;
   core::write_file(out / "plan.json", document.dump(1) + "\n");
   if (globals.json) {
-    std::cout << document.dump(1) << "\n";
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
     return;
   }
   char text[256];

@@ -1,13 +1,17 @@
 // progress.cpp - what the user sees while work is going on, and the log of it.
+#include <fcntl.h>
+#include <poll.h>
 #include <sys/ioctl.h>
 #include <unistd.h>
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <csignal>
 #include <cstdio>
 #include <cstdlib>
 #include <fstream>
+#include <iostream>
 #include <mutex>
 #include <nlohmann/json.hpp>
 #include <set>
@@ -118,7 +122,7 @@ void log(const core::Progress& progress, double now, bool last) {
   record["loss"] = progress.loss;  // NaN is written as null
   record["psnr"] = progress.psnr;
   record["seconds"] = std::round((now - screen.origin) * 1e3) / 1e3;
-  for (std::ofstream& file : screen.logs) file << record.dump() << std::endl;
+  for (std::ofstream& file : screen.logs) file << record.dump(-1, ' ', false, nlohmann::json::error_handler_t::replace) << std::endl;
 }
 
 void on_progress(const core::Progress& progress) {
@@ -136,10 +140,22 @@ void on_progress(const core::Progress& progress) {
   log(progress, now, fresh || last);
 }
 
+constexpr double kOneSignal = 0.1;  // s; timeout(1) and schedulers send to the process and to its group: twice at once
+std::atomic<bool> nothing_to_keep{false};
+std::atomic<double> first_signal{0.0};  // core::seconds_now(), of the first that asks to end
+
 extern "C" void on_signal(int signal) {
-  if (signal == SIGINT && core::stop_requested() == SIGINT) _exit(128 + SIGINT);
+  if (nothing_to_keep) _exit(signal == SIGUSR1 ? 0 : 128 + signal);
+  if (signal != SIGUSR1) {
+    const double now = core::seconds_now();
+    if (first_signal == 0.0) first_signal = now;
+    if (now - first_signal > kOneSignal) _exit(128 + signal);
+  }
   core::request_stop(signal);
 }
+
+// Does nothing, but unlike SIG_IGN it is not inherited by the programs that are started.
+extern "C" void on_closed_pipe(int) {}
 
 }  // namespace
 
@@ -161,7 +177,7 @@ void start_listening(const Globals& globals) {
       if (!told.insert(line).second) return;
     }
     clear_line();
-    std::fprintf(stderr, "chainsplat: warning: %s\n", line.c_str());
+    std::fprintf(stderr, "chainsplat: warning: %s\n", core::printable(line).c_str());
   };
   listener.progress = on_progress;
   core::set_listener(std::move(listener));
@@ -182,19 +198,40 @@ void end_progress() {
 void say(const std::string& line) {
   if (screen.quiet) return;
   end_progress();
-  std::fprintf(stderr, "%s\n", line.c_str());
+  std::fprintf(stderr, "%s\n", core::printable(line).c_str());
 }
 
 void say_more(const std::string& line) {
   if (screen.verbose) say(line);
 }
 
-void watch_signals() {
+void watch_signals(bool keep_nothing) {
+  nothing_to_keep = keep_nothing;
   struct sigaction action {};
   action.sa_handler = on_signal;
   sigemptyset(&action.sa_mask);
   action.sa_flags = SA_RESTART;
   for (const int signal : {SIGINT, SIGTERM, SIGUSR1}) sigaction(signal, &action, nullptr);
+}
+
+void prepare_output() {
+  // a stream that is closed would be taken by the next file that is opened; like this, it cannot be read or written.
+  // open() gives the lowest number that is free
+  for (const int standard : {STDIN_FILENO, STDOUT_FILENO, STDERR_FILENO})
+    if (::fcntl(standard, F_GETFD) < 0) (void)!::open("/dev/null", standard == STDIN_FILENO ? O_WRONLY : O_RDONLY);
+  struct sigaction action {};
+  action.sa_handler = on_closed_pipe;
+  sigemptyset(&action.sa_mask);
+  action.sa_flags = SA_RESTART;
+  sigaction(SIGPIPE, &action, nullptr);
+}
+
+void flush_output() {
+  std::cout.flush();
+  if (std::cout) return;
+  pollfd output{STDOUT_FILENO, 0, 0};
+  if (::poll(&output, 1, 0) == 1 && output.revents & POLLERR) throw Interrupted(SIGPIPE);
+  throw WorkError("standard output", "writing failed", "make room or name another file");
 }
 
 }  // namespace chainsplat::tools

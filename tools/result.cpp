@@ -46,6 +46,7 @@ void evaluate(const Globals& globals, const EvalRequest& request) {
   if (globals.json && request.out == "-")
     throw InputError("--json", "standard output is wanted by '-o -' too", "leave one of them out");
   twin::Twin twin = load_twin(request.run);
+  check_drawable(twin, request.run);
   const auto [first, last] = parse_frames(request.frames);
   capture::LoadOptions load;
   load.first = first;
@@ -103,7 +104,9 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
       request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
   exports::write(twin, motion, request.base.empty() ? own_base(request.run) : read_base(request.base), request.out);
   if (globals.json)
-    std::cout << nlohmann::ordered_json{{"output", request.out}}.dump() << "\n";
+    std::cout << nlohmann::ordered_json{{"output", request.out}}.dump(-1, ' ', false,
+                                                                      nlohmann::ordered_json::error_handler_t::replace)
+              << "\n";
   else
     say("written: " + request.out);
 }
@@ -117,6 +120,7 @@ void synthesize(const Globals& globals, const SynthRequest& request) {
   const Path out = request.out;
   check_output_folder(out, request.force, "name another folder or give --force to write into it");
   const twin::Twin twin = load_twin(request.run);
+  check_drawable(twin, request.run);
   auto [folder, camera] = split_camera(request.camera);
   if (folder.empty()) {
     const auto path = twin.provenance.options.find("path");
@@ -128,6 +132,7 @@ void synthesize(const Globals& globals, const SynthRequest& request) {
   load.images = false;
   load.camera = camera;
   capture::Capture scene = capture::load(folder, load);
+  check_not_capture(out, scene.folder);
   if (!request.base.empty()) scene.base = read_base(request.base);
   const chain::States states = !request.states.empty()
                                    ? twin::read_states(input_path(request.states), twin.chain.angles())
@@ -141,7 +146,9 @@ void synthesize(const Globals& globals, const SynthRequest& request) {
   options.video = !request.images;
   synth::write(engine, twin, states, scene, out, options);
   if (globals.json)
-    std::cout << nlohmann::ordered_json{{"capture", request.out}}.dump() << "\n";
+    std::cout << nlohmann::ordered_json{{"capture", request.out}}.dump(-1, ' ', false,
+                                                                       nlohmann::ordered_json::error_handler_t::replace)
+              << "\n";
   else
     say("capture: " + request.out);
 }

@@ -5,6 +5,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <cmath>
 #include <cstdio>
@@ -12,6 +13,7 @@
 #include <cstring>
 #include <sstream>
 
+#include "chainsplat/recognition.h"
 #include "cli.h"
 
 namespace chainsplat::tools {
@@ -57,14 +59,41 @@ bool is_locked(const Path& file) {
   return locked;
 }
 
-void remove_half_written(const Path& folder) {
+void check_run_files(const Path& run) {
+  std::error_code error;
+  for (const char* name : kRunFiles)
+    if (std::filesystem::is_directory(run / name, error))
+      throw InputError((run / name).string(), "is a folder, and a file is to be written there",
+                       "move it away, or name another run folder");
+  const Path checkpoint = run / kCheckpointFolder;
+  if (std::filesystem::exists(checkpoint, error) && !std::filesystem::is_directory(checkpoint, error))
+    throw InputError(checkpoint.string(), "is no folder, and checkpoints are to be written there",
+                     "move it away, or name another run folder");
+}
+
+void remove_run_files(const Path& run) {
   std::error_code ignored;
-  for (const auto& entry : std::filesystem::directory_iterator(folder, ignored)) {
-    const std::string ending = entry.path().extension().string();
-    if (ending.starts_with(".tmp") && ending.size() > 4 &&
-        ending.find_first_not_of("0123456789", 4) == std::string::npos)
-      std::filesystem::remove(entry.path(), ignored);
-  }
+  for (const char* name : kRunFiles) std::filesystem::remove(run / name, ignored);
+}
+
+void remove_checkpoint_folder(const Path& run) {
+  std::error_code ignored;
+  recognition::remove_checkpoint(run / kCheckpointFolder);
+  std::filesystem::remove(run / kLockFile, ignored);
+  std::filesystem::remove(run / kCheckpointFolder, ignored);  // only where it is empty
+}
+
+void remove_half_written(const Path& run) {
+  std::error_code ignored;
+  for (const Path& folder : {run, run / kCheckpointFolder})
+    for (const auto& entry : std::filesystem::directory_iterator(folder, ignored)) {
+      const std::string ending = entry.path().extension().string(), name = entry.path().stem().string();
+      const bool ours = std::find(std::begin(kRunFiles), std::end(kRunFiles), name) != std::end(kRunFiles) ||
+                        recognition::is_checkpoint(name);
+      if (ours && ending.starts_with(".tmp") && ending.size() > 4 &&
+          ending.find_first_not_of("0123456789", 4) == std::string::npos)
+        std::filesystem::remove(entry.path(), ignored);
+    }
 }
 
 twin::Twin load_twin(const Path& run) {
@@ -73,6 +102,11 @@ twin::Twin load_twin(const Path& run) {
     throw InputError(run.string(), "holds no recognized states",
                      "finish 'chainsplat recognize' or 'chainsplat train' first");
   return twin;
+}
+
+void check_drawable(const twin::Twin& twin, const Path& run) {
+  if (twin.gaussians.count == 0)
+    throw InputError(run.string(), "has no Gaussians to draw", "recognize it from images first");
 }
 
 trajectory::Trajectory read_base(const std::string& file) {
@@ -87,6 +121,19 @@ trajectory::Trajectory own_base(const Path& run) {
     throw InputError(file.string(), "is missing",
                      "give --base with the base motion, or copy the capture's base file there");
   return read_base(file.string());
+}
+
+trajectory::Trajectory own_base(const Path& run, const chain::States& states) {
+  trajectory::Trajectory base = own_base(run);
+  const double first = states.time.front(), last = states.time.back();
+  // as of a capture, half a frame
+  const double slack = 0.5 * (last - first) / static_cast<double>(std::max<std::size_t>(states.time.size() - 1, 1));
+  if (first < base.start() - slack || last > base.end() + slack)
+    throw InputError((run / kBaseFile).string(),
+                     "covers " + core::exact(base.start()) + " to " + core::exact(base.end()) +
+                         " s, but the states are at " + core::exact(first) + " to " + core::exact(last) + " s",
+                     "copy the whole base file of the capture there");
+  return base;
 }
 
 dynamics::Model model_of(const twin::Twin& twin, const Path& run) {
@@ -131,6 +178,9 @@ std::vector<math::MatrixX> read_covariances(const Path& file, const chain::State
     for (Eigen::Index row = 0; row < angles; ++row)
       for (Eigen::Index column = 0; column <= row; ++column)
         covariance(row, column) = covariance(column, row) = numbers[next++];
+    if (!math::is_covariance(covariance))
+      throw InputError(file.string() + ":" + std::to_string(lines[k].number),
+                       "its numbers are no covariance: not positive semidefinite", mend);
     covariances.push_back(std::move(covariance));
   }
   if (covariances.size() != states.time.size())

@@ -70,35 +70,7 @@ void stop_if_asked() {
   if (const int signal = core::stop_requested()) throw Interrupted(signal);
 }
 
-// All that a training writes; of the checkpoint folder only when `checkpoint`.
-void remove_results(const Path& out, bool checkpoint = true) {
-  std::error_code ignored;
-  for (const char* name :
-       {"twin.json", "gaussians.ply", "states.csv", "rollout.csv", kMetricsFile, kLogFile, kBaseFile, kCovarianceFile})
-    fs::remove(out / name, ignored);
-  if (checkpoint) fs::remove_all(out / kCheckpointFolder, ignored);
-}
-
-// For --force: all but the lock that this process holds.
-void remove_old(const Path& out) {
-  remove_results(out, false);
-  std::error_code ignored;
-  for (const auto& entry : fs::directory_iterator(out / kCheckpointFolder, ignored))
-    if (entry.path() != out / kLockFile) fs::remove_all(entry.path(), ignored);
-}
-
-// The same failure, with what is kept named in its last part.
-WorkError with_kept(const WorkError& error, const Path& out) {
-  const std::string text = error.what();
-  const std::size_t colon = text.find(": "), semicolon = text.rfind("; ");
-  if (colon == std::string::npos || semicolon == std::string::npos || semicolon < colon) return error;
-  return {text.substr(0, colon), text.substr(colon + 2, semicolon - colon - 2),
-          text.substr(semicolon + 2) + ", then --resume: what exists so far is kept in " + out.string()};
-}
-
-void recognize_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, gpu::Device& device,
-                     const capture::Capture& capture, const Request& request, const Globals& globals) {
-  const Stopwatch watch(twin, "recognize");
+recognition::Options settings_of(const Request& request, const Globals& globals) {
   recognition::Options options;
   options.joints = request.joints;
   if (request.bending != "auto")
@@ -109,7 +81,13 @@ void recognize_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, 
   options.seed = globals.seed;
   options.checkpoint = Path(request.out) / kCheckpointFolder;
   options.resume = request.resume;
-  recognition::Result found = recognition::recognize(device, capture, options);
+  return options;
+}
+
+void recognize_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, gpu::Device& device,
+                     const capture::Capture& capture, const Request& request, const recognition::Options& settings) {
+  const Stopwatch watch(twin, "recognize");
+  recognition::Result found = recognition::recognize(device, capture, settings);
   twin.chain = std::move(found.chain);
   twin.gaussians = std::move(found.gaussians);
   twin.states = std::move(found.states);
@@ -139,18 +117,21 @@ twin::Twin new_twin(const capture::Capture& capture, const Request& request, con
 
 // Throws InputError where the run folder's twin is not what is asked for now.
 void check_same_work(const twin::Twin& twin, const capture::Capture& capture, const Request& request,
-                     const Stages& stages) {
+                     const Stages& stages, std::uint64_t seed) {
   if (twin.provenance.capture_hash != hash_text(capture.hash))
     throw InputError(request.out,
                      "was made from another capture (" + twin.provenance.capture + ") or it has changed since",
                      "name that one, or begin again with --force");
   if (!stages.recognize) return;
-  for (const auto& [name, value] : recognition_options(request)) {
-    const auto had = twin.provenance.options.find(name);
-    if (had != twin.provenance.options.end() && had->second != value)
-      throw InputError(request.out, "was begun with --" + name + " '" + had->second + "', not '" + value + "'",
+  const auto compare = [&](const std::string& name, const std::string& had, const std::string& value) {
+    if (had != value)
+      throw InputError(request.out, "was begun with --" + name + " '" + had + "', not '" + value + "'",
                        "give the same options, or begin again with --force");
-  }
+  };
+  for (const auto& [name, value] : recognition_options(request))
+    if (const auto had = twin.provenance.options.find(name); had != twin.provenance.options.end())
+      compare(name, had->second, value);
+  compare("seed", std::to_string(twin.provenance.seed), std::to_string(seed));
 }
 
 Json summary_json(const twin::Twin& twin, const Path& out, const eval::Metrics* recognized,
@@ -186,12 +167,21 @@ void check_views(const capture::Capture& capture, const Request& request) {
   }
 }
 
+// Times of the first camera's frames that were asked for: those of the states.
+std::vector<double> times_of(const capture::Capture& capture) {
+  std::vector<double> times;
+  for (const capture::View& view : capture.views)
+    if (view.camera == 0) times.push_back(view.time);
+  return times;
+}
+
 void train(const Globals& globals, const Request& request) {
   const Stages stages = parse_stages(request.stages);
   const Path out = request.out;
   const auto [first, last] = parse_frames(request.frames);
   check_output_folder(out, request.force || request.resume,
                       "name another folder, or give --force to begin again or --resume to continue");
+  check_run_files(out);
   if (!request.picture.empty()) check_output_file(request.picture);
   if (request.force && request.resume)
     throw InputError("--force, --resume", "contradict each other", "give one of them");
@@ -202,11 +192,20 @@ void train(const Globals& globals, const Request& request) {
   capture::LoadOptions load_options;
   load_options.first = first;
   load_options.last = last;
+  load_options.depth = stages.evaluate;  // read now, because a file that is wrong must not end a work that is done
   capture::Capture capture = capture::load(request.capture, load_options);
+  check_not_capture(out, capture.folder);
   if (stages.recognize) check_views(capture, request);
-  const bool continued = request.resume && fs::exists(out / "twin.json");
+  if (stages.evaluate) capture::load_true_centerline(capture.folder);  // to find what is wrong with it
+  std::error_code error;
+  const bool continued = request.resume && fs::exists(out / "twin.json", error);
+  if (request.resume && !continued && fs::exists(out, error) && !fs::is_empty(out, error) &&
+      !fs::exists(out / kCheckpointFolder, error))
+    throw InputError(out.string(), "holds no run to resume, but other files",
+                     "name another folder, or begin in this one with --force");
   twin::Twin twin = continued ? load_twin(out) : new_twin(capture, request, globals);
-  if (continued) check_same_work(twin, capture, request, stages);
+  if (continued) check_same_work(twin, capture, request, stages, globals.seed);
+  if (continued && stages.evaluate) check_drawable(twin, out);
   if (!continued && !stages.recognize)
     throw InputError(out.string(), "holds no recognized twin to go on from",
                      "add recognize to --stages, or give --resume");
@@ -218,8 +217,19 @@ void train(const Globals& globals, const Request& request) {
     throw InputError("--joint", "needs identified dynamics", "add identify to --stages");
   if (joint && request.mode == "paper") throw InputError("--joint", "goes with --mode fast", "leave one of them out");
   const bool roll_out = stages.rollout && (stages.named || identify || joint || twin.rollout.time.empty());
-  if (roll_out && !identify && !twin.parameters)
+  if (roll_out && !identify && !(twin.parameters && twin.initial))
     throw InputError("--stages", "nothing is identified that could be rolled out", "add identify");
+  const std::vector<double> times = recognize ? times_of(capture) : twin.states.time;
+  if ((identify || joint) && times.size() < kLeastFrames)
+    throw InputError(request.frames.empty() ? request.capture : "--frames",
+                     "identification needs " + std::to_string(kLeastFrames) + " frames of " +
+                         capture.cameras.front().name + " or more, and there are " + std::to_string(times.size()),
+                     "give more frames, or leave identification out with --stages recognize,evaluate");
+  if (continued && joint && times_of(capture) != times)
+    throw InputError("--frames", "--joint needs the frames that " + out.string() + " was recognized from",
+                     "give the same --frames as then");
+  const recognition::Options settings = settings_of(request, globals);
+  if (recognize) recognition::check_checkpoint(capture, settings);
   std::vector<math::MatrixX> covariances;
   if (continued && (identify || joint)) covariances = read_covariances(out / kCovarianceFile, twin.states);
   if (continued && joint) check_joint(twin, covariances, out);
@@ -233,36 +243,44 @@ void train(const Globals& globals, const Request& request) {
   }
   stop_if_asked();
 
-  const bool was_there = fs::exists(out);
+  const bool was_there = fs::exists(out, error);
   make_folder(out / kCheckpointFolder);
   const FolderLock lock(out / kLockFile);
   remove_half_written(out);
-  remove_half_written(out / kCheckpointFolder);
-  if (request.force) remove_old(out);
+  if (request.force) {
+    remove_run_files(out);
+    recognition::remove_checkpoint(out / kCheckpointFolder);
+  }
+  const std::string kept = "what exists so far is kept in " + out.string() + ", and --resume goes on from there";
+  bool saved = continued;  // from then on nothing is removed, whatever happens
+  const auto save = [&] {
+    saved = true;
+    twin::save(twin, out);
+  };
   try {
     log_to(out / kLogFile);
     core::write_file(out / kBaseFile, trajectory::write_tum(capture.base.samples()));
     if (recognize) {
-      recognize_stage(twin, covariances, *device, capture, request, globals);
+      recognize_stage(twin, covariances, *device, capture, request, settings);
       trim_memory();  // or the next stage's need comes on top
       if (!covariances.empty()) core::write_file(out / kCovarianceFile, covariance_csv(twin.states, covariances));
-      twin::save(twin, out);  // what comes later can fail without losing this
+      save();  // what comes later can fail without losing this
       stop_if_asked();
     }
     if (identify) {
       identify_stage(twin, capture.base, covariances, request.mode == "paper", globals.seed);
-      twin::save(twin, out);
+      save();
       stop_if_asked();
     }
     if (joint) {
       joint_stage(twin, covariances, capture, *device, globals.seed);
       core::write_file(out / kCovarianceFile, covariance_csv(twin.states, covariances));
-      twin::save(twin, out);
+      save();
       stop_if_asked();
     }
     if (roll_out) {
       rollout_stage(twin, capture.base, out);
-      twin::save(twin, out);
+      save();
       stop_if_asked();
     }
     eval::Metrics recognized, rolled_out;
@@ -277,8 +295,8 @@ void train(const Globals& globals, const Request& request) {
       core::write_file(out / kMetricsFile, metrics_json(&recognized, has_rollout ? &rolled_out : nullptr));
       if (!request.picture.empty()) capture::write_png(request.picture, comparison(engine, twin, recorded));
     }
-    twin::save(twin, out);  // with all durations
-    fs::remove_all(out / kCheckpointFolder);
+    save();  // with all durations
+    remove_checkpoint_folder(out);
 
     end_progress();
     const eval::Metrics* const shown[] = {stages.evaluate ? &recognized : nullptr,
@@ -293,20 +311,23 @@ void train(const Globals& globals, const Request& request) {
       std::cout << "twin: " << out.string() << "\n";
       if (!request.picture.empty() && stages.evaluate) std::cout << "picture: " << request.picture << "\n";
     }
-  } catch (const InputError&) {
-    // nothing is left where nothing was
-    if (!continued && !request.resume) {
-      remove_results(out);
-      std::error_code ignored;
-      if (!was_there) fs::remove(out, ignored);
-    }
-    throw;
-  } catch (const WorkError& error) {
-    throw with_kept(error, out);
   } catch (const Interrupted&) {
     end_progress();
     say("stopped; a checkpoint is in " + out.string() + ": the same command with --resume continues");
     throw;
+  } catch (const InputError& wrong) {
+    if (saved || was_there) throw broken_off(wrong, kept);
+    // nothing is left where nothing was
+    remove_run_files(out);
+    remove_checkpoint_folder(out);
+    fs::remove(out, error);
+    throw;
+  } catch (const WorkError& failure) {
+    throw broken_off(failure, kept);
+  } catch (const std::bad_alloc&) {
+    throw WorkError("memory", "there is not enough of it", "use fewer --frames or a machine with more; " + kept);
+  } catch (const std::exception& defect) {
+    throw WorkError("internal", defect.what(), "this is a defect, please report the command; " + kept);
   }
 }
 

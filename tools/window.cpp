@@ -1,17 +1,15 @@
 #include "window.h"
 
-#include <httplib.h>
-
 #include <algorithm>
 #include <atomic>
 #include <cmath>
-#include <condition_variable>
 #include <deque>
 #include <mutex>
 #include <nlohmann/json.hpp>
-#include <thread>
+#include <optional>
 
 #include "chainsplat/core.h"
+#include "page_server.h"
 #include "window_page.h"
 
 namespace chainsplat::tools {
@@ -21,8 +19,8 @@ namespace {
 using Json = nlohmann::ordered_json;
 
 constexpr std::size_t kHistory = 300;                       // frames of the latency plot: ten seconds at 30 Hz
-constexpr auto kPatience = std::chrono::milliseconds(500);  // until a browser without news is told so
-constexpr double kAsking = 2.0;  // s after the last request in which pictures are still copied
+constexpr double kPatience = 0.5;  // s, until a browser without news is told so
+constexpr double kAsking = 2.0;    // s after the last request in which pictures are still copied
 
 // The masked object on black, as far as there is no picture.
 void draw(const capture::View& view, int width, int height, std::string& rgb) {
@@ -37,10 +35,7 @@ void draw(const capture::View& view, int width, int height, std::string& rgb) {
 }  // namespace
 
 struct Window::Implementation {
-  httplib::Server server;
-  std::thread thread;
   std::mutex mutex;
-  std::condition_variable news;
   bool over = false;
   int width = 0, height = 0;
   std::string title;
@@ -49,16 +44,31 @@ struct Window::Implementation {
   Json state;                              // of the last frame
   std::shared_ptr<const std::string> rgb;  // its picture; none when nobody asked for one
   std::deque<double> latency;              // ms, the last of them of frame `count`
+  std::optional<PageServer> server;        // last: it uses all others
 
-  // Four bytes of length, JSON, then the picture's RGB: what the page's script reads.
-  void next(const httplib::Request& request, httplib::Response& response) {
-    const std::int64_t after = std::strtoll(request.get_param_value("after").c_str(), nullptr, 10);
+  std::optional<PageAnswer> respond(const PageRequest& request) {
+    PageAnswer out;
+    if (request.path == "/") {
+      out.type = "text/html; charset=utf-8";
+      out.body = kWindowPage;
+    } else if (request.path == "/next") {
+      return next(request);
+    } else {
+      out.status = 404;
+    }
+    return out;
+  }
+
+  // The first frame after the number in 'after=N'. Four bytes of length, JSON, then the picture's RGB: what the page's
+  // script reads.
+  std::optional<PageAnswer> next(const PageRequest& request) {
+    const std::int64_t after = std::strtoll(request.after.c_str(), nullptr, 10);
+    PageAnswer out;
     std::unique_lock lock(mutex);
     asked = core::seconds_now();
-    news.wait_for(lock, kPatience, [&] { return over || count > after; });
     if (count <= after || count == 0) {
-      response.status = over ? 410 : 204;
-      return;
+      out.status = over ? 410 : 204;
+      return over || request.waited >= kPatience ? std::optional(out) : std::nullopt;
     }
     Json document = state;
     document["number"] = count;
@@ -67,54 +77,27 @@ struct Window::Implementation {
     document["title"] = title;
     document["picture"] = rgb != nullptr;
     document["latency"] = latency;
-    const std::shared_ptr<const std::string> picture = rgb;
-    lock.unlock();  // the estimator waits for no copy
+    out.rest = rgb;
+    lock.unlock();  // the estimator waits for no text
     const std::string text = document.dump();
-    std::string body(4, '\0');
-    for (int i = 0; i < 4; ++i) body[i] = static_cast<char>(text.size() >> 8 * i & 0xff);
-    body += text;
-    if (picture) body += *picture;
-    response.set_header("Cache-Control", "no-store");
-    response.set_content(body, "application/octet-stream");
+    out.type = "application/octet-stream";
+    out.body.assign(4, '\0');
+    for (int i = 0; i < 4; ++i) out.body[i] = static_cast<char>(text.size() >> 8 * i & 0xff);
+    out.body += text;
+    return out;
   }
 };
 
 Window::Window(int port, int width, int height, const std::string& title)
     : implementation_(std::make_unique<Implementation>()) {
   Implementation& self = *implementation_;
-  self.width = width, self.height = height, self.title = title;
-  // the library's default would let a second program share the port without a word
-  self.server.set_socket_options([](socket_t socket) {
-    int yes = 1;
-    setsockopt(socket, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
-  });
-  // a page from elsewhere that calls itself by another name must not see the camera
-  self.server.set_pre_routing_handler([](const httplib::Request& request, httplib::Response& response) {
-    const std::string host = request.get_header_value("Host");
-    const std::string name = host.substr(0, host.rfind(':'));
-    if (name == "127.0.0.1" || name == "localhost") return httplib::Server::HandlerResponse::Unhandled;
-    response.status = 403;
-    return httplib::Server::HandlerResponse::Handled;
-  });
-  self.server.Get("/", [](const httplib::Request&, httplib::Response& response) {
-    response.set_content(kWindowPage, sizeof kWindowPage - 1, "text/html; charset=utf-8");
-  });
-  self.server.Get(
-      "/next", [&self](const httplib::Request& request, httplib::Response& response) { self.next(request, response); });
-  if (!self.server.bind_to_port("127.0.0.1", port))
-    throw InputError("--serve " + std::to_string(port), "the port cannot be had; another program may use it",
-                     "name another port, for example 8765");
-  self.thread = std::thread([&self] { self.server.listen_after_bind(); });
+  self.width = width, self.height = height, self.title = core::printable(title);
+  self.server.emplace(port, [&self](const PageRequest& request) { return self.respond(request); });
 }
 
 Window::~Window() {
-  {
-    const std::lock_guard lock(implementation_->mutex);
-    implementation_->over = true;
-  }
-  implementation_->news.notify_all();
-  implementation_->server.stop();
-  implementation_->thread.join();
+  const std::lock_guard lock(implementation_->mutex);
+  implementation_->over = true;
 }
 
 void Window::show(const Shown& shown) {
@@ -145,7 +128,7 @@ void Window::show(const Shown& shown) {
     self.state = std::move(state);
     self.rgb = std::move(rgb);
   }
-  self.news.notify_all();
+  self.server->wake();
 }
 
 std::vector<math::Vector2> recorded_line(const capture::Camera& camera, const math::MatrixX& world_points) {

@@ -63,6 +63,11 @@ struct Capture {
   bool has_depth = false;
 };
 
+// What a capture may be at most; the reasons stand where it is checked (src/capture/manifest.cpp).
+constexpr double kSlowestRate = 0.1, kFastestRate = 1e6;  // frames a second
+constexpr int kMostFrames = 1000000;                      // of a camera
+constexpr int kMostPixels = 1 << 27;                      // of an image
+
 struct LoadOptions {
   bool images = true;     // false: capture.json and base only
   bool undistort = true;  // false: recorded pixels (evaluation)
@@ -75,6 +80,10 @@ struct LoadOptions {
 
 // Loads and checks. `path` is the folder or its capture.json. Throws InputError; unknown keys and other doubts warn.
 Capture load(const Path& path, const LoadOptions& options = {});
+
+// Nothing that a capture names may lie outside its folder. Where a symbolic link on the way to `file`, which is named in
+// `folder`, leads out of it: which one and where to, in words; else empty. The folder itself may be reached by links.
+std::string link_out_of(const Path& folder, const Path& file);
 
 // One camera object as in capture.json, alone in a file: what is needed of a camera whose frames come from elsewhere.
 struct Calibration {
@@ -126,7 +135,8 @@ struct DeviceFormat {  // asked of a camera; 0: its own choice
 
 class VideoReader {
  public:
-  // A file, a pipe, or the camera behind a character device (V4L2), of which `format` is asked. Of a camera every frame
+  // A file or pipe (MP4, MOV, MKV, WebM, AVI, MPEG, Ogg, FLV, ASF, or a bare stream of H.264, HEVC, AV1, MJPEG or
+  // Y4M: nothing that names further files), or the camera behind a character device (V4L2), of which `format` is asked. Of a camera every frame
   // is the newest: those that came meanwhile are passed over, and so are damaged ones. next() throws WorkError when it
   // disappears or is silent for 5 s, Interrupted when a stop is requested while it waits.
   explicit VideoReader(const Path& file, int threads = 1, const DeviceFormat& format = {});

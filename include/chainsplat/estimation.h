@@ -9,6 +9,7 @@
 // hardly seen; the dynamics supply it, and the covariance says how well.
 #pragma once
 #include <functional>
+#include <limits>
 #include <optional>
 #include <span>
 #include <string>
@@ -72,6 +73,8 @@ struct Estimate {
                                    // the mask shows has long not looked like the twin
 };
 
+constexpr double kNever = -std::numeric_limits<double>::infinity();  // s; frames may have negative times
+
 // The filter between two frames.
 struct Filter {
   dynamics::Model model;
@@ -85,10 +88,10 @@ struct Filter {
   std::optional<Belief> belief;     // none before the first frame
   double base_start = 0.0;          // s, from here on the base's motion is known: the rope is thought at rest there
   math::VectorX rest;               // rad, how the rope rests (or lies) at that time
-  double contact_until = 0.0;       // s, until then the motion is thought not to follow the model
+  double contact_until = kNever;    // s, until then the motion is thought not to follow the model
   math::VectorX everywhere, place;  // shares of the links' ends in the unknown force: evenly, and as learned in contact
-  double last_seen = 0.0;           // s
-  double last_like = 0.0;           // s, the mask looked like the twin inside
+  double last_seen = kNever;        // s
+  double last_like = kNever;        // s, the mask looked like the twin inside
   bool lost = false;                // in the last frame
   double edge_offset = 0.0, edge_offset_variance = 0.0;  // px, px^2: how much wider the masks are than the tube
 };
@@ -142,8 +145,8 @@ bool has_mask(const capture::View& view);
 double tube_iou(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta,
                 const capture::View& view, const capture::Camera& camera);
 
-// The line of INTERFACE 5, without line feed. `latency`: s. "covariance" is the lower triangle, row by row, of theta's;
-// with `rates` of (theta, thetadot)'s, which begins with it.
+// The line of INTERFACE 5, without line feed; what is not finite is null. `latency`: s. "covariance" is the lower
+// triangle, row by row, of theta's; with `rates` of (theta, thetadot)'s, which begins with it.
 std::string to_json(const Estimate& estimate, double latency, bool rates = false);
 
 }  // namespace chainsplat::estimation

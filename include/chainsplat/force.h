@@ -57,7 +57,8 @@ struct Options {
 };
 
 // What identification leaves open, as models as likely as `model`: one standard deviation away along every principal
-// direction of the estimates' covariance. Without one, every joint's stiffness and damping alone.
+// direction of the estimates' covariance; a warning names the parameters whose covariance is not known (NaN). Without
+// any, every joint's stiffness and damping alone.
 std::vector<dynamics::Model> deviations(const dynamics::Model& model, const dynamics::Estimates& estimates);
 
 // The force at one place.
@@ -69,7 +70,7 @@ struct Fit {
 };
 
 // (J C^-1 J^T + prior^-1)^-1 J C^-1 r. `jacobian` 3 x n, `residual` n, `covariance` n x n of the residual; `prior`:
-// covariance of the force before it was felt, N^2.
+// covariance of the force before it was felt, N^2. Throws InputError where `covariance` is not positive definite.
 Fit solve(const MatrixX& jacobian, const VectorX& residual, const MatrixX& covariance, const Matrix3& prior);
 
 // r of SPEC 7. n, N m.
@@ -132,8 +133,10 @@ std::optional<Estimate> update(Live& live, double time, const VectorX& theta, co
 // The lines that are still due after the last state; none for fewer than three states.
 std::vector<Estimate> finish(Live& live);
 
-// The line of INTERFACE 5, without line feed. `known_mass` false: forces are per kilogram of rope, and the line says
-// so.
+// False where numbers too large or a twin without mass left no force to tell.
+bool is_finite(const Estimate& estimate);
+// The line of INTERFACE 5, without line feed; what is not finite is null. `known_mass` false: forces are per kilogram
+// of rope, and the line says so.
 std::string to_json(const Estimate& estimate, bool known_mass);
 
 }  // namespace chainsplat::force

@@ -3,6 +3,7 @@
 // Twists (omega, v) and wrenches (m, f) have the angular part first. Everything is double, SI units, radians.
 #pragma once
 #include <Eigen/Dense>
+#include <vector>
 
 namespace chainsplat::math {
 
@@ -38,5 +39,17 @@ Vector6 transform_twist(const Pose& pose, const Vector6& twist);  // Ad_T V with
 
 // Nearest rotation to a 3x3 matrix that is almost one (read from a file with few digits).
 Matrix3 orthonormalized(const Matrix3& almost_rotation);
+
+// Whether numbers from outside are a covariance: finite, symmetric and positive semidefinite, each up to
+// kCovarianceTolerance of the correlations (so units do not matter). Files hold nine digits: rounding moves eigenvalues
+// of n numbers' correlations by up to 5e-9 n, and what computed them by less.
+constexpr double kCovarianceTolerance = 1e-6;
+bool is_covariance(const MatrixX& m);
+// Rows and columns that are left when those of unknown (not finite) numbers are taken out, the emptiest first.
+std::vector<Eigen::Index> known_part(const MatrixX& covariance);
+// Whether what was factored is positive definite and finite. Eigen's info() calls a factor of NaN a success, and
+// solving with one that failed gives garbage without a word.
+bool is_positive(const Eigen::LLT<MatrixX>& factor);
+bool is_positive(const Eigen::LDLT<MatrixX>& factor);
 
 }  // namespace chainsplat::math

@@ -42,6 +42,13 @@ struct Result {
 // "recognize".
 Result recognize(gpu::Device& device, const capture::Capture& capture, const Options& options);
 
+// Throws InputError where `options` would resume from a checkpoint of another job: another capture, other frames or
+// masks, other options. Writes nothing.
+void check_checkpoint(const capture::Capture& capture, const Options& options);
+// Removes what recognize() left in a checkpoint folder, and nothing else there.
+void remove_checkpoint(const Path& folder);
+bool is_checkpoint(const std::string& file_name);  // of a file of such a folder
+
 // --- the two halves of a round of `fast`, for what goes on with a recognized twin ------------------------------------
 
 // What is known of every frame's angles beside the pictures. Empty: nothing.

@@ -20,7 +20,7 @@ Adaptation::Adaptation(const chain::Chain& chain, const dynamics::Parameters& pa
                        const dynamics::Estimates& estimates, const Options& options)
     : chain_(chain), first_(parameters), now_(parameters), known_(estimates), options_(options) {
   const auto size = static_cast<Eigen::Index>(estimates.names.size());
-  if (size == 0 || estimates.covariance.rows() != size || !estimates.covariance.allFinite())
+  if (size == 0 || !math::is_covariance(estimates.covariance) || estimates.covariance.rows() != size)
     throw InputError("identify --online", "the twin knows no covariance of its parameters", "identify it first");
   if (!(options.memory > 0.0)) throw InputError("--memory", "is not above 0", "give seconds, for example 5");
   const auto all = dynamics::tangents(chain, parameters, estimates.names);
@@ -123,6 +123,10 @@ bool Adaptation::observe(const Observation& seen, const dynamics::BaseFunction& 
   if (!std::isfinite(seen.time) || !seen.theta.allFinite() || !seen.thetadot.allFinite() || !seen.sigma.allFinite())
     throw InputError("identify --online", "a number of the frame at " + core::exact(seen.time) + " s is not finite",
                      "leave lost frames out");
+  if ((seen.sigma.array() < 0.0).any())
+    throw InputError("identify --online",
+                     "a standard deviation of the frame at " + core::exact(seen.time) + " s is negative",
+                     "give what 'estimate' prints for this rope");
   if (started_ && !(seen.time > time_))
     throw InputError("identify --online", "times go backwards at " + core::exact(seen.time) + " s",
                      "give the frames in their order");
@@ -153,7 +157,11 @@ bool Adaptation::observe(const Observation& seen, const dynamics::BaseFunction& 
       return false;
     }
   rejected_in_a_row_ = 0;
-  const MatrixX gain = spread.ldlt().solve(covariance_.topRows(n)).transpose();
+  const Eigen::LDLT<MatrixX> factor(spread);
+  if (!math::is_positive(factor))
+    throw InputError("identify --online", "the standard deviations at " + core::exact(seen.time) + " s are too large",
+                     "leave frames out that tell nothing");
+  const MatrixX gain = factor.solve(covariance_.topRows(n)).transpose();
   const VectorX step = gain * innovation;
   theta_ += step.head(n);
   thetadot_ += step.segment(n, n);

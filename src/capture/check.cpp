@@ -135,6 +135,9 @@ void check_base(const Manifest& manifest, CheckReport& report) {
            "%.2f m/s^2, %.2f rad/s; position noise %.2g m",
            samples.size(), capture.base.start(), capture.base.end(), rate, travel.x(), travel.y(), travel.z(), speed,
            acceleration, turning, capture.base.noise()));
+  if (!std::isfinite(speed + acceleration + turning))
+    report.problems.push_back(
+        "base: its speed is beyond all numbers: poses lie too far apart for their times; write meters and seconds");
   if (travel.norm() < kStill && turning * seconds < kStill)
     report.doubts.push_back(
         "base: it stays at rest; masses, damping and friction are hardly observable from such a capture");
@@ -279,6 +282,19 @@ void check_camera(const Manifest& manifest, const CameraSource& source, const Vi
   }
 }
 
+void check_truth(const Manifest& manifest, CheckReport& report) {
+  try {
+    const std::optional<TrueCenterline> truth = load_true_centerline(manifest.capture.folder);
+    if (!truth) return;
+    for (const CameraSource& source : manifest.cameras)
+      if (!source.times.empty() &&
+          (source.times.back() < truth->time.front() || source.times.front() > truth->time.back()))
+        report.doubts.push_back("truth/centreline.csv: says nothing of the times of " + source.camera.name);
+  } catch (const InputError& error) {
+    report.problems.push_back(error.what());
+  }
+}
+
 }  // namespace
 
 CheckReport check(const Path& path) {
@@ -337,8 +353,10 @@ CheckReport check(const Path& path) {
   }
   report.facts.push_back(capture.has_depth ? "depth: given, for evaluation" : "depth: none, so no Chamfer distance");
   std::error_code error;
-  if (std::filesystem::is_directory(capture.folder / "truth", error))
+  if (std::filesystem::is_directory(capture.folder / "truth", error)) {
     report.facts.push_back("truth: given, for evaluation; training never opens it");
+    check_truth(manifest, report);
+  }
   return finish();
 }
 

@@ -1,8 +1,8 @@
 #include "image_files.h"
 
 #include <OpenImageIO/imageio.h>
-
 #include <unistd.h>
+#include <zlib.h>
 
 #include <cmath>
 #include <filesystem>
@@ -15,34 +15,89 @@ namespace chainsplat::capture {
 
 namespace {
 
-// A PNG that ends before its last chunk. Found here, because libpng prints a line of its own about it.
-bool cut_off_png(const Path& file) {
+constexpr int kMostChannels = 8;  // colors, alpha, depth: a damaged header claims any number
+
+// What is wrong with a PNG; empty where it is whole, or none. Found here, because libpng prints a line of its own.
+std::string damage_of_png(const Path& file) {
   std::ifstream stream(file, std::ios::binary);
   constexpr std::string_view kSignature = "\x89PNG\r\n\x1a\n";
+  constexpr std::uint32_t kLargestSide = 1u << 15;  // px, as capture.json's
+  constexpr const char* kCutOff = "is cut off";
   char start[8] = {};
-  if (!stream.read(start, sizeof start) || std::string_view(start, sizeof start) != kSignature) return false;
-  for (;;) {  // chunks: length, name, data, checksum
-    unsigned char head[8];
-    if (!stream.read(reinterpret_cast<char*>(head), sizeof head)) return true;
-    const std::streamoff length = (head[0] << 24u) | (head[1] << 16) | (head[2] << 8) | head[3];
-    if (std::string_view(reinterpret_cast<const char*>(head) + 4, 4) == "IEND") return false;
-    if (length < 0) return true;
-    stream.seekg(length + 4, std::ios::cur);
+  if (!stream.read(start, sizeof start) || std::string_view(start, sizeof start) != kSignature) return "";
+  const auto number = [&stream] {
+    unsigned char b[4] = {};
+    stream.read(reinterpret_cast<char*>(b), sizeof b);
+    return std::uint32_t{b[0]} << 24u | std::uint32_t{b[1]} << 16u | std::uint32_t{b[2]} << 8u | b[3];
+  };
+  std::error_code error;
+  const std::uintmax_t at_most = std::filesystem::file_size(file, error);
+  for (std::vector<char> chunk;;) {  // length, name, data, checksum of the last two
+    const std::uint32_t length = number();
+    if (!stream || length > at_most) return kCutOff;
+    chunk.resize(length + 4);
+    if (!stream.read(chunk.data(), static_cast<std::streamsize>(chunk.size()))) return kCutOff;
+    const std::uint32_t sum = number();
+    if (!stream) return kCutOff;
+    if (::crc32(0, reinterpret_cast<const Bytef*>(chunk.data()), static_cast<uInt>(chunk.size())) != sum)
+      return "is damaged";
+    const std::string_view name(chunk.data(), 4);
+    if (name == "IHDR" && length >= 8)
+      for (const std::size_t at : {4u, 8u}) {
+        std::uint32_t side = 0;
+        for (std::size_t i = 0; i < 4; ++i) side = side << 8u | static_cast<unsigned char>(chunk[at + i]);
+        if (side == 0 || side > kLargestSide) return "claims a side of " + std::to_string(side) + " pixels";
+      }
+    if (name == "IEND") return "";
   }
+}
+
+// The reader of OpenImageIO for the format that the file begins as; none: another format. Left to itself it tries all
+// that it has, and some hand the file to libraries that open whatever other file or address it names.
+const char* format_of(const Path& file) {
+  struct Start {
+    std::string_view bytes;
+    const char* format;
+  };
+  using namespace std::string_view_literals;
+  constexpr Start kStarts[] = {{"\x89PNG\r\n\x1a\n"sv, "png"}, {"\xff\xd8\xff"sv, "jpeg"},   {"BM"sv, "bmp"},
+                               {"II\x2a\0"sv, "tiff"},          {"MM\0\x2a"sv, "tiff"},      {"II\x2b\0"sv, "tiff"},
+                               {"MM\0\x2b"sv, "tiff"},          {"\x76\x2f\x31\x01"sv, "openexr"},
+                               {"P2"sv, "pnm"},                 {"P3"sv, "pnm"},             {"P5"sv, "pnm"},
+                               {"P6"sv, "pnm"},                 {"RIFF"sv, "webp"}};
+  char bytes[8] = {};
+  std::ifstream stream(file, std::ios::binary);
+  stream.read(bytes, sizeof bytes);
+  const std::string_view begin(bytes, static_cast<std::size_t>(stream.gcount()));
+  for (const Start& start : kStarts)
+    if (begin.starts_with(start.bytes)) return start.format;
+  return nullptr;
 }
 
 std::unique_ptr<OIIO::ImageInput> open_image(const Path& file) {
   std::error_code error;
   if (!std::filesystem::exists(file, error))
     throw InputError(file.string(), "does not exist", "check the path and the frame numbers");
-  if (cut_off_png(file)) throw InputError(file.string(), "is cut off", "write it again");
+  if (!std::filesystem::is_regular_file(file, error))  // a pipe might never end
+    throw InputError(file.string(), "is not a file", "check the path and the frame numbers");
+  if (const std::string damage = damage_of_png(file); !damage.empty())
+    throw InputError(file.string(), damage, "write it again");
   OIIO::ImageSpec options;
   options.attribute("oiio:UnassociatedAlpha", 1);  // colors as stored, not multiplied by alpha
-  auto input = OIIO::ImageInput::open(file.string(), &options);
-  if (!input) {
+  const char* const format = format_of(file);
+  auto input = format ? OIIO::ImageInput::create(format) : nullptr;
+  OIIO::ImageSpec spec;
+  if (!input || !input->open(file.string(), spec, options)) {
     OIIO::geterror();  // its text names plugins and internals, not the user's mistake
+    if (input) input->geterror();
     throw InputError(file.string(), "is not a readable image", "write it again as PNG");
   }
+  if (spec.width < 1 || spec.height < 1 || spec.depth > 1 || spec.deep || spec.nchannels < 1 ||
+      spec.nchannels > kMostChannels || static_cast<std::int64_t>(spec.width) * spec.height > kMostPixels)
+    throw InputError(file.string(),
+                     "claims " + std::to_string(spec.width) + "x" + std::to_string(spec.height) + "x" +
+                         std::to_string(spec.depth) + " pixels of " + std::to_string(spec.nchannels) + " channels",
+                     "write it again as PNG of at most " + std::to_string(kMostPixels >> 20) + " million pixels");
   input->threads(1);  // files are read in parallel already
   return input;
 }
@@ -70,7 +125,7 @@ std::vector<Value> read_pixels(OIIO::ImageInput& input, const Path& file, OIIO::
 }
 
 // Opens `create` under a temporary name, writes, and renames: a reader never sees half a file.
-void write_image(const Path& file, const std::string& format, const OIIO::ImageSpec& spec, OIIO::TypeDesc type,
+void write_image(const Path& file, const std::string& format, const OIIO::ImageSpec& spec, const OIIO::TypeDesc& type,
                  const void* pixels) {
   const Path temporary = file.string() + ".tmp" + std::to_string(::getpid());
   auto output = OIIO::ImageOutput::create(format);

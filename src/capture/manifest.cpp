@@ -4,6 +4,7 @@
 #include <charconv>
 #include <cmath>
 #include <initializer_list>
+#include <limits>
 #include <nlohmann/json.hpp>
 #include <set>
 
@@ -21,8 +22,20 @@ Path ImageSource::frame_file(int frame) const {
 
 namespace {
 
-constexpr int kLargestSide = 1 << 15;        // px, of an image
-constexpr double kMostFocal = 1e6;           // px, of a focal length and the principal point: parallel rays
+// Bounds of what a file may ask for. Each is far beyond what a rope is recorded with: it is there because memory and
+// time follow the number, so that a slip of the pen or a hostile file ends in a line and not in a full memory.
+constexpr std::size_t kMostText = std::size_t{4} << 20;  // bytes of capture.json
+constexpr std::size_t kMostKeys = 1000;                  // of one object: they are looked up one by one
+constexpr std::size_t kMostCameras = 512;                // all their frames are held at once
+constexpr int kLargestSide = 1 << 15;                    // px, of an image
+constexpr double kLongestRecording = 3600.0;             // s; the dynamics are integrated over it in milliseconds
+constexpr double kLeastFocal = 1.0, kMostFocal = 1e6;    // px: less is no length in pixels, more are parallel rays
+constexpr double kFarthest = 1e6;                        // m, of a place in the world: digits are left for a pixel
+constexpr double kLongestRope = 100.0;                   // m
+constexpr double kThinnest = 1e-4;                       // of the length: masks are made in steps of a diameter
+constexpr double kHeaviest = 1e4;                        // kg
+constexpr double kMostGravity = 1e3;                     // m/s^2
+constexpr int kMostUnknown = 5;                          // unknown keys that are told of an object
 constexpr double kRotationTolerance = 1e-3;  // |R R^T - I|: three digits pass
 constexpr double kUnitTolerance = 1e-3;      // of a direction's length before we doubt it
 constexpr double kPerpendicular = 1e-3;      // rad
@@ -70,14 +83,20 @@ class Reader {
   // Unknown keys are doubts that name the nearest known key.
   void know(std::initializer_list<const char*> known) const {
     if (!object_) return;
-    for (const auto& [key, value] : object_->items()) {
+    int unknown = 0;
+    for (const auto& item : object_->items()) {
+      const std::string key = item.key().substr(0, 40);  // longer than any that is known
       if (std::any_of(known.begin(), known.end(), [&](const char* k) { return key == k; })) continue;
+      if (++unknown > kMostUnknown) continue;
       const char* nearest = *std::min_element(known.begin(), known.end(), [&](const char* a, const char* b) {
         return edit_distance(key, a) < edit_distance(key, b);
       });
       const bool similar = edit_distance(key, nearest) <= std::max<int>(2, static_cast<int>(key.size()) / 3);
       doubt(key, std::string("unknown key, ignored") + (similar ? "; is " + in_quotes(nearest) + " meant?" : ""));
     }
+    if (unknown > kMostUnknown)
+      findings_.doubts.push_back(where_ + (where_.ends_with(": ") ? "" : ": ") + std::to_string(unknown) +
+                                 " unknown keys, all ignored");
   }
 
   const Json* find(const std::string& key, bool required, const char* expected) const {
@@ -96,11 +115,36 @@ class Reader {
     return std::nullopt;
   }
 
-  double positive(const std::string& key, const char* expected) const {
+  // At most `most`, which `reason` explains.
+  double positive(const std::string& key, const char* expected, double most = std::numeric_limits<double>::max(),
+                  const char* reason = "") const {
     const auto value = number(key, true, expected);
     if (!value) return 0.0;
     if (*value <= 0.0) problem(key, core::exact(*value) + " is not positive", std::string("write ") + expected);
+    if (*value > most)
+      problem(key, core::exact(*value) + " is more than " + core::exact(most) + reason,
+              std::string("write ") + expected);
     return *value;
+  }
+
+  // Frames a second; 0 and a problem where it is none.
+  double rate() const {
+    const double value = positive("rate", "frames a second");
+    if (value >= kSlowestRate && value <= kFastestRate) return value;
+    if (value > 0.0)
+      problem("rate",
+              core::exact(value) + " is not between " + core::exact(kSlowestRate) + " and " +
+                  std::to_string(static_cast<int>(kFastestRate)) + " frames a second, between which cameras record motion",
+              "write frames a second");
+    return 0.0;
+  }
+
+  // A place in the world, where `place`: one that is absurdly far away leaves no digits for what is near.
+  bool near(const std::string& key, const Vector3& place) const {
+    if (place.cwiseAbs().maxCoeff() <= kFarthest) return true;
+    problem(key, "lies more than " + std::to_string(static_cast<int>(kFarthest)) + " m from the world's origin, too far for exact numbers",
+            "write meters from an origin near the rope");
+    return false;
   }
 
   int pixels(const std::string& key) const {
@@ -175,6 +219,11 @@ class Reader {
       problem(key, in_quotes(*value) + " is not a path inside the capture's folder", "put the file into the folder");
       return std::nullopt;
     }
+    constexpr std::size_t kLongestPath = 4096;  // bytes, of Linux
+    if (value->size() > kLongestPath) {
+      problem(key, in_quotes(*value) + " is longer than a path can be", "shorten it");
+      return std::nullopt;
+    }
     return value;
   }
 
@@ -227,12 +276,40 @@ bool is_file(const Path& file) {
   return std::filesystem::is_regular_file(file, error);
 }
 
+constexpr const char* kOwnFile = "copy the file itself into the capture's folder";
+
+// Throws InputError unless `file` is one: reading a pipe or a device might never end.
+void require_file(const Path& file) {
+  if (is_file(file)) return;
+  std::error_code error;
+  const auto status = std::filesystem::status(file, error);
+  if (!std::filesystem::exists(status)) throw InputError(file.string(), "does not exist", "check the path");
+  if (std::filesystem::is_directory(status))
+    throw InputError(file.string(), "is a folder, not a file", "name a file");
+  throw InputError(file.string(), "is a pipe or device, not a file", "name a file");
+}
+
+// The same for what a capture names, which must lie in its folder.
+void require_own_file(const Path& folder, const Path& file) {
+  if (const std::string link = link_out_of(folder, file); !link.empty()) throw InputError(file.string(), link, kOwnFile);
+  require_file(file);
+}
+
 // Sets source.frames; false and a problem when there are none or a number is left out.
-bool count_frames(ImageSource& source, const std::string& where, double* rate, const Camera* camera,
-                  Findings& findings) {
+bool count_frames(ImageSource& source, const Path& folder, const std::string& where, double* rate,
+                  const Camera* camera, Findings& findings) {
+  const auto too_many = [&](const Path& file) {
+    findings.problems.push_back({file.string(),
+                                 "there are more than " + std::to_string(kMostFrames) +
+                                     " frames, which no memory holds as a training needs them",
+                                 "split the recording"});
+    return false;
+  };
   if (source.video) {
     try {
+      require_own_file(folder, source.file);
       const VideoFacts facts = video_facts(source.file);
+      if (facts.frames > kMostFrames) return too_many(source.file);
       source.frames = facts.frames;
       if (rate) *rate = facts.rate;
       if (camera && facts.width > 0 && (facts.width != camera->width || facts.height != camera->height)) {
@@ -251,7 +328,23 @@ bool count_frames(ImageSource& source, const std::string& where, double* rate, c
     findings.problems.push_back({source.file.string(), "has no frame", "write the video again"});
     return false;
   }
-  while (is_file(source.frame_file(source.frames))) ++source.frames;
+  std::string leaving;  // where a frame does
+  Path inside;          // the folder of the last frame
+  const auto there = [&](int frame) {
+    const Path file = source.frame_file(frame);
+    if (!is_file(file)) return false;
+    const auto leaves = [&](const Path& place) {
+      leaving = link_out_of(folder, place);
+      if (!leaving.empty()) findings.problems.push_back({where + ": " + place.string(), leaving, kOwnFile});
+      return !leaving.empty();
+    };
+    std::error_code error;
+    if (file.parent_path() != inside && leaves(inside = file.parent_path())) return false;
+    return !std::filesystem::is_symlink(file, error) || !leaves(file);
+  };
+  while (source.frames <= kMostFrames && there(source.frames)) ++source.frames;
+  if (!leaving.empty()) return false;
+  if (source.frames > kMostFrames) return too_many(source.frame_file(0));
   constexpr int kLookAhead = 16;  // frames: a longer gap is taken for the end
   for (int k = source.frames + 1; k < source.frames + kLookAhead; ++k)
     if (is_file(source.frame_file(k))) {
@@ -291,10 +384,11 @@ std::vector<double> read_timestamps(const Path& file) {
   return times;
 }
 
-void set_times(CameraSource& source, Findings& findings) {
+void set_times(CameraSource& source, const Path& folder, Findings& findings) {
   const int frames = source.images.frames;
   if (source.timestamps) {
     try {
+      require_own_file(folder, *source.timestamps);
       source.times = read_timestamps(*source.timestamps);
     } catch (const InputError& error) {
       findings.problems.push_back({source.where + ".timestamps", error.what(), "correct the file"});
@@ -323,6 +417,13 @@ void set_times(CameraSource& source, Findings& findings) {
     for (int k = 0; k < frames; ++k) source.times[k] = source.start + k / source.rate;
     source.interval = 1.0 / source.rate;
   }
+  if (const double seconds = source.times.back() - source.times.front(); seconds > kLongestRecording) {
+    findings.problems.push_back({source.where + (source.timestamps ? ".timestamps" : ".rate"),
+                                 "the frames span " + core::exact(seconds) + " s and a recording at most " +
+                                     core::exact(kLongestRecording) + " s, for the motion between all is computed",
+                                 "correct it or split the recording"});
+    source.times.clear();
+  }
 }
 
 void read_pose(const Reader& reader, Camera& camera) {
@@ -348,6 +449,7 @@ void read_pose(const Reader& reader, Camera& camera) {
     reader.problem("world_from_camera", "its upper left 3x3 is a reflection", "turn the sign of one camera axis");
     return;
   }
+  if (!reader.near("world_from_camera", {a[3], a[7], a[11]})) return;
   camera.world_from_camera = {math::orthonormalized(rotation), {a[3], a[7], a[11]}};
 }
 
@@ -381,6 +483,11 @@ Camera read_optics(const Reader& reader) {
   Camera camera;
   camera.width = reader.pixels("width");
   camera.height = reader.pixels("height");
+  if (static_cast<std::int64_t>(camera.width) * camera.height > kMostPixels)
+    reader.problem("width",
+                   std::to_string(camera.width) + "x" + std::to_string(camera.height) + " are more than " +
+                       std::to_string(kMostPixels >> 20) + " million pixels, which no memory holds for every frame",
+                   "write the image's size, or make the images smaller");
   camera.fx = reader.positive("fx", "the focal length in pixels");
   camera.fy = reader.positive("fy", "the focal length in pixels");
   camera.cx = reader.number("cx", true, "the principal point in pixels").value_or(0.0);
@@ -388,12 +495,15 @@ Camera read_optics(const Reader& reader) {
   for (const auto& [key, value] : {std::pair("fx", camera.fx), {"fy", camera.fy}, {"cx", camera.cx}, {"cy", camera.cy}})
     if (std::abs(value) > kMostFocal)
       reader.problem(key, core::exact(value) + " is beyond every camera", "write it in pixels");
+  for (const auto& [key, value] : {std::pair("fx", camera.fx), {"fy", camera.fy}})
+    if (value > 0.0 && value < kLeastFocal)
+      reader.problem(key, core::exact(value) + " is less than a pixel", "write the focal length in pixels");
   if (camera.width > 0 && camera.height > 0 &&
       (camera.cx < 0 || camera.cx > camera.width || camera.cy < 0 || camera.cy > camera.height))
     reader.doubt("cx", "the principal point lies outside the image");
   if (const auto values = reader.numbers("distortion", 5, false, "OpenCV's [k1, k2, p1, p2, k3]"))
     std::copy(values->begin(), values->end(), camera.distortion.begin());
-  if (camera.width > 0 && camera.height > 0 && camera.fx > 0 && camera.fy > 0) check_lens(reader, camera);
+  if (camera.width > 0 && camera.height > 0 && camera.fx >= kLeastFocal && camera.fy >= kLeastFocal) check_lens(reader, camera);
   read_pose(reader, camera);
   return camera;
 }
@@ -417,7 +527,7 @@ CameraSource read_camera(const Reader& reader, const std::string& where, const P
   if (const auto file = reader.path("timestamps", false, "a text file with a time a line"))
     source.timestamps = folder / *file;
   if (!reader.has("timestamps")) {
-    source.rate = reader.positive("rate", "frames a second");
+    source.rate = reader.rate();
     source.start = reader.number("start", false, "the first frame's time in seconds").value_or(0.0);
   }
   return source;
@@ -428,8 +538,49 @@ std::string line_of(const std::string& text, std::size_t byte) {
   return std::to_string(1 + std::count(text.begin(), text.begin() + static_cast<std::ptrdiff_t>(end), '\n'));
 }
 
+// What a document hides: of a key that stands twice in an object it has the last one only. It also looks keys up one by
+// one, so that very many of them in one object would take a time that grows with their square.
+struct Keys : nlohmann::json_sax<Json> {
+  std::vector<std::set<std::string>> objects;  // that are open
+  std::optional<std::string> twice;
+  bool many = false;
+  bool key(std::string& name) override {
+    if (!objects.back().insert(name).second) twice = name;
+    many = objects.back().size() > kMostKeys;
+    return !twice && !many;
+  }
+  bool start_object(std::size_t) override {
+    objects.emplace_back();
+    return true;
+  }
+  bool end_object() override {
+    objects.pop_back();
+    return true;
+  }
+  bool null() override { return true; }
+  bool boolean(bool) override { return true; }
+  bool number_integer(Json::number_integer_t) override { return true; }
+  bool number_unsigned(Json::number_unsigned_t) override { return true; }
+  bool number_float(Json::number_float_t, const std::string&) override { return true; }
+  bool string(std::string&) override { return true; }
+  bool binary(Json::binary_t&) override { return true; }
+  bool start_array(std::size_t) override { return true; }
+  bool end_array() override { return true; }
+  bool parse_error(std::size_t, const std::string&, const nlohmann::detail::exception&) override { return false; }
+};
+
 // The object in a file.
 Json parse(const std::string& text, const std::string& file, const char* expected) {
+  if (text.size() > kMostText)
+    throw InputError(file, "is larger than " + std::to_string(kMostText >> 20) + " MiB, too large for numbers and names",
+                     std::string("write ") + expected);
+  Keys keys;
+  Json::sax_parse(text, &keys);
+  if (keys.twice)
+    throw InputError(file, "the key " + in_quotes(*keys.twice) + " stands twice in one object", "remove one of them");
+  if (keys.many)
+    throw InputError(file, "an object has more than " + std::to_string(kMostKeys) + " keys",
+                     std::string("write ") + expected);
   Json json;
   try {
     json = core::parse_json(text);
@@ -450,10 +601,11 @@ void survey(Manifest& manifest, bool masked, Findings& findings) {
     CameraSource& source = manifest.cameras[c];
     Findings& mine = found[c];
     if (source.images.file.empty() && source.images.prefix.empty()) return;
-    if (!count_frames(source.images, source.where + ".images", &source.video_rate, &source.camera, mine)) return;
+    const Path& folder = manifest.capture.folder;
+    if (!count_frames(source.images, folder, source.where + ".images", &source.video_rate, &source.camera, mine)) return;
     const int frames = source.images.frames;
     const auto compare = [&](std::optional<ImageSource>& other, const char* key) {
-      if (!other || !count_frames(*other, source.where + "." + key, nullptr, &source.camera, mine)) return;
+      if (!other || !count_frames(*other, folder, source.where + "." + key, nullptr, &source.camera, mine)) return;
       if (other->frames < frames)
         mine.problems.push_back({source.where + "." + key,
                                  std::to_string(other->frames) + " frames, but images has " + std::to_string(frames),
@@ -464,7 +616,7 @@ void survey(Manifest& manifest, bool masked, Findings& findings) {
     };
     if (masked) compare(source.masks, "masks");
     compare(source.depth, "depth");
-    if (source.timestamps || source.rate > 0) set_times(source, mine);
+    if (source.timestamps || source.rate > 0) set_times(source, folder, mine);
   });
   for (const Findings& one : found) {
     findings.problems.insert(findings.problems.end(), one.problems.begin(), one.problems.end());
@@ -475,6 +627,7 @@ void survey(Manifest& manifest, bool masked, Findings& findings) {
 void read_base(Manifest& manifest, const Path& file, Findings& findings) {
   Capture& capture = manifest.capture;
   try {
+    require_own_file(capture.folder, file);
     capture.base = trajectory::fit(trajectory::read_tum(file), file.string());
   } catch (const InputError& error) {
     findings.problems.push_back({manifest.file.string() + ": base", error.what(), "correct the file"});
@@ -516,6 +669,7 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
   manifest.file = std::filesystem::is_directory(path, error) ? path / "capture.json" : path;
   Capture& capture = manifest.capture;
   capture.folder = manifest.file.has_parent_path() ? manifest.file.parent_path() : Path(".");
+  if (std::filesystem::exists(manifest.file, error)) require_file(manifest.file);
   const std::string text = core::read_file(manifest.file);
   const std::string file = manifest.file.string();
   const Json json = parse(text, file, "{ \"format\": \"chainsplat-capture/1\", ... }");
@@ -535,7 +689,10 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
   if (const auto gravity = top.vector("gravity", false, "[0, 0, -9.81]")) {
     capture.gravity = *gravity;
     constexpr double kLeast = 9.7, kMost = 9.9;  // m/s^2, anywhere on Earth
-    if (gravity->norm() < kLeast || gravity->norm() > kMost)
+    if (!(gravity->norm() <= kMostGravity))
+      top.problem("gravity", "is more than " + core::exact(kMostGravity) + " m/s^2, beyond every experiment",
+                  "write it in m/s^2, world frame");
+    else if (gravity->norm() < kLeast || gravity->norm() > kMost)
       top.doubt("gravity", "has length " + core::exact(gravity->norm()) + " m/s^2, not Earth's");
   } else if (!top.has("gravity")) {
     top.doubt("gravity", "is missing; (0, 0, -9.81) is assumed");
@@ -544,15 +701,18 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
   const Reader object = top.child("object", true, "{ \"length\": 0.3, \"diameter\": 0.02, \"mass\": 0.06 }");
   if (object.present()) {
     object.know({"length", "diameter", "mass"});
-    capture.length = object.positive("length", "meters from the grasp to the free end");
+    capture.length = object.positive("length", "meters from the grasp to the free end", kLongestRope, " m");
     capture.diameter = object.positive("diameter", "meters");
     if (object.has("mass")) {
-      const double mass = object.positive("mass", "kilograms, or leave it out");
+      const double mass = object.positive("mass", "kilograms, or leave it out", kHeaviest, " kg");
       if (mass > 0) capture.mass = mass;
     }
     if (capture.length > kTopMeters) object.doubt("length", core::exact(capture.length) + " m: are these millimeters?");
     if (capture.length > 0 && capture.diameter >= capture.length)
       object.problem("diameter", "is not less than the length", "write both in meters");
+    if (capture.diameter > 0 && capture.diameter < kThinnest * capture.length)
+      object.problem("diameter", "is less than 1/" + std::to_string(std::lround(1.0 / kThinnest)) + " of the length, as no camera sees",
+                     "write both in meters");
   }
 
   const Reader grasp = top.child("grasp", true, "{ \"direction\": [0, 0, -1], \"bending_axis\": [0, 1, 0] }");
@@ -575,7 +735,7 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
     const auto normal = table.direction("normal", "the table's upward normal, world frame");
     if (!capture.tabletop)
       top.doubt("table", "is ignored in free space");
-    else if (point && normal)
+    else if (point && normal && table.near("point", *point))
       capture.table = Table{*point, *normal};
   }
 
@@ -583,6 +743,13 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
   const Json* cameras = top.find("cameras", true, "a list of cameras");
   if (cameras && (!cameras->is_array() || cameras->empty())) {
     top.problem("cameras", "is not a list of at least one camera", "describe every camera as an object");
+    cameras = nullptr;
+  }
+  if (cameras && cameras->size() > kMostCameras) {
+    top.problem("cameras",
+                std::to_string(cameras->size()) + " are more than " + std::to_string(kMostCameras) +
+                    ", whose frames no memory holds at once",
+                "leave out what is not needed");
     cameras = nullptr;
   }
   std::set<std::string> names;
@@ -596,7 +763,7 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
     }
     const auto name = value.find("name");
     const std::string given = name != value.end() && name->is_string() ? name->get<std::string>() : "";
-    all_names.append(c ? ", " : "").append(given);
+    all_names.append(c ? ", " : "").append(given, 0, 64);
     if (!given.empty() && !names.insert(given).second)
       findings.problems.push_back(
           {where + ".name", in_quotes(given) + " is used twice", "give every camera its own name"});
@@ -613,8 +780,28 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
     capture.times.push_back(source.times);
     capture.has_depth = capture.has_depth || source.depth.has_value();
   }
-  capture.hash = capture_hash(text, manifest, base ? capture.folder / *base : Path());
+  if (findings.problems.empty()) capture.hash = capture_hash(text, manifest, base ? capture.folder / *base : Path());
   return manifest;
+}
+
+std::string link_out_of(const Path& folder, const Path& file) {
+  namespace fs = std::filesystem;
+  std::error_code error;
+  Path root = fs::weakly_canonical(fs::absolute(folder), error);
+  if (root.filename().empty() && root.has_relative_path()) root = root.parent_path();  // 'folder/'
+  const auto leaves = [&](const Path& place) {
+    const Path resolved = fs::weakly_canonical(fs::absolute(place), error);
+    return !error && std::mismatch(root.begin(), root.end(), resolved.begin(), resolved.end()).first != root.end();
+  };
+  if (!leaves(file)) return "";
+  Path way = folder;
+  for (const Path& part : file.lexically_relative(folder)) {
+    way /= part;
+    if (fs::is_symlink(way, error) && leaves(way))
+      return (way == file ? "" : "its folder " + way.string() + " ") + "is a link out of " + folder.string() + ", to " +
+             fs::weakly_canonical(way, error).string();
+  }
+  return "leads out of " + folder.string() + ", to " + fs::weakly_canonical(file, error).string();
 }
 
 Calibration read_calibration(const Path& path) {
@@ -627,7 +814,7 @@ Calibration read_calibration(const Path& path) {
   Calibration calibration;
   calibration.camera = read_optics(reader);
   calibration.camera.name = reader.text("name", false, "a short name like cam0").value_or("camera");
-  if (reader.has("rate")) calibration.rate = reader.positive("rate", "frames a second");
+  if (reader.has("rate")) calibration.rate = reader.rate();
   calibration.start = reader.number("start", false, "the first frame's time in seconds").value_or(0.0);
   if (!findings.problems.empty()) {
     const Problem& first = findings.problems.front();

@@ -47,7 +47,13 @@ Owned<AVFrame> padded_frame(int width, int height, AVPixelFormat format) {
   return frame;
 }
 
-constexpr int kMostPixels = 1 << 28;  // refuse sizes that only a damaged header claims
+// What libav may open. It knows formats that are lists of further files or addresses (HLS, DASH, concat, SDP, ...) and
+// tells a format by its contents, whatever the name: a file that calls itself cam0.mp4 could have it open any other.
+// These hold their frames themselves.
+constexpr const char* kContainers =
+    "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,ogg,flv,asf,h264,hevc,m4v,mpegvideo,obu,ivf,mjpeg,"
+    "yuv4mpegpipe";
+constexpr const char* kProtocols = "file";
 
 std::string error_text(int code) {
   char text[AV_ERROR_MAX_STRING_SIZE] = {};
@@ -130,10 +136,15 @@ Opened open_video(const Path& file, const DeviceFormat& format = {}) {
   if (!std::filesystem::exists(file, error)) throw InputError(file.string(), "does not exist", "check the path");
   if (is_device(file)) return open_camera_as_asked(file, format);
   AVFormatContext* raw = nullptr;
-  int code = avformat_open_input(&raw, file.c_str(), nullptr, nullptr);
+  AVDictionary* only = nullptr;
+  av_dict_set(&only, "format_whitelist", kContainers, 0);
+  av_dict_set(&only, "protocol_whitelist", kProtocols, 0);
+  // with its protocol before it no name is taken for an address
+  int code = avformat_open_input(&raw, ("file:" + file.string()).c_str(), nullptr, &only);
+  av_dict_free(&only);
   if (code < 0)
     throw InputError(file.string(), "is not a readable video (" + error_text(code) + ")",
-                     "write it again, or name an image pattern like cam0/%06d.png");
+                     "write it again as MP4 or MKV, or name an image pattern like cam0/%06d.png");
   Opened opened{Owned<AVFormatContext>(raw), 0};
   code = avformat_find_stream_info(raw, nullptr);
   if (code >= 0) code = av_find_best_stream(raw, AVMEDIA_TYPE_VIDEO, -1, -1, nullptr, 0);
@@ -285,6 +296,7 @@ VideoReader::VideoReader(const Path& file, int threads, const DeviceFormat& form
   self.decoder.reset(avcodec_alloc_context3(codec));
   avcodec_parameters_to_context(self.decoder.get(), &parameters);
   self.decoder->thread_count = std::max(1, threads);
+  self.decoder->max_pixels = kMostPixels;  // a damaged header claims any size
   self.decoder->pkt_timebase = self.input.video().time_base;
   const int code = avcodec_open2(self.decoder.get(), codec, nullptr);
   if (code < 0) throw InputError(file.string(), "cannot be decoded (" + error_text(code) + ")", "write it as H.264");
@@ -413,7 +425,7 @@ VideoFacts video_facts(const Path& file) {
   facts.height = video.codecpar->height;
   facts.rate = claimed_rate(video);
   Owned<AVPacket> packet(av_packet_alloc());
-  while (av_read_frame(input.format.get(), packet.get()) >= 0) {
+  while (facts.frames <= kMostFrames && av_read_frame(input.format.get(), packet.get()) >= 0) {
     if (packet->stream_index == input.stream && !(packet->flags & AV_PKT_FLAG_DISCARD)) ++facts.frames;
     av_packet_unref(packet.get());
   }

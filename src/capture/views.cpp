@@ -362,7 +362,7 @@ void add_depth(const Manifest& manifest, std::vector<View>& views) {
   for_each_in_parallel(static_cast<std::int64_t>(views.size()), [&](std::int64_t i) {
     View& view = views[i];
     const CameraSource& source = manifest.cameras[view.camera];
-    if (!source.depth) return;
+    if (!source.depth || !view.depth.empty()) return;
     constexpr bool kUndistorting = false;
     fill_depth(view, source.camera,
                read_depth(source.depth->frame_file(view.frame), source.camera.width, source.camera.height,

@@ -36,7 +36,7 @@ class PlanarEngine : public Engine {
     double mass, moment_x, moment_y, xx, xy, yy;  // second moments; about z: xx + yy
   };
   struct Slope {          // minus dW/d(...), as it enters the body force
-    double e[3][3];       // by the link's twist, with the inertial part
+    double e[3][3] = {};  // by the link's twist, with the inertial part
     Planar turn_back[3];  // by the normal, turned back by a unit about x, y, z
     Planar z, zx, zy;     // by the z velocity 1, x, y
   };
@@ -57,7 +57,7 @@ class PlanarEngine : public Engine {
   Vector3 spin_rate_, slide_rate_;  // their derivatives, component by component, without gravity
   Vector3 normal_here_;             // the table's, in the plane's frame
   Vector3 gravity_here_;
-  double tidal_xx_, tidal_xy_, tidal_yy_;
+  double tidal_xx_ = 0.0, tidal_xy_ = 0.0, tidal_yy_ = 0.0;
   std::vector<double> cos_, sin_, first_moment_, second_, across_;  // a link
   std::vector<double> px_, py_;                                     // joints
   std::vector<Planar> inner_v_, inner_a_, v_, a_, turn_k_, wrench_, force_;

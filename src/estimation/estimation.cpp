@@ -1,8 +1,11 @@
 #include "chainsplat/estimation.h"
 
 #include <algorithm>
+#include <charconv>
 #include <cmath>
+#include <cstdio>
 #include <iterator>
+#include <nlohmann/json.hpp>
 #include <numeric>
 
 #include "src/estimation/color.h"
@@ -159,7 +162,9 @@ MatrixX shape_covariance(const chain::Chain& chain, const std::vector<double>& v
   for (std::size_t i = 0; i < variances.size(); ++i) weights[i] = 1.0 / variances[i];
   MatrixX information = torque_covariance(link_end_jacobians(chain, Pose{}, theta), weights);
   information.diagonal().array() += 1.0 / (kUnseenAngle * kUnseenAngle);
-  return information.llt().solve(MatrixX::Identity(n, n));
+  const Eigen::LLT<MatrixX> factor(information);
+  CHAINSPLAT_CHECK(math::is_positive(factor), "angles that are not finite");
+  return factor.solve(MatrixX::Identity(n, n));
 }
 
 // Standard deviation of the centerline, RMS over the rope, m: of the angles, `covariance`, and of the shape, which also
@@ -300,7 +305,11 @@ Measured measure(const Filter& filter, const Belief& predicted, std::span<const 
     for (const int axis : {0, 1}) fitted.push_back(3 * n + 2 * views[v]->camera + axis);
   const VectorX expected = predicted.mean(fitted);
   const MatrixX prior = predicted.covariance(fitted, fitted);
-  const MatrixX information = prior.llt().solve(MatrixX::Identity(prior.rows(), prior.rows()));
+  const Eigen::LLT<MatrixX> factor(prior);
+  if (!math::is_positive(factor))
+    throw WorkError("estimate", "the predicted covariance at " + core::exact(predicted.time) + " s is not positive",
+                    "check the twin's parameters and the base motion about that time");
+  const MatrixX information = factor.solve(MatrixX::Identity(prior.rows(), prior.rows()));
   silhouette::Options options = filter.options.silhouette;
   options.joint_smoothness = kNoSmoothness;
   options.prior.mean = expected;
@@ -371,6 +380,14 @@ void look_at_colors(const Filter& filter, std::span<const capture::View* const> 
     symmetrize(belief.covariance);
     belief.covariance.diagonal().array() += kLeastVariance;
   }
+}
+
+// To nine digits: most of a line is its covariance.
+double rounded(double value) {
+  char text[32];
+  const int size = std::snprintf(text, sizeof text, "%.9g", value);
+  std::from_chars(text, text + size, value);
+  return value;
 }
 
 bool explains(const silhouette::FrameFit& fit) { return fit.covered >= kLostShare && fit.theta.allFinite(); }
@@ -652,29 +669,28 @@ double tube_iou(const chain::Chain& chain, const Pose& base, const VectorX& thet
 }
 
 std::string to_json(const Estimate& estimate, double latency, bool rates) {
-  const auto list = [](const VectorX& values) {
-    std::string text = "[";
-    for (Eigen::Index k = 0; k < values.size(); ++k) text += (k ? "," : "") + core::exact(values[k]);
-    return text + "]";
-  };
+  using Json = nlohmann::ordered_json;
+  const auto list = [](const VectorX& values) { return Json(std::vector<double>(values.begin(), values.end())); };
   const int n = static_cast<int>(estimate.theta.size());
-  std::string covariance;
+  Json covariance = Json::array();
   const Eigen::Index rows = std::min<Eigen::Index>(estimate.covariance.rows(), rates ? 2 * n : n);
   for (Eigen::Index row = 0; row < rows; ++row)
-    for (Eigen::Index column = 0; column <= row; ++column) {
-      char number[32];
-      std::snprintf(number, sizeof number, "%s%.9g", row ? "," : "", estimate.covariance(row, column));
-      covariance += number;
-    }
-  char milliseconds[32];
-  std::snprintf(milliseconds, sizeof milliseconds, "%.3f", 1e3 * latency);
-  return "{\"frame\":" + std::to_string(estimate.frame) + ",\"time\":" + core::exact(estimate.time) +
-         ",\"theta\":" + list(estimate.theta) + ",\"thetadot\":" + list(estimate.thetadot) + ",\"sigma\":" +
-         list(estimate.covariance.diagonal().head(std::min<Eigen::Index>(n, estimate.covariance.rows())).cwiseSqrt()) +
-         ",\"centerline_sigma\":" + (rows > 0 ? core::exact(estimate.centerline_sigma) : "null") +
-         ",\"iou\":" + core::exact(estimate.iou) + ",\"residual\":" + core::exact(estimate.residual) +
-         ",\"color_residual\":" + core::exact(estimate.color_residual) + ",\"covariance\":[" + covariance +
-         "],\"lost\":" + (estimate.lost ? "true" : "false") + ",\"latency_ms\":" + milliseconds + "}";
+    for (Eigen::Index column = 0; column <= row; ++column)
+      covariance.push_back(rounded(estimate.covariance(row, column)));
+  const VectorX variance = estimate.covariance.diagonal().head(std::min<Eigen::Index>(n, estimate.covariance.rows()));
+  const Json line{{"frame", estimate.frame},
+                  {"time", estimate.time},
+                  {"theta", list(estimate.theta)},
+                  {"thetadot", list(estimate.thetadot)},
+                  {"sigma", list(variance.cwiseSqrt())},
+                  {"centerline_sigma", rows > 0 ? Json(estimate.centerline_sigma) : Json()},
+                  {"iou", estimate.iou},
+                  {"residual", estimate.residual},
+                  {"color_residual", estimate.color_residual},
+                  {"covariance", std::move(covariance)},
+                  {"lost", estimate.lost},
+                  {"latency_ms", std::round(1e6 * latency) / 1e3}};
+  return line.dump();
 }
 
 }  // namespace chainsplat::estimation

@@ -97,7 +97,8 @@ struct PixelCloud {
     for (std::size_t k = 0; k < image.depth.size(); ++k) {
       const double z = image.depth[k];
       if (!(z > 0.0)) continue;
-      Vector2 pixel(image.x0 + static_cast<int>(k) % width + 0.5, image.y0 + static_cast<int>(k) / width + 0.5);
+      const int column = static_cast<int>(k) % width, row = static_cast<int>(k) / width;
+      Vector2 pixel(image.x0 + column + 0.5, image.y0 + row + 0.5);
       if (camera.distorted()) pixel = capture::undistort(camera, pixel);
       points[k] = {(pixel.x() - camera.cx) / camera.fx * z, (pixel.y() - camera.cy) / camera.fy * z, z};
       columns.col(next++) = points[k];

@@ -216,7 +216,7 @@ std::string to_json(const Metrics& metrics) {
   using Json = nlohmann::ordered_json;
   const auto values = [](Json out, const FrameMetrics& frame) {
     for (const Metric& metric : kMetrics)
-      if (!std::isnan(frame.*metric.value)) out[metric.name] = frame.*metric.value;
+      if (std::isfinite(frame.*metric.value)) out[metric.name] = frame.*metric.value;
     return out;
   };
   Json out{{"mean", values(Json::object(), metrics.mean)}, {"cameras", Json::object()}, {"frames", Json::array()}};

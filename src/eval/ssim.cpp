@@ -14,7 +14,7 @@ constexpr double kC1 = 0.01 * 0.01, kC2 = 0.03 * 0.03;
 constexpr int kMoments = 5;  // filtered: x, y, x^2, y^2, x y
 
 std::array<double, 2 * kReach + 1> window() {
-  std::array<double, 2 * kReach + 1> weights;
+  std::array<double, 2 * kReach + 1> weights{};
   double sum = 0.0;
   for (int t = -kReach; t <= kReach; ++t) sum += weights[t + kReach] = std::exp(-0.5 * t * t / (kSigma * kSigma));
   for (double& weight : weights) weight /= sum;

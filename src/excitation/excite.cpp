@@ -82,8 +82,10 @@ Known known_parameters(const Problem& problem) {
   known.covariance = (0.5 * (known.covariance + known.covariance.transpose())).eval();
   // written and read, it may be off positive by rounding
   known.covariance.diagonal() *= 1.0 + 1e-9;
-  known.information =
-      known.covariance.ldlt().solve(MatrixX::Identity(known.covariance.rows(), known.covariance.cols()));
+  const Eigen::LDLT<MatrixX> factor(known.covariance);
+  if (!math::is_positive(factor))
+    throw InputError("excite", "the covariance of the twin's parameters is not positive definite", "identify it again");
+  known.information = factor.solve(MatrixX::Identity(known.covariance.rows(), known.covariance.cols()));
   return known;
 }
 

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <nlohmann/json.hpp>
 #include <numeric>
 
 #include "force/track.h"
@@ -284,6 +285,38 @@ Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, 
   return e;
 }
 
+struct Uncertainty {
+  std::vector<std::string> names;
+  MatrixX covariance;
+};
+
+// Of the parameters among the estimates. None where nothing of it is known.
+std::optional<Uncertainty> known_uncertainty(const dynamics::Model& model, const dynamics::Estimates& estimates) {
+  const auto all = static_cast<Eigen::Index>(estimates.names.size());
+  if (all == 0 || estimates.covariance.rows() != all || estimates.covariance.cols() != all) return {};
+  const std::vector<dynamics::Tangent> tangents = dynamics::tangents(model.chain, model.parameters, estimates.names);
+  std::vector<Eigen::Index> of;
+  for (Eigen::Index i = 0; i < all; ++i)
+    if (dynamics::is_parameter(tangents[i])) of.push_back(i);
+  const MatrixX covariance = estimates.covariance(of, of);
+  const std::vector<Eigen::Index> known = math::known_part(covariance);
+  Uncertainty out{{}, covariance(known, known)};
+  std::string unknown;
+  for (std::size_t i = 0; i < of.size(); ++i) {
+    const std::string& name = estimates.names[of[i]];
+    if (std::binary_search(known.begin(), known.end(), static_cast<Eigen::Index>(i)))
+      out.names.push_back(name);
+    else
+      unknown += (unknown.empty() ? "" : ", ") + name;
+  }
+  if (unknown.empty()) return out;
+  core::warn(
+      "twin.json: identification.covariance: has null for " + unknown + "; the forces' standard errors " +
+      (known.empty() ? "assume how uncertain stiffness and damping usually are" : "leave out how uncertain that is"));
+  if (known.empty()) return {};
+  return out;
+}
+
 // The line of state `at` of a live window, which ends with the newest state.
 Estimate live_line(Live& live, std::size_t at) {
   const bool automatic = !live.contact;
@@ -311,7 +344,9 @@ MatrixX angle_covariance(const chain::Chain& chain, const VectorX& theta, const 
   for (const MatrixX& jacobian : link_end_jacobians(chain, axes, chain::link_motions(chain, theta, Pose{})))
     information.noalias() += jacobian.transpose() * jacobian;
   information.diagonal().array() += std::pow(kUnseenLever * chain.diameter, 2);
-  const MatrixX covariance = information.llt().solve(MatrixX::Identity(sigma.size(), sigma.size()));
+  const Eigen::LLT<MatrixX> factor(information);
+  CHAINSPLAT_CHECK(math::is_positive(factor), "angles that are not finite");
+  const MatrixX covariance = factor.solve(MatrixX::Identity(sigma.size(), sigma.size()));
   const VectorX scale = sigma.cwiseQuotient(covariance.diagonal().cwiseSqrt());
   return scale.asDiagonal() * covariance * scale.asDiagonal();
 }
@@ -324,6 +359,9 @@ VectorX residual_torque(const dynamics::Model& model, const trajectory::BaseMoti
 
 Fit solve(const MatrixX& jacobian, const VectorX& residual, const MatrixX& covariance, const Matrix3& prior) {
   const Eigen::LLT<MatrixX> factor(covariance);
+  if (!math::is_positive(factor))
+    throw InputError("force", "the covariance of the unexplained torque is not positive definite",
+                     "check the states, their covariance and the twin's parameters");
   const MatrixX weighted = factor.solve(jacobian.transpose());  // n x 3
   const Matrix3 information = jacobian * weighted + prior.inverse();
   Fit out;
@@ -338,7 +376,7 @@ Contact nearest_contact(const chain::Chain& chain, const splat::Gaussians& gauss
                         const VectorX& theta, const MatrixX& points) {
   const std::vector<Pose> motions = chain::link_motions(chain, theta, base);
   Contact best;
-  double least = 1e300;
+  double least = best.distance = std::numeric_limits<double>::infinity();
   const auto offer = [&](int link, double arclength, const Vector3& home) {
     const Vector3 x = motions[link] * home;
     for (Eigen::Index i = 0; i < points.cols(); ++i) {
@@ -367,21 +405,15 @@ Contact nearest_contact(const chain::Chain& chain, const splat::Gaussians& gauss
 
 std::vector<dynamics::Model> deviations(const dynamics::Model& model, const dynamics::Estimates& estimates) {
   const chain::Chain& chain = model.chain;
-  std::vector<std::string> names;
-  MatrixX covariance;
-  const auto all = static_cast<Eigen::Index>(estimates.names.size());
-  if (all > 0 && estimates.covariance.rows() == all && estimates.covariance.cols() == all) {
-    const std::vector<dynamics::Tangent> tangents = dynamics::tangents(chain, model.parameters, estimates.names);
-    std::vector<Eigen::Index> of;
-    for (Eigen::Index i = 0; i < all; ++i)
-      if (dynamics::is_parameter(tangents[i])) of.push_back(i), names.push_back(estimates.names[i]);
-    covariance = estimates.covariance(of, of);
-  } else {
+  std::optional<Uncertainty> known = known_uncertainty(model, estimates);
+  if (!known) {
+    known.emplace();
     for (const char* const name : {"log_stiffness_joint_", "log_damping_joint_"})
-      for (int joint = 1; joint < chain.links(); ++joint) names.push_back(name + std::to_string(joint));
-    const auto count = static_cast<Eigen::Index>(names.size());
-    covariance = kUnknownDeviation * kUnknownDeviation * MatrixX::Identity(count, count);
+      for (int joint = 1; joint < chain.links(); ++joint) known->names.push_back(name + std::to_string(joint));
+    const auto count = static_cast<Eigen::Index>(known->names.size());
+    known->covariance = kUnknownDeviation * kUnknownDeviation * MatrixX::Identity(count, count);
   }
+  const auto& [names, covariance] = *known;
   const Eigen::SelfAdjointEigenSolver<MatrixX> principal(covariance);
   std::vector<dynamics::Model> out;
   for (Eigen::Index i = 0; i < covariance.rows(); ++i) {
@@ -453,18 +485,30 @@ std::vector<Estimate> finish(Live& live) {
   return out;
 }
 
+bool is_finite(const Estimate& e) {
+  for (const Vector3& v : {e.point, e.force, e.sigma, e.low, e.high, e.observed})
+    if (!v.allFinite()) return false;
+  return std::isfinite(e.time) && std::isfinite(e.contact.arclength) && std::isfinite(e.probability) &&
+         std::isfinite(e.arclength_sigma);
+}
+
 std::string to_json(const Estimate& e, bool known_mass) {
-  const auto list = [](const Vector3& v) {
-    return "[" + core::exact(v.x()) + "," + core::exact(v.y()) + "," + core::exact(v.z()) + "]";
-  };
-  const auto truth = [](bool value) { return value ? "true" : "false"; };
-  return "{\"time\":" + core::exact(e.time) + ",\"link\":" + std::to_string(e.contact.link) +
-         ",\"arclength\":" + core::exact(e.contact.arclength) + ",\"point\":" + list(e.point) +
-         ",\"force\":" + list(e.force) + ",\"sigma\":" + list(e.sigma) + ",\"touching\":" + truth(e.touching) +
-         ",\"probability\":" + core::exact(e.probability) + ",\"observed\":" + list(e.observed) +
-         ",\"low\":" + list(e.low) + ",\"high\":" + list(e.high) +
-         ",\"arclength_sigma\":" + core::exact(e.arclength_sigma) + ",\"moving\":" + truth(e.moving) + ",\"unit\":\"" +
-         (known_mass ? "N" : "N/kg") + "\"}";
+  const auto list = [](const Vector3& v) { return nlohmann::ordered_json{v.x(), v.y(), v.z()}; };
+  const nlohmann::ordered_json line{{"time", e.time},
+                                    {"link", e.contact.link},
+                                    {"arclength", e.contact.arclength},
+                                    {"point", list(e.point)},
+                                    {"force", list(e.force)},
+                                    {"sigma", list(e.sigma)},
+                                    {"touching", e.touching},
+                                    {"probability", e.probability},
+                                    {"observed", list(e.observed)},
+                                    {"low", list(e.low)},
+                                    {"high", list(e.high)},
+                                    {"arclength_sigma", e.arclength_sigma},
+                                    {"moving", e.moving},
+                                    {"unit", known_mass ? "N" : "N/kg"}};
+  return line.dump();
 }
 
 }  // namespace chainsplat::force

@@ -143,8 +143,8 @@ struct Commands::State {
                                                      " bytes of push constants, got " + std::to_string(push_bytes));
     vkCmdBindPipeline(commands, VK_PIPELINE_BIND_POINT_COMPUTE, h.pipeline);
     if (!buffers.empty()) {
-      std::array<VkDescriptorBufferInfo, kLeastStorageBuffers> infos;
-      std::array<VkWriteDescriptorSet, kLeastStorageBuffers> writes;
+      std::array<VkDescriptorBufferInfo, kLeastStorageBuffers> infos{};
+      std::array<VkWriteDescriptorSet, kLeastStorageBuffers> writes{};
       const VkDescriptorSet set = h.pushes_descriptors ? VK_NULL_HANDLE : make_set(h.set_layout);
       for (std::uint32_t i = 0; i < h.buffers; ++i) {
         CHAINSPLAT_CHECK(buffers[i] && &buffers[i]->handles(), h.name + ", binding " + std::to_string(i));

@@ -7,7 +7,6 @@
 #include <cstdlib>
 #include <cstring>
 #include <utility>
-#include <utility>
 
 namespace chainsplat::gpu {
 

@@ -22,6 +22,7 @@ constexpr double kLeastUsual = 0.1;  // of the standard deviation expected: a cl
 constexpr double kMedianRms = 0.9;   // median of the root mean square of a few unit normals
 constexpr int kLag = 10;             // frames over which residuals are taken to be correlated (SPEC 5)
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
+constexpr double kUnknown = std::numeric_limits<double>::quiet_NaN();
 
 // One recording, its own unknowns after the shared ones.
 struct Part {
@@ -367,7 +368,7 @@ double initial_motion(const chain::States& states, VectorX& theta, VectorX& thet
   const double unit = (design.transpose() * design).inverse()(1, 1);
   const double noise = residual.squaredNorm() / freedom * unit;
   const double signal = thetadot.squaredNorm();
-  if (signal > 0.0) thetadot *= std::max(0.0, signal - noise) / signal;
+  if (signal > 0.0 && std::isfinite(noise)) thetadot *= std::max(0.0, signal - noise) / signal;
   return std::sqrt(noise / static_cast<double>(thetadot.size()));
 }
 
@@ -428,14 +429,23 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
     MatrixX normal = MatrixX::Zero(chain.angles(), chain.angles());
     for (const MatrixX& jacobian : jacobians) normal += jacobian.transpose() * jacobian;
     const MatrixX unit = MatrixX::Identity(chain.angles(), chain.angles());
-    MatrixX covariance = kCorrelated * options.model_error * options.model_error * normal.ldlt().solve(unit);
+    const Eigen::LDLT<MatrixX> by_points(normal);
+    MatrixX covariance = kCorrelated * options.model_error * options.model_error * by_points.solve(unit);
     if (!covariances.empty()) covariance += covariances[k];
+    const Eigen::LLT<MatrixX> factor(covariance);
+    if (!math::is_positive(by_points) || !math::is_positive(factor))
+      throw InputError("identify",
+                       "the covariance of the angles at " + core::exact(recognized.time[k]) + " s is not positive",
+                       "recognize again, or leave the covariances out: the frames then count the same");
     part.target.push_back(target);
-    part.whitening.push_back(covariance.llt().matrixL().solve(unit));
+    part.whitening.push_back(factor.matrixL().solve(unit));
   }
 
   VectorX theta, thetadot, theta_sd = VectorX::Constant(chain.angles(), kThetaSd);
   const double thetadot_sd = initial_motion({part.times, part.theta, {}}, theta, thetadot);
+  if (!theta.allFinite() || !thetadot.allFinite() || !std::isfinite(thetadot_sd))
+    throw InputError("identify", "the first times tell no velocity: they are too near or too far from each other",
+                     "give frames of a video");
   if (options.paper) theta = recognized.theta[0];
   if (!covariances.empty()) theta_sd = (covariances[0].diagonal().array() + 0.25 * kThetaSd * kThetaSd).sqrt();
   // Friction soon stops a rope on a table: under a base at rest it is at rest, and what looks like motion is noise. As
@@ -624,11 +634,15 @@ MatrixX covariance_of(const Problem& problem, const MatrixX& hessian, const Roll
     add_part(problem, i,
              covariance_of_scores(problem.parts[i], rollouts.states[i], rollouts.slopes[i], rollouts.values[i], limit),
              meat);
-  const MatrixX bread = (hessian + prior).ldlt().solve(MatrixX::Identity(prior.rows(), prior.cols()));
+  const Eigen::LDLT<MatrixX> factor(hessian + prior);
+  const MatrixX bread = factor.solve(MatrixX::Identity(prior.rows(), prior.cols()));
   const MatrixX out = bread * meat * bread;
   // the sandwich is itself an estimate, of few independent frames: never less than what the weights alone promise
   const VectorX least = (bread.diagonal().array() / out.diagonal().array()).max(1.0).sqrt();
-  return least.asDiagonal() * (0.5 * (out + out.transpose())) * least.asDiagonal();
+  const MatrixX covariance = least.asDiagonal() * (0.5 * (out + out.transpose())) * least.asDiagonal();
+  if (math::is_positive(factor) && math::is_covariance(covariance)) return covariance;
+  core::warn("identify: the data leave the parameters' covariance without meaning; it is written as not known");
+  return MatrixX::Constant(prior.rows(), prior.cols(), kUnknown);
 }
 
 // Eigenvectors of the information about the shared unknowns, those of the initial states eliminated, in units of the
@@ -644,6 +658,7 @@ std::vector<dynamics::Estimates::Weak> weak_directions(const Problem& problem, c
   }
   const MatrixX prior = problem.precision.topLeftCorner(shared, shared);
   const VectorX deviation = prior.ldlt().solve(MatrixX::Identity(shared, shared)).diagonal().cwiseMax(0.0).cwiseSqrt();
+  if (!information.allFinite()) return {};  // its covariance is said not to be known
   const Eigen::SelfAdjointEigenSolver<MatrixX> eigen(deviation.asDiagonal() * information * deviation.asDiagonal());
   constexpr double kLarge = 0.3;  // a component that is named: a tenth of the vector's square
   std::vector<dynamics::Estimates::Weak> weak;
@@ -708,8 +723,7 @@ std::vector<Result> solve(const chain::Chain& chain, std::vector<Part> parts, co
     e.covariance.resize(shared + own, shared + own);
     e.covariance << covariance.topLeftCorner(shared, shared), covariance.block(0, first, shared, own),
         covariance.block(first, 0, own, shared), covariance.block(first, first, own, own);
-    for (Eigen::Index k = 0; k < p.size(); ++k)
-      e.standard_errors.push_back(std::sqrt(std::max(0.0, e.covariance(k, k))));
+    for (Eigen::Index k = 0; k < p.size(); ++k) e.standard_errors.push_back(std::sqrt(e.covariance(k, k)));
   }
   return results;
 }

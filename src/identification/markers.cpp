@@ -18,6 +18,7 @@ constexpr double kStretch = 0.05;    // of a rope, and
 constexpr double kMountMost = 0.03;  // m, of a marker's mount: how far beyond its arclength a marker may be
 constexpr int kIterations = 30;      // of Levenberg-Marquardt, a time
 constexpr double kConverged = 1e-9;  // rad, largest step
+constexpr double kFarthest = 1e4;    // m, from the grasp: no slip of a tracker, but damage
 constexpr double kDoubt = 0.5;       // deviations: markers farther off, RMS, may mean that the rope was folded wrongly
 constexpr int kAimIterations = 8;    // of Gauss-Newton, a joint,
 constexpr double kAimDamping = 0.1;  // with this added to squared sines: full steps stay below a right angle
@@ -42,8 +43,11 @@ void check(const chain::Chain& chain, const trajectory::Trajectory& base, const 
       refuse(at + "the number of positions is another", "give one a marker, NaN where it is not seen");
     const Vector3 grasp = base.pose(markers.time[k]).translation;
     for (Eigen::Index i = 0; i < markers.world[k].cols(); ++i) {
+      if (!markers.world[k].col(i).allFinite()) continue;
       const double distance = (markers.world[k].col(i) - grasp).norm();
-      if (!std::isfinite(distance)) continue;
+      if (!(distance < kFarthest))
+        refuse(at + "marker " + std::to_string(i + 1) + " is " + core::exact(distance) + " m from the grasp",
+               "leave it empty where it is not seen");
       ++seen_at[i];
       if (distance > (1.0 + kStretch) * markers.arclengths[i] + kMountMost && ++beyond[i] == 1) first[i] = distance;
     }
@@ -176,7 +180,11 @@ chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajector
     states.time.push_back(markers.time[frame]);
     states.theta.push_back(theta);
     if (covariances) {
-      const MatrixX inverse = hessian.ldlt().solve(MatrixX::Identity(n, n));
+      const Eigen::LDLT<MatrixX> factor(hessian);
+      if (!math::is_positive(factor))
+        throw InputError("markers", "at " + core::exact(markers.time[frame]) + " s they tell no shape of the rope",
+                         "correct their positions there");
+      const MatrixX inverse = factor.solve(MatrixX::Identity(n, n));
       covariances->push_back(0.5 * (inverse + inverse.transpose()));
     }
   }

@@ -160,7 +160,9 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
       for (int j = 0; j < links; ++j)
         if (!given(i) && !given(j)) covariance(i, j) += kCoulombSd * kCoulombSd;
     }
-    u.precision.block(u.coulomb, u.coulomb, links, links) = covariance.ldlt().solve(MatrixX::Identity(links, links));
+    const Eigen::LDLT<MatrixX> factor(covariance);
+    CHAINSPLAT_CHECK(math::is_positive(factor), std::to_string(links));
+    u.precision.block(u.coulomb, u.coulomb, links, links) = factor.solve(MatrixX::Identity(links, links));
   }
   return u;
 }

@@ -17,7 +17,8 @@ constexpr double kSurelyInside = 4.0, kSurelyOutside = 8.0;  // inside, what hid
 constexpr double kBand = 8.0;                                // px outside the tube: nothing beyond is looked at
 constexpr double kContour = 2.0;                             // cost of a contour through a plain area, a pixel long
 constexpr double kInsideFrom = 0.3, kBesideTo = 1.5;         // radii from the outline: not the outline, still near
-constexpr double kHiddenStep = 0.25;                         // diameters along the rope
+constexpr double kHiddenStep = 0.25;                         // diameters along the rope,
+constexpr int kMostHiddenSteps = 4096;                       // but no more than these
 constexpr int kHiddenSteps = 2;                              // on either side that are looked at together
 constexpr double kSeen = 0.4;            // of the usual log odds and of their usual change: less is hidden
 constexpr double kSurelyHidden = 6.0;    // log odds
@@ -184,7 +185,7 @@ capture::View cut(const Look& look, const Picture& picture, const capture::Camer
   capture::View view;
   if (box.empty()) return view;
   std::vector<float> odds(static_cast<std::size_t>(box.width()) * box.height(), std::nanf(""));
-  const double step = kHiddenStep * chain.diameter;
+  const double step = std::max(kHiddenStep * chain.diameter, chain.length / kMostHiddenSteps);
   std::vector<double> hidden;
   if (theta) hidden = hidden_odds(look, picture, place, chain, step);
   cv::Mat unusual;

@@ -10,7 +10,6 @@ namespace chainsplat::masking {
 
 using math::Matrix3;
 using math::MatrixX;
-using math::Pose;
 using math::Vector2;
 using math::Vector3;
 using math::VectorX;
@@ -21,7 +20,8 @@ constexpr int kBins = 8 * 8 * 8;
 constexpr double kHeard = 0.05;                                          // Dirichlet's concentration of a color
 constexpr std::array kInside = {-0.75, -0.45, -0.15, 0.15, 0.45, 0.75};  // across, in radii
 constexpr std::array kBeside = {-2.1, -1.7, -1.3, 1.3, 1.7, 2.1};        // clear of an outline that is a little off
-constexpr double kSpacing = 0.5;                                         // along, in radii
+constexpr double kSpacing = 0.5;                                         // along, in radii,
+constexpr int kMostStations = 256;  // but the whole rope has no more: a thin one's pixels are then looked at sparsely
 constexpr double kHiddenByGripper = 1.0;                                 // diameters of rope that are not looked at
 constexpr double kSeenFromSide = 0.3;  // of a link's length: one that points at the camera more than that shows no side
 constexpr double kNearest = 0.01;      // m, nothing nearer is in front of a camera (SPEC 2.5)
@@ -33,7 +33,9 @@ constexpr double kBend = 15.0 * M_PI / 180;         // standard deviation of a j
 constexpr double kSamplesPerFact = 4.0;             // neighboring samples say the same: so many count as one
 constexpr std::array kRefinements = {5.0 * M_PI / 180, 2.5 * M_PI / 180, 1.2 * M_PI / 180};
 constexpr int kSweeps = 2;
-constexpr int kMostSamples = 1 << 16;
+// Bounds memory and time, whatever the rope: what other moments have told counts for some 1,000 samples a side
+// (kKnownSamples, each of kBins rounded), a chain adds 12 a station and 18 at the tip.
+constexpr int kMostSamples = 1 << 14;
 
 struct Tables {
   std::vector<double> color, color_of_all;  // log(n + kHeard), log(n + 2 kHeard)
@@ -68,6 +70,7 @@ struct Search {
   const chain::Chain& chain;
   std::span<const Shot> shots;
   double radius = 0.5 * chain.diameter;
+  double spacing = std::max(kSpacing * radius, chain.length / kMostStations);  // m, between stations
   Vector3 second = chain.direction.cross(chain.bending_axis);
   bool planar = chain.angles() == chain.links() - 1;
   mutable Samples samples;
@@ -90,7 +93,6 @@ struct Search {
       if (x < 0 || y < 0 || x >= shot.picture.width || y >= shot.picture.height) return;
       into.push_back(coarse(pixel(shot.picture, x, y)));
     };
-    const double spacing = kSpacing * radius;
     const double hidden = kHiddenByGripper * chain.diameter;
     for (int k = static_cast<int>(std::ceil(std::max(begin, hidden) / spacing)); k * spacing < end; ++k) {
       const Vector3 p = a + (k * spacing - begin) * step;
@@ -115,6 +117,7 @@ struct Search {
     const int more_inside = static_cast<int>(samples.inside.size()),
               more_beside = static_cast<int>(samples.beside.size());
     const int all = inside + beside, more = more_inside + more_beside;
+    CHAINSPLAT_CHECK(all + more < kMostSamples, std::to_string(all + more));
     double gain = t.all[all + more] - t.all[all] - (t.side[inside + more_inside] - t.side[inside]) -
                   (t.side[beside + more_beside] - t.side[beside]);
     for (const int i : samples.inside) {

@@ -59,7 +59,7 @@ Live start(const capture::Camera& camera, const chain::Chain& chain, const std::
   live.camera = camera;
   live.chain = chain;
   live.given.assign(kColorBins, 0.0);
-  const double samples = static_cast<double>(object_rgb.size() / 3);
+  const std::size_t samples = object_rgb.size() / 3;
   for (std::size_t i = 0; i + 2 < object_rgb.size(); i += 3)
     live.given[color_bin(&object_rgb[i])] += kGivenPixels / samples;
   for (Colors* const colors : {&live.look.near, &live.look.far}) {

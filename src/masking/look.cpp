@@ -24,7 +24,8 @@ constexpr double kOddsPerDifference = 0.25;
 constexpr double kSurelySame = -2.0,
                  kSurelyOther = 0.5;  // log odds; other can be a shadow or a hand, same hardly a rope
 
-constexpr double kMarkStep = 0.25;  // diameters
+constexpr double kMarkStep = 0.25;  // diameters,
+constexpr int kMostAlong = 4096;    // but no more cells than these: far below a pixel of a thin rope
 constexpr int kMarksAcross = 6;
 constexpr double kLeastLight = 0.6, kMostLight = 1.3;  // of the usual: the rope's own shading moves, a hand's shadow
 constexpr double kUsual = 16.0;  // gray levels, RMS of the channels: what looks otherwise is not the rope
@@ -118,7 +119,7 @@ namespace {
 // Colors by cell of the marks.
 struct Cells {
   explicit Cells(const chain::Chain& chain) {
-    marks.step = kMarkStep * chain.diameter;
+    marks.step = std::max(kMarkStep * chain.diameter, chain.length / kMostAlong);
     marks.along = static_cast<int>(std::ceil(chain.length / marks.step));
     marks.across = kMarksAcross;
     values.resize(static_cast<std::size_t>(3) * marks.along * marks.across);

@@ -1,6 +1,7 @@
 // A whole capture: chains grown in some moments, what they tell of colors and background, then masks and chains in
 // turn.
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 
 #include "chainsplat/silhouette.h"
@@ -15,8 +16,11 @@ using math::Vector2;
 
 namespace {
 
-constexpr int kBlock = 128;              // frames of one camera held in memory at once
-constexpr int kSamples = 48;             // frames of a camera that background and colors are learned from
+// Whole frames of one camera that are held in memory at once. A block of a video is reached by decoding all before it:
+// small blocks would take a time that grows with the square of a recording's length.
+constexpr double kBlockBytes = 512.0 * 1024 * 1024;
+constexpr int kSamples = 48;                          // frames of a camera that background and colors are learned from,
+constexpr double kSampleBytes = 2048.0 * 1024 * 1024;  // fewer where those of all cameras would take more than this
 constexpr double kAboutPixels = 24.0;    // px about a tube that are told apart from what is far
 constexpr double kLeastUncovered = 0.2;  // of the samples that must show the background
 constexpr int kLeastSamples = 4;
@@ -46,15 +50,18 @@ int frames_of(const Recording& recording, int camera) {
   return std::max(0, last - std::min(recording.first, last));
 }
 
+double frame_bytes(const capture::Camera& camera) { return 4.0 * camera.width * camera.height; }
+
 // Whole undistorted frames of one camera, a block at a time.
 void each_block(const Recording& recording, int camera, const std::function<void(std::vector<View>&)>& body) {
   const int begin = recording.first, end = begin + frames_of(recording, camera);
-  for (int first = begin; first < end; first += kBlock) {
+  const int most = static_cast<int>(std::clamp(kBlockBytes / frame_bytes(recording.capture.cameras[camera]), 1.0, 1e6));
+  for (int first = begin; first < end; first += most) {
     capture::LoadOptions options;
     options.masked = false;
     options.camera = recording.capture.cameras[camera].name;
     options.first = first;
-    options.last = std::min(end, first + kBlock);
+    options.last = std::min(end, first + most);
     capture::Capture block = capture::load(recording.path, options);
     for (View& view : block.views) view.camera = camera;
     body(block.views);
@@ -208,13 +215,15 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
   for (capture::Camera& camera : pinholes) camera.distortion = {};
   std::vector<Samples> samples(cameras);
   const std::int64_t work = static_cast<std::int64_t>(total) * (kRounds + 2);
-  std::int64_t done = 0;
+  std::atomic<std::int64_t> done{0};
   const auto tell = [&](const char* note, std::size_t frames) {
-    done += static_cast<std::int64_t>(frames);
-    core::report({"mask", done, work, std::nan(""), std::nan(""), note});
+    const std::int64_t now = done += static_cast<std::int64_t>(frames);
+    core::report({"mask", now, work, std::nan(""), std::nan(""), note});
   };
   for (int c = 0; c < cameras; ++c) {
-    const int stride = std::max(1, frames_of(recording, c) / kSamples);
+    const double room = kSampleBytes / (cameras * frame_bytes(scene.cameras[c]));
+    const int stride =
+        std::max(1, frames_of(recording, c) / static_cast<int>(std::clamp<double>(room, kLeastSamples, kSamples)));
     each_block(recording, c, [&](std::vector<View>& views) {
       for (View& view : views)
         if ((view.frame - recording.first) % stride == 0) samples[c].frames.push_back(std::move(view));
@@ -252,14 +261,15 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
     for (int c = 0; c < cameras; ++c)
       each_block(recording, c, [&](std::vector<View>& views) {
         core::parallel_for(static_cast<std::int64_t>(views.size()), [&](std::int64_t i) {
+          if (core::stop_requested()) throw Interrupted(core::stop_requested());
           View& view = views[i];
           View masked = cut(looks[c], picture_of(view), pinholes[c], chain, scene.base.pose(view.time),
                             at(states, view.time), place);
           masked.camera = c, masked.frame = view.frame, masked.time = view.time;
           view = std::move(masked);
+          tell(note, 1);
         });
         take(views);
-        tell(note, views.size());
       });
   };
   for (int round = 0; round < kRounds; ++round) {

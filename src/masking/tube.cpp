@@ -10,7 +10,9 @@ using math::Vector3;
 
 namespace {
 
-constexpr double kSpacing = 0.003;  // m along the rope between the tube's samples: well under a radius
+constexpr double kSpacing = 0.003;  // m along the rope between the tube's samples: well under a radius,
+constexpr int kMostSamples = 4096;  // but no more than these in all, for ropes beyond 12 m,
+constexpr double kNotBelow = 0.05;  // and no nearer than this in diameters: each looks at all pixels about it
 constexpr double kNearest = 0.01;   // m, nothing nearer is in front of a camera (SPEC 2.5)
 
 struct Sample {
@@ -24,7 +26,8 @@ struct Sample {
 Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta, const capture::Camera& camera,
           double from, double to, double reach) {
   Tube out;
-  const int count = std::max(2, static_cast<int>(std::ceil((to - from) / kSpacing)) + 1);
+  const double spacing = std::max(kSpacing, kNotBelow * chain.diameter);
+  const int count = std::max(2, static_cast<int>(std::min<double>(kMostSamples, std::ceil((to - from) / spacing))) + 1);
   std::vector<double> arclengths(count);
   for (int i = 0; i < count; ++i) arclengths[i] = from + (to - from) * i / (count - 1);
   const std::vector<math::Pose> motions = chain::link_motions(chain, theta, base);

@@ -1,6 +1,7 @@
 #include "chainsplat/math.h"
 
 #include <cmath>
+#include <numeric>
 
 namespace chainsplat::math {
 
@@ -111,6 +112,48 @@ Matrix3 orthonormalized(const Matrix3& almost_rotation) {
   Matrix3 sign = Matrix3::Identity();
   sign(2, 2) = (svd.matrixU() * svd.matrixV().transpose()).determinant() < 0 ? -1.0 : 1.0;
   return svd.matrixU() * sign * svd.matrixV().transpose();
+}
+
+bool is_covariance(const MatrixX& m) {
+  if (m.rows() != m.cols() || !m.allFinite() || (m.diagonal().array() < 0.0).any()) return false;
+  const VectorX deviation = m.diagonal().cwiseSqrt();
+  MatrixX correlation = m;
+  for (Eigen::Index i = 0; i < m.rows(); ++i)
+    for (Eigen::Index j = 0; j < m.cols(); ++j) {
+      if (deviation[i] == 0.0 || deviation[j] == 0.0) {
+        if (m(i, j) != 0.0) return false;
+        correlation(i, j) = i == j ? 1.0 : 0.0;
+        continue;
+      }
+      correlation(i, j) = m(i, j) / deviation[i] / deviation[j];
+    }
+  if (!((correlation - correlation.transpose()).array().abs() <= kCovarianceTolerance).all()) return false;
+  correlation.diagonal().array() += kCovarianceTolerance;
+  return is_positive(Eigen::LLT<MatrixX>(correlation));
+}
+
+std::vector<Eigen::Index> known_part(const MatrixX& covariance) {
+  std::vector<Eigen::Index> kept(static_cast<std::size_t>(covariance.rows()));
+  std::iota(kept.begin(), kept.end(), Eigen::Index{0});
+  while (!kept.empty()) {
+    const MatrixX part = covariance(kept, kept);
+    const auto unknown = (part.array() - part.array()).isNaN();  // of what is infinite, too
+    const Eigen::ArrayXi gaps = unknown.cast<int>().rowwise().sum() + unknown.cast<int>().colwise().sum().transpose();
+    Eigen::Index emptiest = 0;
+    if (gaps.maxCoeff(&emptiest) == 0) break;
+    kept.erase(kept.begin() + emptiest);
+  }
+  return kept;
+}
+
+bool is_positive(const Eigen::LLT<MatrixX>& factor) {
+  const auto diagonal = factor.matrixLLT().diagonal().array();
+  return factor.info() == Eigen::Success && (diagonal > 0.0).all() && diagonal.isFinite().all();
+}
+
+bool is_positive(const Eigen::LDLT<MatrixX>& factor) {
+  const auto diagonal = factor.vectorD().array();
+  return factor.info() == Eigen::Success && (diagonal > 0.0).all() && diagonal.isFinite().all();
 }
 
 }  // namespace chainsplat::math

@@ -13,7 +13,7 @@ constexpr int kRopes = 9;                         // drawn at equal times
 constexpr int kPathSteps = 200;
 
 struct View {
-  int right, up;  // world axes on the paper
+  int right = 0, up = 0;  // world axes on the paper
   double scale = 1.0, left = 0.0, top = 0.0;
   double x(const Vector3& p) const { return kBorder + scale * (p[right] - left); }
   double y(const Vector3& p) const { return kBorder + scale * (top - p[up]); }

@@ -1,14 +1,18 @@
 #include "src/recognition/checkpoint.h"
 
 #include <cstring>
+#include <sstream>
+
+#include "chainsplat/recognition.h"
 
 namespace chainsplat::recognition {
 
 namespace {
 
-constexpr char kMagic[] = "chainsplat-checkpoint/3\n";
+constexpr char kMagic[] = "chainsplat-checkpoint/4\n";
 constexpr char kFile[] = "recognize.bin";
 constexpr char kFileBefore[] = "recognize.before.bin";
+constexpr const char* kFiles[] = {kFile, kFileBefore};  // the newest first
 
 struct Writer {
   std::string bytes;
@@ -59,6 +63,15 @@ splat::Gaussians get_gaussians(Reader& r) {
   g.degree = r.get<int>();
   for (auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
     *part = r.get_all<float>();
+  constexpr int kHighestDegree = 3;
+  const auto holds = [&](const std::vector<float>& part, std::size_t a_gaussian) {
+    return part.size() == a_gaussian * static_cast<std::size_t>(g.count);
+  };
+  if (g.count < 0 || g.links < 0 || g.degree < 0 || g.degree > kHighestDegree || !holds(g.mean, 3) ||
+      !holds(g.rotation, 4) || !holds(g.log_scale, 3) || !holds(g.opacity_logit, 1) ||
+      !holds(g.sh, 3 * static_cast<std::size_t>(g.sh_coefficients())) ||
+      !holds(g.link_logits, static_cast<std::size_t>(g.links)))
+    throw std::out_of_range("checkpoint");
   return g;
 }
 
@@ -70,6 +83,7 @@ std::vector<double> flat(const std::vector<math::VectorX>& rows) {
 
 std::vector<math::VectorX> rows_of(const std::vector<double>& all, std::size_t count) {
   std::vector<math::VectorX> rows;
+  if (count == 0 ? !all.empty() : all.size() % count != 0) throw std::out_of_range("checkpoint");
   const std::size_t width = count == 0 ? 0 : all.size() / count;
   for (std::size_t k = 0; width > 0 && k < count; ++k)
     rows.push_back(Eigen::Map<const math::VectorX>(all.data() + width * k, static_cast<Eigen::Index>(width)));
@@ -96,7 +110,7 @@ std::optional<Checkpoint> parse(const std::string& bytes) {
     c.watch.bad_steps = r.get<int>();
     c.watch.bad_in_a_row = r.get<int>();
     c.watch.restarts = r.get<int>();
-    c.spatial = r.get<bool>();
+    c.spatial = r.get<std::uint8_t>() != 0;
     c.out_of_plane_rms = r.get<double>();
     c.deviation = r.get<double>();
     c.states.time = r.get_all<double>();
@@ -112,6 +126,18 @@ std::optional<Checkpoint> parse(const std::string& bytes) {
   } catch (const std::out_of_range&) {
     return std::nullopt;
   }
+}
+
+// The first line in which two jobs differ: 'NAME VALUE, not VALUE'.
+std::string difference(const std::string& had, const std::string& asked) {
+  std::istringstream had_lines(had), asked_lines(asked);
+  std::string before, now;
+  do {
+    std::getline(had_lines, before);
+    std::getline(asked_lines, now);
+  } while (before == now && had_lines && asked_lines);
+  const std::size_t value = now.rfind(' ') + 1;
+  return before + ", not " + (before.compare(0, value, now, 0, value) == 0 ? now.substr(value) : now);
 }
 
 }  // namespace
@@ -151,20 +177,28 @@ void save_checkpoint(const Checkpoint& c, const Path& folder) {
 
 std::optional<Checkpoint> load_checkpoint(const Path& folder, const std::string& job) {
   bool damaged = false;
-  for (const char* name : {kFile, kFileBefore}) {
+  for (const char* name : kFiles) {
     const Path file = folder / name;
     std::error_code error;
     if (!std::filesystem::exists(file, error)) continue;
     std::optional<Checkpoint> found = parse(core::read_file(file));
     if (found && found->job != job)
-      throw InputError(file.string(), "the checkpoint is of another job (" + found->job + ")",
-                       "resume with the options that it was started with, or start anew with --force");
+      throw InputError(file.string(), "the checkpoint is of another job (" + difference(found->job, job) + ")",
+                       "resume with the capture, the frames and the options that it was begun with, or begin again "
+                       "with --force");
     if (found) return found;
     damaged = true;
     core::warn(file.string() + ": the checkpoint is damaged or of another version and is passed over");
   }
   if (damaged) core::warn(folder.string() + ": no checkpoint is whole, recognition begins anew");
   return std::nullopt;
+}
+
+bool is_checkpoint(const std::string& file_name) { return file_name == kFile || file_name == kFileBefore; }
+
+void remove_checkpoint(const Path& folder) {
+  std::error_code ignored;
+  for (const char* name : kFiles) std::filesystem::remove(folder / name, ignored);
 }
 
 }  // namespace chainsplat::recognition

@@ -11,7 +11,7 @@
 namespace chainsplat::recognition {
 
 struct Checkpoint {
-  std::string job;       // options that the result depends on; another job's checkpoint is refused
+  std::string job;       // what the result depends on, see job_text; another job's checkpoint is refused
   int stage = 0;         // rounds (fast) or iterations (paper) done
   int step = 0;          // Adam steps done of the round under way (fast); 0: none, and the snapshot is empty
   bool spatial = false;  // the bending that was chosen
@@ -26,7 +26,7 @@ struct Checkpoint {
 // As folder/recognize.bin; the one before becomes folder/recognize.before.bin. Throws WorkError (disk full).
 void save_checkpoint(const Checkpoint& checkpoint, const Path& folder);
 // The last one that is whole, with a warning where a damaged one is passed over. None when there is none: then all
-// begins anew. Throws InputError when it is of another job.
+// begins anew. Throws InputError when it is of another job, and names what differs.
 std::optional<Checkpoint> load_checkpoint(const Path& folder, const std::string& job);
 
 }  // namespace chainsplat::recognition

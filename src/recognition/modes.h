@@ -25,7 +25,7 @@ splat::AdamRates rates(double fraction, double scale);
 Result recognize_fast(gpu::Device& device, const capture::Capture& capture, const Options& options);
 Result recognize_paper(gpu::Device& device, const capture::Capture& capture, const Options& options);
 
-// Text of everything that the result depends on, to recognize a checkpoint of another job.
+// Everything that the result depends on, to recognize a checkpoint of another job: a line 'NAME VALUE' each.
 std::string job_text(const capture::Capture& capture, const Options& options);
 
 // Improves every frame's angles with the Gaussians held. `frames` as assigned to states.time.

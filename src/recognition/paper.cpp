@@ -51,9 +51,8 @@ void hull_bounds(const capture::Capture& capture, const std::vector<FrameViews>&
   const double cell = 2.0 * capture.length / kCells;
   for (const int k : training) {
     for (int n = 0; n < kCells * kCells * kCells; ++n) {
-      const math::Vector3 home =
-          cell *
-          (math::Vector3(n % kCells, n / kCells % kCells, n / kCells / kCells).array() + 0.5 - 0.5 * kCells).matrix();
+      const int column = n % kCells, row = n / kCells % kCells, layer = n / kCells / kCells;
+      const math::Vector3 home = cell * (math::Vector3(column, row, layer).array() + 0.5 - 0.5 * kCells).matrix();
       bool inside = !frames[k].views.empty();
       for (const int v : frames[k].views) {
         const capture::View& view = capture.views[v];

@@ -165,8 +165,9 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
     const Drawn& source = drawn[candidate.picture];
     const capture::View& view = *source.view;
     const capture::Camera& camera = capture.cameras[view.camera];
-    const math::Vector3 ray((view.x0 + candidate.pixel % view.width + 0.5 - camera.cx) / camera.fx,
-                            (view.y0 + candidate.pixel / view.width + 0.5 - camera.cy) / camera.fy, 1.0);
+    const int column = candidate.pixel % view.width, row = candidate.pixel / view.width;
+    const math::Vector3 ray((view.x0 + column + 0.5 - camera.cx) / camera.fx,
+                            (view.y0 + row + 0.5 - camera.cy) / camera.fy, 1.0);
     const math::Vector3 origin = camera.world_from_camera.translation;
     const math::Vector3 along = (camera.world_from_camera.rotation * ray).normalized();
     // the point of the ray nearest to the centerline, moved to the tube's near side

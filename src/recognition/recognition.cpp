@@ -1,9 +1,11 @@
 #include "chainsplat/recognition.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <sstream>
 
+#include "src/recognition/checkpoint.h"
 #include "src/recognition/modes.h"
 
 namespace chainsplat::recognition {
@@ -14,13 +16,41 @@ Result recognize(gpu::Device& device, const capture::Capture& capture, const Opt
 }
 
 std::string job_text(const capture::Capture& capture, const Options& options) {
+  // what was recorded, view by view, and as it was loaded: masks and frames can be others than of the same capture.json
+  const auto hashed = [](const auto& values, std::uint64_t hash) {
+    return core::fnv1a({reinterpret_cast<const char*>(values.data()), values.size() * sizeof values[0]}, hash);
+  };
+  std::vector<std::uint64_t> pictures(capture.views.size());
+  core::parallel_for(static_cast<std::int64_t>(pictures.size()), [&](std::int64_t v) {
+    const capture::View& view = capture.views[v];
+    pictures[v] = hashed(view.rgba, hashed(std::array{view.x0, view.y0, view.width, view.height}, core::fnv1a("")));
+  });
+  std::vector<double> times;
+  std::vector<std::string> ranges;  // of each camera, as --frames names them
+  for (std::size_t v = 0; v < capture.views.size(); ++v) {
+    const capture::View& view = capture.views[v];
+    times.push_back(view.time);
+    if (v == 0 || capture.views[v - 1].camera != view.camera) ranges.push_back(std::to_string(view.frame));
+    if (v + 1 == capture.views.size() || capture.views[v + 1].camera != view.camera)
+      ranges.back() += ":" + std::to_string(view.frame + 1);
+  }
+  ranges.erase(std::unique(ranges.begin(), ranges.end()), ranges.end());
+  std::string frames;
+  for (const std::string& range : ranges) frames += (frames.empty() ? "" : ",") + range;
+  const char* const bending =
+      !options.bending ? "auto" : *options.bending == chain::Bending::planar ? "planar" : "spatial";
   std::ostringstream text;
-  text << "capture " << capture.hash << " views " << capture.views.size() << " joints " << options.joints << " bending "
-       << (options.bending ? (*options.bending == chain::Bending::planar ? "planar" : "spatial") : "auto") << " twist "
-       << options.twist << " every " << options.every << " mode " << (options.mode == Mode::paper ? "paper" : "fast")
-       << " seed " << options.seed << " budget " << options.budget << " paper " << options.paper_gaussians << " "
-       << options.paper_iterations;
+  text << "capture " << capture.hash << "\nframes " << frames << "\n--joints " << options.joints << "\n--bending "
+       << bending << "\n--twist " << (options.twist ? "yes" : "no") << "\n--every " << options.every << "\n--mode "
+       << (options.mode == Mode::paper ? "paper" : "fast") << "\n--seed " << options.seed << "\nbudget "
+       << options.budget << "\nstep " << core::exact(options.step) << "\npaper's Gaussians "
+       << options.paper_gaussians << "\npaper's iterations " << options.paper_iterations << "\ntimes of frames "
+       << hashed(times, core::fnv1a("")) << "\nimages and masks " << hashed(pictures, core::fnv1a("")) << "\n";
   return text.str();
+}
+
+void check_checkpoint(const capture::Capture& capture, const Options& options) {
+  if (options.resume && !options.checkpoint.empty()) load_checkpoint(options.checkpoint, job_text(capture, options));
 }
 
 void differentiate(chain::States& states) {

@@ -251,10 +251,12 @@ RefineSummary refine_angles(const chain::Chain& chain, const capture::Capture& c
   for (std::size_t f = 0; f < selected.size(); ++f) {
     states.theta[selected[f]] = work[f].theta;
     summary.cost_after += work[f].cost;
-    summary.covariances.push_back(
-        work[f].normal.size() > 0
-            ? math::MatrixX((work[f].normal + 1e-6 * math::MatrixX::Identity(chain.angles(), chain.angles())).inverse())
-            : math::MatrixX::Identity(chain.angles(), chain.angles()));
+    const math::MatrixX unit = math::MatrixX::Identity(chain.angles(), chain.angles());
+    summary.covariances.push_back(work[f].normal.size() > 0 ? math::MatrixX((work[f].normal + 1e-6 * unit).inverse())
+                                                            : unit);
+    // where a part of the rope is hardly seen, elimination without symmetry loses the sign of small variances
+    if (!math::is_covariance(summary.covariances.back()))
+      summary.covariances.back() = (work[f].normal + 1e-6 * unit).ldlt().solve(unit);
   }
   return summary;
 }

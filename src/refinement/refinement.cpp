@@ -111,8 +111,14 @@ Angles combine(const chain::Chain& chain, const chain::States& images, std::span
     // gain of the images over the rollout: model (image + model)^-1
     const MatrixX gain = (image + model).ldlt().solve(model).transpose();
     out.states.theta[k] = rollout.theta[k] + gain * (images.theta[k] - rollout.theta[k]);
-    const MatrixX covariance = gain * image;
-    out.covariances[k] = 0.5 * (covariance + covariance.transpose());
+    MatrixX covariance = gain * image;
+    covariance = 0.5 * (covariance + covariance.transpose()).eval();
+    // where the two differ by many orders of magnitude, only Joseph's form keeps small variances positive
+    if (!math::is_covariance(covariance)) {
+      const MatrixX rest = MatrixX::Identity(n, n) - gain;
+      covariance = gain * image * gain.transpose() + rest * model * rest.transpose();
+    }
+    out.covariances[k] = covariance;
   });
   recognition::differentiate(out.states);
   return out;

@@ -11,9 +11,9 @@ using math::Vector2;
 
 // A point of the mask's outline, where coverage crosses one half between two neighboring pixels.
 struct Edge {
-  Vector2 point;    // px
-  Vector2 outward;  // unit normal of the outline, from the mask to the outside
-  double weight;    // length of outline it stands for, px (1 to sqrt 2)
+  Vector2 point;        // px
+  Vector2 outward;      // unit normal of the outline, from the mask to the outside
+  double weight = 0.0;  // length of outline it stands for, px (1 to sqrt 2)
 };
 
 // A connected part of a mask (8-neighborhood). Ranges of MaskPoints::pixels and ::edges, [begin, end).

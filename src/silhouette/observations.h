@@ -14,11 +14,11 @@ using Matrix9 = Eigen::Matrix<double, 9, 9>;
 
 // One link's segment seen by one camera.
 struct Segment {
-  int link;
-  math::Vector3 a, b;       // camera frame, m
-  Vector2 from, step;       // px: image of a, and from there to the image of b
-  Vector2 tangent, normal;  // unit
-  double per_length2;       // 1 / |step|^2
+  int link = 0;
+  math::Vector3 a, b;        // camera frame, m
+  Vector2 from, step;        // px: image of a, and from there to the image of b
+  Vector2 tangent, normal;   // unit
+  double per_length2 = 0.0;  // 1 / |step|^2
 };
 
 // Normal equations of one view by link, in camera coordinates: a row is (x cross g, g, derivatives by the edge offset
@@ -29,7 +29,7 @@ struct LinkSums {
 };
 
 struct ViewWork {
-  const FrameView* view;
+  const FrameView* view = nullptr;
   math::Pose camera_from_base;
   std::vector<Segment> segments;
   LinkSums sums;
@@ -39,7 +39,7 @@ struct ViewWork {
 };
 
 struct Problem {
-  const chain::Chain* chain;
+  const chain::Chain* chain = nullptr;
   std::vector<ViewWork> views;
   std::vector<char> held;  // by angle: twist, which silhouettes do not show
   math::MatrixX axes;      // 6 x n in the base frame, at the angles of the last pose()

@@ -13,6 +13,8 @@ using math::Vector3;
 
 namespace {
 
+constexpr double kLongest = 3600.0;   // s; memory and time of whatever is integrated along it follow the duration
+constexpr double kFarthest = 1e6;     // m, from the origin: digits are left for what moves
 constexpr double kSeriesAngle = 0.1;  // rad; below it the series of the right Jacobian are exact to rounding
 
 // R = R_0 exp([r]): body angular velocity w = J_r(r) r' and its derivative, with the right Jacobian of exp,
@@ -72,11 +74,21 @@ Trajectory fit(std::vector<Sample> samples, const std::string& where) {
     const std::string which = where + ": pose " + std::to_string(k + 1);
     if (!std::isfinite(sample.time) || !sample.pose.rotation.allFinite() || !sample.pose.translation.allFinite())
       throw InputError(which, "a number is not finite", "remove the pose or fill it from its neighbors");
+    if (sample.pose.translation.cwiseAbs().maxCoeff() > kFarthest)
+      throw InputError(which,
+                       "lies more than " + std::to_string(static_cast<int>(kFarthest)) + " m from the origin, too far for exact numbers",
+                       "write meters from an origin near the rope");
     if (k > 0 && !(sample.time > samples[k - 1].time))
       throw InputError(
           which,
           "its time " + core::exact(sample.time) + " s does not come after " + core::exact(samples[k - 1].time) + " s",
           "sort the poses by time and remove doubles");
+    if (sample.time - samples.front().time > kLongest)
+      throw InputError(which,
+                       "comes " + core::exact(sample.time - samples.front().time) +
+                           " s after the first and a motion lasts at most " + core::exact(kLongest) +
+                           " s, for all of it is computed in steps of milliseconds",
+                       "write times in seconds, or split the recording");
   }
 
   auto data = std::make_shared<Trajectory::Data>();

@@ -10,6 +10,7 @@ namespace chainsplat::trajectory {
 namespace {
 
 constexpr int kColumns = 8;
+constexpr std::size_t kMostPoses = 1000000;    // of a file: memory and the fit's time follow the number
 constexpr double kQuaternionTolerance = 1e-2;  // of its length: files with three digits pass, swapped columns rarely do
 
 bool separates(char c) { return c == ' ' || c == '\t' || c == ',' || c == '\r'; }
@@ -55,6 +56,9 @@ std::vector<Sample> read_tum(const Path& file) {
     if (std::abs(q.norm() - 1.0) > kQuaternionTolerance)
       throw InputError(where, "the quaternion has length " + core::exact(q.norm()) + ", not 1",
                        "check the columns: qx qy qz qw are the last four");
+    if (samples.size() == kMostPoses)
+      throw InputError(where, "is beyond the " + std::to_string(kMostPoses) + " poses that a motion has at most",
+                       "sample it at a lower rate, or split the recording");
     samples.push_back({numbers[0], {q.normalized().toRotationMatrix(), {numbers[1], numbers[2], numbers[3]}}});
   }
   if (samples.empty())

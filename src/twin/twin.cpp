@@ -1,6 +1,7 @@
 // twin.json in and out; the run folder as a whole. The keys are documented in twin.h.
 #include <algorithm>
 #include <array>
+#include <charconv>
 #include <cmath>
 #include <limits>
 #include <nlohmann/json.hpp>
@@ -58,18 +59,21 @@ Json list(const Vector& values) {
 
 Json list(const math::VectorX& values) { return list(std::vector<double>(values.begin(), values.end())); }
 
+// Bytes of file names that are not UTF-8 are replaced: JSON has no place for them.
+std::string text_of(const Json& value) { return value.dump(-1, ' ', false, Json::error_handler_t::replace); }
+
 // Objects and lists of objects or lists over several lines, lists of numbers on one.
 void print(const Json& value, const std::string& indent, std::string& out) {
   const bool object = value.is_object();
   if (!object && !(value.is_array() && !value.empty() && value[0].is_structured())) {
-    out += value.dump();
+    out += text_of(value);
     return;
   }
   out += object ? "{" : "[";
   bool first = true;
   for (const auto& [key, entry] : value.items()) {
     out.append(first ? "\n" : ",\n").append(indent).append(1, ' ');
-    if (object) out.append(Json(key).dump()).append(": ");
+    if (object) out.append(text_of(key)).append(": ");
     print(entry, indent + " ", out);
     first = false;
   }
@@ -399,6 +403,9 @@ dynamics::Estimates read_estimates(const Node& node) {
     for (int column = 0; column < count; ++column)
       e.covariance(static_cast<Eigen::Index>(row), column) = values[column];
   }
+  const std::vector<Eigen::Index> known = math::known_part(e.covariance);
+  if (!math::is_covariance(e.covariance(known, known)))
+    node["covariance"].fail("is not symmetric and positive semidefinite", "restore it or identify again");
   for (const Node& held : node["held"].entries()) e.held.emplace_back(held["name"].text(), held["reason"].text());
   if (node.has("weak"))  // absent in files of older versions
     for (const Node& weak : node["weak"].entries()) {
@@ -409,12 +416,37 @@ dynamics::Estimates read_estimates(const Node& node) {
   return e;
 }
 
+// Options are texts; those that later work reads as numbers or as a choice are refused here where they are neither.
+void check_option(const std::string& name, const Node& node) {
+  const std::string text = node.text();
+  const auto refuse = [&](const std::string& what) {
+    constexpr std::size_t kShown = 40;  // characters
+    node.fail("'" + text.substr(0, kShown) + "' is " + what, "correct it, or train again");
+  };
+  const char* const end = text.data() + text.size();
+  if (name == "mass") {
+    double mass = 0.0;
+    const auto [after, error] = std::from_chars(text.data(), end, mass);
+    if (error != std::errc() || after != end || !std::isfinite(mass) || mass <= 0.0)
+      refuse("not a positive number, the mass in kg");
+  } else if (name == "every") {
+    int every = 0;
+    const auto [after, error] = std::from_chars(text.data(), end, every);
+    if (error != std::errc() || after != end || every < 1) refuse("not a whole number >= 1");
+  } else if (name == "mode" && text != "fast" && text != "paper") {
+    refuse("neither fast nor paper");
+  }
+}
+
 Provenance read_provenance(const Node& node) {
   Provenance p;
   p.version = node["version"].text();
   p.capture = node["capture"].text();
   p.capture_hash = node["capture_hash"].text();
-  for (const auto& [name, value] : node["options"].members()) p.options[name] = value.text();
+  for (const auto& [name, value] : node["options"].members()) {
+    check_option(name, value);
+    p.options[name] = value.text();
+  }
   p.seed = node["seed"].unsigned_number();
   p.device = node["device"].text();
   p.driver = node["driver"].text();

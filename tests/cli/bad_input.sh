@@ -82,6 +82,39 @@ refused 'fx'
 fresh; sed -i 's|"base": "base.tum"|"base": "../base.tum"|' "$capture/capture.json"
 refused 'base'
 
+# what only evaluation reads: found before the work, and no matter where nothing is evaluated
+fresh; cp -r "$demo/truth" "$capture/"
+refused 'Vulkan'
+sed -i '1s/.*/t,x,y,z/' "$capture/truth/centreline.csv"
+refused 'truth/centreline\.csv:1: is not the header'
+expect_error 2 'Vulkan' recognize "$capture" -o "$out" --frames 0:12
+run check "$capture"
+expect_code 2 'check, a wrong truth'
+expect_output '^problem: .*centreline\.csv:1' 'check, a wrong truth'
+cp "$demo/truth/centreline.csv" "$capture/truth/"
+sed -i '5s/.*/3,nan,1/' "$capture/truth/centreline.csv"
+refused 'centreline\.csv:5'
+rm -r "$capture"; cp -r "$demo" "$capture"
+black_8x8 >"$capture/depth/cam1/000007.png"
+refused 'depth/cam1/000007\.png: is 8x8 pixels'
+
+# too few frames for identification, not for recognition
+expect_error 2 '--frames: identification needs 3 frames of cam0 or more, and there are 2' train "$demo" -o "$out" --frames 0:2
+[ -e "$out" ] && fail 'too few frames: something was written'
+expect_error 2 'Vulkan' recognize "$demo" -o "$out" --frames 0:2
+
+# results never go into the capture itself
+fresh
+before=$(cd "$capture" && find . -type f | sort)
+expect_error 2 "is the capture's own folder" train "$capture" -o "$capture" --frames 0:12 --force
+[ "$before" = "$(cd "$capture" && find . -type f | sort)" ] || fail 'train into the capture: its files changed'
+
+# nothing to resume, but files of somebody else
+mkdir "$out" && echo mine >"$out/base.tum"
+expect_error 2 'holds no run to resume' train "$demo" -o "$out" --frames 0:12 --resume
+[ "$(cat "$out/base.tum")" = mine ] || fail 'train --resume: wrote over a file that is not its own'
+rm -r "$out"
+
 # frames that are not there
 expect_error 2 'frames' train "$demo" -o "$out" --frames 400:500
 
@@ -97,6 +130,99 @@ echo ' ]}' >>"$work/one.json"
 mv "$work/one.json" "$capture/capture.json"
 refused 'Vulkan'
 grep -q '^chainsplat: warning: .*only one' "$work/stderr" || fail 'one camera: no warning'
+
+# a rate that would make a day of one frame, and a length of time that would be integrated in milliseconds
+fresh; sed -i '0,/"rate": [0-9.]*/s//"rate": 1e-7/' "$capture/capture.json"
+refused 'rate: 1e-07 is not between'
+fresh; echo '1e7 0 0 1 0 0 0 1' >>"$capture/base.tum"
+refused 'base\.tum: pose .* a motion lasts at most 3600 s'
+twin=$source_dir/tests/data/planning/free
+expect_error 2 '--rate: .* 1000000 rows' rollout "$twin" --initial "$twin/states.csv" -o "$work/states.csv" --rate 99999999999
+expect_error 2 '--rate: .* 1000000 rows' plan "$twin" --target 0.1,0,0.3 -o "$work/plan" --rate 99999999999
+expect_error 2 '--horizon: .* 120 s' plan "$twin" --target 0.1,0,0.3 -o "$work/plan" --horizon 1e7
+expect_error 2 '--mpc-rate: .* 1000' plan "$twin" --target 0.1,0,0.3 -o "$work/plan" --mpc-rate 1e12
+expect_error 2 '--rate: .* 1000000 rows' excite "$twin" -o "$work/motion" --rate 99999999999
+expect_error 2 '--frame-rate: .* 100000 frames' excite "$twin" -o "$work/motion" --frame-rate 1e9
+expect_error 2 '--gaussians: .* 2000000' bench --gaussians 2000000000
+expect_error 2 '--views: .* 1000' bench --views 2000000000
+expect_error 2 '--repeats' bench --repeats 2000000000
+python3 - "$demo/capture.json" "$work/camera.json" <<'E1'
+import json, sys
+camera = json.load(open(sys.argv[1]))["cameras"][0]
+camera["rate"] = 1e-7
+json.dump(camera, open(sys.argv[2], "w"))
+E1
+make_straight_twin "$work/straight" "$demo"
+expect_error 2 'camera\.json: rate: 1e-07 is not between' estimate "$work/straight" --camera - --calibration "$work/camera.json"
+
+# brackets in brackets: whatever is read as JSON is refused in a line, long before the stack is full
+deep() { head -c 200000 /dev/zero | tr '\0' '['; echo; }
+fresh; deep >"$capture/capture.json"
+refused 'capture\.json.*JSON'
+deep >"$work/deep.json"
+expect_error 2 'deep\.json.*JSON' estimate "$work/straight" --camera - --calibration "$work/deep.json"
+expect_error 2 'deep\.json.*JSON' plan "$twin" --target 0.1,0,0.3 -o "$work/plan" --simulate "$work/deep.json"
+expect_error 2 'deep\.json.*estimate' force "$twin" --estimate "$work/deep.json" --base "$demo/base.tum"
+cp -r "$twin" "$work/online"
+expect_error 2 'deep\.json.*estimate' identify "$work/online" --online "$work/deep.json" --base "$demo/base.tum"
+mkdir "$work/deep"
+deep >"$work/deep/twin.json"
+expect_error 2 'twin\.json' rollout "$work/deep" -o "$work/states.csv"
+expect_error 2 'twin\.json' diff "$work/deep" "$work/straight"
+cp -r "$work/straight" "$work/metrics"
+deep >"$work/metrics/metrics.json"
+expect_error 2 'metrics\.json' diff "$work/metrics" "$work/straight"
+
+# what the files hold never reaches the terminal raw
+fresh; printf '{"format": "a\033[31m\001\\u0000z"}' >"$capture/capture.json"
+refused 'capture\.json'
+fresh; python3 - "$capture/capture.json" <<'E1'
+import json, sys
+capture = json.load(open(sys.argv[1]))
+capture["name"] = "red \x1b[31m bell \x07 null \x00 end"
+capture["k\x1b[2J\x00"] = 1
+capture["cameras"][0]["name"] = "c\x1b[31m\x00"
+json.dump(capture, open(sys.argv[1], "w"))
+E1
+refused 'cannot name a folder'
+run check "$capture"
+expect_code 2 'check, control characters'
+expect_output 'problem: .*c.x1b\[31m.x00' 'check, control characters'
+expect_output "^capture 'red .x1b\[31m bell .x07 null " 'check, control characters'
+fresh; python3 - "$capture/capture.json" <<'E1'
+import json, sys
+capture = json.load(open(sys.argv[1]))
+capture["k\x1b[2J\x00"] = 1
+json.dump(capture, open(sys.argv[1], "w"))
+E1
+refused 'Vulkan'
+grep -q 'warning: .*k.x1b\[2J.x00: unknown key' "$work/stderr" || fail 'a key with control characters: no warning that shows them'
+cat "$work/stdout" "$work/stderr" | grep -q "$(printf '\033')" && fail 'control characters: they reach the terminal'
+run check "$work/$(printf 'no\033[31m\377folder')"
+expect_code 2 'check of a name that is no text'
+grep -q 'error: .*no.x1b\[31m.xfffolder: ' "$work/stderr" || fail 'check of a name that is no text: not escaped'
+run check "$work/$(printf 'no\377folder')" --json
+expect_code 2 'check --json of a name that is no text'
+[ "$(head -c 1 "$work/stdout")" = '{' ] || fail 'check --json of a name that is no text: no document'
+
+# pipes, which never end, and a capture that is reached by a link or left by one
+fresh; rm "$capture/base.tum"; mkfifo "$capture/base.tum"
+refused 'base\.tum: is a pipe'
+fresh; rm "$capture/cam0.mp4"; mkfifo "$capture/cam0.mp4"
+refused 'cam0\.mp4: is a pipe'
+fresh; rm "$capture/capture.json"; mkfifo "$capture/capture.json"
+refused 'capture\.json: is a pipe'
+fresh; rm "$capture/masks/cam0/000000.png"; mkfifo "$capture/masks/cam0/000000.png"
+refused 'cam0/000000\.png'
+fresh; ln -sf /dev/zero "$capture/base.tum"
+refused 'base\.tum: is a link out of .*/dev/zero'
+fresh; mv "$capture/cam0.mp4" "$work/elsewhere.mp4"; ln -s "$work/elsewhere.mp4" "$capture/cam0.mp4"
+refused "cam0\\.mp4: is a link out of .*, to .*/elsewhere\\.mp4; copy the file"
+printf '#EXTM3U\n#EXT-X-VERSION:3\n#EXT-X-TARGETDURATION:2\n#EXTINF:2.0,\n%s\n#EXT-X-ENDLIST\n' "$work/elsewhere.mp4" >"$work/list"
+fresh; cp "$work/list" "$capture/cam0.mp4"
+refused 'cam0\.mp4: is not a readable video'
+fresh; ln -s "$capture" "$work/way"
+expect_error 2 Vulkan train "$work/way" -o "$out" --frames 0:12
 
 # check tells the same in plain words
 fresh; rm "$capture/cam1.mp4"

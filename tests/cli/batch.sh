@@ -29,6 +29,36 @@ refused 'seeds' <<<'captures = "captures/good"
 seeds = [-1]'
 refused 'settings.output: is chosen by the batch' <<<'captures = "captures/good"
 settings = { output = "x" }'
+# lists in lists, tables in tables and JSON without end are refused in a line, long before the stack is full
+refused 'jobs.toml: line 1: .*depth' < <(printf 'captures = '; head -c 200000 /dev/zero | tr '\0' '[')
+refused 'jobs.toml: line 1: has more than 100 dots' < <(printf 'a'; yes .a | head -n 400000 | tr -d '\n'; echo ' = 1')
+refused 'jobs.toml: line 1: has more than 100 dots' < <(printf '[a'; yes .a | head -n 400000 | tr -d '\n'; echo ']')
+mkdir -p "$work/deep/logs"
+head -c 200000 /dev/zero | tr '\0' '[' >"$work/deep/batch.json"
+expect_error 2 'batch\.json: is damaged' batch status "$work/deep"
+job='"capture": "x", "settings": "", "seed": 0, "arguments": []'
+echo "{\"jobs\": [{\"name\": \"../../x\", $job}]}" >"$work/deep/batch.json"
+expect_error 2 "batch\\.json: .*'\.\./\.\./x'" batch status "$work/deep"
+echo "{\"jobs\": [{\"name\": \"one\", $job}]}" >"$work/deep/batch.json"
+head -c 200000 /dev/zero | tr '\0' '[' >"$work/deep/logs/one.json"
+mkdir -p "$work/deep/one/checkpoint"
+for record in "$(head -c 3000 /dev/zero | tr '\0' '[')" '{"stage": 5}' '{"stage": "x", "iteration": [1], "total": 2}'; do
+  echo "$record" >"$work/deep/one/log.jsonl"
+  run batch status "$work/deep"
+  expect_code 0 'batch status, a damaged state'
+  expect_output '^stopped .* one$' 'batch status, a damaged state'
+done
+printf '{"stage": "red \\u001b[31m"}\n' >"$work/deep/one/log.jsonl"
+run batch status "$work/deep"
+expect_output 'red .x1b\[31m' 'batch status, control characters'
+printf '{"arguments": [], "code": 0, "stopped": false, "seconds": 1, "error": ""}' >"$work/deep/logs/one.json"
+rm -r "$work/deep/one/checkpoint"
+for twin in "$(head -c 200000 /dev/zero | tr '\0' '[')" '{"chain": 5, "provenance": {}}' '[]'; do
+  echo "$twin" >"$work/deep/one/twin.json"
+  run batch collect "$work/deep"
+  expect_code 0 'batch collect, a damaged twin'
+  grep -q 'warning: .*twin.json: is damaged' "$work/stderr" || fail 'batch collect, a damaged twin: no warning'
+done
 expect_error 2 'not the folder of a batch' batch status "$work"
 mkdir "$work/other" && touch "$work/other/file"
 cat >"$work/jobs.toml" <<'E1'
@@ -43,6 +73,14 @@ expect_error 2 'not of a batch' batch "$work/jobs.toml" -o "$work/other"
 code=$?
 expect_code 2 'slurm where there is none'
 grep -q "^chainsplat: error: --launcher slurm: there is no 'sbatch'.*; " "$work/stderr" || fail 'slurm where there is none: no error line'
+
+# a folder whose name Slurm would fill in
+mkdir "$work/bin"
+printf '#!/bin/bash\nprintf "%%s\\n" "$@" >"%s/sbatch"; echo 7\n' "$work" >"$work/bin/sbatch"
+chmod +x "$work/bin/sbatch"
+PATH="$work/bin:$PATH" run batch "$work/jobs.toml" -o "$work/100%j" --launcher slurm
+expect_code 0 'slurm, a folder with a percent sign'
+grep -q '^--output=.*/100%%j/logs/slurm-%a\.txt$' "$work/sbatch" || fail 'slurm: the folder of the logs is filled in'
 
 # interrupted at work: the trainings leave checkpoints
 "$program" batch "$work/jobs.toml" -o "$work/batch" >"$work/stdout" 2>"$work/stderr" </dev/null &

@@ -71,6 +71,51 @@ broken 32 '.*base\.tum: the base motion ends at [0-9.]+ s, before frame 32; ' --
   --centerline "$work/stopped.csv"
 [ "$(wc -l <"$work/stopped.csv")" -eq 33 ] || fail 'a base motion that stops: the centerline was not kept'
 
+# times that do not increase
+broken 1 '.*cam0\.mp4: frame 1 is at 1e\+22 s, not after the one before; ' --camera "$demo/cam0.mp4" \
+  --calibration "$work/camera.json" --start 1e22
+
+# whoever reads the lines has seen enough: what is to be kept is kept
+{ "$program" estimate "$twin" --camera "$demo:cam0" --centerline "$work/read.csv" --covariance 2>"$work/stderr"
+  echo $? >"$work/code"; } | head -2 >"$work/stdout"
+lines 2 'two lines read'
+[ "$(cat "$work/code")" -eq 141 ] || fail "two lines read: exit code $(cat "$work/code")"
+grep -Evq '^([0-9]+ frames; p50 .*|chainsplat: warning: .*)$' "$work/stderr" && fail 'two lines read: it complains'
+[ "$(head -1 "$work/read.csv" 2>/dev/null | cut -c 1-4)" = time ] || fail 'two lines read: the centerline was not kept'
+"$program" estimate "$twin" --camera "$demo:cam0" --centerline "$work/full.csv" >/dev/full 2>"$work/stderr"
+code=$?
+expect_code 1 'a full disk under the lines'
+grep -q '^chainsplat: error: standard output: writing failed; ' "$work/stderr" || fail 'a full disk under the lines: which line?'
+[ -s "$work/full.csv" ] || fail 'a full disk under the lines: the centerline was not kept'
+
+# nobody reads and the pipe is full: the first SIGTERM has to wait, the second one does not
+mkfifo "$work/lines" "$work/video"
+"$program" estimate "$twin" --camera "$demo:cam0" --covariance >"$work/lines" 2>"$work/stderr" </dev/null &
+pid=$!
+exec 4<"$work/lines"
+head -c 1 <&4 >/dev/null
+sleep 1
+kill -TERM $pid
+sleep 0.3
+kill -TERM $pid
+for _ in $(seq 40); do kill -0 $pid 2>/dev/null || break; sleep 0.05; done
+kill -KILL $pid 2>/dev/null
+{ wait $pid; } 2>/dev/null
+code=$?
+exec 4<&-
+expect_code 143 'a second SIGTERM'
+# nothing to keep yet: the first signal ends it, whatever it waits for
+"$program" estimate "$twin" --camera "$work/video" --calibration "$work/camera.json" >"$work/stdout" 2>"$work/stderr" </dev/null &
+pid=$!
+exec 4>"$work/video"  # waits until it is opened for reading
+kill -TERM $pid
+for _ in $(seq 40); do kill -0 $pid 2>/dev/null || break; sleep 0.05; done
+kill -KILL $pid 2>/dev/null
+{ wait $pid; } 2>/dev/null
+code=$?
+exec 4>&-
+expect_code 143 'SIGTERM while a video is opened'
+
 # devices: one that is none, one that is not there
 expect_error 2 '/dev/null: is no camera that V4L2 can read' estimate "$twin" --camera /dev/null \
   --calibration "$work/camera.json"
@@ -78,6 +123,7 @@ expect_error 2 '/dev/video97: does not exist' estimate "$twin" --camera /dev/vid
 
 expect_error 2 '--calibration: is needed with' estimate "$twin" --camera "$demo/cam0.mp4"
 expect_error 2 '--calibration: is needed with' estimate "$twin" --camera -
+expect_error 2 '--base: standard input is for the frames' estimate "$twin" --camera - --base - --calibration "$work/camera.json"
 expect_error 2 '--calibration: is needed with' estimate "$twin" --camera /dev/null
 expect_error 2 'adam draws the twin' estimate "$twin" --camera "$demo:cam0" --solver adam
 expect_error 2 'does not exist' estimate "$twin" --camera "$work/none.mp4" --calibration "$work/camera.json"

@@ -12,6 +12,8 @@
 //   FAKE_CAMERA_GONE     it disappears after so many frames
 //   FAKE_CAMERA_SILENT   it sends nothing any more after so many frames
 //   FAKE_CAMERA_DAMAGED  the frame of this number is damaged on its way
+//   FAKE_CAMERA_BACK     the frame of this number is stamped a second too early
+//   FAKE_CAMERA_STOPPED  the frames from this number on are stamped as the one before
 #ifndef _GNU_SOURCE
 #define _GNU_SOURCE
 #endif
@@ -82,7 +84,7 @@ struct Camera {
   std::size_t capacity = 0;  // bytes of a buffer
   double begun = 0.0;        // s, monotonic: when frame 0 was taken
   int taken = 0;             // frames, those without a buffer among them
-  int damaged = 0;
+  int damaged = 0;  // and others that the program passes over
   std::deque<v4l2_buffer> empty, full;
 } camera;
 
@@ -129,7 +131,10 @@ void fill_buffers() {
     camera.empty.pop_front();
     const std::string& frame = camera.format->frames[camera.taken % camera.format->frames.size()];
     pwrite(camera.file, frame.data(), frame.size(), static_cast<off_t>(buffer.index * camera.capacity));
-    const double time = camera.begun + camera.taken / camera.format->rate;
+    const double stopped = setting("FAKE_CAMERA_STOPPED", INT_MAX);
+    double time = camera.begun + std::min<double>(camera.taken, stopped - 1) / camera.format->rate;
+    if (camera.taken == setting("FAKE_CAMERA_BACK", -1)) time -= 1.0;
+    camera.damaged += camera.taken == setting("FAKE_CAMERA_BACK", -1) || camera.taken >= stopped;
     buffer.timestamp.tv_sec = static_cast<time_t>(time);
     buffer.timestamp.tv_usec = static_cast<suseconds_t>(1e6 * (time - static_cast<double>(buffer.timestamp.tv_sec)));
     buffer.sequence = camera.taken;

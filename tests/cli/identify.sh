@@ -85,6 +85,8 @@ sed '10s/,[^,]*$//' "$work/one.csv" >"$work/wrong.csv"
 refused 'wrong\.csv:10: 16 columns instead of 17'
 sed '10s/,[^,]*$/,abc/' "$work/one.csv" >"$work/wrong.csv"
 refused 'wrong\.csv:10: column 17 is not a finite number'
+sed 's/,c_y,c_z$/,c_y,c_z,c_z/; /^[0-9]/s/$/,0/' "$work/one.csv" >"$work/wrong.csv"
+refused "wrong\.csv:4: there are two columns 'c_z'"
 sed '/^# marker/d' "$work/one.csv" >"$work/wrong.csv"
 refused 'no marker is named'
 sed 's/marker c 0.3/marker c 0.5/' "$work/one.csv" >"$work/wrong.csv"
@@ -93,5 +95,57 @@ sed 's/marker c 0.3/marker c 0.2/' "$work/one.csv" >"$work/wrong.csv"
 refused 'from the grasp.*another rope'
 head -6 "$work/one.csv" >"$work/wrong.csv"
 refused 'fewer than 3 rows'
+sed '10s/,[^,]*$/,1e308/' "$work/one.csv" >"$work/wrong.csv"
+refused 'at .* s marker 3 is .* m from the grasp'
+sed '10s/^[^,]*/1e300/;11,$d' "$work/one.csv" >"$work/wrong.csv"
+refused '; '
 [ "$before" = "$(cat "$work/twin/twin.json")" ] || fail 'a refused file changed the twin'
+
+# run folders that are wrong in one way each: one clear line, and the twin is left as it is
+run identify "$work/run_one"
+expect_code 0 'identify'
+damaged() { rm -rf "$work/damaged"; cp -r "$work/run_one" "$work/damaged"; }
+damaged; sed -i 's/"mass": "0.06"/"mass": "abc"/' "$work/damaged/twin.json"
+expect_error 2 "twin\.json: provenance\.options\.mass: 'abc' is not a positive number" identify "$work/damaged"
+damaged; awk -F, 'NR == 4 { sub($2, "-1e-4") } { print }' "$work/run_one/covariance.csv" >"$work/damaged/covariance.csv"
+expect_error 2 'covariance\.csv:4: its numbers are no covariance' identify "$work/damaged"
+damaged; head -20 "$work/run_one/base.tum" >"$work/damaged/base.tum"
+expect_error 2 'base\.tum: covers 0 to' identify "$work/damaged"
+cmp -s "$work/run_one/twin.json" "$work/damaged/twin.json" || fail 'a damaged run: twin.json changed'
+for text in '[1]' '{"recognized": 3}' '{"recognized": {"mean": 4}}' '{"recognized": {"mean": {"psnr": "x"}}}' '{"rollout": {}}'; do
+  damaged; echo "$text" >"$work/damaged/metrics.json"
+  expect_error 2 'metrics\.json: ' diff "$work/run_one" "$work/damaged"
+done
+
+# a twin whose mass is none
+for mass in none nan -1 '' 1e999 '0.06 kg'; do
+  rm -rf "$work/heavy" && cp -r "$work/run_one" "$work/heavy"
+  sed -i "s/\"mass\": \"[^\"]*\"/\"mass\": \"$mass\"/" "$work/heavy/twin.json"
+  expect_error 2 "options.mass: '$mass' is not a positive number" identify "$work/heavy"
+done
+
+# covariances of the angles that are none
+cp "$work/kept/covariance.csv" "$work/run_one/covariance.csv"
+cp "$work/run_one/covariance.csv" "$work/good.csv"
+bad_covariance() {  # awk's program for the third line
+  awk -F, -v OFS=, "NR == 3 { $1 } 1" "$work/good.csv" >"$work/run_one/covariance.csv"
+  expect_error 2 "covariance.csv:3: $2" identify "$work/run_one"
+}
+bad_covariance '$3 = 10' 'its numbers are no covariance'
+bad_covariance '$2 = -$2' 'its numbers are no covariance'
+bad_covariance '$2 = "nan"' 'column 2 is not a finite number'
+awk -F, -v OFS=, 'NR == 3 { for (i = 2; i <= NF; ++i) $i = 0 } 1' "$work/good.csv" >"$work/run_one/covariance.csv"
+run --json identify "$work/run_one"
+expect_code 0 'identify, a frame that is known exactly'
+python3 -m json.tool "$work/stdout" >"$work/null" || fail 'identify --json: is not JSON'
+
+# file names that are not UTF-8 do not break what is JSON
+odd=$work/odd$(printf '\377')
+run --json new -o "$odd" --length 0.3 --joints 4 --bending planar --mass 0.06
+expect_code 0 'new --json, a name that is not UTF-8'
+python3 -m json.tool "$work/stdout" >"$work/null" || fail 'new --json, a name that is not UTF-8: is not JSON'
+cp "$work/one.csv" "$odd.csv"
+run --json identify "$odd" --markers "$odd.csv" --shape-only
+expect_code 0 'identify --json, names that are not UTF-8'
+python3 -m json.tool "$work/stdout" >"$work/null" || fail 'identify --json, names that are not UTF-8: is not JSON'
 finish

@@ -29,6 +29,11 @@ expect_error 2 'cam0 has masks already.*--force' mask "$demo"
 expect_error 2 '--frames.*-o' mask "$capture" --frames 0:8
 expect_error 2 'no frame' mask "$demo" -o "$work/none" --frames 400:410
 [ -e "$work/none" ] && fail 'no frame: something was written'
+# masks that lie there, though capture.json does not name them, are not written over
+mkdir -p "$capture/masks/cam1"
+echo drawn by hand >"$capture/masks/cam1/000031.png"
+expect_error 2 'cam1 has masks already.*--force' mask "$capture"
+rm -r "$capture/masks"
 
 # an outside program, whose arguments may hold anything
 segmenter="$work/it's a segmenter.sh"
@@ -73,5 +78,38 @@ attempt 'cam0, frame 0: the command wrote no mask' ': {image} {mask}'
 attempt 'cam0, frame 0: .*no image' 'echo nonsense >{mask}; : {image}'
 base64 -d >"$work/small.png" <<<'iVBORw0KGgoAAAANSUhEUgAAAAgAAAAICAAAAADhZOFXAAAADElEQVR42mNgoA4AAABIAAEQRe/SAAAAAElFTkSuQmCC'
 attempt 'cam0, frame 0: .*8x8 pixels.*320x240' "cp '$work/small.png' {mask}; : {image}"
+# a folder that is called like the place of a file in the line
+mkdir "$work/{mask}{image}"
+echo 0 >"$work/count"
+TMPDIR="$work/{mask}{image}" FRAMES=4 FAIL_AT=none run mask "$demo" -o "$work/named" --frames 0:4 --command "$line"
+expect_code 0 'a TMPDIR that is called {mask}'
+expect_output '^cam2: IoU 1\.0000' 'a TMPDIR that is called {mask}'
+
+# no mask is written or read through a link that leads out of the capture
+mkdir "$work/victim"
+bare
+ln -s "$work/victim" "$capture/masks"
+expect_error 2 'its folder .*/masks is a link out of .*/capture, to .*/victim; ' mask "$capture" --command "$line"
+rm "$capture/masks"
+mkdir -p "$capture/masks"
+ln -s "$work/victim" "$capture/masks/cam1"
+expect_error 2 'masks/cam1 is a link out of' mask "$capture"
+mkdir "$work/led"
+ln -s "$work/victim" "$work/led/cam0"
+expect_error 2 'led/cam0 is a link out of' mask "$demo" -o "$work/led" --force
+[ -z "$(ls "$work/victim")" ] || fail 'mask: written through a link'
+bare
+mkdir "$capture/inside"
+ln -s inside "$capture/masks"
+echo 0 >"$work/count"
+FRAMES=60 FAIL_AT=none run mask "$capture" --command "$line"
+expect_code 0 'masks by a link inside the capture'
+[ -s "$capture/inside/cam2/000059.png" ] || fail 'masks by a link inside the capture: no last mask'
+
+# a rope of 2,000 diameters is not there, which is found in seconds
+bare
+sed -i 's/"length": [0-9.]*/"length": 2/; s/"diameter": [0-9.]*/"diameter": 0.001/' "$capture/capture.json"
+expect_error 2 'nothing like the rope|behind' mask "$capture"
+
 expect_error 2 '--command.*\{mask\}' mask "$demo" -o "$work/attempt" --command 'segment {image}'
 finish

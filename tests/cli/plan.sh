@@ -32,6 +32,7 @@ refused 'target.*not a finite' "$free" --target nan,0,0.3
 refused 'target.*not a finite' "$free" --target 0.1,inf,0.3
 refused 'target.*3 numbers' "$free" --target 0.1,0.3
 refused 'target.*3 numbers' "$free" --target 0.1,x,0.3
+refused 'target.*3 numbers' "$free" --target 0.1,0,0.3,
 refused 'target.*under the table' "$table" --target 0.1,0.1,-0.02
 refused 'target.*seed' "$free" --target random:x
 # limits

@@ -44,12 +44,36 @@ stop() {  # signal, exit code, further options
 stop USR1 0
 stop INT 130 --resume
 expect_error 2 'not empty' train "$demo" -o "$work/stopped" "${small[@]}"
-expect_error 2 'bending' train "$demo" -o "$work/whole" --resume --joints 3 --frames 0:12
+# a checkpoint of other frames or options is refused, and so is a finished recognition; nothing is touched
+files() { (cd "$1" && find . -type f -exec sha256sum {} + | sort); }
+other() {  # pattern for the checkpoint, pattern for the twin, further options
+  expect_error 2 "$1" train "$demo" -o "$work/stopped" "${small[@]}" "${@:3}" --resume
+  expect_error 2 "$2" train "$demo" -o "$work/whole" "${small[@]}" "${@:3}" --resume
+}
+small_before=("${small[@]}") stopped_before=$(files "$work/stopped") whole_before=$(files "$work/whole")
+small=(--joints 3 --bending planar)
+other 'frames 0:12, not 2:14' "--frames '0:12', not '2:14'" --frames 2:14
+small=(--bending planar --frames 0:12)
+other '--joints 3, not 8' "--joints '3', not '8'"
+small=("${small_before[@]}")
+other '--seed 0, not 7' "--seed '0', not '7'" --seed 7
+[ "$stopped_before" = "$(files "$work/stopped")" ] || fail 'train --resume of another job: the checkpoint changed'
+[ "$whole_before" = "$(files "$work/whole")" ] || fail 'train --resume of another job: the twin changed'
+# what somebody else put into the folders stays there
+touch "$work/stopped/notes.tmp1" "$work/stopped/checkpoint/notes"
 train "$work/stopped" --resume
 expect_code 0 'train --resume'
+[ -e "$work/stopped/notes.tmp1" ] && [ "$(ls "$work/stopped/checkpoint")" = notes ] ||
+  fail "train --resume: somebody else's files are gone, or ours are left"
+rm -r "$work/stopped/notes.tmp1" "$work/stopped/checkpoint"
 for file in gaussians.ply states.csv rollout.csv; do
   cmp -s "$work/whole/$file" "$work/stopped/$file" || fail "train --resume: $file is not that of an uninterrupted run"
 done
+
+# followed by Adam, which knows no deviations, in the live window, which asks for the force on the rope
+run estimate "$work/whole" --camera "$demo:cam0" --frames 0:6 --solver adam --covariance --serve $((20000 + $$ % 20000))
+expect_code 0 'estimate --solver adam --serve'
+[ "$(grep -c '"sigma":\[\],.*"covariance":\[\],' "$work/stdout")" -eq 6 ] || fail 'estimate --solver adam --serve: not six lines'
 
 # what was made can be used
 run rollout "$work/whole" -o - --rate 60
@@ -64,6 +88,10 @@ expect_code 0 render
 for ending in png mask.png depth.exr; do
   [ "$(ls "$work/frames/cam1" | grep -c "^[0-9]*\.$ending\$")" -eq 12 ] || fail "render: not 12 files *.$ending"
 done
+expect_error 2 'frames: is there already and not empty' render "$work/whole" --camera "$demo:cam0" -o "$work/frames"
+[ -e "$work/frames/cam0" ] && fail 'render: writes into a folder that is not empty'
+run render "$work/whole" --camera "$demo:cam0" -o "$work/frames" --force
+expect_code 0 'render --force'
 run render "$work/whole" --camera "$demo:cam0" -o "$work/video.mp4"
 expect_code 0 'render video'
 [ -s "$work/video.mp4" ] || fail 'render: no video'
@@ -77,6 +105,8 @@ run synth "$work/whole" -o "$work/drawn"
 expect_code 0 synth
 run check "$work/drawn"
 expect_code 0 'check of what synth made'
+expect_error 2 "is the capture's own folder" synth "$work/whole" --camera "$work/drawn" -o "$work/drawn" --force
+expect_error 2 "is the capture's own folder" render "$work/whole" --camera "$work/drawn" -o "$work/drawn" --force
 run eval "$work/whole" "$work/drawn"
 expect_code 0 'eval on another capture'
 grep -q 'only the rollout' "$work/stderr" || fail 'eval on another capture: does not say so'
@@ -97,6 +127,45 @@ cmp -s "$work/joint/rollout.csv" "$work/whole/rollout.csv" && fail 'identify --j
 expect_error 2 'refined already' identify "$work/joint" --joint
 rm "$work/whole/covariance.csv"
 expect_error 2 'covariance.csv' identify "$work/whole" --joint
+
+# an evaluation that fails all the same: the twin stays, and --resume goes on from it
+cp -r "$demo" "$work/capture"
+"$program" --no-progress train "$work/capture" -o "$work/late" "${small[@]}" >"$work/stdout" 2>"$work/stderr" </dev/null &
+pid=$!
+wait_for_file "$work/late/log.jsonl" $pid
+sed -i '1s/.*/t,x,y,z/' "$work/capture/truth/centreline.csv"
+wait $pid
+code=$?
+expect_code 1 'an evaluation that fails'
+[ "$(grep -c '^chainsplat: error: .*centreline\.csv:1: .*; what exists so far is kept in .*--resume' "$work/stderr")" -eq 1 ] ||
+  fail 'an evaluation that fails: no error line that says what is kept'
+for file in twin.json gaussians.ply states.csv rollout.csv covariance.csv; do
+  [ -s "$work/late/$file" ] || fail "an evaluation that fails: no $file"
+done
+cp "$demo/truth/centreline.csv" "$work/capture/truth/"
+run train "$work/capture" -o "$work/late" "${small[@]}" --resume
+expect_code 0 'train --resume after an evaluation that failed'
+cmp -s "$work/late/metrics.json" "$work/stopped/metrics.json" || fail 'train --resume: other metrics'
+
+# something else where a file should go: refused before anything is removed
+for name in log.jsonl base.tum metrics.json; do
+  rm -rf "$work/blocked"
+  cp -r "$work/stopped" "$work/blocked"
+  rm "$work/blocked/$name" && mkdir "$work/blocked/$name" && touch "$work/blocked/$name/x"
+  expect_error 2 "$name: is a folder" train "$demo" -o "$work/blocked" "${small[@]}" --force
+  expect_error 2 "$name: is a folder" train "$demo" -o "$work/blocked" "${small[@]}" --resume
+  [ -s "$work/blocked/twin.json" ] || fail "$name is a folder: the twin was removed"
+done
+ln -s nowhere "$work/link"
+expect_error 2 'is a link to nothing' train "$demo" -o "$work/link" "${small[@]}"
+
+# a twin without pictures
+cp -r "$work/stopped" "$work/bare"
+sed -i '/^ "gaussians"/d' "$work/bare/twin.json"
+expect_error 2 'has no Gaussians to draw' eval "$work/bare" "$demo" --frames 0:12
+expect_error 2 'has no Gaussians to draw' render "$work/bare" --camera "$demo" -o "$work/bare_frames"
+expect_error 2 'has no Gaussians to draw' synth "$work/bare" -o "$work/bare_frames"
+expect_error 2 'has no Gaussians to draw' train "$demo" -o "$work/bare" "${small[@]}" --resume
 
 # no room on the disk: a file size limit stands for it
 ( ulimit -f 8; exec "$program" train "$demo" -o "$work/full" "${small[@]}" ) >"$work/stdout" 2>"$work/stderr" </dev/null

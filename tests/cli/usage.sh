@@ -37,6 +37,12 @@ expect_error 2 '--frames' train capture -o run --frames 5:5
 expect_error 2 '--frames' train capture -o run --frames some
 expect_error 2 'twin.json' rollout "$work/none" -o "$work/states.csv"
 expect_error 2 'ending' export "$work/none" -o "$work/twin.obj"
+run check ''
+expect_code 2 "check ''"
+grep -q "^chainsplat: error: '': " "$work/stderr" || fail "check '': the error line has an empty place"
+for command in 'rollout none' 'render none --camera none' 'export none' 'train none' 'mask none' 'eval none none'; do
+  expect_error 2 '--output: is empty' $command -o ''
+done
 expect_error 2 'twin.json' excite "$work/none" -o "$work/motion"
 expect_error 2 '--output' excite "$work/none"
 expect_error 2 'twin.json' identify "$work/none" --online "$work/none.jsonl"
@@ -44,9 +50,49 @@ expect_error 2 '--online' identify "$work/none" --memory 3
 expect_error 2 'folder does not exist' rollout "$work/none" -o "$work/none/states.csv"
 [ "$(ls "$work")" = "$(printf 'stderr\nstdout')" ] || fail 'something was written'
 
-# a full disk under standard output
-"$program" doctor >/dev/full 2>"$work/stderr"
+# a base that is beyond all numbers is none
+cp -r "$source_dir/assets/demo_free_30" "$work/beyond"
+awk '!/^#/ && n++ % 2 { $2 = 1e300 } { print }' "$source_dir/assets/demo_free_30/base.tum" >"$work/beyond/base.tum"
+run check "$work/beyond"
+expect_code 2 'a base beyond all numbers'
+expect_output '^problem: .*base' 'a base beyond all numbers'
+rm -r "$work/beyond"
+
+# a full disk under standard output, and none at all
+for arguments in doctor --version --help 'estimate --help'; do
+  "$program" $arguments >/dev/full 2>"$work/stderr"
+  code=$?
+  expect_code 1 "$arguments >/dev/full"
+  [ "$(grep -c '^chainsplat: error: standard output: ' "$work/stderr")" -eq 1 ] || fail "$arguments >/dev/full: no error line"
+  "$program" $arguments >&- 2>"$work/stderr"
+  code=$?
+  expect_code 1 "$arguments >&-"
+  [ "$(grep -c '^chainsplat: error: standard output: ' "$work/stderr")" -eq 1 ] || fail "$arguments >&-: no error line"
+done
+
+# nobody reads: an end without a word
+for arguments in doctor --version --help; do
+  { sleep 0.1; "$program" $arguments 2>"$work/stderr"; echo $? >"$work/code"; } | true
+  [ "$(cat "$work/code")" -eq 141 ] || fail "$arguments, and nobody reads: exit code $(cat "$work/code")"
+  [ -s "$work/stderr" ] && fail "$arguments, and nobody reads: it says something"
+done
+
+# a limit on the address space: a line, not an abort in a library (sanitizers need more than any limit)
+if (ulimit -v 4000000 && exec "$program" --version) >/dev/null 2>&1; then
+  for limit in 470000 500000; do
+    (ulimit -v $limit && exec "$program" --version) >"$work/stdout" 2>"$work/stderr"
+    code=$?
+    expect_code 1 "ulimit -v $limit"
+    grep -q '^chainsplat: error: address space: .*; raise it' "$work/stderr" || fail "ulimit -v $limit: no error line"
+  done
+fi
+
+# with a stream closed, the program's own files do not become that stream
+run new --length 0.3 --joints 2 --bending planar -o "$work/twin"
+expect_code 0 new
+"$program" rollout "$work/twin" -o "$work/states.csv" --log "$work/log.jsonl" 2>&- >"$work/stdout"
 code=$?
-expect_code 1 'doctor >/dev/full'
-[ "$(grep -c '^chainsplat: error: standard output: ' "$work/stderr")" -eq 1 ] || fail 'doctor >/dev/full: no error line'
+expect_code 2 'rollout with standard error closed'
+[ -e "$work/log.jsonl" ] || fail 'rollout with standard error closed: no log'
+[ -s "$work/log.jsonl" ] && fail "rollout with standard error closed: in its log '$(cat "$work/log.jsonl")'"
 finish

@@ -1,0 +1,75 @@
+// replay.cpp - reads the corpora and the inputs that once crashed again, without a fuzzer: READER/* of every folder
+// named, each reader in a process of its own.
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <set>
+#include <string>
+#include <vector>
+
+#include "chainsplat/core.h"
+
+extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size);
+
+namespace {
+
+namespace fs = std::filesystem;
+
+constexpr double kLongest = 5.0;  // s, of one input; tools/fuzz has the same bound
+
+int read_all(const std::vector<fs::path>& files) {
+  int failures = 0;
+  for (const fs::path& file : files) {
+    const std::string bytes = chainsplat::core::read_file(file);
+    const double begun = chainsplat::core::seconds_now();
+    std::string failure;
+    std::printf("%s\r", file.c_str());  // stays where the process dies of it
+    std::fflush(stdout);
+    try {
+      LLVMFuzzerTestOneInput(reinterpret_cast<const std::uint8_t*>(bytes.data()), bytes.size());
+    } catch (const std::exception& error) {
+      failure = error.what();
+    }
+    if (chainsplat::core::seconds_now() - begun > kLongest) failure = "takes longer than 5 s";
+    if (failure.empty()) continue;
+    std::printf("FAILED: %s: %s\n", file.c_str(), failure.c_str());
+    ++failures;
+  }
+  return failures;
+}
+
+}  // namespace
+
+int main(int count, char** arguments) {
+  std::set<std::string> readers;
+  for (int i = 1; i < count; ++i) {
+    if (!fs::is_directory(arguments[i])) continue;  // there may be no crashes
+    for (const auto& entry : fs::directory_iterator(arguments[i]))
+      if (entry.is_directory()) readers.insert(entry.path().filename());
+  }
+  int failures = 0;
+  for (const std::string& reader : readers) {
+    std::vector<fs::path> files;
+    for (int i = 1; i < count; ++i)
+      if (fs::is_directory(fs::path(arguments[i]) / reader))
+        for (const auto& entry : fs::directory_iterator(fs::path(arguments[i]) / reader)) files.push_back(entry.path());
+    std::sort(files.begin(), files.end());
+    std::fflush(stdout);
+    const pid_t child = ::fork();
+    if (child == 0) {
+      ::setenv("CHAINSPLAT_READER", reader.c_str(), 1);
+      std::exit(std::min(read_all(files), 100));
+    }
+    int status = 0;
+    ::waitpid(child, &status, 0);
+    const int failed = WIFEXITED(status) ? WEXITSTATUS(status) : 1;
+    if (!WIFEXITED(status)) std::printf("\nFAILED: %s died of signal %d\n", reader.c_str(), WTERMSIG(status));
+    std::printf("%-12s %5zu inputs, %d failed          \n", reader.c_str(), files.size(), failed);
+    failures += failed;
+  }
+  return failures > 0;
+}

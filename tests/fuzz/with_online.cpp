@@ -1,0 +1,26 @@
+// The lines of estimate as identify --online reads them.
+#include "readers.h"
+#include "tools/online.cpp"
+
+namespace chainsplat::fuzz {
+
+void online(std::string_view bytes) {
+  dynamics::Estimates known;
+  known.names = {"log_stiffness"};
+  known.values = {-7.0};
+  known.standard_errors = {0.1};
+  known.covariance = math::MatrixX::Constant(1, 1, 0.01);
+  static const adaptation::Adaptation fresh(two_joints(), parameters_of_two_joints(), known, {});
+  adaptation::Observation seen;
+#if __has_include("tools/estimate_lines.h")
+  const auto line = tools::read_estimate_line(std::string(bytes), "line", two_joints().angles(), -1e300);
+  if (!line) return;
+  seen = {line->time, line->theta, line->thetadot, line->sigma};
+#else
+  if (!tools::read_line(std::string(bytes), "line", seen)) return;
+#endif
+  adaptation::Adaptation adaptation = fresh;
+  adaptation.observe(seen, [](double) { return dynamics::at_rest({}); });
+}
+
+}  // namespace chainsplat::fuzz
