@@ -1,6 +1,7 @@
 // splat_blend_backward.comp - one group an active tile, layout as splat_blend.comp: gradient of each entry from the pixels
 // of the tile (SPEC 2.8), walked front to back: what lies behind entry k is the whole pixel minus what came up to k, so only
-// its product with the pixel's gradient is carried. Each subgroup stores its sum in a slot of its own (no atomics).
+// its product with the pixel's gradient is carried. Each cluster of kSubgroup lanes stores its sum in a slot of its own (no
+// atomics); a subgroup is one cluster or, where a device has wider ones than it promises, several.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -12,7 +13,7 @@ layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(constant_id = 3) const uint kPixels = 8u;
 layout(constant_id = 4) const uint kCutoffs = 1u;
-layout(constant_id = 5) const uint kSubgroup = 8u;  // lanes of a subgroup, fixed by the host
+layout(constant_id = 5) const uint kSubgroup = 8u;  // lanes of a cluster; no subgroup has fewer
 layout(constant_id = 6) const uint kShare = 1u;     // as in splat_blend.comp
 layout(push_constant) uniform Push { SplatPush p; };
 layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
@@ -44,6 +45,9 @@ void main() {
   uint n = counters[kCounterOverflow] != 0u ? 0u : tile_count[tile];
   uint used = min(tile_used[tile], n);
 
+  uint cluster = gl_SubgroupID * (gl_SubgroupSize / kSubgroup) + gl_SubgroupInvocationID / kSubgroup;
+  uint cluster_lane = gl_SubgroupInvocationID % kSubgroup, cluster_slot = 4u * kPartialRows * cluster;
+
   bool dssim = p.weight_dssim > 0.0 && tile < p.near_tiles;
   vec4 gamma[kPixels];                            // gradient of the loss (SPEC 2.7) by color and alpha
   float transmittance[kPixels], behind[kPixels];  // behind: gradient times what lies behind the entries so far
@@ -63,7 +67,7 @@ void main() {
   for (uint begin = 0u; begin < used; begin += kShare) {
     uint turns = kShare > 1u ? min(kShare, used - begin) : 1u, own_turn = gl_SubgroupInvocationID % kShare;
     uvec2 own = sorted[start + begin + min(own_turn, turns - 1u)];
-    uint own_slot = 4u * kPartialRows * (own.y * p.slots + gl_SubgroupID), s = kSplatRows * own.x;
+    uint own_slot = 4u * kPartialRows * p.slots * own.y, s = kSplatRows * own.x;
     vec4 own_a = splats[s], own_b = splats[s + 1u], own_c = splats[s + 2u];
     float own_inverse = own_a.z > 1e-30 ? 1.0 / own_a.z : 0.0, own_blue = 0.0;
     Falloff own_falloff = falloff_of(own_b.xyz);
@@ -95,28 +99,22 @@ void main() {
       float blue = subgroup_sum(grad_color.z);
       own_blue = turn == own_turn ? blue : own_blue;
       float sums[8] = {grad_u, grad_v, shared_by(own_inverse, turn) * moments.x, grad_color.x, xx, xy, yy, grad_color.y};
-      uint slot = shared_by(own_slot, turn);
+      uint slot = shared_by(own_slot, turn) + cluster_slot;
       if (kSubgroup >= 8u) {
         float sum = subgroup_sums(sums);
-        if (gl_SubgroupInvocationID < 8u) partials[slot + gl_SubgroupInvocationID] = sum;
+        if (cluster_lane < 8u) partials[slot + cluster_lane] = sum;
       } else {
         [[unroll]] for (uint k = 0u; k < 8u; ++k) sums[k] = subgroup_sum(sums[k]);
-        if (subgroupElect()) {
+        if (cluster_lane == 0u) {
           [[unroll]] for (uint k = 0u; k < 8u; ++k) partials[slot + k] = sums[k];
         }
       }
     }
-    if (gl_SubgroupInvocationID < turns) partials[own_slot + 8u] = own_blue;
+    if (cluster_lane < turns) partials[own_slot + cluster_slot + 8u] = own_blue;
   }
-  // entries that no pixel reached, and slots that a wider subgroup left free
+  // entries that no pixel reached
   for (uint k = used + lane; k < n; k += gl_WorkGroupSize.x) {
     uint slot = 4u * kPartialRows * p.slots * sorted[start + k].y;
     for (uint m = 0u; m < 4u * kPartialRows * p.slots; ++m) partials[slot + m] = 0.0;
-  }
-  if (gl_NumSubgroups < p.slots) {
-    for (uint k = lane; k < used; k += gl_WorkGroupSize.x) {
-      uint slot = 4u * kPartialRows * (p.slots * sorted[start + k].y + gl_NumSubgroups);
-      for (uint m = 0u; m < 4u * kPartialRows * (p.slots - gl_NumSubgroups); ++m) partials[slot + m] = 0.0;
-    }
   }
 }
