@@ -86,8 +86,8 @@ void main() {
       vec3 from = vec3(slope, 1.0) * z - start;
       vec3 u = vec3(focal.x, 0.0, -focal.x * slope.x), w = vec3(0.0, focal.y, -focal.y * slope.y);
       vec3 u_moment = cross(from, u), w_moment = cross(from, w);
-      float by_u[6] = float[](u_moment.x, u_moment.y, u_moment.z, u.x, u.y, u.z);
-      float by_w[6] = float[](w_moment.x, w_moment.y, w_moment.z, w.x, w.y, w.z);
+      float by_u[6] = {u_moment.x, u_moment.y, u_moment.z, u.x, u.y, u.z};
+      float by_w[6] = {w_moment.x, w_moment.y, w_moment.z, w.x, w.y, w.z};
 
       // channels first: they share the pixel's motion
       vec3 weighted_across = weight * across, weighted_down = weight * down;

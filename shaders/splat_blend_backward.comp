@@ -94,8 +94,7 @@ void main() {
       float xx = falloff.slope * (xy + mixed) + along * along * moments.x;
       float blue = subgroup_sum(grad_color.z);
       own_blue = turn == own_turn ? blue : own_blue;
-      float sums[8] = float[](grad_u, grad_v, shared_by(own_inverse, turn) * moments.x, grad_color.x, xx, xy, yy,
-                              grad_color.y);
+      float sums[8] = {grad_u, grad_v, shared_by(own_inverse, turn) * moments.x, grad_color.x, xx, xy, yy, grad_color.y};
       uint slot = shared_by(own_slot, turn);
       if (kSubgroup >= 8u) {
         float sum = subgroup_sums(sums);

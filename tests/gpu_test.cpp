@@ -219,6 +219,41 @@ TEST_CASE("the choice prefers discrete to integrated to CPU, and never one that 
   CHECK_THROWS_AS(choice(""), InputError);
 }
 
+TEST_CASE("subgroups are of one size, within the device's range and as groups need them") {
+  VkPhysicalDeviceVulkan13Properties v13{};
+  v13.requiredSubgroupSizeStages = VK_SHADER_STAGE_COMPUTE_BIT;
+  v13.maxComputeWorkgroupSubgroups = 16;
+  struct Case {
+    const char* device;
+    std::uint32_t least, most, usual, wanted;
+  };
+  for (const Case& c : {Case{"AMD", 32, 64, 64, 32}, Case{"Intel", 8, 32, 32, 32}, Case{"wide", 64, 128, 64, 64},
+                        Case{"narrow", 8, 16, 8, 16}}) {
+    CAPTURE(c.device);
+    v13.minSubgroupSize = c.least;
+    v13.maxSubgroupSize = c.most;
+    const gpu::SubgroupChoice fixed = gpu::choose_subgroups(v13, c.usual, true);
+    CHECK(fixed.fixed);
+    CHECK(fixed.size == c.wanted);
+    CHECK(fixed.whole == c.wanted);
+    // one that cannot fix a size may launch any of its range
+    const gpu::SubgroupChoice any = gpu::choose_subgroups(v13, c.usual, false);
+    CHECK(!any.fixed);
+    CHECK(any.size == c.least);
+    CHECK(any.whole == c.most);
+  }
+  v13.minSubgroupSize = v13.maxSubgroupSize = 32;
+  const gpu::SubgroupChoice only = gpu::choose_subgroups(v13, 32, true);
+  CHECK(!only.fixed);
+  CHECK(only.size == 32);
+  CHECK(only.whole == 32);
+  // groups of 256 lanes must go into the subgroups that a group may have
+  v13.minSubgroupSize = 16;
+  v13.maxSubgroupSize = 64;
+  v13.maxComputeWorkgroupSubgroups = 4;
+  CHECK(!gpu::choose_subgroups(v13, 64, true).fixed);
+}
+
 TEST_CASE("failures of the driver are work errors, a lost device by its name") {
   gpu::Device device;
   device.info.name = "some card";
@@ -472,6 +507,22 @@ TEST_CASE("synchronization validation sees a missing barrier") {
   commands.dispatch(add, second, nullptr, 0, 16);  // reads b while it is written
   REQUIRE(gpu::validation_messages(*device) > 0);
   CHECK(gpu::validation_texts(*device).front().find("READ_AFTER_WRITE") != std::string::npos);
+}
+
+// tools/test-validation: a kernel that checks its indices must say so, else its silence on all others says nothing.
+TEST_CASE("GPU-assisted validation sees an index outside a buffer" *
+          doctest::skip(std::getenv("CHAINSPLAT_GPU_ASSISTED") == nullptr)) {
+  gpu::DevicePtr device = open_validated();
+  Buffer x(*device, 64, Domain::device, "x"), y(*device, 64, Domain::device, "y");
+  Pipeline saxpy(*device, "test_saxpy", 2, sizeof(SaxpyPush), {16});
+  Commands commands(*device);
+  commands.begin();
+  const SaxpyPush push{17, 1.0f};  // of sixteen
+  const Buffer* const buffers[] = {&x, &y};
+  commands.dispatch(saxpy, buffers, &push, sizeof push, 2);
+  commands.submit();
+  commands.wait();
+  CHECK(gpu::validation_messages(*device) > 0);
 }
 
 TEST_CASE("two threads share a device") {

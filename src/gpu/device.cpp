@@ -161,14 +161,8 @@ Candidate examine_device(VkPhysicalDevice physical, int index) {
   need_size(info.shared_memory_bytes, kLeastSharedBytes, "bytes of shared memory");
   need_size(info.storage_buffers, kLeastStorageBuffers, "storage buffers a shader");
 
-  // where sizes vary, fix one so that callers can size per-subgroup memory; else report the least
-  info.subgroup_size = subgroup.subgroupSize;
-  if (v13.minSubgroupSize != v13.maxSubgroupSize) {
-    c.fixes_subgroup_size = features.v13.subgroupSizeControl &&
-                            (v13.requiredSubgroupSizeStages & VK_SHADER_STAGE_COMPUTE_BIT) &&
-                            v13.maxComputeWorkgroupSubgroups * subgroup.subgroupSize >= kLeastInvocations;
-    if (!c.fixes_subgroup_size) info.subgroup_size = v13.minSubgroupSize;
-  }
+  c.subgroups = choose_subgroups(v13, subgroup.subgroupSize, features.v13.subgroupSizeControl);
+  info.subgroup_size = c.subgroups.size;
 
   std::uint32_t count = 0;
   vkGetPhysicalDeviceQueueFamilyProperties(physical, &count, nullptr);
@@ -226,6 +220,15 @@ const char* result_name(VkResult result) {
     case VK_ERROR_FRAGMENTED_POOL: return "fragmented pool";
     default: return "an unexpected Vulkan result";
   }
+}
+
+// Where sizes vary, one is fixed so that callers can size per-subgroup memory; else the least counts.
+SubgroupChoice choose_subgroups(const VkPhysicalDeviceVulkan13Properties& v13, std::uint32_t usual, bool control) {
+  if (v13.minSubgroupSize == v13.maxSubgroupSize) return {usual, usual, false};
+  const std::uint32_t wanted = std::clamp(kWantedSubgroup, v13.minSubgroupSize, v13.maxSubgroupSize);
+  const bool fixed = control && (v13.requiredSubgroupSizeStages & VK_SHADER_STAGE_COMPUTE_BIT) != 0 &&
+                     v13.maxComputeWorkgroupSubgroups * wanted >= kLeastInvocations;
+  return fixed ? SubgroupChoice{wanted, wanted, true} : SubgroupChoice{v13.minSubgroupSize, v13.maxSubgroupSize, false};
 }
 
 Instance::Instance(Instance&& other) noexcept { *this = std::move(other); }
@@ -444,7 +447,7 @@ DevicePtr open_device(const DeviceOptions& options) {
   d.push_descriptors = options.least ? 0 : c.push_descriptors;
   d.info.push_descriptors = d.push_descriptors > 0;
   d.info.unified_memory = c.info.unified_memory && !options.least;
-  d.fixes_subgroup_size = c.fixes_subgroup_size;
+  d.subgroups = c.subgroups;
   d.timestamp_mask = c.timestamp_bits >= 64 ? ~0ull : (1ull << c.timestamp_bits) - 1;
   d.timestamp_period = c.timestamp_period;
   d.validation = options.validation;
@@ -460,6 +463,7 @@ DevicePtr open_device(const DeviceOptions& options) {
   wanted.v13.maintenance4 = VK_TRUE;
   wanted.v13.subgroupSizeControl = there.v13.subgroupSizeControl;
   wanted.v13.computeFullSubgroups = there.v13.computeFullSubgroups;
+  d.full_subgroups = there.v13.computeFullSubgroups;
 
   const float priority = 1.0f;
   auto queue = of_type<VkDeviceQueueCreateInfo>(VK_STRUCTURE_TYPE_DEVICE_QUEUE_CREATE_INFO);

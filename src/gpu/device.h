@@ -20,6 +20,10 @@ inline constexpr std::uint32_t kLeastInvocations = 256;    // of a work group; V
 inline constexpr std::uint32_t kLeastSharedBytes = 16384;  // the least maxComputeSharedMemorySize of Vulkan
 inline constexpr std::uint32_t kLeastStorageBuffers = 16;  // of a kernel; Vulkan itself promises 4
 
+// What is asked for where subgroups come in several sizes: the lanes of the smallest group that works as subgroups, so
+// that none is launched in part (AMD's are of 64 lanes by default, and can be of 32).
+inline constexpr std::uint32_t kWantedSubgroup = 32;
+
 // A Vulkan struct with its type set and everything else zero.
 template <class T>
 T of_type(VkStructureType type) {
@@ -29,6 +33,14 @@ T of_type(VkStructureType type) {
 }
 
 const char* result_name(VkResult result);
+
+// The subgroups of a device's pipelines, from what it says of them.
+struct SubgroupChoice {
+  std::uint32_t size = 0;   // lanes that each has at least
+  std::uint32_t whole = 0;  // a group of a multiple of so many lanes can be whole subgroups
+  bool fixed = false;       // pipelines must and can ask for `size`
+};
+SubgroupChoice choose_subgroups(const VkPhysicalDeviceVulkan13Properties& v13, std::uint32_t usual, bool control);
 
 struct Messages {  // of the validation layer, from any thread
   std::mutex mutex;
@@ -54,7 +66,7 @@ struct Candidate {
   VkPhysicalDevice handle = VK_NULL_HANDLE;
   DeviceInfo info;
   std::uint32_t queue_family = 0, timestamp_bits = 0, push_descriptors = 0;
-  bool fixes_subgroup_size = false;  // pipelines must and can ask for info.subgroup_size
+  SubgroupChoice subgroups;
   float timestamp_period = 1.0f;     // ns a tick
 };
 
@@ -82,7 +94,8 @@ class Device {
   DeviceInfo info;
   std::uint32_t queue_family = 0;
   std::uint32_t push_descriptors = 0;  // storage buffers that can be pushed; 0: use descriptor sets
-  bool fixes_subgroup_size = false;
+  SubgroupChoice subgroups;
+  bool full_subgroups = false;  // pipelines can ask for subgroups without idle lanes
   std::uint64_t timestamp_mask = 0;  // 0: no timestamps
   double timestamp_period = 1.0;     // ns a tick
   bool validation = false;

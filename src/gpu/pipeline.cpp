@@ -93,6 +93,17 @@ Pipeline::Handles::~Handles() {
 
 namespace {
 
+// Whether the kernel asks for subgroup operations: capabilities come first in a module.
+bool uses_subgroups(std::span<const std::uint32_t> code) {
+  constexpr std::size_t kHeaderWords = 5;
+  constexpr std::uint32_t kOpCapability = 17, kGroupNonUniform = 61, kOperation = 0xffff, kLength = 16;
+  for (std::size_t k = kHeaderWords; k + 1 < code.size() && (code[k] & kOperation) == kOpCapability;
+       k += code[k] >> kLength) {
+    if (code[k + 1] == kGroupNonUniform) return true;
+  }
+  return false;
+}
+
 // Throws as the constructor of Pipeline.
 std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std::string& name, int buffers,
                                                       std::size_t push_bytes,
@@ -148,7 +159,12 @@ std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std:
   subgroup.requiredSubgroupSize = device.info.subgroup_size;
   auto create = of_type<VkComputePipelineCreateInfo>(VK_STRUCTURE_TYPE_COMPUTE_PIPELINE_CREATE_INFO);
   create.stage = of_type<VkPipelineShaderStageCreateInfo>(VK_STRUCTURE_TYPE_PIPELINE_SHADER_STAGE_CREATE_INFO);
-  create.stage.pNext = device.fixes_subgroup_size ? &subgroup : nullptr;
+  create.stage.pNext = device.subgroups.fixed ? &subgroup : nullptr;
+  // Kernels exchange values with lanes of their subgroup by number, and take the lanes of their group from constant 0.
+  // Vulkan promises that lanes are numbered without gaps only where subgroups are full, which a group can be of whole
+  // subgroups only. A group that is a part of one is left to the driver; all known ones number its lanes from 0.
+  if (device.full_subgroups && uses_subgroups(code) && !constants.empty() && constants[0] % device.subgroups.whole == 0)
+    create.stage.flags = VK_PIPELINE_SHADER_STAGE_CREATE_REQUIRE_FULL_SUBGROUPS_BIT;
   create.stage.stage = VK_SHADER_STAGE_COMPUTE_BIT;
   create.stage.module = module;
   create.stage.pName = "main";

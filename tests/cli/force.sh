@@ -76,7 +76,8 @@ expect_code 1 'force --live, a line that is cut off'
 [ "$(wc -l <"$work/stdout")" -eq 6 ] || fail 'force --live, a line that is cut off: not the lines before'
 grep -q '^chainsplat: error: -: line 9: .*; the lines so far are kept$' "$work/stderr" || fail 'force --live: which line?'
 # nobody reads on
-{ estimates 1 8; sleep 1; estimates 9 12; } |
+: >"$work/stdout"
+{ estimates 1 8; wait_for_file "$work/stdout" $$; sleep 0.3; estimates 9 12; } |  # the reader has gone by then
   { "$program" force "$work/twin" --estimate - --base "$demo/base.tum" --live 2>"$work/stderr"; echo $? >"$work/code"; } | head -1 >"$work/stdout"
 [ "$(cat "$work/code")" -eq 141 ] || fail "force --live, one line read: exit code $(cat "$work/code")"
 grep -q error "$work/stderr" && fail 'force --live, one line read: it complains'

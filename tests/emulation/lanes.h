@@ -1,0 +1,231 @@
+// lanes.h - what a kernel sees of a device, on the host: a work group whose lanes are fibers, in subgroups of any width.
+// A lane runs until an operation that others take part in, and goes on when they have come there too. Beyond what a device
+// does it tells when lanes meet at different operations, when one reads from a lane that is not there, when an index is
+// outside its buffer and when a group waits for ever. Lanes run in either order, so that a missing barrier shows.
+#pragma once
+#include <ucontext.h>
+
+#include <algorithm>
+#include <array>
+#include <cstdint>
+#include <cstring>
+#include <map>
+#include <memory>
+#include <numeric>
+#include <source_location>
+#include <span>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+#define GLM_FORCE_SWIZZLE  // .xyz(); before any other include of GLM
+#include <glm/glm.hpp>
+#include <glm/packing.hpp>
+
+namespace chainsplat::emulation {
+
+using glm::uvec3;
+using uint = std::uint32_t;
+
+// How a device lays a work group out.
+struct Layout {
+  uint subgroup = 8;       // lanes of a subgroup
+  bool scattered = false;  // which invocation is which lane of which subgroup is not promised, where subgroups are full
+  bool backward = false;   // the last lane runs first
+};
+
+// What a dispatch binds.
+struct Bindings {
+  std::map<uint, std::span<std::byte>> buffers;
+  std::span<const std::byte> push;
+
+  template <class T>
+  void bind(uint binding, std::vector<T>& values) {
+    buffers[binding] = std::as_writable_bytes(std::span(values));
+  }
+};
+
+inline const Bindings* bindings = nullptr;  // of the dispatch that runs
+
+[[noreturn]] inline void fail(const std::string& what) { throw std::runtime_error(what); }
+
+template <class T>
+struct Storage {  // a buffer
+  std::span<T> values;
+  uint binding;
+
+  explicit Storage(uint at) : binding(at) {
+    const auto found = bindings->buffers.find(at);
+    if (found == bindings->buffers.end()) fail("nothing is bound to " + std::to_string(at));
+    values = {reinterpret_cast<T*>(found->second.data()), found->second.size() / sizeof(T)};
+  }
+  T& operator[](std::size_t k) const {
+    if (k >= values.size())
+      fail("element " + std::to_string(k) + " of the " + std::to_string(values.size()) + " of binding " +
+           std::to_string(binding));
+    return values[k];
+  }
+};
+
+template <class T>
+struct Push {
+  T value;
+  Push() {
+    if (bindings->push.size() != sizeof(T)) fail("push constants of another size");
+    std::memcpy(&value, bindings->push.data(), sizeof(T));
+  }
+};
+
+struct WorkGroupSize {
+  uint x, y = 1, z = 1;
+};
+
+// Specialization constant `at`, or its default where fewer are given.
+template <uint at, uint... kConstants>
+constexpr uint specialized(uint otherwise) {
+  constexpr std::array<uint, sizeof...(kConstants)> given{kConstants...};
+  if constexpr (at < given.size()) {
+    return given[at];
+  } else {
+    return otherwise;
+  }
+}
+
+enum class Waits { no, at_subgroup, at_group, at_end };
+
+struct Lane {
+  ucontext_t context{};
+  std::vector<std::byte> stack;
+  uvec3 invocation{0};           // in the group
+  uint subgroup = 0, place = 0;  // and in the subgroup
+  Waits waits = Waits::no;
+  const char* operation = "";  // where it waits
+  std::uint_least32_t line = 0;
+  uint offered = 0;  // what the others of the subgroup may read
+};
+
+struct Group {
+  static constexpr std::size_t kStackBytes = 256 * 1024;
+
+  std::vector<Lane> lanes;
+  std::vector<uint> offers;         // [subgroup][place]: of the last operation
+  std::vector<std::uint8_t> there;  // likewise: whether the lane took part in it
+  uint width = 1, subgroups = 0;
+  uvec3 group{0}, groups{0};
+  ucontext_t scheduler{};
+  Lane* now = nullptr;
+  void (*body)(void*) = nullptr;
+  void* kernel = nullptr;
+  std::string error;
+
+  void wait(Waits at, const char* operation, std::uint_least32_t line) {
+    now->waits = at;
+    now->operation = operation;
+    now->line = line;
+    Lane* const self = now;
+    swapcontext(&self->context, &scheduler);
+  }
+};
+
+inline Group* running = nullptr;
+
+inline void lane_main() {
+  Group& group = *running;
+  try {
+    group.body(group.kernel);
+  } catch (const std::exception& error) {
+    group.error = error.what();
+  }
+  group.now->waits = Waits::at_end;
+  swapcontext(&group.now->context, &group.scheduler);
+}
+
+// True where all lanes of `chosen` (indices) wait at the same operation of the kind: they go on. A subgroup's may have
+// ended before; a barrier is everyone's.
+inline bool release(Group& group, std::span<const std::size_t> chosen, Waits at) {
+  const Lane* first = nullptr;
+  for (const std::size_t k : chosen) {
+    const Lane& lane = group.lanes[k];
+    if (lane.waits == Waits::at_end && at == Waits::at_subgroup) continue;
+    if (lane.waits != at) return false;
+    if (first && (std::strcmp(first->operation, lane.operation) != 0 || first->line != lane.line))
+      fail(std::string("lanes of one subgroup or group at ") + first->operation + " and at " + lane.operation);
+    first = &lane;
+  }
+  if (!first) return false;
+  for (const std::size_t k : chosen) {
+    Lane& lane = group.lanes[k];
+    if (at == Waits::at_subgroup) {
+      const std::size_t slot = lane.subgroup * static_cast<std::size_t>(group.width) + lane.place;
+      group.there[slot] = lane.waits == at;
+      group.offers[slot] = lane.offered;
+    }
+    if (lane.waits == at) lane.waits = Waits::no;
+  }
+  return true;
+}
+
+// Runs `body(kernel)` in every lane of one work group.
+inline void run_group(Group& group, const Layout& layout, uint size) {
+  group.width = layout.subgroup;
+  group.subgroups = (size + layout.subgroup - 1) / layout.subgroup;
+  group.lanes.resize(size);
+  group.offers.assign(group.subgroups * static_cast<std::size_t>(layout.subgroup), 0);
+  group.there.assign(group.offers.size(), 0);
+  group.error.clear();
+  std::vector<std::vector<std::size_t>> members(group.subgroups);
+  std::vector<std::size_t> everyone(size);
+  std::iota(everyone.begin(), everyone.end(), 0u);
+  for (uint k = 0; k < size; ++k) {
+    Lane& lane = group.lanes[k];
+    lane.invocation = {k, 0, 0};
+    constexpr uint kOdd = 5;  // coprime to every power of two: another order of all lanes
+    const bool full = size % layout.subgroup == 0;
+    const uint at = layout.scattered && full ? (kOdd * k + 3) % size : k;
+    lane.subgroup = at / layout.subgroup;
+    lane.place = at % layout.subgroup;
+    lane.waits = Waits::no;
+    members[lane.subgroup].push_back(k);
+    lane.stack.resize(Group::kStackBytes);
+    getcontext(&lane.context);
+    lane.context.uc_stack.ss_sp = lane.stack.data();
+    lane.context.uc_stack.ss_size = lane.stack.size();
+    lane.context.uc_link = nullptr;
+    makecontext(&lane.context, lane_main, 0);
+  }
+  running = &group;
+  for (;;) {
+    for (uint k = 0; k < size; ++k) {
+      Lane& lane = group.lanes[layout.backward ? size - 1 - k : k];
+      if (lane.waits != Waits::no) continue;
+      group.now = &lane;
+      swapcontext(&group.scheduler, &lane.context);
+      if (!group.error.empty()) fail(group.error);
+    }
+    bool moved = release(group, everyone, Waits::at_group), left = false;
+    for (const auto& subgroup : members) moved = release(group, subgroup, Waits::at_subgroup) || moved;
+    for (const Lane& lane : group.lanes) left = left || lane.waits != Waits::at_end;
+    if (!left) return;
+    if (!moved) fail("lanes wait for each other for ever");
+  }
+}
+
+// All groups of a kernel, one after the other.
+template <class Kernel>
+void dispatch(const Layout& layout, const Bindings& bound, uint x, uint y = 1, uint z = 1) {
+  bindings = &bound;
+  Group group;
+  group.groups = {x, y, z};
+  group.body = [](void* kernel) { static_cast<Kernel*>(kernel)->main(); };
+  for (uint k = 0; k < x * y * z; ++k) {
+    const auto kernel = std::make_unique<Kernel>();  // its members are what the group shares
+    group.kernel = kernel.get();
+    group.group = {k % x, k / x % y, k / (x * y)};
+    run_group(group, layout, Kernel::gl_WorkGroupSize.x);
+  }
+  running = nullptr;
+  bindings = nullptr;
+}
+
+}  // namespace chainsplat::emulation
