@@ -174,6 +174,12 @@ std::vector<float> read_depth(const Path& file, int width, int height, double sc
 Image8 read_image8(const Path& file) {
   const auto input = open_image(file);
   const OIIO::ImageSpec& spec = input->spec();
+  // nobody has said how large it should be
+  if (static_cast<std::int64_t>(spec.width) * spec.height * spec.nchannels > kMostPixels)
+    throw InputError(file.string(),
+                     "claims " + size_text(spec.width, spec.height) + " pixels of " + std::to_string(spec.nchannels) +
+                         " channels",
+                     "write it again with fewer");
   return {spec.width, spec.height, spec.nchannels,
           read_pixels<std::uint8_t>(*input, file, OIIO::TypeDesc::UINT8, spec.nchannels)};
 }

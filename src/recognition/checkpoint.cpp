@@ -42,7 +42,7 @@ struct Reader {
     const auto count = get<std::uint64_t>();
     if (bytes.size() / sizeof(T) < count) throw std::out_of_range("checkpoint");
     std::vector<T> values(count);
-    std::memcpy(values.data(), bytes.data(), count * sizeof(T));
+    if (count > 0) std::memcpy(values.data(), bytes.data(), count * sizeof(T));
     bytes.remove_prefix(count * sizeof(T));
     return values;
   }
