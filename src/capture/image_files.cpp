@@ -52,6 +52,25 @@ std::string damage_of_png(const Path& file) {
   }
 }
 
+// Whether an EXR's header, as far as it is one, has an attribute that is longer than the file: OpenEXR would make room
+// for it first.
+bool is_damaged_exr(const Path& file) {
+  std::ifstream stream(file, std::ios::binary);
+  constexpr std::string_view kSignature = "\x76\x2f\x31\x01";
+  char start[8] = {};  // signature and version
+  if (!stream.read(start, sizeof start) || !std::string_view(start, sizeof start).starts_with(kSignature)) return false;
+  std::error_code error;
+  const std::uintmax_t at_most = std::filesystem::file_size(file, error);
+  for (std::string name, type; std::getline(stream, name, '\0') && !name.empty();) {
+    unsigned char b[4] = {};
+    if (!std::getline(stream, type, '\0') || !stream.read(reinterpret_cast<char*>(b), sizeof b)) return true;
+    const std::uint32_t length = std::uint32_t{b[3]} << 24u | std::uint32_t{b[2]} << 16u | std::uint32_t{b[1]} << 8u | b[0];
+    if (length > at_most) return true;
+    stream.seekg(length, std::ios::cur);
+  }
+  return !stream;  // cut off before the end of the header
+}
+
 // The reader of OpenImageIO for the format that the file begins as; none: another format. Left to itself it tries all
 // that it has, and some hand the file to libraries that open whatever other file or address it names.
 const char* format_of(const Path& file) {
@@ -82,6 +101,7 @@ std::unique_ptr<OIIO::ImageInput> open_image(const Path& file) {
     throw InputError(file.string(), "is not a file", "check the path and the frame numbers");
   if (const std::string damage = damage_of_png(file); !damage.empty())
     throw InputError(file.string(), damage, "write it again");
+  if (is_damaged_exr(file)) throw InputError(file.string(), "is damaged", "write it again");
   OIIO::ImageSpec options;
   options.attribute("oiio:UnassociatedAlpha", 1);  // colors as stored, not multiplied by alpha
   const char* const format = format_of(file);

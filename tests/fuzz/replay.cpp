@@ -4,9 +4,11 @@
 #include <unistd.h>
 
 #include <algorithm>
+#include <csignal>
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
 #include <set>
 #include <string>
 #include <vector>
@@ -21,14 +23,25 @@ namespace fs = std::filesystem;
 
 constexpr double kLongest = 5.0;  // s, of one input; tools/fuzz has the same bound
 
+const char* current = "";  // input, for a process that dies of it
+
+void say_which(int signal) {
+  constexpr char kDied[] = "FAILED, died: ";
+  [[maybe_unused]] ssize_t said = ::write(STDOUT_FILENO, kDied, sizeof kDied - 1);
+  said = ::write(STDOUT_FILENO, current, std::strlen(current));
+  said = ::write(STDOUT_FILENO, "\n", 1);
+  std::signal(signal, SIG_DFL);
+  std::raise(signal);
+}
+
 int read_all(const std::vector<fs::path>& files) {
+  for (const int signal : {SIGSEGV, SIGABRT, SIGFPE, SIGBUS, SIGILL}) std::signal(signal, say_which);
   int failures = 0;
   for (const fs::path& file : files) {
     const std::string bytes = chainsplat::core::read_file(file);
     const double begun = chainsplat::core::seconds_now();
     std::string failure;
-    std::printf("%s\r", file.c_str());  // stays where the process dies of it
-    std::fflush(stdout);
+    current = file.c_str();
     try {
       LLVMFuzzerTestOneInput(reinterpret_cast<const std::uint8_t*>(bytes.data()), bytes.size());
     } catch (const std::exception& error) {
@@ -73,8 +86,8 @@ int main(int count, char** arguments) {
     int status = 0;
     ::waitpid(child, &status, 0);
     const int failed = WIFEXITED(status) ? WEXITSTATUS(status) : 1;
-    if (!WIFEXITED(status)) std::printf("\nFAILED: %s died of signal %d\n", reader.c_str(), WTERMSIG(status));
-    std::printf("%-12s %5zu inputs, %d failed          \n", reader.c_str(), files.size(), failed);
+    if (!WIFEXITED(status)) std::printf("FAILED: %s died of signal %d\n", reader.c_str(), WTERMSIG(status));
+    std::printf("%-12s %5zu inputs, %d failed\n", reader.c_str(), files.size(), failed);
     std::fflush(stdout);
     failures += failed;
   }
