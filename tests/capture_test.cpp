@@ -983,7 +983,8 @@ TEST_CASE("the truth of a capture: refused when it is not one, absent without it
   };
   for (const auto& [text, expected] : wrong) {
     made.write("truth/centreline.csv", text);
-    INFO(text);
+    const std::string given = text;
+    INFO(given);
     CHECK(contains(error_of([&] { capture::load_true_centerline(made.path()); }), expected));
     CHECK(any_contains(capture::check(made.path()).problems, expected));
     CHECK(error_of([&] { capture::load(made.path()); }).empty());  // training never opens it

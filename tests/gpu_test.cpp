@@ -471,8 +471,10 @@ TEST_CASE("broken promises are caught before the driver sees them") {
   gpu::DevicePtr device = open_validated();
   Buffer a(*device, 64, Domain::device, "a"), b(*device, 64, Domain::device, "b");
   Pipeline add(*device, "test_add", 2, 0, {64, 1});
+  const Buffer empty;
   const Buffer* const both[] = {&a, &b};
   const Buffer* const one[] = {&a};
+  const Buffer* const not_made[] = {&a, &empty};
   const std::uint32_t word = 0;
   Commands commands(*device);
   CHECK_THROWS_AS(commands.dispatch(add, both, nullptr, 0, 1), std::logic_error);  // not begun
@@ -480,6 +482,7 @@ TEST_CASE("broken promises are caught before the driver sees them") {
   commands.begin();
   CHECK_THROWS_AS(commands.dispatch(add, both, nullptr, 0, 65536), std::logic_error);
   CHECK_THROWS_AS(commands.dispatch(add, one, nullptr, 0, 1), std::logic_error);
+  CHECK_THROWS_AS(commands.dispatch(add, not_made, nullptr, 0, 1), std::logic_error);
   CHECK_THROWS_AS(commands.dispatch(add, both, &word, 4, 1), std::logic_error);
   CHECK_THROWS_AS(commands.dispatch_indirect(add, both, nullptr, 0, a, 56), std::logic_error);
   CHECK_THROWS_AS(commands.fill(a, 0, 0, 68), std::logic_error);

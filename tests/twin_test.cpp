@@ -296,7 +296,8 @@ TEST_CASE("damage to twin.json is named by file and key") {
     const std::string message = error_with(pointer, value);
     std::string flat = message;  // "file: key: what" and "file: key is missing" alike
     for (std::size_t at; (at = flat.find(": is missing")) != std::string::npos;) flat.erase(at, 1);
-    INFO(pointer << " -> " << message);
+    const std::string given = std::string(pointer) + " -> " + message;
+    INFO(given);
     CHECK(contains(flat, expected));
     CHECK(contains(message, folder.path.string()));
     CHECK(!contains(message, "\n"));

@@ -93,6 +93,7 @@ class Buffer {
   std::span<T> as() const {
     return {static_cast<T*>(mapped_), bytes_ / sizeof(T)};
   }
+  bool made() const { return handles_ != nullptr; }  // false by default and after a move
   struct Handles;
   const Handles& handles() const { return *handles_; }
 

@@ -48,11 +48,11 @@ BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<d
   std::size_t begin = 0;
   if (times.empty()) throw InputError("rollout", "no output times", "ask for at least one");
   // a step is kept with its motion: 1 GiB. At 8 steps a frame these are more than four hours
-  constexpr int kMostSteps = 4000000;
-  if (const double steps = (times.back() - start) / kFrame * substeps; steps > kMostSteps && std::isfinite(times.back()))
+  constexpr int kMostKept = 4000000;
+  if (const double steps = (times.back() - start) / kFrame * substeps; steps > kMostKept && std::isfinite(times.back()))
     throw InputError("rollout",
                      "from " + core::exact(start) + " to " + core::exact(times.back()) + " s it would take " +
-                         core::exact(std::ceil(steps)) + " steps, and memory is meant for " + std::to_string(kMostSteps),
+                         core::exact(std::ceil(steps)) + " steps, and memory is meant for " + std::to_string(kMostKept),
                      "check the times, or split the motion");
   grid.nodes.push_back({start, 0.0, base(start), Vector6::Zero(), false});
   if (times[0] == start) {

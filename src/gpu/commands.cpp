@@ -147,7 +147,7 @@ struct Commands::State {
       std::array<VkWriteDescriptorSet, kLeastStorageBuffers> writes{};
       const VkDescriptorSet set = h.pushes_descriptors ? VK_NULL_HANDLE : make_set(h.set_layout);
       for (std::uint32_t i = 0; i < h.buffers; ++i) {
-        CHAINSPLAT_CHECK(buffers[i] && &buffers[i]->handles(), h.name + ", binding " + std::to_string(i));
+        CHAINSPLAT_CHECK(buffers[i] && buffers[i]->made(), h.name + ", binding " + std::to_string(i));
         infos[i] = {buffers[i]->handles().buffer, 0, VK_WHOLE_SIZE};
         writes[i] = of_type<VkWriteDescriptorSet>(VK_STRUCTURE_TYPE_WRITE_DESCRIPTOR_SET);
         writes[i].dstSet = set;
