@@ -8,7 +8,7 @@ namespace {
 
 constexpr double kFrame = 1.0 / 30.0;  // s, what `substeps` counts in
 constexpr int kMaxRefinement = 32;     // of the steps of a diverging rollout
-constexpr double kMostSteps = 1e6;     // from one output time to the next: hours of a rope's motion
+constexpr int kMostSteps = 4000000;     // a step is kept with its motion: 1 GiB. At 8 steps a frame more than four hours
 constexpr double kJerkStep = 0.01;     // of a step, for the one-sided difference of the base acceleration
 
 // S' = J S + b by the trapezoidal rule; X = d theta / d unknowns, Y = X', acceleration = Y'.
@@ -47,12 +47,10 @@ BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<d
   double now = start;
   std::size_t begin = 0;
   if (times.empty()) throw InputError("rollout", "no output times", "ask for at least one");
-  // a step is kept with its motion: 1 GiB. At 8 steps a frame these are more than four hours
-  constexpr int kMostKept = 4000000;
-  if (const double steps = (times.back() - start) / kFrame * substeps; steps > kMostKept && std::isfinite(times.back()))
+  if (const double steps = (times.back() - start) / kFrame * substeps; steps > kMostSteps && std::isfinite(times.back()))
     throw InputError("rollout",
                      "from " + core::exact(start) + " to " + core::exact(times.back()) + " s it would take " +
-                         core::exact(std::ceil(steps)) + " steps, and memory is meant for " + std::to_string(kMostKept),
+                         core::exact(std::ceil(steps)) + " steps, and memory is meant for " + std::to_string(kMostSteps),
                      "check the times, or split the motion");
   grid.nodes.push_back({start, 0.0, base(start), Vector6::Zero(), false});
   if (times[0] == start) {

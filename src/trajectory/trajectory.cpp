@@ -13,7 +13,7 @@ using math::Vector3;
 
 namespace {
 
-constexpr double kLongest = 3600.0;   // s; memory and time of whatever is integrated along it follow the duration
+constexpr double kLongest = 86400.0;  // s; a rope is followed for hours, and what is integrated has a bound of its own
 constexpr double kFarthest = 1e6;     // m, from the origin: digits are left for what moves
 constexpr double kSeriesAngle = 0.1;  // rad; below it the series of the right Jacobian are exact to rounding
 
@@ -87,7 +87,7 @@ Trajectory fit(std::vector<Sample> samples, const std::string& where) {
       throw InputError(which,
                        "comes " + core::exact(sample.time - samples.front().time) +
                            " s after the first and a motion lasts at most " + core::exact(kLongest) +
-                           " s, for all of it is computed in steps of milliseconds",
+                           " s",
                        "write times in seconds, or split the recording");
   }
 

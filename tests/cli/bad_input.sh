@@ -135,7 +135,7 @@ grep -q '^chainsplat: warning: .*only one' "$work/stderr" || fail 'one camera: n
 fresh; sed -i '0,/"rate": [0-9.]*/s//"rate": 1e-7/' "$capture/capture.json"
 refused 'rate: 1e-07 is not between'
 fresh; echo '1e7 0 0 1 0 0 0 1' >>"$capture/base.tum"
-refused 'base\.tum: pose .* a motion lasts at most 3600 s'
+refused 'base\.tum: pose .* a motion lasts at most 86400 s'
 twin=$source_dir/tests/data/planning/free
 expect_error 2 '--rate: .* 1000000 rows' rollout "$twin" --initial "$twin/states.csv" -o "$work/states.csv" --rate 99999999999
 expect_error 2 '--rate: .* 1000000 rows' plan "$twin" --target 0.1,0,0.3 -o "$work/plan" --rate 99999999999
