@@ -45,6 +45,7 @@ void main() {
   uint start = tile_prefix[tile] + tile_block[tile / kScanBlock];
   uint n = counters[kCounterOverflow] != 0u ? 0u : tile_count[tile];
 
+  // blend until the list ends or all pixels are closed
   vec3 color[kPixels];
   float transmittance[kPixels], depth[kPixels];
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
@@ -83,6 +84,8 @@ void main() {
     [[unroll]] for (uint k = 0u; k < kPixels; ++k) any_open = any_open || transmittance[k] >= 0.0;
     if (kShare > 1u) any_open = subgroupAny(any_open);  // a lane whose pixels are closed still loads for the others
   }
+
+  // write the pixels
   atomicMax(tile_used[tile], used);
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
     if (column < view.width && row + k < view.height) {

@@ -49,6 +49,7 @@ void main() {
   uint cluster = gl_SubgroupID * (gl_SubgroupSize / kSubgroup) + gl_SubgroupInvocationID / kSubgroup;
   uint cluster_lane = gl_SubgroupInvocationID % kSubgroup, cluster_slot = 4u * kPartialRows * cluster;
 
+  // gradient of the loss by the pixels
   bool dssim = p.weight_dssim > 0.0 && tile < p.near_tiles;
   vec4 gamma[kPixels];                            // gradient of the loss (mathematics.md 2.7) by color and alpha
   float transmittance[kPixels], behind[kPixels];  // behind: gamma . (color and alpha behind the entries so far)

@@ -46,6 +46,8 @@ void main() {
   uint replica = i * p.links + link;  // number of replica (i, j) of mathematics.md 2.4, which breaks ties of depth
   uint out_index = v * live_count + r;
   SplatView view = views[v];
+
+  // project the replica
   uint motion = 3u * (view.motion + link);
   uint at = at_mean(n, i), aq = at_rotation(n, i), as = at_log_scale(n, i);
   vec3 mean = vec3(parameters[at], parameters[at + 1u], parameters[at + 2u]);
@@ -55,6 +57,7 @@ void main() {
   float opacity = replica_opacity[e];
   float determinant = a.cov.x * a.cov.z - a.cov.y * a.cov.y;
   vec2 u = view.intrinsics.xy * a.x.xy / a.x.z + view.intrinsics.zw;
+
   // half widths of the box where alpha can reach the cut
   float reach = kCutoffs != 0u ? 2.0 * log(255.0 * opacity) : 2.0 * kFullReach;
   bool visible = a.x.z >= kNear && reach > 0.0 && determinant > 0.0;
@@ -68,6 +71,8 @@ void main() {
   uvec2 t0 = uvec2(max(first, ivec2(0))) / uvec2(kTileWidth, kTileHeight);
   uvec2 t1 = uvec2(max(last, ivec2(0))) / uvec2(kTileWidth, kTileHeight) + 1u;
   if (!visible) t1 = t0;
+
+  // count the active tiles that it touches
   float inverse = 1.0 / determinant;
   vec3 conic = vec3(a.cov.z, -a.cov.y, a.cov.x) * inverse;
   const float kSlack = 1.001;  // rounding must not drop a tile with a pixel that the splat reaches

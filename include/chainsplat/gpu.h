@@ -36,8 +36,8 @@ struct DeviceInfo {
 // why; this is never an exception.
 std::vector<DeviceInfo> list_devices(std::string* why = nullptr);
 // Returns the device that `selector` names: a number, or a part of the device's name. An empty selector means the
-// environment variable CHAINSPLAT_DEVICE if it is set, else the first usable discrete GPU, integrated GPU or CPU, in
-// this order. Throws InputError that lists the candidates and why each is refused.
+// environment variable CHAINSPLAT_DEVICE if it is set, else the first usable device in the order discrete GPU,
+// integrated GPU, others, CPU. Throws InputError that lists the candidates and why each is refused.
 DeviceInfo choose_device(const std::string& selector);
 
 // The findings of the command `doctor`, as values.

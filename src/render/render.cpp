@@ -77,6 +77,7 @@ splat::Picture warp(const splat::Picture& from, const Bounds& drawn, const Bound
   const auto inside = [&](int x, int y) { return x >= 0 && y >= 0 && x < from.width && y < from.height; };
   for (int y = 0; y < to.height; ++y) {
     for (int x = 0; x < to.width; ++x) {
+      // where the pixel lies in the drawn picture
       const Vector2& position = lens.straight[static_cast<std::size_t>(crop.y0 + y) * image_width + crop.x0 + x];
       const double u = position.x() - drawn.x0 - 0.5, v = position.y() - drawn.y0 - 0.5;
       const int x0 = static_cast<int>(std::floor(u)), y0 = static_cast<int>(std::floor(v));

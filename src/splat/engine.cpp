@@ -216,6 +216,8 @@ LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, 
   options.twists = twists != nullptr;
   if (twists) twists->clear();
   ++scene.step;
+
+  // Adam's constants; held link logits are the last section of the parameters and are left out
   AdamPush push{};
   push.gaussians = static_cast<std::uint32_t>(scene.count);
   push.links = static_cast<std::uint32_t>(scene.links);
@@ -234,6 +236,7 @@ LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, 
   push.beta2 = kBeta2;
   push.correction1 = static_cast<float>(1.0 / (1.0 - std::pow(kBeta1, scene.step)));
   push.correction2 = static_cast<float>(1.0 / (1.0 - std::pow(kBeta2, scene.step)));
+
   LossValues values;
   s.run_all(scene, batch, options, &push, [&](std::span<const int> chunk, std::size_t) {
     if (read_losses) append(values, s.sums(chunk.size()), weights, scene.normalizer);

@@ -97,8 +97,9 @@ struct RunOptions {
   double color_scale = 0.0;         // factor that turns sums over pixels and channels into means
   double mask_scale = 0.0;          // factor that turns sums over pixels into means
   bool loss = false, sums = false;  // there are targets; the loss is also read back
-  bool backward = false, twists = false, depth = false, accumulate = false;  // accumulate: add to the gradient so far
-  bool held_links = false;                                                   // leaves out the gradient by link logits
+  // `accumulate` adds the gradient to that of the chunks before
+  bool backward = false, twists = false, depth = false, accumulate = false;
+  bool held_links = false;              // leaves out the gradient by link logits
   const chain::Chain* chain = nullptr;  // if not null, forms the normal equations of the colors; needs `depth`
 };
 
