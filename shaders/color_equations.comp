@@ -121,7 +121,6 @@ void main() {
     sums[kColorExposure + 1u] = bias;
   }
 
-  // sums over the lanes
   uint out_row = 4u * kColorRows * ((v * p.links + link) * p.equation_slices + slice);
   [[unroll]] for (uint first = 0u; first < 4u * kColorRows; first += 8u) {
     float eight[8];

@@ -107,7 +107,6 @@ tinygltf::Primitive primitive(Builder& builder, const splat::Gaussians& g, const
     color.push_back(opacity.back());
   }
 
-  // the primitive and its accessors
   const std::string prefix = std::string(kExtension) + ":";
   tinygltf::Primitive out;
   out.mode = TINYGLTF_MODE_POINTS;

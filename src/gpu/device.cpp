@@ -127,7 +127,6 @@ Candidate examine_device(VkPhysicalDevice physical, int index) {
     return c;
   }
 
-  // driver, subgroups and push descriptors
   auto properties = of_type<VkPhysicalDeviceProperties2>(VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_PROPERTIES_2);
   auto driver = of_type<VkPhysicalDeviceDriverProperties>(VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_DRIVER_PROPERTIES);
   auto subgroup = of_type<VkPhysicalDeviceSubgroupProperties>(VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_SUBGROUP_PROPERTIES);
@@ -475,7 +474,6 @@ DevicePtr open_device(const DeviceOptions& options) {
   wanted.v13.computeFullSubgroups = there.v13.computeFullSubgroups;
   d.full_subgroups = there.v13.computeFullSubgroups;
 
-  // make the logical device with its one queue
   const float priority = 1.0f;
   auto queue = of_type<VkDeviceQueueCreateInfo>(VK_STRUCTURE_TYPE_DEVICE_QUEUE_CREATE_INFO);
   queue.queueFamilyIndex = d.queue_family;

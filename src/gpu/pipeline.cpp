@@ -156,7 +156,6 @@ std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std:
   VkShaderModule module = VK_NULL_HANDLE;
   device.check(vkCreateShaderModule(device.handle, &module_create, nullptr, &module), "take a shader");
 
-  // the pipeline with its subgroup size
   auto subgroup = of_type<VkPipelineShaderStageRequiredSubgroupSizeCreateInfo>(
       VK_STRUCTURE_TYPE_PIPELINE_SHADER_STAGE_REQUIRED_SUBGROUP_SIZE_CREATE_INFO);
   subgroup.requiredSubgroupSize = device.info.subgroup_size;

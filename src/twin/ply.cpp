@@ -215,7 +215,6 @@ math::MatrixX read_points(const Path& path) {
   if (!ascii && !big && header.format != "binary_little_endian")
     throw InputError(file, "is in the format '" + header.format.substr(0, 30) + "'", mend);
 
-  // where x, y and z are in a vertex
   std::array<Property, 3> axes;
   for (int d = 0; d < 3; ++d) {
     const std::string name(1, "xyz"[d]);

@@ -111,7 +111,6 @@ Json chain_json(const Twin& twin) {
     out["table"] = {{"point", list(twin.table_point.value_or(Vector3::Zero()))},
                     {"normal", list(normal.value_or(Vector3::UnitZ()))}};
 
-  // joints, one per angle
   out["joints"] = Json::array();
   for (int k = 0; k < chain.angles(); ++k) {
     Json joint{
@@ -125,7 +124,6 @@ Json chain_json(const Twin& twin) {
     out["joints"].push_back(std::move(joint));
   }
 
-  // links, the base link first
   out["links"] = Json::array();
   for (int j = 0; j < chain.links(); ++j) {
     const double length = chain.link_end(j) - chain.link_start(j);
@@ -142,7 +140,6 @@ Json chain_json(const Twin& twin) {
     out["links"].push_back(std::move(link));
   }
 
-  // parameters of the whole rope
   if (p) {
     out["air_drag"] = {{"linear", drag_per_meter(chain, p->air_linear)},
                        {"quadratic", drag_per_meter(chain, p->air_quadratic)}};
@@ -282,7 +279,6 @@ chain::Chain read_chain(const Node& node, const Node& grasp) {
   if (std::abs(chain.direction.dot(chain.bending_axis)) > kLengthTolerance)
     grasp["bending_axis"].fail("is not perpendicular to direction", "choose an axis across the rope");
 
-  // joints, from base to tip
   for (const Node& joint : node["joints"].entries()) {
     chain.axes.push_back(joint["axis"].vector(6));
     const int previous = chain.child_link.empty() ? 0 : chain.child_link.back();
@@ -359,7 +355,6 @@ dynamics::Parameters read_parameters(const Node& node, const Twin& twin) {
   if (twin.tabletop) p.table_normal = twin.table_normal;
   const std::vector<Node> links = node["links"].entries();
 
-  // per angle
   for (const Node& joint : node["joints"].entries()) {
     p.stiffness.push_back(joint["stiffness"].not_negative());
     p.rest_angle.push_back(joint["rest_angle"].number());
@@ -371,7 +366,6 @@ dynamics::Parameters read_parameters(const Node& node, const Twin& twin) {
         "has roll_lever for " + std::to_string(p.roll_lever.size()) + " joints of " + std::to_string(p.damping.size()),
         "give it for all or none");
 
-  // per moving link
   const double linear = node["air_drag"]["linear"].not_negative(),
                quadratic = node["air_drag"]["quadratic"].not_negative();
   for (int j = 1; j < twin.chain.links(); ++j) {
@@ -387,7 +381,6 @@ dynamics::Parameters read_parameters(const Node& node, const Twin& twin) {
                                       "only uniform links are known; use tip_mass for the rest");
   }
 
-  // of the whole rope
   p.radius = cylinder_radius(twin.chain, p.link_mass, links);
   p.tip_mass = node["tip_mass"].not_negative();
   p.coulomb_speed = node["regularization"]["coulomb_speed"].positive();
