@@ -155,8 +155,7 @@ cv::Mat unusual_odds(const Look& appearance, const Picture& picture, const Tube&
     cv::boxFilter(values, mean, -1, cv::Size(window, window));
     return mean;
   };
-  // the share of such pixels nearby; beside the tube too, because what lies beside a hidden piece belongs to what hides
-  // it
+  // the share of such pixels nearby, beside the tube too, because what hides a piece of the tube goes on beside it
   const cv::Mat near_tube = mean_about(in_tube, kUnusualWindow), near_other = mean_about(other, kUnusualWindow);
   const cv::Mat far_tube = mean_about(in_tube, kBesideWindow), far_other = mean_about(other, kBesideWindow);
   cv::Mat odds(box.height(), box.width(), CV_32F);

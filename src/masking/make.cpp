@@ -26,7 +26,7 @@ constexpr double kAboutPixels = 24.0;    // px around a tube whose colors count 
 constexpr double kLeastUncovered = 0.2;  // share of the samples that must show a pixel's background
 constexpr int kLeastSamples = 4;
 // the chain
-constexpr double kLinkDiameters = 1.5;  // length of a link in diameters, as far as the number of joints is within
+constexpr double kLinkDiameters = 1.5;  // length of a link in diameters, unless the number of joints hits its bounds
 constexpr int kFewestJoints = 8, kMostJoints = 16;
 // chains grown in moments
 constexpr double kSameMoment = 0.02;    // s, largest difference in time between pictures of one moment
