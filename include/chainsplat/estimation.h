@@ -76,7 +76,7 @@ struct Estimate {
                                    // or the colors in them have been unlike the twin's for long
 };
 
-constexpr double kNever = -std::numeric_limits<double>::infinity();  // s; infinite, since frames may have negative times
+constexpr double kNever = -std::numeric_limits<double>::infinity();  // s; before all times, which may be negative
 
 // The state of the filter between two frames.
 struct Filter {

@@ -22,8 +22,8 @@ constexpr double kBlockBytes = 512.0 * 1024 * 1024;
 // what is learned from
 constexpr int kSamples = 48;  // frames per camera from which background and colors are learned,
 constexpr double kSampleBytes = 2048.0 * 1024 * 1024;  // fewer where those of all cameras would take more than this
-constexpr double kAboutPixels = 24.0;    // px around a tube whose colors count as the rope's surroundings
-constexpr double kLeastUncovered = 0.2;  // share of the samples that must show a pixel's background
+constexpr double kAboutPixels = 24.0;                  // px around a tube whose colors count as the rope's surroundings
+constexpr double kLeastUncovered = 0.2;                // share of the samples that must show a pixel's background
 constexpr int kLeastSamples = 4;
 // the chain
 constexpr double kLinkDiameters = 1.5;  // length of a link in diameters, unless the number of joints hits its bounds
