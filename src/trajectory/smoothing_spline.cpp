@@ -41,7 +41,7 @@ Eigen::RowVectorXd de_boor(Rows rows, int degree, const double* knots, double ti
   return rows.row(degree);
 }
 
-// Returns the control rows of the derivative of a spline of degree `degree`; the last row of the result is unused.
+// Returns the control rows of the derivative of a spline of degree `degree`; the rows from `degree` on are unused.
 template <class Rows>
 Rows differentiated(const Rows& rows, int degree, const double* knots) {
   Rows out = rows;
