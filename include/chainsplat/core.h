@@ -1,9 +1,8 @@
 // chainsplat/core.h - the foundation under every module: errors, warnings, progress, files, threads, random numbers.
 //
-// The module depends on no other, and all others include it. A failure is one of two exceptions, because the two lead
-// to different exit codes: InputError (2: the request or its input is wrong, nothing was written) and WorkError (1: the
-// work failed, what exists is kept). The library never prints and never aborts; the tools catch both and print one
-// line. Times are in seconds.
+// The module depends on no other. A failure is one of two exceptions, because the two lead to different exit codes:
+// InputError (2: the request or its input is wrong, nothing was written) and WorkError (1: the work failed, what exists
+// is kept). The library never prints and never aborts; the tools catch both and print one line. Times are in seconds.
 #pragma once
 #include <cstdint>
 #include <filesystem>

@@ -81,7 +81,7 @@ class Reader {
     findings_.doubts.push_back(at(key) + ": " + what);
   }
 
-  // Doubts every unknown key and names the nearest known one.
+  // Doubts unknown keys, and suggests the nearest known one where it is similar.
   void know(std::initializer_list<const char*> known) const {
     if (!object_) return;
     int unknown = 0;

@@ -452,6 +452,7 @@ Belief first_belief(const Filter& filter, double time) {
   belief.time = time;
   belief.mean = VectorX::Zero(size);
   belief.mean.head(n) = filter.rest;
+  // the mean by simulation from rest, where the dynamics are known
   if (filter.identified && filter.base_start < time) {
     const dynamics::BaseGrid grid =
         dynamics::sample_base(filter.base, filter.base_start, {time}, filter.model.parameters.substeps);
@@ -461,6 +462,7 @@ Belief first_belief(const Filter& filter, double time) {
       belief.mean.segment(n, n) = states.thetadot.back();
     }
   }
+  // a wide covariance around it
   belief.covariance = MatrixX::Zero(size, size);
   belief.covariance.diagonal().head(n).setConstant(kFirstAngle * kFirstAngle);
   belief.covariance.diagonal().segment(n, n).setConstant(kFirstRate * kFirstRate);

@@ -383,6 +383,7 @@ Contact nearest_contact(const chain::Chain& chain, const splat::Gaussians& gauss
   const std::vector<Pose> motions = chain::link_motions(chain, theta, base);
   Contact best;
   double least = best.distance = std::numeric_limits<double>::infinity();
+  // keeps the candidate if it is nearer to a point than the best so far
   const auto offer = [&](int link, double arclength, const Vector3& home) {
     const Vector3 x = motions[link] * home;
     for (Eigen::Index i = 0; i < points.cols(); ++i) {
@@ -401,6 +402,7 @@ Contact nearest_contact(const chain::Chain& chain, const splat::Gaussians& gauss
     }
     return best;
   }
+  // without Gaussians, points along the centerline
   constexpr int kPoints = 301;
   for (const double s : chain::equal_arclengths(chain, kPoints)) {
     const int link = chain::link_at(chain, s);

@@ -217,6 +217,7 @@ Background median_background(std::span<const Picture> frames, std::span<const Tu
         for (int c = 0; c < 3; ++c) values[c].push_back(pixel(frames[i], x, y)[c]);
       }
       if (static_cast<int>(values[0].size()) < least) continue;
+      // median color, and noise from the median absolute deviation
       const std::size_t at = static_cast<std::size_t>(y) * width + x;
       for (int c = 0; c < 3; ++c) {
         const std::uint8_t middle = median(values[c]);
