@@ -410,6 +410,7 @@ bool explains(const silhouette::FrameFit& fit) { return fit.covered >= kLostShar
 Options options_for_live_masks(bool tabletop) {
   Options options;
   if (tabletop) return options;
+  // with the usual shares a pushed rope in free space was lost
   options.new_share = 0.1;
   options.color_share = 0.01;
   return options;

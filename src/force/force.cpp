@@ -29,7 +29,7 @@ constexpr double kMovingSpeeds = 3.0;
 constexpr double kUnseenLever = 0.1;   // diameters; angles that move no link's end (twist) show on the surface alone
 constexpr double kLeastTorque = 1e-6;  // of weight times length, keeps covariances invertible
 constexpr double kUnknownDeviation = 0.2;  // of a joint's stiffness and damping, where identification gives none
-// s of states that a live smoother uses; it is short because the size of the jerk changes with a push.
+// s of states that a live smoother uses. The size of the jerk changes with a push, so that 1 s fits it better than 4 s.
 constexpr double kLiveWindow = 1.0;
 
 double total_mass(const dynamics::Parameters& parameters) {

@@ -14,7 +14,8 @@ constexpr double kReachSlack = 1.1;   // times the length, because cameras and l
 constexpr double kNearerShare = 0.5;  // of the length, by which the free end may be nearer to the camera than the grasp
 // the colors' log odds
 constexpr double kUnheardOf = 0.003;  // prior share of either side's colors that is spread evenly over all colors
-constexpr double kSurest = 3.0, kSurestNot = 9.0;  // log odds, the most that a color counts for and against the rope
+// log odds, the most that a color counts for and against the rope: colors that the rope never shows outweigh the place
+constexpr double kSurest = 3.0, kSurestNot = 9.0;
 // the difference from the background
 constexpr double kLeastNoise = 1.5;  // gray levels
 constexpr double kMostNoise = 25.0;
@@ -31,7 +32,7 @@ constexpr double kMarkStep = 0.25;  // diameters per cell along the rope,
 constexpr int kMostAlong = 4096;    // but no more cells than this, which are far smaller than a pixel of a thin rope
 constexpr int kMarksAcross = 6;
 constexpr double kLeastLight = 0.6, kMostLight = 1.3;  // times the usual: shading moves with the rope, a hand shades it
-constexpr double kUsual = 16.0;  // gray levels, RMS over the channels; larger differences are not the rope
+constexpr double kUsual = 16.0;  // gray levels, RMS over the channels, less than from a beige stripe to a hand's skin
 
 // Smooths the counts by [1 2 1] / 4 along each of the three color axes.
 void blur(std::vector<double>& counts) {

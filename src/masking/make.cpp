@@ -37,7 +37,9 @@ constexpr int kKnownSamples = 1000;     // number of samples per side as which t
 // masks and chains in turn
 constexpr double kRoughPlace = 3.0;   // times the usual uncertainty of the place, as long as chains are grown ones
 constexpr double kGrownMargin = 0.4;  // radii, by which the tube of a grown chain may be off,
-constexpr double kFitMargin = 0.5;    // px, and that of a fitted chain, as pixels on its outline show both sides
+// px, and that of a fitted chain, as pixels on its outline show both sides; a wider margin left the rope's dark
+// underside and its contact shadow unlearned
+constexpr double kFitMargin = 0.5;
 constexpr int kRounds = 2;            // of cutting, fitting and learning
 constexpr double kCenter = 0.5;       // of the radius; pixels deeper inside than this count as the centerline
 constexpr double kLeastInside = 0.4;  // mean share of the centerline in the masks, below which there is no rope
