@@ -1,4 +1,4 @@
-// The lines of estimate as identify --online reads them.
+// Fuzzes the lines of `estimate` as `identify --online` reads them.
 #include "readers.h"
 #include "tools/online.cpp"
 
@@ -11,16 +11,16 @@ void online(std::string_view bytes) {
   known.standard_errors = {0.1};
   known.covariance = math::MatrixX::Constant(1, 1, 0.01);
   static const adaptation::Adaptation fresh(two_joints(), parameters_of_two_joints(), known, {});
-  adaptation::Observation seen;
+  adaptation::Observation observation;
 #if __has_include("tools/estimate_lines.h")
   const auto line = tools::read_estimate_line(std::string(bytes), "line", two_joints().angles(), -1e300);
   if (!line) return;
-  seen = {line->time, line->theta, line->thetadot, line->sigma};
+  observation = {line->time, line->theta, line->thetadot, line->sigma};
 #else
-  if (!tools::read_line(std::string(bytes), "line", seen)) return;
+  if (!tools::read_line(std::string(bytes), "line", observation)) return;
 #endif
   adaptation::Adaptation adaptation = fresh;
-  adaptation.observe(seen, [](double) { return dynamics::at_rest({}); });
+  adaptation.observe(observation, [](double) { return dynamics::at_rest({}); });
 }
 
 }  // namespace chainsplat::fuzz
