@@ -130,25 +130,6 @@ struct BaseSlopes {
 BaseSlopes base_slopes(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                        const VectorX& thetadot);
 
-// linearize() and base_slopes() at one state after another without allocation: for integrators and derivatives outside
-// of this module. `model` must outlive it.
-class Engine;
-class Linearizer {
- public:
-  explicit Linearizer(const Model& model);
-  ~Linearizer();
-  // Fills `out`; without `slopes` its acceleration only. False where M is not positive definite.
-  bool at(const trajectory::BaseMotion& base, const Vector6& base_jerk, const VectorX& theta, const VectorX& thetadot,
-          bool slopes, Linearization& out);
-  // Where at() was with `slopes`.
-  void base_slopes(BaseSlopes& out) const;
-  // x = M^-1 x where at() was.
-  void solve_mass(MatrixX& x) const;
-
- private:
-  std::unique_ptr<Engine> engine_;
-};
-
 // The stacked matrices of SPEC 3.5 (paper, "Closed-form dynamics", corrected): for reading and checking, O(n^3),
 // viscous and other wrenches as in 3.3. M thetaddot + coriolis + gravity + base - friction = -K(theta - theta_0) - D
 // thetadot.
@@ -180,6 +161,8 @@ struct BaseGrid {
   };
   std::vector<Node> nodes;
 };
+// Steps for an interval of seconds with `substeps` per 1/30 s, at least one.
+int step_count(double interval, int substeps);
 // From `start` through all `times` (increasing, the first >= start), `substeps` a 1/30 s, equal within each interval.
 BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<double>& times, int substeps);
 
@@ -221,6 +204,19 @@ struct Divergence {
 bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta, const VectorX& thetadot,
               chain::States& states, std::span<const Tangent> unknowns = {}, Sensitivities* sensitivities = nullptr,
               Divergence* divergence = nullptr);
+
+// Unknowns that shape the base motion. `after`: s past a node of the grid, or before it, far less than a step.
+struct BaseUnknowns {
+  Eigen::Index count = 0;
+  // The base motion there.
+  std::function<trajectory::BaseMotion(std::size_t node, double after)> motion;
+  // Sets `torques`, n x count, to d tau_ID / d unknowns there: the sums of `slopes` times the motion's derivatives.
+  std::function<void(std::size_t node, double after, const BaseSlopes& slopes, MatrixX& torques)> torques;
+};
+// The same rollout with its derivatives by those; RODAS3 only. `exact`: those of the discrete map, stage by stage; else
+// by the trapezoidal rule as above, of second order and several times faster, enough for a Gauss-Newton step.
+bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta, const VectorX& thetadot,
+              chain::States& states, const BaseUnknowns& unknowns, bool exact, Sensitivities& sensitivities);
 
 // One evaluation or one step at a time, without allocation: for loops that cannot wait for a rollout (filters,
 // control). `model` must outlive it.

@@ -209,30 +209,6 @@ BaseSlopes base_slopes(const Model& model, const trajectory::BaseMotion& base, c
   return slopes;
 }
 
-Linearizer::Linearizer(const Model& model) : engine_(make_engine(model)) {}
-Linearizer::~Linearizer() = default;
-
-bool Linearizer::at(const trajectory::BaseMotion& base, const Vector6& base_jerk, const VectorX& theta,
-                    const VectorX& thetadot, bool slopes, Linearization& out) {
-  Engine& engine = *engine_;
-  engine.place(base, theta, thetadot, slopes);
-  if (!engine.factor_mass()) return false;
-  engine.accelerate();
-  out.acceleration = engine.acceleration;
-  if (!slopes) return true;
-  engine.linearize(base_jerk);
-  out.mass = engine.mass, out.stiffness = engine.stiffness, out.damping = engine.damping;
-  out.drive_rate = engine.drive_rate;
-  return true;
-}
-
-void Linearizer::base_slopes(BaseSlopes& out) const { engine_->base_slopes(out); }
-
-void Linearizer::solve_mass(MatrixX& x) const {
-  engine_->cholesky.triangularView<Eigen::Lower>().solveInPlace(x);
-  engine_->cholesky.transpose().triangularView<Eigen::Upper>().solveInPlace(x);
-}
-
 MatrixX unknown_forces(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                        const VectorX& thetadot, std::span<const Tangent> unknowns) {
   check_state(model, theta, thetadot);
