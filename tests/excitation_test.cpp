@@ -65,7 +65,7 @@ TEST_CASE("the proposed motion keeps the limits, tells more than the old one, an
   options.mass = 0.062;
   options.per_joint = false;
   const Recording old = record(model, gentle, 4.0, 1);
-  const identification::Result found = identification::identify(model.chain, old.base, old.states, {}, options);
+  const identification::Result found = identification::identify(model.chain, old.base, old.states, options);
 
   excitation::Problem problem;
   problem.model = dynamics::make_model(model.chain, found.parameters);
@@ -102,7 +102,7 @@ TEST_CASE("the proposed motion keeps the limits, tells more than the old one, an
     for (std::uint64_t seed = 10; seed < 14; ++seed) {
       const Recording recording = record(model, motion, 4.0, seed);
       const dynamics::Parameters q =
-          identification::identify(model.chain, recording.base, recording.states, {}, options).parameters;
+          identification::identify(model.chain, recording.base, recording.states, options).parameters;
       for (const double log : {std::log(q.stiffness[2] / 0.012), std::log(q.damping[2] / 6e-4),
                                std::log(q.air_quadratic[2] / model.parameters.air_quadratic[2])})
         sum += log * log;

@@ -92,7 +92,7 @@ TEST_CASE("the parameters of a simulated hanging rope are found again through no
   const Scene s = scene(false, chain::Bending::spatial, 0.5 * kDegree);
   Options options;
   options.mass = 0.06;
-  const Result result = identify(s.chain, s.base, s.seen, {}, options);
+  const Result result = identify(s.chain, s.base, s.seen, options);
   CHECK(node_rms(s.chain, result.rollout, s.clean) < 1.2e-3);  // noise alone displaces the nodes by 3 mm
   CHECK(result.node_rms > 2e-3);
   CHECK(result.parameters.stiffness[6] / 0.012 == doctest::Approx(1.0).epsilon(0.15));
@@ -136,7 +136,7 @@ TEST_CASE("how friction rolls a rope on a table is found again through noise, an
   Options options;
   options.tabletop = true;
   options.mass = 0.06;
-  const Result found = identify(s.chain, s.base, s.seen, {}, options);
+  const Result found = identify(s.chain, s.base, s.seen, options);
   double mean = 0.0;
   for (int k = 1; k < 6; ++k) mean += found.parameters.roll_lever[k] / 5.0;
   CHECK(mean == doctest::Approx(kLever).epsilon(0.25));
@@ -161,7 +161,7 @@ TEST_CASE("Coulomb friction of a rope on a table is found again through noise") 
   const Scene s = scene(true, chain::Bending::planar, 0.5 * kDegree);
   Options options;
   options.tabletop = true;
-  const Result result = identify(s.chain, s.base, s.seen, {}, options);
+  const Result result = identify(s.chain, s.base, s.seen, options);
   CHECK(node_rms(s.chain, result.rollout, s.clean) < 0.8e-3);
   double mean = 0.0;
   for (double c : result.parameters.coulomb_friction) mean += std::log(c) / 6.0;
@@ -176,9 +176,9 @@ TEST_CASE("Coulomb friction of a rope on a table is found again through noise") 
 TEST_CASE("the given mass only scales what has a unit of force") {
   const Scene s = scene(false, chain::Bending::planar, 0.0, 60);
   Options options;
-  const Result unit = identify(s.chain, s.base, s.seen, {}, options);
+  const Result unit = identify(s.chain, s.base, s.seen, options);
   options.mass = 0.06;
-  const Result scaled = identify(s.chain, s.base, s.seen, {}, options);
+  const Result scaled = identify(s.chain, s.base, s.seen, options);
   // the prior of the drag knows the air and is no ratio, so equality is not exact
   CHECK(scaled.parameters.stiffness[3] / unit.parameters.stiffness[3] == doctest::Approx(0.06).epsilon(0.05));
   CHECK(node_rms(s.chain, scaled.rollout, unit.rollout) < 2e-4);
@@ -186,13 +186,11 @@ TEST_CASE("the given mass only scales what has a unit of force") {
 
 TEST_CASE("frames that are declared uncertain do not count") {
   Scene s = scene(false, chain::Bending::planar, 0.0, 60);
-  std::vector<MatrixX> covariances(s.seen.theta.size(), 1e-6 * MatrixX::Identity(6, 6));
-  for (std::size_t k = 20; k < 40; ++k) {
-    s.seen.theta[k].array() += 0.3;
-    covariances[k] = 1.0 * MatrixX::Identity(6, 6);
-  }
-  const Result informed = identify(s.chain, s.base, s.seen, covariances, {});
-  const Result misled = identify(s.chain, s.base, s.seen, {}, {});
+  for (std::size_t k = 20; k < 40; ++k) s.seen.theta[k].array() += 0.3;
+  const Result misled = identify(s.chain, s.base, s.seen, {});
+  s.seen.covariance.assign(s.seen.theta.size(), 1e-6 * MatrixX::Identity(6, 6));
+  for (std::size_t k = 20; k < 40; ++k) s.seen.covariance[k] = MatrixX::Identity(6, 6);
+  const Result informed = identify(s.chain, s.base, s.seen, {});
   CHECK(node_rms(s.chain, informed.rollout, s.clean) < 1e-3);
   CHECK(node_rms(s.chain, misled.rollout, s.clean) > 2.0 * node_rms(s.chain, informed.rollout, s.clean));
 }
@@ -203,9 +201,9 @@ TEST_CASE("results do not depend on the number of threads") {
   options.tabletop = true;
   const int threads = core::threads();
   core::set_threads(1);
-  const Result one = identify(s.chain, s.base, s.seen, {}, options);
+  const Result one = identify(s.chain, s.base, s.seen, options);
   core::set_threads(3);
-  const Result three = identify(s.chain, s.base, s.seen, {}, options);
+  const Result three = identify(s.chain, s.base, s.seen, options);
   core::set_threads(threads);
   REQUIRE(one.estimates.values.size() == three.estimates.values.size());
   for (std::size_t i = 0; i < one.estimates.values.size(); ++i)
@@ -216,10 +214,10 @@ TEST_CASE("the paper's procedure runs, and is worse on an elastic rope") {
   const Scene s = scene(false, chain::Bending::planar, 0.0, 60);
   Options options;
   options.mass = 0.06;
-  const Result ours = identify(s.chain, s.base, s.seen, {}, options);
+  const Result ours = identify(s.chain, s.base, s.seen, options);
   options.paper = true;
   options.adam_iterations = 60;
-  const Result paper = identify(s.chain, s.base, s.seen, {}, options);
+  const Result paper = identify(s.chain, s.base, s.seen, options);
   for (double k : paper.parameters.stiffness) CHECK(k == 0.0);
   CHECK(paper.parameters.integrator == dynamics::Integrator::implicit_velocity_euler);
   CHECK(ours.node_rms < 0.5e-3);
@@ -266,7 +264,7 @@ TEST_CASE("a rope simulated by another program is followed open loop within half
   }
   Options options;
   options.mass = 0.06;
-  const Result result = identify(chain, base, states, {}, options);
+  const Result result = identify(chain, base, states, options);
   double sum = 0.0;
   for (std::size_t k = 0; k < truth.size(); ++k)
     sum += (chain::centerline(chain, chain::link_motions(chain, result.rollout.theta[k], base.pose(states.time[k])),
@@ -320,14 +318,14 @@ TEST_CASE("two recordings of one rope give one set of parameters, better known t
   };
   Options options;
   options.mass = 0.06;
-  std::vector<Recording> recordings{{slow.base, slow.seen, {}}, {other.base, record(slow.truth), {}}};
+  std::vector<Recording> recordings{{slow.base, slow.seen}, {other.base, record(slow.truth)}};
   const std::vector<Result> both = identify(slow.chain, recordings, options);
   REQUIRE(both.size() == 2);
   CHECK(both[0].parameters.stiffness == both[1].parameters.stiffness);
   CHECK(both[1].initial.theta[5] == doctest::Approx(0.15).epsilon(0.3));
   CHECK(both[0].parameters.stiffness[3] / 0.012 == doctest::Approx(1.0).epsilon(0.15));
   for (const Result& r : both) CHECK(r.node_rms < 1.5 * r.alone_rms);
-  const Result one = identify(slow.chain, slow.base, slow.seen, {}, options);
+  const Result one = identify(slow.chain, slow.base, slow.seen, options);
   CHECK(both[0].estimates.names == one.estimates.names);
   CHECK(both[0].estimates.standard_errors[0] < one.estimates.standard_errors[0]);
 
@@ -343,7 +341,7 @@ TEST_CASE("a rope that hangs still tells nothing of what acts on motion only") {
   s.base = trajectory::fit({trajectory::Sample{0.0, {math::Matrix3::Identity(), Vector3(0, 0, 0.5)}}}, "rest");
   const VectorX rest = s.clean.theta[0];
   s.seen = {frames(20), std::vector<VectorX>(20, rest), {}};
-  const Result result = identify(s.chain, s.base, s.seen, {}, {});
+  const Result result = identify(s.chain, s.base, s.seen, {});
   const auto weak = [&](const std::string& name) {
     for (const auto& direction : result.estimates.weak)
       for (const auto& part : direction.parts)
@@ -358,9 +356,9 @@ TEST_CASE("a rope that hangs still tells nothing of what acts on motion only") {
 
 TEST_CASE("whole turns in recognized angles change nothing") {
   Scene s = scene(false, chain::Bending::planar, 0.5 * kDegree, 40);
-  const Result as_is = identify(s.chain, s.base, s.seen, {}, {});
+  const Result as_is = identify(s.chain, s.base, s.seen, {});
   for (std::size_t k = 4; k < s.seen.theta.size(); ++k) s.seen.theta[k][2] += 2.0 * M_PI;
-  const Result turned = identify(s.chain, s.base, s.seen, {}, {});
+  const Result turned = identify(s.chain, s.base, s.seen, {});
   CHECK(node_rms(s.chain, as_is.rollout, turned.rollout) < 1e-6);
 }
 
@@ -424,21 +422,22 @@ TEST_CASE("too little or broken data are refused") {
   const Scene s = scene(false, chain::Bending::planar, 0.0, 5);
   chain::States few = s.seen;
   few.time.resize(2), few.theta.resize(2);
-  CHECK_THROWS_AS(identify(s.chain, s.base, few, {}, {}), InputError);
+  CHECK_THROWS_AS(identify(s.chain, s.base, few, {}), InputError);
   chain::States broken = s.seen;
   broken.theta[1][0] = NAN;
-  CHECK_THROWS_AS(identify(s.chain, s.base, broken, {}, {}), InputError);
+  CHECK_THROWS_AS(identify(s.chain, s.base, broken, {}), InputError);
   const Eigen::Index n = s.chain.angles();
-  std::vector<MatrixX> covariances(s.seen.time.size(), 1e-6 * MatrixX::Identity(n, n));
+  chain::States unsure = s.seen;
+  unsure.covariance.assign(s.seen.time.size(), 1e-6 * MatrixX::Identity(n, n));
   for (const double variance : {-1.0, static_cast<double>(NAN), static_cast<double>(INFINITY)}) {
-    covariances[2](1, 1) = variance;
-    CHECK_THROWS_AS(identify(s.chain, s.base, s.seen, covariances, {}), InputError);
+    unsure.covariance[2](1, 1) = variance;
+    CHECK_THROWS_AS(identify(s.chain, s.base, unsure, {}), InputError);
   }
   // times that no step count can bridge, and times between which nothing moves
   chain::States apart = s.seen;
   apart.time.back() = 1e300;
-  CHECK_THROWS_AS(identify(s.chain, s.base, apart, {}, {}), InputError);
+  CHECK_THROWS_AS(identify(s.chain, s.base, apart, {}), InputError);
   chain::States near = s.seen;
   for (std::size_t k = 0; k < near.time.size(); ++k) near.time[k] = 1e-300 * static_cast<double>(k);
-  CHECK_THROWS_AS(identify(s.chain, s.base, near, {}, {}), InputError);
+  CHECK_THROWS_AS(identify(s.chain, s.base, near, {}), InputError);
 }

@@ -3,7 +3,7 @@
 #include <doctest/doctest.h>
 #include <cmath>
 
-#include "planning/adaptation.h"
+#include "planning/parameter_correction.h"
 #include "planning/search.h"
 
 using namespace chainsplat;
@@ -432,19 +432,19 @@ TEST_CASE("what the rope does tells by how much its parameters are off") {
     std::vector<double> times;
     for (int k = 1; k <= 20; ++k) times.push_back(0.1 * k);
     const chain::States states = dynamics::rollout(truth, base, problem.initial, times);
-    Adaptation adaptation = start_adaptation(problem.model);
+    ParameterCorrection correction = start_correction(problem.model);
     dynamics::InitialState before = problem.initial;
     const std::vector<double> seen = chain::equal_arclengths(problem.model.chain, 17);
     for (std::size_t k = 0; k < times.size(); ++k) {
       const dynamics::InitialState after{times[k], states.theta[k], states.thetadot[k]};
-      adapt(adaptation, base, before, after, seen);
+      correct(correction, base, before, after, seen);
       before = after;
     }
     // stiffness, damping, then friction or drag
-    CHECK(std::exp(adaptation.factors[0]) == doctest::Approx(0.8).epsilon(0.03));
-    CHECK(std::exp(adaptation.factors[1]) == doctest::Approx(1.25).epsilon(0.06));
-    CHECK(std::exp(adaptation.factors[2]) == doctest::Approx(tabletop ? 1.2 : 1.0).epsilon(0.06));
-    CHECK(adaptation.covariance(0, 0) < 0.1 * 0.1);
+    CHECK(std::exp(correction.change[0]) == doctest::Approx(0.8).epsilon(0.03));
+    CHECK(std::exp(correction.change[1]) == doctest::Approx(1.25).epsilon(0.06));
+    CHECK(std::exp(correction.change[2]) == doctest::Approx(tabletop ? 1.2 : 1.0).epsilon(0.06));
+    CHECK(correction.covariance(0, 0) < 0.1 * 0.1);
   }
 }
 

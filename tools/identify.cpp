@@ -93,8 +93,7 @@ void identify_markers(twin::Twin& twin, const Request& request, std::uint64_t se
     if (first_base.empty()) first_base = std::move(measured.base);
     names += (names.empty() ? "" : " ") + Path(file).filename().string();
   }
-  std::vector<math::MatrixX> covariances;
-  twin.states = identification::fit_markers(twin.chain, recordings[0].base, recordings[0].markers, &covariances);
+  twin.states = identification::fit_markers(twin.chain, recordings[0].base, recordings[0].markers);
   if (request.shape_only) {
     twin.parameters.reset(), twin.initial.reset();
     twin.estimates = {}, twin.rollout = {};
@@ -107,7 +106,7 @@ void identify_markers(twin::Twin& twin, const Request& request, std::uint64_t se
   }
   twin.provenance.options["markers"] = names;
   core::write_file(Path(run) / kBaseFile, trajectory::write_tum(first_base));
-  core::write_file(Path(run) / kCovarianceFile, covariance_csv(twin.states, covariances));
+  core::write_file(Path(run) / kCovarianceFile, covariance_csv(twin.states));
 }
 
 // Throws where two twins cannot be of one rope.
@@ -143,12 +142,12 @@ void identify_several(std::vector<twin::Twin>& twins, const std::vector<std::str
   std::vector<identification::Recording> recordings;
   identification::Options options = identification_options(twins[0], false, seed);
   for (std::size_t i = 0; i < twins.size(); ++i) {
-    const twin::Twin& twin = twins[i];
+    twin::Twin& twin = twins[i];
     if (i > 0) same_chain(twins[0], runs[0], twin, runs[i]);
     // a mass that one capture knows is that of all
     if (!options.mass) options.mass = identification_options(twin, false, seed).mass;
-    recordings.push_back(
-        {own_base(runs[i], twin.states), twin.states, read_covariances(Path(runs[i]) / kCovarianceFile, twin.states)});
+    twin.states.covariance = read_covariances(Path(runs[i]) / kCovarianceFile, twin.states);
+    recordings.push_back({own_base(runs[i], twin.states), twin.states});
   }
   std::vector<identification::Result> found;
   {
@@ -190,19 +189,19 @@ void identify(const Globals& globals, const Request& request) {
     } else {
       const trajectory::Trajectory base = own_base(runs[0], twins[0].states);
       const Path covariance_file = Path(runs[0]) / kCovarianceFile;
-      std::vector<math::MatrixX> covariances = read_covariances(covariance_file, twins[0].states);
+      twins[0].states.covariance = read_covariances(covariance_file, twins[0].states);
       capture::Capture capture;
       gpu::DevicePtr device;
       if (request.joint) {
-        check_joint(twins[0], covariances, runs[0]);
+        check_joint(twins[0], runs[0]);
         capture = load_own_capture(twins[0], runs[0]);
         device = gpu::open_device({.selector = globals.device});
       }
-      identify_stage(twins[0], base, covariances, paper, globals.seed);
-      if (request.joint) joint_stage(twins[0], covariances, capture, *device, globals.seed);
+      identify_stage(twins[0], base, paper, globals.seed);
+      if (request.joint) joint_stage(twins[0], capture, *device, globals.seed);
       rollout_stage(twins[0], base, runs[0]);
       // last, when nothing can fail but the disk: covariances and states belong together
-      if (request.joint) core::write_file(covariance_file, covariance_csv(twins[0].states, covariances));
+      if (request.joint) core::write_file(covariance_file, covariance_csv(twins[0].states));
     }
   }
   for (std::size_t i = 0; i < runs.size(); ++i) {
@@ -270,11 +269,10 @@ Stopwatch::~Stopwatch() {
   say_more(stage_ + text);
 }
 
-void identify_stage(twin::Twin& twin, const trajectory::Trajectory& base, const std::vector<math::MatrixX>& covariances,
-                    bool paper, std::uint64_t seed) {
+void identify_stage(twin::Twin& twin, const trajectory::Trajectory& base, bool paper, std::uint64_t seed) {
   const Stopwatch watch(twin, "identify");
   identification::Result found =
-      identification::identify(twin.chain, base, twin.states, covariances, identification_options(twin, paper, seed));
+      identification::identify(twin.chain, base, twin.states, identification_options(twin, paper, seed));
   twin.parameters = std::move(found.parameters);
   twin.initial = std::move(found.initial);
   twin.estimates = std::move(found.estimates);

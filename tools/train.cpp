@@ -84,16 +84,16 @@ recognition::Options settings_of(const Request& request, const Globals& globals)
   return options;
 }
 
-void recognize_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, gpu::Device& device,
-                     const capture::Capture& capture, const Request& request, const recognition::Options& settings) {
+void recognize_stage(twin::Twin& twin, gpu::Device& device, const capture::Capture& capture, const Request& request,
+                     const recognition::Options& settings) {
   const Stopwatch watch(twin, "recognize");
   recognition::Result found = recognition::recognize(device, capture, settings);
   twin.chain = std::move(found.chain);
   twin.gaussians = std::move(found.gaussians);
   twin.states = std::move(found.states);
-  covariances = std::move(found.covariances);
   // exactly symmetric, as they are read back
-  for (math::MatrixX& covariance : covariances) covariance = math::MatrixX(covariance.selfadjointView<Eigen::Lower>());
+  for (math::MatrixX& covariance : twin.states.covariance)
+    covariance = math::MatrixX(covariance.selfadjointView<Eigen::Lower>());
   if (request.bending == "auto" && request.mode == "fast") {
     char text[96];
     std::snprintf(text, sizeof text, " bending (out of plane: %.2f mm)", 1e3 * found.bending.out_of_plane_rms);
@@ -230,9 +230,8 @@ void train(const Globals& globals, const Request& request) {
                      "give the same --frames as then");
   const recognition::Options settings = settings_of(request, globals);
   if (recognize) recognition::check_checkpoint(capture, settings);
-  std::vector<math::MatrixX> covariances;
-  if (continued && (identify || joint)) covariances = read_covariances(out / kCovarianceFile, twin.states);
-  if (continued && joint) check_joint(twin, covariances, out);
+  if (continued && (identify || joint)) twin.states.covariance = read_covariances(out / kCovarianceFile, twin.states);
+  if (continued && joint) check_joint(twin, out);
   gpu::DevicePtr device;
   if (recognize || joint || stages.evaluate) {
     device = gpu::open_device({.selector = globals.device});
@@ -261,20 +260,20 @@ void train(const Globals& globals, const Request& request) {
     log_to(out / kLogFile);
     core::write_file(out / kBaseFile, trajectory::write_tum(capture.base.samples()));
     if (recognize) {
-      recognize_stage(twin, covariances, *device, capture, request, settings);
+      recognize_stage(twin, *device, capture, request, settings);
       trim_memory();  // or the next stage's need comes on top
-      if (!covariances.empty()) core::write_file(out / kCovarianceFile, covariance_csv(twin.states, covariances));
+      if (!twin.states.covariance.empty()) core::write_file(out / kCovarianceFile, covariance_csv(twin.states));
       save();  // what comes later can fail without losing this
       stop_if_asked();
     }
     if (identify) {
-      identify_stage(twin, capture.base, covariances, request.mode == "paper", globals.seed);
+      identify_stage(twin, capture.base, request.mode == "paper", globals.seed);
       save();
       stop_if_asked();
     }
     if (joint) {
-      joint_stage(twin, covariances, capture, *device, globals.seed);
-      core::write_file(out / kCovarianceFile, covariance_csv(twin.states, covariances));
+      joint_stage(twin, capture, *device, globals.seed);
+      core::write_file(out / kCovarianceFile, covariance_csv(twin.states));
       save();
       stop_if_asked();
     }

@@ -49,13 +49,17 @@ struct Parameters {
   int substeps = 4;  // a frame of 1/30 s
 };
 
+// Of all links and the tip, kg.
+double total_mass(const Parameters& parameters);
+
 // State at one time: where a rollout starts.
 struct InitialState {
   double time = 0.0;
   VectorX theta, thetadot;  // rad, rad/s
 };
 
-// What identification says of its numbers; one entry a fitted parameter, in the order of the covariance.
+// What identification says of its numbers; one entry per fitted number, in the order of the covariance. Names are those
+// of files and may be of another program; dynamics/parametrization.h says what they mean.
 struct Estimates {
   std::vector<std::string> names;               // e.g. "log_stiffness", "rest_angle_3": a log where the name says so
   std::vector<double> values, standard_errors;  // in the units of the name
@@ -166,21 +170,14 @@ int step_count(double interval, int substeps);
 // From `start` through all `times` (increasing, the first >= start), `substeps` a 1/30 s, equal within each interval.
 BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<double>& times, int substeps);
 
-// One unknown's derivative: d(Parameters) and d(initial state). Empty arrays mean zeros.
+// One unknown's derivative: d(Parameters) and d(initial state). Empty arrays mean zeros. dynamics/parametrization.h
+// makes them.
 struct Tangent {
   std::vector<double> link_mass, viscous_friction, coulomb_friction, air_linear, air_quadratic;  // a link
   std::vector<double> stiffness, rest_angle, damping, roll_lever;                                // an angle
   double tip_mass = 0.0;
   VectorX theta, thetadot;
 };
-// `parameters` after the numbers that identification calls `names` (Estimates) have changed by `change`: an addition to
-// a log or logit, to a rest angle or a lever. The total mass stays. Names of initial states change nothing.
-Parameters moved(const chain::Chain& chain, const Parameters& parameters, std::span<const std::string> names,
-                 const VectorX& change);
-// The derivatives of that, and of the initial state for names theta_k and thetadot_k.
-std::vector<Tangent> tangents(const chain::Chain& chain, const Parameters& parameters,
-                              std::span<const std::string> names);
-bool is_parameter(const Tangent& tangent);  // it changes parameters, not an initial state alone
 // d(joint law - tau_ID) / d unknowns at fixed thetaddot = a, n x unknowns; M^-1 of it is da / d unknowns. The tangents'
 // initial states have no part in it.
 MatrixX unknown_forces(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,

@@ -34,9 +34,9 @@ struct Motion {
 
 // Kalman filter and Rauch-Tung-Striebel smoother of every angle under random jerk. How large jerk and noise are, and
 // how the angles' errors hang together, is found by maximum likelihood; the ratio of jerk and noise is one for all
-// angles. `standing`: covariances of the angles' lasting errors, n x n a time, or empty. Throws InputError for fewer
-// than three times.
-Motion smooth(const chain::States& states, std::span<const MatrixX> standing);
+// angles. The covariances of `states`, if any, are those of the angles' lasting errors: `standing`. Throws InputError for
+// fewer than three times.
+Motion smooth(const chain::States& states);
 
 // Covariance of angles of which only the standard deviations are known. Cameras see where the rope is: errors of the
 // links' ends are independent, so those of neighboring angles cancel.
@@ -123,8 +123,7 @@ struct Live {
   // what touches at a time, given the angles then; empty: automatic
   std::function<std::optional<Contact>(double time, const VectorX& theta)> contact;
   Options options;
-  chain::States states;  // of the last seconds, with `standing` a time, or none
-  std::vector<MatrixX> standing;
+  chain::States states;  // of the last seconds
   VectorX belief;  // where it is touched, at the last line's time; empty before the first
   std::size_t lines = 0, taken = 0;
 };

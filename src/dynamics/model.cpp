@@ -102,6 +102,12 @@ void check_state(const Model& model, const VectorX& theta, const VectorX& thetad
 
 }  // namespace
 
+double total_mass(const Parameters& parameters) {
+  double mass = parameters.tip_mass;
+  for (const double m : parameters.link_mass) mass += m;
+  return mass;
+}
+
 trajectory::BaseMotion at_rest(const math::Pose& pose) {
   trajectory::BaseMotion base;
   base.pose = pose;

@@ -10,6 +10,7 @@ namespace chainsplat::identification {
 namespace {
 
 using dynamics::BaseGrid;
+using dynamics::Quantity;
 using math::Vector3;
 
 constexpr double kHorizons[] = {1.0 / 3, 2.0 / 3, 4.0 / 3};  // s, then doubled until everything is within
@@ -29,10 +30,9 @@ struct Part {
   const chain::Chain& chain;
   Unknowns unknowns;
   std::vector<double> times;
-  std::vector<int> links;       // of each compared point: middles and ends of the links, two a link, then
-  std::vector<Vector3> home;    // where the rope can twist a point of its surface a link; base frame, at theta = 0
-  std::vector<MatrixX> target;  // a frame: 3 x points, base frame
-  std::vector<VectorX> theta;   // recognized
+  std::vector<chain::MaterialPoint> points;  // that are compared
+  std::vector<MatrixX> target;               // per frame: 3 x points, base frame
+  std::vector<VectorX> theta;                // recognized
   // a frame: of the angles, n x n, in the metric of the points; of markers, 3 x 3 blocks side by side
   std::vector<MatrixX> whitening;
   BaseGrid grids[2];                  // half the substeps, for the way to the minimum, and all of them
@@ -60,14 +60,11 @@ struct Problem {
 // Points of the centerline in the base frame and, where asked, their derivatives by theta.
 void place_points(const Part& part, const VectorX& theta, MatrixX& points, std::vector<MatrixX>* slopes) {
   const auto motions = chain::link_motions(part.chain, theta, {});
-  const std::size_t count = part.home.size();
-  points.resize(3, count);
-  for (std::size_t i = 0; i < count; ++i) points.col(i) = motions[part.links[i]] * part.home[i];
-  if (!slopes) return;
-  const MatrixX axes = chain::world_axes(part.chain, theta, {});
-  slopes->resize(count);
-  for (std::size_t i = 0; i < count; ++i)
-    (*slopes)[i] = chain::point_jacobian(part.chain, axes, part.links[i], points.col(i));
+  points.resize(3, part.points.size());
+  for (std::size_t i = 0; i < part.points.size(); ++i)
+    points.col(i) = motions[part.points[i].link] * part.points[i].home;
+  if (slopes)
+    *slopes = chain::point_jacobians(part.chain, chain::world_axes(part.chain, theta, {}), motions, part.points);
 }
 
 BaseGrid prefix(const Part& part, std::size_t frames, bool fine) {
@@ -88,12 +85,13 @@ bool simulate(const Part& part, const BaseGrid& grid, const VectorX& p, chain::S
               dynamics::Sensitivities* sensitivities = nullptr) {
   const State state = apply(part.chain, part.unknowns, p);
   const dynamics::Model model = dynamics::make_model(part.chain, state.parameters);
-  if (!sensitivities) return dynamics::simulate(model, grid, state.theta, state.thetadot, states);
+  if (!sensitivities) return dynamics::simulate(model, grid, state.initial.theta, state.initial.thetadot, states);
   const auto unknowns = tangents(part.chain, part.unknowns, p);
   if (model.parameters.integrator == dynamics::Integrator::rodas3)
-    return dynamics::simulate(model, grid, state.theta, state.thetadot, states, unknowns, sensitivities);
+    return dynamics::simulate(model, grid, state.initial.theta, state.initial.thetadot, states, unknowns,
+                              sensitivities);
   // the Euler step has no variational equation: differences of rollouts
-  if (!dynamics::simulate(model, grid, state.theta, state.thetadot, states)) return false;
+  if (!dynamics::simulate(model, grid, state.initial.theta, state.initial.thetadot, states)) return false;
   const std::size_t frames = states.theta.size();
   const int size = static_cast<int>(p.size());
   sensitivities->theta.assign(frames, MatrixX::Zero(part.chain.angles(), size));
@@ -104,8 +102,8 @@ bool simulate(const Part& part, const BaseGrid& grid, const VectorX& p, chain::S
     moved[i] += kStep;
     const State shifted = apply(part.chain, part.unknowns, moved);
     chain::States out;
-    if (!dynamics::simulate(dynamics::make_model(part.chain, shifted.parameters), grid, shifted.theta, shifted.thetadot,
-                            out))
+    if (!dynamics::simulate(dynamics::make_model(part.chain, shifted.parameters), grid, shifted.initial.theta,
+                            shifted.initial.thetadot, out))
       return;
     good[i] = 1;
     for (std::size_t k = 0; k < frames; ++k) sensitivities->theta[k].col(i) = (out.theta[k] - states.theta[k]) / kStep;
@@ -373,7 +371,8 @@ double initial_motion(const chain::States& states, VectorX& theta, VectorX& thet
 }
 
 Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,
-               std::span<const MatrixX> covariances, const Options& options, const Markers* markers = nullptr) {
+               const Options& options, const Markers* markers = nullptr) {
+  const std::vector<MatrixX>& covariances = recognized.covariance;
   const std::size_t frames = recognized.time.size();
   if (frames < 3 || recognized.theta.size() != frames)
     throw InputError("identify", std::to_string(frames) + " recognized states", "give at least 3 with their times");
@@ -382,30 +381,15 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
       throw InputError("identify", "a recognized state is not finite or of another chain", "recognize again");
   CHAINSPLAT_CHECK(covariances.empty() || covariances.size() == frames, std::to_string(covariances.size()));
 
-  Part part{chain, {}, recognized.time, {}, {}, {}, recognized.theta, {}, {}, {}};
+  Part part{chain, {}, recognized.time, {}, {}, recognized.theta, {}, {}, {}};
   for (std::size_t k = 1; k < frames; ++k)  // angles are known up to whole turns: the nearest to the frame before
     for (Eigen::Index i = 0; i < part.theta[k].size(); ++i)
       part.theta[k][i] -= 2.0 * M_PI * std::round((part.theta[k][i] - part.theta[k - 1][i]) / (2.0 * M_PI));
   part.has_markers = markers != nullptr;
-  for (int link = 1; !markers && link < chain.links(); ++link) {
-    part.home.push_back(0.5 * (chain.link_start(link) + chain.link_end(link)) * chain.direction);
-    part.home.push_back(chain.link_end(link) * chain.direction);
-    part.links.insert(part.links.end(), 2, link);
-  }
-  const bool twists = std::any_of(chain.axes.begin(), chain.axes.end(), [&](const math::Vector6& axis) {
-    return std::abs(axis.head<3>().dot(chain.direction)) > 0.5;
-  });
-  for (int link = 1; !markers && twists && link < chain.links(); ++link) {
-    part.home.push_back(chain.link_end(link) * chain.direction + 0.5 * chain.diameter * chain.bending_axis);
-    part.links.push_back(link);
-  }
-
-  for (std::size_t i = 0; markers && i < markers->arclengths.size(); ++i) {
-    part.home.push_back(markers->arclengths[i] * chain.direction);
-    part.links.push_back(chain::link_at(chain, markers->arclengths[i]));
-  }
-
-  const std::size_t points = part.home.size();
+  if (!markers) part.points = chain::shape_points(chain, true);
+  for (std::size_t i = 0; markers && i < markers->arclengths.size(); ++i)
+    part.points.push_back(chain::centerline_point(chain, markers->arclengths[i]));
+  const std::size_t points = part.points.size();
   std::vector<MatrixX> jacobians;
   for (std::size_t k = 0; k < frames; ++k) {
     if (markers) {
@@ -426,8 +410,7 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
     MatrixX target;
     place_points(part, recognized.theta[k], target, &jacobians);
     // what the model's error of the points is in angles, and the recognized angles' own
-    MatrixX normal = MatrixX::Zero(chain.angles(), chain.angles());
-    for (const MatrixX& jacobian : jacobians) normal += jacobian.transpose() * jacobian;
+    const MatrixX normal = chain::displacement_metric(jacobians);
     const MatrixX unit = MatrixX::Identity(chain.angles(), chain.angles());
     const Eigen::LDLT<MatrixX> by_points(normal);
     MatrixX covariance = kCorrelated * options.model_error * options.model_error * by_points.solve(unit);
@@ -442,7 +425,7 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
   }
 
   VectorX theta, thetadot, theta_sd = VectorX::Constant(chain.angles(), kThetaSd);
-  const double thetadot_sd = initial_motion({part.times, part.theta, {}}, theta, thetadot);
+  const double thetadot_sd = initial_motion({part.times, part.theta, {}, {}}, theta, thetadot);
   if (!theta.allFinite() || !thetadot.allFinite() || !std::isfinite(thetadot_sd))
     throw InputError("identify", "the first times tell no velocity: they are too near or too far from each other",
                      "give frames of a video");
@@ -457,7 +440,7 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
                        thetadot.cwiseAbs().maxCoeff() < std::max(kRopeAtRest, kSignificant * thetadot_sd);
   if (at_rest) thetadot.setZero();
   part.unknowns = make_unknowns(chain, options, theta, thetadot, theta_sd, at_rest ? kAtRestSd : kRateSd);
-  const int substeps = part.unknowns.fixed.substeps;
+  const int substeps = part.unknowns.reference.substeps;
   for (bool fine : {false, true}) {
     BaseGrid& grid = part.grids[fine];
     grid = dynamics::sample_base([&](double t) { return base.at(t); }, recognized.time[0], recognized.time,
@@ -470,7 +453,7 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
 
 Problem make_problem(const chain::Chain& chain, std::vector<Part> parts) {
   const Unknowns& first = parts.front().unknowns;
-  const int shared = first.theta < 0 ? first.size() : first.theta;
+  const int theta = first.first(Quantity::theta), shared = theta < 0 ? first.size() : theta;
   Problem problem{chain, std::move(parts), shared, {}, {}};
   const int own = problem.own();
   const Eigen::Index size = shared + own * static_cast<Eigen::Index>(problem.parts.size());
@@ -519,18 +502,21 @@ Fit fit_centerline(const Problem& problem, const Options& options) {
 
   const auto start = [&](int index) {
     VectorX p = problem.mean;
-    for (int i : {u.stiffness, u.damping, u.drag})
-      if (i >= 0) p[i] += std::log(options.start_factor);
-    for (int j = 0; u.coulomb >= 0 && j < problem.chain.links() - 1; ++j)
-      p[u.coulomb + j] += std::log(options.start_factor);
+    const int coulomb = u.first(Quantity::coulomb_friction), links = coulomb < 0 ? 0 : problem.chain.links() - 1;
+    const auto scale = [&](std::initializer_list<Quantity> quantities, const auto& by) {
+      for (const Quantity quantity : quantities)
+        if (const int i = u.first(quantity); i >= 0) p[i] += by();
+    };
+    const auto factor = [&] { return std::log(options.start_factor); };
+    scale({Quantity::stiffness, Quantity::damping, Quantity::drag}, factor);
+    for (int j = 0; j < links; ++j) p[coulomb + j] += factor();
     if (index < 3) {
-      for (int i : {u.stiffness, u.damping})
-        if (i >= 0) p[i] += std::log(kScales[index]);
+      scale({Quantity::stiffness, Quantity::damping}, [&] { return std::log(kScales[index]); });
     } else {
       core::Random random(options.seed * 1000003u + static_cast<std::uint64_t>(index));
-      for (int i : {u.stiffness, u.damping, u.drag, u.tip})
-        if (i >= 0) p[i] += 1.5 * random.normal();
-      for (int j = 0; u.coulomb >= 0 && j < problem.chain.links() - 1; ++j) p[u.coulomb + j] += random.normal();
+      scale({Quantity::stiffness, Quantity::damping, Quantity::drag, Quantity::tip_mass},
+            [&] { return 1.5 * random.normal(); });
+      for (int j = 0; j < links; ++j) p[coulomb + j] += random.normal();
     }
     return p;
   };
@@ -670,7 +656,7 @@ std::vector<dynamics::Estimates::Weak> weak_directions(const Problem& problem, c
     if (vector[largest] < 0.0) vector = -vector;
     for (int k = 0; k < shared; ++k)
       if (k == largest || std::abs(vector[k]) >= kLarge)
-        direction.parts.emplace_back(problem.parts[0].unknowns.names[k], vector[k]);
+        direction.parts.emplace_back(dynamics::name_of(problem.parts[0].unknowns.list[k]), vector[k]);
     std::stable_sort(direction.parts.begin(), direction.parts.end(),
                      [](const auto& a, const auto& b) { return std::abs(a.second) > std::abs(b.second); });
     weak.push_back(std::move(direction));
@@ -709,13 +695,13 @@ std::vector<Result> solve(const chain::Chain& chain, std::vector<Part> parts, co
     const VectorX p = problem.of_part(fit.p, i);
     const State state = apply(chain, part.unknowns, p);
     result.parameters = state.parameters;
-    result.initial = {part.times[0], state.theta, state.thetadot};
+    result.initial = {part.times[0], state.initial.theta, state.initial.thetadot};
     result.rollout = std::move(rollouts.states[i]);
     result.node_rms = result.alone_rms = rms_of(part, result.rollout);
     if (results.size() > 1 && !options.paper)
       result.alone_rms = std::min(result.node_rms, alone_rms(problem, i, fit.p));
     dynamics::Estimates& e = result.estimates;
-    e.names = part.unknowns.names;
+    e.names = part.unknowns.names();
     e.held = part.unknowns.held;
     e.weak = weak;
     e.values.assign(p.begin(), p.end());
@@ -732,24 +718,21 @@ std::vector<Result> solve(const chain::Chain& chain, std::vector<Part> parts, co
 
 std::vector<Result> identify(const chain::Chain& chain, std::span<const Recording> recordings, const Options& options) {
   std::vector<Part> parts;
-  for (const Recording& r : recordings) parts.push_back(make_part(chain, r.base, r.recognized, r.covariances, options));
+  for (const Recording& r : recordings) parts.push_back(make_part(chain, r.base, r.recognized, options));
   return solve(chain, std::move(parts), options);
 }
 
 std::vector<Result> identify(const chain::Chain& chain, std::span<const MarkerRecording> recordings,
                              const Options& options) {
   std::vector<Part> parts;
-  for (const MarkerRecording& r : recordings) {
-    std::vector<MatrixX> covariances;
-    const chain::States fitted = fit_markers(chain, r.base, r.markers, &covariances);
-    parts.push_back(make_part(chain, r.base, fitted, covariances, options, &r.markers));
-  }
+  for (const MarkerRecording& r : recordings)
+    parts.push_back(make_part(chain, r.base, fit_markers(chain, r.base, r.markers), options, &r.markers));
   return solve(chain, std::move(parts), options);
 }
 
 Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,
-                std::span<const MatrixX> covariances, const Options& options) {
-  const Recording recording{base, recognized, {covariances.begin(), covariances.end()}};
+                const Options& options) {
+  const Recording recording{base, recognized};
   return std::move(identify(chain, std::span(&recording, 1), options).front());
 }
 

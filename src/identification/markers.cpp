@@ -104,8 +104,7 @@ VectorX along_polygon(const chain::Chain& chain, const math::Pose& pose, const M
 
 }  // namespace
 
-chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers,
-                          std::vector<MatrixX>* covariances) {
+chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers) {
   check(chain, base, markers);
   const int n = chain.angles();
   MatrixX shape = MatrixX::Identity(n, n) / (kBendSd * kBendSd);
@@ -116,7 +115,6 @@ chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajector
       const double weight = 1.0 / (kSmoothSd * kSmoothSd);
       shape(i, i) += weight, shape(k, k) += weight, shape(i, k) -= weight, shape(k, i) -= weight;
     }
-  if (covariances) covariances->clear();
   chain::States states;
   VectorX theta = VectorX::Zero(n);
   for (std::size_t frame = 0; frame < markers.time.size(); ++frame) {
@@ -179,14 +177,12 @@ chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajector
     cost_at(theta, &gradient);  // the hessian there
     states.time.push_back(markers.time[frame]);
     states.theta.push_back(theta);
-    if (covariances) {
-      const Eigen::LDLT<MatrixX> factor(hessian);
-      if (!math::is_positive(factor))
-        throw InputError("markers", "at " + core::exact(markers.time[frame]) + " s they tell no shape of the rope",
-                         "correct their positions there");
-      const MatrixX inverse = factor.solve(MatrixX::Identity(n, n));
-      covariances->push_back(0.5 * (inverse + inverse.transpose()));
-    }
+    const Eigen::LDLT<MatrixX> factor(hessian);
+    if (!math::is_positive(factor))
+      throw InputError("markers", "at " + core::exact(markers.time[frame]) + " s they tell no shape of the rope",
+                       "correct their positions there");
+    const MatrixX inverse = factor.solve(MatrixX::Identity(n, n));
+    states.covariance.push_back(0.5 * (inverse + inverse.transpose()));
   }
   return states;
 }

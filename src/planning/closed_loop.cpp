@@ -5,7 +5,7 @@
 #include <cmath>
 #include <limits>
 
-#include "adaptation.h"
+#include "parameter_correction.h"
 #include "search.h"
 
 namespace chainsplat::planning {
@@ -232,7 +232,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
   core::Random random(options.seed + 3);
   double foretold = std::numeric_limits<double>::infinity();  // miss, by the last replan
   bool elsewhere = false;
-  Adaptation adaptation = start_adaptation(problem.model);
+  ParameterCorrection corrected = start_correction(problem.model);
   dynamics::InitialState last_seen = problem.initial;
   last_seen.time = 0.0;
   // the twin's state from the points of the rope that a camera could follow
@@ -253,7 +253,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
     if (loop.feedback && k > 0 && left > kShortest) {
       const double begin = core_time();
       const dynamics::InitialState estimate = look(now);
-      adapt(adaptation, base, last_seen, estimate, seen);
+      correct(corrected, base, last_seen, estimate, seen);
       last_seen = estimate;
       const double rest = end - now;
       const double length = problem.tabletop ? rest : std::min(rest, std::max(kLeastPiece, kPieceMargin * left));
@@ -261,7 +261,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
       append_piece(motion, now, length);
       const int full = problem.model.parameters.substeps;
       const int substeps = std::clamp(static_cast<int>(kReplanNodes / (30.0 * length)), full > 4 ? 2 : 1, full);
-      Task task = make_task(problem, options, {&adaptation.model}, motion, estimate, problem.targets.front(), substeps);
+      Task task = make_task(problem, options, {&corrected.model}, motion, estimate, problem.targets.front(), substeps);
       task.exact = false;
       task.target = target_at(now);
       task.target_velocity = loop.target_velocity;
@@ -280,8 +280,8 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
         // what asks too much of the arm is taken in part
         c.samples.take_within(c.motion, options.limits);
         Rollout rollout;
-        if (roll_out(adaptation.model, task.motion, task.grid, unknowns_of(c.motion), estimate, false, rollout)) {
-          const Hit hit = measure(task, adaptation.model, rollout);
+        if (roll_out(corrected.model, task.motion, task.grid, unknowns_of(c.motion), estimate, false, rollout)) {
+          const Hit hit = measure(task, corrected.model, rollout);
           c.miss = hit.miss, c.time = hit.time;
         }
         return c;

@@ -280,6 +280,7 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
   }
   constexpr int kIterations = 8;  // Gauss-Newton steps from the interpolated angles
   refine_all(engine, chain, capture, frames, result.gaussians, others, kIterations, {}, states);
+  states.covariance.clear();  // nothing says how sure the training frames are
   differentiate(states);
   result.states = std::move(states);
   return result;

@@ -72,13 +72,12 @@ void differentiate(chain::States& states) {
   }
 }
 
-std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain& chain, const capture::Capture& capture,
-                                      const std::vector<FrameViews>& frames, const splat::Gaussians& gaussians,
-                                      const std::vector<int>& selected, int iterations, const AnglePrior& prior,
-                                      chain::States& states) {
+void refine_all(splat::Engine& engine, const chain::Chain& chain, const capture::Capture& capture,
+                const std::vector<FrameViews>& frames, const splat::Gaussians& gaussians,
+                const std::vector<int>& selected, int iterations, const AnglePrior& prior, chain::States& states) {
   // the targets of one part must fit one buffer on the smallest device
   constexpr std::size_t kPartPixels = 2u << 20;
-  std::vector<math::MatrixX> covariances;
+  states.covariance.assign(states.time.size(), math::MatrixX::Identity(chain.angles(), chain.angles()));
   engine.set_gaussians(gaussians);
   std::size_t from = 0;
   while (from < selected.size()) {
@@ -113,10 +112,9 @@ std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain&
     refine.mask_weight = kAngleMaskWeight;
     refine.trusted = kTrustedStep;
     RefineSummary summary = refine_angles(chain, capture, frames, part, draw, refine, prior, states);
-    for (auto& covariance : summary.covariances) covariances.push_back(std::move(covariance));
+    for (std::size_t i = 0; i < part.size(); ++i) states.covariance[part[i]] = std::move(summary.covariances[i]);
     from += part.size();
   }
-  return covariances;
 }
 
 }  // namespace chainsplat::recognition

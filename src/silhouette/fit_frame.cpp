@@ -148,7 +148,7 @@ std::vector<VectorX> cold_starts(const chain::Chain& chain, const VectorX& start
   const int joints = chain.links() - 1;
   for (const int axis : first) {
     const Vector3 about = chain.axes[axis].head<3>();
-    if (std::abs(about.dot(chain.direction)) > kSameAxis) continue;
+    if (chain::is_twist(chain, axis)) continue;
     for (const double sign : {1.0, -1.0}) {
       VectorX bent = VectorX::Zero(chain.angles());
       for (int k = 0; k < chain.angles(); ++k)
@@ -167,7 +167,7 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
   Problem problem;
   problem.chain = &chain;
   problem.held.assign(n, 0);
-  for (int k = 0; k < n; ++k) problem.held[k] = std::abs(chain.axes[k].head<3>().dot(chain.direction)) > kSameAxis;
+  for (int k = 0; k < n; ++k) problem.held[k] = chain::is_twist(chain, k);
   for (const FrameView& view : views) {
     ViewWork work;
     work.view = &view;
