@@ -1,7 +1,8 @@
-// color_equations.comp - one group, a subgroup, a (link, slice of a view's tiles): sums of the normal equations of the colors
-// of the link's pixels, residual r = gain drawn + bias - seen (chainsplat/splat.h, ColorSums). A pixel that shows the surface
-// point x moves with its link: dr/d(twist) = -slope . d(pixel)/dx . (motion of x), with the mean of the drawn and the seen
-// slope (second order in the step: Malis' ESM). Gain and bias are solved for first, from the sums of color_pixels.comp.
+// color_equations.comp - one work group, which is one subgroup, per (link, slice of a view's tiles): the normal
+// equations of the colors of the link's pixels, with the residual r = gain drawn + bias - observed (chainsplat/splat.h,
+// ColorSums). A pixel that shows the surface point x moves with its link: dr/d(twist) = -grad . d(pixel)/dx . (motion
+// of x), where grad is the mean of the drawn and the observed image gradients (second order in the step: Malis' ESM).
+// Gain and bias are solved for first, from the sums of color_pixels.comp.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -12,7 +13,7 @@
 layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
-layout(constant_id = 3) const uint kSubgroup = 8u;  // lanes of the group
+layout(constant_id = 3) const uint kSubgroup = 8u;  // lanes per work group
 layout(push_constant) uniform Push { ColorPush p; };
 layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
 layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
@@ -24,11 +25,11 @@ layout(std430, binding = 6) readonly buffer Target { uint target[]; };
 layout(std430, binding = 7) readonly buffer TilePixels { uint tile_pixels[]; };
 layout(std430, binding = 8) readonly buffer TileSummary { uvec2 tile_summary[]; };
 layout(std430, binding = 9) readonly buffer PixelSums { vec4 pixel_sums[]; };
-layout(std430, binding = 10) writeonly buffer Sums { float link_sums[]; };  // 4 kColorRows a (view, link, slice)
+layout(std430, binding = 10) writeonly buffer Sums { float link_sums[]; };  // 4 kColorRows per (view, link, slice)
 
 #include "inc/subgroup_sum.glsl"
 
-// Robust least squares from gain 1, bias 0; every group comes to the same bits.
+// Gain and bias after one step of robust least squares from 1 and 0; every work group computes the same bits.
 vec2 exposure(uint v, uint lane) {
   float sums[5];
   [[unroll]] for (uint k = 0u; k < 5u; ++k) sums[k] = 0.0;
@@ -49,7 +50,7 @@ vec2 exposure(uint v, uint lane) {
 
 bool shows(uint tile, uint link) { return (tile_summary[tile].y >> (link & 31u) & 1u) != 0u; }
 
-vec3 seen_at(uint at) { return unpackUnorm4x8(target[at]).xyz; }
+vec3 observed_at(uint at) { return unpackUnorm4x8(target[at]).xyz; }
 
 void main() {
   uint link = gl_WorkGroupID.x, slice = gl_WorkGroupID.y, v = gl_WorkGroupID.z, lane = gl_SubgroupInvocationID;
@@ -62,7 +63,7 @@ void main() {
   [[unroll]] for (uint k = 0u; k < 4u * kColorRows; ++k) sums[k] = 0.0;
   uint t = slice;
   for (;;) {
-    // a software device runs the body also where no lane takes it
+    // jump to the next tile that shows the link: a software device executes a branch's body even if no lane takes it
     while (t < color_view.tiles && !shows(color_view.first_tile + t, link)) t += p.equation_slices;
     if (t >= color_view.tiles) break;
     uint tile = color_view.first_tile + t, count = tile_summary[tile].x, first = tile * kTileWidth * kTileHeight;
@@ -72,15 +73,16 @@ void main() {
       if (entry >> 8u != link) continue;
       uvec2 pixel = corner + uvec2(place % kTileWidth, place / kTileWidth);
       uint offset = pixel.y * view.width + pixel.x, shown = view.pixel + offset, looked = view.target + offset;
+      // image gradients, residual and its weight
       vec3 drawn = image[shown].xyz;
       vec3 across = 0.25 * (gain * (image[shown + 1u].xyz - image[shown - 1u].xyz) +
-                            seen_at(looked + 1u) - seen_at(looked - 1u));
+                            observed_at(looked + 1u) - observed_at(looked - 1u));
       vec3 down = 0.25 * (gain * (image[shown + view.width].xyz - image[shown - view.width].xyz) +
-                          seen_at(looked + view.width) - seen_at(looked - view.width));
-      vec3 residual = gain * drawn + bias - seen_at(looked);
+                          observed_at(looked + view.width) - observed_at(looked - view.width));
+      vec3 residual = gain * drawn + bias - observed_at(looked);
       vec3 weight = min(vec3(1.0), kColorNoise / max(abs(residual), vec3(1e-6)));
 
-      // -d(pixel)/d(twist): a point moves by force, and by moment about the link's start
+      // -d(pixel)/d(twist): u and w by translation, u_moment and w_moment by rotation about the link's start
       float z = depth_image[shown];
       vec2 slope = (vec2(pixel) + 0.5 - view.intrinsics.zw) / view.intrinsics.xy, focal = -view.intrinsics.xy / z;
       vec3 from = vec3(slope, 1.0) * z - start;
@@ -89,7 +91,7 @@ void main() {
       float by_u[6] = {u_moment.x, u_moment.y, u_moment.z, u.x, u.y, u.z};
       float by_w[6] = {w_moment.x, w_moment.y, w_moment.z, w.x, w.y, w.z};
 
-      // channels first: they share the pixel's motion
+      // sum over the channels first: they share the pixel's motion
       vec3 weighted_across = weight * across, weighted_down = weight * down;
       float aa = dot(weighted_across, across), ad = dot(weighted_across, down), dd = dot(weighted_down, down);
       vec2 by_gain = vec2(dot(weighted_across, drawn), dot(weighted_down, drawn));
@@ -118,6 +120,7 @@ void main() {
     sums[kColorExposure] = gain;
     sums[kColorExposure + 1u] = bias;
   }
+
   uint out_row = 4u * kColorRows * ((v * p.links + link) * p.equation_slices + slice);
   [[unroll]] for (uint first = 0u; first < 4u * kColorRows; first += 8u) {
     float eight[8];

@@ -1,7 +1,8 @@
-// color_pixels.comp - one group, a subgroup, a slice of a view's tiles: the pixels whose color counts, the link that each one
-// shows (the nearest axis to the drawn surface), and what the exposure and the likeness of drawn and seen need.
-// A pixel counts inside the mask, away from its edge, where the rope is drawn opaque.
-// writes tile_pixels, tile by tile: place in the tile | link << 8; tile_summary: how many, and a bit for every link % 32 there.
+// color_pixels.comp - one work group, which is one subgroup, per slice of a view's tiles: finds the pixels whose color
+// counts, the link that each of them shows (the one whose axis is nearest to the drawn surface), and the sums for the
+// exposure and for the correlation of drawn and observed colors. A pixel counts if it lies inside the mask, away from
+// its edge, and the rope is drawn opaque there.
+// writes tile_pixels, tile by tile: place in the tile | link << 8; tile_summary: their number, a bit per link % 32.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -12,9 +13,9 @@
 layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
-layout(constant_id = 3) const uint kSubgroup = 8u;  // lanes of the group, at most a tile's pixels
-layout(constant_id = 4) const uint kColumns = 1u;   // of a tile that a lane sees to,
-layout(constant_id = 5) const uint kRows = 8u;      // and how many pixels of each
+layout(constant_id = 3) const uint kSubgroup = 8u;  // lanes per work group, at most the pixels of a tile
+layout(constant_id = 4) const uint kColumns = 1u;   // columns of a tile that a lane covers
+layout(constant_id = 5) const uint kRows = 8u;      // pixels of each of these columns that it covers
 layout(push_constant) uniform Push { ColorPush p; };
 layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
 layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
@@ -32,12 +33,12 @@ const uint kReach = 2u * kColorEdge;
 const uint kNone = 0xffffffu;
 const float kFar = 1e30;
 
-// of every column of the tile and those beside it: bit r says whether rows r .. r + kReach are inside the mask
+// per column of the tile and of the margin beside it: bit r says whether rows r .. r + kReach are inside the mask
 shared uint column_inside[kTileWidth + kReach];
 
 #include "inc/subgroup_sum.glsl"
 
-// What the lanes before this one have, and this one.
+// Inclusive prefix sum over the lanes.
 uint subgroup_prefix(uint x) {
   uint lane = gl_SubgroupInvocationID;
   [[unroll]] for (uint step = 1u; step < kSubgroup; step *= 2u) {
@@ -75,12 +76,15 @@ void main() {
   for (uint t = slice; t < color_view.tiles; t += p.pixel_slices) {
     uint tile = color_view.first_tile + t;
     uvec2 corner = uvec2(tiles[tile].x * kTileWidth, tiles[tile].y * kTileHeight);
+
+    // mask, eroded by kColorEdge
     subgroupBarrier();
     for (uint c = lane; c < kTileWidth + kReach; c += kSubgroup)
       column_inside[c] = inside_below(view, int(corner.x + c) - int(kColorEdge), int(corner.y) - int(kColorEdge));
     subgroupBarrier();
 
-    vec3 point[kColumns * kRows];  // of the drawn surface, camera frame
+    // points of the drawn surface at the pixels that count
+    vec3 point[kColumns * kRows];  // camera frame
     float least[kColumns * kRows];
     uint link[kColumns * kRows];
     uint count = 0u;
@@ -102,7 +106,8 @@ void main() {
       }
     }
     uint inclusive = subgroup_prefix(count), total = subgroupShuffle(inclusive, kSubgroup - 1u);
-    // lanes load a segment each, and hand them round
+
+    // nearest link of each point; lanes load one segment each and exchange them
     for (uint first = 0u; first < (total > 0u ? p.links : 0u); first += kSubgroup) {
       uint own = 2u * (color_view.first_segment + min(first + lane, p.links - 1u));
       vec4 own_start = segments[own];
@@ -123,6 +128,8 @@ void main() {
         }
       }
     }
+
+    // list of the pixels, and the sums at gain 1 and bias 0 (shared/color.h)
     uint place = tile * kTileWidth * kTileHeight + inclusive - count, links_there = 0u;
     [[unroll]] for (uint c = 0u; c < kColumns; ++c) {
       [[unroll]] for (uint r = 0u; r < kRows; ++r) {
@@ -132,25 +139,25 @@ void main() {
           tile_pixels[place] = y * kTileWidth + x | link[k] << 8u;
           ++place;
           uint offset = (corner.y + y) * view.width + corner.x + x;
-          vec3 drawn = image[view.pixel + offset].xyz, seen = unpackUnorm4x8(target[view.target + offset]).xyz;
-          vec3 residual = drawn - seen;
+          vec3 drawn = image[view.pixel + offset].xyz, observed = unpackUnorm4x8(target[view.target + offset]).xyz;
+          vec3 residual = drawn - observed;
           vec3 weight = min(vec3(1.0), kColorNoise / max(abs(residual), vec3(1e-6)));
-          vec3 drawn0 = drawn - 0.5, seen0 = seen - 0.5;
+          vec3 drawn0 = drawn - 0.5, observed0 = observed - 0.5;
           sums[0] += dot(weight, drawn * drawn);
           sums[1] += dot(weight, drawn);
           sums[2] += dot(weight, vec3(1.0));
           sums[3] += dot(weight * residual, drawn);
           sums[4] += dot(weight, residual);
           sums[5] += 1.0;
-          sums[6] += dot(drawn0, seen0);
+          sums[6] += dot(drawn0, observed0);
           sums[7] += dot(drawn0, drawn0);
           sums[8] += drawn0.x;
           sums[9] += drawn0.y;
           sums[10] += drawn0.z;
-          sums[11] += dot(seen0, seen0);
-          sums[12] += seen0.x;
-          sums[13] += seen0.y;
-          sums[14] += seen0.z;
+          sums[11] += dot(observed0, observed0);
+          sums[12] += observed0.x;
+          sums[13] += observed0.y;
+          sums[14] += observed0.z;
         }
       }
     }

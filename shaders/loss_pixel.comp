@@ -1,5 +1,6 @@
-// loss_pixel.comp - one group an active tile: the tile's sums of |color| and |mask| error (SPEC 2.7), squared color error and
-// number of pixels inside the object. Their gradient: splat_blend_backward.comp.
+// loss_pixel.comp - one work group per active tile: the tile's sums of absolute color and mask errors (mathematics.md
+// 2.7), and the squared color error and the number of pixels inside the object. splat_blend_backward.comp has the
+// gradient.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"

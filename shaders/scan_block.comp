@@ -1,5 +1,5 @@
-// scan_block.comp - one group an aligned block of kScanBlock elements: exclusive prefix sums inside the block, and its sum.
-// reads values[]; writes prefix[], block_sum[]. scan_sums.comp turns block sums into block offsets.
+// scan_block.comp - one work group per aligned block of kScanBlock elements: exclusive prefix sums inside the block,
+// and its total. reads values[]; writes prefix[], block_sum[]. scan_sums.comp turns block sums into block offsets.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
@@ -13,7 +13,7 @@ layout(std430, binding = 3) readonly buffer Counters { uint counters[]; };
 shared uint lane_sum[64];
 
 void main() {
-  // lengths that only the device knows: so many elements a live replica
+  // scan_per_live elements per live replica, whose number only the device knows
   uint length = p.scan_per_live > 0u ? p.scan_per_live * counters[kCounterLive] : p.scan_length;
   uint block = gl_WorkGroupID.x + gl_WorkGroupID.y * gl_NumWorkGroups.x;
   uint lane = gl_LocalInvocationID.x;

@@ -1,5 +1,5 @@
-// scan_sums.comp - one group: block sums become block offsets (exclusive prefix sums); the total goes to a counter, is held
-// against its capacity, and sizes the dispatches that depend on it.
+// scan_sums.comp - one work group: turns block sums into block offsets (exclusive prefix sums). The total goes to a
+// counter, is compared with its capacity, and sizes the dispatches that depend on it.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"

@@ -1,4 +1,4 @@
-# Every shaders/*.comp becomes SPIR-V at build time and is embedded; gpu::shader_code(name) finds it.
+# Compiles every shaders/*.comp to SPIR-V at build time and embeds it; gpu::shader_code(name) returns it.
 file(GLOB shader_sources CONFIGURE_DEPENDS ${CMAKE_SOURCE_DIR}/shaders/*.comp)
 set(shader_dir ${CMAKE_BINARY_DIR}/shaders)
 file(MAKE_DIRECTORY ${shader_dir})

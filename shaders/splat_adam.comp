@@ -1,5 +1,5 @@
-// splat_adam.comp - one invocation four parameters: Adam (Kingma & Ba 2015). Nothing happens after an overflow, and a gradient
-// that is not finite leaves its parameter and moments alone and is counted.
+// splat_adam.comp - one invocation per four parameters: Adam (Kingma & Ba 2015). After an overflow it does nothing. A
+// gradient that is not finite is counted, and its parameter and moments stay as they are.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"

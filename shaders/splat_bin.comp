@@ -1,5 +1,6 @@
-// splat_bin.comp - one invocation a (live replica, view): an entry into the list of every active tile that it touches.
-// Integer atomics hand out places in any order; splat_sort.comp puts the entries in an order that does not depend on it.
+// splat_bin.comp - one invocation per (live replica, view): enters it into the list of every active tile that it
+// touches. Integer atomics assign the places in any order; splat_sort.comp then brings them into an order that is
+// unique.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
@@ -16,14 +17,14 @@ layout(std430, binding = 7) readonly buffer TilePrefix { uint tile_prefix[]; };
 layout(std430, binding = 8) readonly buffer TileBlock { uint tile_block[]; };
 layout(std430, binding = 9) buffer TileCursor { uint tile_cursor[]; };
 layout(std430, binding = 10) readonly buffer TileHits { uint tile_hits[]; };
-layout(std430, binding = 11) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica number, splat, instance
+layout(std430, binding = 11) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica, splat, instance
 
 void main() {
   uint r = gl_GlobalInvocationID.x, v = gl_GlobalInvocationID.y;
   uint live_count = counters[kCounterLive];
   if (r >= live_count || counters[kCounterOverflow] != 0u) return;
   uint e = live[r];
-  uint replica = (e % p.gaussians) * p.links + e / p.gaussians;  // SPEC's index, breaks ties of depth
+  uint replica = (e % p.gaussians) * p.links + e / p.gaussians;  // breaks ties of depth (splat_project.comp)
   uint s = v * live_count + r;
   uint columns = floatBitsToUint(splats[kSplatRows * s + 1u].w), rows = floatBitsToUint(splats[kSplatRows * s + 2u].w);
   uint depth = floatBitsToUint(splats[kSplatRows * s].w);  // positive floats sort like their bits
@@ -31,7 +32,7 @@ void main() {
   SplatView view = views[v];
   uint hits = tile_hits[s];
   uvec2 t0 = uvec2(columns, rows) & 0xffffu, t1 = uvec2(columns, rows) >> 16u, t = t0;
-  uint places = (t1.x - t0.x) * (t1.y - t0.y);  // one loop: see splat_project.comp
+  uint places = (t1.x - t0.x) * (t1.y - t0.y);  // for one loop over the rectangle (splat_project.comp)
   for (uint k = 0u; k < places; ++k) {
     uint tile = tile_map[view.tile_map + t.y * view.tiles_x + t.x];
     bool hit = k >= kTileHits || (hits >> k & 1u) != 0u;

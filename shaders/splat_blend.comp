@@ -1,7 +1,8 @@
-// splat_blend.comp - one group an active tile, kPixels pixels a lane (a column of them): front-to-back blending (SPEC 2.6).
-// A splat loaded once serves all pixels of the lane: what makes it fast where loads cost most (DESIGN). For the same reason
-// kShare lanes load a splat each, and hand them round, where a load by all lanes of one splat costs as much as of eight.
-// writes image (premultiplied color, alpha), depth where asked, and how many entries of the tile any pixel used.
+// splat_blend.comp - one work group per active tile, a column of kPixels pixels per lane: front-to-back blending
+// (mathematics.md 2.6). One loaded splat serves all pixels of the lane, which makes the pass fast where loads dominate
+// the cost (design.md, 'The size of the work'). For the same reason kShare lanes load one splat each and exchange them,
+// on devices where all lanes loading one splat costs as much as each loading another.
+// writes image (premultiplied color, alpha), depth if asked for, and the number of entries of the tile that were used.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -14,7 +15,7 @@ layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(constant_id = 3) const uint kPixels = 8u;
 layout(constant_id = 4) const uint kCutoffs = 1u;
 layout(constant_id = 5) const uint kDepth = 0u;
-layout(constant_id = 6) const uint kShare = 1u;  // lanes of a subgroup that load a splat each; 1: every lane loads all
+layout(constant_id = 6) const uint kShare = 1u;  // lanes that load one splat each and exchange; 1: every lane loads all
 layout(push_constant) uniform Push { SplatPush p; };
 layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
 layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
@@ -28,7 +29,7 @@ layout(std430, binding = 8) writeonly buffer Image { vec4 image[]; };
 layout(std430, binding = 9) buffer TileUsed { uint tile_used[]; };
 layout(std430, binding = 10) writeonly buffer DepthImage { float depth_image[]; };
 
-// entries in one turn of the loop: what a loop carries from turn to turn costs as much as a fifth of an entry
+// entries per iteration: the values that a loop carries from one iteration to the next cost a fifth of an entry's time
 const uint kTurns = kShare > 1u ? 2u : 1u;
 
 #include "inc/alpha.glsl"
@@ -44,6 +45,7 @@ void main() {
   uint start = tile_prefix[tile] + tile_block[tile / kScanBlock];
   uint n = counters[kCounterOverflow] != 0u ? 0u : tile_count[tile];
 
+  // blend until the list ends or all pixels are closed
   vec3 color[kPixels];
   float transmittance[kPixels], depth[kPixels];
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
@@ -54,6 +56,7 @@ void main() {
   uint used = 0u;
   bool any_open = true;
   while (used < n && any_open) {
+    // load one splat per sharing lane, then blend them in turn
     uint turns = kShare > 1u ? min(kShare, n - used) : 1u, own_turn = gl_SubgroupInvocationID % kShare;
     uint own = kSplatRows * sorted[start + used + min(own_turn, turns - 1u)].x;
     vec4 own_a = splats[own], own_b = splats[own + 1u], own_c = splats[own + 2u];
@@ -69,8 +72,8 @@ void main() {
         float alpha[kPixels];
         alphas_of(falloff, shared_by(own_a.z, turn), dx, dy, alpha);
         [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
-          bool seen;
-          float weight = blend_weight(min(alpha[k], kAlphaCap), transmittance[k], seen);
+          bool contributes;
+          float weight = blend_weight(min(alpha[k], kAlphaCap), transmittance[k], contributes);
           color[k] += weight * splat_color;
           if (kDepth != 0u) depth[k] += weight * splat_depth;
         }
@@ -79,8 +82,10 @@ void main() {
     used += turns;
     any_open = false;
     [[unroll]] for (uint k = 0u; k < kPixels; ++k) any_open = any_open || transmittance[k] >= 0.0;
-    if (kShare > 1u) any_open = subgroupAny(any_open);  // lanes that are done still load for the others
+    if (kShare > 1u) any_open = subgroupAny(any_open);  // a lane whose pixels are closed still loads for the others
   }
+
+  // write the pixels
   atomicMax(tile_used[tile], used);
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
     if (column < view.width && row + k < view.height) {

@@ -1,7 +1,8 @@
-// splat_blend_backward.comp - one group an active tile, layout as splat_blend.comp: gradient of each entry from the pixels
-// of the tile (SPEC 2.8), walked front to back: what lies behind entry k is the whole pixel minus what came up to k, so only
-// its product with the pixel's gradient is carried. Each cluster of kSubgroup lanes stores its sum in a slot of its own (no
-// atomics); a subgroup is one cluster or, where a device has wider ones than it promises, several.
+// splat_blend_backward.comp - one work group per active tile, laid out as in splat_blend.comp: the gradient of each
+// entry by the pixels of the tile (mathematics.md 2.8). It walks front to back: the color behind entry k is that of the
+// whole pixel minus that up to k, and only its product with the pixel's gradient is carried along. Each cluster of
+// kSubgroup lanes stores its sum in a slot of its own (no atomics). A subgroup is one cluster, or several where it
+// turns out wider than the least size that the device guarantees.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -13,7 +14,7 @@ layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(constant_id = 3) const uint kPixels = 8u;
 layout(constant_id = 4) const uint kCutoffs = 1u;
-layout(constant_id = 5) const uint kSubgroup = 8u;  // lanes of a cluster; no subgroup has fewer
+layout(constant_id = 5) const uint kSubgroup = 8u;  // lanes per cluster; no subgroup has fewer
 layout(constant_id = 6) const uint kShare = 1u;     // as in splat_blend.comp
 layout(push_constant) uniform Push { SplatPush p; };
 layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
@@ -28,7 +29,7 @@ layout(std430, binding = 8) readonly buffer Image { vec4 image[]; };
 layout(std430, binding = 9) readonly buffer TileUsed { uint tile_used[]; };
 layout(std430, binding = 10) readonly buffer Target { uint target[]; };
 layout(std430, binding = 11) readonly buffer PixelGradient { vec4 pixel_gradient[]; };  // of D-SSIM, by color
-layout(std430, binding = 12) writeonly buffer Partials { float partials[]; };  // kPartialRows vec4 a slot
+layout(std430, binding = 12) writeonly buffer Partials { float partials[]; };  // kPartialRows vec4 per slot
 
 #include "inc/alpha.glsl"
 #include "inc/share.glsl"
@@ -48,9 +49,10 @@ void main() {
   uint cluster = gl_SubgroupID * (gl_SubgroupSize / kSubgroup) + gl_SubgroupInvocationID / kSubgroup;
   uint cluster_lane = gl_SubgroupInvocationID % kSubgroup, cluster_slot = 4u * kPartialRows * cluster;
 
+  // gradient of the loss by the pixels
   bool dssim = p.weight_dssim > 0.0 && tile < p.near_tiles;
-  vec4 gamma[kPixels];                            // gradient of the loss (SPEC 2.7) by color and alpha
-  float transmittance[kPixels], behind[kPixels];  // behind: gradient times what lies behind the entries so far
+  vec4 gamma[kPixels];                            // gradient of the loss (mathematics.md 2.7) by color and alpha
+  float transmittance[kPixels], behind[kPixels];  // behind: gamma . (color and alpha behind the entries so far)
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
     bool inside = column < view.width && row + k < view.height;
     uint offset = (row + k) * view.width + column;
@@ -64,6 +66,8 @@ void main() {
     }
     transmittance[k] = 1.0;
   }
+
+  // entries front to back: the gradient by color, opacity, center and covariance
   for (uint begin = 0u; begin < used; begin += kShare) {
     uint turns = kShare > 1u ? min(kShare, used - begin) : 1u, own_turn = gl_SubgroupInvocationID % kShare;
     uvec2 own = sorted[start + begin + min(own_turn, turns - 1u)];
@@ -80,17 +84,17 @@ void main() {
       vec3 grad_color = vec3(0.0), moments = vec3(0.0);  // moments: of dL/d(exponent), by powers of dy
       [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
         float alpha = min(uncapped[k], kAlphaCap), before = transmittance[k];
-        bool seen;
-        float weight = blend_weight(alpha, transmittance[k], seen);
+        bool contributes;
+        float weight = blend_weight(alpha, transmittance[k], contributes);
         float gamma_color = dot(gamma[k], c);
         behind[k] -= weight * gamma_color;
         grad_color += weight * gamma[k].xyz;
         float grad_alpha = before * gamma_color - behind[k] / max(1.0 - alpha, 1e-6);
-        float g = seen && uncapped[k] <= kAlphaCap ? uncapped[k] * grad_alpha : 0.0;
+        float g = contributes && uncapped[k] <= kAlphaCap ? uncapped[k] * grad_alpha : 0.0;
         float g_dy = g * (dy + float(k));
         moments += vec3(g, g_dy, g_dy * (dy + float(k)));
       }
-      // from the column's dx and powers of dy back to those of Q delta = (conic.x dx + conic.y dy, conic.y dx + conic.z dy)
+      // from the moments in the column's dx and dy to those of Q delta (mathematics.md 2.8)
       const float kMinus2Ln2 = -1.3862944;
       float across = kMinus2Ln2 * falloff.fall, along = kMinus2Ln2 * falloff.along * dx;
       float grad_v = across * moments.y, grad_u = falloff.slope * grad_v + along * moments.x;
@@ -112,7 +116,7 @@ void main() {
     }
     if (cluster_lane < turns) partials[own_slot + cluster_slot + 8u] = own_blue;
   }
-  // entries that no pixel reached
+  // entries behind the last one that a pixel used have no gradient
   for (uint k = used + lane; k < n; k += gl_WorkGroupSize.x) {
     uint slot = 4u * kPartialRows * p.slots * sorted[start + k].y;
     for (uint m = 0u; m < 4u * kPartialRows * p.slots; ++m) partials[slot + m] = 0.0;

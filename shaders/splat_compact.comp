@@ -1,4 +1,4 @@
-// splat_compact.comp - one invocation a replica: the live ones, in order, into live[].
+// splat_compact.comp - one invocation per replica: writes the live ones to live[], in their order.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"

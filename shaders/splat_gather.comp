@@ -1,5 +1,6 @@
-// splat_gather.comp - one invocation a Gaussian: sums the records of its live replicas over the views of the chunk, in order,
-// and ends the chain rule at opacity logit, link logits and SH coefficients (SPEC 2.8).
+// splat_gather.comp - one invocation per Gaussian: sums the gradient records of its live replicas over the views of the
+// chunk, in a fixed order, and completes the chain rule to opacity logit, link logits and SH coefficients
+// (mathematics.md 2.8).
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
@@ -16,7 +17,7 @@ layout(std430, binding = 6) readonly buffer Motions { vec4 motions[]; };
 layout(std430, binding = 7) readonly buffer Counters { uint counters[]; };
 layout(std430, binding = 8) readonly buffer Records { vec4 records[]; };
 layout(std430, binding = 9) buffer Gradient { float gradient[]; };
-layout(std430, binding = 10) buffer ReplicaGradient { float replica_gradient[]; };  // d/d(opacity of replica)
+layout(std430, binding = 10) buffer ReplicaGradient { float replica_gradient[]; };  // d/d(opacity of the replica)
 
 void put(uint at, float value) {
   gradient[at] = (p.flags & kFlagAccumulate) != 0u ? gradient[at] + value : value;
@@ -36,7 +37,9 @@ void main() {
   float mean_gradient = 0.0;  // sum over links of rho_j d/d(sigma rho_j)
   bool held_links = (p.flags & kFlagHeldLinks) != 0u;
   vec3 mean = vec3(parameters[at_mean(n, i)], parameters[at_mean(n, i) + 1u], parameters[at_mean(n, i) + 2u]);
-  // from one live replica to the next: most have one, and a software device runs the body also where no lane takes it
+
+  // sum over replicas and views; the loop jumps from one live replica to the next, because most Gaussians have one and
+  // a software device executes the body of a branch even if no lane takes it
   for (uint j = 0u;; ++j) {
     while (j < p.links && live_flag[j * n + i] == 0u) {
       if (!held_links) replica_gradient[j * n + i] = 0.0;
@@ -69,13 +72,16 @@ void main() {
     mean_gradient += replica_opacity[e] / opacity * grad_opacity;
     if (!held_links) replica_gradient[e] = grad_opacity;
   }
+
+  // write the gradient by section
   for (uint k = 0u; k < 3u; ++k) {
     put(at_mean(n, i) + k, grad_mean[k]);
     put(at_log_scale(n, i) + k, grad_scale[k]);
     put(sh + k, sh_basis(0u, vec3(0.0)) * grad_dc[k]);
   }
   for (uint k = 0u; k < 4u; ++k) put(at_rotation(n, i) + k, grad_rotation[k]);
-  // replica opacity = sigma rho: with w_j = d/d(sigma rho_j), d/dsigma = sum rho_j w_j, d/dlambda_j = sigma rho_j (w_j - that)
+  // the replica's opacity is sigma rho_j: with w_j = d/d(sigma rho_j) this gives d/dsigma = sum rho_j w_j and
+  // d/dlambda_j = sigma rho_j (w_j - sum rho_j w_j)
   put(at_opacity(n, i), opacity * (1.0 - opacity) * mean_gradient);
   if (held_links) return;
   uint logits = at_link(n, p.coefficients, p.links, i);

@@ -1,4 +1,5 @@
-// splat_link_twist.comp - one group a (link, view): the link's twist gradient, summed over its live replicas in fixed order.
+// splat_link_twist.comp - one work group per (link, view): the gradient by the link's twist, summed over its live
+// replicas in a fixed order.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
@@ -8,7 +9,7 @@ layout(std430, binding = 0) readonly buffer LivePrefix { uint live_prefix[]; };
 layout(std430, binding = 1) readonly buffer LiveBlock { uint live_block[]; };
 layout(std430, binding = 2) readonly buffer Counters { uint counters[]; };
 layout(std430, binding = 3) readonly buffer Records { vec4 records[]; };
-layout(std430, binding = 4) writeonly buffer LinkTwist { vec4 link_twist[]; };  // (view * links + link) * 2: moment, force
+layout(std430, binding = 4) writeonly buffer LinkTwist { vec4 link_twist[]; };  // per (view, link): moment, force
 
 shared vec4 moments[64];
 shared vec4 forces[64];

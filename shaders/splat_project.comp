@@ -1,6 +1,7 @@
-// splat_project.comp - one invocation a (live replica, view): its 2-D splat, the tiles that it touches, and how many of them
-// are active. A splat reaches as far as its alpha reaches 1/255, not three sigma. Where the tiles' lists have their places
-// (tile_capacity) it also enters the splat into them: few splats are drawn sooner without prefix sums and splat_bin.comp.
+// splat_project.comp - one invocation per (live replica, view): its 2-D splat, the tiles that it touches, and how many
+// of them are active. A splat extends to where its alpha falls to 1/255, not to three sigma. Where the tiles' lists
+// have fixed places (tile_capacity) the pass also enters the splat into them: for few splats this is faster than prefix
+// sums and splat_bin.comp.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
@@ -24,11 +25,11 @@ layout(std430, binding = 9) buffer TileCount { uint tile_count[]; };
 layout(std430, binding = 10) writeonly buffer TileHits { uint tile_hits[]; };
 layout(std430, binding = 11) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica number, splat, -
 
-// exponent below which a Gaussian is 0 in float: the reach when there is no 1/255 cut
+// -exponent at which a Gaussian is about 0 in float: the extent when there is no 1/255 cut
 const float kFullReach = 80.0;
 
-// Least delta^T Q delta over the pixel centers' rectangle [low, high], given from the splat's center: where that lies outside,
-// it is on one of the two edges that face the center.
+// Least delta^T Q delta over the rectangle [low, high] of pixel centers, relative to the splat's center. If the center
+// lies outside, the minimum is on one of the two edges that face it.
 float least_in(vec3 conic, vec2 low, vec2 high) {
   vec2 facing = clamp(vec2(0.0), low, high);
   vec2 a = vec2(facing.x, clamp(-conic.y / conic.z * facing.x, low.y, high.y));
@@ -42,9 +43,11 @@ void main() {
   uint live_count = counters[kCounterLive];
   if (r >= live_count) return;
   uint e = live[r], n = p.gaussians, i = e % n, link = e / n;
-  uint replica = i * p.links + link;  // SPEC's index, breaks ties of depth
+  uint replica = i * p.links + link;  // number of replica (i, j) of mathematics.md 2.4, which breaks ties of depth
   uint out_index = v * live_count + r;
   SplatView view = views[v];
+
+  // project the replica
   uint motion = 3u * (view.motion + link);
   uint at = at_mean(n, i), aq = at_rotation(n, i), as = at_log_scale(n, i);
   vec3 mean = vec3(parameters[at], parameters[at + 1u], parameters[at + 2u]);
@@ -54,25 +57,29 @@ void main() {
   float opacity = replica_opacity[e];
   float determinant = a.cov.x * a.cov.z - a.cov.y * a.cov.y;
   vec2 u = view.intrinsics.xy * a.x.xy / a.x.z + view.intrinsics.zw;
+
   // half widths of the box where alpha can reach the cut
   float reach = kCutoffs != 0u ? 2.0 * log(255.0 * opacity) : 2.0 * kFullReach;
-  bool seen = a.x.z >= kNear && reach > 0.0 && determinant > 0.0;
+  bool visible = a.x.z >= kNear && reach > 0.0 && determinant > 0.0;
   vec2 half_width = sqrt(max(reach, 0.0) * a.cov.xz);
-  // pixel centers are at +0.5: pixel k is inside the box when u - h <= k + 0.5 <= u + h
+  // pixel centers are at + 0.5: pixel k is inside the box when u - h <= k + 0.5 <= u + h
   vec2 low = clamp(u - half_width - 0.5, vec2(-1.0), vec2(view.width, view.height) + 1.0);
   vec2 high = clamp(u + half_width - 0.5, vec2(-1.0), vec2(view.width, view.height) + 1.0);
   ivec2 first = max(ivec2(ceil(low)), ivec2(0));
   ivec2 last = min(ivec2(floor(high)), ivec2(view.width, view.height) - 1);
-  seen = seen && all(lessThanEqual(first, last));
+  visible = visible && all(lessThanEqual(first, last));
   uvec2 t0 = uvec2(max(first, ivec2(0))) / uvec2(kTileWidth, kTileHeight);
   uvec2 t1 = uvec2(max(last, ivec2(0))) / uvec2(kTileWidth, kTileHeight) + 1u;
-  if (!seen) t1 = t0;
+  if (!visible) t1 = t0;
+
+  // count the active tiles that it touches
   float inverse = 1.0 / determinant;
   vec3 conic = vec3(a.cov.z, -a.cov.y, a.cov.x) * inverse;
-  const float kSlack = 1.001;  // rounding never takes away a tile that a pixel of it would have shown
+  const float kSlack = 1.001;  // rounding must not drop a tile with a pixel that the splat reaches
   vec2 size = vec2(kTileWidth, kTileHeight);
   uint count = 0u, hits = 0u;
-  // one loop over the rectangle, not one over its rows and one in them: lanes with other rectangles wait for its area only
+  // one loop over the rectangle instead of one per row: lanes with smaller rectangles then wait for the largest area
+  // only, not for the largest number of rows times that of columns
   uint places = (t1.x - t0.x) * (t1.y - t0.y);
   uvec2 t = t0;
   for (uint place = 0u; place < places; ++place) {
@@ -91,7 +98,9 @@ void main() {
   tile_hits[out_index] = hits;
   instance_count[out_index] = count;
   if (count == 0u) t1 = t0;
-  vec3 direction = normalize(a.x) * a.link;  // R^T r: the view direction in the home frame
+
+  // color in the view direction, which in the home frame is R^T r
+  vec3 direction = normalize(a.x) * a.link;
   vec3 color = vec3(0.5);
   uint sh = at_sh(n, p.coefficients, i);
   for (uint l = 0u; l < p.coefficients; ++l) {

@@ -1,6 +1,7 @@
-// splat_project_backward.comp - one invocation a (live replica, view): sums its instances' partial gradients in their order
-// and takes them through the projection (SPEC 2.8) to the Gaussian's parameters and to the link's twist.
-// The link's moment is about the view's moment point, in the camera frame; the host turns it into the world's.
+// splat_project_backward.comp - one invocation per (live replica, view): sums the partial gradients of its instances in
+// their order and propagates them through the projection (mathematics.md 2.8) to the Gaussian's parameters and to the
+// link's twist. The link's moment is about the view's moment point, in the camera frame; the host transforms it to the
+// world frame.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
@@ -48,7 +49,8 @@ void main() {
   vec3 log_scale = vec3(parameters[as], parameters[as + 1u], parameters[as + 2u]);
   Projection a = project(view, motions[motion], motions[motion + 1u], motions[motion + 2u], mean, rotation, log_scale);
 
-  // color: zero where the max(0, .) acts
+
+  // color: no gradient where max(0, .) is active
   vec3 splat_color = splats[kSplatRows * s + 2u].xyz;
   vec3 grad_color = vec3(sum0.w, sum1.w, blue) * vec3(greaterThan(splat_color, vec3(0.0)));
   // Sigma' = T T^T, T = J M
@@ -57,14 +59,14 @@ void main() {
   vec3 grad_t1 = 2.0 * (h.y * a.t0 + h.z * a.t1);
   mat3 grad_m = outerProduct(a.j0, grad_t0) + outerProduct(a.j1, grad_t1);
   vec3 grad_j0 = a.m * grad_t0, grad_j1 = a.m * grad_t1;
-  // position, camera frame
+  // position in the camera frame
   float inverse_z = 1.0 / a.x.z, fx = view.intrinsics.x * inverse_z, fy = view.intrinsics.y * inverse_z;
   vec3 grad_x = vec3(fx * sum0.x, fy * sum0.y, -(fx * a.x.x * sum0.x + fy * a.x.y * sum0.y) * inverse_z);
   grad_x.z -= inverse_z * (fx * grad_j0.x + fy * grad_j1.y);
   grad_x.x -= a.clamped.x ? 0.0 : fx * inverse_z * grad_j0.z;
   grad_x.y -= a.clamped.y ? 0.0 : fy * inverse_z * grad_j1.z;
   grad_x.z -= inverse_z * ((a.clamped.x ? 1.0 : 2.0) * a.j0.z * grad_j0.z + (a.clamped.y ? 1.0 : 2.0) * a.j1.z * grad_j1.z);
-  // view direction of the spherical harmonics, home frame
+  // view direction of the spherical harmonics: by position, and as the link turns
   vec3 turn = vec3(0.0);
   if (p.coefficients > 1u) {
     float distance = length(a.x);
@@ -80,6 +82,7 @@ void main() {
     grad_x += (grad_camera_direction - camera_direction * dot(camera_direction, grad_camera_direction)) / distance;
     turn = -cross(camera_direction, grad_camera_direction);
   }
+  // scale, rotation, and the moment that the position and the covariance exert on the link
   vec3 grad_scale = vec3(dot(a.local[0], grad_m[0]), dot(a.local[1], grad_m[1]), dot(a.local[2], grad_m[2])) * a.scale;
   mat3 grad_r = transpose(a.link) * mat3(grad_m[0] * a.scale.x, grad_m[1] * a.scale.y, grad_m[2] * a.scale.z);
   vec3 moment = cross(a.x - view.moment_point.xyz, grad_x) + turn + cross(a.m[0], grad_m[0]) +

@@ -1,12 +1,13 @@
-// splat_replicate.comp - one invocation a Gaussian: opacity times link probability of each of its replicas (SPEC 2.4), and
-// which of them can be seen at all. Link-major order, so that a link's live replicas lie side by side.
-// reads parameters; writes replica_opacity[link * gaussians + i], live_flag[same].
+// splat_replicate.comp - one invocation per Gaussian: the opacity of each of its replicas, which is its own times the
+// link probability (mathematics.md 2.4), and whether that replica can be visible at all (live). The order is
+// link-major, so that a link's live replicas are contiguous.
+// reads parameters; writes replica_opacity[link * gaussians + i], live_flag[link * gaussians + i].
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
 #include "inc/gaussian.glsl"
 layout(local_size_x = 64) in;
-layout(constant_id = 0) const uint kCutoffs = 1u;  // 0: every replica lives (finite-difference tests)
+layout(constant_id = 0) const uint kCutoffs = 1u;  // 0: every replica is live (finite-difference tests)
 layout(push_constant) uniform Push { SplatPush p; };
 layout(std430, binding = 0) readonly buffer Parameters { float parameters[]; };
 layout(std430, binding = 1) writeonly buffer ReplicaOpacity { float replica_opacity[]; };

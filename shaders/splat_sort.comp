@@ -1,5 +1,6 @@
-// splat_sort.comp - one group an active tile: its entries by (depth, replica), where they are few: by rank, every key compared
-// with every other. Longer lists are left to splat_sort_long.comp, which a software device would otherwise step through here.
+// splat_sort.comp - one work group per active tile: sorts a short list by (depth, replica). It sorts by rank: every key
+// is compared with every other. Longer lists are left to splat_sort_long.comp, a kernel of its own because a software
+// device also steps through code that a branch skips.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -8,12 +9,12 @@
 #include "shared/splat.h"
 layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kRankLimit = 256u;  // longest list that is sorted by rank
-layout(constant_id = 2) const uint kShare = 8u;        // lanes of a subgroup
+layout(constant_id = 2) const uint kShare = 8u;        // lanes that load one key each and exchange them
 layout(push_constant) uniform Push { SplatPush p; };
 layout(std430, binding = 0) readonly buffer TilePrefix { uint tile_prefix[]; };
 layout(std430, binding = 1) readonly buffer TileBlock { uint tile_block[]; };
 layout(std430, binding = 2) readonly buffer TileCount { uint tile_count[]; };
-layout(std430, binding = 3) readonly buffer Entries { uvec4 entries[]; };  // depth's bits, replica, splat, instance
+layout(std430, binding = 3) readonly buffer Entries { uvec4 entries[]; };  // depth bits, replica, splat, instance
 layout(std430, binding = 4) writeonly buffer LongTiles { uint long_tiles[]; };
 layout(std430, binding = 5) writeonly buffer Sorted { uvec2 sorted[]; };   // splat, instance
 layout(std430, binding = 6) buffer Counters { uint counters[]; };
@@ -23,7 +24,7 @@ void main() {
   uint start = tile_prefix[tile] + tile_block[tile / kScanBlock];
   bool own_places = p.tile_capacity > 0u;
   uint n = !own_places && counters[kCounterOverflow] != 0u ? 0u : tile_count[tile];
-  bool no_place = own_places && n > p.tile_capacity;  // it could not be entered whole
+  bool no_place = own_places && n > p.tile_capacity;  // some of its entries were dropped
   if (n > kRankLimit || no_place) {
     if (lane == 0u) {
       if (no_place) {
@@ -38,12 +39,12 @@ void main() {
     n = 0u;
   }
   uint shared_lane = gl_SubgroupInvocationID % kShare;
-  // a lane counts the rank of two entries at a time: a key loaded once serves both
+  // a lane computes the ranks of two entries at a time, so that one loaded key serves both
   for (uint first = 0u; first < n; first += 2u * lanes) {
     uvec2 k = uvec2(first + lane, first + lanes + lane);
     uvec4 a = entries[start + min(k.x, n - 1u)], b = entries[start + min(k.y, n - 1u)];
     ivec2 depth = ivec2(a.x, b.x), nearer = ivec2(0), same = ivec2(0);  // positive floats sort like their bits
-    // kShare lanes load a key each, and hand them round
+    // kShare lanes load one key each and exchange them
     for (uint others = 0u; others < n; others += kShare) {
       uint other = others + shared_lane;
       int own_key = other < n ? int(entries[start + other].x) : 0x7fffffff;  // behind everything
@@ -53,7 +54,7 @@ void main() {
         same += ivec2(equal(key, depth));
       }
     }
-    // equal depths are rare: only then is the replica's number looked at
+    // only equal depths, which are rare, need the replicas' numbers
     uint ties = same.x > 1 || same.y > 1 ? n : 0u;
     for (uint m = 0u; m < ties; ++m) {
       uvec2 other = entries[start + m].xy;

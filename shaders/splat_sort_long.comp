@@ -1,5 +1,5 @@
-// splat_sort_long.comp - one group a tile that splat_sort left: its entries by (depth, replica), by a radix sort of the bits
-// in which the depths of the tile differ.
+// splat_sort_long.comp - one work group per tile that splat_sort.comp left: sorts its list by (depth, replica), with a
+// radix sort of the bits in which the depths of the tile differ.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -9,16 +9,16 @@ layout(push_constant) uniform Push { SplatPush p; };
 layout(std430, binding = 0) readonly buffer TilePrefix { uint tile_prefix[]; };
 layout(std430, binding = 1) readonly buffer TileBlock { uint tile_block[]; };
 layout(std430, binding = 2) readonly buffer TileCount { uint tile_count[]; };
-layout(std430, binding = 3) readonly buffer Entries { uvec4 entries[]; };  // depth's bits, replica, splat, instance
+layout(std430, binding = 3) readonly buffer Entries { uvec4 entries[]; };  // depth bits, replica, splat, instance
 layout(std430, binding = 4) readonly buffer LongTiles { uint long_tiles[]; };
-layout(std430, binding = 5) coherent buffer Scratch { uvec2 scratch[]; };  // two an entry: key, entry in the tile
+layout(std430, binding = 5) coherent buffer Scratch { uvec2 scratch[]; };  // two per entry: key, number in the list
 layout(std430, binding = 6) writeonly buffer Sorted { uvec2 sorted[]; };   // splat, instance
 
 const uint kDigitBits = 5u, kDigits = 1u << kDigitBits;
-const uint kLongRun = 8u;  // so many equal depths in a row are not sorted one against the other
-const uint kUnroll = 4u;   // lavapipe ends all loops of an invocation after 65535 iterations in sum: fewer, longer ones
+const uint kLongRun = 8u;  // more equal depths in a row than this are sorted by radix, not one against the other
+const uint kUnroll = 4u;   // fewer, longer iterations: lavapipe ends an invocation's loops after 65535 of them in all
 
-shared uint place[kDigits * gl_WorkGroupSize.x];  // [digit][lane]: how many, then where the next one goes
+shared uint place[kDigits * gl_WorkGroupSize.x];  // [digit][lane]: number of keys, then place of the next one
 shared uint lane_total[gl_WorkGroupSize.x];
 shared uint least, most, long_run;
 
@@ -27,13 +27,15 @@ void everyone_sees() {
   barrier();
 }
 
-// A lane's stretch of the tile's list: it counts and places these entries, so that equal keys keep their order.
+// The contiguous part of the tile's list that a lane counts and places: equal keys keep their order.
 struct Stretch {
   uint from, to;
 };
 
-// Sorts scratch[ping ..] by key, least significant digit first; returns where the result lies. All lanes take part.
+// Sorts scratch[ping ..] by key, least significant digit first, and returns where the result starts. All lanes must
+// call it.
 uint sort_by_key(uint ping, uint pong, Stretch s, uint lane, uint lanes) {
+  // range of the keys: only bits in which they differ are sorted by
   uint low = 0xffffffffu, high = 0u;
   for (uint first = s.from; first < s.to; first += kUnroll) {
     [[unroll]] for (uint m = 0u; m < kUnroll; ++m) {
@@ -50,9 +52,10 @@ uint sort_by_key(uint ping, uint pong, Stretch s, uint lane, uint lanes) {
   atomicMin(least, low);
   atomicMax(most, high);
   barrier();
-  low = least;  // only bits in which keys of this tile differ are looked at
+  low = least;
   uint bits = most > low ? uint(findMSB(most - low)) + 1u : 0u;
   for (uint shift = 0u; shift < bits; shift += kDigitBits) {
+    // count the keys of each digit
     [[unroll]] for (uint d = 0u; d < kDigits; ++d) place[d * lanes + lane] = 0u;
     for (uint first = s.from; first < s.to; first += kUnroll) {
       [[unroll]] for (uint m = 0u; m < kUnroll; ++m) {
@@ -61,7 +64,7 @@ uint sort_by_key(uint ping, uint pong, Stretch s, uint lane, uint lanes) {
       }
     }
     barrier();
-    // exclusive prefix sums over [digit][lane], a lane kDigits of them in a row
+    // exclusive prefix sums over [digit][lane], kDigits consecutive ones per lane
     uint total = 0u;
     [[unroll]] for (uint d = 0u; d < kDigits; ++d) {
       uint count = place[lane * kDigits + d];
@@ -74,6 +77,7 @@ uint sort_by_key(uint ping, uint pong, Stretch s, uint lane, uint lanes) {
     for (uint l = 0u; l < lane; ++l) before += lane_total[l];
     [[unroll]] for (uint d = 0u; d < kDigits; ++d) place[lane * kDigits + d] += before;
     barrier();
+    // move each item to its place
     for (uint first = s.from; first < s.to; first += kUnroll) {
       [[unroll]] for (uint m = 0u; m < kUnroll; ++m) {
         uint k = first + m;
@@ -99,17 +103,21 @@ void main() {
   uint start = tile_prefix[tile] + tile_block[tile / kScanBlock], n = tile_count[tile];
   uint each = (n + lanes - 1u) / lanes;
   Stretch s = Stretch(min(n, lane * each), min(n, (lane + 1u) * each));
-  uint begin = 2u * start, middle = begin + n;  // the tile's two halves of the scratch
+  uint begin = 2u * start, middle = begin + n;  // the tile's two halves of the scratch buffer
+
+  // sort by depth
   for (uint k = s.from; k < s.to; ++k) scratch[begin + k] = uvec2(entries[start + k].x, k);
   if (lane == 0u) long_run = 0u;
   everyone_sees();
   uint at = sort_by_key(begin, middle, s, lane, lanes);
+
+  // with a long run of equal depths, sort by replica first and then, keeping that order, by depth
   for (uint k = s.from; k < s.to; ++k) {
     if (k + kLongRun < n && scratch[at + k].x == scratch[at + k + kLongRun].x) long_run = 1u;
   }
   barrier();
   bool many_equal = long_run != 0u;
-  if (many_equal) {  // by replica first, then, keeping that order, by depth
+  if (many_equal) {
     for (uint k = s.from; k < s.to; ++k) scratch[begin + k] = uvec2(entries[start + k].y, k);
     everyone_sees();
     at = sort_by_key(begin, middle, s, lane, lanes);
@@ -117,13 +125,15 @@ void main() {
     everyone_sees();
     at = sort_by_key(at, at == begin ? middle : begin, s, lane, lanes);
   }
+
+  // write the result, short runs of equal depths by the rank of their replicas
   for (uint k = s.from; k < s.to; ++k) {
     uvec2 item = scratch[at + k];
     bool equal_before = k > 0u && scratch[at + k - 1u].x == item.x;
     bool equal_after = k + 1u < n && scratch[at + k + 1u].x == item.x;
     if (many_equal || (!equal_before && !equal_after)) {
       sorted[start + k] = entries[start + item.y].zw;
-    } else if (!equal_before) {  // entries came in any order; this lane sees to the whole run of equal depths
+    } else if (!equal_before) {  // this lane has the first of the run and writes all of it
       uint end = k + 1u;
       while (end < n && scratch[at + end].x == item.x) ++end;
       for (uint m = k; m < end; ++m) {

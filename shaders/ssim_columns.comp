@@ -1,6 +1,6 @@
-// ssim_columns.comp - the window along y over what ssim_rows left, a lane a strip of a column; the SSIM map's sum by tile, and
-// the three factors P, Q, R of its gradient (SPEC 2.7). Three vec4 a pixel, nine floats of them used:
-//   0: P.rgb, Q.r   1: Q.gb, R.rg   2: R.b
+// ssim_columns.comp - filters the output of ssim_rows.comp by the window along y, one strip of a column per lane, and
+// computes each tile's sum of 1 - SSIM and the three factors P, Q, R of its gradient (mathematics.md 2.7). Three vec4
+// per pixel, of which nine floats are used:   0: P.rgb, Q.r   1: Q.gb, R.rg   2: R.b
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -42,6 +42,8 @@ void main() {
       s2[k] += w * v2;
     }
   }
+
+  // the similarity and the factors of its gradient
   float sum = 0.0;
   bool inside = t.x * kTileWidth + column < view.width;
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
@@ -49,7 +51,7 @@ void main() {
     vec3 a1 = 2.0 * mx * my + kC1, a2 = 2.0 * (s2[k].yzw - mx * my) + kC2;
     vec3 b1 = mx * mx + my * my + kC1, b2 = vec3(s1[k].zw, s2[k].x) - mx * mx - my * my + kC2;
     vec3 similarity = a1 * a2 / (b1 * b2);
-    // the loss is weight * (1 - S): every pixel's factor is -weight; outside the image there is none
+    // the loss is weight * (1 - S), so the gradient by S is -weight for every pixel of the image
     bool counts = inside && t.y * kTileHeight + first + k < view.height;
     float g = counts ? -p.weight_dssim : 0.0;
     sum += counts ? dot(1.0 - similarity, vec3(1.0)) : 0.0;

@@ -1,5 +1,6 @@
-// ssim_columns_backward.comp - the window along y over what ssim_rows_backward left, a lane a strip of a column, and the
-// gradient of the D-SSIM term by the pixel's color: w*P + 2x (w*Q) + y (w*R) (SPEC 2.7).
+// ssim_columns_backward.comp - filters the output of ssim_rows_backward.comp by the window along y, one strip of a
+// column per lane, and forms the gradient of the D-SSIM term by the pixel's color: w*P + 2x (w*Q) + y (w*R)
+// (mathematics.md 2.7).
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require

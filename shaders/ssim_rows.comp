@@ -1,5 +1,5 @@
-// ssim_rows.comp - the window along x over image, target, the sum of their squares and their product; a lane a strip of a
-// row. Three vec4 a pixel:   0: x.rgb, y.r   1: y.gb, (xx + yy).rg   2: (xx + yy).b, xy.rgb
+// ssim_rows.comp - filters image x, target y, the sum of their squares and their product by the window along x; one
+// strip of a row per lane. Three vec4 per pixel:   0: x.rgb, y.r   1: y.gb, (xx + yy).rg   2: (xx + yy).b, xy.rgb
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require

@@ -1,5 +1,5 @@
-// ssim_rows_backward.comp - the window along x over the gradient factors P, Q, R; a lane a strip of a row; layout as
-// ssim_columns.comp leaves it.
+// ssim_rows_backward.comp - filters the gradient factors P, Q, R by the window along x, one strip of a row per lane; in
+// the layout of ssim_columns.comp.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require

@@ -1,5 +1,5 @@
-// test_add.comp - one invocation an element: to[i] = from[i] + kAdd. Reads one buffer, writes another: a chain of them
-// needs a barrier between, which synchronization validation can see.
+// test_add.comp - one invocation per element: to[i] = from[i] + kAdd. It reads one buffer and writes another, so that a
+// chain of these passes needs barriers, whose absence synchronization validation detects.
 #version 460
 layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kAdd = 0u;

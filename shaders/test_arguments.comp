@@ -1,5 +1,5 @@
-// test_arguments.comp - one invocation: the group counts of an indirect dispatch for `count` elements in groups of
-// kLanes, written after three words that belong to somebody else.
+// test_arguments.comp - one invocation: writes the group counts of an indirect dispatch for `count` elements in work
+// groups of kLanes, at an offset of three words.
 #version 460
 layout(local_size_x = 1) in;
 layout(constant_id = 0) const uint kLanes = 64u;

@@ -1,5 +1,5 @@
-// test_limits.comp - sixteen buffers and 128 bytes of push constants, the most that a kernel may ask for:
-// out[0] = sum over all buffers and all push words, each weighted with its place.
+// test_limits.comp - one invocation with sixteen buffers and 128 bytes of push constants, the most that a kernel may
+// ask for: out[0] = sum over all buffers and all push words, each weighted with its number.
 #version 460
 layout(local_size_x = 1) in;
 layout(push_constant) uniform Push { uvec4 words[8]; };

@@ -1,5 +1,5 @@
-// test_prefix.comp - one group: inclusive prefix sums of `count` elements with shuffles inside each subgroup and shared
-// memory between them; right for every subgroup size. size[0] tells gl_SubgroupSize.
+// test_prefix.comp - one work group: inclusive prefix sums of `count` elements, with shuffles inside each subgroup and
+// shared memory between them, for any subgroup size. size[0] returns gl_SubgroupSize.
 #version 460
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_shuffle : require
@@ -9,7 +9,7 @@ layout(std430, binding = 0) readonly buffer Values { uint values[]; };
 layout(std430, binding = 1) writeonly buffer Prefix { uint prefix[]; };
 layout(std430, binding = 2) writeonly buffer Size { uint size[]; };
 
-shared uint subgroup_total[gl_WorkGroupSize.x];  // more than there are subgroups: one lane is the smallest
+shared uint subgroup_total[gl_WorkGroupSize.x];  // enough even for subgroups of one lane
 shared uint block_total;
 
 void main() {
@@ -30,6 +30,6 @@ void main() {
     barrier();
     if (i < count) prefix[i] = carry + sum;
     carry += block_total;
-    barrier();  // before the next block writes the totals
+    barrier();  // the next block overwrites the totals
   }
 }

@@ -1,4 +1,4 @@
-// test_saxpy.comp - one invocation an element: y = scale * x + y. The least kernel, for the tests of the gpu module.
+// test_saxpy.comp - one invocation per element: y = scale * x + y. A minimal kernel for the tests of the gpu module.
 #version 460
 layout(local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint count; float scale; };

@@ -1,5 +1,5 @@
-// Captures: the demo against its truth, small captures made here with every source of images, and everything that can
-// be wrong with one.
+// Tests of captures: the demo against its truth, small captures made here with every source of images, and every kind
+// of problem that a capture can have.
 #include <OpenImageIO/imageio.h>
 #include <doctest/doctest.h>
 
@@ -29,7 +29,7 @@ namespace {
 
 const Path kDemo = Path(CHAINSPLAT_SOURCE_DIR) / "assets/demo_free_30";
 
-struct Folder {  // removed at the end
+struct Folder {  // a folder of this test, removed at the end
   Path path = std::filesystem::temp_directory_path() / ("chainsplat_capture_test_" + std::to_string(::getpid()));
   Folder() {
     std::filesystem::remove_all(path);
@@ -38,7 +38,7 @@ struct Folder {  // removed at the end
   ~Folder() { std::filesystem::remove_all(path); }
 };
 
-struct Warnings {  // collects what the library warns of
+struct Warnings {  // collects the library's warnings
   std::vector<std::string> lines;
   std::mutex mutex;
   Warnings() {
@@ -87,7 +87,7 @@ Image8 filled(int channels, const std::function<std::array<double, 3>(int, int)>
   return image;
 }
 
-// The object: a disk of radius 8 around (30 + frame, 22).
+// The object is a disk of radius 8 px around (30 + frame, 22).
 bool in_disk(double x, double y, int frame) { return std::hypot(x - 30 - frame, y - 22) <= 8.0; }
 
 Image8 disk_mask(int frame) {
@@ -102,7 +102,8 @@ std::string numbered(const std::string& stem, int k) {
   return stem + "/" + std::string(6 - number.size(), '0') + number + ".png";
 }
 
-// A capture of two cameras, 4 frames at 10 Hz: image folders, mask images and depth. The base is at (0, 0, 1) in front.
+// A capture of two cameras with 4 frames each at 10 Hz: image folders, mask images and depth. The base is in front of
+// them, near (0, 0, 1).
 struct Made {
   Folder folder;
   Json json;
@@ -166,7 +167,7 @@ const std::uint8_t* pixel(const View& view, int x, int y) {
 
 }  // namespace
 
-// load_recorded() gives what load() with these options gives.
+// Checks that load_recorded() returns what load() with the same options returns.
 void check_recorded(const Made& made, const std::string& camera) {
   LoadOptions options;
   options.camera = camera;
@@ -190,7 +191,7 @@ TEST_CASE("lens distortion: OpenCV's formula and its inverse") {
   camera.distortion = {-0.25, 0.08, 0.001, -0.0007, -0.01};
   CHECK(camera.distorted());
   for (const Vector2& u : {Vector2(5, 7), Vector2(315, 244), Vector2(600.5, 30.25), Vector2(200, 470)}) {
-    // written out term by term, as in OpenCV's documentation
+    // OpenCV's formula, written out term by term as in its documentation
     const double x = (u.x() - 315) / 610, y = (u.y() - 244) / 605, r2 = x * x + y * y;
     const double factor = 1 - 0.25 * r2 + 0.08 * r2 * r2 - 0.01 * r2 * r2 * r2;
     const double dx = x * factor + 2 * 0.001 * x * y - 0.0007 * (r2 + 2 * x * x);
@@ -236,12 +237,12 @@ TEST_CASE("the demo: masks, crops and base agree with the truth of the simulatio
   }
   CHECK(bright_outside == 0);
   CHECK(inside > 0.995 * points);
-  // captures/README.md of the simulation: 693, 606, 881 px in the mean of every 7th frame
+  // the simulation counted 693, 606 and 881 px per mask and camera, the mean over every 7th frame
   CHECK(object / 180.0 == doctest::Approx((693 + 606 + 881) / 3.0).epsilon(0.01));
 }
 
 TEST_CASE("videos decode to the pixels of another reader, whatever the number of threads") {
-  // OpenImageIO reads a video's first frame through its own use of libav
+  // OpenImageIO reads a video's first frame with its own libav code
   const auto input = OIIO::ImageInput::open((kDemo / "cam0.mp4").string());
   REQUIRE(input);
   Image8 other{input->spec().width, input->spec().height, 3, {}};
@@ -300,7 +301,7 @@ TEST_CASE("image folders, depth, crops") {
   REQUIRE(loaded.views.size() == 2 * kFrames);
   for (const View& view : loaded.views) {
     CHECK(view.time == doctest::Approx(0.1 * view.frame));
-    // the disk covers the pixels whose centers are within 8 of its middle: [22, 38) x [14, 30)
+    // the disk covers the pixels whose centers are within 8 px of its center: [22, 38) x [14, 30) in frame 0
     CHECK(view.x0 == 22 + view.frame - 3);
     CHECK(view.y0 == 14 - 3);
     CHECK(view.width == 16 + 6);
@@ -332,7 +333,7 @@ TEST_CASE("undistortion: straight pixels, masks, and edges that are not darkened
   camera.width = kWidth, camera.height = kHeight;
   camera.fx = camera.fy = 60, camera.cx = 32, camera.cy = 24;
   camera.distortion = {-0.2, 0.05, 0.002, -0.001, 0.01};
-  // what a lens would record of a scene that is linear in the undistorted image, and of the disk
+  // record, as through a lens, a scene that is linear in undistorted pixels, and the disk as mask
   for (int k = 0; k < kFrames; ++k) {
     const auto scene = [&](int x, int y) { return capture::undistort(camera, {x + 0.5, y + 0.5}); };
     capture::write_png(made.path() / numbered("cam0", k), filled(3, [&](int x, int y) {
@@ -361,9 +362,9 @@ TEST_CASE("undistortion: straight pixels, masks, and edges that are not darkened
         CHECK(std::abs(p[1] - (230 - 4 * (y + 0.5))) < 1.6);
         CHECK(p[2] == 200);
       }
-    CHECK(wrong < 0.06 * object);  // edge pixels only
+    CHECK(wrong < 0.06 * object);  // only edge pixels may differ
   }
-  // recorded pixels stay recorded pixels
+  // without undistortion the pixels are those of the files
   options.undistort = false;
   const Capture recorded = made.load(options);
   const Image8 image = capture::read_image8(made.path() / numbered("cam0", 1));
@@ -480,7 +481,7 @@ TEST_CASE("everything that can be wrong with capture.json is refused in one line
     made.json = before;
     return message;
   };
-  const double infinity = std::numeric_limits<double>::infinity();  // nlohmann writes it as null
+  const double infinity = std::numeric_limits<double>::infinity();  // the JSON library writes it as null
   CHECK(made.refused() == "");
   CHECK(contains(with("/format", "chainsplat-capture/2"), "format"));
   CHECK(contains(with("/scenario", "sea"), "scenario: 'sea' is unknown"));
@@ -526,7 +527,7 @@ TEST_CASE("everything that can be wrong with capture.json is refused in one line
   CHECK(contains(without("/cameras/0", "world_from_camera"), "world_from_camera: is missing"));
   CHECK(contains(without("/cameras/1", "rate"), "cameras[1].rate: is missing"));
 
-  // half a frame beyond the base is allowed
+  // frames may lie up to half a frame interval beyond the base
   made.json["cameras"][0]["start"] = 0.149;
   CHECK(made.refused() == "");
 }
@@ -557,7 +558,7 @@ TEST_CASE("numbers that memory and time follow are bounded, each with its reason
     crowd.push_back(made.json["cameras"][0]);
     crowd.back()["name"] = "cam" + std::to_string(c);
   }
-  CHECK(contains(with("/cameras", crowd), "capture.json: "));  // 4 MiB are reached first
+  CHECK(contains(with("/cameras", crowd), "capture.json: "));  // the bound of 4 MiB is exceeded first
   crowd.erase(crowd.begin() + 600, crowd.end());
   CHECK(contains(with("/cameras", crowd), "cameras: 600 are more than 512"));
   Json keys = made.json["object"];
@@ -664,14 +665,14 @@ TEST_CASE("a file that names other files is neither video nor image, whatever it
   CHECK(contains(made.refused(), "cam0.mp4: is not a readable video"));
   made.write("cam0.mp4", "ffconcat version 1.0\nfile 'real.mp4'\n");
   CHECK(contains(made.refused(), "cam0.mp4: is not a readable video"));
-  // a name that looks like an address is a name
+  // a file name that looks like an address is a file name
   std::filesystem::rename(made.path() / "real.mp4", made.path() / "concat:x.mp4");
   const Path before = std::filesystem::current_path();
   std::filesystem::current_path(made.path());
   CHECK(error_of([] { capture::VideoReader reader("concat:x.mp4"); }) == "");
   std::filesystem::current_path(before);
   std::filesystem::rename(made.path() / "concat:x.mp4", made.path() / "real.mp4");
-  // OpenImageIO reads videos, too
+  // OpenImageIO could read videos, but must not
   made.json["cameras"][0]["images"] = "cam0/%06d.png";
   made.write(numbered("cam0", 1), playlist);
   CHECK(contains(made.refused(), "cam0/000001.png: is not a readable image"));
@@ -831,7 +832,7 @@ TEST_CASE("a calibration is checked as a camera of a capture is") {
   CHECK(calibration.camera.fx == good["fx"].get<double>());
   CHECK(calibration.rate == good["rate"].get<double>());
   CHECK(calibration.start == 2.5);
-  CHECK(read(Json{{"cameras", {good}}}).camera.name == "cam0");  // a whole capture.json
+  CHECK(read(Json{{"cameras", {good}}}).camera.name == "cam0");  // the same in a whole capture.json
   CHECK(refused("fx", 600.0).empty());
   CHECK(contains(refused("width", 64.5), "camera.json: width"));
   CHECK(contains(refused("fx", 1e300), "camera.json: fx"));
@@ -959,7 +960,7 @@ TEST_CASE("check: nothing to complain about in the demo; wrong poses, clocks and
     CHECK(any_contains(report.problems, "object.length"));
     CHECK(any_contains(report.problems, "masks/none/000000.png"));
     CHECK(any_contains(report.problems, "cam9.mp4"));
-    CHECK(any_contains(report.facts, "cam1: 320x240"));  // the sound camera is described all the same
+    CHECK(any_contains(report.facts, "cam1: 320x240"));  // the camera without problems is still described
     CHECK(contains(error_of([&] { capture::load(copy); }), "and 2 more"));
   }
 }
@@ -983,11 +984,11 @@ TEST_CASE("the truth of a capture: refused when it is not one, absent without it
   };
   for (const auto& [text, expected] : wrong) {
     made.write("truth/centreline.csv", text);
-    const std::string given = text;
-    INFO(given);
+    const std::string file_text = text;
+    INFO(file_text);
     CHECK(contains(error_of([&] { capture::load_true_centerline(made.path()); }), expected));
     CHECK(any_contains(capture::check(made.path()).problems, expected));
-    CHECK(error_of([&] { capture::load(made.path()); }).empty());  // training never opens it
+    CHECK(error_of([&] { capture::load(made.path()); }).empty());  // training never opens the truth
   }
   made.write("truth/centreline.csv", "frame,time,x0,y0,z0\n0,77,1,2,3\n1,78,1,2,3\n");
   CHECK(any_contains(capture::check(made.path()).doubts, "says nothing of the times of"));

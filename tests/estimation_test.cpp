@@ -1,4 +1,5 @@
-// The filter on masks drawn from a known motion: a rope of the twin's kind with other parameters, seen by one camera.
+// Tests of the filter on masks drawn from a known motion: a rope of the twin's kind with other parameters, seen by one
+// camera.
 #include "chainsplat/estimation.h"
 
 #include <doctest/doctest.h>
@@ -34,7 +35,7 @@ twin::Twin rope_twin() {
   return twin;
 }
 
-// Swings along x, the camera looks along -y: out-of-plane motion is depth.
+// The base swings along x and the camera looks along y, so that motion out of that plane is depth.
 trajectory::BaseMotion moving_base(double t) {
   const double a = 0.05, w = 3.0;
   trajectory::BaseMotion base;
@@ -57,7 +58,7 @@ capture::Camera front_camera() {
   return c;
 }
 
-// Pixels whose rays pass within the radius of the rope's axis, tried at 3 x 3 places of a pixel.
+// Draws the mask of the pixels whose rays pass within the radius of the rope's axis, tried at 3 x 3 places per pixel.
 capture::View draw(const chain::Chain& chain, const VectorX& theta, double time, int frame, const capture::Camera& c) {
   const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, moving_base(time).pose));
   const Vector3 eye = c.world_from_camera.translation;
@@ -68,7 +69,7 @@ capture::View draw(const chain::Chain& chain, const VectorX& theta, double time,
     for (int i = 0; i + 1 < nodes.cols(); ++i) {
       const Vector3 a = nodes.col(i), d = nodes.col(i + 1) - nodes.col(i);
       if (d.norm() <= 0.0) continue;
-      // nearest points of the ray and the axis
+      // distance between the ray and the axis at their nearest points
       const Vector3 across = ray.cross(d);
       const double t = across.dot(ray.cross(eye - a)) / across.squaredNorm();
       if (t < (i == 0 ? 0.0 : -0.02) || t > 1.0) continue;
@@ -91,7 +92,7 @@ capture::View draw(const chain::Chain& chain, const VectorX& theta, double time,
   return view;
 }
 
-// True motion: from a bend out of the plane that the twin does not know of.
+// The true motion, from a bend out of the plane that the twin does not know.
 chain::States true_motion(const twin::Twin& twin, int frames) {
   dynamics::InitialState initial;
   initial.theta = VectorX::Zero(12);
@@ -112,7 +113,7 @@ double rms(const chain::Chain& chain, const VectorX& a, const VectorX& b) {
   return std::sqrt((p - q).squaredNorm() / p.cols());
 }
 
-// Standard deviation of the centerline, as rms measures it.
+// The standard deviation of the centerline over the same points as in rms().
 double deviation(const chain::Chain& chain, const estimation::Estimate& e) {
   const std::vector<double> arclengths = chain::equal_arclengths(chain, 31);
   const MatrixX p = chain::centerline(chain, chain::link_motions(chain, e.theta, Pose{}), arclengths);
@@ -178,8 +179,8 @@ TEST_CASE("one camera and the dynamics follow a rope in space, with honest devia
   }
 }
 
-// The rope with rings of irregular width painted on it, drawn on the host: the colors where the ray meets the tube, and
-// the depth there.
+// The rope with rings of irregular width painted on it, drawn on the host: the color and the depth where each ray meets
+// the tube.
 double paint(double arclength) { return 0.5 + 0.2 * std::sin(500.0 * arclength) + 0.2 * std::sin(313.0 * arclength); }
 
 splat::Picture painted(const chain::Chain& chain, const std::vector<Pose>& motions, const capture::View& view,
@@ -200,7 +201,7 @@ splat::Picture painted(const chain::Chain& chain, const std::vector<Pose>& motio
         const Vector3 a = camera_from_world * Vector3(nodes.col(i)), b = camera_from_world * Vector3(nodes.col(i + 1));
         if ((b - a).norm() <= 0.0) continue;
         const Vector3 d = (b - a).normalized();
-        // |(z ray - a) across d| = radius
+        // solve |(z ray - a) across d| = radius for the depth z
         const Vector3 u = ray - d * d.dot(ray), v = a - d * d.dot(a);
         const double p = u.dot(v), q = u.squaredNorm(), root = p * p - q * (v.squaredNorm() - radius * radius);
         if (root < 0.0) continue;
@@ -233,7 +234,7 @@ std::vector<capture::View> painted_views() {
   return views;
 }
 
-// What a device would say of the painted rope.
+// Compares colors as a device would, with the painted rope as the twin.
 std::vector<splat::ColorSums> compare_painted(std::span<const capture::View* const> views,
                                               std::span<const std::vector<Pose>> motions) {
   const capture::Camera camera = front_camera();
@@ -278,7 +279,7 @@ TEST_CASE("what has the rope's outline and not its marks is not the rope: lost i
   estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
   filter.compare_colors = compare_painted;
   const auto found = follow(filter, views);
-  for (int f = 0; f < 12; ++f) CHECK_FALSE(found[f].lost);  // it may be a glint
+  for (int f = 0; f < 12; ++f) CHECK_FALSE(found[f].lost);  // for some frames it may be a glint
   for (int f = 16; f < 24; ++f) CHECK(found[f].lost);
   for (std::size_t f = 26; f < found.size(); ++f) CHECK_FALSE(found[f].lost);
   CHECK(found[4].likeness.value() > 0.9);
@@ -313,8 +314,8 @@ TEST_CASE("Adam on the rendering loss finds the rope from near, and says nothing
   const auto spec = [&](const std::vector<Pose>& motions) {
     return splat::ViewSpec{&camera, 0, 0, view.width, view.height, motions};
   };
-  const splat::ViewSpec seen = spec(chain::link_motions(chain, truth, base));
-  const splat::Picture picture = engine.draw(gaussians, {&seen, 1}).front();
+  const splat::ViewSpec true_spec = spec(chain::link_motions(chain, truth, base));
+  const splat::Picture picture = engine.draw(gaussians, {&true_spec, 1}).front();
   for (std::size_t k = 0; k < picture.rgba.size(); ++k)
     view.rgba.push_back(k % 4 == 3
                             ? (picture.rgba[k] >= 0.5f ? 255 : 0)
@@ -332,11 +333,11 @@ TEST_CASE("Adam on the rendering loss finds the rope from near, and says nothing
         return gradients.link_twists.front();
       });
   adam.theta = truth;
-  for (int k = 0; k < 12; k += 2) adam.theta[k] += 0.03;  // in the picture's plane
+  for (int k = 0; k < 12; k += 2) adam.theta[k] += 0.03;  // bends in the image plane
   adam.time = -kInterval;
   std::vector<double> errors{rms(chain, adam.theta, truth)};
   for (int frame = 0; frame < 5; ++frame) {
-    view.time = frame * kInterval * 1e-6;  // the base stays
+    view.time = frame * kInterval * 1e-6;  // so short that the base stays
     const capture::View* const one[] = {&view};
     const estimation::Estimate e = estimation::update(adam, one);
     CHECK(asked == 10 * (frame + 1));
@@ -346,7 +347,7 @@ TEST_CASE("Adam on the rendering loss finds the rope from near, and says nothing
     CHECK(nlohmann::json::parse(estimation::to_json(e, 0.0))["sigma"].empty());
   }
   CHECK(errors[0] > 10e-3);
-  // steps of 0.01 rad do not come to rest: some millimeters remain
+  // steps of 0.01 rad do not converge, so that some millimeters remain
   for (int frame = 2; frame <= 5; ++frame) CHECK(errors[frame] < 0.4 * errors[0]);
 }
 
@@ -361,7 +362,7 @@ TEST_CASE("a clock whose zero is elsewhere changes nothing: frames may have nega
     estimation::Filter filter = estimation::start(
         shared_twin(), {front_camera()}, [=](double time) { return moving_base(time - zero); }, zero);
     filter.compare_colors = compare_painted;
-    std::vector<std::pair<estimation::Estimate, bool>> out;  // and whether it is thought to be touched
+    std::vector<std::pair<estimation::Estimate, bool>> out;  // with whether a contact is assumed
     for (capture::View view : views) {
       view.time += zero;
       const capture::View* const one[] = {&view};
@@ -387,7 +388,7 @@ TEST_CASE("a clock whose zero is elsewhere changes nothing: frames may have nega
 
 TEST_CASE("what hides a part of the rope is not 'no rope'") {
   std::vector<capture::View> views = shared_views();
-  for (int f = 12; f < 40; ++f)  // a hand before the middle of the rope
+  for (int f = 12; f < 40; ++f)  // a hand in front of the middle of the rope
     for (int y = 105; y < 150; ++y)
       for (int x = 0; x < views[f].width; ++x) views[f].rgba[4 * (y * views[f].width + x) + 3] = 0;
   estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
@@ -438,7 +439,7 @@ TEST_CASE("a rope that is elsewhere at once is found again") {
   CHECK(rms(shared_twin().chain, found[29].theta, thrown) < 10e-3);
 }
 
-// Stops the end of link `link` within an instant, as a rod in its way would.
+// Stops the end of a link instantly, as a rod in its way would.
 void strike(const dynamics::Model& model, const trajectory::BaseMotion& base, int link, dynamics::InitialState& state) {
   const MatrixX axes = chain::world_axes(model.chain, state.theta, base.pose);
   const MatrixX nodes = chain::nodes(model.chain, chain::link_motions(model.chain, state.theta, base.pose));
@@ -449,7 +450,8 @@ void strike(const dynamics::Model& model, const trajectory::BaseMotion& base, in
   state.thetadot -= push * (velocity.squaredNorm() / velocity.dot(j * push));
 }
 
-// Where the links end, of a belief conditioned on what a camera that looks along `ray` sees of them, 1 mm exact.
+// Returns the links' ends by a belief that is conditioned on their positions across `ray`, as a camera that looks along
+// it measures them to 1 mm.
 MatrixX seen_from(const chain::Chain& chain, const Pose& base, const estimation::Belief& belief, const Vector3& ray,
                   const MatrixX& true_nodes) {
   const int n = chain.angles(), count = static_cast<int>(true_nodes.cols());
@@ -492,7 +494,7 @@ TEST_CASE("a rope that swung into something is found where one camera does not s
     const MatrixX true_nodes = chain::nodes(twin.chain, chain::link_motions(twin.chain, truth, base));
     const estimation::Belief touched = estimation::predict(filter, belief, time, estimation::Contact::touched);
     const estimation::Belief struck = estimation::predict(filter, belief, time, estimation::Contact::struck);
-    const auto surprise = [&](const estimation::Belief& predicted) {  // squared deviations
+    const auto surprise = [&](const estimation::Belief& predicted) {  // the squared Mahalanobis distance
       const VectorX off = truth - predicted.mean.head(n);
       return off.dot(VectorX(predicted.covariance.topLeftCorner(n, n).llt().solve(off)));
     };
@@ -556,7 +558,7 @@ TEST_CASE("a mask that is too wide on a table is thought to be so on the rope's 
   twin.tabletop = true;
   twin.parameters.reset();  // nothing moves
   const int n = twin.chain.angles();
-  capture::Camera camera = front_camera();  // now 45 degrees down on the grasp, which is at the origin
+  capture::Camera camera = front_camera();  // turned to look 45 degrees down at the grasp, which is at the origin
   const double half = std::sqrt(0.5);
   camera.world_from_camera.rotation << 1, 0, 0, 0, -half, half, 0, -half, -half;
   camera.world_from_camera.translation = -0.7 * camera.world_from_camera.rotation.col(2);
@@ -564,10 +566,10 @@ TEST_CASE("a mask that is too wide on a table is thought to be so on the rope's 
       twin, {camera}, [](double) { return trajectory::BaseMotion{}; }, 0.0);
   filter.edge_offset = 0.5;
   estimation::Belief belief{0.0, VectorX::Zero(3 * n + 2), 1e-4 * MatrixX::Identity(3 * n + 2, 3 * n + 2)};
-  belief.mean.tail(2) << 1.0, -1.0;  // long forgotten
+  belief.mean.tail(2) << 1.0, -1.0;  // forgotten by the time of the prediction
   const VectorX shift = estimation::predict(filter, belief, 100.0, estimation::Contact::none).mean.tail(2);
   CHECK(shift[0] == doctest::Approx(0.0).epsilon(1e-6));
-  CHECK(shift[1] > 0.3);  // image rows go down
+  CHECK(shift[1] > 0.3);  // downward, as image rows count
   CHECK(shift[1] <= 0.5);
 }
 
@@ -578,9 +580,9 @@ TEST_CASE("the predicted covariance is that of the predicted mean's derivative")
   belief.time = 0.3;
   belief.mean = VectorX::Zero(3 * n);
   for (int k = 0; k < 3 * n; ++k) belief.mean[k] = 0.1 * std::sin(1.0 + k);
-  VectorX direction(3 * n);  // smooth along the rope: the variational equation is second order in stiff modes
+  VectorX direction(3 * n);  // smooth along the rope: the variational equation is of second order in stiff modes only
   for (int k = 0; k < 3 * n; ++k) direction[k] = 1.0 + 0.3 * std::cos(0.2 * k);
-  const double size = 1e4;  // makes the process noise small beside
+  const double size = 1e4;  // so large that the process noise is negligible
   belief.covariance = size * size * direction * direction.transpose();
   const estimation::Belief moved = estimation::predict(filter, belief, 0.3 + kInterval, estimation::Contact::none);
   const double step = 1e-5;
@@ -635,7 +637,7 @@ TEST_CASE("a line of JSON holds what INTERFACE 5 names") {
   CHECK(line["residual"] == 0.25);
   CHECK(line["lost"] == false);
   CHECK(line["latency_ms"].get<double>() == doctest::Approx(7.9));
-  e.theta[1] = NAN;  // JSON knows no such number
+  e.theta[1] = NAN;  // JSON has no such number
   e.covariance(1, 0) = INFINITY;
   const auto broken = nlohmann::json::parse(estimation::to_json(e, 0.0079));
   CHECK(broken["theta"][1].is_null());

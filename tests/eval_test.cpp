@@ -20,7 +20,7 @@ struct Pair {
   std::vector<float> x, y;
 };
 
-// Row-major RGB of a case of ssim.json, put at (left, top) of a black canvas.
+// Row-major RGB image of a case of ssim.json, placed at (left, top) of a black canvas.
 Pair pair_of(const Json& example, int left = 0, int top = 0, int right = 0, int bottom = 0) {
   const int width = example["width"], height = example["height"];
   Pair out{width + left + right, height + top + bottom, {}, {}};
@@ -54,7 +54,7 @@ capture::Camera small_camera() {
   return camera;
 }
 
-// A view whose mask is the rectangle [x0, x1) x [y0, y1), of one gray, inside a crop with some margin.
+// A view whose mask is the rectangle [x0, x1) x [y0, y1) of one gray, inside a crop with a margin.
 capture::View rectangle_view(int x0, int y0, int x1, int y1, std::uint8_t gray, float depth) {
   capture::View view;
   view.x0 = x0 - 2;
@@ -106,7 +106,7 @@ TEST_CASE("SSIM of a crop is that of the image around it") {
   const double whole = eval::ssim(image.x, image.y, image.width, image.height, pixels);
   CHECK(whole < 0.999);
   CHECK(std::abs(whole - eval::ssim(crop.x, crop.y, crop.width, crop.height, pixels)) < 1e-14);
-  // content at the image's border: zero padding there as well
+  // content at the image's border, which has zero padding as well
   const Pair corner = pair_of(example, 0, 0, 12, 12), corner_crop = pair_of(example, 0, 0, 5, 5);
   const double corner_pixels = static_cast<double>(corner.width) * corner.height;
   CHECK(std::abs(eval::ssim(corner.x, corner.y, corner.width, corner.height, corner_pixels) -
@@ -120,7 +120,7 @@ TEST_CASE("chamfer equals the double loop") {
     math::MatrixX p(3, count), q(3, 2 * count + 1);
     for (double& x : p.reshaped()) x = random.normal();
     for (double& x : q.reshaped()) x = random.normal();
-    q.row(2) *= 0.01;  // thin, as the surface of a rope
+    q.row(2) *= 0.01;  // flat, like the surface of a rope
     double forward = 0.0, backward = 0.0;
     for (const auto& a : p.colwise())
       forward += (q.colwise() - a).colwise().norm().minCoeff() / static_cast<double>(p.cols());
@@ -128,7 +128,7 @@ TEST_CASE("chamfer equals the double loop") {
       backward += (p.colwise() - b).colwise().norm().minCoeff() / static_cast<double>(q.cols());
     CHECK(eval::chamfer(p, q) == doctest::Approx(0.5 * (forward + backward)).epsilon(1e-12));
   }
-  // equal points many times over
+  // many equal points
   const math::MatrixX same = Vector3(1, 2, 3).replicate(1, 50);
   CHECK(eval::chamfer(same, same) == 0.0);
   CHECK(eval::chamfer(same, (same.colwise() + Vector3(0, 3, 4)).eval()) == doctest::Approx(5.0));
@@ -164,11 +164,11 @@ TEST_CASE("chamfer of depth images equals that of their points, near and far, st
 
 TEST_CASE("metrics of a frame, by hand") {
   const capture::Camera camera = small_camera();
-  // true: 10 x 6 pixels of 102/255 = 0.4; drawn: the same shifted by 5 columns, 0.6
+  // recorded: 10 x 6 pixels of 102/255 = 0.4; drawn: the same rectangle shifted by 5 columns, of 0.6
   const capture::View view = rectangle_view(10, 8, 20, 14, 102, 2.0f);
   const render::Frame frame = rectangle_frame(15, 8, 25, 14, 0.6f, 2.0f);
   const eval::FrameMetrics m = eval::compare(frame, view, camera);
-  // 30 pixels 0.4 against 0, 30 of 0.4 against 0.6, 30 of 0 against 0.6; all of 1200 pixels
+  // 30 pixels of 0.4 against 0, 30 of 0.4 against 0.6, 30 of 0 against 0.6; means over all 1200 pixels
   const double squared = 30 * 0.16 + 30 * 0.04 + 30 * 0.36;
   CHECK(m.psnr == doctest::Approx(-10 * std::log10(squared / 1200)).epsilon(1e-6));
   CHECK(m.psnr_object == doctest::Approx(-10 * std::log10((30 * 0.16 + 30 * 0.04) / 60)).epsilon(1e-6));
@@ -178,7 +178,7 @@ TEST_CASE("metrics of a frame, by hand") {
   CHECK(m.ssim < 0.95);
   CHECK(std::isnan(m.tip_rms));
 
-  // the same picture: everything perfect
+  // equal pictures: every metric is perfect
   const eval::FrameMetrics same =
       eval::compare(rectangle_frame(10, 8, 20, 14, static_cast<float>(0.4), 2.0f), view, camera);
   CHECK(same.psnr == eval::kMostPsnr);
@@ -186,11 +186,11 @@ TEST_CASE("metrics of a frame, by hand") {
   CHECK(same.ssim == doctest::Approx(1.0).epsilon(1e-12));
   CHECK(same.chamfer < 1e-12);
 
-  // depth alone wrong by 1 cm along the axis: nearest points are about that far
+  // only the depth is wrong, by 1 cm along the axis: nearest points are about as far apart
   const eval::FrameMetrics nearer = eval::compare(rectangle_frame(10, 8, 20, 14, 0.4f, 2.01f), view, camera);
   CHECK(nearer.chamfer == doctest::Approx(0.01).epsilon(0.02));
 
-  // nothing drawn, nothing there
+  // nothing is drawn and nothing is recorded
   capture::View nothing;
   const eval::FrameMetrics empty = eval::compare({}, nothing, camera);
   CHECK(empty.psnr == eval::kMostPsnr);
@@ -198,7 +198,7 @@ TEST_CASE("metrics of a frame, by hand") {
   CHECK(empty.iou == 1.0);
   CHECK(std::isnan(empty.psnr_object));
   CHECK(std::isnan(empty.chamfer));
-  // all that is drawn is wrong: psnr counts it, psnr_object has no pixel to count
+  // everything drawn is wrong: psnr counts it, psnr_object has no pixel to count
   const eval::FrameMetrics spurious = eval::compare(frame, nothing, camera);
   CHECK(spurious.iou == 0.0);
   CHECK(spurious.psnr == doctest::Approx(-10 * std::log10(60 * 0.36 / 1200)).epsilon(1e-6));
@@ -217,8 +217,8 @@ TEST_CASE("alpha and colors are clamped and thresholded as SPEC 9 says") {
 TEST_CASE("distorted pixels are straightened before they are projected back") {
   capture::Camera camera = small_camera();
   camera.distortion = {-0.3, 0.1, 0.003, -0.002, 0.0};
-  // recorded depth of one pixel; the drawn cloud is that pixel as well, so both are the same point wherever it is. Move
-  // the camera's principal point by a pixel for the expected distance: depth * 1 px / f
+  // if the same pixel is recorded and drawn, the points are equal; with the next pixel drawn, their distance is depth /
+  // f times that of the undistorted pixels
   const eval::FrameMetrics same =
       eval::compare(rectangle_frame(33, 25, 34, 26, 0.4f, 1.0f), rectangle_view(33, 25, 34, 26, 102, 1.0f), camera);
   CHECK(same.chamfer == 0.0);
@@ -277,7 +277,7 @@ TEST_CASE("a twin explains pictures of itself, and the metrics know by how much 
       recorded.views.push_back(std::move(view));
     }
   }
-  // and two views that no state covers
+  // two views that no state covers
   capture::View late = recorded.views.back();
   late.frame = 39;
   late.time = recorded.times[1][39];
@@ -286,7 +286,7 @@ TEST_CASE("a twin explains pictures of itself, and the metrics know by how much 
   late.time = recorded.times[1][38];
   recorded.views.insert(recorded.views.end() - 1, late);
 
-  // truth by nodes of the chain: the chain has points at 0, 13 mm and every 57.4 mm; 301 points are 1 mm apart
+  // the truth is the chain, with nodes at 0, 13 mm and every 57.4 mm from there; its 301 points are 1 mm apart
   std::filesystem::create_directories(folder.path / "truth");
   std::string text = "frame,time";
   for (int i = 0; i <= 300; ++i)
@@ -311,16 +311,16 @@ TEST_CASE("a twin explains pictures of itself, and the metrics know by how much 
   CHECK(metrics.camera_names == std::vector<std::string>{"cam0", "cam1"});
   CHECK(metrics.mean.iou == 1.0);
   CHECK(metrics.mean.psnr_object > 52.0);  // 8 bits: 20 log10(255 sqrt(12)) = 58.9
-  CHECK(metrics.mean.psnr > 35.0);         // less: the faint rim outside the mask is black in the recording
+  CHECK(metrics.mean.psnr > 35.0);         // lower, because the faint rim outside the mask is black in the recording
   CHECK(metrics.mean.ssim > 0.98);
   CHECK(metrics.mean.chamfer < 1e-7);
   CHECK(metrics.empty_clouds == 0);
   CHECK(metrics.cameras[0].centerline_rms < 1e-4);
   CHECK(metrics.cameras[0].tip_rms < 1e-12);
-  CHECK(metrics.cameras[1].tip_rms < 1e-3);  // between the truth's times: cubic
+  CHECK(metrics.cameras[1].tip_rms < 1e-3);  // between the truth's times, where it is interpolated by cubics
   CHECK(metrics.cameras[1].tip_rms > 1e-9);
 
-  // a base that is 5 mm away moves the centerline by exactly that, and the picture by enough to see
+  // a base that is off by 5 mm moves the centerline by exactly as much, and the picture noticeably
   capture::Capture shifted = recorded;
   std::vector<trajectory::Sample> samples = recorded.base.samples();
   for (trajectory::Sample& sample : samples) sample.pose.translation += Vector3(0.003, 0, 0.004);
@@ -342,7 +342,7 @@ TEST_CASE("a twin explains pictures of itself, and the metrics know by how much 
     if (!std::isnan(frame.tip_rms)) squares += frame.tip_rms * frame.tip_rms;
   CHECK(off.mean.tip_rms == doctest::Approx(std::sqrt(squares / 61)));
 
-  // the same on one thread
+  // the result is the same on one thread
   const int threads = core::threads();
   core::set_threads(1);
   CHECK(eval::to_json(eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, shifted)) == eval::to_json(off));

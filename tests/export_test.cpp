@@ -45,7 +45,7 @@ math::Matrix3 rotation_of(const double* xyzw) {
   return Eigen::Quaterniond(xyzw[3], xyzw[0], xyzw[1], xyzw[2]).toRotationMatrix();
 }
 
-// World transforms of all nodes with the animation's key `key` put on (key < 0: the static ones), as a viewer does it.
+// World transforms of all nodes at key `key` of the animation (key < 0: without it), computed as a viewer does.
 std::vector<math::Pose> world_transforms(const tinygltf::Model& model, int key) {
   std::vector<tinygltf::Node> nodes = model.nodes;
   if (key >= 0) {
@@ -72,7 +72,7 @@ std::vector<math::Pose> world_transforms(const tinygltf::Model& model, int key) 
   return world;
 }
 
-// glTF is y-up: world (x, y, z) of ours is (x, z, -y) there.
+// glTF is y-up: our world point (x, y, z) is (x, z, -y) there.
 math::Pose y_up() {
   math::Matrix3 turn;
   turn << 1, 0, 0, 0, 0, 1, 0, -1, 0;
@@ -120,7 +120,7 @@ TEST_CASE("the animated nodes are where the chain's links are") {
 TEST_CASE("the animation is what viewers need") {
   const twin::Twin twin = test::small_twin(chain::Bending::spatial, 60);
   chain::States motion = test::swing(twin.chain, 1.0);
-  // the base turns by more than half a turn: plain quaternions would flip their sign on the way
+  // the base turns by more than half a turn, so quaternions would flip their sign if their signs were not continued
   std::vector<trajectory::Sample> samples;
   for (int k = 0; k <= 60; ++k)
     samples.push_back({k / 60.0, {math::exp_so3({0, 0, 5.0 * k / 60.0}), math::Vector3::Zero()}});
@@ -160,7 +160,7 @@ TEST_CASE("every Gaussian is on its link, in the extension's units") {
   std::size_t total = 0;
   for (int j = 0; j < twin.chain.links(); ++j) {
     const tinygltf::Node& node = model.nodes[link_node(model, j)];
-    // members by arclength: the spiral's Gaussians are sure of the link that holds their arclength
+    // the members follow from the arclength: each Gaussian of the spiral is certain of the link that contains it
     std::vector<int> members;
     for (int i = 0; i < g.count; ++i) {
       const double s = twin.chain.length * (i + 0.5) / g.count;
@@ -194,7 +194,7 @@ TEST_CASE("every Gaussian is on its link, in the extension's units") {
         CHECK(position[3 * m + c] >= bounds.minValues[c]);
         CHECK(position[3 * m + c] <= bounds.maxValues[c]);
       }
-      // ln 0.004 and ln 0.006 went in; logit 2; quaternions 1.3 long, wxyz
+      // the input was ln 0.004 and ln 0.006, a logit of 2, and quaternions wxyz of length 1.3
       CHECK(scale[3 * m] == doctest::Approx(0.004));
       CHECK(scale[3 * m + 2] == doctest::Approx(0.006));
       CHECK(opacity[m] == doctest::Approx(0.8807970779778823));
@@ -250,7 +250,7 @@ TEST_CASE("files by ending") {
   CHECK(glb == exports::gltf(twin.gaussians, twin.chain, twin.rollout, base, true));
   exports::write(twin, twin.rollout, base, folder.path / "a.gltf");
   loaded(core::read_file(folder.path / "a.gltf"), false);
-  // for tools/test-gltf, which has the file judged by an outside program
+  // for tools/test-gltf, which checks the file with an outside program
   if (const char* const kept = std::getenv("CHAINSPLAT_TEST_GLB")) core::write_file(kept, glb);
 
   const auto message = [&](const char* name, const twin::Twin& of) -> std::string {

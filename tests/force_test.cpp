@@ -1,5 +1,5 @@
-// External forces against vectors made without this code (tests/data/vectors), motions known in closed form, and ropes
-// put in balance with a force.
+// Tests of external forces against vectors computed without this code (tests/data/vectors), motions known in closed
+// form, and ropes in balance with a force.
 #include "chainsplat/force.h"
 
 #include <doctest/doctest.h>
@@ -37,7 +37,7 @@ dynamics::Parameters uniform(int joints, int angles, double mass, double stiffne
   return p;
 }
 
-// The elastic rope of DESIGN's captures, hanging, with rest angles that put it in balance at `theta` with a force.
+// The elastic rope of the simulated captures, hanging, with rest angles that balance it at `theta` with a force.
 struct Balanced {
   dynamics::Model model;
   math::Pose base;
@@ -53,7 +53,7 @@ Balanced balance(chain::Bending bending, const VectorX& theta, double arclength,
   out.model = dynamics::make_model(rope, p);
   const int link = chain::link_at(rope, arclength);
   const auto motions = chain::link_motions(rope, theta, out.base);
-  // on the side of the rope that is pushed
+  // the contact's point on the side of the rope that is pushed
   const Vector3 push = motions[link].rotation.transpose() * force;
   const Vector3 across = push - rope.direction.dot(push) * rope.direction;
   Vector3 home = arclength * rope.direction;
@@ -62,7 +62,7 @@ Balanced balance(chain::Bending bending, const VectorX& theta, double arclength,
       chain::point_jacobian(rope, chain::world_axes(rope, theta, out.base), link, motions[link] * home);
   const VectorX zero = VectorX::Zero(theta.size());
   const VectorX gravity = dynamics::inverse_dynamics(out.model, dynamics::at_rest(out.base), theta, zero, zero);
-  // J^T f = gravity + K (theta - rest)
+  // solve J^T f = gravity + K (theta - rest) for the rest angles
   for (int k = 0; k < theta.size(); ++k)
     p.rest_angle[k] = theta[k] + (gravity[k] - jacobian.col(k).dot(force)) / p.stiffness[k];
   out.model = dynamics::make_model(rope, p);
@@ -116,7 +116,7 @@ TEST_CASE("Jacobian, residual torque and force of the vectors") {
     const force::Fit fit =
         force::solve(jacobian, residual, 1e-8 * MatrixX::Identity(links, links), 1e6 * Matrix3::Identity());
     CHECK((fit.force - Vector3(vector_of(test["estimate"]))).norm() <= 1e-6);
-    // the bending axis is invisible and said to be
+    // the bending axis is unobservable, and the covariance shows it
     CHECK(fit.covariance(1, 1) == doctest::Approx(1e6));
   }
 }
@@ -143,7 +143,7 @@ TEST_CASE("smoothing finds angle, rate and acceleration of a swing, and its own 
     ++used;
   }
   CHECK(std::sqrt(rate / used) < 0.04);
-  CHECK(std::sqrt(acceleration / used) < 0.5);  // second differences: 11 rad/s^2
+  CHECK(std::sqrt(acceleration / used) < 0.5);  // second differences have 11 rad/s^2
   CHECK(inside >= 0.95 * used);
 }
 
@@ -187,7 +187,7 @@ TEST_CASE("a force is found where it acts, automatically") {
     for (const force::Estimate& e : found) {
       CHECK(e.touching);
       CHECK(std::abs(e.contact.arclength - arclength) < 0.015);
-      // along the rope, which hangs nearly straight, the force and its place are hardly told apart
+      // along the rope, which hangs nearly straight, a force can hardly be distinguished from a change of its place
       CHECK((e.force - force).head<2>().norm() < 0.1 * force.norm());
       CHECK((e.force - force).norm() < 0.5 * force.norm());
       for (int i = 0; i < 3; ++i) CHECK(std::abs(e.force[i] - force[i]) <= 3.0 * e.sigma[i]);
@@ -229,17 +229,18 @@ TEST_CASE("a planar chain says that it does not see the force along its bending 
   CHECK(line["force"][0] == found[0].force.x());
 }
 
-// A rope of 40 links under a moving base and a force, and the angles of a chain of few links that are nearest to it.
+// A rope of many links under a moving base and a force, and noisy angles of the nearest chain of few links.
 struct Swing {
   trajectory::Trajectory base;
-  chain::States seen;
-  std::vector<Vector3> push;  // N, at the seen times
+  chain::States observed;
+  std::vector<Vector3> push;  // N, at the observed times
 };
 
 Swing swing(const dynamics::Model& rope, const chain::Chain& twin, double amplitude, double frequency, int frames,
             double place, const std::function<Vector3(double)>& push_at, core::Random& random) {
   constexpr int kSubsteps = 4;
   constexpr double kRate = 30.0, kNoise = 0.003;  // 1/s, rad
+  // the base's motion
   Swing out;
   std::vector<trajectory::Sample> samples;
   for (int i = 0; i <= 4 * frames; ++i) {
@@ -257,6 +258,7 @@ Swing swing(const dynamics::Model& rope, const chain::Chain& twin, double amplit
     const double time = step * h;
     const math::Pose pose = out.base.pose(time);
     const auto motions = chain::link_motions(rope.chain, theta, pose);
+    // fit the twin's angles to the rope's centerline at every frame
     if (step % kSubsteps == 0) {
       const MatrixX curve = chain::centerline(rope.chain, motions, arclengths);
       for (int iteration = 0; iteration < 4; ++iteration) {
@@ -273,12 +275,12 @@ Swing swing(const dynamics::Model& rope, const chain::Chain& twin, double amplit
         }
         angles += normal.ldlt().solve(gradient);
       }
-      out.seen.time.push_back(time);
-      out.seen.theta.push_back(angles);
-      for (int k = 0; k < twin.angles(); ++k) out.seen.theta.back()[k] += kNoise * random.normal();
+      out.observed.time.push_back(time);
+      out.observed.theta.push_back(angles);
+      for (int k = 0; k < twin.angles(); ++k) out.observed.theta.back()[k] += kNoise * random.normal();
       out.push.push_back(push_at(time));
     }
-    // the push as a shift of the rest angles
+    // integrate, with the push as a shift of the rest angles
     const MatrixX jacobian = chain::point_jacobian(rope.chain, chain::world_axes(rope.chain, theta, pose), link,
                                                    motions[link] * Vector3(place * rope.chain.direction));
     dynamics::Model pushed = rope;
@@ -292,7 +294,7 @@ Swing swing(const dynamics::Model& rope, const chain::Chain& twin, double amplit
   return out;
 }
 
-// The twin is identified from another swing that nothing touches, of a rope that is damped less. Pushed twice, by a
+// The twin is identified from another, untouched swing of a rope with less damping. The rope is then pushed twice, by a
 // force that grows and falls.
 TEST_CASE("pushes on a swinging rope that is finer and more damped than its twin") {
   const double length = 0.3, mass = 0.06, bending = 4.5e-4, place = 0.19;  // m, kg, N m^2, m
@@ -303,7 +305,7 @@ TEST_CASE("pushes on a swinging rope that is finer and more damped than its twin
   const auto rope_of = [&](double damping_time) {
     const double stiffness = bending * 40 / length;
     dynamics::Parameters p = uniform(40, 40, mass, stiffness, damping_time * stiffness, 0.01);
-    p.stiffness[0] *= 2.0, p.damping[0] *= 2.0;  // half as much rope bends at the grasp
+    p.stiffness[0] *= 2.0, p.damping[0] *= 2.0;  // at the grasp half as much rope bends
     return dynamics::make_model(fine, p);
   };
   const auto push_at = [](double time) {
@@ -317,7 +319,7 @@ TEST_CASE("pushes on a swinging rope that is finer and more damped than its twin
   const Swing pushed = swing(rope_of(0.10), coarse, 0.08, 0.4, 150, place, push_at, random);
   identification::Options options;
   options.mass = mass;
-  const identification::Result twin = identification::identify(coarse, alone.base, alone.seen, options);
+  const identification::Result twin = identification::identify(coarse, alone.base, alone.observed, options);
   const dynamics::Model model = dynamics::make_model(coarse, twin.parameters);
   const std::vector<dynamics::Model> deviations = force::deviations(model, twin.estimates);
   const auto base = [&](double time) { return pushed.base.at(time); };
@@ -334,14 +336,14 @@ TEST_CASE("pushes on a swinging rope that is finer and more damped than its twin
       follower.model = model;
       follower.deviations = deviations;
       follower.base = base;
-      for (std::size_t f = 0; f < pushed.seen.time.size(); ++f)
-        if (const auto line = force::update(follower, pushed.seen.time[f], pushed.seen.theta[f], {}))
+      for (std::size_t f = 0; f < pushed.observed.time.size(); ++f)
+        if (const auto line = force::update(follower, pushed.observed.time[f], pushed.observed.theta[f], {}))
           found.push_back(*line);
       for (const force::Estimate& line : force::finish(follower)) found.push_back(line);
     } else {
-      found = force::estimate(model, deviations, base, force::smooth(pushed.seen), {});
+      found = force::estimate(model, deviations, base, force::smooth(pushed.observed), {});
     }
-    REQUIRE(found.size() == pushed.seen.time.size());
+    REQUIRE(found.size() == pushed.observed.time.size());
     std::vector<double> angle, share, away, feigned;
     int honest = 0;
     for (std::size_t f = 0; f < found.size(); ++f) {
@@ -372,7 +374,7 @@ TEST_CASE("on a table friction at rest hides forces, and the interval says how m
   const force::Contact contact{chain::link_at(rope, 0.2), 0.2, 0.2 * rope.direction};
   const std::vector<std::optional<force::Contact>> contacts(5, contact);
   const Vector3 push(0.0, 0.1, 0.0);
-  // the rope's rest angles are such that it lies straight under the push, and friction has nothing to do, or all
+  // with these rest angles the rope lies straight under the push, and friction balances none, half or all of it
   const MatrixX jacobian = chain::point_jacobian(rope, chain::world_axes(rope, VectorX::Zero(8), {}), contact.link,
                                                  contact.arclength * rope.direction);
   for (const double held : {0.0, 0.5, 1.0}) {
@@ -385,13 +387,14 @@ TEST_CASE("on a table friction at rest hides forces, and the interval says how m
       CHECK_FALSE(e.moving);
       CHECK(e.low.y() < push.y());
       CHECK(e.high.y() > push.y());
-      CHECK(e.high.y() - e.low.y() < 0.5);  // friction of 0.2 N to either side, and the prior's shrinking
+      CHECK(e.high.y() - e.low.y() < 0.5);  // friction of 0.2 N on either side, and the shrinkage by the prior
       CHECK(e.low.z() == doctest::Approx(e.high.z()));
     }
   }
 }
 
-// A finger that pushes a sliding rope presses it down, one that brakes it lifts it: the rope's roll rubs at the finger.
+// A finger that pushes a sliding rope presses it down, and one that brakes it lifts it, because the rolling rope rubs
+// at the finger.
 TEST_CASE("on a table a push is told with what it presses the rope down") {
   const chain::Chain rope =
       chain::make_chain(0.3, 0.02, Vector3::UnitX(), Vector3::UnitZ(), 8, chain::Bending::planar, false);
@@ -409,11 +412,11 @@ TEST_CASE("on a table a push is told with what it presses the rope down") {
   const Vector3 slip = (jacobian * thetadot).normalized();
   const Vector3 across = Vector3::UnitZ().cross(motions[contact.link].rotation * rope.direction);
   const force::Options options;
-  for (const double push : {0.15, -0.15}) {  // with the slip and, braking it, against
+  for (const double push : {0.15, -0.15}) {  // N, along the slip, and against it to brake it
     CAPTURE(push);
     const Vector3 force = push * slip;
     const double pressed = options.pressing * push;
-    // what the rope feels: the push, friction of what presses the rope down, and the roll that is held back
+    // the torque by the push, by the friction of what presses the rope down, and by the impeded roll
     VectorX torque = jacobian.transpose() * (force - 0.35 * pressed * slip);
     for (int k = 0; k < 8; ++k)
       torque[k] -=
@@ -430,7 +433,7 @@ TEST_CASE("on a table a push is told with what it presses the rope down") {
       CHECK(e.moving);
       CHECK((flat - force).norm() < 0.1 * std::abs(push));
       CHECK(e.force.z() == doctest::Approx(-pressed).epsilon(0.1));
-      CHECK(e.observed.z() < 1e-6);  // it is only thought
+      CHECK(e.observed.z() < 1e-6);  // inferred from the push alone
     }
   }
 }
@@ -475,7 +478,7 @@ TEST_CASE("what is not known of the parameters' covariance is named, and the res
   estimates.covariance = 0.01 * MatrixX::Identity(3, 3);
   CHECK(force::deviations(rope.model, estimates).size() == 2);
   estimates.covariance.row(1).setConstant(NAN), estimates.covariance.col(1).setConstant(NAN);
-  CHECK(force::deviations(rope.model, estimates).size() == 2);  // an initial angle is no parameter
+  CHECK(force::deviations(rope.model, estimates).size() == 2);  // an initial angle is not a parameter
   CHECK(warnings.empty());
   estimates.covariance(2, 2) = NAN;
   const auto kept = force::deviations(rope.model, estimates);

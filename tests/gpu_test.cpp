@@ -1,5 +1,5 @@
-// Tests of chainsplat/gpu.h. Devices are opened with validation, and most lists run twice: with what the device offers,
-// and as on the least device (descriptor sets, staged transfers). Expected values are computed by the host.
+// Tests of chainsplat/gpu.h. Devices are opened with validation, and most lists run twice: with all that the device
+// offers, and as on the least capable one (descriptor sets, staged transfers). The host computes the expected values.
 #include "chainsplat/gpu.h"
 
 #include <doctest/doctest.h>
@@ -30,7 +30,7 @@ struct SaxpyPush {
   float scale;
 };
 
-// A device with validation; without the layer the test must fail, not pass unseen.
+// A device with validation. Without the layer the test must fail, not pass unchecked.
 gpu::DevicePtr open_validated(bool least = false) {
   gpu::DeviceOptions options;
   options.validation = true;
@@ -50,7 +50,7 @@ std::vector<std::uint32_t> read(gpu::Device& device, const Buffer& buffer) {
   return values;
 }
 
-// Sets an environment variable for the life of the object; null unsets it.
+// Sets an environment variable for the lifetime of the object; null unsets it.
 class Environment {
  public:
   Environment(const char* name, const char* value) : name_(name) {
@@ -68,7 +68,7 @@ class Environment {
   bool had_ = false;
 };
 
-// Exit code of `body` in a child process: drivers and loader read some variables once only.
+// Exit code of `body` in a child process, because drivers and the loader read some variables only once per process.
 template <class Body>
 int in_child(Body body) {
   const pid_t child = fork();
@@ -119,7 +119,7 @@ TEST_CASE("prefix sums do not depend on the subgroup size") {
     const int code = in_child([width] {
       setenv("LP_NATIVE_VECTOR_WIDTH", width, 1);
       gpu::DevicePtr device = open_validated();
-      constexpr std::uint32_t kCount = 1000;  // not a multiple of any group
+      constexpr std::uint32_t kCount = 1000;  // not a multiple of any work group's size
       Buffer values(*device, kCount * 4, Domain::host, "values"), prefix(*device, kCount * 4, Domain::host, "prefix"),
           size(*device, 4, Domain::host, "size");
       std::vector<std::uint32_t> expected(kCount);
@@ -173,7 +173,7 @@ TEST_CASE("devices are listed and chosen by number, name and variable") {
   } catch (const InputError& error) {
     const std::string text = error.what();
     CHECK(text.find("no such device") != std::string::npos);
-    CHECK(text.find(chosen.name) != std::string::npos);  // what there is instead
+    CHECK(text.find(chosen.name) != std::string::npos);  // the message lists the available devices
     CHECK(text.find('\n') == std::string::npos);
   }
   {
@@ -236,7 +236,7 @@ TEST_CASE("subgroups are of one size, within the device's range and as groups ne
     CHECK(fixed.fixed);
     CHECK(fixed.size == c.wanted);
     CHECK(fixed.whole == c.wanted);
-    // one that cannot fix a size may launch any of its range
+    // a device that cannot fix a size may use any in its range
     const gpu::SubgroupChoice any = gpu::choose_subgroups(v13, c.usual, false);
     CHECK(!any.fixed);
     CHECK(any.size == c.least);
@@ -247,7 +247,7 @@ TEST_CASE("subgroups are of one size, within the device's range and as groups ne
   CHECK(!only.fixed);
   CHECK(only.size == 32);
   CHECK(only.whole == 32);
-  // groups of 256 lanes must go into the subgroups that a group may have
+  // a work group of 256 lanes must fit into the number of subgroups that it may have
   v13.minSubgroupSize = 16;
   v13.maxSubgroupSize = 64;
   v13.maxComputeWorkgroupSubgroups = 4;
@@ -291,14 +291,14 @@ TEST_CASE("saxpy, resubmitted and recorded again, on both descriptor paths and b
         commands.begin();
         commands.dispatch(pipeline, buffers, &push, sizeof push, 50, ((kCount + lanes - 1) / lanes + 49) / 50);
         commands.submit();
-        commands.submit();  // the same list once more, without a wait between
+        commands.submit();  // the same list again, without a wait between
         commands.wait();
         gpu::download(*device, y, result.data(), kCount * 4);
         std::size_t wrong = 0;
-        // exact: halves of small integers
+        // halves of small integers are exact in float
         for (std::uint32_t i = 0; i < kCount; ++i) wrong += result[i] != a[i] + b[i];
         CHECK(wrong == 0);
-        commands.begin();  // nothing refers to the pipeline any more when it goes
+        commands.begin();  // drops the references to the pipeline before it is destroyed
       }
     }
     check_silent(*device);
@@ -315,7 +315,7 @@ TEST_CASE("a chain of dispatches, fills and copies runs in order") {
     const Buffer* const forth[] = {&a, &b};
     const Buffer* const back[] = {&b, &a};
     Commands commands(*device);
-    constexpr int kTurns = 100;  // 200 dispatches: several descriptor pools
+    constexpr int kTurns = 100;  // 200 dispatches need several descriptor pools
     for (std::uint32_t recording = 0; recording < 3; ++recording) {
       commands.begin();
       commands.fill(a, 7 + recording, 0, a.bytes());
@@ -325,7 +325,7 @@ TEST_CASE("a chain of dispatches, fills and copies runs in order") {
         commands.dispatch(add, forth, nullptr, 0, kCount / kLanes);
         commands.dispatch(add, back, nullptr, 0, kCount / kLanes);
       }
-      commands.dispatch(add, forth, nullptr, 0, 0);  // no groups: nothing, and the order stays
+      commands.dispatch(add, forth, nullptr, 0, 0);  // no groups: does nothing, and the order is kept
       commands.no_barrier();
       commands.copy(a, 4, c, 8, 4 * 100);
       commands.submit();
@@ -432,14 +432,14 @@ TEST_CASE("timings are summed by label and shorter than the wall clock") {
     CHECK(sum <= wall);
     best_share = std::max(best_share, sum / wall);
   }
-  CHECK(best_share >= 0.5);  // the rest is submission; a wrong tick length would show
+  CHECK(best_share >= 0.5);  // the remainder is submission; a wrong tick length would be noticed
   check_silent(*device);
 }
 
 TEST_CASE("buffers: transfers at offsets, in parts, of nothing, and moves") {
   for (bool least : {false, true}) {
     gpu::DevicePtr device = open_validated(least);
-    constexpr std::size_t kBytes = (16u << 20) + 40;  // more than one staging part
+    constexpr std::size_t kBytes = (16u << 20) + 40;  // more than one part of staging
     std::vector<std::uint32_t> out(kBytes / 4), in(kBytes / 4);
     core::Random random(1);
     for (std::uint32_t& v : out) v = static_cast<std::uint32_t>(random.next());
@@ -512,7 +512,7 @@ TEST_CASE("synchronization validation sees a missing barrier") {
   CHECK(gpu::validation_texts(*device).front().find("READ_AFTER_WRITE") != std::string::npos);
 }
 
-// tools/test-validation: a kernel that checks its indices must say so, else its silence on all others says nothing.
+// For tools/test-validation: an index error must be reported, else the silence on all other kernels proves nothing.
 TEST_CASE("GPU-assisted validation sees an index outside a buffer" *
           doctest::skip(std::getenv("CHAINSPLAT_GPU_ASSISTED") == nullptr)) {
   gpu::DevicePtr device = open_validated();
@@ -520,7 +520,7 @@ TEST_CASE("GPU-assisted validation sees an index outside a buffer" *
   Pipeline saxpy(*device, "test_saxpy", 2, sizeof(SaxpyPush), {16});
   Commands commands(*device);
   commands.begin();
-  const SaxpyPush push{17, 1.0f};  // of sixteen
+  const SaxpyPush push{17, 1.0f};  // the buffers have sixteen elements
   const Buffer* const buffers[] = {&x, &y};
   commands.dispatch(saxpy, buffers, &push, sizeof push, 2);
   commands.submit();
@@ -561,7 +561,7 @@ TEST_CASE("the pipeline cache is kept, and a damaged or unwritable one is no tro
   const Path folder = std::filesystem::temp_directory_path() / ("chainsplat_gpu_test_" + std::to_string(getpid()));
   std::filesystem::remove_all(folder);
   Environment cache("XDG_CACHE_HOME", folder.c_str());
-  Environment mesa("MESA_SHADER_CACHE_DISABLE", "true");  // Mesa's own cache lies there too, and it prints
+  Environment mesa("MESA_SHADER_CACHE_DISABLE", "true");  // Mesa's own cache would be there too, and it prints
   const auto work = [] {
     gpu::DevicePtr device = open_validated();
     Pipeline add(*device, "test_add", 2, 0, {64, 1});
@@ -570,7 +570,7 @@ TEST_CASE("the pipeline cache is kept, and a damaged or unwritable one is no tro
   };
   const Path file = work();
   CHECK(file.parent_path() == folder / "chainsplat");
-  // a driver may keep nothing; the file of one that does must read back, and any damage must be seen
+  // a driver may cache nothing; the file of one that does must read back, and any damage must be detected
   const bool kept = std::filesystem::exists(file);
   MESSAGE(std::string(kept ? "the driver keeps" : "the driver does not keep") << " compiled pipelines in the cache");
   std::filesystem::create_directories(file.parent_path());
@@ -607,7 +607,7 @@ TEST_CASE("any damage to a cache file is seen") {
 }
 
 TEST_CASE("what a submit and a dispatch cost") {
-  gpu::DevicePtr device = gpu::open_device();  // without validation, which costs more than the work
+  gpu::DevicePtr device = gpu::open_device();  // without validation, which takes longer than the work itself
   constexpr int kDispatches = 50, kTurns = 200;
   Buffer a(*device, 4096, Domain::device, "a"), b(*device, 4096, Domain::device, "b");
   Pipeline add(*device, "test_add", 2, 0, {64, 1});

@@ -1,5 +1,5 @@
-// Masks made without prompts against the exact masks of the demo capture, and the parts they are made of against
-// geometry done by hand.
+// Tests of masks made without prompts against the exact masks of the demo capture, and of the parts they are made of
+// against geometry done by hand.
 #include "chainsplat/masking.h"
 
 #include <doctest/doctest.h>
@@ -18,7 +18,7 @@ using math::VectorX;
 
 const Path kDemo = Path(CHAINSPLAT_SOURCE_DIR) / "assets/demo_free_30";
 
-capture::Camera front_camera() {  // at the origin, looks along world z
+capture::Camera front_camera() {  // at the origin, looking along the world's z
   capture::Camera camera;
   camera.name = "front";
   camera.width = 200, camera.height = 150;
@@ -50,8 +50,8 @@ TEST_CASE("the tube of a straight rope is a rectangle with the right sides") {
   base.translation = Vector3(-0.1, 0.0, 1.0);
   const masking::Tube tube = masking::tube(rope, base, VectorX::Zero(4), front_camera(), 0.0, rope.length, 6.0);
   CHECK(tube.radius == doctest::Approx(2.0));
-  CHECK(tube.at(100, 74) == doctest::Approx(0.5 - 2.0).epsilon(0.01));  // center half a pixel above the axis
-  CHECK(tube.at(100, 79) == doctest::Approx(4.5 - 2.0).epsilon(0.01));  // 4.5 px below
+  CHECK(tube.at(100, 74) == doctest::Approx(0.5 - 2.0).epsilon(0.01));  // its center is half a pixel above the axis
+  CHECK(tube.at(100, 79) == doctest::Approx(4.5 - 2.0).epsilon(0.01));  // and 4.5 px below the axis
   // the free end's disc is seen at an angle of 0.1 rad: an ellipse that reaches sin(0.1) 2 px beyond its center
   const double disc = 2.0 * std::sin(std::atan(0.1)) * std::sqrt(1.0 - 0.25 * 0.25);
   CHECK(tube.at(122, 74) == doctest::Approx(122.5 - 120 - disc).epsilon(0.01));  // beyond the free end
@@ -82,12 +82,12 @@ TEST_CASE("a shadow is background, another color is not") {
   const masking::Picture picture{now, 3, 1, 3};
   CHECK(masking::difference_odds(background, picture, 0, 0) < 0.0);
   CHECK(masking::difference_odds(background, picture, 1, 0) > 0.0);
-  CHECK(masking::difference_odds(background, picture, 2, 0) == 0.0);  // not known there
+  CHECK(masking::difference_odds(background, picture, 2, 0) == 0.0);  // the background is unknown there
 }
 
 TEST_CASE("what hides the rope has not its marks, though its colors are thought to be the rope's") {
-  // 160 px by 16 px, from column 20 to 180, about row 75; striped, on gray, with a finger from above to the rope's
-  // middle
+  // a striped rope of 160 px by 16 px on gray, from column 20 to 180, about row 75, with a finger that reaches over its
+  // middle from above
   const chain::Chain rope =
       chain::make_chain(0.2, 0.02, Vector3::UnitX(), Vector3::UnitY(), 4, chain::Bending::planar, false);
   math::Pose base;
@@ -98,8 +98,8 @@ TEST_CASE("what hides the rope has not its marks, though its colors are thought 
   const auto is_rope = [](int x, int y) { return x >= 20 && x < 180 && y >= 67 && y < 83; };
   const auto is_finger = [](int x, int y) { return x >= 90 && x < 115 && y < 90; };
   std::vector<std::uint8_t> clean, hidden;
-  masking::Look look;
-  for (masking::Colors* const colors : {&look.near, &look.far}) {
+  masking::Look appearance;
+  for (masking::Colors* const colors : {&appearance.near, &appearance.far}) {
     colors->object.assign(masking::kColorBins, 0.0);
     colors->surroundings.assign(masking::kColorBins, 0.0);
     for (const std::uint8_t* const color : {red, white, skin}) colors->object[masking::color_bin(color)] = 500;
@@ -111,26 +111,27 @@ TEST_CASE("what hides the rope has not its marks, though its colors are thought 
     for (int x = 0; x < camera.width; ++x) {
       const std::uint8_t* const color = !is_rope(x, y) ? gray : (x / 10) % 2 ? red : white;
       for (int c = 0; c < 3; ++c) clean.push_back(static_cast<std::uint8_t>(color[c] * 10 / 8));  // in more light
-      const std::uint8_t* const seen = is_finger(x, y) ? skin : color;
-      hidden.insert(hidden.end(), seen, seen + 3);
+      const std::uint8_t* const in_front = is_finger(x, y) ? skin : color;
+      hidden.insert(hidden.end(), in_front, in_front + 3);
     }
   const masking::Picture before{clean.data(), 200, 150, 3}, now{hidden.data(), 200, 150, 3};
-  const auto finger_share = [&] {  // of the finger over the rope that counts as rope, and of the rest of the rope
-    const capture::View mask = masking::cut(look, now, camera, rope, base, straight);
-    double finger = 0.0, fingers = 0.0, seen = 0.0, rest = 0.0;
+  // the shares that count as rope: of the finger over the rope, and of the rest of the rope
+  const auto finger_share = [&] {
+    const capture::View mask = masking::cut(appearance, now, camera, rope, base, straight);
+    double finger = 0.0, fingers = 0.0, masked_rest = 0.0, rest = 0.0;
     for (int y = 70; y < 80; ++y)
       for (int x = 25; x < 175; ++x) {
         const int u = x - mask.x0, v = y - mask.y0;
         const bool inside =
             u >= 0 && v >= 0 && u < mask.width && v < mask.height && mask.rgba[4 * (v * mask.width + u) + 3];
-        (is_finger(x, y) ? finger : seen) += inside, (is_finger(x, y) ? fingers : rest) += 1.0;
+        (is_finger(x, y) ? finger : masked_rest) += inside, (is_finger(x, y) ? fingers : rest) += 1.0;
       }
-    return std::pair(finger / fingers, seen / rest);
+    return std::pair(finger / fingers, masked_rest / rest);
   };
   CHECK(finger_share().first > 0.8);
   const masking::Tube tube = masking::tube(rope, base, straight, camera, 0.0, rope.length, 8.0);
   CHECK(tube.is_left(100, 70) != tube.is_left(100, 80));
-  look.marks = masking::marks({&before, 1}, {&tube, 1}, rope);
+  appearance.marks = masking::marks({&before, 1}, {&tube, 1}, rope);
   CHECK(finger_share().first < 0.2);
   CHECK(finger_share().second > 0.9);
 }
@@ -150,7 +151,7 @@ TEST_CASE("masks of the demo capture without a prompt") {
   CHECK(summary.empty == 0);
   CHECK(summary.inside > 0.9);
   MESSAGE("IoU mean ", sum / frames, ", least ", least);
-  // the rope is 7 px wide here: half a pixel too much on either side is 0.87
+  // the rope is 7 px wide here, so that half a pixel too much on either side gives 0.87
   CHECK(sum / frames > 0.88);
   CHECK(least > 0.8);
 }
@@ -190,13 +191,13 @@ TEST_CASE("a rope grown in one moment is where the rope is") {
   MESSAGE("grown: ", 1e3 * rms, " mm");
   CHECK(rms < 0.005);
 
-  // where there is no rope there is little evidence
+  // beside the rope there is little evidence
   for (masking::Shot& shot : shots) shot.camera_from_base.translation += Vector3(0.12, 0.0, 0.0);
   CHECK(masking::grow(rope, shots, {}).evidence < 0.5 * grown.evidence);
 }
 
 TEST_CASE("thin and thick ropes take no more memory and time than others") {
-  // 2 m long, seen as a third of a pixel: 2,000 diameters. Red on gray
+  // a red rope on gray, 2 m or 2,000 diameters long and a third of a pixel wide
   constexpr int kWidth = 640, kHeight = 120;
   capture::Camera camera = front_camera();
   camera.width = kWidth, camera.height = kHeight, camera.fx = camera.fy = 300.0, camera.cx = 10.0, camera.cy = 60.0;
@@ -212,17 +213,17 @@ TEST_CASE("thin and thick ropes take no more memory and time than others") {
   const masking::Grown thin = masking::grow(rope(2.0, 0.001), {&shot, 1}, {});
   CHECK(thin.evidence >= 0.0);
   CHECK(thin.evidence < std::log(2.0));
-  // the tallies say how many samples there were
+  // the tallies count the samples
   for (const masking::Tally& tally : thin.tallies) CHECK(tally.inside_sum + tally.beside_sum < 4000);
 
-  masking::Look look;
+  masking::Look appearance;
   const VectorX straight = VectorX::Zero(32);
   for (const auto& [length, diameter] : {std::pair{2.0, 1e-8}, {1e4, 0.02}, {0.5, 0.49}}) {
     const chain::Chain other = rope(length, diameter);
     const masking::Tube tube = masking::tube(other, base, straight, camera, 0.0, length, 8.0);
-    look.marks = masking::marks({&picture, 1}, {&tube, 1}, other);
-    CHECK(look.marks.along <= 4096);
-    masking::cut(look, picture, camera, other, base, straight);
+    appearance.marks = masking::marks({&picture, 1}, {&tube, 1}, other);
+    CHECK(appearance.marks.along <= 4096);
+    masking::cut(appearance, picture, camera, other, base, straight);
   }
 }
 
@@ -233,7 +234,7 @@ TEST_CASE("live masks of one camera") {
   const chain::Chain rope = chain::make_chain(masked.length, masked.diameter, masked.direction, masked.bending_axis, 8,
                                               chain::Bending::spatial, false);
   const silhouette::SequenceFit fit = silhouette::fit_sequence(rope, masked);
-  std::vector<std::uint8_t> colors;  // of the first masked view
+  std::vector<std::uint8_t> colors;  // the rope's, from the first masked view
   for (std::size_t i = 0; i + 3 < masked.views[0].rgba.size(); i += 4)
     if (masked.views[0].rgba[i + 3])
       colors.insert(colors.end(), &masked.views[0].rgba[i], &masked.views[0].rgba[i + 3]);
@@ -244,7 +245,7 @@ TEST_CASE("live masks of one camera") {
   for (int k = 0; k < 40; ++k) {
     REQUIRE(video.next(picture));
     const double time = masked.times[0][k];
-    // expected where the last two frames lead at constant velocity: a prediction that knows nothing of the dynamics
+    // extrapolate the last two frames at constant velocity, a prediction without dynamics
     const VectorX last = chain::interpolate(fit.states, masked.times[0][std::max(0, k - 1)]);
     const VectorX expected = 2.0 * last - chain::interpolate(fit.states, masked.times[0][std::max(0, k - 2)]);
     const capture::View view = masking::mask(live, picture, masked.base.pose(time), expected);

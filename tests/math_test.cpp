@@ -53,7 +53,7 @@ TEST_CASE("exp, Ad and ad equal the 60-digit vectors") {
 
 TEST_CASE("a covariance is finite, symmetric and positive semidefinite, in any units") {
   math::MatrixX good(3, 3);
-  good << 4, 2e-6, 0, 2e-6, 1e-12, 0, 0, 0, 0;  // correlated fully, and a number that is known
+  good << 4, 2e-6, 0, 2e-6, 1e-12, 0, 0, 0, 0;  // two fully correlated variables and one without variance
   CHECK(math::is_covariance(good));
   CHECK(math::is_covariance(math::MatrixX()));
   const auto with = [&](int row, int column, double value) {
@@ -61,7 +61,7 @@ TEST_CASE("a covariance is finite, symmetric and positive semidefinite, in any u
     m(row, column) = m(column, row) = value;
     return m;
   };
-  CHECK(math::is_covariance(with(0, 1, 2e-6 * (1.0 + 1e-8))));  // rounding
+  CHECK(math::is_covariance(with(0, 1, 2e-6 * (1.0 + 1e-8))));  // within rounding
   CHECK_FALSE(math::is_covariance(with(0, 1, 2.1e-6)));
   CHECK_FALSE(math::is_covariance(with(1, 1, -1e-30)));
   CHECK_FALSE(math::is_covariance(with(2, 0, 1e-30)));

@@ -1,6 +1,6 @@
-// reference_colors.h - splat::ColorSums in double on the host, pixel by pixel, from a drawn picture with depth: what
-// the device's are measured against, and what stands for it where a test paints its own pictures. Header only; for
-// tests.
+// reference_colors.h - splat::ColorSums in double on the host, pixel by pixel, from a drawn picture with depth. The
+// device's sums are compared with these, and they replace the device's in tests that paint their own pictures. Header
+// only; for tests.
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -11,17 +11,18 @@
 
 namespace chainsplat::reference {
 
-// `drawn`: the twin in the pixels of `spec`. `seen`: RGBA8 of them, A = mask.
+// `drawn`: the twin in the pixels of `spec`. `observed`: RGBA8 of the same pixels, A = mask.
 inline splat::ColorSums color_sums(const chain::Chain& chain, const splat::ViewSpec& spec,
-                                   const std::vector<std::uint8_t>& seen, const splat::Picture& drawn) {
+                                   const std::vector<std::uint8_t>& observed, const splat::Picture& drawn) {
   using math::Vector3;
+  // the constants of shaders/shared/color.h
   constexpr int kEdge = 2;                              // px
-  constexpr double kOpaque = 0.95, kNoise = 0.05;       // coverage; intensity
-  constexpr double kGainWeight = 10, kBiasWeight = 40;  // pixels
+  constexpr double kOpaque = 0.95, kNoise = 0.05;       // alpha; intensity
+  constexpr double kGainWeight = 10, kBiasWeight = 40;  // of the priors
   constexpr double kNearer = 0.999;                     // of squared distances: a later link must be clearly nearer
   const int w = spec.width, h = spec.height;
   const auto inside = [&](int x, int y) {
-    return x >= 0 && y >= 0 && x < w && y < h && seen[4 * (static_cast<std::size_t>(y) * w + x) + 3] >= 128;
+    return x >= 0 && y >= 0 && x < w && y < h && observed[4 * (static_cast<std::size_t>(y) * w + x) + 3] >= 128;
   };
   const auto counts = [&](int x, int y) {
     for (int dy = -kEdge; dy <= kEdge; ++dy)
@@ -46,8 +47,10 @@ inline splat::ColorSums color_sums(const chain::Chain& chain, const splat::ViewS
   };
   struct Pixel {
     int x, y, link;
-    Eigen::Matrix<double, 2, 6> flow;  // px a world twist about the world origin
+    Eigen::Matrix<double, 2, 6> flow;  // px per world twist about the world origin
   };
+
+  // the pixels that count, with their links and their motion
   std::vector<Pixel> pixels;
   const capture::Camera& camera = *spec.camera;
   for (int y = 0; y < h; ++y)
@@ -66,24 +69,29 @@ inline splat::ColorSums color_sums(const chain::Chain& chain, const splat::ViewS
       pixels.push_back(pixel);
     }
 
+  // central moments of the colors
   splat::ColorSums out;
   out.pixels = static_cast<int>(pixels.size());
   const auto shown_at = [&](int x, int y, int c) -> double {
     return drawn.rgba[4 * (static_cast<std::size_t>(y) * w + x) + c];
   };
-  const auto seen_at = [&](int x, int y, int c) { return seen[4 * (static_cast<std::size_t>(y) * w + x) + c] / 255.0; };
+  const auto observed_at = [&](int x, int y, int c) {
+    return observed[4 * (static_cast<std::size_t>(y) * w + x) + c] / 255.0;
+  };
   for (int c = 0; c < 3; ++c) {
     double shown_mean = 0.0, seen_mean = 0.0;
     for (const Pixel& pixel : pixels) {
       shown_mean += shown_at(pixel.x, pixel.y, c) / out.pixels;
-      seen_mean += seen_at(pixel.x, pixel.y, c) / out.pixels;
+      seen_mean += observed_at(pixel.x, pixel.y, c) / out.pixels;
     }
     for (const Pixel& pixel : pixels) {
-      const double s = shown_at(pixel.x, pixel.y, c) - shown_mean, t = seen_at(pixel.x, pixel.y, c) - seen_mean;
+      const double s = shown_at(pixel.x, pixel.y, c) - shown_mean, t = observed_at(pixel.x, pixel.y, c) - seen_mean;
       out.covariance += s * t, out.drawn_variance += s * s, out.seen_variance += t * t;
     }
   }
-  for (int pass = 0; pass < 2; ++pass) {  // the first finds the exposure
+
+  // normal equations; the first pass is for the exposure only
+  for (int pass = 0; pass < 2; ++pass) {
     out.normal.assign(chain.links(), splat::ColorSums::Matrix8::Zero());
     out.right.assign(chain.links(), splat::ColorSums::Vector8::Zero());
     out.weight = out.square = 0.0;
@@ -91,13 +99,13 @@ inline splat::ColorSums color_sums(const chain::Chain& chain, const splat::ViewS
     Eigen::Vector2d pull = Eigen::Vector2d::Zero();
     for (const Pixel& pixel : pixels)
       for (int c = 0; c < 3; ++c) {
-        const double residual = out.gain * shown_at(pixel.x, pixel.y, c) + out.bias - seen_at(pixel.x, pixel.y, c);
+        const double residual = out.gain * shown_at(pixel.x, pixel.y, c) + out.bias - observed_at(pixel.x, pixel.y, c);
         const double weight = std::abs(residual) <= kNoise ? 1.0 : kNoise / std::abs(residual);
         const auto slope = [&](int dx, int dy) {
           const auto difference = [&](const auto& at) {
             return at(pixel.x + dx, pixel.y + dy, c) - at(pixel.x - dx, pixel.y - dy, c);
           };
-          return 0.25 * (out.gain * difference(shown_at) + difference(seen_at));
+          return 0.25 * (out.gain * difference(shown_at) + difference(observed_at));
         };
         splat::ColorSums::Vector8 row;
         row << -pixel.flow.transpose() * math::Vector2(slope(1, 0), slope(0, 1)), shown_at(pixel.x, pixel.y, c), 1.0;

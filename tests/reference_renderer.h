@@ -1,5 +1,5 @@
-// reference_renderer.h - SPEC 2.4-2.8 in double on the host, pixel by pixel over all replicas: what the device is
-// measured against. Only the forward formulas are written down; gradients come from reverse-mode differentiation on a
+// reference_renderer.h - mathematics.md 2.4-2.8 in double on the host, pixel by pixel over all replicas: the reference
+// for the device. Only the forward formulas are written down; gradients come from reverse-mode differentiation on a
 // tape, so that no backward formula can share a mistake with the device's. Header only; for tests.
 #pragma once
 #include <algorithm>
@@ -30,7 +30,7 @@ class Tape {
     if (index >= 0) adjoints_[index] += adjoint;
   }
   double adjoint(int index) const { return index >= 0 ? adjoints_[index] : 0.0; }
-  // Hands the adjoints of the nodes from `first` on down to their operands and forgets those nodes.
+  // Propagates the adjoints of the nodes from `first` on to their operands and removes those nodes.
   void sweep(std::size_t first) {
     for (std::size_t k = nodes_.size(); k-- > first;) {
       const double adjoint = adjoints_[k];
@@ -64,7 +64,7 @@ struct Variable {
   double value = 0.0;
   int index = -1;
   Variable() = default;
-  Variable(double constant) : value(constant) {}  // implicit: constants mix with variables in formulas
+  Variable(double constant) : value(constant) {}  // implicit, so that formulas can mix constants with variables
   Variable(double v, int i) : value(v), index(i) {}
 };
 
@@ -90,7 +90,7 @@ inline Variable exp(const Variable& a) { return made(std::exp(a.value), a, std::
 inline Variable sqrt(const Variable& a) { return made(std::sqrt(a.value), a, 0.5 / std::sqrt(a.value)); }
 inline Variable sin(const Variable& a) { return made(std::sin(a.value), a, std::cos(a.value)); }
 inline Variable cos(const Variable& a) { return made(std::cos(a.value), a, -std::sin(a.value)); }
-// derivative 0 at 0, as sign() of the device
+// The derivative at 0 is 0, as that of the device's sign().
 inline Variable abs(const Variable& a) {
   return made(std::abs(a.value), a, a.value > 0 ? 1.0 : a.value < 0 ? -1.0 : 0.0);
 }
@@ -98,7 +98,7 @@ inline Variable abs(const Variable& a) {
 inline double value(double a) { return a; }
 inline double value(const Variable& a) { return a.value; }
 
-// sum + weight * term in one node
+// sum + weight * term, in one node
 inline double plus_weighted(double sum, double weight, double term) { return sum + weight * term; }
 inline Variable plus_weighted(const Variable& sum, double weight, const Variable& term) {
   return made(sum.value + weight * term.value, sum, 1.0, term, weight);
@@ -153,7 +153,7 @@ Motion<S> operator*(const Motion<S>& a, const Motion<S>& b) {
   return c;
 }
 
-// splat::Gaussians with another scalar, same layout.
+// splat::Gaussians with another scalar type, in the same layout.
 template <class S>
 struct Parameters {
   int count = 0, links = 0, degree = 0;
@@ -179,17 +179,17 @@ inline Parameters<double> parameters(const splat::Gaussians& g) {
           wide(g.link_logits)};
 }
 
-// The discrete rules of SPEC 2.5 and 2.6, each of which can be switched off.
+// The discrete rules of mathematics.md 2.5 and 2.6, each of which can be switched off.
 struct Rules {
-  bool skip = true;   // alpha < 1/255
-  bool cap = true;    // alpha at most 0.99
-  bool stop = true;   // before T < 1e-4
-  bool clamp = true;  // slopes in the projection's Jacobian at 1.3 half images
+  bool skip = true;   // entries with alpha < 1/255
+  bool cap = true;    // alpha is at most 0.99
+  bool stop = true;   // before T falls below 1e-4
+  bool clamp = true;  // x/z and y/z in the projection's Jacobian, at 1.3 half images
 };
 constexpr Rules kNoCutoffs{false, false, false, true};
 constexpr double kLeastAlpha = 1.0 / 255.0, kMostAlpha = 0.99, kLeastTransmittance = 1e-4;
 
-// E_j at theta: T_b exp([S_1] theta_1) ... with unit-length axes (SPEC 2.2), by Rodrigues' formula.
+// E_j at theta: T_b exp([S_1] theta_1) ... with axes of unit length (mathematics.md 2.2), by Rodrigues' formula.
 template <class S>
 std::vector<Motion<S>> link_motions(const std::vector<math::Vector6>& axes, const std::vector<S>& theta,
                                     const math::Pose& base) {
@@ -213,7 +213,7 @@ std::vector<Motion<S>> link_motions(const std::vector<math::Vector6>& axes, cons
 
 // --- forward ---------------------------------------------------------------------------------------------------------
 
-// Real spherical harmonics, 3DGS order and signs (vectors/README.md); r is a unit vector.
+// Real spherical harmonics in the order and signs of 3DGS (vectors/README.md); r is a unit vector.
 template <class S>
 std::vector<S> sh_basis(int degree, const Vec3<S>& r) {
   const S x = r[0], y = r[1], z = r[2], xx = x * x, yy = y * y, zz = z * z;
@@ -238,7 +238,7 @@ std::vector<S> sh_basis(int degree, const Vec3<S>& r) {
   return b;
 }
 
-// A replica as one view sees it. `center` in crop pixels.
+// A replica projected into one view; `center` is in pixels of the crop.
 template <class S>
 struct Splat {
   int replica = 0;  // gaussian * links + link
@@ -255,7 +255,7 @@ std::vector<Splat<S>> project(const Parameters<S>& g, const splat::ViewSpec& vie
                               const std::vector<Motion<S>>& motions, const Rules& rules) {
   using std::exp;
   using std::sqrt;
-  constexpr double kNear = 0.01, kLowPass = 0.3, kClamp = 1.3;  // m, px^2, half images (SPEC 2.5)
+  constexpr double kNear = 0.01, kLowPass = 0.3, kClamp = 1.3;  // m, px^2, half images (mathematics.md 2.5)
   const capture::Camera& camera = *view.camera;
   const Motion<S> camera_from_world = motion<S>(camera.world_from_camera.inverse());
   const double limit_x = kClamp * 0.5 * camera.width / camera.fx, limit_y = kClamp * 0.5 * camera.height / camera.fy;
@@ -300,7 +300,7 @@ std::vector<Splat<S>> project(const Parameters<S>& g, const splat::ViewSpec& vie
       s.covariance = {dot(row_x, cx) + kLowPass, dot(row_x, cy), dot(row_y, cy) + kLowPass};
       const S determinant = s.covariance[0] * s.covariance[2] - s.covariance[1] * s.covariance[1];
       s.conic = {s.covariance[2] / determinant, -s.covariance[1] / determinant, s.covariance[0] / determinant};
-      // the direction from the camera center, turned into the home frame
+      // color in the direction from the camera center, in the home frame
       const S distance = sqrt(dot(p, p));
       const Vec3<S> direction =
           transposed(from_home.rotation) * Vec3<S>{p[0] / distance, p[1] / distance, p[2] / distance};
@@ -318,9 +318,10 @@ std::vector<Splat<S>> project(const Parameters<S>& g, const splat::ViewSpec& vie
   return splats;
 }
 
-// Where float and double may decide a discrete rule differently, and by how much a pixel's values can then differ.
+// Whether float and double may decide a discrete rule of a pixel differently, and how much its values can then differ.
 struct Doubt {
-  // bands, relative: alpha at the skip, alpha at the cap, transmittance at the stop, depths of two neighbors
+  // relative widths of the bands in doubt: alpha at the skip, at the cap, transmittance at the stop, depths of
+  // neighbors
   double skip = 2e-4, cap = 2e-4, stop = 5e-3, order = 6e-7;
   double change = 0.0;  // bound on the change of a channel (color or alpha)
   bool doubtful = false;
@@ -363,7 +364,7 @@ Pixel<S> blend(const std::vector<Splat<S>>& splats, double px, double py, const 
     }
     if (rules.stop && after < kLeastTransmittance) break;
     if (doubt) {
-      // two neighbors in depth that may change places (equal depths are told apart by index in float too)
+      // two neighbors in depth that may change places (equal depths are ordered by index in float too)
       for (std::size_t k = blended.size(); k-- > 0;) {
         const Blended& other = blended[k];
         const double gap = (value(s.depth) - value(other.splat->depth)) / value(s.depth);
@@ -400,7 +401,7 @@ inline std::array<double, 11> ssim_window() {
   return w;
 }
 
-// One channel of width x height, filtered with zeros outside.
+// One channel of width x height filtered by the window, with zeros outside.
 template <class S>
 std::vector<S> filtered(const std::vector<S>& image, int width, int height) {
   static const std::array<double, 11> w = ssim_window();
@@ -423,7 +424,7 @@ std::vector<S> filtered(const std::vector<S>& image, int width, int height) {
   return out;
 }
 
-// SSIM of each pixel of one channel (SPEC 2.7); x the render, y the target.
+// SSIM of each pixel of one channel (mathematics.md 2.7); x is the render, y the target.
 template <class S>
 std::vector<S> ssim_map(const std::vector<S>& x, const std::vector<double>& y, int width, int height) {
   constexpr double c1 = 0.01 * 0.01, c2 = 0.03 * 0.03;
@@ -457,9 +458,9 @@ inline Target target(const std::vector<std::uint8_t>& rgba) {
 
 template <class S>
 struct ViewLoss {
-  S l1, ssim, mask;  // means over the normalizer's pixels
+  S l1, ssim, mask;  // means over `normalizer` pixels
 };
-// `rgba` is 4 x pixels. A normalizer of 0 stands for the crop's pixels.
+// `rgba` is 4 x pixels. A normalizer of 0 means the number of pixels of the crop.
 template <class S>
 ViewLoss<S> view_loss(const std::vector<S>& rgba, const Target& wanted, int width, int height, double normalizer) {
   using std::abs;
@@ -480,13 +481,12 @@ ViewLoss<S> view_loss(const std::vector<S>& rgba, const Target& wanted, int widt
   return {l1 / (3.0 * normalizer), S(1.0) - dissimilarity / (3.0 * normalizer), mask / normalizer};
 }
 
-// --- pictures, losses and gradients of some views
-// ----------------------------------------------------------------------
+// --- pictures, losses and gradients of some views --------------------------------------------------------------------
 
 struct Picture {
   int width = 0, height = 0;
   std::vector<double> rgba, depth;  // as splat::Picture
-  std::vector<double> change;       // a pixel: Doubt::change
+  std::vector<double> change;       // Doubt::change per pixel
   std::vector<std::uint8_t> doubtful;
   int doubtful_count() const { return std::accumulate(doubtful.begin(), doubtful.end(), 0); }
 };
@@ -533,12 +533,11 @@ struct Evaluation {
   std::vector<ViewLoss<double>> losses;
   std::vector<Picture> pictures;
   Parameters<double> gradient;                      // summed over views
-  std::vector<math::MatrixX> link_twists;           // a view: 6 x links
-  std::vector<std::vector<double>> image_gradient;  // a view: 4 x pixels
+  std::vector<math::MatrixX> link_twists;           // 6 x links per view
+  std::vector<std::vector<double>> image_gradient;  // 4 x pixels per view
 };
 
-// `own_motions`, when given, makes the link motions of every view (in place of ViewSpec::motions) from numbers on the
-// tape.
+// `own_motions`, if set, returns the link motions of every view (instead of ViewSpec::motions) as numbers on the tape.
 template <class MakeMotions>
 Evaluation evaluate(const Parameters<double>& g, std::span<const splat::ViewSpec> views,
                     std::span<const Target> targets, const splat::LossWeights& weights, double normalizer,
@@ -551,7 +550,7 @@ Evaluation evaluate(const Parameters<double>& g, std::span<const splat::ViewSpec
   Evaluation out;
   for (std::size_t k = 0; k < views.size(); ++k) {
     const splat::ViewSpec& view = views[k];
-    // every link motion turned by a twist of size zero about the world origin: e^[xi] E_j
+    // apply a twist of zero size about the world origin to every link motion, e^[xi] E_j, to differentiate by it
     const std::size_t view_start = t.size();
     std::vector<Variable> twist;
     for (int m = 0; m < 6 * g.links; ++m) twist.push_back(independent(0.0));
@@ -617,7 +616,7 @@ inline Evaluation evaluate(const Parameters<double>& g, std::span<const splat::V
   });
 }
 
-// Only the number, without a gradient: for finite differences.
+// The loss without a gradient, for finite differences.
 inline double loss(const Parameters<double>& g, std::span<const splat::ViewSpec> views, std::span<const Target> targets,
                    const splat::LossWeights& weights, double normalizer, const Rules& rules) {
   double total = 0.0;
@@ -629,7 +628,7 @@ inline double loss(const Parameters<double>& g, std::span<const splat::ViewSpec>
   return total;
 }
 
-// dB over pixels whose mask is at least 128/255, renders clamped to [0, 1] (SPEC 9).
+// dB over pixels whose mask is at least 128/255, with renders clamped to [0, 1] (mathematics.md 9).
 inline double psnr_object(const Picture& drawn, const Target& wanted) {
   double squared = 0.0, count = 0.0;
   for (std::size_t k = 0; k < wanted.mask.size(); ++k) {

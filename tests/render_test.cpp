@@ -16,7 +16,7 @@ splat::Engine& engine() {
   return engine;
 }
 
-// In front of the rope of small_twin(), looking along world +y, z up.
+// A camera in front of the rope of small_twin() that looks along world +y, z up.
 capture::Camera front_camera(bool distorted) {
   capture::Camera camera;
   camera.name = "front";
@@ -85,7 +85,7 @@ TEST_CASE("a ball appears in the recorded pixel where its center projects") {
           render::frames(engine(), ball.gaussians, ball.chain, ball.states, ball.base, camera, 0, {0.0}, options);
       CHECK((centroid(plain.at(0)) - straight).norm() < 0.1);
 
-      // whole images: the mask is a disk there, its depth that of the ball's center
+      // in the whole images the mask is a disk with the depth of the ball's center
       const capture::Image8 mask = render::mask_image(frames[0], camera),
                             color = render::color_image(frames[0], camera);
       const std::vector<float> depth = render::depth_image(frames[0], camera);
@@ -100,7 +100,7 @@ TEST_CASE("a ball appears in the recorded pixel where its center projects") {
       CHECK(depth[at(expected + Vector2(0, 12))] == 0.0f);
       int solid = 0;
       for (const std::uint8_t value : mask.pixels) solid += value == 255;
-      // sigma G >= 1/2 inside a circle of radius r, r^2 = 2 ln(2 sigma) (projected variance + 0.3)
+      // sigma G >= 1/2 inside a circle with r^2 = 2 ln(2 sigma) (projected variance + 0.3)
       const double variance = std::pow(camera.fx * 0.006 / z, 2) + 0.3, opacity = 1.0 / (1.0 + std::exp(-6.0));
       if (!distorted) CHECK(solid == doctest::Approx(M_PI * 2 * std::log(2 * opacity) * variance).epsilon(0.35));
     }
@@ -128,7 +128,7 @@ TEST_CASE("the crop holds all of the full image") {
     const splat::Picture picture = engine().draw(twin.gaussians, {&whole, 1})[0];
     const render::Frame& frame = frames[k];
     CHECK(frame.picture.width < camera.width / 2);
-    double largest = 0.0, seen = 0.0;
+    double largest = 0.0, painted = 0.0;
     for (int y = 0; y < camera.height; ++y)
       for (int x = 0; x < camera.width; ++x)
         for (int c = 0; c < 4; ++c) {
@@ -138,9 +138,9 @@ TEST_CASE("the crop holds all of the full image") {
               inside ? frame.picture.rgba[4 * (static_cast<std::size_t>(cy) * frame.picture.width + cx) + c] : 0.0;
           const double full = picture.rgba[4 * (static_cast<std::size_t>(y) * camera.width + x) + c];
           largest = std::max(largest, std::abs(cropped - full));
-          seen += full;
+          painted += full;
         }
-    CHECK(seen > 500);
+    CHECK(painted > 500);
     CHECK(largest < 2e-5);
   }
 }

@@ -1,4 +1,4 @@
-// tests/small_twin.h - a twin made by hand, for tests of what stores, draws and exports twins.
+// tests/small_twin.h - a twin made by hand, for tests of modules that store, draw and export twins.
 #pragma once
 #include <cmath>
 #include <random>
@@ -7,7 +7,8 @@
 
 namespace chainsplat::test {
 
-// Gaussians on a spiral around the rope at home, degree 1, colors that vary along and around it; each sure of its link.
+// Gaussians of degree 1 on a spiral around the rope at home, with colors that vary along and around it; each has one
+// link with a probability of nearly 1.
 inline splat::Gaussians spiral_gaussians(const chain::Chain& chain, int count) {
   splat::Gaussians g;
   g.resize(count, chain.links(), 1);
@@ -34,7 +35,7 @@ inline splat::Gaussians spiral_gaussians(const chain::Chain& chain, int count) {
   return g;
 }
 
-// A swing of `seconds` at 30 Hz, larger toward the tip, in every axis.
+// States of a swing of `seconds` at 30 Hz about every axis, larger toward the tip.
 inline chain::States swing(const chain::Chain& chain, double seconds, double start = 0.0) {
   chain::States states;
   for (int k = 0; k <= std::lround(30 * seconds); ++k) {
@@ -64,7 +65,7 @@ inline trajectory::Trajectory moving_base(double seconds) {
 
 inline twin::Twin small_twin(chain::Bending bending = chain::Bending::spatial, int gaussians = 300) {
   twin::Twin twin;
-  // a first joint off the grasp and lengths that are no short decimals
+  // the first joint is away from the grasp, and lengths are no short decimals
   twin.chain = chain::make_chain(0.3, 0.02, {0, 0, -1}, {0, 1, 0}, 5, bending, false, 0.013);
   twin.gaussians = spiral_gaussians(twin.chain, gaussians);
   twin.states = swing(twin.chain, 1.0);
@@ -95,7 +96,7 @@ inline twin::Twin small_twin(chain::Bending bending = chain::Bending::spatial, i
   return twin;
 }
 
-// A folder of its own under the system's temporary one, removed at the end.
+// A folder under the system's temporary one that is removed at the end of its lifetime.
 struct TemporaryFolder {
   Path path;
   explicit TemporaryFolder(const std::string& name)

@@ -1,5 +1,5 @@
-// The device's normal equations of the colors inside a mask against a host's in double (reference_colors.h), against
-// differences of the drawn loss, and as what they are for: a step that finds a small motion.
+// Compares the device's normal equations of the colors inside a mask with those of the host in double
+// (reference_colors.h) and with differences of the drawn loss, and tests their use: a step that finds a small motion.
 #include <doctest/doctest.h>
 
 #include <array>
@@ -32,7 +32,7 @@ gpu::Device& device(bool least = false) {
   return least ? *poor : *best;
 }
 
-// Every test case ends with it.
+// Every test case ends with this check.
 void check_silent() {
   for (const bool least : {false, true}) {
     const std::vector<std::string> texts = gpu::validation_texts(device(least));
@@ -40,20 +40,21 @@ void check_silent() {
   }
 }
 
-// A rope of 0.3 m and 2 cm in colors that change along it and about it, bent, before cameras on three sides; what they
-// see is the rope a little further on, in another exposure, with noise, a hand before its middle.
+// A bent rope, 0.3 m long and 2 cm thick, with colors that vary along and around it, in front of cameras on three
+// sides. They observe it at slightly different angles, with another exposure and noise; hide_middle() covers its
+// middle.
 struct Scene {
   chain::Chain chain;
   splat::Gaussians gaussians;
   std::vector<capture::Camera> cameras;
   VectorX theta;
   Pose base;
-  std::vector<splat::ViewSpec> views;  // of the twin; they point into `cameras`
-  std::vector<std::vector<std::uint8_t>> seen;
+  std::vector<splat::ViewSpec> views;  // with the twin's motions; they point into `cameras`
+  std::vector<std::vector<std::uint8_t>> observed;
 
-  std::vector<const std::vector<std::uint8_t>*> seen_pointers() const {
+  std::vector<const std::vector<std::uint8_t>*> observed_pointers() const {
     std::vector<const std::vector<std::uint8_t>*> out;
-    for (const auto& s : seen) out.push_back(&s);
+    for (const auto& s : observed) out.push_back(&s);
     return out;
   }
 };
@@ -95,7 +96,7 @@ Scene make_scene() {
   }
   scene.theta = VectorX::Zero(scene.chain.angles());
   for (int k = 0; k < scene.theta.size(); ++k) scene.theta[k] = 0.25 * std::sin(1.3 * k + 0.4);
-  scene.base.translation = Vector3(0.3, -0.2, 0.6);  // the world's origin is elsewhere
+  scene.base.translation = Vector3(0.3, -0.2, 0.6);  // away from the world origin
   for (const double side : {-0.9, 0.0, 1.1}) {
     capture::Camera c;
     c.width = 200;
@@ -114,17 +115,17 @@ Scene make_scene() {
   return scene;
 }
 
-// Crops of different sizes; the third is small and cuts the rope off.
-void look(Scene& scene, splat::Engine& engine, const VectorX& theta_seen, const Exposure& exposure) {
+// Draws what the cameras observe at `theta_seen`. The crops have different sizes; the third is small and cuts the rope.
+void observe(Scene& scene, splat::Engine& engine, const VectorX& theta_seen, const Exposure& exposure) {
   const std::array<std::array<int, 4>, 3> crops{{{0, 0, 200, 240}, {30, 5, 141, 223}, {60, 60, 77, 101}}};
   core::Random random(5);
   scene.views.clear();
-  scene.seen.clear();
+  scene.observed.clear();
   for (std::size_t v = 0; v < crops.size(); ++v) {
     const auto [x0, y0, width, height] = crops[v];
     splat::ViewSpec spec{
         &scene.cameras[v], x0, y0, width, height, chain::link_motions(scene.chain, theta_seen, scene.base)};
-    scene.seen.push_back(looked_at(engine.draw(scene.gaussians, {&spec, 1})[0], exposure, random));
+    scene.observed.push_back(looked_at(engine.draw(scene.gaussians, {&spec, 1})[0], exposure, random));
     spec.motions = chain::link_motions(scene.chain, scene.theta, scene.base);
     scene.views.push_back(spec);
   }
@@ -133,11 +134,11 @@ void look(Scene& scene, splat::Engine& engine, const VectorX& theta_seen, const 
 void hide_middle(Scene& scene) {
   for (std::size_t v = 0; v < scene.views.size(); ++v)
     for (int y = scene.views[v].height / 2; y < scene.views[v].height / 2 + 25; ++y)
-      for (int x = 0; x < scene.views[v].width; ++x) scene.seen[v][4 * (y * scene.views[v].width + x) + 3] = 0;
+      for (int x = 0; x < scene.views[v].width; ++x) scene.observed[v][4 * (y * scene.views[v].width + x) + 3] = 0;
 }
 
-// Largest difference of two sums, of what the wanted ones have of that kind: twists about the links' starts, where
-// moments and forces are of one size each.
+// Largest difference of two sums, relative to the largest wanted entry of its kind. Twists are taken about the links'
+// starts, where all moments are of one size and all forces of another.
 double worst_difference(const Scene& scene, const splat::ViewSpec& view, const ColorSums& got,
                         const ColorSums& wanted) {
   double worst = 0.0;
@@ -164,7 +165,7 @@ double worst_difference(const Scene& scene, const splat::ViewSpec& view, const C
 }
 
 void check_sums(const Scene& scene, const splat::ViewSpec& view, const ColorSums& got, const ColorSums& wanted) {
-  constexpr double kSums = 2e-5;  // some thousand floats, and an exposure that comes of such sums
+  constexpr double kSums = 2e-5;  // for sums of some thousand floats, and an exposure computed from such sums
   CHECK(got.pixels == wanted.pixels);
   CHECK(got.gain == doctest::Approx(wanted.gain).epsilon(kSums));
   CHECK(std::abs(got.bias - wanted.bias) <= kSums);
@@ -189,12 +190,12 @@ TEST_CASE("the device's color sums are those of a host in double") {
   splat::Engine engine(device());
   VectorX moved = scene.theta;
   for (int k = 0; k < moved.size(); ++k) moved[k] += 0.01 * std::sin(2.1 * k);
-  look(scene, engine, moved, {1.2, -0.04, 0.02});
+  observe(scene, engine, moved, {1.2, -0.04, 0.02});
   hide_middle(scene);
   const auto pictures = engine.draw(scene.gaussians, scene.views, true);
   std::vector<ColorSums> wanted;
   for (std::size_t v = 0; v < scene.views.size(); ++v) {
-    wanted.push_back(reference::color_sums(scene.chain, scene.views[v], scene.seen[v], pictures[v]));
+    wanted.push_back(reference::color_sums(scene.chain, scene.views[v], scene.observed[v], pictures[v]));
     REQUIRE(wanted[v].pixels > 300);
     CHECK(wanted[v].gain == doctest::Approx(1.2).epsilon(0.1));
   }
@@ -211,15 +212,15 @@ TEST_CASE("the device's color sums are those of a host in double") {
     settings.pixels_per_lane = variant.pixels_per_lane;
     splat::Engine other(device(variant.least), settings);
     other.set_gaussians(scene.gaussians);
-    const auto got = other.color_sums(scene.chain, scene.views, scene.seen_pointers());
+    const auto got = other.color_sums(scene.chain, scene.views, scene.observed_pointers());
     REQUIRE(got.size() == scene.views.size());
     for (std::size_t v = 0; v < got.size(); ++v) {
       CAPTURE(v);
       check_sums(scene, scene.views[v], got[v], wanted[v]);
     }
-    // one seed, one device, same bits; also after other pictures
+    // the same device gives the same bits, also after other pictures
     other.draw(scene.gaussians, {&scene.views[1], 1});
-    const auto again = other.color_sums(scene.chain, scene.views, scene.seen_pointers());
+    const auto again = other.color_sums(scene.chain, scene.views, scene.observed_pointers());
     for (std::size_t v = 0; v < got.size(); ++v) CHECK(same_bits(got[v], again[v]));
   }
   check_silent();
@@ -228,8 +229,8 @@ TEST_CASE("the device's color sums are those of a host in double") {
 TEST_CASE("tiles with more Gaussians than their lists first have room for") {
   Scene scene = make_scene();
   splat::Engine engine(device());
-  look(scene, engine, scene.theta, {1.1, 0.02, 0.02});
-  // every Gaussian twenty times, a little apart, fainter
+  observe(scene, engine, scene.theta, {1.1, 0.02, 0.02});
+  // replace every Gaussian by twenty fainter ones, slightly apart
   const splat::Gaussians once = scene.gaussians;
   constexpr int kTimes = 20;
   scene.gaussians = {};
@@ -247,13 +248,13 @@ TEST_CASE("tiles with more Gaussians than their lists first have room for") {
   }
   engine.set_gaussians(scene.gaussians);
   const std::uint64_t submitted = device().submitted;
-  const auto got = engine.color_sums(scene.chain, scene.views, scene.seen_pointers());
-  CHECK(device().submitted > submitted + 1);  // there was no room, and room was made
+  const auto got = engine.color_sums(scene.chain, scene.views, scene.observed_pointers());
+  CHECK(device().submitted > submitted + 1);  // the first submission overflowed and was run again
   const auto pictures = engine.draw(scene.gaussians, scene.views, true);
   for (std::size_t v = 0; v < got.size(); ++v) {
     CAPTURE(v);
     check_sums(scene, scene.views[v], got[v],
-               reference::color_sums(scene.chain, scene.views[v], scene.seen[v], pictures[v]));
+               reference::color_sums(scene.chain, scene.views[v], scene.observed[v], pictures[v]));
     CHECK(got[v].pixels > 300);
   }
   check_silent();
@@ -264,20 +265,20 @@ TEST_CASE("the right side is the slope of the drawn loss") {
   splat::Engine engine(device());
   VectorX moved = scene.theta;
   for (int k = 0; k < moved.size(); ++k) moved[k] += 0.004 * std::sin(2.1 * k);
-  look(scene, engine, moved, {});
+  observe(scene, engine, moved, {});
   engine.set_gaussians(scene.gaussians);
-  const auto sums = engine.color_sums(scene.chain, scene.views, scene.seen_pointers());
+  const auto sums = engine.color_sums(scene.chain, scene.views, scene.observed_pointers());
   for (std::size_t v = 0; v < 2; ++v) {
     CAPTURE(v);
     const splat::ViewSpec& view = scene.views[v];
     const auto pictures = engine.draw(scene.gaussians, {&view, 1}, true);
-    // Huber's loss over the same pixels at the same exposure; which pixels, says a weight that is not 0
+    // Huber's loss over the same pixels at the same exposure
     std::vector<bool> counts(static_cast<std::size_t>(view.width) * view.height, false);
     for (int y = 2; y < view.height - 2; ++y)
       for (int x = 2; x < view.width - 2; ++x) {
         bool all = pictures[0].rgba[4 * (y * view.width + x) + 3] >= 0.95f;
         for (int i = 0; all && i < 25; ++i)
-          all = scene.seen[v][4 * ((y + i / 5 - 2) * view.width + x + i % 5 - 2) + 3] >= 128;
+          all = scene.observed[v][4 * ((y + i / 5 - 2) * view.width + x + i % 5 - 2) + 3] >= 128;
         counts[y * view.width + x] = all;
       }
     const auto loss = [&](const Vector6& twist) {
@@ -287,18 +288,18 @@ TEST_CASE("the right side is the slope of the drawn loss") {
       double sum = 0.0;
       for (std::size_t k = 0; k < picture.rgba.size(); ++k) {
         if (k % 4 == 3 || !counts[k / 4]) continue;
-        const double r = std::abs(sums[v].gain * picture.rgba[k] + sums[v].bias - scene.seen[v][k] / 255.0);
+        const double r = std::abs(sums[v].gain * picture.rgba[k] + sums[v].bias - scene.observed[v][k] / 255.0);
         sum += r <= 0.05 ? 0.5 * r * r : 0.05 * (r - 0.025);
       }
       return sum;
     };
     Vector6 right = Vector6::Zero();
     for (const auto& part : sums[v].right) right += part.head<6>();
-    // Motions in the picture's plane, about the rope's middle. Of others it matters how deep the Gaussians lie of which
-    // a pixel's color is mixed.
+    // Motions in the picture's plane, about the rope's middle. The effect of others depends on the depths of all
+    // Gaussians that a pixel's color is blended from, not on the one point that it stands for.
     const Pose about{view.camera->world_from_camera.rotation, scene.base * Vector3(0, 0, -0.14)};
     const Vector6 found = math::adjoint(about).transpose() * right;
-    Vector3 slope, looked_up;  // by 10 cm of lever, so that they are of one size
+    Vector3 slope, looked_up;  // rotations with a lever of 10 cm, so that all entries are of one size
     for (const int k : {2, 3, 4}) {
       const double lever = k < 3 ? 10.0 : 1.0, step = 2e-4 * lever;  // a fifth of a pixel
       const Vector6 twist = math::transform_twist(about, step * Vector6::Unit(k));
@@ -315,7 +316,7 @@ TEST_CASE("a step on the colors finds a small motion of the rope") {
   splat::Engine engine(device());
   VectorX moved = scene.theta;
   for (int k = 0; k < moved.size(); ++k) moved[k] += 0.006 * std::sin(1.7 * k + 0.5);  // up to 2 px
-  look(scene, engine, moved, {0.9, 0.05, 0.0});
+  observe(scene, engine, moved, {0.9, 0.05, 0.0});
   engine.set_gaussians(scene.gaussians);
   const int n = scene.chain.angles();
   std::vector<double> errors{(scene.theta - moved).norm()};
@@ -324,7 +325,7 @@ TEST_CASE("a step on the colors finds a small motion of the rope") {
     const MatrixX axes = chain::world_axes(scene.chain, scene.theta, scene.base);
     MatrixX normal = MatrixX::Zero(n + 2, n + 2);
     VectorX right = VectorX::Zero(n + 2);
-    for (const ColorSums& sums : engine.color_sums(scene.chain, scene.views, scene.seen_pointers()))
+    for (const ColorSums& sums : engine.color_sums(scene.chain, scene.views, scene.observed_pointers()))
       for (int j = 0; j < scene.chain.links(); ++j) {
         MatrixX columns = MatrixX::Zero(8, n + 2);
         const int count = scene.chain.last_angle(j) + 1;
@@ -345,9 +346,9 @@ TEST_CASE("following needs no new memory, whatever the crops' sizes, and nothing
   Scene scene = make_scene();
   for (const bool least : {false, true}) {
     splat::Engine engine(device(least));
-    look(scene, engine, scene.theta, {});
+    observe(scene, engine, scene.theta, {});
     engine.set_gaussians(scene.gaussians);
-    engine.color_sums(scene.chain, {scene.views.data(), 1}, {scene.seen_pointers().data(), 1});  // the largest
+    engine.color_sums(scene.chain, {scene.views.data(), 1}, {scene.observed_pointers().data(), 1});  // the largest crop
     const std::uint64_t bytes = device(least).buffer_bytes, submitted = device(least).submitted;
     int calls = 0;
     for (int cut = 0; cut < 60; cut += 7, ++calls) {
@@ -356,20 +357,20 @@ TEST_CASE("following needs no new memory, whatever the crops' sizes, and nothing
       view.height -= 2 * cut;
       std::vector<std::uint8_t> part;
       for (int y = 0; y < view.height; ++y)
-        part.insert(part.end(), scene.seen[0].begin() + 4 * y * 200,
-                    scene.seen[0].begin() + 4 * (y * 200 + view.width));
+        part.insert(part.end(), scene.observed[0].begin() + 4 * y * 200,
+                    scene.observed[0].begin() + 4 * (y * 200 + view.width));
       const std::vector<std::uint8_t>* const one = &part;
       CHECK(engine.color_sums(scene.chain, {&view, 1}, {&one, 1})[0].pixels > 100);
       CHECK(device(least).buffer_bytes == bytes);
     }
-    CHECK(device(least).submitted == submitted + calls);  // one submission a frame, transfers included
+    CHECK(device(least).submitted == submitted + calls);  // one submission per frame, transfers included
 
     std::vector<std::uint8_t> no_mask(4u * 200 * 240, 0);
     const splat::ViewSpec empty{&scene.cameras[0], 3, 4, 0, 0, scene.views[0].motions};
     const std::vector<std::uint8_t> no_pixels;
     const std::array views{scene.views[0], empty};
-    const std::array<const std::vector<std::uint8_t>*, 2> seen{&no_mask, &no_pixels};
-    for (const ColorSums& sums : engine.color_sums(scene.chain, views, seen)) {
+    const std::array<const std::vector<std::uint8_t>*, 2> observed{&no_mask, &no_pixels};
+    for (const ColorSums& sums : engine.color_sums(scene.chain, views, observed)) {
       CHECK(sums.pixels == 0);
       CHECK(sums.weight == 0.0);
       CHECK(sums.gain == 1.0);

@@ -16,7 +16,7 @@ nlohmann::json vectors(const std::string& name) {
   return nlohmann::json::parse(file);
 }
 
-// All numbers of nested lists, in order.
+// All numbers of nested lists, in their order.
 std::vector<double> flat(const nlohmann::json& list) {
   if (list.is_number()) return {list.get<double>()};
   std::vector<double> out;
@@ -25,7 +25,7 @@ std::vector<double> flat(const nlohmann::json& list) {
   return out;
 }
 
-// Largest difference, relative to the largest wanted entry.
+// Largest difference relative to the largest expected entry.
 double relative_error(const std::vector<double>& got, const std::vector<double>& wanted) {
   REQUIRE(got.size() == wanted.size());
   double error = 0.0, largest = 0.0;
@@ -88,7 +88,7 @@ TEST_CASE("the reference equals the splat vectors: replicas, image, loss and eve
   }
   CHECK(relative_error(motion_rows, flat(file["chain"]["link_motions"])) <= kVectorTolerance);
 
-  // the vectors were made without the clamp of SPEC 2.5
+  // the vectors were computed without the clamp of mathematics.md 2.5
   reference::Rules rules;
   rules.clamp = false;
   const auto splats = reference::project(g, view, motions, rules);
@@ -107,8 +107,7 @@ TEST_CASE("the reference equals the splat vectors: replicas, image, loss and eve
   }
 
   reference::Target target{flat(file["target"]), std::vector<double>(24 * 16, 0.0)};
-  // 0.8 and 0.2 are not floats, as LossWeights has them: one evaluation with weights (1, 0), one with (0, 1), mixed in
-  // double
+  // LossWeights are floats, which 0.8 and 0.2 are not: evaluate with weights (1, 0) and (0, 1) and mix in double
   splat::LossWeights weights;
   std::vector<reference::Variable> angles;
   for (const double x : theta) angles.push_back(reference::independent(x));
@@ -172,7 +171,7 @@ TEST_CASE("the reference's spherical harmonics equal the vectors to degree 3") {
     const std::vector<double> direction = flat(c["direction"]);
     const auto basis = reference::sh_basis<double>(3, {direction[0], direction[1], direction[2]});
     CHECK(relative_error(basis, flat(c["basis"])) <= kVectorTolerance);
-    // the module's own function, in float coefficients: rounding 6e-8 of sums of 16 terms
+    // the module's own function has float coefficients: rounding of 6e-8 in sums of 16 terms
     for (int degree = 0; degree <= 3; ++degree) {
       splat::Gaussians g;
       g.resize(1, 1, degree);
@@ -273,7 +272,8 @@ TEST_CASE("the tape's gradients are those of central differences: degree 3, mask
   };
   const auto got = reference::evaluate(g, views, targets, weights, 0.0, reference::kNoCutoffs);
   CHECK(got.total == doctest::Approx(at(g, views)).epsilon(1e-13));
-  // central differences: error about h^2 of the third derivative plus 1e-16/h, each 1e-9 or less of the largest entry
+  // the error of central differences is about h^2 of the third derivative plus 1e-16/h, each below 1e-9 of the largest
+  // entry
   constexpr double kStep = 1e-5, kTolerance = 1e-6;
   for (int kind = 0; kind < 6; ++kind) {
     std::vector<double> differences;

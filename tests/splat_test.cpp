@@ -1,9 +1,10 @@
-// The device's splatting engine (chainsplat/splat.h) against the double-precision renderer of reference_renderer.h.
+// Compares the device's splatting engine (chainsplat/splat.h) with the double-precision renderer of
+// reference_renderer.h.
 //
-// A float device and a double host decide the discrete rules (1/255 skip, 1e-4 stop, order of two depths) differently
-// where a number lies within rounding of its threshold. The reference says for each pixel whether that can happen and
-// bounds the change (reference::Doubt): pixels beyond doubt are compared strictly, the others within the bound, and
-// their share is capped. Gradients are compared where no pixel is in doubt, or without the rules.
+// A float device and a double host may decide the discrete rules (1/255 skip, 1e-4 stop, order of two depths)
+// differently if a number lies within rounding of its threshold. The reference knows for each pixel whether that can
+// happen, and bounds the change (reference::Doubt): pixels beyond doubt are compared strictly, the others within the
+// bound, and their share is limited. Gradients are compared where no pixel is in doubt, or without the rules.
 #include "chainsplat/splat.h"
 
 #include <doctest/doctest.h>
@@ -29,15 +30,15 @@ namespace {
 
 // Float rounding (6e-8) of pixel coordinates up to 50 px, through conics up to 1/0.3 px^-2, summed over the entries.
 constexpr double kImageTolerance = 2e-5;
-// Of the largest entry of a kind (vectors/README.md): the same, through quotients and sums with cancellation.
+// Relative to the largest entry of a kind (vectors/README.md): the same rounding, through quotients and cancellation.
 constexpr double kGradientTolerance = 1e-3;
-// Of the largest entry of one Gaussian's row, so that a wrong weak Gaussian does not hide behind a strong one; with a
-// floor of kRowFloor of the kind's largest entry, below which cancellation leaves no digits.
+// Relative to the largest entry of one Gaussian's row, so that an error of a weak Gaussian does not hide behind a
+// strong one; plus kRowFloor of the kind's largest entry, since cancellation leaves much smaller rows no digits.
 constexpr double kRowTolerance = 1e-2, kRowFloor = 1e-4;
-// Gradients of at most this size come from alphas that vanish beside 1 in float (the sign of alpha - mask is then
-// lost); losses are of order 1, lengths of order 0.1 m.
+// Gradients of at most this size come from alphas that are lost when added to 1 in float (as is the sign of
+// alpha - mask); losses are of order 1, lengths of order 0.1 m.
 constexpr double kNothing = 1e-8;
-// Sums of some thousand floats.
+// For sums of some thousand floats.
 constexpr double kLossTolerance = 1e-5;
 
 gpu::Device& device() {
@@ -49,7 +50,7 @@ gpu::Device& device() {
   return *opened;
 }
 
-// One engine for each setting in use: its pipelines take the longest of a test.
+// One engine per setting in use, because making its pipelines takes most of a test's time.
 Engine& engine(bool exact_cutoffs = true) {
   static Engine with(device());
   static Engine without(device(), [] {
@@ -60,20 +61,19 @@ Engine& engine(bool exact_cutoffs = true) {
   return exact_cutoffs ? with : without;
 }
 
-// Every test case ends with it.
+// Every test case ends with this check.
 void check_silent() {
   const std::vector<std::string> texts = gpu::validation_texts(device());
   CHECK(gpu::validation_messages(device()) == 0);
   CHECK_MESSAGE(texts.empty(), (texts.empty() ? std::string() : texts.front()));
 }
 
-// --- scenes
-// ------------------------------------------------------------------------------------------------------------
+// --- scenes ----------------------------------------------------------------------------------------------------------
 
 struct Scene {
   Gaussians gaussians;
   std::vector<capture::Camera> cameras;
-  std::vector<ViewSpec> views;  // point into `cameras`
+  std::vector<ViewSpec> views;  // they point into `cameras`
   std::vector<std::vector<std::uint8_t>> targets;
 
   std::vector<const std::vector<std::uint8_t>*> target_pointers() const {
@@ -128,7 +128,7 @@ Gaussians random_gaussians(core::Random& random, int count, int links, int degre
   return g;
 }
 
-// Two poses of a bent chain: motions that carry the rope in front of the cameras.
+// Link motions of a bent chain that place the rope in front of the cameras.
 std::vector<math::Pose> random_motions(core::Random& random, int links) {
   std::vector<math::Pose> motions{pose(0.2 * random.normal(), 0.2 * random.normal(), 0.3 * random.normal(),
                                        0.01 * random.normal(), 0.01 * random.normal(), 0.35)};
@@ -141,7 +141,7 @@ std::vector<math::Pose> random_motions(core::Random& random, int links) {
   return motions;
 }
 
-// Patches of noise with partial masks; RGB is 0 where the mask is.
+// Patches of noise with partial masks; RGB is 0 where the mask is 0.
 std::vector<std::uint8_t> random_target(core::Random& random, int width, int height) {
   std::vector<std::uint8_t> rgba(4 * static_cast<std::size_t>(width) * height, 0);
   for (int y = 0; y < height; ++y) {
@@ -155,7 +155,7 @@ std::vector<std::uint8_t> random_target(core::Random& random, int width, int hei
   return rgba;
 }
 
-// Three views of different sizes and cameras at two poses: a whole image, a crop, and a tall one.
+// Three views with different sizes and cameras, of two poses of the rope: a whole image, a crop, and a tall image.
 Scene random_scene(std::uint64_t seed, int count, int links, int degree, Logits logits, double size = 0.006) {
   core::Random random(seed);
   Scene s;
@@ -170,10 +170,9 @@ Scene random_scene(std::uint64_t seed, int count, int links, int degree, Logits 
   return s;
 }
 
-// --- comparisons
-// -------------------------------------------------------------------------------------------------------
+// --- comparisons -----------------------------------------------------------------------------------------------------
 
-// Share of pixels where rounding may decide a rule.
+// Returns the share of pixels where rounding may decide a rule.
 double check_picture(const splat::Picture& got, const reference::Picture& wanted, double tolerance = kImageTolerance) {
   REQUIRE(got.width == wanted.width);
   REQUIRE(got.height == wanted.height);
@@ -183,7 +182,7 @@ double check_picture(const splat::Picture& got, const reference::Picture& wanted
     double error = std::abs(got.rgba[k] - wanted.rgba[k]);
     if (!std::isfinite(got.rgba[k])) error = INFINITY;
     if (!wanted.doubtful[k / 4]) worst = std::max(worst, error);
-    // the bound is of first order; its own rounding is a hundredth of it
+    // the bound is of first order; the hundredth is for its own error
     worst_excess = std::max(worst_excess, error - 1.01 * wanted.change[k / 4]);
   }
   CHECK(worst <= tolerance);
@@ -219,7 +218,7 @@ void check_gradients(const splat::Gradients& got, const reference::Evaluation& w
     check_kind(reference::kKindNames[kind], *g.kinds()[kind], *wanted.gradient.kinds()[kind], rows[kind], tolerance);
   REQUIRE(got.link_twists.size() == wanted.link_twists.size());
   for (std::size_t v = 0; v < wanted.link_twists.size(); ++v) {
-    // moments (N m) and forces (N) are two kinds
+    // moments and forces are two kinds, because their units differ
     for (const int half : {0, 1}) {
       const math::MatrixX a = got.link_twists[v].middleRows(3 * half, 3),
                           b = wanted.link_twists[v].middleRows(3 * half, 3);
@@ -236,7 +235,7 @@ void check_losses(const splat::LossValues& got, const Scene& scene, const refere
     CHECK(std::abs(got.l1[v] - wanted.losses[v].l1) <= kLossTolerance);
     CHECK(std::abs(got.ssim[v] - wanted.losses[v].ssim) <= kLossTolerance);
     CHECK(std::abs(got.mask[v] - wanted.losses[v].mask) <= kLossTolerance);
-    constexpr double kDecibels = 1e-3;  // relative error 2e-4 of the squared error
+    constexpr double kDecibels = 1e-3;  // a relative error of 2e-4 of the squared error
     CHECK(std::abs(got.psnr_object[v] -
                    reference::psnr_object(wanted.pictures[v], reference::target(scene.targets[v]))) <= kDecibels);
   }
@@ -249,7 +248,7 @@ int doubtful(const reference::Evaluation& evaluation) {
   return sum;
 }
 
-// A scene of the family whose pixels are all beyond doubt, with its gradients.
+// A random scene whose pixels are all beyond doubt, with its gradients.
 template <class Make>
 std::pair<Scene, reference::Evaluation> clear_scene(Make make, const LossWeights& weights, double normalizer) {
   constexpr std::uint64_t kTries = 40;
@@ -330,7 +329,7 @@ TEST_CASE("the device equals the splat vectors") {
     view.motions.push_back(motion);
   }
   scene.views = {view};
-  // the vectors have no clamp in the projection
+  // the vectors were computed without a clamp in the projection
   Settings settings;
   settings.projection_clamp = false;
   Engine unclamped(device(), settings);
@@ -348,8 +347,8 @@ TEST_CASE("the device equals the splat vectors") {
   }
   CHECK(worst <= kImageTolerance);
 
-  // Targets on the device have 8 bits, the vectors' do not: the wanted gradient is the reference's for the rounded
-  // target (it equals the vectors for theirs: splat_reference_test.cpp).
+  // Targets on the device have 8 bits, those of the vectors do not. The expected gradient is therefore the reference's
+  // for the rounded target; splat_reference_test.cpp compares the reference with the vectors.
   std::vector<std::uint8_t> target;
   for (int y = 0; y < camera.height; ++y) {
     for (int x = 0; x < camera.width; ++x) {
@@ -375,8 +374,8 @@ TEST_CASE("pictures of random scenes equal the reference's with all rules on") {
     int count, links, degree;
     Logits logits;
     double size;  // m
-    double needle =
-        1.0;  // one axis longer by it, the others thinner: rectangles hold many tiles that the ellipse misses
+    // factor by which one axis is longer and the others are thinner: rectangles hold many tiles that the ellipse misses
+    double needle = 1.0;
   };
   int number = 0;
   for (const Case& c : {Case{60, 4, 0, Logits::soft, 0.006}, Case{150, 9, 0, Logits::sharp, 0.004},
@@ -390,17 +389,17 @@ TEST_CASE("pictures of random scenes equal the reference's with all rules on") {
     REQUIRE(pictures.size() == 3);
     for (int v = 0; v < 3; ++v) {
       const auto wanted = reference::draw(reference::parameters(scene.gaussians), scene.views[v]);
-      // bands of 2e-4 about 1/255, crossed by some dozens of rims
+      // the bands of 2e-4 around 1/255 are crossed by the rims of some dozens of splats
       constexpr double kDoubtfulShare = 0.05;
       CHECK(check_picture(pictures[v], wanted) <= kDoubtfulShare);
       REQUIRE(pictures[v].depth.size() == wanted.depth.size());
       double worst = 0.0;
       for (std::size_t k = 0; k < wanted.depth.size(); ++k) {
-        constexpr double kRim = 1e-3;  // of alpha around 1/2
+        constexpr double kRim = 1e-3;  // alpha this close to 1/2 may decide differently whether there is a depth
         if (wanted.doubtful[k] || std::abs(wanted.rgba[4 * k + 3] - 0.5) < kRim) continue;
         worst = std::max(worst, std::abs(pictures[v].depth[k] - wanted.depth[k]));
       }
-      // a quotient of two sums that are each good to the image tolerance, times less than 1 m
+      // a quotient of two sums, each within the image tolerance, of depths below 1 m
       CHECK(worst <= 2.0 * kImageTolerance);
     }
   }
@@ -436,7 +435,7 @@ TEST_CASE("gradients and pictures equal the reference's without the rules") {
     CAPTURE(degree);
     const Scene scene = random_scene(50 + degree, 40, 3, degree, Logits::soft);
     for (const LossWeights& weights : {LossWeights{1, 0, 0}, LossWeights{0, 1, 0}, LossWeights{0, 0, 1}, kAllTerms}) {
-      if (degree != 0 && weights.l1 != kAllTerms.l1) continue;  // one term at a time: once is enough
+      if (degree != 0 && weights.l1 != kAllTerms.l1) continue;  // single terms are tested for one degree only
       const auto wanted = reference::evaluate(reference::parameters(scene.gaussians), scene.views,
                                               scene.reference_targets(), weights, 0.0, reference::kNoCutoffs);
       splat::Gradients gradients;
@@ -499,11 +498,11 @@ TEST_CASE(
   for (const bool cutoffs : {true, false}) {
     CAPTURE(cutoffs);
     const reference::Rules rules = cutoffs ? reference::Rules{} : reference::kNoCutoffs;
-    // all together: pictures
+    // pictures of all of them together
     const auto pictures = engine(cutoffs).draw(g, scene.views);
     for (std::size_t v = 0; v < pictures.size(); ++v)
       CHECK(check_picture(pictures[v], reference::draw(plain, scene.views[v], rules)) <= 0.02);
-    // alone: gradients, so that none hides behind the others
+    // gradients of each alone, so that none hides behind the others
     for (int i = 0; i < g.count; ++i) {
       CAPTURE(odd[i].what);
       Gaussians one;
@@ -549,7 +548,7 @@ TEST_CASE("spherical harmonics turn with the link and reach the position: Gaussi
       for (int c = 0; c < 3; ++c) g.sh[c] = 9.0f;  // away from the max(0, .)
       g.opacity_logit[0] = 0.3f;
       g.link_logits[0] = 0.4f;
-      // the pull of the color on the picture, without L1's signs
+      // D-SSIM alone, whose gradient is smooth, unlike L1's
       const LossWeights weights{0.0f, 1.0f, 0.0f};
       const auto wanted =
           reference::evaluate(reference::parameters(g), scene.views, scene.reference_targets(), weights, 0.0);
@@ -592,11 +591,12 @@ TEST_CASE("lists longer than any fast path: 700, 1500, 5000 entries in one tile,
     splat::Gradients gradients;
     std::vector<splat::Picture> pictures;
     engine(false).loss(g, scene.views, scene.target_pointers(), kAllTerms, 0.0, &gradients, &pictures);
-    // thousands of roundings of the transmittance and of the sums, in place of dozens
+    // the transmittance and the sums are rounded thousands of times instead of dozens
     constexpr double kLongImage = 5e-5;
     check_picture(pictures[0], wanted.pictures[0], kLongImage);
     check_gradients(gradients, wanted);
-    // with the rules, each just above 1/255 (0.0039): nearly every pixel is in doubt somewhere, by 1/255 of a thin rest
+    // with the rules and every alpha just above 1/255 (0.0039): nearly every pixel has an entry in doubt, which changes
+    // it by 1/255 of a small transmittance
     for (float& logit : g.opacity_logit) logit = static_cast<float>(std::log(random.uniform(0.0045, 0.012)));
     constexpr double kLongWithRules = 1e-3;
     check_picture(engine().draw(g, scene.views)[0], reference::draw(reference::parameters(g), scene.views[0]),
@@ -635,7 +635,7 @@ TEST_CASE("equal depths are blended in the order of the replica index") {
   }
   const auto wanted = reference::draw(reference::parameters(g), scene.views[0]);
   CHECK(check_picture(engine().draw(g, scene.views)[0], wanted) <= 0.05);
-  // the order matters: reversed, the picture is another one
+  // the order matters: reversing it changes the picture
   Gaussians reversed = g;
   for (int i = 0; i < 8; ++i) std::copy_n(g.sh.begin() + 3 * (7 - i), 3, reversed.sh.begin() + 3 * i);
   const auto other = reference::draw(reference::parameters(reversed), scene.views[0]);
@@ -682,7 +682,7 @@ TEST_CASE("a crop is the cut-out of the whole image, and its loss is the whole i
   const splat::Picture full = engine().draw(scene.gaussians, std::span(&whole, 1))[0];
   const auto wanted = reference::draw(reference::parameters(scene.gaussians), whole);
   check_picture(full, wanted);
-  // the bounds of what is drawn, and a target inside them
+  // the bounds of the drawn pixels, and a target inside them
   int x0 = 75, y0 = 58, x1 = 0, y1 = 0;
   for (int y = 0; y < 58; ++y) {
     for (int x = 0; x < 75; ++x) {
@@ -693,7 +693,7 @@ TEST_CASE("a crop is the cut-out of the whole image, and its loss is the whole i
       y1 = std::max(y1, y + 1);
     }
   }
-  constexpr int kMargin = 5;  // px, SPEC 2.7
+  constexpr int kMargin = 5;  // px; reach of SSIM's window (mathematics.md 2.7)
   REQUIRE(x0 > kMargin);
   REQUIRE(y0 > kMargin);
   REQUIRE(x1 + kMargin < 75);
@@ -710,7 +710,7 @@ TEST_CASE("a crop is the cut-out of the whole image, and its loss is the whole i
                     full_target.begin() + 4 * (75 * y + right));
     return std::pair{view, target};
   };
-  // odd corners, inside and at the border of what is drawn
+  // corners at odd pixels, inside and at the border of the drawn pixels
   for (const auto& [left, top, right, bottom] : {std::array{x0 - 5, y0 - 5, x1 + 5, y1 + 5},
                                                  {x0 + 3, y0 + 1, x1 - 2, y1 - 4},
                                                  {0, 0, 9, 58},
@@ -727,7 +727,7 @@ TEST_CASE("a crop is the cut-out of the whole image, and its loss is the whole i
                                        full.rgba[4 * (75 * y + x) + c]));
       }
     }
-    CHECK(worst <= kImageTolerance);  // the crop's center coordinates are rounded anew
+    CHECK(worst <= kImageTolerance);  // center coordinates relative to the crop round differently
   }
   const auto evaluate = [&](const ViewSpec& view, const std::vector<std::uint8_t>& target,
                             splat::Gradients& gradients) {
@@ -748,7 +748,7 @@ TEST_CASE("a crop is the cut-out of the whole image, and its loss is the whole i
   CHECK(a.psnr_object[0] == doctest::Approx(b.psnr_object[0]).epsilon(1e-5));
   check_kind("mean", std::vector<double>(of_crop.gaussians.mean.begin(), of_crop.gaussians.mean.end()),
              {of_whole.gaussians.mean.begin(), of_whole.gaussians.mean.end()}, 3, kGradientTolerance);
-  // without the margin the SSIM part is another one: the rule is needed
+  // without the margin the SSIM term differs: the rule is needed
   CHECK(std::abs(a.ssim[0] - c.ssim[0]) > 10.0 * kSame);
   check_silent();
 }
@@ -782,7 +782,7 @@ TEST_CASE("a batch of views is the sum of its views") {
   constexpr double kRounding = 1e-6;  // of sums of three floats
   for (int kind = 0; kind < 6; ++kind)
     check_kind(reference::kKindNames[kind], *g.kinds()[kind], sums[kind], 1, kRounding);
-  // a normalizer of 0 stands for each crop's own pixels
+  // a normalizer of 0 means the pixels of each crop
   const auto own = engine().loss(scene.gaussians, scene.views, scene.target_pointers(), kAllTerms, 0.0, nullptr);
   for (std::size_t v = 0; v < scene.views.size(); ++v)
     CHECK(own.l1[v] ==
@@ -821,7 +821,7 @@ TEST_CASE("the same input gives the same bits: loss, gradients, 20 steps, and on
     CHECK((runs[0].gradients.link_twists[v].array() == runs[1].gradients.link_twists[v].array()).all());
   CHECK(same_bits(runs[0].after, runs[1].after));
   CHECK_FALSE(same_bits(runs[0].after, scene.gaussians));
-  // resumed where the second run was after kMiddle steps
+  // resume where the second run was after kMiddle steps
   CHECK(middle.step == kMiddle);
   engine().restore(middle);
   for (int step = kMiddle; step < kSteps; ++step) engine().step(batches[step % 3], kAllTerms, rates, false);
@@ -830,7 +830,7 @@ TEST_CASE("the same input gives the same bits: loss, gradients, 20 steps, and on
 }
 
 TEST_CASE("step is Adam on the mean loss of the batch") {
-  // targets whose mask reaches within 16 px of everything, so that all of every crop is charged
+  // every pixel is within 16 px of the targets' masks, so that all tiles of the crops are active
   Scene scene = random_scene(61, 16, 3, 1, Logits::soft);
   scene.views = {{&scene.cameras[0], 11, 9, 30, 19, scene.views[0].motions},
                  {&scene.cameras[1], 13, 8, 27, 22, scene.views[1].motions}};
@@ -842,7 +842,7 @@ TEST_CASE("step is Adam on the mean loss of the batch") {
     for (std::size_t k = 3; k < scene.targets.back().size(); k += 4)
       object_pixels += scene.targets.back()[k] >= 128 ? 1 : 0;
   }
-  const double normalizer = object_pixels / 2.0;  // training's means are over the views' mean number of object pixels
+  const double normalizer = object_pixels / 2.0;  // training takes means over the views' mean number of object pixels
   const std::array<float, 7> rate{3e-4f, 2e-3f, 4e-3f, 1e-2f, 5e-3f, 1e-3f, 3e-2f};
   const splat::AdamRates rates{rate[0], rate[1], rate[2], rate[3], rate[4], rate[5], rate[6]};
   engine(false).set_views(scene.views, scene.target_pointers());
@@ -852,7 +852,7 @@ TEST_CASE("step is Adam on the mean loss of the batch") {
   auto first = g, second = g;
   for (auto* moments : {&first, &second})
     for (auto* kind : moments->kinds()) std::fill(kind->begin(), kind->end(), 0.0);
-  std::array<std::vector<bool>, 6> weak;  // entries whose gradient was near zero once: there Adam multiplies rounding
+  std::array<std::vector<bool>, 6> weak;  // entries whose gradient was once near zero, where Adam amplifies rounding
   for (int kind = 0; kind < 6; ++kind) weak[kind].assign(g.kinds()[kind]->size(), false);
   const std::vector<reference::Target> targets = scene.reference_targets();
   const std::array<std::vector<int>, 2> batches{std::vector<int>{0, 1}, {1}};
@@ -869,7 +869,7 @@ TEST_CASE("step is Adam on the mean loss of the batch") {
                                             normalizer * static_cast<double>(batch.size()), reference::kNoCutoffs);
     std::vector<math::MatrixX> twists;
     const auto losses = engine(false).step(batch, kAllTerms, rates, true, &twists);
-    // losses are those before the step, means over the normalizer's pixels
+    // losses are those before the step, means over `normalizer` pixels
     REQUIRE(losses.l1.size() == batch.size());
     for (std::size_t v = 0; v < batch.size(); ++v)
       CHECK(losses.l1[v] == doctest::Approx(wanted.losses[v].l1 * static_cast<double>(batch.size())).epsilon(1e-3));
@@ -904,11 +904,11 @@ TEST_CASE("step is Adam on the mean loss of the batch") {
       if (weak[kind][k]) continue;
       ++compared;
       const double moved = (*g.kinds()[kind])[k] - start[k];
-      const double rounding = 4.0 * 6e-8 * std::abs(start[k]);  // of the float parameter itself, once a step
+      const double rounding = 4.0 * 6e-8 * std::abs(start[k]);  // of the float parameter itself, once per step
       worst = std::max(worst, (std::abs((*got.kinds()[kind])[k] - (*g.kinds()[kind])[k]) - rounding) / std::abs(moved));
     }
     CHECK(compared >= 5);
-    CHECK(worst <= 0.02);  // a gradient good to 1e-3 of the largest, at a fiftieth of the largest: 5 %, seldom reached
+    CHECK(worst <= 0.02);  // an error of 1e-3 of the largest gradient is 5 % of a gradient of kWeak, but rarely occurs
   }
   check_silent();
 }
@@ -934,7 +934,7 @@ TEST_CASE("resets cap the opacity, even the links out, and forget their moments 
   CHECK(same_bits(after.gaussians.mean, before.gaussians.mean));
   CHECK(same_bits(after.gaussians.sh, before.gaussians.sh));
   CHECK(after.step == before.step);
-  // as many moments are forgotten as the two sections have entries that had any
+  // exactly the nonzero moments of the two sections are reset
   const auto zeros = [](const std::vector<float>& x) { return std::count(x.begin(), x.end(), 0.0f); };
   REQUIRE(before.first_moment.size() == 20u * (3 + 4 + 3 + 1 + 3 + 3));
   for (const auto& [now, then] :
@@ -951,7 +951,7 @@ TEST_CASE("training draws and charges near the mask, or everywhere when asked") 
   Scene scene;
   scene.cameras = {make_camera(96, 40, 60.0, {})};
   scene.views = {{&scene.cameras[0], 0, 0, 96, 40, {pose(0, 0, 0, 0, 0, 0.5)}}};
-  // the mask at the left; one Gaussian on it, one far right
+  // a mask at the left, with one Gaussian on it and one far to the right
   std::vector<std::uint8_t> target(4 * 96 * 40, 0);
   for (int y = 14; y < 26; ++y)
     for (int x = 6; x < 18; ++x)
@@ -986,7 +986,7 @@ TEST_CASE("training draws and charges near the mask, or everywhere when asked") 
     CHECK(after.sh[0] != 0.0f);
     CHECK((after.sh[3] != 0.0f) == everywhere);
   }
-  // other motions move the picture
+  // other motions change the picture
   engine().set_gaussians(g);
   scene.views[0].motions = {pose(0, 0, 0.1, 0.02, 0.01, 0.5)};
   engine().set_motions(0, scene.views[0].motions);
@@ -1022,7 +1022,7 @@ TEST_CASE("tile sizes and pixels a lane do not change the result") {
         if (error > kRounding) ++flipped;
         worst = std::max(worst, error);
       }
-      // a skip that such rounding decides changes a pixel by 1/255 of its rest at most
+      // a skip that such rounding decides changes a pixel by at most 1/255 of its transmittance
       CHECK(flipped <= 8);
       CHECK(worst <= 1.5 / 255.0);
     }

@@ -53,10 +53,10 @@ capture::Capture scene() {
 TEST_CASE("a synthesized capture loads and holds what was drawn") {
   const test::TemporaryFolder folder("synth");
   const twin::Twin twin = test::small_twin(chain::Bending::spatial, 400);
-  const capture::Capture given = scene();
+  const capture::Capture source = scene();
   synth::Options options;
   options.video = false;
-  synth::write(engine(), twin, twin.states, given, folder.path / "capture", options);
+  synth::write(engine(), twin, twin.states, source, folder.path / "capture", options);
 
   capture::LoadOptions load;
   load.undistort = false;
@@ -70,21 +70,21 @@ TEST_CASE("a synthesized capture loads and holds what was drawn") {
   CHECK(read.mass.value_or(0.0) == doctest::Approx(mass));
   REQUIRE(read.cameras.size() == 2);
   CHECK(read.cameras[1].name == "left");
-  CHECK(read.cameras[1].distortion == given.cameras[1].distortion);
-  CHECK((read.cameras[1].world_from_camera.rotation - given.cameras[1].world_from_camera.rotation).norm() < 1e-14);
+  CHECK(read.cameras[1].distortion == source.cameras[1].distortion);
+  CHECK((read.cameras[1].world_from_camera.rotation - source.cameras[1].world_from_camera.rotation).norm() < 1e-14);
   REQUIRE(read.views.size() == 16);
   for (int c = 0; c < 2; ++c)
-    for (int k = 0; k < 8; ++k) CHECK(read.times[c][k] == doctest::Approx(given.times[c][k]).epsilon(1e-12));
+    for (int k = 0; k < 8; ++k) CHECK(read.times[c][k] == doctest::Approx(source.times[c][k]).epsilon(1e-12));
   for (const double t : {0.2, 0.35, 0.5})
-    CHECK((read.base.pose(t).translation - given.base.pose(t).translation).norm() < 1e-6);
+    CHECK((read.base.pose(t).translation - source.base.pose(t).translation).norm() < 1e-6);
 
-  // the views are the pictures, to 8 bits and 0.1 mm
+  // the loaded views equal the pictures, to 8 bits and 0.1 mm
   int solid = 0;
   for (const capture::View& view : read.views) {
     const capture::Camera& camera = read.cameras[view.camera];
     render::Options drawing;
     drawing.depth = true;
-    const auto frames = render::frames(engine(), twin.gaussians, twin.chain, twin.states, given.base, camera,
+    const auto frames = render::frames(engine(), twin.gaussians, twin.chain, twin.states, source.base, camera,
                                        view.camera, {view.time}, drawing);
     const capture::Image8 color = render::color_image(frames.at(0), camera),
                           mask = render::mask_image(frames[0], camera);
@@ -107,13 +107,13 @@ TEST_CASE("a synthesized capture loads and holds what was drawn") {
   }
   CHECK(solid > 5000);
 
-  // the truth is the chain: its ends exactly, points between on the straight links
+  // the truth is the chain: its ends are exact, and points between lie on the straight links
   const auto truth = capture::load_true_centerline(folder.path / "capture");
   REQUIRE(truth.has_value());
   REQUIRE(truth->time.size() == 8);
   for (std::size_t k = 0; k < 8; ++k) {
-    const auto motions = chain::link_motions(twin.chain, chain::interpolate(twin.states, given.times[0][k]),
-                                             given.base.pose(given.times[0][k]));
+    const auto motions = chain::link_motions(twin.chain, chain::interpolate(twin.states, source.times[0][k]),
+                                             source.base.pose(source.times[0][k]));
     const math::MatrixX nodes = chain::nodes(twin.chain, motions);
     REQUIRE(truth->points[k].cols() == 49);
     CHECK((truth->points[k].col(0) - nodes.col(0)).norm() < 1e-12);
@@ -126,11 +126,11 @@ TEST_CASE("only frames that the states cover are written, numbered from 0; video
   twin::Twin twin = test::small_twin(chain::Bending::planar, 200);
   twin.known_mass = false;
   twin.tabletop = true;
-  capture::Capture given = scene();
-  given.cameras.resize(1);
-  given.times.resize(1);
+  capture::Capture source = scene();
+  source.cameras.resize(1);
+  source.times.resize(1);
   const chain::States states = test::swing(twin.chain, 0.1, 0.3);  // 0.3 to 0.4 s; frames 0.2, 0.2333, ...
-  synth::write(engine(), twin, states, given, folder.path);
+  synth::write(engine(), twin, states, source, folder.path);
   capture::LoadOptions load;
   load.undistort = false;
   const capture::Capture read = capture::load(folder.path, load);
@@ -142,7 +142,7 @@ TEST_CASE("only frames that the states cover are written, numbered from 0; video
   REQUIRE(read.times[0].size() == 4);
   CHECK(read.times[0][0] == doctest::Approx(0.3));
   for (const capture::View& view : read.views) CHECK(view.width > 20);
-  CHECK_THROWS_AS(synth::write(engine(), twin, test::swing(twin.chain, 0.1, 5.0), given, folder.path / "none"),
+  CHECK_THROWS_AS(synth::write(engine(), twin, test::swing(twin.chain, 0.1, 5.0), source, folder.path / "none"),
                   InputError);
   CHECK(!std::filesystem::exists(folder.path / "none"));
 }

@@ -20,7 +20,7 @@ namespace {
 
 constexpr double kTurn = 2.0 * std::numbers::pi;
 
-struct Folder {  // removed at the end
+struct Folder {  // a folder of this test, removed at the end
   Path path =
       std::filesystem::temp_directory_path() / ("chainsplat_trajectory_" + std::to_string(core::fnv1a(__FILE__)));
   Folder() { std::filesystem::create_directories(path); }
@@ -49,7 +49,7 @@ Vector3 analytic_acceleration(double t) {
   return {-0.15 * 6.25 * std::sin(2.5 * t), -0.1 * 2.89 * std::cos(1.7 * t), -0.05 * 9.61 * std::sin(3.1 * t)};
 }
 
-// (T^-1 dT/dt)^vee by fourth-order differences of logarithms.
+// Returns (T^-1 dT/dt)^vee by fourth-order differences of logarithms.
 Vector6 twist_by_differences(const std::function<math::Pose(double)>& pose, double t, double h) {
   const math::Pose inverse = pose(t).inverse();
   const auto step = [&](double s) { return math::log_se3(inverse * pose(t + s)); };
@@ -159,7 +159,7 @@ TEST_CASE("noise: its size is found and the acceleration stays sensible") {
     }
     MESSAGE("noise " << sigma << " m: found " << found << " m, worst RMS acceleration error " << worst << " m/s^2");
     CHECK(found == doctest::Approx(sigma).epsilon(0.1));
-    // a tenth of what second differences give, sqrt(6) * 900 * sigma: 1.1 m/s^2 for 0.5 mm
+    // a tenth of the error of second differences at 30 Hz, sqrt(6) * 900 * sigma: 1.1 m/s^2 for 0.5 mm
     CHECK(worst < 0.1 * std::sqrt(6.0) * 900.0 * sigma);
   }
 }
@@ -170,7 +170,7 @@ TEST_CASE("rotations beyond half a turn go on continuously") {
   for (int k = 0; k <= 200; ++k)
     samples.push_back(
         {k * 0.02, {math::exp_so3(2.5 * k * 0.02 * axis) * math::exp_so3(Vector3(0.1, 0.2, 0.3)), Vector3::Zero()}});
-  // the axis is fixed in the world, so the rotation vector from the first sample is along a fixed line: ten radians
+  // the axis is fixed in the world, so the rotation vector from the first sample grows along a line, to ten radians
   const Trajectory fitted = trajectory::fit(samples, "test");
   for (double t = 0.0; t <= 4.0; t += 0.013) {
     const trajectory::BaseMotion motion = fitted.at(t);
@@ -222,8 +222,8 @@ TEST_CASE("uneven and doubled sampling, few samples, the ends") {
 TEST_CASE("large offsets and long, dense recordings keep their digits") {
   core::Random random(11);
   std::vector<Sample> samples;
-  constexpr double kOffset = 1.6e9;  // s: clocks that count from 1970
-  for (int k = 0; k < 20000; ++k) {  // 1 kHz, 0.1 mm
+  constexpr double kOffset = 1.6e9;  // s, as of clocks that count from 1970
+  for (int k = 0; k < 20000; ++k) {  // samples at 1 kHz with 0.1 mm of noise
     const double t = 0.001 * k;
     samples.push_back({kOffset + t, analytic_pose(t)});
     for (int i = 0; i < 3; ++i) samples.back().pose.translation[i] += 1e-4 * random.normal();
@@ -273,7 +273,7 @@ TEST_CASE("TUM files: read, written, refused with file and line") {
   CHECK(contains(error_of([] { trajectory::fit({{0, {}}, {std::nan(""), {}}}, "x.tum"); }), "not finite"));
   CHECK(contains(error_of([] { trajectory::fit({}, "x.tum"); }), "no pose"));
 
-  // what follows the numbers in memory and time is bounded
+  // values on which memory and time depend are bounded
   CHECK(contains(error_of([] { trajectory::fit({{0, {}}, {1, {}}, {1e7, {}}}, "x.tum"); }),
                  "pose 3: comes 1e+07 s after the first and a motion lasts at most 86400 s"));
   CHECK(error_of([] { trajectory::fit({{1.7e9, {}}, {1.7e9 + 86400, {}}}, "x.tum"); }) == "");

@@ -24,7 +24,7 @@ std::string message_of(const std::function<void()>& work) {
 
 bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
-// Bit by bit; NaN equals NaN.
+// Equality bit by bit; NaN equals NaN.
 bool same(double a, double b) { return std::memcmp(&a, &b, sizeof a) == 0 || (std::isnan(a) && std::isnan(b)); }
 
 template <class A>
@@ -50,7 +50,7 @@ twin::Twin full_twin() {
   twin.estimates.standard_errors = {0.01, std::numeric_limits<double>::quiet_NaN()};
   twin.estimates.covariance = math::MatrixX::Identity(2, 2) / 3.0;
   twin.estimates.covariance(1, 0) = 1e-300;
-  twin.estimates.weak = {{0.25, {{"rest_angle_3", 0.8}, {"log_stiffness", -0.6}}}};  // not in the alphabet's order
+  twin.estimates.weak = {{0.25, {{"rest_angle_3", 0.8}, {"log_stiffness", -0.6}}}};  // not in alphabetical order
   twin.estimates.held = {{"mass", "given by the capture"}, {"twist", "not observed, \"held\""}};
   twin.provenance = {"1.2.3",
                      "free \xc3\xa4",
@@ -128,7 +128,7 @@ TEST_CASE("a twin reads back bit by bit") {
   check_same_states(read.states, twin.states);
   check_same_states(read.rollout, twin.rollout);
 
-  // what was read is written as the same bytes
+  // writing what was read gives the same bytes
   twin::save(read, folder.path / "again");
   for (const char* name : {"twin.json", "gaussians.ply", "states.csv", "rollout.csv"})
     CHECK(core::read_file(folder.path / "run" / name) == core::read_file(folder.path / "again" / name));
@@ -207,7 +207,7 @@ TEST_CASE("twin.json has the keys that other programs read") {
   // both axes of a joint name the same links
   CHECK(json["chain"]["joints"][3]["parent_link"] == 1);
   CHECK(json["chain"]["joints"][3]["child_link"] == 2);
-  // a cylinder along z: SPEC 3.1 by hand
+  // a cylinder along z, by hand from mathematics.md 3.1
   const Json& link = json["chain"]["links"][2];
   const double m = link["mass"], l = link["length"], r = 0.01;
   CHECK(link["inertia"][0].get<double>() == doctest::Approx(m * (l * l / 12 + r * r / 4)));
@@ -294,15 +294,15 @@ TEST_CASE("damage to twin.json is named by file and key") {
   };
   for (const auto& [pointer, value, expected] : cases) {
     const std::string message = error_with(pointer, value);
-    std::string flat = message;  // "file: key: what" and "file: key is missing" alike
+    std::string flat = message;  // treats "file: key: what" and "file: key is missing" alike
     for (std::size_t at; (at = flat.find(": is missing")) != std::string::npos;) flat.erase(at, 1);
-    const std::string given = std::string(pointer) + " -> " + message;
-    INFO(given);
+    const std::string changed = std::string(pointer) + " -> " + message;
+    INFO(changed);
     CHECK(contains(flat, expected));
     CHECK(contains(message, folder.path.string()));
     CHECK(!contains(message, "\n"));
   }
-  // cut off anywhere: an error, never a crash
+  // a file that is cut off anywhere is an error, never a crash
   const std::string text = good.dump();
   for (std::size_t size = 0; size < text.size(); size += 97) {
     core::write_file(file, text.substr(0, size));
@@ -348,7 +348,7 @@ TEST_CASE("centerlines are the nodes in the world") {
   const chain::Chain chain = chain::make_chain(0.4, 0.02, {0, 0, -1}, {0, 1, 0}, 2, chain::Bending::planar, false);
   chain::States states;
   states.time = {0.5};
-  // 90 degrees about y at the grasp turns -z to -x; the second joint turns on to +z
+  // 90 degrees about y at the grasp turn -z to -x; the second joint turns it further, to +z
   states.theta = {math::Vector2(M_PI / 2, M_PI / 2)};
   const auto base = trajectory::fit({{0.0, {math::Matrix3::Identity(), {1, 2, 3}}}}, "base");
   const std::string text = twin::centerline_csv(chain, states, base);

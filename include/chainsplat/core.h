@@ -1,9 +1,8 @@
-// chainsplat/core.h - what every module needs and no module is about: errors, warnings, progress, files, threads,
-// random.
+// chainsplat/core.h - the foundation under every module: errors, warnings, progress, files, threads, random numbers.
 //
-// Errors are two exceptions, because they decide the exit code: InputError (2: the request or its input is wrong,
-// nothing was written) and WorkError (1: the work failed, what exists is kept). The library never prints and never
-// aborts; the tools catch both and print one line.
+// The module depends on no other. A failure is one of two exceptions, because the two lead to different exit codes:
+// InputError (2: the request or its input is wrong, nothing was written) and WorkError (1: the work failed, what exists
+// is kept). The library never prints and never aborts; the tools catch both and print one line. Times are in seconds.
 #pragma once
 #include <cstdint>
 #include <filesystem>
@@ -19,24 +18,25 @@ namespace chainsplat {
 using Path = std::filesystem::path;
 
 namespace core {
-// The text with control characters and bytes that are not UTF-8 written as \xNN: what comes from a file or a command
-// line can then stand in a line for the user.
+// Returns the text with control characters and bytes that are not UTF-8 written as \xNN, so that text from a file or a
+// command line cannot break the line that shows it to the user.
 std::string printable(std::string_view text);
 }  // namespace core
 
-// One line for the user: WHERE: WHAT; HOW TO MEND. Bytes that cannot be printed are escaped.
+// The request or its input is wrong. The text is one line for the user, 'WHERE: WHAT; HOW TO MEND', with unprintable
+// bytes escaped.
 struct InputError : std::runtime_error {
   InputError(const std::string& where, const std::string& what, const std::string& mend)
       : std::runtime_error(core::printable(where + ": " + what + "; " + mend)) {}
 };
 
-// The work failed half-way (device lost, disk full, diverged). Same form.
+// The work failed half-way (device lost, disk full, divergence). The text has the same form as InputError's.
 struct WorkError : std::runtime_error {
   WorkError(const std::string& where, const std::string& what, const std::string& mend)
       : std::runtime_error(core::printable(where + ": " + what + "; " + mend)) {}
 };
 
-// Thrown by long work when stop_requested() turns true, after it has left a checkpoint.
+// Thrown by long work when stop_requested() is not 0, after it has saved a checkpoint if it keeps one.
 struct Interrupted : std::runtime_error {
   explicit Interrupted(int which) : std::runtime_error("interrupted"), signal(which) {}
   int signal;  // SIGINT, SIGTERM or SIGUSR1
@@ -44,81 +44,87 @@ struct Interrupted : std::runtime_error {
 
 namespace core {
 
-// A broken promise between our own functions: throws std::logic_error with file, line and the condition.
+// Reports that the library has broken one of its own invariants, which is a defect and never the user's mistake. Throws
+// std::logic_error with the file, the line, the condition and `values`.
 [[noreturn]] void check_failed(const char* condition, const char* file, int line, const std::string& values);
 #define CHAINSPLAT_CHECK(condition, values)                                                       \
   do {                                                                                            \
     if (!(condition)) ::chainsplat::core::check_failed(#condition, __FILE__, __LINE__, (values)); \
   } while (false)
 
-// One state of a long task, sent to whoever listens (terminal bar, log file). Numbers that do not apply are NaN.
+// One state of a long task, sent to the listener (terminal bar, log file). Numbers that do not apply are NaN.
 struct Progress {
   std::string stage;      // "recognize", "identify", ...
   std::int64_t step = 0;  // of `total`
   std::int64_t total = 0;
   double loss = 0.0;
-  double psnr = 0.0;  // dB inside the object
-  std::string note;   // what is being done, a few words
+  double psnr = 0.0;  // dB, over the object's pixels
+  std::string note;   // the current activity in a few words
 };
 
-// Where warnings and progress go. Set once by the tool; the default swallows both. Thread-safe to call.
+// The receiver of warnings and progress. The tool sets it once; the default discards both. set_listener(), warn() and
+// report() may be called from any thread.
 struct Listener {
   std::function<void(const std::string&)> warning;
   std::function<void(const Progress&)> progress;
 };
 void set_listener(Listener listener);
-void warn(const std::string& line);  // one line, says what was assumed
+void warn(const std::string& line);  // one line that names the assumption made
 void report(const Progress& progress);
 
-// Set by the signal handler of the tool; long work polls it between steps.
+// The tool's signal handler sets the request, and long work polls it between its steps.
 void request_stop(int signal) noexcept;
-int stop_requested() noexcept;  // 0 or the signal
+int stop_requested() noexcept;  // the signal, or 0 when no stop is requested
 void clear_stop() noexcept;
 
-// Number of host threads for parallel_for: --threads, else the number of cores. Results never depend on it.
+// Number of host threads that parallel_for uses: the value set last, or the number of cores where none or 0 was set.
+// Results never depend on it.
 void set_threads(int threads);
 int threads();
-// Calls body(i) for i in [0, count), each exactly once, on threads() threads. The first exception is rethrown.
+// Calls body(i) exactly once for each i in [0, count), on up to threads() threads, the caller's among them. After an
+// exception no further i is begun, and the first exception is rethrown.
 void parallel_for(std::int64_t count, const std::function<void(std::int64_t)>& body);
 
-// Writes `bytes` as `path` in one step (temporary file in the same folder, fsync, rename). Throws WorkError (disk full,
-// ...).
+// Writes `bytes` as `path` in one step (temporary file in the same folder, fsync, rename), so that a reader never finds
+// half a file. Throws WorkError when the disk is full or the folder cannot be written.
 void write_file(const Path& path, std::string_view bytes);
-// The whole file. Throws InputError naming `path` when it is missing, unreadable or larger than 1 GiB (a pipe or device
-// may never end).
+// Returns the whole file. Throws InputError that names `path` when the file is missing, unreadable or larger than 1 GiB
+// (the bound exists because a pipe or device may never end).
 std::string read_file(const Path& path);
-// JSON from outside, with a bound on its nesting: the library that parses it frees, copies and prints a document by
-// recursion, so a file of brackets alone would overflow the stack. Throws nlohmann::json::exception where the text is no
-// JSON, has a number beyond double, or is nested deeper than kDeepestJson.
+// Parses JSON from outside with a bound on its nesting: the JSON library frees, copies and prints a document by
+// recursion, so a file of nothing but brackets would overflow the stack. Throws nlohmann::json::exception when the text
+// is not JSON, has a number beyond double, or is nested deeper than kDeepestJson.
 constexpr int kDeepestJson = 64;
 nlohmann::ordered_json parse_json(std::string_view text);
-// The same without exceptions: is_discarded() where the text cannot be read.
+// As parse_json(), but returns a value whose is_discarded() is true instead of throwing.
 nlohmann::ordered_json parse_json_or_discard(std::string_view text);
-// A table of numbers between commas: its lines that are not blank, without line ends and trailing spaces.
+// One line of a table of comma-separated numbers, without its line end and trailing spaces.
 struct TableLine {
-  int number;  // from 1
+  int number;  // in the file, counted from 1
   std::string_view text;
 };
+// Returns the lines of a table that are not blank; their texts refer to `text`.
 std::vector<TableLine> table_lines(std::string_view text);
-// The cells of a line, `columns` of them; where `may_be_empty`, NaN for an empty one or 'nan'. Throws InputError naming
-// the line for anything else that is no finite number; `mend` is its advice.
+// Returns the line's numbers, one per column. With `may_be_empty` an empty cell and 'nan' are read as NaN. Throws
+// InputError that names the line, with the advice `mend`, for any other cell that is not a finite number and for a
+// number of columns other than `columns`.
 std::vector<double> table_numbers(const Path& file, const TableLine& line, std::size_t columns, const std::string& mend,
                                   bool may_be_empty = false);
-// A double with the digits that read back exactly ("%.17g", shortest that round-trips).
+// Returns the shortest decimal text that reads back as exactly this double; 'nan' for NaN.
 std::string exact(double value);
-// Seconds on a steady clock since an arbitrary origin.
+// Returns seconds on a steady clock since an arbitrary origin.
 double seconds_now();
-// 64-bit FNV-1a, for capture hashes and checkpoints' checksums.
+// 64-bit FNV-1a, which captures' hashes and checkpoints' checksums use. `hash` continues an earlier one.
 std::uint64_t fnv1a(std::string_view bytes, std::uint64_t hash = 14695981039346656037ull);
 
-// SplitMix64: small, seeded, the same on every machine.
+// SplitMix64 random numbers: the same sequence for the same seed on every machine.
 class Random {
  public:
   explicit Random(std::uint64_t seed) : state_(seed) {}
   std::uint64_t next();
   double uniform();  // [0, 1)
   double uniform(double low, double high);
-  double normal();  // mean 0, sd 1
+  double normal();  // mean 0, standard deviation 1
  private:
   std::uint64_t state_;
 };

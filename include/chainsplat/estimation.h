@@ -1,12 +1,14 @@
-// chainsplat/estimation.h - a rope followed live, from one camera or more: joint angles, rates and how sure they are
-// (SPEC 6).
+// chainsplat/estimation.h - a rope followed live from one camera or more: a twin and masked frames in; joint angles,
+// rates and their covariance out, frame by frame (mathematics.md 6).
 //
-// An iterated extended Kalman filter. Its motion model is the twin's own dynamics under the base's motion; what the
-// model does not know (a hand, a finger, its own errors) is a force on the rope that wanders slowly and is estimated
-// too, as a shift of the joints' rest angles. Its first measurement is the silhouette fit of one mask, with the
-// prediction as the fit's prior (silhouette.h); its second, where the twin can be drawn, the colors inside the mask: by
-// them marks along the rope are recognized, which tells its slope in depth. Depth along the camera's rays is else
-// hardly seen; the dynamics supply it, and the covariance says how well.
+// The estimator is an iterated extended Kalman filter. Its motion model is the twin's own dynamics under the base's
+// motion. What the model does not contain (a hand, a finger, its own errors) is an unknown force on the rope, modeled
+// as a slow random walk and estimated as a shift of the joints' rest angles. The first measurement is the silhouette
+// fit of the frame's masks, with the prediction as the fit's prior (silhouette.h). The second, where the twin can be
+// drawn, is the colors inside the masks: they match marks along the rope, which reveals its slope in depth. Otherwise
+// depth along a camera's rays is hardly observable; the dynamics supply it, and the covariance shows how well.
+//
+// Angles are in rad, rates in rad/s, times in s, positions in the world frame in m.
 #pragma once
 #include <functional>
 #include <limits>
@@ -23,35 +25,36 @@
 
 namespace chainsplat::estimation {
 
-// Unknown forces are per kilogram of rope. The values were chosen on captures with truth.
+// The filter's noise model. Unknown forces are per kilogram of rope. The values were chosen on captures with truth.
 struct Options {
-  double model_force = 0.06;         // N/sqrt(s) a kilogram of rope, random walk of the unknown force without contact
-  double contact_force = 4.0;        // N/sqrt(s) a kilogram, the same while the motion does not follow the model
-  double force_memory = 0.5;         // s, in which an unknown force that nothing confirms is forgotten
-  double acceleration = 2.0;         // rad/s^2, of every angle, independent from frame to frame
-  double blind_acceleration = 30.0;  // rad/s^2, the same where the motion does not follow the model and
-                                     // no force is estimated (no dynamics or stiffness)
-  double new_share = 0.4;            // of a silhouette's variance that is new in every frame (the rest stays)
-  double color_share = 0.002;        // of a pixel's and channel's information that counts: channels are alike, pixels
-                                     // over about 5 x 5, and the errors of the twin's looks stay for many frames
-  int color_steps = 1;               // Gauss-Newton steps on the colors
-  silhouette::Options silhouette;    // the prior is set by the filter
+  double model_force = 0.06;         // N/sqrt(s) per kilogram, random walk of the unknown force without contact
+  double contact_force = 4.0;        // N/sqrt(s) per kilogram, the same while the motion departs from the model
+  double force_memory = 0.5;         // s, time constant with which an unconfirmed unknown force decays
+  double acceleration = 2.0;         // rad/s^2, process noise per angle, independent from frame to frame
+  double blind_acceleration = 30.0;  // rad/s^2, the same without dynamics, or where the motion departs from the
+                                     // model and no force can be estimated (without stiffness)
+  double new_share = 0.4;            // share of a silhouette's variance that is independent in each frame
+  double color_share = 0.002;        // share of the information per pixel and channel that counts: channels are
+                                     // correlated, so are some 5 x 5 pixels, and errors of the twin's colors last
+  int color_steps = 1;               // number of Gauss-Newton steps on the colors
+  silhouette::Options silhouette;    // the filter sets the prior
 };
 
-// Where the masks of a rope in space are made while it is followed: their outline errs the same way for long (a hand's
-// edge, the rope's dark side), so that less of it is new in every frame, and colors count for more. On a table what
-// lasts is a part of the belief instead: the masks' shift.
+// Returns the options for masks that are made while the rope is followed. In free space the error of their outline
+// persists (a hand's edge, the rope's dark side), so that less of it is independent in each frame and colors count for
+// more. On a table the persistent part, the masks' shift, is in the belief instead.
 Options options_for_live_masks(bool tabletop);
 
-// Gaussian belief about (theta, thetadot, shift of the rest angles), 3 n, rad and rad/s; on a table, where ropes have
-// contact shadows, also about the shift of each camera's masks (silhouette::Prior), px in x and y.
+// A Gaussian belief about (theta, thetadot, shift of the rest angles), 3 n numbers in rad and rad/s. On a table, where
+// ropes have contact shadows, it also holds the shift of each camera's masks (silhouette::Prior), px in x and y.
 struct Belief {
-  double time = 0.0;
+  double time = 0.0;  // s
   math::VectorX mean;
   math::MatrixX covariance;
 };
 
-// The twin, its links moved so, compared with what the views show inside their masks: one a view. Throws WorkError.
+// Compares the twin, with its links at `motions`, with the colors inside the views' masks. Returns one result per view.
+// Throws WorkError.
 using CompareColors = std::function<std::vector<splat::ColorSums>(std::span<const capture::View* const> views,
                                                                   std::span<const std::vector<math::Pose>> motions)>;
 
@@ -59,26 +62,26 @@ struct Estimate {
   int frame = 0;
   double time = 0.0;               // s
   math::VectorX theta, thetadot;   // rad, rad/s; n
-  math::MatrixX covariance;        // of (theta, thetadot), 2 n x 2 n; empty: not known
+  math::MatrixX covariance;        // of (theta, thetadot), 2 n x 2 n; empty: unknown
   double centerline_sigma = 0.0;   // m, standard deviation of the centerline, RMS over the rope
-  double iou = 0.0;                // of the chain's tube and the mask
-  double residual = 0.0;           // px, RMS of the mask's outline about the tube's, robust
-  double color_residual = 0.0;     // RMS of drawn against seen colors inside the mask, of 1; 0: not looked at
-  std::optional<double> likeness;  // correlation of drawn and seen colors, each channel without its mean; the best of
-                                   // the views'; none: not looked at, or a rope without marks
-  double gain = 1.0, bias = 0.0;   // exposure of the (last) view against the twin's looks
-  double surprise = 0.0;           // squared innovation over its expectation; about 1 as long as the model holds
-  bool seen = false;               // the mask showed something
-  bool lost = false;               // the estimate does not explain the mask, nothing was seen for long, or what
-                                   // the mask shows has long not looked like the twin
+  double iou = 0.0;                // of the chain's tube and the mask, mean over the views
+  double residual = 0.0;           // px, robust RMS distance of the mask's outline from the tube's
+  double color_residual = 0.0;     // RMS difference of drawn and recorded colors in the mask, 0..1; 0: not compared
+  std::optional<double> likeness;  // correlation of drawn and recorded colors about each channel's mean, the best
+                                   // of the views'; none: not compared, or a rope without marks
+  double gain = 1.0, bias = 0.0;   // exposure of the last view relative to the twin's colors
+  double surprise = 0.0;           // squared innovation over its expectation, about 1 as long as the model holds
+  bool seen = false;               // whether a mask shows anything
+  bool lost = false;               // whether the estimate does not explain the mask, the masks were empty for long,
+                                   // or the colors in them have been unlike the twin's for long
 };
 
-constexpr double kNever = -std::numeric_limits<double>::infinity();  // s; frames may have negative times
+constexpr double kNever = -std::numeric_limits<double>::infinity();  // s; before all times, which may be negative
 
-// The filter between two frames.
+// The state of the filter between two frames.
 struct Filter {
   dynamics::Model model;
-  bool identified = false;                    // the twin has dynamics; else angles go on at constant rate
+  bool identified = false;                    // the twin has dynamics; otherwise rates are constant
   bool shifts = false;                        // the unknown force is a part of the state
   std::optional<math::Vector3> table_normal;  // unit, world; on a table the masks' shift is a part of the state too
   std::vector<capture::Camera> cameras;
@@ -86,67 +89,71 @@ struct Filter {
   Options options;
   CompareColors compare_colors;     // empty: silhouettes alone
   std::optional<Belief> belief;     // none before the first frame
-  double base_start = 0.0;          // s, from here on the base's motion is known: the rope is thought at rest there
-  math::VectorX rest;               // rad, how the rope rests (or lies) at that time
-  double contact_until = kNever;    // s, until then the motion is thought not to follow the model
-  math::VectorX everywhere, place;  // shares of the links' ends in the unknown force: evenly, and as learned in contact
-  double last_seen = kNever;        // s
-  double last_like = kNever;        // s, the mask looked like the twin inside
+  double base_start = 0.0;          // s, where the base's motion begins to be known; the rope is assumed at rest there
+  math::VectorX rest;               // rad, angles of the rope at rest at that time
+  double contact_until = kNever;    // s, end of the time in which the motion is assumed to depart from the model
+  math::VectorX everywhere, place;  // shares of the links' ends in the unknown force: even, and as learned in contact
+  double last_seen = kNever;        // s, last frame in which the masks showed the rope
+  double last_like = kNever;        // s, last frame in which the colors in the masks were like the twin's
   bool lost = false;                // in the last frame
-  double edge_offset = 0.0, edge_offset_variance = 0.0;  // px, px^2: how much wider the masks are than the tube
+  double edge_offset = 0.0, edge_offset_variance = 0.0;  // px, px^2, of the masks' outline outside the tube's
 };
 
-// `base_start`: the first time that `base` is good for. Throws InputError where the twin's chain or parameters are no
-// good.
+// Starts a filter. `base_start`: the first time at which `base` is valid. Throws InputError where the twin's chain or
+// parameters are unusable.
 Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
              double base_start, const Options& options = {});
 
-// One frame: undistorted crops with their masks, which may be empty, of one camera or of several at nearly one time
-// (that of the first; View::camera counts in Filter::cameras). Times must increase.
+// Processes one frame: undistorted crops with their masks, which may be empty, of one camera or of several at nearly
+// the same time (the first view's; View::camera is an index into Filter::cameras). Times must increase. Throws
+// WorkError.
 Estimate update(Filter& filter, std::span<const capture::View* const> views);
 
-// What may have happened to the rope in a step: nothing that the model does not know, a force that changes as under a
-// hand, or a blow too: it ran into something, or was let go.
+// What may have happened to the rope in a step: nothing beyond the model, a force that changes as under a hand, or also
+// a blow, when the rope runs into something or is released.
 enum class Contact { none, touched, struck };
 
-// The belief at a later time, without looking.
+// Returns the belief at a later time, without a measurement.
 Belief predict(const Filter& filter, const Belief& belief, double time, Contact contact);
 
-// Where the rope will be at `time`, for whoever must look for it there; none before the first frame and while lost.
+// Returns the predicted angles at `time`, where the masks should be searched for; none before the first frame and while
+// the rope is lost.
 std::optional<math::VectorX> expected(const Filter& filter, double time);
 
-// The paper's way ("State Estimation"), to compare with: a few Adam steps on the rendering loss of every frame, from
-// the last frame's angles. No motion model, no covariance; rates are differences of the angles.
+// The paper's method ("State Estimation"), for comparison: a few Adam steps on the rendering loss of every frame, from
+// the previous frame's angles. It has no motion model and no covariance; rates are differences of the angles.
 struct AdamOptions {
-  int steps = 10;         // a frame, the paper's
-  int first_steps = 100;  // of the first frame, from the motion that the twin expects
+  int steps = 10;         // per frame, as in the paper
+  int first_steps = 100;  // in the first frame, from the motion that the twin predicts
   double rate = 0.01;     // rad, as in recognition
 };
 
-// Gradient of the rendering loss with respect to the links' motions: world twists, 6 x links (SPEC 2.8).
+// The gradient of the rendering loss with respect to the links' motions: world twists, 6 x links (mathematics.md 2.8).
 using LinkGradient = std::function<math::MatrixX(const capture::View& view, const std::vector<math::Pose>& motions)>;
 
 struct AdamFollower {
-  Filter filter;  // its twin, cameras and base; it has no belief
+  Filter filter;  // supplies the twin, the cameras and the base; its belief is unused
   LinkGradient gradient;
   AdamOptions options;
   math::VectorX theta;  // of the last frame; empty before the first
-  double time = 0.0;
+  double time = 0.0;    // s, of the last frame
 };
 
 AdamFollower start_adam(const Filter& filter, LinkGradient gradient, const AdamOptions& options = {});
 
-// As update() of the filter, with an empty covariance.
+// As the filter's update(), with an empty covariance.
 Estimate update(AdamFollower& follower, std::span<const capture::View* const> views);
 
+// Returns whether any pixel of the view is in the mask.
 bool has_mask(const capture::View& view);
 
-// Share of pixels in both the mask and the tube about the chain among those in either.
+// Returns the intersection over union of the mask and the tube around the chain.
 double tube_iou(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta,
                 const capture::View& view, const capture::Camera& camera);
 
-// The line of INTERFACE 5, without line feed; what is not finite is null. `latency`: s. "covariance" is the lower
-// triangle, row by row, of theta's; with `rates` of (theta, thetadot)'s, which begins with it.
+// Returns the line of INTERFACE 5, without line feed; numbers that are not finite become null. `latency`: s.
+// "covariance" is the lower triangle of theta's covariance, row by row; with `rates` it is that of (theta, thetadot),
+// which begins with the same numbers.
 std::string to_json(const Estimate& estimate, double latency, bool rates = false);
 
 }  // namespace chainsplat::estimation

@@ -1,4 +1,7 @@
-// chainsplat/eval.h - how well states and Gaussians explain a capture (SPEC 9, INTERFACE 4).
+// chainsplat/eval.h - metrics of how well Gaussians and states reproduce a capture (mathematics.md 9, INTERFACE 4).
+//
+// It draws the states through the cameras of the capture and compares the pictures with the recorded, masked images,
+// and the centerlines with the truth where the capture has one. Colors are in [0, 1], distances in m.
 #pragma once
 #include <string>
 #include <vector>
@@ -8,41 +11,42 @@
 
 namespace chainsplat::eval {
 
-struct FrameMetrics {  // NaN where a metric does not apply (no depth, no truth, nothing in the mask)
+struct FrameMetrics {  // a metric that does not apply is NaN (no depth, no truth, nothing in the mask)
   int camera = 0, frame = 0;
   double time = 0, psnr = 0, psnr_object = 0, ssim = 0, iou = 0, chamfer = 0, centerline_rms = 0, tip_rms = 0;
 };
 
-// dB of two equal images, and the most that any image gets: a mean needs a number.
+// dB; the PSNR of two equal images, and the most that any image gets, because a mean needs a finite number.
 inline constexpr double kMostPsnr = 100.0;
 
 struct Metrics {
-  FrameMetrics mean;  // over the frames where a metric applies; centerline_rms and tip_rms: root mean square
+  FrameMetrics mean;  // over the frames to which each metric applies; centerline_rms and tip_rms: root mean square
   std::vector<std::string> camera_names;
-  std::vector<FrameMetrics> cameras;  // the same by camera
+  std::vector<FrameMetrics> cameras;  // the same per camera
   std::vector<FrameMetrics> frames;
-  int empty_clouds = 0;  // frames with depth whose chamfer is left out: no rendered or no true point
+  int empty_clouds = 0;  // number of frames with depth but without a Chamfer distance: no rendered or no true point
 };
 
-// Draws the states through every camera of the capture (loaded with undistort = false, depth when present) and
-// compares. Frames that the states do not cover are left out, with a warning. Throws InputError when none is left.
+// Draws the states through every camera of the capture, which must be loaded with undistort = false and, for the
+// Chamfer distance, with depth, and compares. Frames that the states do not cover are left out with a warning; throws
+// InputError if none is left.
 Metrics evaluate(splat::Engine& engine, const splat::Gaussians& gaussians, const chain::Chain& chain,
                  const chain::States& states, const capture::Capture& recorded);
 
-// One frame against its view (recorded pixels both): all but centerline_rms and tip_rms.
+// All metrics of one frame but centerline_rms and tip_rms; both pictures in recorded pixels.
 FrameMetrics compare(const render::Frame& drawn, const capture::View& view, const capture::Camera& camera);
 
-// The M object of metrics.json as JSON text; metrics that do not apply are left out. Beside INTERFACE 4's keys
-// "empty_clouds" where it is not 0.
+// The object M of metrics.json (INTERFACE 4) as JSON text, without metrics that do not apply; and "empty_clouds" if it
+// is not 0.
 std::string to_json(const Metrics& metrics);
 
-// SSIM of SPEC 2.7 over a full image of which only a crop is not black in either picture; double precision, host. RGB
-// interleaved, values in [0, 1]. The crop must hold everything that is not black and 5 px around it, as far as the
-// image goes.
+// Mean SSIM (mathematics.md 2.7) of two images of `full_pixels` pixels, of which both are black outside a crop; on the
+// host, in double. The arguments hold the crop of width x height: interleaved RGB, values in [0, 1]. It must contain
+// everything that is not black and a margin of 5 px around it, except beyond the image's border.
 double ssim(const std::vector<float>& a_rgb, const std::vector<float>& b_rgb, int width, int height,
             double full_pixels);
 
-// Symmetric mean distance of two clouds (columns, m), SPEC 9. NaN when one is empty.
+// Chamfer distance (mathematics.md 9) of two clouds, 3 x count each, in m. NaN if one is empty.
 double chamfer(const math::MatrixX& p, const math::MatrixX& q);
 
 }  // namespace chainsplat::eval

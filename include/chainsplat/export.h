@@ -1,13 +1,13 @@
-// chainsplat/export.h - a twin in other programs' formats, by file ending (INTERFACE 1).
+// chainsplat/export.h - writes a finished twin in formats of other programs, chosen by the file's ending (INTERFACE 1).
 //
-//   .glb .gltf  glTF 2.0 with KHR_gaussian_splatting: root node (turns z-up to glTF's y-up), below it the chain, one
-//               node a link (each the child of the one before), in the link frames of SPEC 2.2 (home pose: translation
-//               only). A link's mesh has one POINTS primitive with the Gaussians whose largest link probability is that
-//               link's, in the link frame. The motion is one animation: translation and rotation of the base, rotation
-//               of each link; its time starts at 0. One file: buffers are inside.
-//   .ply        gaussians.ply of the run folder: home configuration, base frame. y is down in viewers that take PLY so.
+//   .glb .gltf  glTF 2.0 with KHR_gaussian_splatting: a root node (turns z-up to glTF's y-up) and below it the chain,
+//               with one node per link (each the child of the one before) in the link frames of mathematics.md 2.2 (a
+//               pure translation at home). The mesh of a link has one POINTS primitive with the Gaussians that are most
+//               probable on this link, in the link frame. The motion is one animation: translation and rotation of the
+//               base, rotation of each link; its time starts at 0. The file contains its buffers.
+//   .ply        gaussians.ply of the run folder: home configuration, base frame. Some PLY viewers show it with y down.
 //   .csv        the states, and beside them NAME.centerline.csv: the nodes in the world frame.
-// The namespace is not `export`: that is a keyword.
+// The namespace is not `export`, which is a keyword.
 #pragma once
 #include <string>
 #include <vector>
@@ -17,15 +17,15 @@
 
 namespace chainsplat::exports {
 
-// What write() understands: ".glb", ".gltf", ...
+// The endings that write() knows: ".glb", ".gltf", ...
 const std::vector<std::string>& endings();
 
-// `motion` may be empty: home configuration, no animation. `base` may be default-made: at rest at the world origin.
-// Throws InputError for an unknown ending (lists the known ones) and for a twin that lacks what the file needs,
-// WorkError when the file cannot be written.
+// Writes `file`. An empty `motion` means the home configuration without animation; a default-constructed `base` is at
+// rest at the world origin. Throws InputError for an unknown ending (listing the known ones) and for a twin without the
+// data that the format needs, WorkError if the file cannot be written.
 void write(const twin::Twin& twin, const chain::States& motion, const trajectory::Trajectory& base, const Path& file);
 
-// Bytes of a .glb (`binary`) or .gltf.
+// Returns the bytes of a .glb (`binary`) or .gltf file.
 std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, const chain::States& motion,
                  const trajectory::Trajectory& base, bool binary);
 

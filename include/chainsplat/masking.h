@@ -1,14 +1,15 @@
-// chainsplat/masking.h - object masks without prompts or a model file (INTERFACE 1, mask).
+// chainsplat/masking.h - object masks without prompts or a model file (INTERFACE 1, mask): whole images and the base's
+// pose in, masks of the rope out, for a whole capture or live.
 //
-// What is known does most of the work: the rope is a tube of known length and diameter that begins at the base's pose,
-// seen by known cameras. In some moments a chain is grown from the grasp so that its tube best parts the colors inside
-// from those beside it, in all cameras together; nothing need move for that. The tubes say what colors the rope and its
-// surroundings have and what the background is; a graph cut in a band about the tube decides each pixel from votes -
-// color, difference from the background, place, and whether the picture changes at the tube's outline at all or
-// something hides it - with contours where the picture has edges. The masks give a better chain (silhouette.h), that
-// better masks. A gripper, a finger or a shadow is not tube, not the rope's color, or both.
+// The method uses that the rope is a tube of known length and diameter that begins at the base's pose, seen by known
+// cameras. In some moments a chain is grown from the grasp so that its tube best separates the colors inside from those
+// beside it, in all cameras together; nothing need move for that. These tubes show the colors of the rope and of its
+// surroundings and the background. A graph cut in a band around the tube then labels each pixel from log odds of color,
+// difference from the background and place, and of whether the picture changes at the tube's outline at all or
+// something hides the rope, with contours along the picture's edges. The masks give a better chain (silhouette.h), and
+// that gives better masks. A gripper, a finger or a shadow is outside the tube, unlike the rope in color, or both.
 //
-// Pictures are undistorted pixels unless a function says otherwise. Nothing here depends on time or threads.
+// Pictures are in undistorted pixels unless a function says otherwise. Results do not depend on time or threads.
 #pragma once
 #include <functional>
 #include <optional>
@@ -19,87 +20,90 @@
 
 namespace chainsplat::masking {
 
-// Log odds (natural) of a color for the rope against what surrounds it: 32 steps a channel, index (r, g, b) / 8.
+// Natural log odds of a color for the rope against its surroundings, on a grid of 32 steps per channel with index
+// (r, g, b) / 8.
 struct Colors {
-  std::vector<double> object, surroundings;  // pixels counted, 32^3; empty: nothing known
-  std::vector<float> log_odds;               // 32^3, from the counts by settle()
-  double usual = 0.0, separation = 0.0;      // mean log odds of the object's pixels; less that of the surroundings'
+  std::vector<double> object, surroundings;  // numbers of pixels, 32^3; empty: nothing known
+  std::vector<float> log_odds;               // 32^3, computed from the counts by settle()
+  double usual = 0.0, separation = 0.0;      // mean log odds of the object's pixels; that minus the surroundings' mean
 };
-// Makes log_odds from the counts, smoothed, so that near colors speak for each other.
+// Computes log_odds from the counts, smoothed over neighboring colors.
 void settle(Colors& colors);
 
-// What a camera sees behind the rope.
+// The picture of one camera without the rope.
 struct Background {
   std::vector<std::uint8_t> rgb;    // 3 * width * height
-  std::vector<std::uint8_t> noise;  // width * height: standard deviation, gray levels; 0: not known here
+  std::vector<std::uint8_t> noise;  // width * height, standard deviation in gray levels; 0: background unknown here
 };
 
-// What the rope looks like along and across, as one camera sees it: while it does not turn about itself every mark
-// stays at its arclength and side.
+// The rope's colors along and across as one camera sees it. While the rope does not turn about itself, every mark stays
+// at its arclength and side.
 struct Marks {
-  int along = 0, across = 0;      // cells; 0: nothing known
-  double step = 0.0;              // m, of a cell along
+  int along = 0, across = 0;      // numbers of cells; 0: nothing known
+  double step = 0.0;              // m, length of a cell along the rope
   std::vector<std::uint8_t> rgb;  // 3 * along * across
   std::vector<char> known;        // along * across
 };
 
-// How one camera tells the rope from the rest.
+// What distinguishes the rope from everything else for one camera.
 struct Look {
-  Colors near, far;  // the rope's half at the grasp and that at the free end, whose tip may look different
+  Colors near, far;  // of the rope's half at the grasp and of that at the free end, whose tip may differ in color
   Background background;
   Marks marks;
 };
 
-// The mask of one picture, 255 or 0: RGB or RGBA pixels of the camera's size, row-major. With `theta` the chain is
-// thought to be there, to within about half a diameter; without, colors and background decide alone, as far as the rope
-// can reach. `doubt`: times the usual doubt about the place.
-// Returned as a crop whose RGB is that of the picture inside the mask; empty (width 0) when there is none.
+// An image of the camera's size, RGB or RGBA, row-major; the pixels are not owned.
 struct Picture {
   const std::uint8_t* pixels = nullptr;
   int width = 0, height = 0, channels = 3;
 };
-capture::View cut(const Look& look, const Picture& picture, const capture::Camera& camera, const chain::Chain& chain,
-                  const math::Pose& base, const std::optional<math::VectorX>& theta, double doubt = 1.0);
+// Returns the mask of one picture, 0 or 255, as a crop with the picture's RGB inside the mask; an empty view (width 0)
+// when nothing is found. With `theta` the chain is expected there to within about half a diameter; without it, colors
+// and background alone decide, as far as the rope can reach. `doubt` multiplies the usual uncertainty of the place.
+capture::View cut(const Look& appearance, const Picture& picture, const capture::Camera& camera,
+                  const chain::Chain& chain, const math::Pose& base, const std::optional<math::VectorX>& theta,
+                  double doubt = 1.0);
 
 struct Options {
-  int first = 0, last = -1;  // frames [first, last), last < 0: to the end, of each camera
+  int first = 0, last = -1;  // frames [first, last) of each camera; last < 0: to the end
 };
 
-// A mask of one frame in recorded pixels, one channel, 0 or 255.
+// Receives the mask of one frame in recorded pixels, one channel, 0 or 255.
 using Sink = std::function<void(int camera, int frame, const capture::Image8& mask)>;
 
 struct Summary {
   int frames = 0;     // of all cameras
-  int empty = 0;      // masks in which nothing was found
-  double inside = 0;  // share of the chain's centerline that lies in the masks, mean; low: hidden, or masks are wrong
+  int empty = 0;      // number of masks in which nothing was found
+  double inside = 0;  // mean share of the chain's centerline that lies in the masks; low: hidden, or masks are wrong
 };
 
-// Masks of a whole capture, by camera, then frame; masks that it has are not looked at.
-// Throws InputError when the capture is no good, has no frames or nothing like a rope is found at the grasp.
+// Makes the masks of a whole capture, by camera, then by frame; masks that the capture has are ignored.
+// Throws InputError when the capture is unusable, has no frames, or shows nothing like the rope at the grasp.
 Summary make(const Path& capture, const Options& options, const Sink& sink);
 
-// Masks while the rope is being followed. Learns as it goes: the background where the rope is not, and the colors of
-// what is masked.
+// The state of live masking, while the rope is followed. It learns the background where the rope is not, and the colors
+// of what is masked.
 struct Live {
-  capture::Camera camera;  // as recorded
+  capture::Camera camera;  // as recorded, with its lens distortion
   chain::Chain chain;
   Look look;
-  std::vector<float> mean, variance;   // of the background, by channel and by pixel
-  std::vector<std::uint16_t> seen;     // frames in which the background was seen, by pixel
-  std::vector<double> given;           // counts of the colors given at the start
-  std::vector<std::uint8_t> straight;  // work space: the frame without its lens distortion, and by pixel
-  std::vector<std::int16_t> from;      // where that comes from: column and row of the recorded frame,
-  std::vector<std::uint16_t> part;     // and the share of the next ones, as cv::remap has it
+  std::vector<float> mean, variance;   // of the background, per channel and per pixel
+  std::vector<std::uint16_t> seen;     // number of frames in which the background was visible, per pixel
+  std::vector<double> given;           // counts of the colors passed to start()
+  std::vector<std::uint8_t> straight;  // work space: the frame without its lens distortion
+  std::vector<std::int16_t> from;      // its source for cv::remap, per pixel: column and row of the recorded frame,
+  std::vector<std::uint16_t> part;     // and the interpolation's index into OpenCV's table of weights
   int frames = 0;
 };
 
-// `object_rgb`: colors of the rope, 0..255, three a sample (of a twin: its Gaussians', of a capture: its masks').
+// Starts live masking. `object_rgb`: colors of the rope, 0..255, three numbers per sample (those of a twin's Gaussians,
+// or of a capture's masks).
 Live start(const capture::Camera& camera, const chain::Chain& chain, const std::vector<std::uint8_t>& object_rgb);
-// The rope's marks as a drawn picture of it at these angles shows them (an undistorted crop with its coverage): what
-// hides the rope has not these.
+// Learns the rope's marks, which nothing that hides it has, from a drawn picture of the rope at these angles (an
+// undistorted crop with its coverage as alpha).
 void learn_marks(Live& live, const capture::View& drawn, const math::Pose& base, const math::VectorX& theta);
-// A recorded frame -> the undistorted crop with its mask. `theta`: where the rope is expected; none when that is not
-// known (the first frame, or lost).
+// Returns the undistorted crop of a recorded frame with its mask. `theta`: the expected angles; none where they are
+// unknown (in the first frame, or when the rope is lost).
 capture::View mask(Live& live, const capture::Image8& recorded_rgb, const math::Pose& base,
                    const std::optional<math::VectorX>& theta);
 

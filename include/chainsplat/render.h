@@ -1,4 +1,7 @@
-// chainsplat/render.h - twin + angles + camera -> color, mask and depth in a camera's pixels.
+// chainsplat/render.h - draws a twin: Gaussians, angles over time and a camera give color, mask and depth images.
+//
+// Rendering, evaluation and synthetic captures use it. Pictures are crops around the rope, in recorded pixels (with the
+// lens distortion) unless undistorted ones are asked for; depth is the camera's z in m.
 #pragma once
 #include <functional>
 #include <vector>
@@ -9,38 +12,39 @@
 namespace chainsplat::render {
 
 struct Frame {
-  int camera = 0, frame = 0;  // `frame` is the index into the `times` that were asked for
-  double time = 0.0;
-  int x0 = 0, y0 = 0;      // of the crop in the image; outside it everything is black
-  splat::Picture picture;  // in recorded pixels (warped by the lens distortion) unless `undistorted`; may be 0 x 0
+  int camera = 0, frame = 0;  // `frame` is an index into the `times` that were asked for
+  double time = 0.0;          // s
+  int x0 = 0, y0 = 0;         // px, of the crop in the image; the image is black outside the crop
+  splat::Picture picture;     // in recorded pixels (warped by the lens distortion) unless `undistorted`; may be 0 x 0
 };
 
 struct Options {
   bool depth = false;
-  bool undistorted = false;  // leave the lens distortion out
-  int margin = 8;            // px around what the Gaussians can reach (where their alpha falls below 1/255: SPEC 2.6)
-  double interval = 0.0;     // s between the camera's frames; 0: the median of `times`
+  bool undistorted = false;  // do not apply the lens distortion
+  int margin = 8;            // px around the reach of the Gaussians, where their alpha is below 1/255
+  double interval = 0.0;     // s between the camera's frames; 0: the median difference of `times`
 };
 
-// The camera's frames whose times the states cover (at most half a frame beyond their ends, cubic in theta).
+// Draws the frames at those of `times` (s) that the states cover, at most half an interval beyond their ends. Between
+// states theta is interpolated by cubics.
 std::vector<Frame> frames(splat::Engine& engine, const splat::Gaussians& gaussians, const chain::Chain& chain,
                           const chain::States& states, const trajectory::Trajectory& base,
                           const capture::Camera& camera, int camera_index, const std::vector<double>& times,
                           const Options& options = {});
 
-// The same, a batch of some frames at a time, in order: what is in memory does not grow with the number of frames.
+// The same in batches, in order, so that the memory in use does not grow with the number of frames.
 void for_batches(splat::Engine& engine, const splat::Gaussians& gaussians, const chain::Chain& chain,
                  const chain::States& states, const trajectory::Trajectory& base, const capture::Camera& camera,
                  int camera_index, const std::vector<double>& times, const Options& options,
                  const std::function<void(std::vector<Frame>& batch)>& use);
 
-// Whether the states reach `time`: at most half of `interval` outside them.
+// Whether the states cover `time`, which may lie outside their times by half of `interval` (s).
 bool covered(const chain::States& states, double time, double interval);
-// Median difference of `times`; 0 for fewer than two.
+// Median difference of consecutive `times` (s); 0 for fewer than two.
 double median_interval(const std::vector<double>& times);
 
-// The whole image of a frame, black outside the crop: 8 bits RGB (clamped, rounded); 255 where alpha >= 0.5, else 0;
-// depth in meters, 0 = none.
+// Whole images of a frame, 0 outside the crop: RGB of 8 bits (clamped, rounded); mask, 255 where alpha >= 0.5, else 0;
+// depth in m, 0 = none.
 capture::Image8 color_image(const Frame& frame, const capture::Camera& camera);
 capture::Image8 mask_image(const Frame& frame, const capture::Camera& camera);
 std::vector<float> depth_image(const Frame& frame, const capture::Camera& camera);
@@ -50,7 +54,7 @@ struct Bounds {
   int x0 = 0, y0 = 0, x1 = 0, y1 = 0;
   bool empty() const { return x1 <= x0 || y1 <= y0; }
 };
-// Not cut to the image. `motions` as chain::link_motions.
+// The result is not cut to the image. `motions` are those of chain::link_motions.
 Bounds reach(const splat::Gaussians& gaussians, const std::vector<math::Pose>& motions, const capture::Camera& camera);
 
 }  // namespace chainsplat::render

@@ -1,8 +1,10 @@
 // chainsplat/splat.h - link-aware 3-D Gaussians on the device: replicate, project, bin, sort, blend, loss, backward,
-// Adam (SPEC 2.4-2.8; paper, "Link-aware Gaussian splatting").
+// Adam (mathematics.md 2.4-2.8; paper, "Link-aware Gaussian splatting").
 //
-// The unit of work is a batch of views (crops of different sizes, each with its camera and the link poses of its time)
-// in one submission. Float on the device, no atomics on floats: the same input gives the same bits on one device.
+// Recognition trains the Gaussians here, rendering draws them, and state estimation measures against their colors. The
+// unit of work is a batch of views in one submission: crops of different sizes, each with its camera and the link poses
+// of its time. The device computes in float without float atomics, so on one device equal input gives equal bits.
+// Lengths are meters, image lengths pixels; cameras have OpenCV axes, and the center of pixel (0, 0) is (0.5, 0.5).
 #pragma once
 #include <cstdint>
 #include <memory>
@@ -14,39 +16,39 @@
 
 namespace chainsplat::splat {
 
-// Gaussians in the home configuration (base frame). Arrays of structures-of-rows, row i is Gaussian i.
+// Gaussians in the home configuration (all angles 0), base frame. Row i of every array belongs to Gaussian i.
 struct Gaussians {
   int count = 0;
-  int links = 0;                     // n_l + 1
-  int degree = 0;                    // of the spherical harmonics, 0..3
+  int links = 0;                     // n_l + 1, with the base link
+  int degree = 0;                    // of the spherical harmonics (SH), 0..3
   std::vector<float> mean;           // count x 3, m
   std::vector<float> rotation;       // count x 4, quaternion wxyz (normalized before use)
   std::vector<float> log_scale;      // count x 3, ln m
   std::vector<float> opacity_logit;  // count
-  std::vector<float> sh;             // count x (degree+1)^2 x 3: coefficient-major, RGB inside
+  std::vector<float> sh;             // count x (degree+1)^2 x 3: RGB of one coefficient after the other
   std::vector<float> link_logits;    // count x links
   int sh_coefficients() const { return (degree + 1) * (degree + 1); }
-  void resize(int count, int links, int degree);  // keeps rows that exist; new rows are zero (rotation 1,0,0,0)
+  void resize(int count, int links, int degree);  // keeps existing rows; new ones are zero, with rotation (1, 0, 0, 0)
 };
 
-// One picture to draw: pinhole camera, crop [x0, x0+width) x [y0, y0+height) of its image, and the link motions E_j.
+// One picture to draw: a pinhole camera, the crop [x0, x0+width) x [y0, y0+height) of its image, and the link motions.
 struct ViewSpec {
-  const capture::Camera* camera = nullptr;  // distortion is ignored here (images are undistorted)
+  const capture::Camera* camera = nullptr;  // its distortion is ignored: crops are of undistorted images
   int x0 = 0, y0 = 0, width = 0, height = 0;
-  std::vector<math::Pose> motions;  // links()
+  std::vector<math::Pose> motions;  // E_j of every link, base link first (mathematics.md 2.2)
 };
 
-// Row-major pictures of one view. Color is premultiplied over a black background.
+// Row-major picture of one view. Colors are premultiplied by alpha, over a black background.
 struct Picture {
   int width = 0, height = 0;
-  std::vector<float> rgba;   // 4 x pixels: red, green, blue in [0, ..), alpha = 1 - T_end
-  std::vector<float> depth;  // sum z alpha T / alpha where alpha > 0.5, else 0; m; empty unless asked for
+  std::vector<float> rgba;   // 4 x pixels: red, green, blue (not clamped above), alpha = 1 - T_end
+  std::vector<float> depth;  // m, alpha-weighted mean z where alpha > 0.5, else 0; empty unless asked for
 };
 
-// Gradients of one loss (summed over views) and per view, as SPEC 2.8.
+// Gradients of one loss: by the Gaussians summed over the views, by the link motions per view (mathematics.md 2.8).
 struct Gradients {
   Gaussians gaussians;                     // same layout; rotation holds d/dq of the unnormalized quaternion
-  std::vector<math::MatrixX> link_twists;  // one 6 x links a view: world twist about the world origin
+  std::vector<math::MatrixX> link_twists;  // 6 x links per view: moment, force; world axes, about the world origin
 };
 
 struct LossWeights {
@@ -57,38 +59,39 @@ struct LossWeights {
 
 struct LossValues {
   double total = 0.0;
-  std::vector<double> l1, ssim, mask;  // one a view: means over the view's `normalizer` pixels
-  std::vector<double> psnr_object;     // dB over pixels with mask >= 128
-  int not_finite = 0;                  // step() only: parameters left alone because their gradient was NaN or infinite
+  std::vector<double> l1, ssim, mask;  // one entry per view: means over `normalizer` pixels
+  std::vector<double> psnr_object;     // dB, one entry per view: over the pixels with mask >= 128
+  int not_finite = 0;                  // step() only: parameters not updated because their gradient is NaN or infinite
 };
 
-// The normal equations of the colors inside a view's mask, for second-order refinement (SPEC 6): of the residual
-// r = gain * drawn + bias - seen, colors 0..1, over the channels of the pixels away from the mask's and the drawn
-// rope's edge, with Huber's weights w. A pixel that shows the surface point x moves with the link whose axis is nearest
-// to x: dr/d(twist) = -grad . d(pixel)/d(twist), grad the mean of the slopes of gain * drawn and of seen (Malis' ESM).
+// The normal equations of the colors inside a view's mask, for second-order refinement (mathematics.md 6). The residual
+// is r = gain * drawn + bias - observed, colors 0..1, over the channels of the pixels that lie away from the edges of
+// the mask and of the drawn rope; w are Huber's weights. A pixel that shows the surface point x moves with the link
+// whose axis is nearest to x: dr/d(twist) = -grad . d(pixel)/d(twist), where grad is the mean of the gradients of
+// gain * drawn and of the observed image (efficient second-order minimization, ESM, of Malis).
 struct ColorSums {
-  using Vector8 = Eigen::Matrix<double, 8, 1>;  // world twist about the world origin (SPEC 2.3), gain, bias
+  using Vector8 = Eigen::Matrix<double, 8, 1>;  // world twist about the world origin (mathematics.md 2.3), gain, bias
   using Matrix8 = Eigen::Matrix<double, 8, 8>;
-  std::vector<Matrix8> normal;        // one a link: sum of w J^T J
-  std::vector<Vector8> right;         // one a link: sum of w J^T r
+  std::vector<Matrix8> normal;        // per link: sum of w J^T J
+  std::vector<Vector8> right;         // per link: sum of w J^T r
   double weight = 0.0, square = 0.0;  // sums of w and of w r^2
-  double gain = 1.0, bias = 0.0;      // at which all that was formed: one robust step from 1 and 0
-  int pixels = 0;                     // that count; sums over them of the colors, each channel about its mean:
+  double gain = 1.0, bias = 0.0;      // at which all sums were formed: one robust step from gain 1 and bias 0
+  int pixels = 0;                     // that count; and their second central moments, summed over pixels and channels:
   double covariance = 0.0, drawn_variance = 0.0, seen_variance = 0.0;
 };
 
 struct Settings {
   int tile = 0;                  // px, 8 or 16; 0: chosen for the device
-  int pixels_per_lane = 0;       // 0: chosen for the device
-  bool projection_clamp = true;  // of SPEC 2.5; false where a reference has none
+  int pixels_per_lane = 0;       // of the blending passes; 0: chosen for the device
+  bool projection_clamp = true;  // of mathematics.md 2.5; false for comparison with a reference that has none
   bool exact_cutoffs = true;     // 1/255 cut, 0.99 cap, 1e-4 stop; false: none of them (for finite-difference tests)
 };
 
-struct AdamRates {  // step sizes, units of the parameter (mean: m)
+struct AdamRates {  // step sizes in the units of their parameters (mean: m)
   float mean = 0, rotation = 0, log_scale = 0, opacity = 0, sh0 = 0, sh_rest = 0, link_logits = 0;
 };
 
-// Renderer, trainer and their device buffers for one set of views at a time.
+// Renderer and trainer with their device buffers, for one set of views at a time.
 class Engine {
  public:
   Engine(gpu::Device& device, const Settings& settings = {});
@@ -99,38 +102,39 @@ class Engine {
   std::vector<Picture> draw(const Gaussians& gaussians, std::span<const ViewSpec> views, bool depth = false);
 
   // --- loss and gradients of some views (tests, paper mode, refinement) ----------------------------------------------
-  // targets[v]: RGBA8 of the crop, A = mask. `normalizer` is the number of pixels that means are taken over (the full
-  // image's for SPEC 2.7; 0: the crop's).
+  // targets[v]: RGBA8 of the crop, A = mask. `normalizer` is the number of pixels that means are taken over: that of
+  // the full image for mathematics.md 2.7; 0: that of each crop.
   LossValues loss(const Gaussians& gaussians, std::span<const ViewSpec> views,
                   std::span<const std::vector<std::uint8_t>* const> targets, const LossWeights& weights,
                   double normalizer, Gradients* gradients, std::vector<Picture>* pictures = nullptr);
 
-  // --- training: parameters, moments and targets stay on the device
-  // ---------------------------------------------------- Targets of all views that will be used; `views` keep their
-  // indices. Poses can be changed later. Only tiles near the mask are drawn and charged; with `everywhere` the whole
-  // crop is (D-SSIM still near the mask only: elsewhere L1 says enough).
+  // --- training: parameters, moments and targets stay on the device --------------------------------------------------
+  // Loads the targets of all views of the training; step() and others refer to them by their index in `views`. Motions
+  // can be changed later. Only tiles near the mask are drawn and contribute to the loss; with `everywhere` the whole
+  // crop does, but D-SSIM is still taken near the mask only: elsewhere L1 is enough to charge stray splats.
   void set_views(std::span<const ViewSpec> views, std::span<const std::vector<std::uint8_t>* const> targets,
                  bool everywhere = false);
   void set_motions(int view, const std::vector<math::Pose>& motions);
   void set_gaussians(const Gaussians& gaussians);  // resets Adam's moments and step count
   Gaussians gaussians() const;
-  // One Adam step on the mean loss of the views in `batch`.
-  // `twists`: also the gradient of the mean loss with respect to each view's link motions (world twists, SPEC 2.3).
+  // Takes one Adam step on the mean loss of the views in `batch`. `twists`, if not null, gets the gradient of the mean
+  // loss with respect to each view's link motions (as Gradients::link_twists).
   LossValues step(std::span<const int> batch, const LossWeights& weights, const AdamRates& rates, bool read_losses,
                   std::vector<math::MatrixX>* twists = nullptr);
   std::vector<Picture> draw_views(std::span<const int> batch, bool depth = false);
 
-  // --- colors as a measurement: the Gaussians of set_gaussians() stay on the device, a call uploads motions and crops
-  // in one submission and reads back sums, no picture. `seen`: RGBA8 of the crops, A = mask. `chain` has the Gaussians'
-  // links. Takes the place of set_views().
+  // --- colors as a measurement ---------------------------------------------------------------------------------------
+  // The Gaussians of set_gaussians() stay on the device; one submission uploads motions and crops and reads back the
+  // sums, no picture. `observed`: RGBA8 of the crops, A = mask. `chain` must have as many links as the Gaussians.
+  // Replaces the views of set_views().
   std::vector<ColorSums> color_sums(const chain::Chain& chain, std::span<const ViewSpec> views,
-                                    std::span<const std::vector<std::uint8_t>* const> seen);
+                                    std::span<const std::vector<std::uint8_t>* const> observed);
 
-  // The paper's resets: opacity to at most `largest`, link probabilities to uniform; Adam's moments of that section to
-  // zero.
+  // The paper's resets: of opacities to at most `largest`, of link probabilities to uniform. Both also zero Adam's
+  // moments of these parameters.
   void reset_opacity(float largest);
   void reset_links();
-  // Everything that a later step depends on, for checkpoints.
+  // For checkpoints: everything that a later step depends on.
   struct Snapshot {
     Gaussians gaussians;
     std::vector<float> first_moment, second_moment;  // in the order of the device's parameter buffer
@@ -146,7 +150,7 @@ class Engine {
   std::unique_ptr<State> state_;
 };
 
-// Spherical harmonics color of SPEC 2.4 for one direction (unit, home frame): used by export and tests.
+// Color of one Gaussian by its spherical harmonics (mathematics.md 2.4), seen along `direction` (unit, home frame).
 math::Vector3 sh_color(const Gaussians& gaussians, int index, const math::Vector3& direction);
 
 }  // namespace chainsplat::splat

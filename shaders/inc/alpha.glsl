@@ -1,11 +1,13 @@
-// alpha.glsl - what one splat does to a column of pixels, the same forward and backward (SPEC 2.6). Needs kCutoffs, kPixels.
+// alpha.glsl - the alpha of one splat in a column of pixels, shared by the forward and the backward pass so that both
+// agree (mathematics.md 2.6). Needs kCutoffs, kPixels.
 
 const float kAlphaCap = kCutoffs != 0u ? 0.99 : 2.0;
 const float kAlphaLeast = kCutoffs != 0u ? 1.0 / 255.0 : -1.0;
 const float kTransmittanceLeast = kCutoffs != 0u ? 1e-4 : -1.0;
 
-// -1/2 delta^T Q delta, Q = [x y; y z], with the square completed in y: in a column of pixels, dx to the right of the
-// splat's center, it is along dx^2 + fall dy^2, dy from the center + (0, -slope dx). Times log2(e).
+// The exponent log2(e) (-1/2 delta^T Q delta), Q = [x y; y z], with the square completed in y: in a column of pixels at
+// dx to the right of the splat's center it is along dx^2 + fall dy^2, where dy counts from the column's peak, which
+// lies slope dx above the center.
 struct Falloff {
   float slope, along, fall;
   float change;  // 2^(2 fall)
@@ -21,12 +23,13 @@ Falloff falloff_of(vec3 conic) {
   return f;
 }
 
-// `opacity` times the falloff at kPixels pixels of a column, the first dy below the column's peak. From a row to the next
-// it changes by a factor that itself changes by a constant factor: three exponentials instead of kPixels. From the middle
-// outward, where nothing that counts is lost to the least float: sigma is at least half a pixel.
+// `opacity` times the falloff at kPixels pixels of a column, the first of them dy below the column's peak. From one row
+// to the next the value changes by a factor that itself changes by a constant factor: this takes three exponentials
+// instead of kPixels. It proceeds from the middle outward: sigma is at least half a pixel, so no value that matters is
+// lost to underflow on the way.
 void alphas_of(Falloff f, float opacity, float dx, float dy, out float alpha[kPixels]) {
   const uint kMiddle = kPixels / 2u;
-  const float kLargest = 100.0;  // beyond it the middle is 0, and the factor has to stay finite
+  const float kLargest = 100.0;  // beyond it the middle is 0 already, and the factor must stay finite
   float middle = dy + float(kMiddle);
   alpha[kMiddle] = opacity * exp2(f.along * dx * dx + f.fall * middle * middle);
   float factor = exp2(min(f.fall * (1.0 + 2.0 * middle), kLargest));
@@ -41,13 +44,14 @@ void alphas_of(Falloff f, float opacity, float dx, float dy, out float alpha[kPi
   }
 }
 
-// Front-to-back blending of one pixel: `transmittance` is negative once the pixel is closed, that is, a splat would have
-// taken it below the least; that splat and those behind it are not seen. Returns the splat's weight, 0 if not seen.
-float blend_weight(float alpha, inout float transmittance, out bool seen) {
+// Front-to-back blending of one splat into one pixel. Returns the splat's weight, 0 if it does not contribute. The
+// first splat that would take the transmittance below the least closes the pixel: `transmittance` keeps its size and
+// becomes negative, and neither that splat nor any behind it contributes.
+float blend_weight(float alpha, inout float transmittance, out bool contributes) {
   float after = transmittance * (1.0 - alpha);
   bool reaches = alpha >= kAlphaLeast, stays_open = after >= kTransmittanceLeast;
-  seen = reaches && stays_open;
-  float weight = seen ? alpha * transmittance : 0.0;
+  contributes = reaches && stays_open;
+  float weight = contributes ? alpha * transmittance : 0.0;
   transmittance = reaches ? (stays_open ? after : -abs(transmittance)) : transmittance;
   return weight;
 }

@@ -1,5 +1,6 @@
-// gaussian.glsl - where a Gaussian's numbers lie in the parameter buffer, and small functions of them.
-// Sections, each [row][component]: mean 3, rotation 4, log scale 3, opacity logit 1, SH 3 K, link logits L.
+// gaussian.glsl - the layout of the parameter buffer, and small functions of a Gaussian's parameters.
+// For n Gaussians the sections follow one another, each [Gaussian][component]: mean 3, rotation 4, log scale 3, opacity
+// logit 1, SH 3 x coefficients, link logits.
 
 uint at_mean(uint n, uint i) { return 3u * i; }
 uint at_rotation(uint n, uint i) { return 3u * n + 4u * i; }
@@ -16,7 +17,8 @@ mat3 rotation_matrix(vec4 q) {
               2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
-// d/dq of sum_ij G_ij R(q/|q|)_ij; `columns` holds G by columns, `q` is the unit quaternion, `size` = |q| before.
+// d/dq of sum_ij G_ij R(q/|q|)_ij; `columns` holds G by columns, `q` is the unit quaternion, `size` = |q| before
+// normalization.
 vec4 rotation_matrix_backward(vec4 q, float size, mat3 columns) {
   float w = q.x, x = q.y, y = q.z, z = q.w;
   float g00 = columns[0][0], g10 = columns[0][1], g20 = columns[0][2];
@@ -29,7 +31,7 @@ vec4 rotation_matrix_backward(vec4 q, float size, mat3 columns) {
   return (d - q * dot(q, d)) / size;
 }
 
-// Real spherical harmonics in the 3DGS order and signs (SPEC 2.4), one coefficient at a time, and its gradient.
+// Real spherical harmonics in the order and signs of 3DGS (mathematics.md 2.4), one basis function, and its gradient.
 float sh_basis(uint l, vec3 r) {
   float x = r.x, y = r.y, z = r.z;
   switch (l) {

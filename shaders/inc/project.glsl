@@ -1,8 +1,8 @@
-// project.glsl - the projection of one replica into one view (SPEC 2.5), used forward and backward so that both agree.
-// Needs: SplatView, rotation_matrix.
+// project.glsl - the projection of one replica into one view (mathematics.md 2.5), shared by the forward and the
+// backward pass so that both agree. Needs SplatView, rotation_matrix.
 
-const float kNear = 0.01;     // m; nearer is not drawn (SPEC 2.5)
-const float kLowPass = 0.3;   // px^2, added to the projected covariance (SPEC 2.5)
+const float kNear = 0.01;     // m; replicas nearer than this are not drawn (mathematics.md 2.5)
+const float kLowPass = 0.3;   // px^2; added to the projected covariance (mathematics.md 2.5)
 
 struct Projection {
   vec3 x;            // camera frame, m

@@ -1,4 +1,5 @@
-// share.glsl - what lane `turn` of a subgroup loaded, in every lane. Needs alpha.glsl, kShare, GL_KHR_shader_subgroup_shuffle.
+// share.glsl - gives every lane of a subgroup the value that lane `turn` has loaded. Needs alpha.glsl, kShare,
+// GL_KHR_shader_subgroup_shuffle.
 
 float shared_by(float x, uint turn) { return kShare > 1u ? subgroupShuffle(x, turn) : x; }
 uint shared_by(uint x, uint turn) { return kShare > 1u ? subgroupShuffle(x, turn) : x; }

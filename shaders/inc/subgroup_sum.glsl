@@ -1,8 +1,8 @@
-// subgroup_sum.glsl - sums over the lanes of a subgroup, in an order that is always the same. Needs kSubgroup (lanes, a power
-// of two, at most 128), GL_KHR_shader_subgroup_shuffle.
+// subgroup_sum.glsl - sums over the lanes of a subgroup in a fixed order, so that the bits never vary. Needs kSubgroup
+// (number of lanes, a power of two, at most 128), GL_KHR_shader_subgroup_shuffle.
 
-// Every lane gets it, with the same bits. Constant tests, no loop: lavapipe ends all loops of an invocation after 65535
-// iterations in sum, without a word.
+// Every lane gets the sum, with the same bits. There is no loop, because lavapipe silently ends the loops of an
+// invocation after 65535 iterations in all.
 float subgroup_sum(float x) {
   if (kSubgroup > 64u) x += subgroupShuffleXor(x, 64u);
   if (kSubgroup > 32u) x += subgroupShuffleXor(x, 32u);
@@ -14,8 +14,8 @@ float subgroup_sum(float x) {
   return x;
 }
 
-// Sums of eight values over a subgroup of eight lanes or more: lane l ends with that of value l % 8. Each exchange halves
-// the values that a lane holds: ten exchanges instead of eight times as many.
+// Sums eight values over a subgroup of at least eight lanes; lane l gets the sum of value l % 8. Each of the first
+// exchanges halves the number of values that a lane holds, so that eight lanes need 7 exchanges instead of 24.
 float subgroup_sums(float v[8]) {
   uint lane = gl_SubgroupInvocationID;
   bool upper = (lane & 4u) != 0u;

@@ -1,4 +1,5 @@
-// shaders/shared/splat.h - structs that src/splat and shaders/splat_*.comp, loss_*.comp share. Only vec4, float, uint.
+// shaders/shared/splat.h - structs and constants that src/splat and the shaders share. Only vec4, float and uint, which
+// have the same layout in C++ and GLSL.
 #ifdef __cplusplus
 #pragma once
 #include <glm/glm.hpp>
@@ -7,10 +8,10 @@ using glm::vec4;
 using uint = unsigned;
 #endif
 
-// One view of the batch. Camera frame: OpenCV axes, origin at the camera center. Crop pixels.
+// One view of the batch. The camera frame has OpenCV axes and its origin at the camera center; pixels are the crop's.
 struct SplatView {
   vec4 intrinsics;   // fx, fy, cx - x0, cy - y0 (px)
-  vec4 limits;       // x, y: largest |x/z|, |y/z| in the projection's Jacobian (SPEC 2.5); z, w unused
+  vec4 limits;       // x, y: largest |x/z|, |y/z| in the projection's Jacobian (mathematics.md 2.5); z, w unused
   vec4 moment_point; // xyz: base origin in the camera frame (m), about which link moments are summed; w unused
   uint width, height;            // px of the crop
   uint tiles_x, tiles_y;
@@ -20,7 +21,7 @@ struct SplatView {
   uint motion;                   // first link pose, in units of one pose (3 vec4 rows of camera_from_home)
 };
 
-// One active tile: a tile of a view that is blended and charged.
+// One active tile: a tile of a view that is blended and contributes to the loss.
 struct SplatTile {
   uint view, x, y, padding;      // x, y in tiles
 };
@@ -28,48 +29,49 @@ struct SplatTile {
 struct SplatPush {
   uint gaussians, links, coefficients, views;
   uint live_capacity, instance_capacity, tiles, slots;
-  float weight_l1, weight_dssim, weight_mask;  // already divided by what means are taken over
-  uint near_tiles;                             // the first so many active tiles have a D-SSIM term
+  float weight_l1, weight_dssim, weight_mask;  // already divided by the number of summands of each mean
+  uint near_tiles;                             // the first near_tiles active tiles have a D-SSIM term
   uint scan_length, scan_per_live, scan_counter, flags;
-  uint tile_stride;                            // group g of a pass over all active tiles takes tile g * tile_stride % tiles
-  uint tile_capacity;                          // entries that each tile's list has room for, which project then fills; 0: the
-                                               // lists lie side by side, found by prefix sums
+  uint tile_stride;    // work group g of a pass over all active tiles processes tile g * tile_stride % tiles
+  uint tile_capacity;  // entries of each list at its fixed place, which splat_project.comp fills; 0: the lists are
+                       // contiguous, laid out by prefix sums and filled by splat_bin.comp
   uint padding0, padding1;
 };
 
 const uint kNoTile = 0xffffffffu;
-const uint kScanBlock = 1024u;      // elements one group scans
-const uint kGroup = 64u;            // invocations of the passes that run one invocation an item
+const uint kScanBlock = 1024u;      // elements that one work group scans
+const uint kGroup = 64u;            // invocations per work group of the passes that run one invocation per item
 
-// counters[]: filled by scan_sums. The first kCounterKept stay as long as the Gaussians do.
-const uint kCounterLive = 0u;       // live replicas R
-const uint kCounterWantLive = 1u;   // what their capacity would have to be
-const uint kCounterDispatch = 2u;   // 3 uints: groups of the passes over (replica, view); the host sets the last two
+// Places in counters[], which scan_sums.comp and others fill. The first kCounterKept keep their values for as long as
+// the Gaussians do not change.
+const uint kCounterLive = 0u;       // number of live replicas
+const uint kCounterWantLive = 1u;   // the capacity for live replicas that was needed
+const uint kCounterDispatch = 2u;   // 3 uints: work groups of the passes over pairs; the host sets the last two
 const uint kCounterKept = 3u;
-const uint kCounterInstances = 5u;  // (view, replica, tile) triples
-const uint kCounterTiles = 6u;      // the same sum, counted by tile
+const uint kCounterInstances = 5u;  // number of (view, replica, tile) triples
+const uint kCounterTiles = 6u;      // the same number, summed by tile
 const uint kCounterWantInstances = 7u;
-const uint kCounterOverflow = 8u;   // not 0: a capacity was exceeded; nothing of this batch may be used
+const uint kCounterOverflow = 8u;   // not 0: a capacity was exceeded, and no result of this submission may be used
 const uint kCounterTooLong = 9u;    // not 0: a tile's list is longer than kLongestList
-const uint kCounterLongTiles = 10u; // 3 uints: groups of splat_sort_long; the host sets the last two
-const uint kCounterNotFinite = 13u; // gradients that Adam left alone
-const uint kCounterWantTile = 14u;  // what the tile capacity would have to be
+const uint kCounterLongTiles = 10u; // 3 uints: work groups of splat_sort_long.comp; the host sets the last two
+const uint kCounterNotFinite = 13u; // number of gradients that Adam skipped
+const uint kCounterWantTile = 14u;  // the tile capacity that was needed
 const uint kCounters = 16u;
-const uint kLongestList = 32768u;   // entries of a tile that sorting and blending get through on every device
+const uint kLongestList = 32768u;   // entries of a tile; lavapipe ends an invocation's loops after 65535 iterations
 
-const uint kFlagAccumulate = 1u;    // gradients of this chunk of views are added to those before
-const uint kFlagHeldLinks = 2u;     // the gradient by link logits is not asked for
+const uint kFlagAccumulate = 1u;    // gradients of this chunk of views are added to those of the chunks before
+const uint kFlagHeldLinks = 2u;     // the gradient by link logits is not computed
 
 // splat record: 3 vec4
-//   0: u (px), opacity, depth (m)   1: conic xx, xy, yy, tile rectangle x0 | x1 << 16   2: color, rectangle y0 | y1 << 16
+//   0: u (px), opacity, depth (m)   1: conic xx, xy, yy, tiles x0 | x1 << 16   2: color, tiles y0 | y1 << 16
 const uint kSplatRows = 3u;
-const uint kTileHits = 32u;         // tiles of the rectangle, row by row, of which a bit says whether the splat touches them;
-                                    // those behind them count as touched
+const uint kTileHits = 32u;         // first tiles of the rectangle, by rows, with a bit that says whether the splat
+                                    // touches them; later tiles count as touched
 // gradient record of one (replica, view): 6 vec4
 //   0: mean (home), opacity   1: rotation   2: log scale   3: color   4: link moment   5: link force (camera frame)
 const uint kGradientRows = 6u;
 // partial gradient of one (instance, subgroup): 3 vec4
-//   0: u, opacity, red   1: H'xx, H'xy, H'yy (of dL/dSigma' without the 1/2), green   2: blue, -, -, -
+//   0: u, opacity, red   1: xx, xy, yy of 2 dL/dSigma', green   2: blue, -, -, -
 const uint kPartialRows = 3u;
 
 #ifdef __cplusplus

@@ -9,7 +9,7 @@ using math::Vector3;
 
 namespace {
 
-constexpr int kMostIterations = 200;  // of the fixed-point inverse; mild lenses need about ten
+constexpr int kMostIterations = 200;  // of the fixed-point inverse, of which mild lenses need about ten
 constexpr double kConverged = 1e-13;  // normalized coordinates: under 1e-9 px for any image size
 
 Vector2 normalized(const Camera& camera, const Vector2& pixel) {
@@ -20,7 +20,7 @@ Vector2 pixel(const Camera& camera, const Vector2& point) {
   return {camera.fx * point.x() + camera.cx, camera.fy * point.y() + camera.cy};
 }
 
-// OpenCV's model: radial factor and tangential offset at a normalized point.
+// The radial factor and the tangential offset of OpenCV's lens model at a normalized point.
 double radial(const Camera& camera, const Vector2& p) {
   const auto& [k1, k2, p1, p2, k3] = camera.distortion;
   const double r2 = p.squaredNorm();

@@ -1,4 +1,4 @@
-// What is in a capture and what is wrong or odd with it, in plain words.
+// `chainsplat check`: what a capture contains and what is wrong or doubtful about it, in plain words.
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
@@ -15,25 +15,25 @@ using math::Vector3;
 
 namespace {
 
-// What we doubt. Lengths are compared in the image through the distance of the grasp.
-constexpr double kGripperReach = 0.015;  // m of rope that fingers may hide beyond the grasp
+// Thresholds beyond which a capture is doubted. Meters become pixels at the distance of the grasp.
+constexpr double kGripperReach = 0.015;  // m of rope beyond the grasp that fingers may hide
 constexpr double kPoseSlack = 3.0;       // px of reprojection error that a calibrated camera may have
 constexpr double kThinRope = 5.0;        // px across; thinner ropes leave too few pixels
-constexpr double kSaturated = 250;       // of 255, any channel
+constexpr double kSaturated = 250;       // of 255, in any channel
 constexpr double kMostSaturated = 0.05;  // share of the object's pixels
 constexpr double kDark = 20;             // of 255, mean of the object
-constexpr double kFlicker = 0.15;        // relative spread of a camera's object brightness between frames
-constexpr double kRateTolerance = 0.01;  // between `rate` and the container's
-constexpr double kStill = 1e-3;          // m of base travel below which it counts as at rest
-constexpr double kNoisyBase = 2e-3;      // m
+constexpr double kFlicker = 0.15;        // relative change of the object's brightness from one frame to the next
+constexpr double kRateTolerance = 0.01;  // relative difference between two rates
+constexpr double kStill = 1e-3;          // m of base travel below which the base counts as at rest
+constexpr double kNoisyBase = 2e-3;      // m, standard deviation of the base's position
 constexpr double kAlong = 0.1;           // rad between the bending axis and the table's normal
 constexpr double kBehind = 0.2;          // share of the mask on the wrong side of the grasp
-constexpr double kForeshortened = 0.3;   // a rope seen shorter than this, relative to its length, has no side to judge
-constexpr int kMostLag = 4;              // frames of delay between base and images that are tried
-constexpr double kLagGain = 0.7;         // a delay is believed when it leaves less than this share of the error
-constexpr double kLagPixels = 1.0;       // px and when the error shrinks by at least this
-constexpr int kLagFrames = 50;           // frames of a camera that the search for a delay looks at
-constexpr int kFarPixels = 100000;       // px, "no mask"
+constexpr double kForeshortened = 0.3;   // share of its length below which a projected rope shows no direction
+constexpr int kMostLag = 4;              // frames, the largest delay between base and images that is tried
+constexpr double kLagGain = 0.7;         // a delay is believed when it leaves less than this share of the error,
+constexpr double kLagPixels = 1.0;       // px, and when the error shrinks by at least this
+constexpr int kLagFrames = 50;           // frames per camera that the search for a delay uses
+constexpr int kFarPixels = 100000;       // px, the distance to an empty mask
 constexpr double kDegrees = 180.0 / std::numbers::pi;
 
 std::string text(const char* format, auto... values) {
@@ -49,7 +49,7 @@ double median(std::vector<double> values) {
   return *middle;
 }
 
-// Distance from an image position to the nearest mask pixel, px.
+// Returns the distance from an image position to the nearest mask pixel, px.
 double mask_distance(const View& view, const Vector2& position) {
   double nearest = static_cast<double>(kFarPixels) * kFarPixels;
   for (int y = 0; y < view.height; ++y)
@@ -59,14 +59,14 @@ double mask_distance(const View& view, const Vector2& position) {
   return std::sqrt(nearest);
 }
 
-// Share of the mask that lies against the direction in which the rope leaves the gripper, beyond the gripper's reach.
-// NaN when the rope points at the camera.
+// Returns the share of the mask that lies behind the grasp, seen in the direction in which the rope leaves the gripper,
+// by more than the gripper's reach; NaN when the rope points at the camera. `grasp` and `direction`: camera frame.
 double share_behind(const View& view, const Camera& camera, const Vector3& grasp, const Vector3& direction,
                     double length) {
   const Vector3 along = grasp + length * direction;
   if (along.z() <= 0) return std::numeric_limits<double>::quiet_NaN();
   const Vector2 start = project(camera, grasp), step = project(camera, along) - start;
-  const double scale = camera.fx / grasp.z();  // px a meter
+  const double scale = camera.fx / grasp.z();  // px per meter
   if (step.norm() < kForeshortened * length * scale) return std::numeric_limits<double>::quiet_NaN();
   const Vector2 forward = step.normalized();
   int behind = 0, all = 0;
@@ -112,6 +112,7 @@ ViewFacts facts_of(const View& view, const Camera& camera) {
 }
 
 void check_base(const Manifest& manifest, CheckReport& report) {
+  // extremes of place, speed and acceleration at the samples
   const Capture& capture = manifest.capture;
   const auto& samples = capture.base.samples();
   Vector3 low = samples.front().pose.translation, high = low;
@@ -135,6 +136,7 @@ void check_base(const Manifest& manifest, CheckReport& report) {
            "%.2f m/s^2, %.2f rad/s; position noise %.2g m",
            samples.size(), capture.base.start(), capture.base.end(), rate, travel.x(), travel.y(), travel.z(), speed,
            acceleration, turning, capture.base.noise()));
+  // speeds that are impossible, a base at rest, noise, and a rate below the cameras'
   if (!std::isfinite(speed + acceleration + turning))
     report.problems.push_back(
         "base: its speed is beyond all numbers: poses lie too far apart for their times; write meters and seconds");
@@ -151,6 +153,7 @@ void check_base(const Manifest& manifest, CheckReport& report) {
                1.0 / source.interval, source.camera.name.c_str()));
       break;
     }
+  // the pose relative to the table
   if (capture.table) {
     const Pose& first = samples.front().pose;
     const Vector3 axis = first.rotation * capture.bending_axis;
@@ -164,14 +167,16 @@ void check_base(const Manifest& manifest, CheckReport& report) {
   }
 }
 
-// Reprojection of the grasp, exposure, borders, depth of one camera. `views` are all of it, undistorted.
+// Checks the reprojection of the grasp, exposure, image borders, clock and depth of one camera. `views` are all its
+// views, undistorted.
 void check_camera(const Manifest& manifest, const CameraSource& source, const View* views, int count,
                   CheckReport& report) {
+  // statistics over the frames; `shifted` holds the grasp's distance from the mask per delay of the base
   const Camera& camera = source.camera;
   const trajectory::Trajectory& base = manifest.capture.base;
   const Pose camera_from_world = camera.world_from_camera.inverse();
   const std::string name = camera.name;
-  int seen = 0, border = 0, behind = 0;
+  int visible = 0, border = 0, behind = 0;
   double pixels = 0.0, saturated = 0.0;
   std::vector<double> brightness, distance, wrong_side, grasp_depth, object_depth;
   std::vector<std::vector<double>> shifted(2 * kMostLag + 1);
@@ -179,7 +184,7 @@ void check_camera(const Manifest& manifest, const CameraSource& source, const Vi
     const View& view = views[k];
     const ViewFacts facts = facts_of(view, camera);
     if (facts.pixels == 0) continue;
-    ++seen;
+    ++visible;
     pixels += facts.pixels;
     saturated += facts.saturated;
     border += facts.at_border;
@@ -203,26 +208,28 @@ void check_camera(const Manifest& manifest, const CameraSource& source, const Vi
       shifted[lag + kMostLag].push_back(moved.z() > 0 ? mask_distance(view, project(camera, moved)) : kFarPixels);
     }
   }
+  // the facts
   const double z = median(grasp_depth), miss = median(distance), bright = median(brightness);
   const double across = manifest.capture.diameter * camera.fx / z;
   std::string line =
       text("%s: %dx%d, %d frames, %.3f to %.3f s, %s; sees the object in %d, %.0f px in the mean (%.2f %%)",
            name.c_str(), camera.width, camera.height, count, source.times.front(), source.times.back(),
-           camera.distorted() ? "lens distortion is taken out" : "no lens distortion", seen, seen ? pixels / seen : 0.0,
-           seen ? 100.0 * pixels / seen / camera.width / camera.height : 0.0);
-  if (seen > 0) line += text("; brightness %.0f of 255", bright);
+           camera.distorted() ? "lens distortion is taken out" : "no lens distortion", visible,
+           visible ? pixels / visible : 0.0, visible ? 100.0 * pixels / visible / camera.width / camera.height : 0.0);
+  if (visible > 0) line += text("; brightness %.0f of 255", bright);
   if (std::isfinite(z))
     line +=
         text("; grasp %.2f m away, the rope about %.1f px across, the grasp %.1f px from the mask", z, across, miss);
   report.facts.push_back(line);
 
+  // rate, masks and exposure
   if (source.video_rate > 0 && source.interval > 0 &&
       std::abs(source.video_rate * source.interval - 1.0) > kRateTolerance)
     report.doubts.push_back(text("%s: the video says %.4g frames a second, the capture %.4g", name.c_str(),
                                  source.video_rate, 1.0 / source.interval));
-  if (seen == 0) return;  // a problem already
-  if (seen < count)
-    report.doubts.push_back(text("%s: the mask is empty in %d of %d frames", name.c_str(), count - seen, count));
+  if (visible == 0) return;  // load_views() has reported a problem already
+  if (visible < count)
+    report.doubts.push_back(text("%s: the mask is empty in %d of %d frames", name.c_str(), count - visible, count));
   if (border > 0)
     report.doubts.push_back(
         text("%s: the mask touches the image's border in %d of %d frames: part of the rope may be out of sight",
@@ -239,6 +246,7 @@ void check_camera(const Manifest& manifest, const CameraSource& source, const Vi
     report.doubts.push_back(
         text("%s: the object's brightness jumps between frames (%.0f to %.0f of 255): is the exposure fixed?",
              name.c_str(), *darkest, *brightest));
+  // where the grasp projects to
   if (behind > 0)
     report.doubts.push_back(
         text("%s: the grasp is behind the camera in %d frames: does world_from_camera use OpenCV's axes (z forward)?",
@@ -256,8 +264,8 @@ void check_camera(const Manifest& manifest, const CameraSource& source, const Vi
         "%s: %.0f %% of the mask lies behind the grasp, against grasp.direction: check the camera's pose, the base "
         "trajectory and the direction",
         name.c_str(), 100.0 * median(wrong_side)));
-  // a wrong clock shows as a distance that shrinks when the base is moved in time; rests tell nothing, so all frames
-  // count
+  // a wrong clock shows as a distance that shrinks when the base is moved in time; the RMS over all frames is compared,
+  // because frames at rest carry no information and would decide a median
   const auto rms = [](const std::vector<double>& values) {
     double sum = 0.0;
     for (const double v : values) sum += v * v;
@@ -272,6 +280,7 @@ void check_camera(const Manifest& manifest, const CameraSource& source, const Vi
         "%s: the images fit the base better %d frames %s (%.1f px instead of %.1f): are start and the base's times "
         "on one clock?",
         name.c_str(), std::abs(best), best > 0 ? "later" : "earlier", then, now));
+  // depth against the distance of the grasp
   if (source.depth) {
     const double depth = median(object_depth);
     if (!std::isfinite(depth))
@@ -306,6 +315,7 @@ CheckReport check(const Path& path) {
     report.doubts.insert(report.doubts.begin(), findings.doubts.begin(), findings.doubts.end());
     return report;
   };
+  // the manifest and the base
   Manifest manifest;
   try {
     manifest = read_manifest(path, "", true, findings);
@@ -323,7 +333,7 @@ CheckReport check(const Path& path) {
   if (manifest.cameras.size() == 1) report.doubts.push_back("cameras: only one; depth along its rays is hardly seen");
   if (!capture.base.samples().empty()) check_base(manifest, report);
 
-  // images are judged as far as their files are whole: a camera with a problem of its own does not hide the others'
+  // the images of every camera whose files are whole, so that one camera's problem does not hide the others'
   for (std::size_t c = 0; c < manifest.cameras.size(); ++c) {
     const CameraSource& source = manifest.cameras[c];
     const auto of_this_camera = [&](const Problem& problem) {
@@ -351,6 +361,7 @@ CheckReport check(const Path& path) {
     }
     check_camera(manifest, source, views.data(), static_cast<int>(views.size()), report);
   }
+  // what serves evaluation only
   report.facts.push_back(capture.has_depth ? "depth: given, for evaluation" : "depth: none, so no Chamfer distance");
   std::error_code error;
   if (std::filesystem::is_directory(capture.folder / "truth", error)) {

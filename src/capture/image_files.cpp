@@ -15,13 +15,14 @@ namespace chainsplat::capture {
 
 namespace {
 
-constexpr int kMostChannels = 8;  // colors, alpha, depth: a damaged header claims any number
+constexpr int kMostChannels = 8;  // enough for colors, alpha and depth; a damaged header may claim any number
 
-// What is wrong with a PNG; empty where it is whole, or none. Found here, because libpng prints a line of its own.
+// Returns what is wrong with a PNG, or an empty text where it is whole or the file is no PNG. It is found here because
+// libpng would print a line of its own.
 std::string damage_of_png(const Path& file) {
   std::ifstream stream(file, std::ios::binary);
   constexpr std::string_view kSignature = "\x89PNG\r\n\x1a\n";
-  constexpr std::uint32_t kLargestSide = 1u << 15;  // px, as capture.json's
+  constexpr std::uint32_t kLargestSide = 1u << 15;  // px, the same as for capture.json
   constexpr const char* kCutOff = "is cut off";
   char start[8] = {};
   if (!stream.read(start, sizeof start) || std::string_view(start, sizeof start) != kSignature) return "";
@@ -32,7 +33,7 @@ std::string damage_of_png(const Path& file) {
   };
   std::error_code error;
   const std::uintmax_t at_most = std::filesystem::file_size(file, error);
-  for (std::vector<char> chunk;;) {  // length, name, data, checksum of the last two
+  for (std::vector<char> chunk;;) {  // each chunk has its length, name, data and the checksum of name and data
     const std::uint32_t length = number();
     if (!stream || length > at_most) return kCutOff;
     chunk.resize(length + 4);
@@ -52,8 +53,8 @@ std::string damage_of_png(const Path& file) {
   }
 }
 
-// Whether an EXR's header, as far as it is one, has an attribute that is longer than the file: OpenEXR would make room
-// for it first.
+// Returns whether a file that begins as an EXR has a header that is cut off or has an attribute longer than the file:
+// OpenEXR would allocate the attribute's claimed length before it reads.
 bool is_damaged_exr(const Path& file) {
   std::ifstream stream(file, std::ios::binary);
   constexpr std::string_view kSignature = "\x76\x2f\x31\x01";
@@ -68,11 +69,12 @@ bool is_damaged_exr(const Path& file) {
     if (length > at_most) return true;
     stream.seekg(length, std::ios::cur);
   }
-  return !stream;  // cut off before the end of the header
+  return !stream;  // the file ends before its header does
 }
 
-// The reader of OpenImageIO for the format that the file begins as; none: another format. Left to itself it tries all
-// that it has, and some hand the file to libraries that open whatever other file or address it names.
+// Returns the name of OpenImageIO's reader for the format that the file's first bytes show, or null for another format.
+// Without a name OpenImageIO tries all its readers, and some pass the file to libraries that open any other file or
+// address it names.
 const char* format_of(const Path& file) {
   struct Start {
     std::string_view bytes;
@@ -97,18 +99,18 @@ std::unique_ptr<OIIO::ImageInput> open_image(const Path& file) {
   std::error_code error;
   if (!std::filesystem::exists(file, error))
     throw InputError(file.string(), "does not exist", "check the path and the frame numbers");
-  if (!std::filesystem::is_regular_file(file, error))  // a pipe might never end
+  if (!std::filesystem::is_regular_file(file, error))  // reading a pipe might never end
     throw InputError(file.string(), "is not a file", "check the path and the frame numbers");
   if (const std::string damage = damage_of_png(file); !damage.empty())
     throw InputError(file.string(), damage, "write it again");
   if (is_damaged_exr(file)) throw InputError(file.string(), "is damaged", "write it again");
   OIIO::ImageSpec options;
-  options.attribute("oiio:UnassociatedAlpha", 1);  // colors as stored, not multiplied by alpha
+  options.attribute("oiio:UnassociatedAlpha", 1);  // keep colors as stored, not multiplied by alpha
   const char* const format = format_of(file);
   auto input = format ? OIIO::ImageInput::create(format) : nullptr;
   OIIO::ImageSpec spec;
   if (!input || !input->open(file.string(), spec, options)) {
-    OIIO::geterror();  // its text names plugins and internals, not the user's mistake
+    OIIO::geterror();  // discarded, because its text names plugins and internals instead of the user's mistake
     if (input) input->geterror();
     throw InputError(file.string(), "is not a readable image", "write it again as PNG");
   }
@@ -135,7 +137,7 @@ template <class Value>
 std::vector<Value> read_pixels(OIIO::ImageInput& input, const Path& file, OIIO::TypeDesc type, int channels) {
   const OIIO::ImageSpec& spec = input.spec();
   std::vector<Value> pixels(static_cast<std::size_t>(spec.width) * spec.height * channels);
-  // asked for what the file holds, OpenImageIO reads in place; else through a buffer of 64 MB an image
+  // with the file's own format OpenImageIO reads in place, otherwise through a buffer of 64 MB per image
   if (spec.format == type && spec.nchannels == channels) type = OIIO::TypeDesc::UNKNOWN;
   if (!input.read_image(0, 0, 0, channels, type, pixels.data())) {
     input.geterror();
@@ -144,7 +146,7 @@ std::vector<Value> read_pixels(OIIO::ImageInput& input, const Path& file, OIIO::
   return pixels;
 }
 
-// Opens `create` under a temporary name, writes, and renames: a reader never sees half a file.
+// Writes an image under a temporary name and renames it, so that a reader never sees half a file.
 void write_image(const Path& file, const std::string& format, const OIIO::ImageSpec& spec, const OIIO::TypeDesc& type,
                  const void* pixels) {
   const Path temporary = file.string() + ".tmp" + std::to_string(::getpid());
@@ -194,7 +196,7 @@ std::vector<float> read_depth(const Path& file, int width, int height, double sc
 Image8 read_image8(const Path& file) {
   const auto input = open_image(file);
   const OIIO::ImageSpec& spec = input->spec();
-  // nobody has said how large it should be
+  // no camera gives the expected size here, so the total is bounded
   if (static_cast<std::int64_t>(spec.width) * spec.height * spec.nchannels > kMostPixels)
     throw InputError(file.string(),
                      "claims " + size_text(spec.width, spec.height) + " pixels of " + std::to_string(spec.nchannels) +
@@ -214,7 +216,7 @@ void write_png(const Path& file, const Image8& image) {
 
 void write_depth_png(const Path& file, int width, int height, const std::vector<float>& meters, double scale) {
   CHAINSPLAT_CHECK(meters.size() == static_cast<std::size_t>(width) * height, file.string());
-  constexpr double kLargest = 65535.0;  // of 16 bits; what does not fit is "none"
+  constexpr double kLargest = 65535.0;  // of 16 bits; depths that do not fit are written as none
   std::vector<std::uint16_t> raw(meters.size());
   for (std::size_t i = 0; i < raw.size(); ++i) {
     const double value = std::round(meters[i] / scale);
@@ -227,7 +229,7 @@ void write_depth_png(const Path& file, int width, int height, const std::vector<
 void write_depth_exr(const Path& file, int width, int height, const std::vector<float>& meters) {
   CHAINSPLAT_CHECK(meters.size() == static_cast<std::size_t>(width) * height, file.string());
   OIIO::ImageSpec spec(width, height, 1, OIIO::TypeDesc::FLOAT);
-  spec.channelnames = {"Z"};  // OpenEXR's name for depth
+  spec.channelnames = {"Z"};  // OpenEXR's name of depth
   write_image(file, "openexr", spec, OIIO::TypeDesc::FLOAT, meters.data());
 }
 

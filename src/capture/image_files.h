@@ -1,4 +1,6 @@
-// src/capture/image_files.h - single images through OpenImageIO's ImageInput, without its cache.
+// src/capture/image_files.h - reading of single images with OpenImageIO's ImageInput, without its cache.
+//
+// All readers throw InputError when the image is missing, unreadable or of another size than expected.
 #pragma once
 #include <cstdint>
 #include <vector>
@@ -6,11 +8,11 @@
 
 namespace chainsplat::capture {
 
-// The first channel, 8 bit. Throws InputError when missing, unreadable or of another size than expected.
+// Returns the first channel in 8 bits.
 std::vector<std::uint8_t> read_mask(const Path& file, int width, int height);
-// Red, green, blue (gray is repeated, alpha dropped), 8 bit.
+// Returns red, green and blue in 8 bits each; gray is repeated and alpha dropped.
 std::vector<std::uint8_t> read_rgb(const Path& file, int width, int height);
-// 16-bit values times `scale`, m; 0 = none.
+// Returns the 16-bit values times `scale`, in m; 0 stands for none.
 std::vector<float> read_depth(const Path& file, int width, int height, double scale);
 
 }  // namespace chainsplat::capture

@@ -6,7 +6,7 @@ namespace chainsplat::capture {
 
 namespace {
 
-// The first problem as an exception; the others are counted.
+// Throws the first problem, if there is one, with the number of the others.
 void throw_first(const Findings& findings) {
   if (findings.problems.empty()) return;
   const Problem& first = findings.problems.front();

@@ -22,27 +22,27 @@ Path ImageSource::frame_file(int frame) const {
 
 namespace {
 
-// Bounds of what a file may ask for. Each is far beyond what a rope is recorded with: it is there because memory and
-// time follow the number, so that a slip of the pen or a hostile file ends in a line and not in a full memory.
+// Bounds of what a file may request. Each is far beyond any recording of a rope. They exist because memory and time
+// grow with these numbers, so that a typing error or a hostile file ends in a message and not in exhausted memory.
 constexpr std::size_t kMostText = std::size_t{4} << 20;  // bytes of capture.json
-constexpr std::size_t kMostKeys = 1000;                  // of one object: they are looked up one by one
-constexpr std::size_t kMostCameras = 512;                // all their frames are held at once
+constexpr std::size_t kMostKeys = 1000;                  // per object, because keys are looked up one by one
+constexpr std::size_t kMostCameras = 512;                // because the frames of all are in memory at once
 constexpr int kLargestSide = 1 << 15;                    // px, of an image
-constexpr double kLongestRecording = 3600.0;             // s; the dynamics are integrated over it in milliseconds
-constexpr double kLeastFocal = 1.0, kMostFocal = 1e6;    // px: less is no length in pixels, more are parallel rays
-constexpr double kFarthest = 1e6;                        // m, of a place in the world: digits are left for a pixel
+constexpr double kLongestRecording = 3600.0;             // s; the dynamics are integrated over it in millisecond steps
+constexpr double kLeastFocal = 1.0, kMostFocal = 1e6;    // px; less is no length in pixels, more are parallel rays
+constexpr double kFarthest = 1e6;                        // m from the origin; enough digits remain to resolve a pixel
 constexpr double kLongestRope = 100.0;                   // m
-constexpr double kThinnest = 1e-4;                       // of the length: masks are made in steps of a diameter
+constexpr double kThinnest = 1e-4;                       // of the length, because masks are made in steps of a diameter
 constexpr double kHeaviest = 1e4;                        // kg
 constexpr double kMostGravity = 1e3;                     // m/s^2
-constexpr int kMostUnknown = 5;                          // unknown keys that are told of an object
-constexpr double kRotationTolerance = 1e-3;  // |R R^T - I|: three digits pass
-constexpr double kUnitTolerance = 1e-3;      // of a direction's length before we doubt it
-constexpr double kPerpendicular = 1e-3;      // rad
-constexpr double kInversePixels = 1e-3;      // px, largest error of undistort(distort(.)) at the corners
-constexpr double kTopMeters = 5.0;           // a longer rope is doubted (millimeters?)
+constexpr int kMostUnknown = 5;                          // unknown keys per object that are named
+constexpr double kRotationTolerance = 1e-3;              // of |R R^T - I|; numbers of three digits pass
+constexpr double kUnitTolerance = 1e-3;                  // of a direction's length, beyond which it is doubted
+constexpr double kPerpendicular = 1e-3;                  // rad
+constexpr double kInversePixels = 1e-3;                  // px, largest error of undistort(distort(.)) at the border
+constexpr double kTopMeters = 5.0;                       // m; a longer rope is doubted, as it may be in millimeters
 
-// In quotes, cut to what fits on a line.
+// The text in quotes, cut to a length that fits on a line.
 std::string in_quotes(const std::string& text) {
   constexpr std::size_t kMost = 60;
   std::string out = "'";
@@ -50,6 +50,7 @@ std::string in_quotes(const std::string& text) {
   return out;
 }
 
+// Levenshtein's distance, which finds the key that a misspelled one stands for.
 int edit_distance(const std::string& a, const std::string& b) {
   std::vector<int> row(b.size() + 1);
   for (std::size_t j = 0; j <= b.size(); ++j) row[j] = static_cast<int>(j);
@@ -65,7 +66,7 @@ int edit_distance(const std::string& a, const std::string& b) {
   return row[b.size()];
 }
 
-// One JSON object of the file: typed access that notes what is missing or wrong and goes on with a default.
+// One JSON object of the file: typed access that records what is missing or wrong and continues with a default.
 class Reader {
  public:
   Reader(const Json* object, std::string where, Findings& findings)
@@ -80,12 +81,12 @@ class Reader {
     findings_.doubts.push_back(at(key) + ": " + what);
   }
 
-  // Unknown keys are doubts that name the nearest known key.
+  // Doubts unknown keys, and suggests the nearest known one where it is similar.
   void know(std::initializer_list<const char*> known) const {
     if (!object_) return;
     int unknown = 0;
     for (const auto& item : object_->items()) {
-      const std::string key = item.key().substr(0, 40);  // longer than any that is known
+      const std::string key = item.key().substr(0, 40);  // more characters than any known key has
       if (std::any_of(known.begin(), known.end(), [&](const char* k) { return key == k; })) continue;
       if (++unknown > kMostUnknown) continue;
       const char* nearest = *std::min_element(known.begin(), known.end(), [&](const char* a, const char* b) {
@@ -115,7 +116,7 @@ class Reader {
     return std::nullopt;
   }
 
-  // At most `most`, which `reason` explains.
+  // A positive number, or 0 and a problem. It may be at most `most`; `reason` ends the sentence that says so.
   double positive(const std::string& key, const char* expected, double most = std::numeric_limits<double>::max(),
                   const char* reason = "") const {
     const auto value = number(key, true, expected);
@@ -127,7 +128,7 @@ class Reader {
     return *value;
   }
 
-  // Frames a second; 0 and a problem where it is none.
+  // The frames per second, or 0 and a problem.
   double rate() const {
     const double value = positive("rate", "frames a second");
     if (value >= kSlowestRate && value <= kFastestRate) return value;
@@ -139,7 +140,7 @@ class Reader {
     return 0.0;
   }
 
-  // A place in the world, where `place`: one that is absurdly far away leaves no digits for what is near.
+  // Returns whether a place in the world is near enough to the origin that enough digits remain for the rope.
   bool near(const std::string& key, const Vector3& place) const {
     if (place.cwiseAbs().maxCoeff() <= kFarthest) return true;
     problem(key, "lies more than " + std::to_string(static_cast<int>(kFarthest)) + " m from the world's origin, too far for exact numbers",
@@ -187,7 +188,7 @@ class Reader {
     return Vector3((*values)[0], (*values)[1], (*values)[2]);
   }
 
-  // Normalized.
+  // A direction, normalized; a length other than 1 is doubted.
   std::optional<Vector3> direction(const std::string& key, const char* expected) const {
     const auto value = vector(key, true, expected);
     if (!value) return std::nullopt;
@@ -209,7 +210,7 @@ class Reader {
     return std::nullopt;
   }
 
-  // A path inside the folder.
+  // A relative path that stays inside the capture's folder.
   std::optional<std::string> path(const std::string& key, bool required, const char* expected) const {
     const auto value = text(key, required, expected);
     if (!value) return std::nullopt;
@@ -219,7 +220,7 @@ class Reader {
       problem(key, in_quotes(*value) + " is not a path inside the capture's folder", "put the file into the folder");
       return std::nullopt;
     }
-    constexpr std::size_t kLongestPath = 4096;  // bytes, of Linux
+    constexpr std::size_t kLongestPath = 4096;  // bytes, Linux's limit
     if (value->size() > kLongestPath) {
       problem(key, in_quotes(*value) + " is longer than a path can be", "shorten it");
       return std::nullopt;
@@ -244,7 +245,7 @@ class Reader {
   Findings& findings_;
 };
 
-// 'cam0.mp4' or 'cam0/%06d.png'.
+// Reads 'cam0.mp4' as a video and 'cam0/%06d.png' as a pattern of image files.
 std::optional<ImageSource> image_source(const Reader& reader, const std::string& key, const Path& folder,
                                         bool required) {
   const auto text = reader.path(key, required, "a video like cam0.mp4 or a pattern like cam0/%06d.png");
@@ -278,7 +279,7 @@ bool is_file(const Path& file) {
 
 constexpr const char* kOwnFile = "copy the file itself into the capture's folder";
 
-// Throws InputError unless `file` is one: reading a pipe or a device might never end.
+// Throws InputError unless `file` is a regular file, because reading a pipe or a device might never end.
 void require_file(const Path& file) {
   if (is_file(file)) return;
   std::error_code error;
@@ -289,13 +290,14 @@ void require_file(const Path& file) {
   throw InputError(file.string(), "is a pipe or device, not a file", "name a file");
 }
 
-// The same for what a capture names, which must lie in its folder.
+// The same for a file that a capture names, which must also lie in its folder.
 void require_own_file(const Path& folder, const Path& file) {
   if (const std::string link = link_out_of(folder, file); !link.empty()) throw InputError(file.string(), link, kOwnFile);
   require_file(file);
 }
 
-// Sets source.frames; false and a problem when there are none or a number is left out.
+// Sets source.frames, and `*rate` for a video. Returns false and records a problem when there is no frame, a number is
+// missing, or a file is unreadable or leads out of the folder.
 bool count_frames(ImageSource& source, const Path& folder, const std::string& where, double* rate,
                   const Camera* camera, Findings& findings) {
   const auto too_many = [&](const Path& file) {
@@ -305,6 +307,7 @@ bool count_frames(ImageSource& source, const Path& folder, const std::string& wh
                                  "split the recording"});
     return false;
   };
+  // a video: its container counts the frames
   if (source.video) {
     try {
       require_own_file(folder, source.file);
@@ -328,8 +331,9 @@ bool count_frames(ImageSource& source, const Path& folder, const std::string& wh
     findings.problems.push_back({source.file.string(), "has no frame", "write the video again"});
     return false;
   }
-  std::string leaving;  // where a frame does
-  Path inside;          // the folder of the last frame
+  // image files: count them from 0, and check each folder and each link once
+  std::string leaving;  // how a frame's path leaves the folder
+  Path inside;          // the folder of the previous frame
   const auto there = [&](int frame) {
     const Path file = source.frame_file(frame);
     if (!is_file(file)) return false;
@@ -345,7 +349,7 @@ bool count_frames(ImageSource& source, const Path& folder, const std::string& wh
   while (source.frames <= kMostFrames && there(source.frames)) ++source.frames;
   if (!leaving.empty()) return false;
   if (source.frames > kMostFrames) return too_many(source.frame_file(0));
-  constexpr int kLookAhead = 16;  // frames: a longer gap is taken for the end
+  constexpr int kLookAhead = 16;  // frames; a longer gap is regarded as the end
   for (int k = source.frames + 1; k < source.frames + kLookAhead; ++k)
     if (is_file(source.frame_file(k))) {
       findings.problems.push_back({source.frame_file(source.frames).string(), "is missing, though later frames exist",
@@ -358,6 +362,7 @@ bool count_frames(ImageSource& source, const Path& folder, const std::string& wh
   return false;
 }
 
+// Reads one time per line, with '#' comments.
 std::vector<double> read_timestamps(const Path& file) {
   const std::string text = core::read_file(file);
   std::vector<double> times;
@@ -384,6 +389,7 @@ std::vector<double> read_timestamps(const Path& file) {
   return times;
 }
 
+// Sets source.times and source.interval from the timestamps, or else from start and rate.
 void set_times(CameraSource& source, const Path& folder, Findings& findings) {
   const int frames = source.images.frames;
   if (source.timestamps) {
@@ -394,16 +400,16 @@ void set_times(CameraSource& source, const Path& folder, Findings& findings) {
       findings.problems.push_back({source.where + ".timestamps", error.what(), "correct the file"});
       return;
     }
-    const int given = static_cast<int>(source.times.size());
-    if (given < frames) {
+    const int count = static_cast<int>(source.times.size());
+    if (count < frames) {
       findings.problems.push_back({source.timestamps->string(),
-                                   "has " + std::to_string(given) + " times for " + std::to_string(frames) + " frames",
+                                   "has " + std::to_string(count) + " times for " + std::to_string(frames) + " frames",
                                    "write one number a frame"});
       source.times.clear();
       return;
     }
-    if (given > frames)
-      findings.doubts.push_back(source.timestamps->string() + ": has " + std::to_string(given) + " times for " +
+    if (count > frames)
+      findings.doubts.push_back(source.timestamps->string() + ": has " + std::to_string(count) + " times for " +
                                 std::to_string(frames) + " frames; the last ones are ignored");
     source.times.resize(frames);
     std::vector<double> intervals;
@@ -453,7 +459,7 @@ void read_pose(const Reader& reader, Camera& camera) {
   camera.world_from_camera = {math::orthonormalized(rotation), {a[3], a[7], a[11]}};
 }
 
-// A strong lens model may fold the image over itself; then undistorting has no answer.
+// Checks that the lens model can be inverted: a strong one may fold the image over itself.
 void check_lens(const Reader& reader, const Camera& camera) {
   if (!camera.distorted()) return;
   const double w = camera.width, h = camera.height;
@@ -476,7 +482,7 @@ bool good_name(const std::string& name) {
                      [](unsigned char c) { return std::isalnum(c) || c == '_' || c == '-' || c == '.'; });
 }
 
-// All of a camera but where its frames are.
+// Reads a camera except its name and the location of its frames.
 Camera read_optics(const Reader& reader) {
   reader.know({"name", "width", "height", "fx", "fy", "cx", "cy", "distortion", "world_from_camera", "images", "masks",
                "depth", "depth_scale", "rate", "start", "timestamps"});
@@ -538,10 +544,10 @@ std::string line_of(const std::string& text, std::size_t byte) {
   return std::to_string(1 + std::count(text.begin(), text.begin() + static_cast<std::ptrdiff_t>(end), '\n'));
 }
 
-// What a document hides: of a key that stands twice in an object it has the last one only. It also looks keys up one by
-// one, so that very many of them in one object would take a time that grows with their square.
+// Finds what a parsed document hides or cannot bear: of a key that stands twice in an object it keeps only the last
+// one, and it looks keys up one by one, so that very many keys in one object would take time quadratic in their number.
 struct Keys : nlohmann::json_sax<Json> {
-  std::vector<std::set<std::string>> objects;  // that are open
+  std::vector<std::set<std::string>> objects;  // keys of the open objects, outermost first
   std::optional<std::string> twice;
   bool many = false;
   bool key(std::string& name) override {
@@ -569,7 +575,7 @@ struct Keys : nlohmann::json_sax<Json> {
   bool parse_error(std::size_t, const std::string&, const nlohmann::detail::exception&) override { return false; }
 };
 
-// The object in a file.
+// Parses a text that must be one JSON object; `file` and `expected` are for the messages.
 Json parse(const std::string& text, const std::string& file, const char* expected) {
   if (text.size() > kMostText)
     throw InputError(file, "is larger than " + std::to_string(kMostText >> 20) + " MiB, too large for numbers and names",
@@ -588,15 +594,16 @@ Json parse(const std::string& text, const std::string& file, const char* expecte
     throw InputError(file + ":" + line_of(text, failure.byte),
                      "is not JSON (a comma, bracket or quote is missing, or the file is cut off)",
                      "correct this line or the one before");
-  } catch (const Json::exception&) {  // a number beyond double
+  } catch (const Json::exception&) {  // thrown for a number beyond double
     throw InputError(file, "has a number that is too large", "write finite numbers");
   }
   if (!json.is_object()) throw InputError(file, "is not a JSON object", std::string("write ") + expected);
   return json;
 }
 
+// Counts the frames of all cameras and sets their times.
 void survey(Manifest& manifest, bool masked, Findings& findings) {
-  std::vector<Findings> found(manifest.cameras.size());  // cameras in parallel, findings in order
+  std::vector<Findings> found(manifest.cameras.size());  // per camera, so that their order does not depend on threads
   core::parallel_for(static_cast<std::int64_t>(manifest.cameras.size()), [&](std::int64_t c) {
     CameraSource& source = manifest.cameras[c];
     Findings& mine = found[c];
@@ -624,6 +631,7 @@ void survey(Manifest& manifest, bool masked, Findings& findings) {
   }
 }
 
+// Reads the base trajectory and checks that it covers the frames of all cameras.
 void read_base(Manifest& manifest, const Path& file, Findings& findings) {
   Capture& capture = manifest.capture;
   try {
@@ -664,6 +672,7 @@ std::uint64_t capture_hash(const std::string& text, const Manifest& manifest, co
 }  // namespace
 
 Manifest read_manifest(const Path& path, const std::string& camera, bool masked, Findings& findings) {
+  // the document
   Manifest manifest;
   std::error_code error;
   manifest.file = std::filesystem::is_directory(path, error) ? path / "capture.json" : path;
@@ -678,8 +687,10 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
   const auto format = top.text("format", true, "\"chainsplat-capture/1\"");
   if (format && *format != "chainsplat-capture/1") {
     top.problem("format", in_quotes(*format) + " is not chainsplat-capture/1", "convert the capture to this format");
-    return manifest;  // other keys would be judged by the wrong rules
+    return manifest;  // the other keys would be judged by the wrong rules
   }
+
+  // the scene
   top.know({"format", "name", "scenario", "gravity", "object", "grasp", "table", "base", "cameras"});
   capture.name = top.text("name", false, "a short name").value_or(capture.folder.filename().string());
   const std::string scenario = top.text("scenario", true, "\"free\" or \"tabletop\"").value_or("free");
@@ -698,6 +709,7 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
     top.doubt("gravity", "is missing; (0, 0, -9.81) is assumed");
   }
 
+  // the rope
   const Reader object = top.child("object", true, "{ \"length\": 0.3, \"diameter\": 0.02, \"mass\": 0.06 }");
   if (object.present()) {
     object.know({"length", "diameter", "mass"});
@@ -715,6 +727,7 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
                      "write both in meters");
   }
 
+  // how the gripper holds it; the bending axis is made exactly perpendicular to the direction
   const Reader grasp = top.child("grasp", true, "{ \"direction\": [0, 0, -1], \"bending_axis\": [0, 1, 0] }");
   if (grasp.present()) {
     grasp.know({"direction", "bending_axis"});
@@ -739,6 +752,7 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
       capture.table = Table{*point, *normal};
   }
 
+  // the base's file and the cameras, of which those not asked for are only checked for their names
   const auto base = top.path("base", true, "\"base.tum\"");
   const Json* cameras = top.find("cameras", true, "a list of cameras");
   if (cameras && (!cameras->is_array() || cameras->empty())) {
@@ -762,17 +776,18 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
       continue;
     }
     const auto name = value.find("name");
-    const std::string given = name != value.end() && name->is_string() ? name->get<std::string>() : "";
-    all_names.append(c ? ", " : "").append(given, 0, 64);
-    if (!given.empty() && !names.insert(given).second)
+    const std::string own_name = name != value.end() && name->is_string() ? name->get<std::string>() : "";
+    all_names.append(c ? ", " : "").append(own_name, 0, 64);
+    if (!own_name.empty() && !names.insert(own_name).second)
       findings.problems.push_back(
-          {where + ".name", in_quotes(given) + " is used twice", "give every camera its own name"});
-    if (!camera.empty() && given != camera) continue;
+          {where + ".name", in_quotes(own_name) + " is used twice", "give every camera its own name"});
+    if (!camera.empty() && own_name != camera) continue;
     manifest.cameras.push_back(read_camera(Reader(&value, where, findings), where, capture.folder));
   }
   if (!camera.empty() && cameras && manifest.cameras.empty())
     findings.problems.push_back({file, "has no camera " + in_quotes(camera), "choose one of " + all_names});
 
+  // the files that it names
   survey(manifest, masked, findings);
   if (base) read_base(manifest, capture.folder / *base, findings);
   for (const CameraSource& source : manifest.cameras) {
@@ -788,11 +803,12 @@ std::string link_out_of(const Path& folder, const Path& file) {
   namespace fs = std::filesystem;
   std::error_code error;
   Path root = fs::weakly_canonical(fs::absolute(folder), error);
-  if (root.filename().empty() && root.has_relative_path()) root = root.parent_path();  // 'folder/'
+  if (root.filename().empty() && root.has_relative_path()) root = root.parent_path();  // for 'folder/'
   const auto leaves = [&](const Path& place) {
     const Path resolved = fs::weakly_canonical(fs::absolute(place), error);
     return !error && std::mismatch(root.begin(), root.end(), resolved.begin(), resolved.end()).first != root.end();
   };
+  // name the first link on the way that leads out
   if (!leaves(file)) return "";
   Path way = folder;
   for (const Path& part : file.lexically_relative(folder)) {
@@ -807,7 +823,7 @@ std::string link_out_of(const Path& folder, const Path& file) {
 Calibration read_calibration(const Path& path) {
   const std::string file = path.string();
   const Json json = parse(core::read_file(path), file, "a camera object as in capture.json");
-  const auto cameras = json.find("cameras");  // or a whole capture.json of one camera
+  const auto cameras = json.find("cameras");  // a whole capture.json of one camera is accepted, too
   const bool whole = cameras != json.end() && cameras->is_array() && cameras->size() == 1 && (*cameras)[0].is_object();
   Findings findings;
   const Reader reader(whole ? &(*cameras)[0] : &json, file + ": ", findings);

@@ -1,4 +1,5 @@
-// src/capture/manifest.h - capture.json and what it names: read, checked, counted; no image is decoded here.
+// src/capture/manifest.h - capture.json and the files it names: they are read, checked and counted, but no image is
+// decoded here.
 #pragma once
 #include <optional>
 #include <string>
@@ -7,54 +8,56 @@
 
 namespace chainsplat::capture {
 
-struct Problem {  // the parts of an InputError
+// The parts of an InputError.
+struct Problem {
   std::string where, what, mend;
 };
 
-// What is wrong (load() throws the first) and what is odd (load() warns).
+// What is wrong (load() throws the first problem) and what is doubtful (load() warns of each).
 struct Findings {
   std::vector<Problem> problems;
   std::vector<std::string> doubts;
 };
 
-// A video, or one image file a frame by a printf pattern.
+// A video, or one image file per frame by a printf pattern.
 struct ImageSource {
   bool video = false;
   Path file;                   // the video
-  std::string prefix, suffix;  // of an image's path
-  int digits = 0;              // at least so many, with zeros in front
+  std::string prefix, suffix;  // of an image's path, around the frame number
+  int digits = 0;              // the least number of digits, filled with leading zeros
   int frames = 0;
-  Path frame_file(int frame) const;  // of a pattern
+  Path frame_file(int frame) const;  // the image file of a pattern
 };
 
 struct CameraSource {
-  std::string where;  // "capture.json: cameras[0]"
+  std::string where;  // for messages, like "capture.json: cameras[0]"
   Camera camera;
   ImageSource images;
   std::optional<ImageSource> masks, depth;
-  double depth_scale = 0.0;  // m a unit
-  double rate = 0.0;         // frames a second; 0 with timestamps
-  double start = 0.0;        // s
+  double depth_scale = 0.0;  // m per unit
+  double rate = 0.0;         // frames per second; 0 with timestamps
+  double start = 0.0;        // s, time of the first frame
   std::optional<Path> timestamps;
-  double interval = 0.0;    // s, median between frames
-  double video_rate = 0.0;  // frames a second as the container says, 0 = unknown
-  std::vector<double> times;
+  double interval = 0.0;      // s, median time between frames
+  double video_rate = 0.0;    // frames per second by the container, 0 = unknown
+  std::vector<double> times;  // s, one per frame; empty after a problem
 };
 
 struct Manifest {
   Path file;                          // capture.json
-  Capture capture;                    // all but views; `base` when it could be read
-  std::vector<CameraSource> cameras;  // as capture.cameras
+  Capture capture;                    // without views; without `base` where it could not be read
+  std::vector<CameraSource> cameras;  // in the order of capture.cameras
 };
 
-// Reads as far as it can. `masked` false: masks are not looked for. `camera`: only this one when not empty.
+// Reads as much as it can and collects the findings. `masked` false: mask files are ignored. `camera`: read only this
+// one, unless empty. Throws InputError when capture.json itself cannot be read.
 Manifest read_manifest(const Path& path, const std::string& camera, bool masked, Findings& findings);
 
-// src/capture/views.cpp: the views of all cameras for options.first, options.last.
+// Loads the views of all cameras for the frames from options.first to options.last (src/capture/views.cpp).
 // Throws InputError for images that cannot be read.
 void load_views(const Manifest& manifest, const LoadOptions& options, Findings& findings, std::vector<View>& views);
 
-// Recorded depth into views that were loaded without; no camera has lens distortion.
+// Adds recorded depth to views that were loaded without it; no camera may have lens distortion.
 void add_depth(const Manifest& manifest, std::vector<View>& views);
 
 }  // namespace chainsplat::capture

@@ -6,6 +6,7 @@ namespace chainsplat::capture {
 
 namespace {
 
+// The header line of a file with so many points per row.
 std::string truth_header(std::size_t points) {
   std::string text = "frame,time";
   for (std::size_t i = 0; i < points; ++i)

@@ -1,4 +1,4 @@
-// Videos and cameras through libav: decoding frame by frame, counting, encoding.
+// Videos and cameras with libav: decoding frame by frame, counting, encoding.
 extern "C" {
 #include <libavcodec/avcodec.h>
 #include <libavdevice/avdevice.h>
@@ -35,7 +35,8 @@ struct Free {
 template <class T>
 using Owned = std::unique_ptr<T, Free>;
 
-// An RGB frame with libav's own padding, zeroed: libswscale's vector code reads and writes past the ends of tight rows.
+// Returns a zeroed frame with libav's own padding, because libswscale's vector code reads and writes past the ends of
+// rows without padding.
 Owned<AVFrame> padded_frame(int width, int height, AVPixelFormat format) {
   Owned<AVFrame> frame(av_frame_alloc());
   frame->width = width;
@@ -47,9 +48,9 @@ Owned<AVFrame> padded_frame(int width, int height, AVPixelFormat format) {
   return frame;
 }
 
-// What libav may open. It knows formats that are lists of further files or addresses (HLS, DASH, concat, SDP, ...) and
-// tells a format by its contents, whatever the name: a file that calls itself cam0.mp4 could have it open any other.
-// These hold their frames themselves.
+// The formats that libav may open, all of which hold their frames themselves. It also knows formats that are lists of
+// further files or addresses (HLS, DASH, concat, SDP, ...), and it recognizes a format by its contents, whatever the
+// file's name: a file called cam0.mp4 could have it open any other file.
 constexpr const char* kContainers =
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,ogg,flv,asf,h264,hevc,m4v,mpegvideo,obu,ivf,mjpeg,"
     "yuv4mpegpipe";
@@ -61,12 +62,13 @@ std::string error_text(int code) {
   return text;
 }
 
-// libav writes to standard error by default; the library does not print.
+// Keeps libav from writing to standard error, because the library does not print.
 void silence() {
   static std::once_flag once;
   std::call_once(once, [] { av_log_set_level(AV_LOG_QUIET); });
 }
 
+// An opened file or camera and the index of its video stream.
 struct Opened {
   Owned<AVFormatContext> format;
   int stream = 0;
@@ -78,8 +80,8 @@ bool is_device(const Path& file) {
   return std::filesystem::is_character_file(file, error);
 }
 
-// `encoding` as libavcodec calls it; empty: the first of libavdevice's list that the camera has. It begins with raw
-// ones.
+// Opens a camera. `encoding` is libavcodec's name; empty: the first of libavdevice's list that the camera has, and the
+// list begins with raw encodings.
 Opened open_camera(const Path& file, const DeviceFormat& format, const char* encoding = "") {
   avdevice_register_all();
   AVDictionary* asked = nullptr;
@@ -89,7 +91,7 @@ Opened open_camera(const Path& file, const DeviceFormat& format, const char* enc
   if (*encoding) av_dict_set(&asked, "input_format", encoding, 0);
   AVFormatContext* raw = avformat_alloc_context();
   if (!raw) throw std::bad_alloc();
-  raw->flags |= AVFMT_FLAG_NONBLOCK;  // a camera may fall silent, and whoever waits for it must be able to leave
+  raw->flags |= AVFMT_FLAG_NONBLOCK;  // a camera may fall silent, and a reader that waits for it must be able to stop
   const int code = avformat_open_input(&raw, file.c_str(), av_find_input_format("video4linux2"), &asked);
   av_dict_free(&asked);
   if (code < 0)
@@ -98,15 +100,16 @@ Opened open_camera(const Path& file, const DeviceFormat& format, const char* enc
   return {Owned<AVFormatContext>(raw), 0};
 }
 
+// The mean rate by the stream's header in frames per second, 0 when unknown.
 double claimed_rate(const AVStream& video) {
   const AVRational rate = video.avg_frame_rate;
   return rate.num > 0 && rate.den > 0 ? av_q2d(rate) : 0.0;
 }
 
-// Raw frames where the camera has them in the size and at the rate that were asked for. On USB 2 it often has them
-// small or slow only, and larger or faster ones as JPEG.
+// Opens a camera with raw frames where it has them in the requested size and rate, otherwise with JPEG frames if these
+// come nearer. On USB 2 many cameras have only small or slow raw frames, and larger or faster ones as JPEG.
 Opened open_camera_as_asked(const Path& file, const DeviceFormat& format) {
-  constexpr double kEnough = 0.95;  // of the rate
+  constexpr double kEnough = 0.95;  // share of the requested rate that counts as reached
   const auto merit = [&](const Opened& opened) {
     const AVCodecParameters& is = *opened.video().codecpar;
     const bool sized = format.width <= 0 || (is.width == format.width && is.height == format.height);
@@ -114,7 +117,7 @@ Opened open_camera_as_asked(const Path& file, const DeviceFormat& format) {
   };
   Opened opened = open_camera(file, format);
   if (const auto raw = merit(opened); raw < std::pair(true, kEnough * format.rate)) {
-    opened.format.reset();  // a camera has one reader at a time
+    opened.format.reset();  // a camera allows one reader at a time
     try {
       opened = open_camera(file, format, "mjpeg");
     } catch (const InputError&) {
@@ -139,7 +142,7 @@ Opened open_video(const Path& file, const DeviceFormat& format = {}) {
   AVDictionary* only = nullptr;
   av_dict_set(&only, "format_whitelist", kContainers, 0);
   av_dict_set(&only, "protocol_whitelist", kProtocols, 0);
-  // with its protocol before it no name is taken for an address
+  // with the protocol in front, no file name is taken for an address
   int code = avformat_open_input(&raw, ("file:" + file.string()).c_str(), nullptr, &only);
   av_dict_free(&only);
   if (code < 0)
@@ -153,8 +156,8 @@ Opened open_video(const Path& file, const DeviceFormat& format = {}) {
   return opened;
 }
 
-// Fetches a camera's frames as they come and keeps the newest. Whoever is slower than the camera misses frames; in the
-// driver's queue they would grow old instead, up to 32 of them.
+// Fetches a camera's frames in a thread as they arrive and keeps the newest. A reader slower than the camera thus
+// misses frames; without the thread up to 32 of them would wait and age in the driver's queue.
 class NewestFrame {
  public:
   explicit NewestFrame(AVFormatContext& camera) : thread_([this, &camera] { fetch(camera); }) {}
@@ -163,12 +166,12 @@ class NewestFrame {
     thread_.join();
   }
 
-  // The newest frame that was not taken before, into `packet`, how many came until then, and the stamp of the first of
-  // them. Waits for it as long as a camera may be silent; a libav code below 0 when it does not come any more. Throws
-  // Interrupted.
-  int take(AVPacket& packet, int& received, std::int64_t& first_stamp) {
-    constexpr double kSilence = 5.0;                     // s
-    constexpr std::chrono::milliseconds kAttention{50};  // to a request to stop
+  // Waits for a frame newer than that of the last call and moves it into `packet`. Sets `received` to the number of
+  // frames up to it and `first_stamp` to the time stamp of the first. Returns 0, or a negative libav code when the
+  // camera ended or was silent for too long. Throws Interrupted.
+  int wait_for_newest(AVPacket& packet, int& received, std::int64_t& first_stamp) {
+    constexpr double kSilence = 5.0;                     // s without a frame, after which the camera counts as lost
+    constexpr std::chrono::milliseconds kAttention{50};  // between two looks for a request to stop
     const double begun = core::seconds_now();
     std::unique_lock lock(mutex_);
     while (!fresh_) {
@@ -197,7 +200,7 @@ class NewestFrame {
           const std::lock_guard lock(mutex_);
           first_stamp_ = packet->pts;
         }
-        if (packet->size > 0) {  // else it was damaged on its way
+        if (packet->size > 0) {  // an empty packet was damaged in transmission
           av_packet_unref(last.get());
           av_packet_move_ref(last.get(), packet.get());
           last_count = count;
@@ -205,7 +208,7 @@ class NewestFrame {
         av_packet_unref(packet.get());
         continue;
       }
-      // all that had queued has been read
+      // the queue is empty: publish the last packet, or the error
       if (last->size > 0 || code != AVERROR(EAGAIN)) {
         const std::lock_guard lock(mutex_);
         if (last->size > 0) {
@@ -229,7 +232,7 @@ class NewestFrame {
   int received_ = 0, code_ = 0;
   std::int64_t first_stamp_ = AV_NOPTS_VALUE;
   Owned<AVPacket> newest_{av_packet_alloc()};
-  std::thread thread_;  // last: it uses all others
+  std::thread thread_;  // the last member, because it uses all others
 };
 
 bool full_range(const AVFrame& frame) {
@@ -244,7 +247,8 @@ bool full_range(const AVFrame& frame) {
   }
 }
 
-// An untagged stream is BT.601; the numbers of AVColorSpace and SWS_CS_* are the same.
+// Returns swscale's number of the color matrix; an untagged stream counts as BT.601. The numbers of AVColorSpace and
+// SWS_CS_* are the same.
 int matrix(AVColorSpace space) {
   switch (space) {
     case AVCOL_SPC_BT709:
@@ -271,8 +275,8 @@ struct VideoReader::Implementation {
   int scaler_width = 0, scaler_height = 0, scaler_format = -1, scaler_matrix = -1;
   bool scaler_full = false, at_end = false;
   int frames = 0;
-  std::int64_t first_stamp = AV_NOPTS_VALUE;  // of a camera
-  std::unique_ptr<NewestFrame> camera;        // none: a recording
+  std::int64_t first_stamp = AV_NOPTS_VALUE;  // time stamp of a camera's first frame
+  std::unique_ptr<NewestFrame> camera;        // null for a recording
 
   double seconds(std::int64_t stamp) const {
     if (stamp == AV_NOPTS_VALUE) return std::numeric_limits<double>::quiet_NaN();
@@ -285,6 +289,7 @@ struct VideoReader::Implementation {
 
 VideoReader::VideoReader(const Path& file, int threads, const DeviceFormat& format)
     : implementation_(std::make_unique<Implementation>()) {
+  // open the input and a decoder for it
   Implementation& self = *implementation_;
   self.file = file;
   self.input = open_video(file, format);
@@ -296,10 +301,11 @@ VideoReader::VideoReader(const Path& file, int threads, const DeviceFormat& form
   self.decoder.reset(avcodec_alloc_context3(codec));
   avcodec_parameters_to_context(self.decoder.get(), &parameters);
   self.decoder->thread_count = std::max(1, threads);
-  self.decoder->max_pixels = kMostPixels;  // a damaged header claims any size
+  self.decoder->max_pixels = kMostPixels;  // a damaged header may claim any size
   self.decoder->pkt_timebase = self.input.video().time_base;
   const int code = avcodec_open2(self.decoder.get(), codec, nullptr);
   if (code < 0) throw InputError(file.string(), "cannot be decoded (" + error_text(code) + ")", "write it as H.264");
+  // a camera: skipping frames needs an encoding in which each can be read alone
   if (!is_device(file)) return;
   const AVCodecDescriptor* kind = avcodec_descriptor_get(parameters.codec_id);
   if (!kind || !(kind->props & AV_CODEC_PROP_INTRA_ONLY))
@@ -314,7 +320,7 @@ VideoReader::~VideoReader() = default;
 VideoReader::VideoReader(VideoReader&&) noexcept = default;
 VideoReader& VideoReader::operator=(VideoReader&&) noexcept = default;
 
-// Decodes the next frame in display order into `frame`; false at the end.
+// Decodes the next frame in display order into `frame`. Returns false at the end.
 bool VideoReader::Implementation::decode() {
   if (camera) {
     decode_newest();
@@ -342,10 +348,10 @@ bool VideoReader::Implementation::decode() {
   }
 }
 
-// The newest frame of a camera that can be decoded, into `frame`.
+// Decodes the newest frame of a camera into `frame`, waiting for the next one where it is damaged.
 void VideoReader::Implementation::decode_newest() {
   for (;;) {
-    int code = camera->take(*packet, frames, first_stamp);
+    int code = camera->wait_for_newest(*packet, frames, first_stamp);
     if (code < 0)
       throw WorkError(file.string(),
                       "gives no more frames after " + std::to_string(frames) + " (" +
@@ -355,16 +361,18 @@ void VideoReader::Implementation::decode_newest() {
     av_packet_unref(packet.get());
     if (code >= 0) code = avcodec_receive_frame(decoder.get(), frame.get());
     if (code >= 0) return;
-    avcodec_flush_buffers(decoder.get());  // damaged on its way: the next one will do
+    avcodec_flush_buffers(decoder.get());  // damaged in transmission
   }
 }
 
+// Converts `frame` to RGB.
 void VideoReader::Implementation::convert(Image8& rgb) {
   const int width = frame->width, height = frame->height;
   if (width <= 0 || height <= 0 || static_cast<std::int64_t>(width) * height > kMostPixels)
     throw InputError(file.string(),
                      "claims frames of " + std::to_string(width) + "x" + std::to_string(height) + " pixels",
                      "write the video again");
+  // make a converter when the format differs from the previous frame's
   const int coefficients = matrix(frame->colorspace);
   const bool full = full_range(*frame);
   if (!scaler || width != scaler_width || height != scaler_height || frame->format != scaler_format ||
@@ -374,7 +382,7 @@ void VideoReader::Implementation::convert(Image8& rgb) {
     scaler_format = frame->format;
     scaler_matrix = coefficients;
     scaler_full = full;
-    // flags: exactly the default. Others move colors at chroma edges by up to 200 levels
+    // exactly the default flags: others move colors at chroma edges by up to 200 levels
     scaler.reset(sws_getContext(width, height, static_cast<AVPixelFormat>(frame->format), width, height,
                                 AV_PIX_FMT_RGB24, SWS_BICUBIC, nullptr, nullptr, nullptr));
     if (!scaler) throw InputError(file.string(), "has a pixel format without a way to RGB", "write it as yuv420p");
@@ -383,6 +391,7 @@ void VideoReader::Implementation::convert(Image8& rgb) {
     sws_setColorspaceDetails(scaler.get(), sws_getCoefficients(coefficients), full, sws_getCoefficients(SWS_CS_DEFAULT),
                              1, 0, kOne, kOne);
   }
+  // convert into padded rows and copy them without the padding
   rgb.width = width;
   rgb.height = height;
   rgb.channels = 3;
@@ -446,7 +455,7 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
                     "check the folder, the free space and the encoders of libav");
   };
 
-  // quality close to lossless for the eye; the noise of a camera stays visible
+  // choose the encoder; the quality is visually close to lossless and keeps a camera's noise
   constexpr const char* kX264Quality = "16";
   constexpr int kMpeg4Quality = 3;
   const bool even = width % 2 == 0 && height % 2 == 0;
@@ -456,23 +465,24 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
   if (!codec) fail("no video encoder in libav", 0);
   if (!even && !x264) fail("an odd size needs libx264", 0);
 
+  // set it up
   Owned<AVCodecContext> encoder(avcodec_alloc_context3(codec));
   const AVRational frame_rate = av_d2q(rate, 1001000);
   encoder->width = width;
   encoder->height = height;
-  encoder->pix_fmt = even ? AV_PIX_FMT_YUV420P : AV_PIX_FMT_YUV444P;  // half-size chroma has no odd sizes
+  encoder->pix_fmt = even ? AV_PIX_FMT_YUV420P : AV_PIX_FMT_YUV444P;  // chroma at half size needs even sizes
   encoder->time_base = av_inv_q(frame_rate);
   encoder->framerate = frame_rate;
   encoder->color_range = AVCOL_RANGE_MPEG;
   encoder->colorspace = AVCOL_SPC_SMPTE170M;  // BT.601
   encoder->color_primaries = AVCOL_PRI_SMPTE170M;
   encoder->color_trc = AVCOL_TRC_SMPTE170M;
-  encoder->thread_count = 1;  // x264's bits depend on it
+  encoder->thread_count = 1;  // x264's output depends on the number of threads
   encoder->flags |= AV_CODEC_FLAG_GLOBAL_HEADER | AV_CODEC_FLAG_BITEXACT;
   if (x264) {
     av_opt_set(encoder->priv_data, "crf", kX264Quality, 0);
     av_opt_set(encoder->priv_data, "preset", "medium", 0);
-    // its vector code for macroblock trees lets uninitialized memory into the bits; this path does not, on any CPU
+    // x264's vector code for macroblock trees lets uninitialized memory influence the output; this path does not
     av_opt_set(encoder->priv_data, "x264-params", "cpu-independent=1", 0);
   } else {
     encoder->flags |= AV_CODEC_FLAG_QSCALE;
@@ -481,6 +491,7 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
   int code = avcodec_open2(encoder.get(), codec, nullptr);
   if (code < 0) fail("the encoder refuses", code);
 
+  // open the file under a temporary name and write its header
   const Path temporary = file.string() + ".tmp" + std::to_string(::getpid());
   AVFormatContext* raw = nullptr;
   code = avformat_alloc_output_context2(&raw, nullptr, "mp4", temporary.c_str());
@@ -492,7 +503,7 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
     }
   };
   std::unique_ptr<AVFormatContext, FreeOutput> output(raw);
-  output->flags |= AVFMT_FLAG_BITEXACT;  // no version and no date inside
+  output->flags |= AVFMT_FLAG_BITEXACT;  // writes no version and no date
   const auto clean = [&](const std::string& what, int reason) {
     output.reset();
     ::unlink(temporary.c_str());
@@ -507,6 +518,7 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
   code = avformat_write_header(raw, nullptr);
   if (code < 0) clean("writing failed", code);
 
+  // convert, encode and write every frame
   const AVPixelFormat source = frames.front().channels == 3 ? AV_PIX_FMT_RGB24 : AV_PIX_FMT_RGBA;
   Owned<SwsContext> scaler(
       sws_getContext(width, height, source, width, height, encoder->pix_fmt, SWS_BICUBIC, nullptr, nullptr, nullptr));
@@ -531,7 +543,7 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
     }
   };
   for (std::size_t k = 0; k < frames.size(); ++k) {
-    // a fresh one each: the encoder keeps what it was given
+    // a new frame each time, because the encoder keeps references to earlier ones
     const Owned<AVFrame> picture = padded_frame(width, height, encoder->pix_fmt);
     picture->color_range = encoder->color_range;
     picture->colorspace = encoder->colorspace;
@@ -544,6 +556,7 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
     if (code < 0) clean("encoding failed", code);
     drain();
   }
+  // flush the encoder, close the file and give it its name
   code = avcodec_send_frame(encoder.get(), nullptr);
   if (code < 0) clean("encoding failed", code);
   drain();

@@ -13,10 +13,10 @@ using math::Vector2;
 
 namespace {
 
-constexpr std::uint8_t kInside = 128;  // mask values from here on are object (INTERFACE 2)
-// Without masks, what is brighter than this in any channel is object. Lossy coding does not keep black black.
+constexpr std::uint8_t kInside = 128;  // mask values from here on mean the object (INTERFACE 2)
+// Without masks, pixels brighter than this in any channel are the object. Lossy coding does not keep black at 0.
 constexpr std::uint8_t kBlackLossless = 0, kBlackLossy = 16;
-constexpr double kMostCovered = 0.5;  // of an image: more means that nothing was masked
+constexpr double kMostCovered = 0.5;  // share of an image; more means that nothing was masked
 
 using Pixels = std::vector<std::uint8_t>;
 
@@ -30,7 +30,7 @@ Bounds grown(const Bounds& bounds, int margin, int width, int height) {
           std::min(height, bounds.y1 + margin)};
 }
 
-// Of the pixels that are inside.
+// Returns the bounds of the mask's inside pixels; empty where there are none.
 Bounds bounds_of(const std::uint8_t* mask, int width, int height) {
   Bounds bounds{width, height, 0, 0};
   const auto inside = [](std::uint8_t value) { return value >= kInside; };
@@ -48,7 +48,8 @@ Bounds bounds_of(const std::uint8_t* mask, int width, int height) {
   return bounds;
 }
 
-// Bilinear sample at a pixel position (centers at +0.5) of channel `channel`. Outside: the nearest pixel's value.
+// Returns the bilinear sample of a channel at a pixel position (centers at +0.5); outside the image, the value of the
+// nearest pixel.
 double sample(const std::uint8_t* image, int width, int height, int channels, int channel, const Vector2& position) {
   const double x = std::clamp(position.x() - 0.5, 0.0, width - 1.0),
                y = std::clamp(position.y() - 0.5, 0.0, height - 1.0);
@@ -67,10 +68,11 @@ bool recorded(const Camera& camera, const Vector2& position) {
 
 Vector2 center(int x, int y) { return {x + 0.5, y + 0.5}; }
 
-// A rectangle of undistorted pixels that holds everything the recorded rectangle shows: its border maps to the border.
+// Returns a rectangle of undistorted pixels that holds all that the recorded rectangle shows. Undistorting the border
+// suffices, because it maps to the border.
 Bounds undistorted_bounds(const Camera& camera, const Bounds& bounds) {
-  constexpr int kStep = 8;   // px between border points
-  constexpr int kSlack = 2;  // px, for the curve between them and the bilinear footprint
+  constexpr int kStep = 8;   // px between points of the border
+  constexpr int kSlack = 2;  // px, for the curve between the points and the bilinear footprint
   Vector2 low(1e9, 1e9), high(-1e9, -1e9);
   const auto include = [&](double x, double y) {
     const Vector2 p = undistort(camera, {x, y});
@@ -88,10 +90,11 @@ Bounds undistorted_bounds(const Camera& camera, const Bounds& bounds) {
           whole(std::ceil(high.x()) + kSlack, camera.width), whole(std::ceil(high.y()) + kSlack, camera.height)};
 }
 
-// Sets the crop and its alpha from a full recorded mask.
+// Sets the view's crop and alpha from the full mask in recorded pixels; an empty mask leaves the view empty.
 void cut_mask(View& view, const Camera& camera, const Pixels& mask, bool undistorting, int margin) {
   Bounds bounds = bounds_of(mask.data(), camera.width, camera.height);
   if (bounds.empty()) return;
+  // undistort the mask where it may be inside
   Pixels straight;  // the undistorted mask inside `region`
   Bounds region;
   if (undistorting) {
@@ -109,6 +112,7 @@ void cut_mask(View& view, const Camera& camera, const Pixels& mask, bool undisto
     if (bounds.empty()) return;
     bounds = {bounds.x0 + region.x0, bounds.y0 + region.y0, bounds.x1 + region.x0, bounds.y1 + region.y0};
   }
+  // crop with a margin and set alpha
   const Bounds crop = grown(bounds, margin, camera.width, camera.height);
   view.x0 = crop.x0;
   view.y0 = crop.y0;
@@ -125,7 +129,8 @@ void cut_mask(View& view, const Camera& camera, const Pixels& mask, bool undisto
     }
 }
 
-// Colors of the pixels inside the mask. The unmasked image is sampled, so that edges are not darkened.
+// Sets the colors of the pixels inside the mask. They are sampled from the unmasked image, so that edges are not
+// darkened.
 void fill_color(View& view, const Camera& camera, const Pixels& rgb, bool undistorting) {
   for (int y = 0; y < view.height; ++y)
     for (int x = 0; x < view.width; ++x) {
@@ -142,7 +147,7 @@ void fill_color(View& view, const Camera& camera, const Pixels& rgb, bool undist
     }
 }
 
-// The nearest recorded pixel: depth is not blended across edges.
+// Sets the depth from the nearest recorded pixel, because depth must not be blended across edges.
 void fill_depth(View& view, const Camera& camera, const std::vector<float>& depth, bool undistorting) {
   view.depth.assign(static_cast<std::size_t>(view.width) * view.height, 0.0f);
   for (int y = 0; y < view.height; ++y)
@@ -186,7 +191,8 @@ Pixels bright(const Pixels& rgb, std::uint8_t black) {
   return mask;
 }
 
-// The frames [first, last) of one camera whose images are a video; `views` is theirs.
+// Loads the frames [first, last) of one camera whose images are a video into `views`. Where masks are image files, they
+// have been read before.
 void load_video_frames(const CameraSource& source, const LoadOptions& options, int first, int last, bool undistorting,
                        int threads, View* views) {
   const Camera& camera = source.camera;
@@ -213,6 +219,7 @@ void load_video_frames(const CameraSource& source, const LoadOptions& options, i
   }
 }
 
+// The same for the masks alone, where they are a video and the images are not.
 void load_mask_video(const CameraSource& source, const LoadOptions& options, int first, int last, bool undistorting,
                      int threads, View* views) {
   VideoReader masks(source.masks->file, threads);
@@ -225,7 +232,7 @@ void load_mask_video(const CameraSource& source, const LoadOptions& options, int
   }
 }
 
-// core::parallel_for that throws the exception of the lowest number, so that messages do not depend on the threads.
+// As core::parallel_for(), but throws the exception of the lowest index, so that messages do not depend on the threads.
 void for_each_in_parallel(std::int64_t count, const std::function<void(std::int64_t)>& body) {
   std::vector<std::exception_ptr> failures(static_cast<std::size_t>(count));
   core::parallel_for(count, [&](std::int64_t i) {
@@ -247,6 +254,7 @@ bool lossless(const ImageSource& images) {
 }  // namespace
 
 void load_views(const Manifest& manifest, const LoadOptions& options, Findings& findings, std::vector<View>& views) {
+  // list the frames of every camera and make their views
   struct Range {
     int first = 0, last = 0;
     std::size_t offset = 0;
@@ -288,15 +296,15 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
     return views[ranges[f.camera].offset + f.frame - ranges[f.camera].first];
   };
 
-  // masks by file first: they say which part of an image is kept
+  // masks from image files come first, because they decide which part of an image is kept
   for_each_in_parallel(total, [&](std::int64_t i) {
     const CameraSource& source = manifest.cameras[frames[i].camera];
     if (!options.masked || !source.masks || source.masks->video) return;
     const Pixels mask = read_mask(source.masks->frame_file(frames[i].frame), source.camera.width, source.camera.height);
     cut_mask(view_of(frames[i]), source.camera, mask, ranges[frames[i].camera].undistorting, options.margin);
   });
-  // videos: one camera a task. Where cameras do not go round evenly, the decoders use the threads that are left (their
-  // output does not depend on it)
+  // videos, with one task per camera; where the cameras do not fill the threads evenly, the decoders use more threads
+  // (their output does not depend on the number)
   const int cameras = static_cast<int>(manifest.cameras.size());
   const int even = cameras % core::threads() == 0 ? 1 : 2;
   const int decoder_threads = std::max(even, (core::threads() + cameras - 1) / std::max(1, cameras));
@@ -310,7 +318,7 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
     else if (options.masked && source.masks && source.masks->video)
       load_mask_video(source, options, range.first, range.last, range.undistorting, decoder_threads, mine);
   });
-  // images and depth by file
+  // images and depth from image files
   for_each_in_parallel(total, [&](std::int64_t i) {
     const CameraSource& source = manifest.cameras[frames[i].camera];
     const bool undistorting = ranges[frames[i].camera].undistorting;
@@ -329,16 +337,17 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
                  undistorting);
   });
 
+  // check that the masks are neither full nor all empty
   if (!options.masked) return;
   for (int c = 0; c < cameras; ++c) {
     const CameraSource& source = manifest.cameras[c];
     const Range& range = ranges[c];
     if (range.first == range.last) continue;
-    int seen = 0;
+    int visible = 0;
     double covered = 0.0;
     for (int k = range.first; k < range.last; ++k) {
       const View& view = views[range.offset + k - range.first];
-      seen += view.width > 0;
+      visible += view.width > 0;
       for (std::size_t i = 3; i < view.rgba.size(); i += 4) covered += view.rgba[i] != 0;
     }
     covered /= static_cast<double>(range.last - range.first) * source.camera.width * source.camera.height;
@@ -348,7 +357,7 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
                                                 : "is missing and the background of the images is not black",
                                    source.masks ? std::string("the object must be 255 and the rest 0")
                                                 : "make them: chainsplat mask " + manifest.capture.folder.string()});
-    if (seen == 0) {
+    if (visible == 0) {
       const std::string what = source.camera.name + " never sees the object: every mask is empty";
       if (range.first == 0 && range.last == source.images.frames)
         findings.problems.push_back({source.where + ".masks", what, "mend the masks or remove the camera"});

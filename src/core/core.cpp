@@ -26,9 +26,9 @@ Listener current_listener;
 std::atomic<int> stop_signal{0};
 std::atomic<int> thread_count{0};
 
-constexpr std::size_t kLargestFile = std::size_t{1} << 30;  // bytes; a twin of a million Gaussians has a quarter
+constexpr std::size_t kLargestFile = std::size_t{1} << 30;  // bytes; a twin of a million Gaussians needs a quarter
 
-// Length in bytes of the UTF-8 character that `text` begins with; 0 where it begins with none.
+// Returns the length in bytes of the UTF-8 character that `text` begins with, or 0 where it begins with none.
 std::size_t utf8_length(std::string_view text) {
   const auto byte = [&](std::size_t i) { return static_cast<unsigned char>(text[i]); };
   const std::size_t length = byte(0) < 0x80                      ? 1
@@ -49,6 +49,7 @@ std::string printable(std::string_view text) {
   while (!text.empty()) {
     const std::size_t length = utf8_length(text);
     const auto first = static_cast<unsigned char>(text[0]);
+    // U+0080 to U+009F, which some terminals obey
     const bool c1_control = length == 2 && first == 0xc2 && static_cast<unsigned char>(text[1]) < 0xa0;
     if (length == 0 || first < 0x20 || first == 0x7f || c1_control) {
       char escaped[8];
@@ -118,7 +119,7 @@ void parallel_for(std::int64_t count, const std::function<void(std::int64_t)>& b
   std::vector<std::jthread> pool;
   for (int w = 1; w < workers; ++w) pool.emplace_back(work);
   work();
-  pool.clear();  // joins
+  pool.clear();  // joins the threads
   if (failure) std::rethrow_exception(failure);
 }
 
@@ -130,6 +131,7 @@ void write_file(const Path& path, std::string_view bytes) {
     throw WorkError(path.string(), std::string(what) + " failed (" + reason + ")",
                     "make room or choose a folder that can be written");
   };
+  // write all bytes to the temporary file; closing it may change errno, which the message needs
   const int file = ::open(temporary.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0644);
   if (file < 0) fail("opening for writing");
   std::size_t written = 0;
@@ -144,6 +146,7 @@ void write_file(const Path& path, std::string_view bytes) {
     }
     written += static_cast<std::size_t>(n);
   }
+  // the bytes must be on the disk before the name refers to them
   if (::fsync(file) != 0) {
     const int reason = errno;
     ::close(file);
@@ -166,7 +169,7 @@ std::string read_file(const Path& path) {
     const std::size_t had = bytes.size();
     if (had > kLargestFile)
       throw InputError(path.string(), "is larger than 1 GiB", "name the file that is meant; none that is read is so large");
-    bytes.resize(had + std::max(kBlock, had));  // twice the size, so that the time is linear
+    bytes.resize(had + std::max(kBlock, had));  // doubling keeps the total time linear in the size
     file.read(bytes.data() + had, static_cast<std::streamsize>(bytes.size() - had));
     bytes.resize(had + static_cast<std::size_t>(file.gcount()));
   }

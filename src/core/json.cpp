@@ -6,7 +6,8 @@ namespace chainsplat::core {
 
 namespace {
 
-// Byte at which the nesting passes the bound; npos where it never does. Brackets inside strings do not count.
+// Returns the byte at which the nesting exceeds kDeepestJson, or npos where it never does. Brackets inside strings do
+// not count.
 std::size_t too_deep(std::string_view text) {
   int depth = 0;
   bool in_string = false;
@@ -33,6 +34,7 @@ std::size_t too_deep(std::string_view text) {
 nlohmann::ordered_json parse_json(std::string_view text) {
   using Json = nlohmann::ordered_json;
   if (const std::size_t at = too_deep(text); at != std::string_view::npos)
+    // 101 is the library's own id for a syntax error
     throw nlohmann::json::parse_error::create(
         101, at, "nested deeper than " + std::to_string(kDeepestJson) + " brackets", nullptr);
   return Json::parse(text);

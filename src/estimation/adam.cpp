@@ -1,4 +1,4 @@
-// The paper's state estimation, to compare with.
+// The paper's state estimation, for comparison.
 #include <cmath>
 
 #include "src/estimation/start.h"
@@ -10,7 +10,7 @@ using math::VectorX;
 
 namespace {
 
-constexpr double kBeta1 = 0.9, kBeta2 = 0.999, kEpsilon = 1e-15;  // 3DGS' and recognition's
+constexpr double kBeta1 = 0.9, kBeta2 = 0.999, kEpsilon = 1e-15;  // as in 3DGS and in recognition
 
 }  // namespace
 
@@ -30,12 +30,14 @@ Estimate update(AdamFollower& follower, std::span<const capture::View* const> vi
   const double time = views.front()->time;
   const bool first = follower.theta.size() == 0;
 
+  // where to start, and how many steps to take
   Estimate out;
   out.frame = views.front()->frame;
   out.time = time;
   for (const capture::View* const view : views) out.seen = out.seen || has_mask(*view);
   VectorX theta = first ? VectorX(first_belief(filter, time).mean.head(n)) : follower.theta;
   const int steps = !out.seen ? 0 : first ? follower.options.first_steps : follower.options.steps;
+  // Adam on the sum of the views' losses
   VectorX mean = VectorX::Zero(n), square = VectorX::Zero(n);
   for (int step = 1; step <= steps; ++step) {
     VectorX gradient = VectorX::Zero(n);
@@ -52,6 +54,7 @@ Estimate update(AdamFollower& follower, std::span<const capture::View* const> vi
     const VectorX second_moment = square / (1.0 - std::pow(kBeta2, step));
     theta.array() -= follower.options.rate * first_moment.array() / (second_moment.array().sqrt() + kEpsilon);
   }
+  // report, with rates by differences
   out.theta = theta;
   out.thetadot = first ? VectorX(VectorX::Zero(n)) : VectorX((theta - follower.theta) / (time - follower.time));
   for (const capture::View* const view : views)

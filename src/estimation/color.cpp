@@ -12,11 +12,11 @@ using math::VectorX;
 
 namespace {
 
-constexpr int kLeastPixels = 100;        // fewer are not compared,
-constexpr double kLeastContrast = 0.06;  // nor a rope on which less is to see: standard deviation of the drawn colors
+constexpr int kLeastPixels = 100;        // fewer pixels are not compared,
+constexpr double kLeastContrast = 0.06;  // nor a rope with less contrast, the standard deviation of the drawn colors
 
-// Of the colors in the pixels, each channel without its mean: whatever the exposure, what has no marks where the twin
-// has them is not the rope.
+// Returns the correlation of the drawn and the recorded colors about each channel's mean. Whatever the exposure, an
+// object without marks where the twin has them is not the rope.
 std::optional<double> likeness_of(const splat::ColorSums& sums) {
   if (sums.pixels < kLeastPixels) return {};
   if (sums.drawn_variance < 3.0 * sums.pixels * kLeastContrast * kLeastContrast) return {};
@@ -34,7 +34,7 @@ ColorEquations color_equations(const chain::Chain& chain, const math::Pose& base
   out.square = sums.square;
   out.gain = sums.gain;
   out.bias = sums.bias;
-  // links to angles (SPEC 2.3), exposure last
+  // normal equations in the angles (mathematics.md 2.3) and, as the last two, gain and bias with their priors
   const MatrixX axes = chain::world_axes(chain, theta, base);
   MatrixX full = MatrixX::Zero(n + 2, n + 2);
   VectorX pull = VectorX::Zero(n + 2);
@@ -50,6 +50,7 @@ ColorEquations color_equations(const chain::Chain& chain, const math::Pose& base
   full(n + 1, n + 1) += shared::kColorBiasWeight;
   pull[n] += shared::kColorGainWeight * (out.gain - 1.0);
   pull[n + 1] += shared::kColorBiasWeight * out.bias;
+  // eliminate the exposure by the Schur complement
   const Eigen::Matrix2d exposure = full.bottomRightCorner<2, 2>().inverse();
   const MatrixX coupling = full.topRightCorner(n, 2);
   out.normal = full.topLeftCorner(n, n) - coupling * exposure * coupling.transpose();

@@ -22,64 +22,70 @@ using math::VectorX;
 
 namespace {
 
-constexpr double kFrame = 1.0 / 30.0;  // s, what a frame's random acceleration counts in
+constexpr double kFrame = 1.0 / 30.0;  // s, frame interval to which the options' random acceleration refers
 
-// before the first frame: about the motion that the twin expects from rest
+// Standard deviations before the first frame, around the motion from rest that the twin predicts.
 constexpr double kFirstAngle = 0.15;  // rad
 constexpr double kFirstRate = 1.0;    // rad/s
-constexpr double kFirstForce = 0.3;   // N a kilogram of rope, standing (a wrong rest shape, for example)
+constexpr double kFirstForce = 0.3;   // N per kilogram of rope, for a constant force such as a wrong rest shape causes
 
-// A frame whose innovation is so many times what the model expects is met again with the force free to change, and so
-// are the frames after it, for a while and as long as the force that was found is a share of the rope's weight. Where
-// that does not explain it either, the rope was struck: a swinging rope that meets a finger loses its velocity in one
-// frame, with many times its weight. Of all such forces those along its path are likely, so that one camera tells from
-// the motion that it sees the one along its rays, which it does not.
+// A frame whose innovation exceeds kSurprise times the model's expectation is processed again with the force free to
+// change, and so are the following frames, for a while and as long as the estimated force is a share of the rope's
+// weight. Where this does not explain the frame either, the rope was struck: a swinging rope that meets a finger loses
+// its velocity in one frame, by a force of many times its weight. Such forces act along the rope's path, so that the
+// motion that one camera sees determines the motion along its rays, which it does not see.
 constexpr double kSurprise = 1.5;
 constexpr double kContactMemory = 0.5;  // s
-constexpr double kContactForce = 0.05;  // of the rope's weight
+constexpr double kContactForce = 0.05;  // share of the rope's weight
 
-// A hand touches a rope at one place. Where, is learned from the force found so far: each frame by this share, and
-// every link keeps a little.
+// A hand touches a rope at one place. The place is learned from the force estimated so far: by kPlaceRate per frame,
+// with a floor for every link so that the place can move.
 constexpr double kPlaceRate = 0.5;
 constexpr double kPlaceFloor = 0.005;
-constexpr double kPlaceRidge = 1e-3;  // of the mean variance of the torques, which a force at few places cannot give
+// Ridge, as a share of the torques' mean variance, for torques that a force at few places cannot cause.
+constexpr double kPlaceRidge = 1e-3;
 
-// What straight links and a tube of constant width cannot follow, a coordinate of every joint's position: of the
-// diameter. Not in the filter, only in what is reported.
+// Deviation of the model's shape, which straight links and a tube of constant width cannot follow: per coordinate of
+// every joint's position, as a share of the diameter. It is added to the reported covariance, not to the filter's.
 constexpr double kLinkDeviation = 0.02;
-// A straight link stands for an arc: where it turns by an angle they are up to length * angle / 8 apart, half of that
-// to either side of a link that is laid through the arc's middle.
+// A straight link stands for an arc. Where the arc turns by an angle, the two are up to length * angle / 8 apart, half
+// of it on either side of a link through the arc's middle.
 constexpr double kArc = 1.0 / 16.0;
-constexpr double kUnseenAngle = 0.5;  // rad, of angles that move no joint (twist)
+constexpr double kUnseenAngle = 0.5;  // rad, deviation of angles that move no joint (twist)
 
-constexpr double kLongUnseen = 0.5;     // s without a mask after which the rope counts as lost
-constexpr double kLostAngle = 0.5;      // rad, and
-constexpr double kLostRate = 5.0;       // rad/s: standard deviations from which a lost rope is sought
-constexpr double kNoSmoothness = 1e-9;  // 1/rad^2: the filter's prior replaces the fit's own
+constexpr double kLongUnseen = 0.5;  // s without a mask, after which the rope counts as lost
+// Standard deviations that are added for the search of a lost rope.
+constexpr double kLostAngle = 0.5;      // rad
+constexpr double kLostRate = 5.0;       // rad/s
+constexpr double kNoSmoothness = 1e-9;  // 1/rad^2, because the filter's prior replaces the silhouette fit's own
 
-// of the masks' edge offset: how sure it is at first, at best, and after how many frames
+// Standard deviation of the masks' edge offset, at first and at best, and the number of frames over which it is
+// learned.
 constexpr double kOffsetDeviation = 0.5, kLeastOffsetDeviation = 0.05;  // px
 constexpr double kOffsetFrames = 30.0;
 
-// Of the masks' shift on a table, where a contact shadow may count as rope: a strip of about a pixel, which shifts the
-// mask by half of that. As one camera sees it, it changes slowly while the rope lies there in one light.
-constexpr double kMaskShift = 0.2;        // px, standard deviation about what the edge offset lets expect,
-constexpr double kLowerSide = 0.8;        // which is this share of it, down: the rest is alike on all sides
+// The masks' shift on a table, where a contact shadow may count as rope: a strip of about a pixel shifts the mask by
+// half a pixel. In one camera it changes slowly while the rope lies in constant light.
+constexpr double kMaskShift = 0.2;        // px, standard deviation from the shift expected from the edge offset,
+constexpr double kLowerSide = 0.8;        // which is this share of the offset, downward; the rest is even on all sides
 constexpr double kMaskShiftMemory = 5.0;  // s
 
-constexpr double kUnlike = 0.5;      // likeness of drawn and seen colors: less is not the rope,
-constexpr double kLongUnlike = 0.2;  // s, after which what is followed counts as something else
+constexpr double kUnlike = 0.5;      // likeness of drawn and recorded colors, below which the object is not the rope
+constexpr double kLongUnlike = 0.2;  // s of such frames, after which the rope counts as lost
 
-constexpr double kLeastColorWeight = 100;  // pixels and channels; fewer say nothing
+constexpr double kLeastColorWeight = 100;  // pixels times channels; fewer carry too little information
 
 constexpr double kLeastVariance = 1e-12;  // rad^2, keeps covariances invertible
 
+// Whether the unknown force is estimated: shifts of the rest angles stand for it only where every joint has stiffness,
+// and a twin of another integrator (the paper's) is followed without.
 bool identified_shifts(const dynamics::Parameters& parameters) {
   return parameters.integrator == dynamics::Integrator::rodas3 &&
          std::all_of(parameters.stiffness.begin(), parameters.stiffness.end(), [](double k) { return k > 0.0; });
 }
 
-// Covariance of the rest angles' shifts that stand for a random force of `deviation` N somewhere on the rope.
+// Returns the covariance of the shifts of the rest angles that stand for a random force of `deviation` N on the rope,
+// which acts at the links' ends with the shares `place`.
 MatrixX shift_covariance(const Filter& filter, const Pose& base, const VectorX& theta, double deviation,
                          const VectorX& place) {
   MatrixX out = chain::displacement_metric(chain::link_end_jacobians(filter.model.chain, theta, base), place);
@@ -91,7 +97,7 @@ MatrixX shift_covariance(const Filter& filter, const Pose& base, const VectorX& 
   return out;
 }
 
-// The believed force, if it is spread as filter.place allows, and each link end's share in it.
+// The estimated force, distributed over the links' ends as filter.place allows, and each end's share in it.
 struct FoundForce {
   Vector3 sum = Vector3::Zero();  // N
   VectorX shares;
@@ -118,11 +124,11 @@ FoundForce found_force(const Filter& filter, const Belief& belief) {
   return out;
 }
 
-// Variance of every link end's position that the model's own shape leaves open, a coordinate, m^2.
+// Returns the variance, m^2 per coordinate, that the model's shape leaves in the position of every link's end.
 std::vector<double> shape_variances(const chain::Chain& chain, const VectorX& theta) {
   std::vector<double> variances(chain.links() - 1, 0.0);
   for (int link = 1; link < chain.links(); ++link) {
-    double bend2 = 0.0;  // at the link's start and at its end, rad^2
+    double bend2 = 0.0;  // rad^2, mean of the squared bends at the link's two ends
     for (int k = 0; k < chain.angles(); ++k)
       if (chain.child_link[k] == link || chain.child_link[k] == link + 1) bend2 += 0.5 * theta[k] * theta[k];
     const double arc = kArc * (chain.link_end(link) - chain.link_start(link));
@@ -132,7 +138,7 @@ std::vector<double> shape_variances(const chain::Chain& chain, const VectorX& th
   return variances;
 }
 
-// The same of the angles.
+// Returns the covariance of the angles that follows from these variances of the links' ends.
 MatrixX shape_covariance(const chain::Chain& chain, const std::vector<double>& variances, const VectorX& theta) {
   const int n = chain.angles();
   VectorX weights(variances.size());
@@ -144,12 +150,12 @@ MatrixX shape_covariance(const chain::Chain& chain, const std::vector<double>& v
   return factor.solve(MatrixX::Identity(n, n));
 }
 
-// Standard deviation of the centerline, RMS over the rope, m: of the angles, `covariance`, and of the shape, which also
-// leaves the directions in which no angle moves a link.
+// Returns the standard deviation of the centerline in m, RMS over the rope: by the angles' `covariance` and by the
+// shape variances, which include directions in which no angle moves a link.
 double centerline_deviation(const chain::Chain& chain, const VectorX& theta, const MatrixX& covariance,
                             const std::vector<double>& shape) {
   const std::vector<MatrixX> jacobians = chain::link_end_jacobians(chain, theta, Pose{});
-  // a link end counts for its half of the links on either side
+  // a link's end stands for half of each adjacent link
   double variance = 0.0;
   for (std::size_t i = 0; i < jacobians.size(); ++i) {
     const int link = static_cast<int>(i) + 1;
@@ -160,7 +166,7 @@ double centerline_deviation(const chain::Chain& chain, const VectorX& theta, con
   return std::sqrt(variance);
 }
 
-// After a frame: where the force acts and whether it still does.
+// After a frame, learns where the unknown force acts and whether the contact continues.
 void learn_force(Filter& filter, double time) {
   if (!filter.shifts) return;
   if (time > filter.contact_until) {
@@ -176,9 +182,8 @@ void learn_force(Filter& filter, double time) {
     filter.contact_until = std::max(filter.contact_until, time + kContactMemory);
 }
 
-// A blow that stops a link's end in the world: for every link, the shift of the rest angles that stands for the force
-// which, acting all through the step along the end's path, takes its velocity. `rate_by_shift`: n x n, of the predicted
-// rates.
+// Returns, per link, the shift of the rest angles that stands for a blow which stops the link's end in the world: a
+// force against the end's velocity throughout the step. `rate_by_shift`: n x n, derivative of the predicted rates.
 std::vector<VectorX> stopping_shifts(const Filter& filter, const trajectory::BaseMotion& base, const VectorX& theta,
                                      const VectorX& thetadot, const MatrixX& rate_by_shift) {
   const chain::Chain& chain = filter.model.chain;
@@ -186,19 +191,20 @@ std::vector<VectorX> stopping_shifts(const Filter& filter, const trajectory::Bas
   const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, base.pose));
   std::vector<VectorX> shifts;
   for (std::size_t i = 0; i < jacobians.size(); ++i) {
+    // the end's velocity in the world: by the rates and by the base
     const Vector3 from_base = base.pose.inverse() * Vector3(nodes.col(i + 2));
     const Vector3 carried = base.pose.rotation * (base.velocity.tail<3>() + base.velocity.head<3>().cross(from_base));
     const Vector3 velocity = jacobians[i] * thetadot + carried;
-    VectorX shift = jacobians[i].transpose() * velocity;  // of a force of as many N as the velocity has m/s
+    VectorX shift = jacobians[i].transpose() * velocity;  // by a force of as many N as the velocity has m/s
     for (int k = 0; k < shift.size(); ++k) shift[k] /= filter.model.parameters.stiffness[k];
-    const double taken = velocity.dot(jacobians[i] * (rate_by_shift * shift));  // (m/s)^2
+    const double taken = velocity.dot(jacobians[i] * (rate_by_shift * shift));  // (m/s)^2, change along the velocity
     shifts.push_back(taken > 0.0 ? VectorX(-velocity.squaredNorm() / taken * shift) : VectorX(0.0 * shift));
   }
   return shifts;
 }
 
-// Where the cameras expect their masks to be shifted, px in x and y each: a camera above the table sees the rope's
-// contact with it, and the shadow there, on the rope's lower side, so that a mask that is too wide is so on that side.
+// Returns the expected shift of each camera's masks, px in x and y. A camera above the table sees the rope's contact
+// with it, and the shadow there, on the rope's lower side, so that a mask that is too wide is too wide on that side.
 VectorX expected_mask_shifts(const Filter& filter, double time) {
   VectorX out(2 * filter.cameras.size());
   const Pose base = filter.base(time).pose;
@@ -210,7 +216,8 @@ VectorX expected_mask_shifts(const Filter& filter, double time) {
     const Vector3 a = camera_from_world * base.translation, b = camera_from_world * below;
     Vector2 down = Vector2::Zero();
     if (std::min(a.z(), b.z()) > 0.0) down = capture::project(camera, b) - capture::project(camera, a);
-    const double radius = 0.5 * step * camera.fx / std::max(a.z(), step);  // px; a camera right above sees no side
+    // px; dividing by at least the radius lets the shift vanish for a camera right above, which sees no lower side
+    const double radius = 0.5 * step * camera.fx / std::max(a.z(), step);
     out.segment<2>(2 * c) = kLowerSide * filter.edge_offset * down / std::max(down.norm(), radius);
   }
   return out;
@@ -218,7 +225,7 @@ VectorX expected_mask_shifts(const Filter& filter, double time) {
 
 void symmetrize(MatrixX& matrix) { matrix = (0.5 * (matrix + matrix.transpose())).eval(); }
 
-// The mean of a belief moved in time, and the derivative of that with respect to it (empty where it is constant rate).
+// The mean of a belief moved in time, and its derivatives with respect to the mean before.
 struct Motion {
   VectorX theta, thetadot;
   MatrixX theta_by_state, thetadot_by_state;  // n x 3 n
@@ -228,6 +235,7 @@ Motion move(const Filter& filter, const Belief& belief, double time) {
   const int n = filter.model.chain.angles();
   const double h = time - belief.time;
   Motion out;
+  // by the dynamics and their sensitivities
   if (filter.identified) {
     dynamics::Model model = filter.model;
     for (int k = 0; k < n; ++k) model.parameters.rest_angle[k] += belief.mean[2 * n + k];
@@ -248,6 +256,7 @@ Motion move(const Filter& filter, const Belief& belief, double time) {
       return out;
     }
   }
+  // at constant rate, without dynamics or where their integration failed
   out.theta = belief.mean.head(n) + h * belief.mean.segment(n, n);
   out.thetadot = belief.mean.segment(n, n);
   out.theta_by_state = MatrixX::Zero(n, 3 * n);
@@ -260,17 +269,18 @@ Motion move(const Filter& filter, const Belief& belief, double time) {
 
 struct Measured {
   silhouette::FrameFit fit;
-  Belief belief;          // with what was seen
+  Belief belief;          // posterior
   double surprise = 0.0;  // squared innovation over its expectation
 };
 
-// The views brought to `predicted`. The fit's variance is partly old news: the prior is tightened in proportion, which
-// gives the same angles as weakening the data, and the covariance is widened again.
+// Updates `predicted` with the views' silhouettes. Only a share of the fit's variance is independent of earlier frames:
+// the prior is tightened in proportion, which gives the same angles as weakening the data, and the covariance is
+// widened again.
 Measured measure(const Filter& filter, const Belief& predicted, std::span<const capture::View* const> views,
                  bool warm) {
   const int n = filter.model.chain.angles();
   const double share = filter.options.new_share;
-  // the angles, and the shifts of these views' masks
+  // the part of the state that is fitted: the angles and the shifts of these views' masks
   std::vector<int> fitted(n);
   std::iota(fitted.begin(), fitted.end(), 0);
   for (std::size_t v = 0; predicted.mean.size() > 3 * n && v < views.size(); ++v)
@@ -291,6 +301,7 @@ Measured measure(const Filter& filter, const Belief& predicted, std::span<const 
   const double time = views.front()->time;
 
   Measured out;
+  // fit, and compare the innovation with its expectation
   out.fit = silhouette::fit_frame(filter.model.chain, filter.base(time).pose, views, filter.cameras,
                                   predicted.mean.head(n), warm, options);
   MatrixX posterior = out.fit.covariance / share;
@@ -302,7 +313,7 @@ Measured measure(const Filter& filter, const Belief& predicted, std::span<const 
   const double freedom = static_cast<double>(change.size()) - (information * posterior).trace();
   out.surprise = change.dot(information * change) / std::max(1.0, freedom);
 
-  // rates and rest angles follow by what ties them to what was fitted
+  // rates and rest angles follow by their correlation with the fitted part
   const MatrixX gain = predicted.covariance(Eigen::all, fitted) * information;
   out.belief.time = time;
   out.belief.mean = predicted.mean + gain * change;
@@ -313,7 +324,7 @@ Measured measure(const Filter& filter, const Belief& predicted, std::span<const 
   return out;
 }
 
-// The belief with the colors inside the masks. The drawn rope must be near: a stripe's width.
+// Updates the belief with the colors inside the masks. The drawn rope must be within a stripe's width of the real one.
 void look_at_colors(const Filter& filter, std::span<const capture::View* const> views, Belief& belief, Estimate& out) {
   const chain::Chain& chain = filter.model.chain;
   const int n = chain.angles();
@@ -322,6 +333,7 @@ void look_at_colors(const Filter& filter, std::span<const capture::View* const> 
   std::vector<const capture::View*> shown;
   std::copy_if(views.begin(), views.end(), std::back_inserter(shown),
                [](const capture::View* view) { return view->width > 0 && view->height > 0; });
+  // Gauss-Newton steps on the sum of the views' normal equations and the belief as prior
   for (int step = 0; step < filter.options.color_steps; ++step) {
     const VectorX theta = belief.mean.head(n);
     MatrixX information = MatrixX::Zero(n, n);
@@ -334,7 +346,7 @@ void look_at_colors(const Filter& filter, std::span<const capture::View* const> 
     for (std::size_t v = 0; v < shown.size(); ++v) {
       const ColorEquations e = color_equations(chain, filter.base(shown[v]->time).pose, theta, sums[v]);
       if (e.weight < kLeastColorWeight || !(e.square > 0.0)) continue;
-      const double scale = filter.options.color_share * e.weight / e.square;  // by what this view's residuals are
+      const double scale = filter.options.color_share * e.weight / e.square;  // over this view's residual variance
       information += scale * e.normal;
       right += scale * e.right;
       if (e.likeness) out.likeness = std::max(out.likeness.value_or(-1.0), *e.likeness);
@@ -345,7 +357,7 @@ void look_at_colors(const Filter& filter, std::span<const capture::View* const> 
     }
     if (weight == 0.0) return;
     out.color_residual = std::sqrt(square / weight);
-    right += information * (before.mean.head(n) - theta);  // linearized at theta, seen from the belief before
+    right += information * (before.mean.head(n) - theta);  // linearized at theta, relative to the prior mean
     const MatrixX inverse = (MatrixX::Identity(n, n) + information * before.covariance.topLeftCorner(n, n)).inverse();
     belief.mean = before.mean - by_angles * (inverse * right);
     belief.covariance = before.covariance - by_angles * (inverse * information) * by_angles.transpose();
@@ -354,7 +366,7 @@ void look_at_colors(const Filter& filter, std::span<const capture::View* const> 
   }
 }
 
-// To nine digits: most of a line is its covariance.
+// Rounds to nine digits, because most of a line is its covariance.
 double rounded(double value) {
   char text[32];
   const int size = std::snprintf(text, sizeof text, "%.9g", value);
@@ -369,6 +381,7 @@ bool explains(const silhouette::FrameFit& fit) { return fit.covered >= kLostShar
 Options options_for_live_masks(bool tabletop) {
   Options options;
   if (tabletop) return options;
+  // with the usual shares a pushed rope in free space was lost
   options.new_share = 0.1;
   options.color_share = 0.01;
   return options;
@@ -381,7 +394,7 @@ Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras
   if (filter.identified) {
     filter.model = dynamics::make_model(twin.chain, *twin.parameters);
     filter.shifts = identified_shifts(*twin.parameters);
-    // the variational equation needs it
+    // sensitivities come from the variational equation of this integrator only
     filter.model.parameters.integrator = dynamics::Integrator::rodas3;
   } else {
     filter.model.chain = twin.chain;
@@ -411,6 +424,7 @@ Belief first_belief(const Filter& filter, double time) {
   belief.time = time;
   belief.mean = VectorX::Zero(size);
   belief.mean.head(n) = filter.rest;
+  // the mean by simulation from rest, where the dynamics are known
   if (filter.identified && filter.base_start < time) {
     const dynamics::BaseGrid grid =
         dynamics::sample_base(filter.base, filter.base_start, {time}, filter.model.parameters.substeps);
@@ -420,6 +434,7 @@ Belief first_belief(const Filter& filter, double time) {
       belief.mean.segment(n, n) = states.thetadot.back();
     }
   }
+  // a wide covariance around it
   belief.covariance = MatrixX::Zero(size, size);
   belief.covariance.diagonal().head(n).setConstant(kFirstAngle * kFirstAngle);
   belief.covariance.diagonal().segment(n, n).setConstant(kFirstRate * kFirstRate);
@@ -448,6 +463,7 @@ Belief predict(const Filter& filter, const Belief& belief, double time, Contact 
 
   const double keep_mask_shift = std::exp(-h / kMaskShiftMemory);
 
+  // move mean and covariance; forces decay, and mask shifts return to their expectation
   const Eigen::Index size = belief.mean.size();
   MatrixX transition = MatrixX::Zero(size, size);
   transition.topLeftCorner(n, 3 * n) = motion.theta_by_state;
@@ -463,12 +479,13 @@ Belief predict(const Filter& filter, const Belief& belief, double time, Contact 
   out.covariance = transition * belief.covariance * transition.transpose();
   out.covariance.diagonal().tail(size - 3 * n).array() +=
       kMaskShift * kMaskShift * (1.0 - keep_mask_shift * keep_mask_shift);
+  // add the random walk of the force, and the blows that stop a link's end
   if (filter.shifts) {
     const double force = (touched ? filter.options.contact_force : filter.options.model_force) *
                          dynamics::total_mass(filter.model.parameters) * std::sqrt(h);
     const MatrixX shift = shift_covariance(filter, filter.base(time).pose, motion.theta, force,
                                            touched ? filter.place : filter.everywhere);
-    // the force changes during the step: a third of the change acts all along in the mean square
+    // the force changes during the step: in the mean square a third of the change acts throughout
     MatrixX noise = transition.middleCols(2 * n, n);
     noise.topRows(2 * n) *= std::sqrt(1.0 / 3.0);
     noise.middleRows(2 * n, n).setIdentity();
@@ -479,13 +496,14 @@ Belief predict(const Filter& filter, const Belief& belief, double time, Contact 
       for (std::size_t i = 0; i < stops.size(); ++i) {
         VectorX blow = std::sqrt(filter.place[i]) * (transition.block(0, 2 * n, 2 * n, n) * stops[i]);
         out.covariance.topLeftCorner(2 * n, 2 * n) += blow * blow.transpose();
-        // it came at any time of the step: its effect on the angles is h/2 of that on the rates, give or take
+        // at a random time of the step it changes the angles by h/2 times the rates' change, give or take sqrt(1/3) of
+        // it
         blow.head(n) *= std::sqrt(1.0 / 3.0);
         out.covariance.topLeftCorner(n, n) += blow.head(n) * blow.head(n).transpose();
       }
     }
   }
-  // an acceleration that is new every frame
+  // add an acceleration that is independent in every frame
   const bool explained = filter.identified && (filter.shifts || !touched);
   const double a = explained ? filter.options.acceleration : filter.options.blind_acceleration;
   const double rate = a * a * h * kFrame;
@@ -515,6 +533,7 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
   const auto believed = [&](Contact contact) {
     return first ? first_belief(filter, view.time) : predict(filter, *filter.belief, view.time, contact);
   };
+  // predict
   const bool in_contact = view.time <= filter.contact_until;
   Belief predicted = believed(in_contact ? Contact::touched : Contact::none);
   if (first) filter.last_seen = view.time;
@@ -524,6 +543,7 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
   out.time = view.time;
   out.seen = std::any_of(views.begin(), views.end(), [](const capture::View* v) { return has_mask(*v); });
   if (out.seen) {
+    // measure; where the model does not explain the frame, again with a force that may change, and then with a blow
     Measured measured = measure(filter, predicted, views, !first);
     if (!first && (measured.surprise > kSurprise || !explains(measured.fit))) {
       filter.contact_until = view.time + kContactMemory;
@@ -536,13 +556,15 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
         measured = measure(filter, predicted, views, true);
       }
     }
-    if (!explains(measured.fit)) {  // sought again from afar
+    // where nothing explains the masks, search from a wide belief
+    if (!explains(measured.fit)) {
       Belief wide = first_belief(filter, view.time);
       wide.covariance.diagonal().head(n).array() += kLostAngle * kLostAngle;
       wide.covariance.diagonal().segment(n, n).array() += kLostRate * kLostRate;
       const Measured again = measure(filter, wide, views, false);
       if (explains(again.fit)) measured = again;
     }
+    // take the colors, the force and the masks' edge offset from a frame that is explained
     out.lost = !explains(measured.fit);
     out.residual = measured.fit.residual_pixels;
     out.surprise = measured.surprise;
@@ -561,10 +583,11 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
   if (!out.seen || out.lost) {
     filter.belief = predicted;
     out.lost = out.lost || view.time - filter.last_seen > kLongUnseen;
-  } else if (view.time - filter.last_like > kLongUnlike) {  // sought again where the twin alone would be
+  } else if (view.time - filter.last_like > kLongUnlike) {  // search again where the twin alone would be
     filter.belief = first_belief(filter, view.time);
     out.lost = true;
   }
+  // report, with the uncertainty of the model's shape
   filter.lost = out.lost;
   out.theta = filter.belief->mean.head(n);
   out.thetadot = filter.belief->mean.segment(n, n);
@@ -580,7 +603,8 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
 
 double tube_iou(const chain::Chain& chain, const Pose& base, const VectorX& theta, const capture::View& view,
                 const capture::Camera& camera) {
-  constexpr double kNear = 0.01;  // m, SPEC 2.5
+  // project the nodes, and bound the tube and the mask
+  constexpr double kNear = 0.01;  // m, mathematics.md 2.5
   const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, base));
   const Pose camera_from_world = camera.world_from_camera.inverse();
   const double focal = 0.5 * (camera.fx + camera.fy);
@@ -604,13 +628,14 @@ double tube_iou(const chain::Chain& chain, const Pose& base, const VectorX& thet
   const int bottom = std::min(camera.height, static_cast<int>(std::ceil(y1)));
   if (right <= left || bottom <= top) return 0.0;
   const int width = right - left, height = bottom - top;
+  // mark the pixels within each segment's radius; joints are round
   std::vector<char> tube(static_cast<std::size_t>(width) * height, 0);
   for (std::size_t i = 0; i + 1 < points.size(); ++i) {
     const Point &a = points[i], &b = points[i + 1];
     const Vector2 step = b.pixel - a.pixel;
     const double length2 = step.squaredNorm();
     if (length2 <= 0.0) continue;
-    const bool last = i + 2 == points.size();  // the free end is flat
+    const bool last = i + 2 == points.size();  // its end, the free end, is flat
     const double reach = std::max(a.radius, b.radius);
     const int ax = std::max(left, static_cast<int>(std::min(a.pixel.x(), b.pixel.x()) - reach));
     const int bx = std::min(right - 1, static_cast<int>(std::max(a.pixel.x(), b.pixel.x()) + reach));
@@ -627,6 +652,7 @@ double tube_iou(const chain::Chain& chain, const Pose& base, const VectorX& thet
           tube[static_cast<std::size_t>(y - top) * width + x - left] = 1;
       }
   }
+  // compare with the mask
   long both = 0, either = 0;
   for (int y = top; y < bottom; ++y)
     for (int x = left; x < right; ++x) {

@@ -1,12 +1,12 @@
-// start.h - what is believed of the rope before the first frame.
+// start.h - the belief about the rope before the first frame.
 #pragma once
 #include "chainsplat/estimation.h"
 
 namespace chainsplat::estimation {
 
-// The motion from rest that the twin expects, roughly.
+// Returns a wide belief around the motion from rest that the twin predicts.
 Belief first_belief(const Filter& filter, double time);
 
-constexpr double kLostShare = 0.5;  // of the mask explained, under which the rope is lost (SPEC 6)
+constexpr double kLostShare = 0.5;  // share of the mask explained, below which the rope is lost (mathematics.md 6)
 
 }  // namespace chainsplat::estimation

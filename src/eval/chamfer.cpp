@@ -14,9 +14,10 @@ using math::Vector3;
 
 namespace {
 
-constexpr int kLeaf = 8;  // points below which searching all is as fast
+constexpr int kLeaf = 8;  // points; testing so few one by one is as fast as going deeper
 
-// Points sorted so that every half of a range lies on its side of the middle one along the range's widest axis.
+// A k-d tree without nodes: points sorted so that each half of a range lies on its side of the middle point along the
+// range's widest axis.
 class Tree {
  public:
   explicit Tree(const MatrixX& points) : points_(points.cols()), axis_(points.cols(), 0) {
@@ -24,8 +25,8 @@ class Tree {
     build(0, static_cast<int>(points_.size()));
   }
 
-  // Squared distance from x to the nearest point. `near` is any point's index before, the nearest one's after:
-  // neighbors in an image have neighbors in the cloud, and a good first guess prunes most of the tree.
+  // Squared distance from x to the nearest point. `near` is the index of any point on entry and of the nearest one on
+  // return: neighbors in an image have near neighbors in the cloud, and a good first guess prunes most of the tree.
   double nearest(const Vector3& x, int& near) const {
     double best = (points_[near] - x).squaredNorm();
     search(x, 0, static_cast<int>(points_.size()), best, near);
@@ -81,13 +82,13 @@ double mean_distance(const MatrixX& from, const Tree& to) {
   return sum / static_cast<double>(from.cols());
 }
 
-constexpr int kFarRings = 12;  // px: where the nearest point is farther away in the image, the tree finds it sooner
+constexpr int kFarRings = 12;  // px; if the nearest point is farther away in the image, the tree finds it sooner
 
-// A depth image's points by pixel, camera frame.
+// The points of a depth image, in the camera frame.
 struct PixelCloud {
   int width = 0, height = 0;
-  std::vector<Vector3> points;  // z = 0: none
-  MatrixX columns;              // those that are there
+  std::vector<Vector3> points;  // one per pixel; z = 0: none
+  MatrixX columns;              // those with a depth
 
   PixelCloud(const DepthImage& image, const capture::Camera& camera)
       : width(image.width), height(image.height), points(image.depth.size(), Vector3::Zero()) {
@@ -106,9 +107,9 @@ struct PixelCloud {
   }
 };
 
-// The nearest point lies on the ray of a pixel close by: pixels are looked at in growing rings, until no ray farther
-// out can come as close as what was found. Exact for straight rays; through a lens the rays are no grid, and the tree
-// answers.
+// The nearest point usually lies on the ray of a nearby pixel: the search visits pixels in growing rings, until no ray
+// farther out can come closer than the best point so far. This is exact for a camera without distortion; the rays of a
+// distorted one form no regular grid, and the tree is used.
 double mean_distance(const PixelCloud& from, const PixelCloud& to, const capture::Camera& camera) {
   std::optional<Tree> tree;
   int hint = 0;
@@ -116,7 +117,8 @@ double mean_distance(const PixelCloud& from, const PixelCloud& to, const capture
     if (!tree) tree.emplace(to.columns);
     return tree->nearest(x, hint);
   };
-  // least distance from x to the rays of pixels at least `ring` columns or rows away: to the planes before them
+  // squared lower bound of the distance from x to the rays of pixels at least `ring` columns or rows away: the distance
+  // to the planes through the nearest of these columns and rows
   const auto beyond = [&](const Vector3& x, int ring) {
     const double u = ring / camera.fx, v = ring / camera.fy;
     const double far_u = std::abs(x.x()) / x.z() + u, far_v = std::abs(x.y()) / x.z() + v;

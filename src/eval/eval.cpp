@@ -15,18 +15,18 @@ using math::MatrixX;
 namespace {
 
 constexpr double kNone = std::numeric_limits<double>::quiet_NaN();
-constexpr int kWindow = 5;             // px around the content that SSIM's window reaches
-constexpr std::uint8_t kInMask = 128;  // mask values from here on are object
-constexpr float kSolid = 0.5f;         // 1 - T_end from here on is object
-constexpr int kCenterlinePoints = 97;  // SPEC 9
-constexpr double kSameTime = 1e-6;     // s
+constexpr int kWindow = 5;             // px; reach of SSIM's window
+constexpr std::uint8_t kInMask = 128;  // least mask value of the object
+constexpr float kSolid = 0.5f;         // least 1 - T_end of the object
+constexpr int kCenterlinePoints = 97;  // mathematics.md 9
+constexpr double kSameTime = 1e-6;     // s; times closer than this are equal
 
 struct Rectangle {
   int x0 = 0, y0 = 0, x1 = 0, y1 = 0;
   bool empty() const { return x1 <= x0 || y1 <= y0; }
 };
 
-// Holds both, grown by what SSIM sees, inside the image.
+// The rectangle that encloses both, grown by the reach of SSIM's window, within the image.
 Rectangle compared(const Rectangle& a, const Rectangle& b, const capture::Camera& camera) {
   if (a.empty() && b.empty()) return {};
   Rectangle all = a.empty() ? b : a;
@@ -40,7 +40,7 @@ double psnr(double squared_sum, double count) {
   return std::min(kMostPsnr, -10.0 * std::log10(std::max(squared_sum / count, std::numeric_limits<double>::min())));
 }
 
-// True points at a time: a row of the file, else cubic between its rows; none outside.
+// True points at a time: a row of the file if there is one at this time, else a cubic between rows; none outside.
 std::optional<MatrixX> true_points(const capture::TrueCenterline& truth, double time) {
   const int count = static_cast<int>(truth.time.size());
   const auto above = std::lower_bound(truth.time.begin(), truth.time.end(), time - kSameTime);
@@ -50,7 +50,7 @@ std::optional<MatrixX> true_points(const capture::TrueCenterline& truth, double 
   if (i == 0) return std::nullopt;
   const int a = i - 1, b = i;
   const double h = truth.time[b] - truth.time[a], u = (time - truth.time[a]) / h, u2 = u * u, u3 = u2 * u;
-  const auto slope = [&](int k) -> MatrixX {  // m an interval h
+  const auto slope = [&](int k) -> MatrixX {  // m per interval h
     const int before = std::max(k - 1, 0), after = std::min(k + 1, count - 1);
     return (truth.points[after] - truth.points[before]) * (h / (truth.time[after] - truth.time[before]));
   };
@@ -93,7 +93,7 @@ constexpr std::array kMetrics{
     Metric{"tip_rms", &FrameMetrics::tip_rms, true},
 };
 
-// camera < 0: all.
+// Mean over the frames of one camera; camera < 0: of all.
 FrameMetrics mean_of(const std::vector<FrameMetrics>& frames, int camera) {
   FrameMetrics mean;
   mean.camera = camera;
@@ -119,6 +119,8 @@ FrameMetrics compare(const render::Frame& drawn, const capture::View& view, cons
   metrics.frame = view.frame;
   metrics.time = view.time;
   metrics.chamfer = metrics.centerline_rms = metrics.tip_rms = kNone;
+
+  // the area outside of which both pictures are black
   const splat::Picture& picture = drawn.picture;
   const Rectangle area = compared({view.x0, view.y0, view.x0 + view.width, view.y0 + view.height},
                                   {drawn.x0, drawn.y0, drawn.x0 + picture.width, drawn.y0 + picture.height}, camera);
@@ -128,6 +130,8 @@ FrameMetrics compare(const render::Frame& drawn, const capture::View& view, cons
   std::int64_t object = 0, both = 0, either = 0;
   DepthImage true_depth{area.x0, area.y0, width, height, std::vector<float>(static_cast<std::size_t>(width) * height)};
   DepthImage depth = true_depth;
+
+  // collect colors, depths and the counts of the masks, pixel by pixel
   for (int y = area.y0; y < area.y1; ++y) {
     for (int x = area.x0; x < area.x1; ++x) {
       const int vx = x - view.x0, vy = y - view.y0, px = x - drawn.x0, py = y - drawn.y0;
@@ -157,6 +161,8 @@ FrameMetrics compare(const render::Frame& drawn, const capture::View& view, cons
         depth.depth[out / 3] = picture.depth[p];
     }
   }
+
+  // metrics; means are over the full image
   const double full = static_cast<double>(camera.width) * camera.height;
   metrics.psnr = psnr(squared, 3.0 * full);
   metrics.psnr_object = object > 0 ? psnr(object_squared, 3.0 * static_cast<double>(object)) : kNone;
@@ -170,6 +176,8 @@ Metrics evaluate(splat::Engine& engine, const splat::Gaussians& gaussians, const
                  const chain::States& states, const capture::Capture& recorded) {
   const auto truth = capture::load_true_centerline(recorded.folder);
   Metrics metrics;
+
+  // draw and compare the frames of each camera, a batch at a time
   for (int c = 0; c < static_cast<int>(recorded.cameras.size()); ++c) {
     const capture::Camera& camera = recorded.cameras[c];
     metrics.camera_names.push_back(camera.name);

@@ -8,10 +8,11 @@ namespace chainsplat::eval {
 
 namespace {
 
-constexpr int kReach = 5;       // px, half of the window of 11
+// mathematics.md 2.7
+constexpr int kReach = 5;       // px; half of the window of 11
 constexpr double kSigma = 1.5;  // px
 constexpr double kC1 = 0.01 * 0.01, kC2 = 0.03 * 0.03;
-constexpr int kMoments = 5;  // filtered: x, y, x^2, y^2, x y
+constexpr int kMoments = 5;  // filtered quantities: x, y, x^2, y^2, x y
 
 std::array<double, 2 * kReach + 1> window() {
   std::array<double, 2 * kReach + 1> weights{};
@@ -39,7 +40,7 @@ double ssim(const std::vector<float>& a_rgb, const std::vector<float>& b_rgb, in
   CHAINSPLAT_CHECK(a_rgb.size() == 3 * pixels && b_rgb.size() == 3 * pixels, std::to_string(a_rgb.size()));
   static const auto weights = window();
 
-  // where a window sees anything but black; elsewhere S = 1
+  // columns per row whose window contains anything but black; elsewhere S = 1
   std::vector<Span> row_span(height), span(height);
   for (int y = 0; y < height; ++y) {
     const std::size_t row = 3u * static_cast<std::size_t>(width) * y;
@@ -57,6 +58,7 @@ double ssim(const std::vector<float>& a_rgb, const std::vector<float>& b_rgb, in
     for (int t = std::max(0, y - kReach); t < std::min(height, y + kReach + 1); ++t)
       span[y] = joined(span[y], row_span[t]);
 
+  // filter along rows, then along columns, and sum 1 - S
   std::vector<double> filtered(kMoments * pixels, 0.0);  // along rows; 0 outside the spans in every channel
   std::vector<double> line(kMoments * (width + 2u * kReach)), sum(kMoments * static_cast<std::size_t>(width));
   const std::size_t padded = width + 2u * kReach;

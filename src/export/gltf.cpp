@@ -1,4 +1,5 @@
-// glTF 2.0 with KHR_gaussian_splatting (Khronos' extension registry): splats ride on the nodes of the chain.
+// glTF 2.0 with KHR_gaussian_splatting (Khronos' extension registry): the splats are attached to the nodes of the
+// chain.
 #include <tiny_gltf.h>
 
 #include <array>
@@ -24,7 +25,7 @@ double linear_from_srgb(double value) {
   return value <= 0.04045 ? value / 12.92 : std::pow((value + 0.055) / 1.055, 2.4);
 }
 
-// Unit quaternion x, y, z, w of the sign nearest to `previous`: viewers differ in how they treat a flip.
+// Unit quaternion x, y, z, w with the sign nearer to `previous`: viewers differ in how they interpolate across a flip.
 std::array<double, 4> quaternion(const math::Matrix3& rotation, const std::array<double, 4>& previous) {
   const Eigen::Quaterniond q = Eigen::Quaterniond(rotation).normalized();
   std::array<double, 4> out{q.x(), q.y(), q.z(), q.w()};
@@ -35,7 +36,7 @@ std::array<double, 4> quaternion(const math::Matrix3& rotation, const std::array
   return out;
 }
 
-// Appends float columns to the one buffer and describes them. glTF wants min and max of positions and key times.
+// Appends arrays of floats to the one buffer and describes them. glTF requires bounds of positions and of key times.
 class Builder {
  public:
   explicit Builder(tinygltf::Model& model) : model_(model) { model_.buffers.emplace_back(); }
@@ -86,6 +87,8 @@ tinygltf::Primitive primitive(Builder& builder, const splat::Gaussians& g, const
   const int coefficients = g.sh_coefficients();
   std::vector<float> position, rotation, scale, opacity, color;
   std::vector<std::vector<float>> sh(coefficients);
+
+  // attributes in glTF's units: linear scale, opacity, quaternion xyzw
   for (const int i : members) {
     double norm = 0.0;
     for (int c = 0; c < 4; ++c) norm += static_cast<double>(g.rotation[4 * i + c]) * g.rotation[4 * i + c];
@@ -103,11 +106,12 @@ tinygltf::Primitive primitive(Builder& builder, const splat::Gaussians& g, const
     }
     color.push_back(opacity.back());
   }
+
   const std::string prefix = std::string(kExtension) + ":";
   tinygltf::Primitive out;
   out.mode = TINYGLTF_MODE_POINTS;
   out.attributes["POSITION"] = builder.vertices(position, 3, true);
-  out.attributes["COLOR_0"] = builder.vertices(color, 4);  // for viewers that only know points
+  out.attributes["COLOR_0"] = builder.vertices(color, 4);  // for viewers that do not know the extension
   out.attributes[prefix + "ROTATION"] = builder.vertices(rotation, 4);
   out.attributes[prefix + "SCALE"] = builder.vertices(scale, 3);
   out.attributes[prefix + "OPACITY"] = builder.vertices(opacity, 1);
@@ -125,12 +129,13 @@ tinygltf::Primitive primitive(Builder& builder, const splat::Gaussians& g, const
   return out;
 }
 
+// The link with the largest probability.
 int surest_link(const splat::Gaussians& g, int i) {
   const auto first = g.link_logits.begin() + static_cast<std::ptrdiff_t>(g.links) * i;
   return static_cast<int>(std::max_element(first, first + g.links) - first);
 }
 
-// Poses of all link frames in their parents' (link 0: in the world) at one time.
+// Poses of all link frames at one time, each in its parent's frame (link 0: in the world).
 std::vector<math::Pose> local_poses(const chain::Chain& chain, const math::VectorX& theta, const math::Pose& base) {
   const std::vector<math::Pose> motions = chain::link_motions(chain, theta, base);
   std::vector<math::Pose> world, local;
@@ -159,7 +164,7 @@ std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, c
   const math::VectorX home = math::VectorX::Zero(chain.angles());
   const double start = moving ? motion.time[0] : base.start();
 
-  // node 0 turns z up to y up; node 1 + j is link j, a child of the node before
+  // nodes: node 0 turns z-up to y-up; node 1 + j is link j, a child of the node before
   tinygltf::Node root;
   root.name = "z_up";
   root.rotation = {-kHalfRoot, 0.0, 0.0, kHalfRoot};
@@ -177,7 +182,7 @@ std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, c
     node.rotation.assign(turns[j].begin(), turns[j].end());
     node.translation.assign(first[j].translation.begin(), first[j].translation.end());
     if (j + 1 < links) node.children = {j + 2};
-    if (!members[j].empty()) {  // an accessor may not be empty: a link without Gaussians has no mesh
+    if (!members[j].empty()) {  // glTF allows no empty accessor: a link without Gaussians has no mesh
       tinygltf::Mesh mesh;
       mesh.name = node.name;
       mesh.primitives.push_back(primitive(builder, gaussians, members[j], chain.link_start(j) * chain.direction));
@@ -191,12 +196,13 @@ std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, c
   model.scenes.push_back(scene);
   model.defaultScene = 0;
 
+  // animation: translation of the base, rotation of every link
   if (moving) {
     std::vector<float> times, base_translation;
     std::vector<std::vector<float>> rotation(links);
     for (std::size_t k = 0; k < motion.time.size(); ++k) {
       const auto time = static_cast<float>(motion.time[k] - start);
-      if (!times.empty() && !(time > times.back())) continue;  // closer than a float can tell
+      if (!times.empty() && !(time > times.back())) continue;  // equal in float
       times.push_back(time);
       const std::vector<math::Pose> local = local_poses(chain, motion.theta[k], base_pose(motion.time[k]));
       for (const double x : local[0].translation) base_translation.push_back(static_cast<float>(x));

@@ -15,35 +15,35 @@ using math::Pose;
 
 namespace {
 
-constexpr double kPushedMass = 0.06;  // kg, of the rope that Options::force_scale is for
+constexpr double kPushedMass = 0.06;  // kg, of the rope to which Options::force_scale refers
 
-// A force is said to touch where that is more likely than not and it is larger than this share of the rope's weight,
-// which model errors feign.
+// `touching` means that a contact is more likely than not and its force exceeds this share of the rope's weight, since
+// model errors cause apparent forces below it.
 constexpr double kTouchingWeight = 0.04;
 
-// How much longer nothing touches a rope than something does, where contacts are sought, and where the user names one.
+// Ratio of the times without and with a contact, where contacts are searched for and where the user names one.
 constexpr double kOddsOfNone = 3.0, kOddsWhereNamed = 1.0;
-constexpr double kNotSaid = -1e6;  // log likelihood of a contact where the user says that there is none
+constexpr double kNotSaid = -1e6;  // log likelihood of a contact where the user excludes one
 
-constexpr double kMovingSpeeds =
-    3.0;                              // of the friction's regularization speed, beyond which friction is known (SPEC 7)
-constexpr double kUnseenLever = 0.1;  // diameters; angles that move no link's end (twist) are seen on the surface alone
-constexpr double kLeastTorque = 1e-6;      // of weight times length, keeps covariances invertible
-constexpr double kUnknownDeviation = 0.2;  // of a joint's stiffness and damping, where identification says nothing
-constexpr double kLiveWindow =
-    1.0;  // s of states that a live smoother looks back on: how calm they are changes with a push
+// Multiple of the friction's regularization speed beyond which friction is known (mathematics.md 7).
+constexpr double kMovingSpeeds = 3.0;
+constexpr double kUnseenLever = 0.1;   // diameters; angles that move no link's end (twist) show on the surface alone
+constexpr double kLeastTorque = 1e-6;  // of weight times length, keeps covariances invertible
+constexpr double kUnknownDeviation = 0.2;  // of a joint's stiffness and damping, where identification gives none
+// s of states that a live smoother uses. The size of the jerk changes with a push, so that 1 s fits it better than 4 s.
+constexpr double kLiveWindow = 1.0;
 
-// What one frame contributes: the unexplained torque, how sure it is, and where the rope is.
+// The data of one time: the residual torque, its covariance, and the rope's configuration.
 struct Frame {
   VectorX residual;
-  MatrixX covariance;          // with friction at rest as noise,
-  MatrixX sliding_covariance;  // and without
+  MatrixX covariance;          // of the residual, with friction at rest as noise
+  MatrixX sliding_covariance;  // the same without friction at rest
   MatrixX axes;
   std::vector<Pose> motions;
-  std::vector<double> hidden;  // N a link, friction that may balance a force unseen
-  std::vector<double> speed;   // m/s a link, of its middle, over the table
-  std::vector<Vector3> slip;   // its direction, shorter than 1 below the friction's regularization speed
-  Contact named;               // what is said to touch; none where it is not
+  std::vector<double> hidden;  // N per link, friction that may balance a force unseen
+  std::vector<double> speed;   // m/s per link, of its middle over the table
+  std::vector<Vector3> slip;   // per link, direction of that speed; shorter than 1 below the regularization speed
+  Contact named;               // the contact that the user names, valid if `is_named`
   bool is_named = false;
 };
 
@@ -54,36 +54,40 @@ Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> de
   const int n = chain.angles();
   const VectorX &theta = motion.theta[f], &thetadot = motion.thetadot[f], &thetaddot = motion.thetaddot[f];
   Frame out;
+  // the residual and the configuration
   out.residual = residual_torque(model, base, theta, thetadot, thetaddot);
   out.axes = chain::world_axes(chain, theta, base.pose);
   out.motions = chain::link_motions(chain, theta, base.pose);
 
+  // covariance of the residual: from the states' errors,
   const dynamics::Linearization at = dynamics::linearize(model, base, math::Vector6::Zero(), theta, thetadot);
   const MatrixX* const by[] = {&at.stiffness, &at.damping, &at.mass};
   out.covariance = MatrixX::Zero(n, n);
   for (int a = 0; a < 3; ++a)
     for (int b = 0; b < 3; ++b)
       out.covariance.noalias() += motion.covariance[f](a, b) * *by[a] * motion.noise * by[b]->transpose();
-  const std::vector<MatrixX> jacobians = chain::link_end_jacobians(chain, out.axes, out.motions);
   if (!motion.standing.empty())
     out.covariance.noalias() += at.stiffness * motion.standing[f] * at.stiffness.transpose();
+  // from the parameters',
   for (const dynamics::Model& other : deviations) {
     const VectorX off = residual_torque(other, base, theta, thetadot, thetaddot) - out.residual;
     out.covariance.noalias() += off * off.transpose();
   }
+  // from the joint laws',
   const double moment = dynamics::total_mass(p) * p.gravity.norm() * chain.length;
   for (int k = 0; k < n; ++k) {
     const double spring = options.relative_deviation * p.stiffness[k] * (theta[k] - p.rest_angle[k]);
     const double damper = options.relative_deviation * p.damping[k] * thetadot[k];
     out.covariance(k, k) += spring * spring + damper * damper + std::pow(kLeastTorque * moment, 2);
   }
-  // an error that grows toward the grasp, as a small force at every joint and at the free end would make it
+  // and an error that grows toward the grasp, as a small force at every joint and at the free end would cause
   const double error = options.gravity_deviation * dynamics::total_mass(p) * p.gravity.norm();
   const MatrixX nodes = chain::nodes(chain, out.motions);
-  out.covariance += error * error * chain::displacement_metric(jacobians);
+  out.covariance += error * error *
+                    chain::displacement_metric(chain::link_end_jacobians(chain, out.axes, out.motions));
 
   out.sliding_covariance = out.covariance;
-  // friction at rest balances anything up to its limit; neighboring links were dragged there together
+  // friction at rest balances any force up to its limit; neighbors are correlated, as they were dragged there together
   out.hidden.assign(chain.links(), 0.0);
   out.speed.assign(chain.links(), 0.0);
   out.slip.assign(chain.links(), Vector3::Zero());
@@ -113,10 +117,10 @@ Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> de
   return out;
 }
 
-// Of the contact's point, as the rope feels a force there. A rope that slides over a table rolls, and its side rubs at
-// the finger that pushes it: the finger presses it down (one that brakes it lifts it) by a share of the push
-// (Options::pressing). That adds to the table's friction there and holds the roll back: it turns the rope about itself
-// as a force at the underside along the push would.
+// Returns the Jacobian of the contact's point with the side effects of a force there. A rope that slides over a table
+// rolls, and its side rubs at the finger that pushes it: the finger presses the rope down by a share of the push
+// (Options::pressing), and a finger that brakes it lifts it. This adds to the table's friction there and impedes the
+// roll: it turns the rope about itself as a force at the underside along the push would.
 MatrixX felt_jacobian(const dynamics::Model& model, const Frame& frame, const Contact& contact, double pressing) {
   const chain::Chain& chain = model.chain;
   const dynamics::Parameters& p = model.parameters;
@@ -139,7 +143,7 @@ Contact contact_at(const chain::Chain& chain, double arclength) {
   return {chain::link_at(chain, arclength), arclength, arclength * chain.direction, 0.0};
 }
 
-// A contact with the force that the prior allows and the residual tells.
+// A contact with its force by the residual and the prior.
 struct Touch {
   Contact contact;
   Matrix3 prior;
@@ -160,8 +164,8 @@ Touch touch_at(const dynamics::Model& model, const Frame& frame, const Contact& 
   return out;
 }
 
-// The same at an arclength, on the side of the rope that is pushed: a force along the rope bends it there by the
-// radius.
+// Returns the contact at an arclength, on the side of the rope that is pushed, where a force along the rope has the
+// radius as its lever.
 Touch touch_on_surface(const dynamics::Model& model, const Frame& frame, double arclength, const Options& options) {
   const chain::Chain& chain = model.chain;
   const Touch axis = touch_at(model, frame, contact_at(chain, arclength), options);
@@ -174,7 +178,7 @@ Touch touch_on_surface(const dynamics::Model& model, const Frame& frame, double 
   return touch_at(model, frame, contact, options);
 }
 
-// What a frame says of every place that is followed: all along the rope, or the named one.
+// Returns the fits at every place that is tracked: all along the rope, or the named one.
 std::vector<Fit> fits_at(const dynamics::Model& model, const Frame& frame, const Track& track, bool automatic) {
   std::vector<Fit> out;
   if (!automatic && !frame.is_named) {
@@ -203,13 +207,14 @@ Track track_of(const chain::Chain& chain, bool automatic, const Options& options
   return out;
 }
 
-// The line of one time from what is believed then.
+// Returns the estimate of one time from the belief about the contact's place.
 Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, const std::vector<Fit>& fits,
                  const VectorX& belief, const Track& track, bool automatic) {
   const chain::Chain& chain = model.chain;
   const dynamics::Parameters& p = model.parameters;
   Estimate e;
   e.time = time;
+  // without a contact the place is the free end
   e.contact = automatic || !frame.is_named ? contact_at(chain, chain.length) : frame.named;
   if (automatic || frame.is_named) {
     e.probability = 1.0 - belief[0];
@@ -219,7 +224,7 @@ Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, 
     Vector3 force;
     Matrix3 covariance;
     if (automatic) {
-      // the mean over the places, weighed by the belief, and the spread of their forces beside each one's own error
+      // mean over the places, weighted by the belief; the spread of their forces adds to each one's own error
       const double sum = std::max(at.sum(), std::numeric_limits<double>::min());
       const double mean = at.dot(s) / sum;
       e.arclength_sigma = std::sqrt(at.dot((s.array() - mean).square().matrix()) / sum);
@@ -238,7 +243,7 @@ Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, 
     }
     e.contact = touch.contact;
     if (const auto& normal = p.table_normal) {
-      // how hard the finger presses is not seen; the friction is as uncertain as that
+      // how hard the finger presses is not observed, and the friction has the same relative uncertainty
       const Matrix3 plane = Matrix3::Identity() - *normal * normal->transpose();
       const double pressed = track.options.pressing * frame.slip[e.contact.link].dot(force);
       const double unseen = normal->dot(covariance * *normal) / normal->dot(touch.prior * *normal);
@@ -246,14 +251,14 @@ Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, 
       force -= unseen * pressed * *normal;
       covariance += std::pow(friction * pressed, 2) * plane;
     }
-    // a contact that was named is believed
+    // a named contact is certain
     const double believed = automatic ? e.probability : 1.0;
     const Vector3 variance = covariance.diagonal();
     e.force = believed * force;
     e.sigma = (variance + believed * (1.0 - believed) * force.cwiseProduct(force)).cwiseSqrt();
     e.observed = (Vector3::Ones() - variance.cwiseQuotient(touch.prior.diagonal())).cwiseMax(0.0);
     e.touching = e.probability > 0.5 && e.force.norm() > kTouchingWeight * dynamics::total_mass(p) * p.gravity.norm();
-    // friction at rest may balance any force up to its limit: about what the rope would feel if it balanced none
+    // friction at rest may balance any force up to its limit: bounds around the force if it balanced none
     const Fit sliding = solve(touch.jacobian, frame.residual, frame.sliding_covariance, touch.prior);
     const double limit = std::accumulate(frame.hidden.begin(), frame.hidden.end(), 0.0);
     e.low = e.high = e.force;
@@ -271,12 +276,13 @@ Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, 
   return e;
 }
 
+// The parameters of known covariance.
 struct Uncertainty {
   std::vector<dynamics::Unknown> unknowns;
   MatrixX covariance;
 };
 
-// Of the parameters among the estimates. None where nothing of it is known.
+// Returns the known covariance of the parameters among the estimates; none where nothing of it is known.
 std::optional<Uncertainty> known_uncertainty(const dynamics::Model& model, const dynamics::Estimates& estimates) {
   const auto all = static_cast<Eigen::Index>(estimates.names.size());
   if (all == 0 || estimates.covariance.rows() != all || estimates.covariance.cols() != all) return {};
@@ -300,7 +306,7 @@ std::optional<Uncertainty> known_uncertainty(const dynamics::Model& model, const
   return out;
 }
 
-// The line of state `at` of a live window, which ends with the newest state.
+// Returns the estimate of state `at` of a live window, which ends with the newest state.
 Estimate live_line(Live& live, std::size_t at) {
   const bool automatic = !live.contact;
   const Motion motion = smooth(live.states);
@@ -314,7 +320,7 @@ Estimate live_line(Live& live, std::size_t at) {
   const double interval = at > 0 ? time - motion.time[at - 1] : motion.time[at + 1] - time;
   const VectorX before =
       live.belief.size() == 0 ? first_belief(track) : VectorX(transition(track, interval) * live.belief);
-  live.belief = seen(before, likelihood(track, evidence_of(fits), interval));
+  live.belief = posterior(before, likelihood(track, evidence_of(fits), interval));
   ++live.lines;
   return line_of(live.model, time, frame, fits, live.belief, track, automatic);
 }
@@ -357,6 +363,7 @@ Contact nearest_contact(const chain::Chain& chain, const splat::Gaussians& gauss
   const std::vector<Pose> motions = chain::link_motions(chain, theta, base);
   Contact best;
   double least = best.distance = std::numeric_limits<double>::infinity();
+  // keeps the candidate if it is nearer to a point than the best so far
   const auto offer = [&](int link, double arclength, const Vector3& home) {
     const Vector3 x = motions[link] * home;
     for (Eigen::Index i = 0; i < points.cols(); ++i) {
@@ -375,6 +382,7 @@ Contact nearest_contact(const chain::Chain& chain, const splat::Gaussians& gauss
     }
     return best;
   }
+  // without Gaussians, points along the centerline
   constexpr int kPoints = 301;
   for (const double s : chain::equal_arclengths(chain, kPoints)) {
     const int link = chain::link_at(chain, s);
@@ -412,6 +420,7 @@ std::vector<Estimate> estimate(const dynamics::Model& model, std::span<const dyn
   const bool automatic = contacts.empty();
   CHAINSPLAT_CHECK(automatic || contacts.size() == count, std::to_string(contacts.size()));
   const Track track = track_of(model.chain, automatic, options);
+  // forward pass of the hidden Markov chain
   std::vector<Frame> frames;
   std::vector<std::vector<Fit>> fits;
   std::vector<VectorX> likely, belief;
@@ -429,13 +438,15 @@ std::vector<Estimate> estimate(const dynamics::Model& model, std::span<const dyn
     if (!automatic && contacts[f]) frames[f].named = *contacts[f], frames[f].is_named = true;
     fits.push_back(fits_at(model, frames[f], track, automatic));
     likely.push_back(likelihood(track, evidence_of(fits[f]), interval(f)));
-    belief.push_back(seen(f > 0 ? VectorX(step_over(interval(f)) * belief[f - 1]) : first_belief(track), likely[f]));
+    belief.push_back(
+        posterior(f > 0 ? VectorX(step_over(interval(f)) * belief[f - 1]) : first_belief(track), likely[f]));
   }
+  // backward pass
   VectorX later = VectorX::Ones(belief.back().size());
   for (std::size_t f = count - 1; f-- > 0;) {
     later = step_over(interval(f + 1)).transpose() * later.cwiseProduct(likely[f + 1]);
     later /= later.sum();
-    belief[f] = seen(belief[f], later);
+    belief[f] = posterior(belief[f], later);
   }
   std::vector<Estimate> out;
   for (std::size_t f = 0; f < count; ++f)
@@ -448,7 +459,7 @@ std::optional<Estimate> update(Live& live, double time, const VectorX& theta, co
   live.states.theta.push_back(theta);
   if (standing.size() > 0) live.states.covariance.push_back(standing);
   ++live.taken;
-  // the window keeps what is still needed for a line and a speed before it
+  // the window keeps the states that the next estimate and the speed before it need
   std::size_t old = 0;
   while (live.states.time.size() - old > kLiveLag + 3 && live.states.time[old] < time - kLiveWindow) ++old;
   live.states.time.erase(live.states.time.begin(), live.states.time.begin() + old);

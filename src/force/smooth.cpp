@@ -1,4 +1,4 @@
-// Angles along time under random jerk: Kalman filter and Rauch-Tung-Striebel smoother.
+// Smoothing of angles over time under random jerk: Kalman filter and Rauch-Tung-Striebel smoother.
 #include <cmath>
 
 #include "chainsplat/force.h"
@@ -6,23 +6,23 @@
 namespace chainsplat::force {
 namespace {
 
-// Jerk's spectral density over the noise's variance, 1/s^5: from motions that noise hides for half a second to motions
-// seen afresh in every frame of a camera. One ratio is chosen for all angles.
+// Ratios tried of the jerk's spectral density to the noise's variance, 1/s^5: from motions that are smoothed over half
+// a second to motions that each frame of a camera measures anew. One ratio is chosen for all angles.
 constexpr double kLeastRatio = 1e3, kLargestRatio = 1e9;
 constexpr int kRatios = 13;
-constexpr double kFirstRate = 10.0, kFirstAcceleration = 100.0;  // rad/s, rad/s^2, before anything was seen
+constexpr double kFirstRate = 10.0, kFirstAcceleration = 100.0;  // rad/s, rad/s^2, prior standard deviations
 constexpr double kLeastNoise = 1e-5;                             // rad
-constexpr double kCorrelationTimes = 2.0;  // an angle, as many as are needed to believe half of a correlation
-// What the noise is thought to be before it was seen, and as how many times that counts: the first states of a stream.
+constexpr double kCorrelationTimes = 2.0;  // number of times per angle that it takes to believe half of a correlation
+// The noise's prior standard deviation, and the number of times as which it counts, for the first states of a stream.
 constexpr double kUsualNoise = 5e-3;  // rad
 constexpr double kUsualTimes = 0.5;
 
-// All angles share the gains, which depend on the ratio and the times alone, so that variances are the noise's times
-// one 3 x 3 matrix a time.
+// The result of the filter. All angles share the gains, which depend on the ratio and the times alone, so that each
+// covariance is the Kronecker product of the noise and one 3 x 3 matrix per time.
 struct Filtered {
   std::vector<MatrixX> predicted, mean;                   // n x 3: theta, thetadot, thetaddot
   std::vector<Matrix3> predicted_covariance, covariance;  // for noise of 1 rad
-  MatrixX noise;                                          // n x n, rad^2, covariance of the observations, found
+  MatrixX noise;                                          // n x n, rad^2, estimated covariance of the observations
   double log_likelihood = 0.0;
 };
 
@@ -32,7 +32,7 @@ Matrix3 transition(double h) {
   return f;
 }
 
-// Covariance of white jerk of density 1 over h.
+// Covariance that white jerk of spectral density 1 adds over a time h.
 Matrix3 jerk(double h) {
   const double h2 = h * h, h3 = h2 * h, h4 = h3 * h, h5 = h4 * h;
   Matrix3 q;
@@ -46,7 +46,7 @@ Filtered filter(const std::vector<double>& time, const std::vector<VectorX>& the
   const Eigen::Index n = theta[0].size();
   MatrixX mean = MatrixX::Zero(n, 3);
   mean.col(0) = theta[0];
-  // far wider than any motion, in units of noise of a milliradian
+  // a prior far wider than any motion, in units of a noise of one milliradian
   Matrix3 covariance = Vector3(1.0, std::pow(kFirstRate * 1e3, 2), std::pow(kFirstAcceleration * 1e3, 2)).asDiagonal();
   MatrixX squares = MatrixX::Zero(n, n);
   double logs = 0.0;
@@ -58,6 +58,7 @@ Filtered filter(const std::vector<double>& time, const std::vector<VectorX>& the
       mean = (mean * step.transpose()).eval();
       covariance = (step * covariance * step.transpose() + ratio * jerk(h)).eval();
     }
+    // update; the first three innovations show the prior and not the noise
     out.predicted.push_back(mean);
     out.predicted_covariance.push_back(covariance);
     const VectorX innovation = theta[f] - mean.col(0);
@@ -74,7 +75,7 @@ Filtered filter(const std::vector<double>& time, const std::vector<VectorX>& the
     out.mean.push_back(mean);
     out.covariance.push_back(covariance);
   }
-  // few times do not tell how the angles' errors hang together
+  // shrink the correlations, which few times do not determine, and the variances toward the usual noise
   out.noise = squares / (used + kCorrelationTimes * n);
   out.noise.diagonal() = (squares.diagonal().array() + kUsualTimes * kUsualNoise * kUsualNoise) / (used + kUsualTimes) +
                          kLeastNoise * kLeastNoise;
@@ -89,12 +90,14 @@ Filtered filter(const std::vector<double>& time, const std::vector<VectorX>& the
 Motion smooth(const chain::States& states) {
   const std::size_t count = states.time.size();
   if (count < 3) throw InputError("states", "are fewer than three", "give more: forces need accelerations");
+  // choose the ratio by maximum likelihood
   Filtered best;
   for (int i = 0; i < kRatios; ++i) {
     const double ratio = kLeastRatio * std::pow(kLargestRatio / kLeastRatio, i / (kRatios - 1.0));
     Filtered tried = filter(states.time, states.theta, ratio);
     if (i == 0 || tried.log_likelihood > best.log_likelihood) best = std::move(tried);
   }
+  // smooth backward
   Motion out;
   out.time = states.time;
   out.theta.resize(count);

@@ -16,7 +16,7 @@ MatrixX transition(const Track& track, double interval) {
   const auto places = static_cast<Eigen::Index>(track.arclengths.size());
   MatrixX out = MatrixX::Zero(places + 1, places + 1);
   const double leave = 1.0 - std::exp(-interval / track.options.contact_time), come = leave / track.odds;
-  const double slide = track.options.slide * track.arclengths.back();  // m/sqrt(s); the last place is the free end
+  const double slide = track.options.slide * track.arclengths.back();  // m/sqrt(s); the last arclength is the length
   const double variance = slide * slide * interval;
   out(0, 0) = 1.0 - come;
   out.col(0).tail(places).setConstant(come / places);
@@ -36,7 +36,7 @@ VectorX likelihood(const Track& track, const VectorX& evidence, double interval)
   return (logs.array() - logs.maxCoeff()).exp();
 }
 
-VectorX seen(const VectorX& before, const VectorX& likely) {
+VectorX posterior(const VectorX& before, const VectorX& likely) {
   const VectorX out = before.cwiseProduct(likely);
   return out / out.sum();
 }

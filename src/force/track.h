@@ -1,4 +1,5 @@
-// track.h - whether the rope is touched, and where, along time: a hidden Markov chain over 'nowhere' and the places.
+// track.h - tracking over time whether and where the rope is touched: a hidden Markov chain whose states are 'nowhere'
+// and the places.
 #pragma once
 #include <vector>
 
@@ -8,18 +9,19 @@ namespace chainsplat::force {
 
 struct Track {
   std::vector<double> arclengths;  // m, the places
-  double odds = 1.0;               // of none over a contact, before anything was seen
+  double odds = 1.0;               // prior odds of no contact against a contact
   Options options;
 };
 
-// Beliefs are probabilities: 'nowhere' first, then the places.
+// Returns the prior belief. Beliefs are probabilities: of 'nowhere' first, then of the places.
 VectorX first_belief(const Track& track);
-// From a time to one `interval` later; a column a belief before.
+// Returns the transition matrix to a time `interval` s later; one column per state before.
 MatrixX transition(const Track& track, double interval);
-// How likely what is seen is at a time, up to a factor. `evidence`: log likelihood of a force at each place over that
-// of none; `interval`: s since the state before. Errors last, so what is near in time is in part the same news.
+// Returns the likelihood of the observation at a time per state, up to a factor. `evidence`: log likelihood ratio of a
+// force at each place to none; `interval`: s since the previous time. Errors are correlated over time, so that evidence
+// counts only in part when it follows shortly.
 VectorX likelihood(const Track& track, const VectorX& evidence, double interval);
-// Both together: the belief after what was seen.
-VectorX seen(const VectorX& before, const VectorX& likely);
+// Returns the belief after an observation by Bayes' rule.
+VectorX posterior(const VectorX& before, const VectorX& likely);
 
 }  // namespace chainsplat::force

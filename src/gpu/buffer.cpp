@@ -8,11 +8,11 @@ namespace chainsplat::gpu {
 
 namespace {
 
-constexpr std::size_t kStagingBytes = 16u << 20;  // a larger transfer goes in parts: bounds the host memory it pins
-constexpr std::size_t kBufferAlignment = 4;       // fills and copies count in words
+constexpr std::size_t kStagingBytes = 16u << 20;  // larger transfers go in parts, which bounds the pinned host memory
+constexpr std::size_t kBufferAlignment = 4;       // Vulkan fills whole words
 
-// Index of the first memory type allowed by `bits` with all of `flags` and none of `without`, or -1. Drivers list the
-// better type first.
+// Index of the first memory type allowed by `bits` with all of `flags` and none of `without`, or -1. The first is the
+// best: drivers list the faster type first.
 int memory_type(const Device& d, std::uint32_t bits, VkMemoryPropertyFlags flags, VkMemoryPropertyFlags without = 0) {
   for (std::uint32_t i = 0; i < d.memory.memoryTypeCount; ++i) {
     const VkMemoryPropertyFlags has = d.memory.memoryTypes[i].propertyFlags;
@@ -38,7 +38,8 @@ int memory_type_for(const Device& d, std::uint32_t bits, Domain domain) {
 
 std::string mebibytes(std::uint64_t bytes) { return std::to_string((bytes + (1u << 20) - 1) >> 20) + " MiB"; }
 
-// Calls transfer(part, offset in the whole, bytes) with the commands and the staging buffer ready.
+// Splits a transfer of `bytes` into parts that fit the staging buffer and calls transfer(commands, offset, part bytes)
+// for each. Holds the staging lock throughout.
 template <class Transfer>
 void in_parts(Device& device, std::size_t bytes, Transfer transfer) {
   std::lock_guard lock(device.staging_mutex);
@@ -55,7 +56,7 @@ void in_parts(Device& device, std::size_t bytes, Transfer transfer) {
 
 Buffer::Handles::~Handles() {
   vkDestroyBuffer(device->handle, buffer, nullptr);
-  vkFreeMemory(device->handle, memory, nullptr);  // unmaps too
+  vkFreeMemory(device->handle, memory, nullptr);  // also unmaps it
   device->buffer_bytes -= allocated;
 }
 
@@ -76,6 +77,7 @@ Buffer::Buffer(Device& device, std::size_t bytes, Domain domain, const char* nam
   device.check(vkCreateBuffer(device.handle, &create, nullptr, &handles_->buffer), "make a buffer");
   device.name(VK_OBJECT_TYPE_BUFFER, reinterpret_cast<std::uint64_t>(handles_->buffer), name);
 
+  // allocate memory of the best type, or fail as if the device were full (DeviceOptions::most_bytes)
   VkMemoryRequirements needs{};
   vkGetBufferMemoryRequirements(device.handle, handles_->buffer, &needs);
   const int type = memory_type_for(device, needs.memoryTypeBits, domain);
@@ -95,6 +97,8 @@ Buffer::Buffer(Device& device, std::size_t bytes, Domain domain, const char* nam
   handles_->allocated = needs.size;
   device.buffer_bytes += needs.size;
   device.check(vkBindBufferMemory(device.handle, handles_->buffer, handles_->memory, 0), "bind memory");
+
+  // map coherent memory for the buffer's whole life
   if (domain == Domain::host || device.info.unified_memory) {
     const VkMemoryPropertyFlags flags = device.memory.memoryTypes[type].propertyFlags;
     if (flags & VK_MEMORY_PROPERTY_HOST_COHERENT_BIT) {

@@ -7,8 +7,8 @@ namespace chainsplat::gpu {
 
 namespace {
 
-constexpr std::uint32_t kQueriesAPool = 64;  // timestamps; further pools are made when a list has more
-constexpr std::uint32_t kSetsAPool = 64;     // descriptor sets, likewise
+constexpr std::uint32_t kQueriesAPool = 64;  // timestamps per query pool; a longer list makes further pools
+constexpr std::uint32_t kSetsAPool = 64;     // descriptor sets per pool; likewise
 
 constexpr VkPipelineStageFlags2 kWorkStages =
     VK_PIPELINE_STAGE_2_COMPUTE_SHADER_BIT | VK_PIPELINE_STAGE_2_ALL_TRANSFER_BIT;
@@ -36,20 +36,20 @@ struct Commands::State {
   VkCommandPool pool = VK_NULL_HANDLE;
   VkCommandBuffer commands = VK_NULL_HANDLE;
   bool recording = false, recorded = false;
-  bool barrier = true;           // before the next command
-  std::uint64_t submitted = 0;   // timeline value of the last submit; 0: none
+  bool barrier = true;          // whether one precedes the next command
+  std::uint64_t submitted = 0;  // timeline value of the last submission; 0: none is in flight
 
   std::vector<VkQueryPool> query_pools;
-  std::vector<std::string> labels;  // of timestamp 1, 2, ...; timestamp 0 is the beginning
+  std::vector<std::string> labels;  // of timestamps 1, 2, ...; timestamp 0 marks the beginning
   std::vector<Timing> timings;
-  bool timings_due = false;         // submitted, not yet read
+  bool timings_due = false;  // submitted, and the timestamps are not yet read
 
   std::vector<VkDescriptorPool> set_pools;
   std::uint32_t sets_used = 0;
 
   explicit State(Device& d) : device(d) {}
   ~State() {
-    if (submitted > 0) wait_for_timeline();  // its result cannot help here
+    if (submitted > 0) wait_for_timeline();  // a destructor cannot report a failure
     for (VkQueryPool query_pool : query_pools) vkDestroyQueryPool(device.handle, query_pool, nullptr);
     for (VkDescriptorPool set_pool : set_pools) vkDestroyDescriptorPool(device.handle, set_pool, nullptr);
     vkDestroyCommandPool(device.handle, pool, nullptr);
@@ -101,7 +101,7 @@ struct Commands::State {
     }
     constexpr double kMillisecondsANanosecond = 1e-6;
     for (std::size_t i = 0; i < labels.size(); ++i) {
-      const std::uint64_t passed = (ticks[i + 1] - ticks[i]) & device.timestamp_mask;  // the counter may wrap
+      const std::uint64_t passed = (ticks[i + 1] - ticks[i]) & device.timestamp_mask;  // right also when it wraps
       const double milliseconds = static_cast<double>(passed) * device.timestamp_period * kMillisecondsANanosecond;
       const auto same =
           std::find_if(timings.begin(), timings.end(), [&](const Timing& t) { return t.label == labels[i]; });
@@ -202,7 +202,7 @@ void Commands::dispatch(const Pipeline& pipeline, std::span<const Buffer* const>
   CHAINSPLAT_CHECK(x <= kMostGroups && y <= kMostGroups && z <= kMostGroups,
                    pipeline.handles().name + ": " + std::to_string(x) + " x " + std::to_string(y) + " x " +
                        std::to_string(z) + " groups; at most 65535 an axis, spread them over y");
-  state_->before_command();  // also for none: the next command may lean on this one's barrier
+  state_->before_command();  // also without groups: the next command may skip its own barrier and rely on this one
   if (x == 0 || y == 0 || z == 0) return;
   state_->bind(pipeline, buffers, push, push_bytes);
   vkCmdDispatch(state_->commands, x, y, z);
@@ -251,7 +251,7 @@ void Commands::submit() {
   CHAINSPLAT_CHECK(s.recording || s.recorded, "nothing was recorded");
   wait();
   if (s.recording) {
-    // what the list wrote must be visible to the host after wait()
+    // make the list's writes visible to the host after wait()
     memory_barrier(s.commands, kWorkStages, kWorkWrites, VK_PIPELINE_STAGE_2_HOST_BIT,
                    VK_ACCESS_2_HOST_READ_BIT | VK_ACCESS_2_HOST_WRITE_BIT);
     s.device.check(vkEndCommandBuffer(s.commands), "record commands");
@@ -260,6 +260,7 @@ void Commands::submit() {
   }
   for (VkQueryPool query_pool : s.query_pools) vkResetQueryPool(s.device.handle, query_pool, 0, kQueriesAPool);
 
+  // submit under the queue's lock, so that timeline values rise in queue order
   auto commands = of_type<VkCommandBufferSubmitInfo>(VK_STRUCTURE_TYPE_COMMAND_BUFFER_SUBMIT_INFO);
   commands.commandBuffer = s.commands;
   auto signal = of_type<VkSemaphoreSubmitInfo>(VK_STRUCTURE_TYPE_SEMAPHORE_SUBMIT_INFO);

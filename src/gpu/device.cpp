@@ -38,7 +38,7 @@ VKAPI_ATTR VkBool32 VKAPI_CALL on_message(VkDebugUtilsMessageSeverityFlagBitsEXT
   return VK_FALSE;
 }
 
-// GENERAL messages are the loader's remarks on drivers and layers, no fault of ours, and are left out.
+// Messages of type GENERAL are left out: the loader uses them for remarks on drivers and layers, not for our faults.
 VkDebugUtilsMessengerCreateInfoEXT messenger_info(Messages* messages) {
   auto info = of_type<VkDebugUtilsMessengerCreateInfoEXT>(VK_STRUCTURE_TYPE_DEBUG_UTILS_MESSENGER_CREATE_INFO_EXT);
   info.messageSeverity =
@@ -59,7 +59,7 @@ const char* type_name(VkPhysicalDeviceType type) {
   }
 }
 
-// Order of choice; smaller is better.
+// Rank by which devices are preferred; smaller is better.
 int rank(const std::string& type) {
   constexpr std::array kOrder = {"discrete GPU", "integrated GPU", "virtual GPU", "other", "CPU"};
   return static_cast<int>(std::find(kOrder.begin(), kOrder.end(), type) - kOrder.begin());
@@ -90,7 +90,7 @@ std::string list_text(const std::vector<DeviceInfo>& devices) {
   return join(parts, "; ");
 }
 
-struct Features {  // the feature structs that we ask about and enable, chained
+struct Features {  // the chain of feature structs that are queried and enabled
   VkPhysicalDeviceFeatures2 all{};
   VkPhysicalDeviceVulkan12Features v12{};
   VkPhysicalDeviceVulkan13Features v13{};
@@ -110,6 +110,7 @@ Candidate examine_device(VkPhysicalDevice physical, int index) {
   DeviceInfo& info = c.info;
   info.index = index;
 
+  // limits that every Vulkan version reports; a device before 1.3 is described no further
   VkPhysicalDeviceProperties basic{};
   vkGetPhysicalDeviceProperties(physical, &basic);
   info.name = basic.deviceName;
@@ -141,6 +142,7 @@ Candidate examine_device(VkPhysicalDevice physical, int index) {
   c.push_descriptors = push.maxPushDescriptors;
   info.push_descriptors = push.maxPushDescriptors > 0;
 
+  // features and limits without which the device is refused
   Features features;
   vkGetPhysicalDeviceFeatures2(physical, &features.all);
   const auto need = [&](bool there, const std::string& what) {
@@ -164,6 +166,7 @@ Candidate examine_device(VkPhysicalDevice physical, int index) {
   c.subgroups = choose_subgroups(v13, subgroup.subgroupSize, features.v13.subgroupSizeControl);
   info.subgroup_size = c.subgroups.size;
 
+  // the first queue family that can compute
   std::uint32_t count = 0;
   vkGetPhysicalDeviceQueueFamilyProperties(physical, &count, nullptr);
   std::vector<VkQueueFamilyProperties> families(count);
@@ -178,13 +181,13 @@ Candidate examine_device(VkPhysicalDevice physical, int index) {
     info.timestamps = c.timestamp_bits > 0;
   }
 
+  // memory; a discrete GPU may also expose device memory to the host, but host reads from it are very slow
   VkPhysicalDeviceMemoryProperties memory{};
   vkGetPhysicalDeviceMemoryProperties(physical, &memory);
   for (std::uint32_t i = 0; i < memory.memoryHeapCount; ++i) {
     const VkMemoryHeap& heap = memory.memoryHeaps[i];
     if (heap.flags & VK_MEMORY_HEAP_DEVICE_LOCAL_BIT) info.heap_bytes = std::max(info.heap_bytes, heap.size);
   }
-  // a discrete GPU may show the host a window on its memory too, but reading through it crawls
   constexpr VkMemoryPropertyFlags kBoth = VK_MEMORY_PROPERTY_DEVICE_LOCAL_BIT | VK_MEMORY_PROPERTY_HOST_VISIBLE_BIT |
                                           VK_MEMORY_PROPERTY_HOST_COHERENT_BIT | VK_MEMORY_PROPERTY_HOST_CACHED_BIT;
   const bool shared = info.software || basic.deviceType == VK_PHYSICAL_DEVICE_TYPE_INTEGRATED_GPU;
@@ -222,7 +225,8 @@ const char* result_name(VkResult result) {
   }
 }
 
-// Where sizes vary, one is fixed so that callers can size per-subgroup memory; else the least counts.
+// Where sizes vary, one is fixed if the device can, so that callers can size their per-subgroup memory; else they have
+// to reckon with the smallest.
 SubgroupChoice choose_subgroups(const VkPhysicalDeviceVulkan13Properties& v13, std::uint32_t usual, bool control) {
   if (v13.minSubgroupSize == v13.maxSubgroupSize) return {usual, usual, false};
   const std::uint32_t wanted = std::clamp(kWantedSubgroup, v13.minSubgroupSize, v13.maxSubgroupSize);
@@ -266,12 +270,14 @@ Instance make_instance(bool validation, std::string* why) {
   application.pApplicationName = "chainsplat";
   application.apiVersion = VK_API_VERSION_1_3;
 
+  // debug names and messages, where the extension exists
   std::vector<const char*> extensions;
   instance.debug_utils =
       instance_extension_present(nullptr, VK_EXT_DEBUG_UTILS_EXTENSION_NAME) ||
       (validation && instance_extension_present(kValidationLayer, VK_EXT_DEBUG_UTILS_EXTENSION_NAME));
   if (instance.debug_utils) extensions.push_back(VK_EXT_DEBUG_UTILS_EXTENSION_NAME);
 
+  // the validation layer with synchronization validation, when asked for
   auto create = of_type<VkInstanceCreateInfo>(VK_STRUCTURE_TYPE_INSTANCE_CREATE_INFO);
   create.pApplicationInfo = &application;
   VkDebugUtilsMessengerCreateInfoEXT messenger = messenger_info(instance.messages.get());
@@ -288,7 +294,7 @@ Instance make_instance(bool validation, std::string* why) {
       features.pEnabledValidationFeatures = &synchronization;
       create.pNext = &features;
     }
-    if (watch) {  // faults of instance creation itself
+    if (watch) {  // also reports faults of vkCreateInstance itself
       messenger.pNext = create.pNext;
       create.pNext = &messenger;
     }
@@ -338,6 +344,7 @@ std::size_t choose(const std::vector<DeviceInfo>& devices, const std::string& se
                      "install a Vulkan 1.3 driver (Debian: mesa-vulkan-drivers brings a CPU device)");
   }
 
+  // nothing is named: take the usable device of the best rank
   std::size_t best = devices.size();
   if (wanted.empty()) {
     for (std::size_t i = 0; i < devices.size(); ++i) {
@@ -351,7 +358,7 @@ std::size_t choose(const std::vector<DeviceInfo>& devices, const std::string& se
     return best;
   }
 
-  // a number that is no index may still be part of a name ("4090")
+  // an index, or a part of a name; a number that is no index may still be part of a name ("4090")
   int index = -1;
   const auto [end, error] = std::from_chars(wanted.data(), wanted.data() + wanted.size(), index);
   const bool is_number = error == std::errc() && end == wanted.data() + wanted.size();
@@ -363,7 +370,7 @@ std::size_t choose(const std::vector<DeviceInfo>& devices, const std::string& se
     how = "name contains '" + wanted + "'";
     for (std::size_t i = 0; i < devices.size(); ++i) {
       if (lower(devices[i].name).find(lower(wanted)) == std::string::npos) continue;
-      // a usable one wins over an unusable one that matches too
+      // a usable device wins over an unusable one whose name also matches
       if (best == devices.size() || (!devices[best].refused.empty() && devices[i].refused.empty())) best = i;
     }
   }
@@ -431,6 +438,7 @@ DevicePtr open_device(const DeviceOptions& options) {
     throw InputError("device", std::string("the layer ") + kValidationLayer + " is not installed",
                      "install it (Debian: vulkan-validationlayers) or turn validation off");
   }
+  // choose the physical device and keep what is known about it
   DevicePtr device(new Device);
   std::string why;
   Instance instance = make_instance(options.validation, &why);
@@ -455,6 +463,7 @@ DevicePtr open_device(const DeviceOptions& options) {
   d.most_submits = options.most_submits;
   vkGetPhysicalDeviceMemoryProperties(d.physical, &d.memory);
 
+  // enable the required features and, where there, control over subgroup sizes
   Features there, wanted;
   vkGetPhysicalDeviceFeatures2(d.physical, &there.all);
   wanted.v12.timelineSemaphore = VK_TRUE;
@@ -488,6 +497,7 @@ DevicePtr open_device(const DeviceOptions& options) {
         vkGetInstanceProcAddr(d.instance.handle, "vkSetDebugUtilsObjectNameEXT"));
   }
 
+  // the timeline that submissions signal, and the pipelines of earlier runs
   auto timeline = of_type<VkSemaphoreTypeCreateInfo>(VK_STRUCTURE_TYPE_SEMAPHORE_TYPE_CREATE_INFO);
   timeline.semaphoreType = VK_SEMAPHORE_TYPE_TIMELINE;
   auto semaphore = of_type<VkSemaphoreCreateInfo>(VK_STRUCTURE_TYPE_SEMAPHORE_CREATE_INFO);

@@ -13,15 +13,15 @@
 
 namespace chainsplat::gpu {
 
-// What every device that we accept offers (checked by list_devices, relied on by everyone).
-inline constexpr std::uint32_t kMostPushBytes = 128;       // the least maxPushConstantsSize of Vulkan
-inline constexpr std::uint32_t kMostGroups = 65535;        // the least maxComputeWorkGroupCount of Vulkan, an axis
-inline constexpr std::uint32_t kLeastInvocations = 256;    // of a work group; Vulkan itself promises 128
-inline constexpr std::uint32_t kLeastSharedBytes = 16384;  // the least maxComputeSharedMemorySize of Vulkan
-inline constexpr std::uint32_t kLeastStorageBuffers = 16;  // of a kernel; Vulkan itself promises 4
+// Limits that every accepted device offers: checked by list_devices, relied on everywhere.
+inline constexpr std::uint32_t kMostPushBytes = 128;       // the least maxPushConstantsSize that Vulkan allows
+inline constexpr std::uint32_t kMostGroups = 65535;        // the least maxComputeWorkGroupCount per axis
+inline constexpr std::uint32_t kLeastInvocations = 256;    // per work group; Vulkan itself guarantees only 128
+inline constexpr std::uint32_t kLeastSharedBytes = 16384;  // the least maxComputeSharedMemorySize that Vulkan allows
+inline constexpr std::uint32_t kLeastStorageBuffers = 16;  // per kernel; Vulkan itself guarantees only 4
 
-// What is asked for where subgroups come in several sizes: the lanes of the smallest group that works as subgroups, so
-// that none is launched in part (AMD's are of 64 lanes by default, and can be of 32).
+// Subgroup size requested on a device that offers several. It equals the size of the smallest work groups that use
+// subgroup operations, so that none of them fills a subgroup only in part (AMD: 64 lanes by default, 32 on request).
 inline constexpr std::uint32_t kWantedSubgroup = 32;
 
 // A Vulkan struct with its type set and everything else zero.
@@ -34,15 +34,16 @@ T of_type(VkStructureType type) {
 
 const char* result_name(VkResult result);
 
-// The subgroups of a device's pipelines, from what it says of them.
+// The subgroups that a device's pipelines get, derived from the device's properties.
 struct SubgroupChoice {
-  std::uint32_t size = 0;   // lanes that each has at least
-  std::uint32_t whole = 0;  // a group of a multiple of so many lanes can be whole subgroups
-  bool fixed = false;       // pipelines must and can ask for `size`
+  std::uint32_t size = 0;   // least number of lanes of a subgroup
+  std::uint32_t whole = 0;  // a work group of a multiple of this number of lanes consists of full subgroups
+  bool fixed = false;       // pipelines must request `size`, and the device supports that
 };
+// `usual`: the device's default subgroup size; `control`: it supports subgroupSizeControl.
 SubgroupChoice choose_subgroups(const VkPhysicalDeviceVulkan13Properties& v13, std::uint32_t usual, bool control);
 
-struct Messages {  // of the validation layer, from any thread
+struct Messages {  // of the validation layer, which may report from any thread
   std::mutex mutex;
   std::vector<std::string> texts;
 };
@@ -59,7 +60,7 @@ struct Instance {
 };
 
 bool validation_layer_present();
-// Never throws for a missing loader, driver or layer: the handle is null then, and `why` says so.
+// Never throws for a missing loader, driver or layer: the handle is null then, and `why` states the reason.
 Instance make_instance(bool validation, std::string* why);
 
 struct Candidate {
@@ -67,18 +68,18 @@ struct Candidate {
   DeviceInfo info;
   std::uint32_t queue_family = 0, timestamp_bits = 0, push_descriptors = 0;
   SubgroupChoice subgroups;
-  float timestamp_period = 1.0f;     // ns a tick
+  float timestamp_period = 1.0f;  // ns per tick
 };
 
 std::vector<Candidate> candidates(const Instance& instance, std::string* why);
-// Index into `devices` of what `selector` means, with the reason; throws InputError (see choose_device).
+// Index into `devices` of the one that `selector` names, and the reason; throws InputError (see choose_device).
 std::size_t choose(const std::vector<DeviceInfo>& devices, const std::string& selector, const std::string& why_none,
                    std::string* reason);
 
-// Folder of the pipeline cache, empty without a home folder.
+// Folder of the pipeline cache; empty without a home folder.
 Path pipeline_cache_folder();
-// Content of a cache file. Drivers check the header of their data but trust the rest: a damaged file must not reach
-// them, so without_checksum gives nothing then.
+// Content of a cache file: a checksum and the driver's data. Drivers check the header of their data but trust the rest,
+// so a damaged file must not reach them: without_checksum returns nothing for it.
 std::string with_checksum(std::string_view data);
 std::string_view without_checksum(std::string_view content);
 VkPipelineCache load_pipeline_cache(VkDevice device, const VkPhysicalDeviceProperties& properties, Path* file);
@@ -93,16 +94,16 @@ class Device {
   VkPhysicalDeviceMemoryProperties memory{};
   DeviceInfo info;
   std::uint32_t queue_family = 0;
-  std::uint32_t push_descriptors = 0;  // storage buffers that can be pushed; 0: use descriptor sets
+  std::uint32_t push_descriptors = 0;  // number of storage buffers that can be pushed; 0: use descriptor sets
   SubgroupChoice subgroups;
-  bool full_subgroups = false;  // pipelines can ask for subgroups without idle lanes
-  std::uint64_t timestamp_mask = 0;  // 0: no timestamps
-  double timestamp_period = 1.0;     // ns a tick
+  bool full_subgroups = false;       // pipelines can request subgroups without inactive lanes
+  std::uint64_t timestamp_mask = 0;  // valid bits of a timestamp; 0: no timestamps
+  double timestamp_period = 1.0;     // ns per tick
   bool validation = false;
   std::uint64_t most_bytes = 0, most_submits = 0;      // see DeviceOptions
-  mutable std::atomic<std::uint64_t> buffer_bytes{0};  // of all buffers there are
+  mutable std::atomic<std::uint64_t> buffer_bytes{0};  // allocated by all live buffers
 
-  // every submit signals the next value, in queue order
+  // every submission signals the next value of the timeline, in queue order
   std::mutex queue_mutex;
   VkSemaphore timeline = VK_NULL_HANDLE;
   std::uint64_t submitted = 0;
@@ -110,11 +111,11 @@ class Device {
   VkPipelineCache pipeline_cache = VK_NULL_HANDLE;
   Path pipeline_cache_file;
   std::atomic<bool> pipelines_made{false};
-  // compiled, by everything that they depend on; for as long as the device
+  // compiled pipelines by name and everything else that they depend on; they live as long as the device
   std::mutex pipelines_mutex;
   std::map<std::string, std::shared_ptr<const Pipeline::Handles>> pipelines;
 
-  // upload and download of memory that is not mapped
+  // for upload() and download() of memory that is not mapped
   std::mutex staging_mutex;
   Buffer staging;
   std::unique_ptr<Commands> staging_commands;
@@ -123,7 +124,7 @@ class Device {
   PFN_vkSetDebugUtilsObjectNameEXT set_name = nullptr;
 
   ~Device();
-  // Throws WorkError that names this device unless `result` is VK_SUCCESS.
+  // Throws WorkError that names this device unless `result` is VK_SUCCESS; `what` is the verb after "could not".
   void check(VkResult result, const char* what) const;
   void name(VkObjectType type, std::uint64_t object, const char* text) const;
 };

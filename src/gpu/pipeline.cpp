@@ -9,7 +9,7 @@ namespace chainsplat::gpu {
 
 namespace {
 
-constexpr std::size_t kChecksumBytes = sizeof(std::uint64_t);  // before the driver's data in a cache file
+constexpr std::size_t kChecksumBytes = sizeof(std::uint64_t);  // they precede the driver's data in a cache file
 
 std::string hexadecimal(const std::uint8_t* bytes, std::size_t count) {
   constexpr char kDigits[] = "0123456789abcdef";
@@ -25,7 +25,7 @@ std::string hexadecimal(const std::uint8_t* bytes, std::size_t count) {
 
 Path pipeline_cache_folder() {
   const char* cache = std::getenv("XDG_CACHE_HOME");
-  if (cache && *cache == '/') return Path(cache) / "chainsplat";  // a relative one is void by the XDG rules
+  if (cache && *cache == '/') return Path(cache) / "chainsplat";  // the XDG rules say to ignore a relative path
   const char* home = std::getenv("HOME");
   if (home && *home == '/') return Path(home) / ".cache" / "chainsplat";
   return {};
@@ -81,7 +81,7 @@ void save_pipeline_cache(VkDevice device, VkPipelineCache cache, const Path& fil
     std::filesystem::create_directories(file.parent_path(), error);
     if (!error) core::write_file(file, content);
   } catch (const std::exception&) {
-    // a cache is a convenience: a full disk or a read-only home must not stop the work
+    // the cache only saves time: a full disk or a read-only home must not stop the work
   }
 }
 
@@ -93,7 +93,7 @@ Pipeline::Handles::~Handles() {
 
 namespace {
 
-// Whether the kernel asks for subgroup operations: capabilities come first in a module.
+// Whether the kernel declares subgroup operations. Capabilities are the first instructions of a SPIR-V module.
 bool uses_subgroups(std::span<const std::uint32_t> code) {
   constexpr std::size_t kHeaderWords = 5;
   constexpr std::uint32_t kOpCapability = 17, kGroupNonUniform = 61, kOperation = 0xffff, kLength = 16;
@@ -104,7 +104,7 @@ bool uses_subgroups(std::span<const std::uint32_t> code) {
   return false;
 }
 
-// Throws as the constructor of Pipeline.
+// Throws like the constructor of Pipeline.
 std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std::string& name, int buffers,
                                                       std::size_t push_bytes,
                                                       const std::vector<std::uint32_t>& constants) {
@@ -119,6 +119,7 @@ std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std:
   h.push_bytes = static_cast<std::uint32_t>(push_bytes);
   h.pushes_descriptors = device.push_descriptors >= h.buffers && device.push_descriptor_set;
 
+  // layout: storage buffers of set 0 and push constants
   std::array<VkDescriptorSetLayoutBinding, kLeastStorageBuffers> bindings{};
   for (std::uint32_t i = 0; i < h.buffers; ++i) {
     bindings[i] = {i, VK_DESCRIPTOR_TYPE_STORAGE_BUFFER, 1, VK_SHADER_STAGE_COMPUTE_BIT, nullptr};
@@ -137,6 +138,7 @@ std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std:
   layout.pPushConstantRanges = &range;
   device.check(vkCreatePipelineLayout(device.handle, &layout, nullptr, &h.layout), "make a pipeline layout");
 
+  // specialization constants and SPIR-V
   std::vector<VkSpecializationMapEntry> entries;
   for (std::uint32_t i = 0; i < constants.size(); ++i) {
     entries.push_back({i, i * static_cast<std::uint32_t>(sizeof(std::uint32_t)), sizeof(std::uint32_t)});
@@ -160,9 +162,9 @@ std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std:
   auto create = of_type<VkComputePipelineCreateInfo>(VK_STRUCTURE_TYPE_COMPUTE_PIPELINE_CREATE_INFO);
   create.stage = of_type<VkPipelineShaderStageCreateInfo>(VK_STRUCTURE_TYPE_PIPELINE_SHADER_STAGE_CREATE_INFO);
   create.stage.pNext = device.subgroups.fixed ? &subgroup : nullptr;
-  // Kernels exchange values with lanes of their subgroup by number, and take the lanes of their group from constant 0.
-  // Vulkan promises that lanes are numbered without gaps only where subgroups are full, which a group can be of whole
-  // subgroups only. A group that is a part of one is left to the driver; all known ones number its lanes from 0.
+  // Kernels address other lanes of their subgroup by number, and constant 0 is the size of their work group. Vulkan
+  // guarantees a numbering without gaps only for full subgroups, which can be required only of a work group that is
+  // made of whole ones. Smaller work groups rely on the driver: all known ones number their lanes from 0.
   if (device.full_subgroups && uses_subgroups(code) && !constants.empty() && constants[0] % device.subgroups.whole == 0)
     create.stage.flags = VK_PIPELINE_SHADER_STAGE_CREATE_REQUIRE_FULL_SUBGROUPS_BIT;
   create.stage.stage = VK_SHADER_STAGE_COMPUTE_BIT;

@@ -1,4 +1,4 @@
-// One picture: votes by pixel, then a graph cut that puts contours where the picture has edges.
+// The mask of one picture: log odds per pixel, then a graph cut that puts contours where the picture has edges.
 #include <algorithm>
 #include <cmath>
 #include <opencv2/core.hpp>
@@ -11,26 +11,30 @@ namespace chainsplat::masking {
 
 namespace {
 
-// place: log odds by the distance to the tube's outline, which is right to about a pixel or two
-constexpr double kPlacePixels = 0.6;                         // px for one unit of log odds
-constexpr double kSurelyInside = 4.0, kSurelyOutside = 8.0;  // inside, what hides the rope can outvote the place
-constexpr double kBand = 8.0;                                // px outside the tube: nothing beyond is looked at
-constexpr double kContour = 2.0;                             // cost of a contour through a plain area, a pixel long
-constexpr double kInsideFrom = 0.3, kBesideTo = 1.5;         // radii from the outline: not the outline, still near
-constexpr double kHiddenStep = 0.25;                         // diameters along the rope,
-constexpr int kMostHiddenSteps = 4096;                       // but no more than these
-constexpr int kHiddenSteps = 2;                              // on either side that are looked at together
-constexpr double kSeen = 0.4;            // of the usual log odds and of their usual change: less is hidden
-constexpr double kSurelyHidden = 6.0;    // log odds
-constexpr int kUnusualWindow = 5;        // px, whose share of pixels without the rope's marks counts,
-constexpr int kBesideWindow = 11;        // and the same beside the tube:
-constexpr double kFewUnusual = 0.5;      // up to this the chain may only be a little off,
-constexpr double kMostUnusual = 0.75;    // and where so much of the tube is, the marks themselves are wrong
-constexpr double kSurelyUnusual = 12.0;  // log odds, outvote place and color
-constexpr double kSurelyRope = 2.0;      // log odds of a color
-constexpr double kSpeck = 0.02;          // share of the largest part under which a part is noise
-constexpr double kLeastShare = 0.1;      // of the tube's area: less is not the rope
-constexpr int kMargin = 24;              // px about the mask: what capture::load leaves
+// the log odds of place, from the distance to the tube's outline, which is accurate to about a pixel or two
+constexpr double kPlacePixels = 0.6;                         // px per unit of log odds
+constexpr double kSurelyInside = 4.0, kSurelyOutside = 8.0;  // inside, evidence of occlusion can outweigh the place
+constexpr double kBand = 8.0;                                // px outside the tube, beyond which no pixel is labeled
+// the graph cut
+constexpr double kContour = 2.0;  // cost per pixel of a contour through a plain area
+// where the rope is hidden along its length
+constexpr double kInsideFrom = 0.3, kBesideTo = 1.5;  // radii from the outline, so that the outline itself is left out
+constexpr double kHiddenStep = 0.25;                  // diameters along the rope per step,
+constexpr int kMostHiddenSteps = 4096;                // but no more steps than this, to bound memory for thin ropes
+constexpr int kHiddenSteps = 2;                       // steps on either side that are pooled
+constexpr double kSeen = 0.4;          // share of the usual log odds or of their usual change, below which it is hidden
+constexpr double kSurelyHidden = 6.0;  // log odds
+// where the picture lacks the rope's marks
+constexpr int kUnusualWindow = 5;        // px, window for the share of unusual pixels inside the tube,
+constexpr int kBesideWindow = 11;        // px, and beside the tube
+constexpr double kFewUnusual = 0.5;      // share up to which the chain may merely be a little off
+constexpr double kMostUnusual = 0.75;    // share of the whole tube beyond which the marks themselves must be wrong
+constexpr double kSurelyUnusual = 12.0;  // log odds, enough to outweigh place and color
+constexpr double kSurelyRope = 2.0;      // log odds of a color that is certainly the rope's
+// the result
+constexpr double kSpeck = 0.02;      // share of the largest part's area, below which a part is noise
+constexpr double kLeastShare = 0.1;  // of the tube's area, below which the mask is not the rope
+constexpr int kMargin = 24;          // px around the mask, as capture::load leaves
 
 double squared_difference(const Picture& picture, int x, int y, int u, int v) {
   const std::uint8_t *a = pixel(picture, x, y), *b = pixel(picture, u, v);
@@ -41,14 +45,16 @@ double squared_difference(const Picture& picture, int x, int y, int u, int v) {
 
 constexpr int kNeighbors[4][2] = {{1, 0}, {0, 1}, {1, 1}, {-1, 1}};
 
-// Labels (0 or 255) of the box by a minimal cut; `odds` of the box's pixels, NaN: outside for sure.
+// Returns the labels (0 or 255) of the box's pixels by a minimum cut. `odds`: log odds per pixel, NaN where the pixel
+// is certainly outside.
 cv::Mat least_cut(const Picture& picture, const Box& box, const std::vector<float>& odds) {
   const int width = box.width(), height = box.height();
+  // one node per undecided pixel
   std::vector<int> node(odds.size(), -1);
   int nodes = 0;
   for (std::size_t i = 0; i < odds.size(); ++i)
     if (!std::isnan(odds[i])) node[i] = nodes++;
-  // as in GrabCut: edges are what is large against the picture's own mean difference
+  // as in GrabCut, differences between neighbors are scaled by the picture's own mean difference
   double sum = 0.0;
   int pairs = 0;
   const auto each_pair = [&](const auto& body) {
@@ -66,6 +72,7 @@ cv::Mat least_cut(const Picture& picture, const Box& box, const std::vector<floa
   };
   each_pair([&](int, int, double difference, bool) { sum += difference, ++pairs; });
   const double beta = sum > 0.0 ? pairs / (2.0 * sum) : 0.0;
+  // build the graph, cut it and read the labels
   cv::detail::GCGraph<double> graph(nodes, 2 * pairs);
   for (std::size_t i = 0; i < odds.size(); ++i) {
     if (node[i] < 0) continue;
@@ -83,18 +90,19 @@ cv::Mat least_cut(const Picture& picture, const Box& box, const std::vector<floa
   return labels;
 }
 
-const Colors& colors_at(const Look& look, const chain::Chain& chain, double arclength) {
-  return arclength < 0.5 * chain.length ? look.near : look.far;
+const Colors& colors_at(const Look& appearance, const chain::Chain& chain, double arclength) {
+  return arclength < 0.5 * chain.length ? appearance.near : appearance.far;
 }
 
-// Where a hand hides the rope the tube has not the rope's colors, and the picture does not change at its outline as it
-// does elsewhere: log odds by arclength, in steps of `step` m, 0 or less.
-std::vector<double> hidden_odds(const Look& look, const Picture& picture, const Tube& place, const chain::Chain& chain,
-                                double step) {
+// Where a hand hides the rope, the tube does not have the rope's colors and the picture does not change at the tube's
+// outline as it does elsewhere. Returns log odds per arclength, in steps of `step` m; they are 0 or negative.
+std::vector<double> hidden_odds(const Look& appearance, const Picture& picture, const Tube& place,
+                                const chain::Chain& chain, double step) {
   struct Sum {
     double odds = 0.0;
     int pixels = 0;
   };
+  // sum the colors' log odds inside and beside the tube, per step and its neighbors
   const int steps = static_cast<int>(chain.length / step) + 1;
   std::vector<Sum> inside(steps), beside(steps);
   for (int y = place.box.y0; y < place.box.y1; ++y)
@@ -102,39 +110,42 @@ std::vector<double> hidden_odds(const Look& look, const Picture& picture, const 
       const double outside = place.at(x, y) / place.radius;
       if (outside > kBesideTo || (outside > -kInsideFrom && outside < kInsideFrom)) continue;
       const double arclength = place.arclength(x, y);
-      const double odds = color_odds(colors_at(look, chain, arclength), pixel(picture, x, y));
+      const double odds = color_odds(colors_at(appearance, chain, arclength), pixel(picture, x, y));
       const int at = static_cast<int>(arclength / step);
       for (int k = std::max(0, at - kHiddenSteps); k <= std::min(steps - 1, at + kHiddenSteps); ++k) {
         Sum& sum = (outside < 0.0 ? inside : beside)[k];
         sum.odds += odds, ++sum.pixels;
       }
     }
+  // compare them with what is usual
   std::vector<double> out(steps, 0.0);
   for (int k = 0; k < steps; ++k) {
-    const Colors& colors = colors_at(look, chain, k * step);
+    const Colors& colors = colors_at(appearance, chain, k * step);
     if (inside[k].pixels == 0 || beside[k].pixels == 0 || colors.usual <= 0.0) continue;
     const double mean = inside[k].odds / inside[k].pixels;
     const double separation = mean - beside[k].odds / beside[k].pixels;
-    // a hand beside the rope has the second low, but not the first
-    const double seen = std::max(mean / colors.usual, separation / colors.separation);
-    out[k] = std::clamp((seen / kSeen - 1.0) * kSurelyHidden, -kSurelyHidden, 0.0);
+    // a hand beside the rope lowers the second share but not the first
+    const double visibility = std::max(mean / colors.usual, separation / colors.separation);
+    out[k] = std::clamp((visibility / kSeen - 1.0) * kSurelyHidden, -kSurelyHidden, 0.0);
   }
   return out;
 }
 
-// Where the tube does not have the rope's marks something may hide it: log odds of the box's pixels, 0 or less. Colors
-// that are surely the rope's are not hidden, whatever the marks (it may have turned about itself).
-cv::Mat unusual_odds(const Look& look, const Picture& picture, const Tube& place, const chain::Chain& chain) {
+// Where the tube does not have the rope's marks, something may hide it. Returns log odds per pixel of the box, 0 or
+// negative; empty where the marks themselves must be wrong. Colors that are certainly the rope's do not count as
+// hidden, whatever the marks, because the rope may have turned about itself.
+cv::Mat unusual_odds(const Look& appearance, const Picture& picture, const Tube& place, const chain::Chain& chain) {
+  // mark the tube's pixels and those among them without the marks
   const Box& box = place.box;
-  cv::Mat seen(box.height(), box.width(), CV_32F, cv::Scalar(0)), other = seen.clone();
+  cv::Mat in_tube(box.height(), box.width(), CV_32F, cv::Scalar(0)), other = in_tube.clone();
   int pixels = 0, unusual = 0;
   for (int y = box.y0; y < box.y1; ++y)
     for (int x = box.x0; x < box.x1; ++x) {
       if (place.at(x, y) >= 0.0f) continue;
-      const Colors& colors = colors_at(look, chain, place.arclength(x, y));
+      const Colors& colors = colors_at(appearance, chain, place.arclength(x, y));
       const bool is_other =
-          !usual(look.marks, place, picture, x, y) && color_odds(colors, pixel(picture, x, y)) < kSurelyRope;
-      seen.at<float>(y - box.y0, x - box.x0) = 1.0f;
+          !usual(appearance.marks, place, picture, x, y) && color_odds(colors, pixel(picture, x, y)) < kSurelyRope;
+      in_tube.at<float>(y - box.y0, x - box.x0) = 1.0f;
       other.at<float>(y - box.y0, x - box.x0) = is_other;
       ++pixels, unusual += is_other;
     }
@@ -144,14 +155,14 @@ cv::Mat unusual_odds(const Look& look, const Picture& picture, const Tube& place
     cv::boxFilter(values, mean, -1, cv::Size(window, window));
     return mean;
   };
-  // what lies beside a hidden piece of the tube hides it, too
-  const cv::Mat near_seen = mean_about(seen, kUnusualWindow), near_other = mean_about(other, kUnusualWindow);
-  const cv::Mat far_seen = mean_about(seen, kBesideWindow), far_other = mean_about(other, kBesideWindow);
+  // the share of such pixels nearby, beside the tube too, because what hides a piece of the tube goes on beside it
+  const cv::Mat near_tube = mean_about(in_tube, kUnusualWindow), near_other = mean_about(other, kUnusualWindow);
+  const cv::Mat far_tube = mean_about(in_tube, kBesideWindow), far_other = mean_about(other, kBesideWindow);
   cv::Mat odds(box.height(), box.width(), CV_32F);
   for (int y = 0; y < box.height(); ++y)
     for (int x = 0; x < box.width(); ++x) {
-      const bool inside = seen.at<float>(y, x) > 0.0f;
-      const float all = (inside ? near_seen : far_seen).at<float>(y, x);
+      const bool inside = in_tube.at<float>(y, x) > 0.0f;
+      const float all = (inside ? near_tube : far_tube).at<float>(y, x);
       const double share = (inside ? near_other : far_other).at<float>(y, x) / std::max(1e-6f, all);
       odds.at<float>(y, x) =
           static_cast<float>(-kSurelyUnusual * std::clamp((share - kFewUnusual) / (1.0 - kFewUnusual), 0.0, 1.0));
@@ -159,7 +170,7 @@ cv::Mat unusual_odds(const Look& look, const Picture& picture, const Tube& place
   return odds;
 }
 
-// Takes small parts out; returns the area that stays.
+// Removes small parts and returns the area that remains.
 int without_specks(cv::Mat& labels) {
   cv::Mat parts, facts, centers;
   const int count = cv::connectedComponentsWithStats(labels, parts, facts, centers, 8);
@@ -176,8 +187,10 @@ int without_specks(cv::Mat& labels) {
 
 }  // namespace
 
-capture::View cut(const Look& look, const Picture& picture, const capture::Camera& camera, const chain::Chain& chain,
-                  const math::Pose& base, const std::optional<math::VectorX>& theta, double doubt) {
+capture::View cut(const Look& appearance, const Picture& picture, const capture::Camera& camera,
+                  const chain::Chain& chain, const math::Pose& base, const std::optional<math::VectorX>& theta,
+                  double doubt) {
+  // where the rope is expected, and where it may be hidden
   const Reach where = reach(chain, base, camera);
   Tube place;
   if (theta) place = tube(chain, base, *theta, camera, 0.0, chain.length, kBand + (doubt - 1.0) * 2.0 * kPlacePixels);
@@ -187,9 +200,10 @@ capture::View cut(const Look& look, const Picture& picture, const capture::Camer
   std::vector<float> odds(static_cast<std::size_t>(box.width()) * box.height(), std::nanf(""));
   const double step = std::max(kHiddenStep * chain.diameter, chain.length / kMostHiddenSteps);
   std::vector<double> hidden;
-  if (theta) hidden = hidden_odds(look, picture, place, chain, step);
+  if (theta) hidden = hidden_odds(appearance, picture, place, chain, step);
   cv::Mat unusual;
-  if (theta && look.marks.along > 0) unusual = unusual_odds(look, picture, place, chain);
+  if (theta && appearance.marks.along > 0) unusual = unusual_odds(appearance, picture, place, chain);
+  // add the log odds of place, color, occlusion and background per pixel
   double tube_area = 0.0;
   for (int y = box.y0; y < box.y1; ++y)
     for (int x = box.x0; x < box.x1; ++x) {
@@ -205,25 +219,27 @@ capture::View cut(const Look& look, const Picture& picture, const capture::Camer
       const std::uint8_t* const rgb = pixel(picture, x, y);
       if (theta) {
         const double arclength = place.arclength(x, y);
-        sum += color_odds(colors_at(look, chain, arclength), rgb) +
+        sum += color_odds(colors_at(appearance, chain, arclength), rgb) +
                hidden[static_cast<std::size_t>(std::min(arclength, chain.length) / step)];
         if (!unusual.empty()) sum += unusual.at<float>(y - box.y0, x - box.x0);
       } else {
-        sum += std::max(color_odds(look.near, rgb), color_odds(look.far, rgb));
+        sum += std::max(color_odds(appearance.near, rgb), color_odds(appearance.far, rgb));
       }
-      sum += difference_odds(look.background, picture, x, y);
+      sum += difference_odds(appearance.background, picture, x, y);
       odds[static_cast<std::size_t>(y - box.y0) * box.width() + (x - box.x0)] = static_cast<float>(sum);
     }
+  // label the pixels
   cv::Mat labels;
   if (theta) {
     labels = least_cut(picture, box, odds);
-  } else {  // rough, and over a large area: most of a neighborhood decides
+  } else {  // rough odds over a large area: the majority of each neighborhood decides
     labels = cv::Mat(box.height(), box.width(), CV_8U, cv::Scalar(0));
     for (std::size_t i = 0; i < odds.size(); ++i) labels.data[i] = odds[i] > 0.0f ? 255 : 0;
     cv::medianBlur(labels, labels, 5);
   }
   const int area = without_specks(labels);
   if (area == 0 || area < kLeastShare * tube_area) return view;
+  // crop
   const cv::Rect bounds = cv::boundingRect(labels);
   view.x0 = std::max(0, box.x0 + bounds.x - kMargin), view.y0 = std::max(0, box.y0 + bounds.y - kMargin);
   view.width = std::min(camera.width, box.x0 + bounds.x + bounds.width + kMargin) - view.x0;

@@ -17,29 +17,32 @@ using math::VectorX;
 namespace {
 
 constexpr int kBins = 8 * 8 * 8;
-constexpr double kHeard = 0.05;                                          // Dirichlet's concentration of a color
-constexpr std::array kInside = {-0.75, -0.45, -0.15, 0.15, 0.45, 0.75};  // across, in radii
-constexpr std::array kBeside = {-2.1, -1.7, -1.3, 1.3, 1.7, 2.1};        // clear of an outline that is a little off
-constexpr double kSpacing = 0.5;                                         // along, in radii,
-constexpr int kMostStations = 256;  // but the whole rope has no more: a thin one's pixels are then looked at sparsely
-constexpr double kHiddenByGripper = 1.0;                                 // diameters of rope that are not looked at
-constexpr double kSeenFromSide = 0.3;  // of a link's length: one that points at the camera more than that shows no side
-constexpr double kNearest = 0.01;      // m, nothing nearer is in front of a camera (SPEC 2.5)
-constexpr int kBeam = 48;              // ropes kept
-constexpr double kSameTip = 0.25;      // diameters: of ropes whose tips are nearer than this only the best is kept
+// where colors are sampled
+constexpr double kHeard = 0.05;                                          // concentration per color, Dirichlet prior
+constexpr std::array kInside = {-0.75, -0.45, -0.15, 0.15, 0.45, 0.75};  // radii across the rope
+constexpr std::array kBeside = {-2.1, -1.7, -1.3, 1.3, 1.7, 2.1};  // radii, clear of an outline that is a little off
+constexpr double kSpacing = 0.5;                                   // radii between stations along the rope,
+constexpr int kMostStations = 256;        // but no more stations than this, so that a thin rope is sampled sparsely
+constexpr double kHiddenByGripper = 1.0;  // diameters of rope at the grasp that are not sampled
+constexpr double kSeenFromSide = 0.3;     // share of a link's length; one that appears shorter shows no sides
+constexpr double kNearest = 0.01;         // m, the nearest depth in front of a camera (mathematics.md 2.5)
+// the beam search over the joints' angles, and its refinement
+constexpr int kBeam = 48;          // number of ropes that are kept per link
+constexpr double kSameTip = 0.25;  // diameters; of ropes whose tips are nearer than this only the best is kept
 constexpr double kPlanarStep = 5.0 * M_PI / 180, kSpatialStep = 7.5 * M_PI / 180;
-constexpr int kPlanarSteps = 9, kSpatialSteps = 4;  // on either side, a joint
-constexpr double kBend = 15.0 * M_PI / 180;         // standard deviation of a joint's angle, a priori
-constexpr double kSamplesPerFact = 4.0;             // neighboring samples say the same: so many count as one
+constexpr int kPlanarSteps = 9, kSpatialSteps = 4;  // number of angles tried on either side, per axis of a joint
+constexpr double kBend = 15.0 * M_PI / 180;         // prior standard deviation of a joint's angle
+constexpr double kSamplesPerFact = 4.0;  // neighboring samples are correlated, so that this many count as one
 constexpr std::array kRefinements = {5.0 * M_PI / 180, 2.5 * M_PI / 180, 1.2 * M_PI / 180};
-constexpr int kSweeps = 2;
-// Bounds memory and time, whatever the rope: what other moments have told counts for some 1,000 samples a side
-// (kKnownSamples, each of kBins rounded), a chain adds 12 a station and 18 at the tip.
+constexpr int kSweeps = 2;  // over all angles per refinement
+// Bounds memory and time for any rope: the colors known from other moments count for some 1,000 samples per side
+// (kKnownSamples, each of kBins rounded), and a chain adds 12 samples per station and 18 at the tip.
 constexpr int kMostSamples = 1 << 14;
 
+// Logarithms of the Dirichlet-multinomial likelihood, for counts n below kMostSamples.
 struct Tables {
   std::vector<double> color, color_of_all;  // log(n + kHeard), log(n + 2 kHeard)
-  std::vector<double> side, all;            // sums over i < n of log(i + bins kHeard), log(i + 2 bins kHeard)
+  std::vector<double> side, all;            // sums over i < n of log(i + kBins kHeard), log(i + 2 kBins kHeard)
 };
 const Tables& tables() {
   static const Tables made = [] {
@@ -56,15 +59,17 @@ const Tables& tables() {
   return made;
 }
 
+// The bin of a color, 8 steps per channel.
 int coarse(const std::uint8_t* rgb) { return (rgb[0] >> 5) << 6 | (rgb[1] >> 5) << 3 | rgb[2] >> 5; }
 
 Tally empty_tally() { return {std::vector<int>(kBins, 0), std::vector<int>(kBins, 0), 0, 0}; }
 
-// Samples of one link in one picture.
+// The sampled color bins of one link in one picture.
 struct Samples {
   std::vector<int> inside, beside;
 };
 
+// Evaluates chains against the pictures.
 struct Search {
   Search(const chain::Chain& rope, std::span<const Shot> pictures) : chain(rope), shots(pictures) {}
   const chain::Chain& chain;
@@ -74,9 +79,10 @@ struct Search {
   Vector3 second = chain.direction.cross(chain.bending_axis);
   bool planar = chain.angles() == chain.links() - 1;
   mutable Samples samples;
-  mutable std::int64_t looked_at = 0;  // samples
+  mutable std::int64_t looked_at = 0;  // number of samples so far
 
-  // The link from base-frame point `from` along `along`; its arclengths.
+  // Samples the link from arclength `begin` to `end`, which starts at `from` in direction `along` (base frame), into
+  // `samples`; none where the link is behind the camera or points at it.
   void sample(const Shot& shot, const Vector3& from, const Vector3& along, double begin, double end) const {
     samples.inside.clear(), samples.beside.clear();
     const Vector3 a = shot.camera_from_base * from;
@@ -88,7 +94,7 @@ struct Search {
     const double long_enough = kSeenFromSide * length * shot.camera->fx / a.z();
     if (in_picture.norm() < long_enough) return;
     const Vector2 forward = in_picture.normalized(), across(-forward.y(), forward.x());
-    const auto look = [&](const Vector2& at, std::vector<int>& into) {
+    const auto add_color = [&](const Vector2& at, std::vector<int>& into) {
       const int x = static_cast<int>(std::floor(at.x())), y = static_cast<int>(std::floor(at.y()));
       if (x < 0 || y < 0 || x >= shot.picture.width || y >= shot.picture.height) return;
       into.push_back(coarse(pixel(shot.picture, x, y)));
@@ -98,18 +104,20 @@ struct Search {
       const Vector3 p = a + (k * spacing - begin) * step;
       const Vector2 center = capture::project(*shot.camera, p);
       const double pixels = radius * shot.camera->fx / p.z();
-      for (const double u : kInside) look(center + u * pixels * across, samples.inside);
-      for (const double u : kBeside) look(center + u * pixels * across, samples.beside);
+      for (const double u : kInside) add_color(center + u * pixels * across, samples.inside);
+      for (const double u : kBeside) add_color(center + u * pixels * across, samples.beside);
     }
+    // beyond the free end
     if (end < chain.length - 1e-9) return;
     const Vector2 tip = capture::project(*shot.camera, b);
     const double pixels = radius * shot.camera->fx / b.z();
     for (const double u : kInside)
       for (const double v : kBeside)
-        if (v > 0.0) look(tip + pixels * (u * across + v * forward), samples.beside);
+        if (v > 0.0) add_color(tip + pixels * (u * across + v * forward), samples.beside);
   }
 
-  // Gain in evidence by the samples, which are added to the tally; when there is none they are not.
+  // Adds `samples` to the tally and returns the gain in evidence, in nats. Where there is no gain, the samples stem
+  // from one population (something hides the rope): they are not added, and the gain is 0.
   double count(Tally& tally) const {
     const Tables& t = tables();
     if (samples.inside.empty() || samples.beside.empty()) return 0.0;
@@ -140,6 +148,7 @@ struct Search {
     for (const int i : samples.beside) --tally.beside[i];
   }
 
+  // Returns the evidence of a link in all pictures; `keep` false: leaves the tallies as they were.
   double link(std::vector<Tally>& tallies, const Vector3& from, const Vector3& along, double begin, double end,
               bool keep) const {
     double gain = 0.0;
@@ -162,9 +171,10 @@ struct Search {
     if (!planar) out = out * Eigen::AngleAxisd(other, second).toRotationMatrix();
     return out;
   }
+  // The log prior of the angles, up to a constant.
   double believed(const VectorX& theta) const { return -0.5 * theta.squaredNorm() / (kBend * kBend); }
 
-  // Evidence and belief of a whole chain; `tallies` come with what is known.
+  // Returns the evidence and the log prior of a whole chain. `tallies` begin with the known colors.
   double whole(const VectorX& theta, std::vector<Tally>& tallies) const {
     double sum = believed(theta);
     Matrix3 rotation = Matrix3::Identity();
@@ -182,7 +192,7 @@ struct Search {
   }
 };
 
-struct Rope {  // as far as it has grown
+struct Rope {  // the part of a rope that has grown so far
   VectorX theta;
   Matrix3 rotation = Matrix3::Identity();
   Vector3 tip;
@@ -221,6 +231,7 @@ Grown grow(const chain::Chain& chain, std::span<const Shot> shots, std::span<con
   for (std::size_t i = 0; i < shots.size(); ++i)
     begin.push_back(i < known.size() && !known[i].inside.empty() ? known[i] : empty_tally());
 
+  // grow link by link: try a grid of angles at the tip of every kept rope, keep the best ropes with different tips
   std::vector<Rope> beam(1);
   beam[0].theta = VectorX::Zero(chain.angles());
   beam[0].tip = chain.link_end(0) * chain.direction;
@@ -264,7 +275,7 @@ Grown grow(const chain::Chain& chain, std::span<const Shot> shots, std::span<con
     beam = std::move(next);
   }
 
-  // finer: single angles, pairs that shift the rest of the rope, triples that move one link
+  // refine the best: single angles, pairs of angles that shift the rest of the rope, triples that move one link
   VectorX theta = beam[0].theta;
   std::vector<Tally> tallies = begin;
   double best = search.whole(theta, tallies);
@@ -285,7 +296,7 @@ Grown grow(const chain::Chain& chain, std::span<const Shot> shots, std::span<con
         }
   Grown out;
   out.theta = theta;
-  // what this moment alone says
+  // the evidence and the tallies of this moment alone
   out.tallies.assign(shots.size(), empty_tally());
   search.looked_at = 0;
   const double score = search.whole(theta, out.tallies) - search.believed(theta);

@@ -1,10 +1,10 @@
-// The rope in pictures of one moment, before anything is known of its colors: where a tube of the known length and
-// diameter, begun at the grasp, best parts the colors inside from those beside it.
+// The rope in pictures of one moment, before its colors are known: where a tube of the known length and diameter that
+// begins at the grasp best separates the colors inside from those beside it.
 //
-// A chain is laid link by link, in space, so that all cameras must agree. Its evidence is a Bayes factor: the sampled
-// colors inside and beside the tube as two populations, against one (each a Dirichlet-multinomial, so that few samples
-// prove little and a color unheard of speaks for neither). What hides the rope from a camera is one population and
-// counts nothing.
+// A chain is laid link by link, in space, so that all cameras must agree. Its evidence is the Bayes factor of two
+// populations, the sampled colors inside and beside the tube, against a single one. Each population is a
+// Dirichlet-multinomial, so that few samples prove little and an unknown color favors neither. Where something hides
+// the rope from a camera there is only one population, which adds no evidence.
 #pragma once
 #include <span>
 
@@ -12,30 +12,30 @@
 
 namespace chainsplat::masking {
 
-// A picture of the moment.
+// One camera's picture of the moment.
 struct Shot {
   Picture picture;  // undistorted
   const capture::Camera* camera = nullptr;
   math::Pose camera_from_base;
 };
 
-// Colors sampled inside and beside the tube, by coarse color.
+// Numbers of samples inside and beside the tube per coarse color.
 struct Tally {
   std::vector<int> inside, beside;  // 8^3; empty: nothing known
   int inside_sum = 0, beside_sum = 0;
 };
-// Adds `other`; `most`: samples beyond which the sum is scaled down.
+// Adds the numbers of `other`.
 void add(Tally& tally, const Tally& other);
-// As if of `samples` samples a side.
+// Returns the tally scaled to about `samples` samples per side.
 Tally scaled(const Tally& tally, int samples);
 
 struct Grown {
   math::VectorX theta;
-  double evidence = 0.0;       // log of the Bayes factor a sample, 0 (none) to log 2 (all colors tell)
-  std::vector<Tally> tallies;  // by shot: of this moment alone
+  double evidence = 0.0;       // nats per sample, log of the Bayes factor: 0 (none) to log 2 (colors never shared)
+  std::vector<Tally> tallies;  // per shot, of this moment alone
 };
 
-// `known`: by shot, what other moments have told of the colors; empty: nothing.
+// Grows a chain without twist joints. `known`: per shot, the colors known from other moments; empty: none.
 Grown grow(const chain::Chain& chain, std::span<const Shot> shots, std::span<const Tally> known);
 
 }  // namespace chainsplat::masking

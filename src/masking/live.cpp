@@ -1,4 +1,4 @@
-// Masks of a stream: the same votes, learned as the frames come.
+// Masks of a stream: the same log odds, learned as the frames arrive.
 #include <algorithm>
 #include <cmath>
 #include <opencv2/core.hpp>
@@ -11,19 +11,19 @@ namespace chainsplat::masking {
 
 namespace {
 
-constexpr double kForget = 0.02;          // of the background a frame: some two seconds at 30 Hz
-constexpr int kLeastSeen = 8;             // frames, before a background pixel is believed
-constexpr double kFirstNoise = 4.0;       // gray levels
-constexpr double kGivenPixels = 3e4;      // the given colors count as so many pixels: some ten frames of a rope
-constexpr double kLeastGiven = 0.1;       // share of them that is never forgotten
-constexpr double kAboutPixels = 24.0;     // px about the tube that are told apart from what is far
-constexpr double kDoubt = 2.0;            // a prediction is not as sure as a fit
-constexpr double kLeastEvidence = 0.1;    // nats a sample: less is no rope
+constexpr double kForget = 0.02;          // share of the background forgotten per frame: some two seconds at 30 Hz
+constexpr int kLeastSeen = 8;             // number of frames before a background pixel is believed
+constexpr double kFirstNoise = 4.0;       // gray levels, assumed in the first frame
+constexpr double kGivenPixels = 3e4;      // weight of the colors passed to start(): the pixels of some ten frames
+constexpr double kLeastGiven = 0.1;       // share of that weight that is never forgotten
+constexpr double kAboutPixels = 24.0;     // px around the tube whose colors count as the rope's surroundings
+constexpr double kDoubt = 2.0;            // for a prediction; with less, masks followed wrong ones of pushed ropes
+constexpr double kLeastEvidence = 0.1;    // nats per sample, below which nothing is a rope
 constexpr double kPredictedMargin = 0.7;  // px, by which the tube at a prediction may be off
-constexpr int kColorEvery = 5;            // frames between two lessons in color
-constexpr double kForgetColors = 0.1;     // of the counted colors a lesson
+constexpr int kColorEvery = 5;            // frames between two updates of the colors
+constexpr double kForgetColors = 0.1;     // share of the counted colors forgotten per update
 
-// For cv::remap, made once: where every pixel without lens distortion comes from.
+// Computes once, for cv::remap, from where every pixel without lens distortion comes.
 void map_straight(Live& live) {
   const capture::Camera& camera = live.camera;
   cv::Mat wanted(camera.height, camera.width, CV_32FC2);
@@ -40,7 +40,7 @@ void map_straight(Live& live) {
   cv::convertMaps(wanted, cv::noArray(), from, part, CV_16SC2);
 }
 
-// The recorded frame without its lens distortion, in the box.
+// Removes the lens distortion of a recorded frame inside the box.
 void straighten(const capture::Image8& image, const Box& box, Live& live) {
   live.straight.resize(image.pixels.size());
   const cv::Rect rect(box.x0, box.y0, box.width(), box.height());
@@ -85,6 +85,7 @@ void learn_marks(Live& live, const capture::View& drawn, const math::Pose& base,
 
 capture::View mask(Live& live, const capture::Image8& recorded, const math::Pose& base,
                    const std::optional<math::VectorX>& theta) {
+  // the undistorted picture, as far as the rope can reach
   capture::Camera camera = live.camera;
   camera.distortion = {};
   const Reach where = reach(live.chain, base, camera);
@@ -95,17 +96,17 @@ capture::View mask(Live& live, const capture::Image8& recorded, const math::Pose
     pixels = &live.straight;
   }
   const Picture picture{pixels->data(), camera.width, camera.height, 3};
-  if (live.frames == 0) {  // all that the rope can reach: mostly surroundings
+  if (live.frames == 0) {  // the first frame's colors count as surroundings, since the rope covers little of them
     for (int y = where.box.y0; y < where.box.y1; ++y)
       for (int x = where.box.x0; x < where.box.x1; ++x)
         live.look.near.surroundings[color_bin(pixel(picture, x, y))] += 1.0;
     live.look.far.surroundings = live.look.near.surroundings;
     settle(live.look);
   }
-  // where the rope is expected, or where it seems to be
+  // where the rope is expected, or else where a chain grown in this picture lies
   std::optional<math::VectorX> place = theta;
   const int joints = live.chain.links() - 1;
-  if (!theta && (live.chain.angles() == joints || live.chain.angles() == 2 * joints)) {  // no twist
+  if (!theta && (live.chain.angles() == joints || live.chain.angles() == 2 * joints)) {  // without twist joints
     const Shot shot{picture, &camera, camera.world_from_camera.inverse() * base};
     const Grown grown = grow(live.chain, {&shot, 1}, {});
     if (grown.evidence > kLeastEvidence) place = grown.theta;
@@ -114,16 +115,16 @@ capture::View mask(Live& live, const capture::Image8& recorded, const math::Pose
   ++live.frames;
   if (!theta) return view;
 
-  // learn: background where the tube is not, colors on either side of its outline
+  // learn the background where the tube is not
   const Tube around = tube(live.chain, base, *theta, camera, 0.0, live.chain.length, kAboutPixels);
   Background& background = live.look.background;
   for (int y = where.box.y0; y < where.box.y1; ++y)
     for (int x = where.box.x0; x < where.box.x1; ++x) {
       if (around.at(x, y) < around.radius) continue;
       const std::size_t at = static_cast<std::size_t>(y) * camera.width + x;
-      std::uint16_t& seen = live.seen[at];
-      if (seen < UINT16_MAX) ++seen;
-      const float share = static_cast<float>(std::max(kForget, 1.0 / seen));
+      std::uint16_t& times_visible = live.seen[at];
+      if (times_visible < UINT16_MAX) ++times_visible;
+      const float share = static_cast<float>(std::max(kForget, 1.0 / times_visible));
       float square = 0.0f;
       for (int c = 0; c < 3; ++c) {
         float& mean = live.mean[3 * at + c];
@@ -133,10 +134,11 @@ capture::View mask(Live& live, const capture::Image8& recorded, const math::Pose
         background.rgb[3 * at + c] = static_cast<std::uint8_t>(mean + 0.5f);
       }
       float& variance = live.variance[at];
-      if (seen == 1) square = static_cast<float>(kFirstNoise * kFirstNoise);
+      if (times_visible == 1) square = static_cast<float>(kFirstNoise * kFirstNoise);
       variance += share * (square - variance);
-      if (seen >= kLeastSeen) background.noise[at] = noise_level(std::sqrt(variance));
+      if (times_visible >= kLeastSeen) background.noise[at] = noise_level(std::sqrt(variance));
     }
+  // learn the colors on either side of the tube's outline
   if (live.frames % kColorEvery == 1) {
     for (Colors* const colors : {&live.look.near, &live.look.far})
       for (int i = 0; i < kColorBins; ++i) {

@@ -10,27 +10,31 @@ using math::Vector3;
 
 namespace {
 
-constexpr double kReachSlack = 1.1;   // of the length: cameras and lengths are not exact
-constexpr double kNearerShare = 0.5;  // of the length that the free end may be nearer to the camera than the grasp
-constexpr double kUnheardOf = 0.003;  // share of either side's colors that is thought to be spread over all colors
-constexpr double kSurest = 3.0, kSurestNot = 9.0;  // log odds, the most that a color can say for and against the rope
-constexpr double kLeastNoise = 1.5;                // gray levels
+constexpr double kReachSlack = 1.1;   // times the length, because cameras and lengths are not exact
+constexpr double kNearerShare = 0.5;  // of the length, by which the free end may be nearer to the camera than the grasp
+// the colors' log odds
+constexpr double kUnheardOf = 0.003;  // prior share of either side's colors that is spread evenly over all colors
+// log odds, the most that a color counts for and against the rope: colors that the rope never shows outweigh the place
+constexpr double kSurest = 3.0, kSurestNot = 9.0;
+// the difference from the background
+constexpr double kLeastNoise = 1.5;  // gray levels
 constexpr double kMostNoise = 25.0;
-constexpr double kTexture = 0.04;  // share of the brightness by which a background pixel may differ: lossy coding
-constexpr double kDarkest = 0.25, kBrightest = 1.08;  // a shadow leaves this share of the light, an automatic exposure
-                                                      // adds some
-constexpr double kSameDifference = 8.0;  // squared differences over their variances, sum of three, that say nothing
+constexpr double kTexture = 0.04;  // share of its brightness by which a background pixel may differ after lossy coding
+// the share of light that a shadow leaves, and the excess that automatic exposure adds
+constexpr double kDarkest = 0.25, kBrightest = 1.08;
+constexpr double kSameDifference = 8.0;  // sum over the channels of squared difference / variance that decides nothing
 constexpr double kOddsPerDifference = 0.25;
-constexpr double kSurelySame = -2.0,
-                 kSurelyOther = 0.5;  // log odds; other can be a shadow or a hand, same hardly a rope
+// log odds; a different pixel may be a shadow or a hand, but an unchanged one is hardly the rope
+constexpr double kSurelySame = -2.0, kSurelyOther = 0.5;
 
-constexpr double kMarkStep = 0.25;  // diameters,
-constexpr int kMostAlong = 4096;    // but no more cells than these: far below a pixel of a thin rope
+// the rope's marks
+constexpr double kMarkStep = 0.25;  // diameters per cell along the rope,
+constexpr int kMostAlong = 4096;    // but no more cells than this, which are far smaller than a pixel of a thin rope
 constexpr int kMarksAcross = 6;
-constexpr double kLeastLight = 0.6, kMostLight = 1.3;  // of the usual: the rope's own shading moves, a hand's shadow
-constexpr double kUsual = 16.0;  // gray levels, RMS of the channels: what looks otherwise is not the rope
+constexpr double kLeastLight = 0.6, kMostLight = 1.3;  // times the usual: shading moves with the rope, a hand shades it
+constexpr double kUsual = 16.0;  // gray levels, RMS over the channels, less than from a beige stripe to a hand's skin
 
-// [1 2 1] / 4 along each of the three axes.
+// Smooths the counts by [1 2 1] / 4 along each of the three color axes.
 void blur(std::vector<double>& counts) {
   for (const int stride : {1, 32, 32 * 32}) {
     const std::vector<double> old = counts;
@@ -52,6 +56,7 @@ T median(std::vector<T>& values) {
 }  // namespace
 
 void settle(Colors& colors) {
+  // smooth the counts
   colors.log_odds.clear();
   if (colors.object.empty() || colors.surroundings.empty()) return;
   std::vector<double> object = colors.object, surroundings = colors.surroundings;
@@ -60,6 +65,7 @@ void settle(Colors& colors) {
   if (object_sum <= 0.0 || surroundings_sum <= 0.0) return;
   blur(object);
   blur(surroundings);
+  // log ratio of the two shares, then its mean on either side
   colors.log_odds.resize(kColorBins);
   const double floor = kUnheardOf / kColorBins;
   colors.usual = colors.separation = 0.0;
@@ -85,7 +91,7 @@ Reach reach(const chain::Chain& chain, const math::Pose& base, const capture::Ca
   const Vector3 ahead = camera_from_world * (base * Vector3(chain.diameter * chain.direction));
   const Vector2 step = capture::project(camera, ahead) - out.grasp;
   const double diameter = chain.diameter * camera.fx / grasp.z();
-  // a rope that points at the camera has no side that is behind
+  // for a rope that points at the camera no side is behind the grasp
   out.along = step.norm() > 0.3 * diameter ? step.normalized() : Vector2::Zero();
   out.behind = step.norm() > 0.3 * diameter ? 0.0 : 1.0;
   const auto whole = [](double value, int size) { return static_cast<int>(std::clamp(value, 0.0, 1.0 * size)); };
@@ -94,6 +100,7 @@ Reach reach(const chain::Chain& chain, const math::Pose& base, const capture::Ca
   return out;
 }
 
+// The index of the marks' cell at a pixel inside the tube.
 int cell(const Marks& marks, const Tube& tube, int x, int y) {
   const int row = std::clamp(static_cast<int>(tube.arclength(x, y) / marks.step), 0, marks.along - 1);
   // 0 at the left outline, 1 at the right one
@@ -106,6 +113,7 @@ bool usual(const Marks& marks, const Tube& tube, const Picture& picture, int x, 
   if (marks.along == 0) return true;
   const int at = cell(marks, tube, x, y);
   if (!marks.known[at]) return true;
+  // the difference that remains after the light is fitted
   const std::uint8_t *const now = pixel(picture, x, y), *const then = &marks.rgb[3 * at];
   double product = 0.0, square = 1.0, difference = 0.0;
   for (int c = 0; c < 3; ++c) product += now[c] * then[c], square += then[c] * then[c];
@@ -116,7 +124,7 @@ bool usual(const Marks& marks, const Tube& tube, const Picture& picture, int x, 
 
 namespace {
 
-// Colors by cell of the marks.
+// Collects the colors per cell of the marks.
 struct Cells {
   explicit Cells(const chain::Chain& chain) {
     marks.step = std::max(kMarkStep * chain.diameter, chain.length / kMostAlong);
@@ -156,7 +164,7 @@ Marks marks(std::span<const Picture> frames, std::span<const Tube> tubes, const 
 }
 
 Marks marks(const capture::View& drawn, const Tube& tube, const chain::Chain& chain) {
-  constexpr std::uint8_t kOpaque = 242;  // 0.95
+  constexpr std::uint8_t kOpaque = 242;  // alpha of 0.95
   Cells cells(chain);
   for (int y = 0; y < drawn.height; ++y)
     for (int x = 0; x < drawn.width; ++x) {
@@ -166,14 +174,14 @@ Marks marks(const capture::View& drawn, const Tube& tube, const chain::Chain& ch
   return cells.medians();
 }
 
-void count_colors(Look& look, const Picture& picture, const Tube& tube, const Reach& where, const chain::Chain& chain,
-                  double margin, const capture::View* mask) {
+void count_colors(Look& appearance, const Picture& picture, const Tube& tube, const Reach& where,
+                  const chain::Chain& chain, double margin, const capture::View* mask) {
   const auto masked = [&](int x, int y) {
     x -= mask->x0, y -= mask->y0;
     return x >= 0 && y >= 0 && x < mask->width && y < mask->height &&
            mask->rgba[4 * (static_cast<std::size_t>(y) * mask->width + x) + 3] != 0;
   };
-  for (Colors* const colors : {&look.near, &look.far}) {
+  for (Colors* const colors : {&appearance.near, &appearance.far}) {
     if (colors->object.empty()) colors->object.assign(kColorBins, 0.0);
     if (colors->surroundings.empty()) colors->surroundings.assign(kColorBins, 0.0);
   }
@@ -183,11 +191,11 @@ void count_colors(Look& look, const Picture& picture, const Tube& tube, const Re
       const int bin = color_bin(pixel(picture, x, y));
       if (outside < -margin) {
         const double s = tube.arclength(x, y);
-        if (s > chain.diameter && (!mask || masked(x, y)) && usual(look.marks, tube, picture, x, y))
-          (s < 0.5 * chain.length ? look.near : look.far).object[bin] += 1.0;
+        if (s > chain.diameter && (!mask || masked(x, y)) && usual(appearance.marks, tube, picture, x, y))
+          (s < 0.5 * chain.length ? appearance.near : appearance.far).object[bin] += 1.0;
       } else if (outside > margin && outside < Tube::kFar) {
-        look.near.surroundings[bin] += 1.0;
-        look.far.surroundings[bin] += 1.0;
+        appearance.near.surroundings[bin] += 1.0;
+        appearance.far.surroundings[bin] += 1.0;
       }
     }
 }
@@ -205,11 +213,12 @@ Background median_background(std::span<const Picture> frames, std::span<const Tu
       for (auto& channel : values) channel.clear();
       away.clear();
       for (std::size_t i = 0; i < frames.size(); ++i) {
-        // the rope's contact shadow and its soft outline are not background either
+        // a margin of one radius leaves out the rope's contact shadow and its soft outline
         if (i < covered.size() && covered[i].at(x, y) < covered[i].radius) continue;
         for (int c = 0; c < 3; ++c) values[c].push_back(pixel(frames[i], x, y)[c]);
       }
       if (static_cast<int>(values[0].size()) < least) continue;
+      // median color, and noise from the median absolute deviation
       const std::size_t at = static_cast<std::size_t>(y) * width + x;
       for (int c = 0; c < 3; ++c) {
         const std::uint8_t middle = median(values[c]);
@@ -217,7 +226,7 @@ Background median_background(std::span<const Picture> frames, std::span<const Tu
         for (const std::uint8_t value : values[c])
           away.push_back(static_cast<std::uint8_t>(std::abs(static_cast<int>(value) - middle)));
       }
-      constexpr double kDeviationOfMedian = 1.4826;
+      constexpr double kDeviationOfMedian = 1.4826;  // standard over median absolute deviation of Gaussian noise
       out.noise[at] = noise_level(kDeviationOfMedian * median(away));
     }
   });
@@ -247,9 +256,9 @@ double difference_odds(const Background& background, const Picture& picture, int
   return std::clamp(kOddsPerDifference * (difference - kSameDifference), kSurelySame, kSurelyOther);
 }
 
-void settle(Look& look) {
-  settle(look.near);
-  settle(look.far);
+void settle(Look& appearance) {
+  settle(appearance.near);
+  settle(appearance.far);
 }
 
 double color_odds(const Colors& colors, const std::uint8_t* rgb) {

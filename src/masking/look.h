@@ -1,4 +1,4 @@
-// Colors and background of one camera: learned from frames, asked by pixel.
+// The colors, marks and background of one camera: learned from frames, evaluated per pixel.
 #pragma once
 #include <span>
 
@@ -15,11 +15,11 @@ inline const std::uint8_t* pixel(const Picture& picture, int x, int y) {
          static_cast<std::size_t>(picture.channels) * (static_cast<std::size_t>(y) * picture.width + x);
 }
 
-// What pixels the rope can reach at all: nearer to the grasp than its length, and not behind the grasp.
+// The pixels that the rope can reach at all: nearer to the grasp than its length, and not behind the grasp.
 struct Reach {
   Box box;
-  math::Vector2 grasp, along;  // px; unit, or zero where the rope points at the camera
-  double radius = 0.0, behind = 0.0;
+  math::Vector2 grasp, along;         // px; unit, or zero where the rope points at the camera
+  double radius = 0.0, behind = 0.0;  // px around the grasp, and px against `along`
   bool holds(int x, int y) const {
     const math::Vector2 d(x + 0.5 - grasp.x(), y + 0.5 - grasp.y());
     return d.squaredNorm() <= radius * radius && d.dot(along) >= -behind;
@@ -27,32 +27,32 @@ struct Reach {
 };
 Reach reach(const chain::Chain& chain, const math::Pose& base, const capture::Camera& camera);
 
-// The rope's marks: medians of the frames' colors, so that what hides the rope for less than half of them does not
+// Returns the rope's marks as medians over the frames, so that what hides the rope in less than half of them does not
 // count.
 Marks marks(std::span<const Picture> frames, std::span<const Tube> tubes, const chain::Chain& chain);
-// Those of one picture, where it shows something (alpha).
+// Returns the marks of one drawn picture, where its alpha is nearly opaque.
 Marks marks(const capture::View& drawn, const Tube& tube, const chain::Chain& chain);
-// Whether a pixel inside the tube has the color that is usual there, in more or less light; true where that is not
-// known.
+// Returns whether a pixel inside the tube has the usual color of its place, in more or less light; true where that
+// color is unknown.
 bool usual(const Marks& marks, const Tube& tube, const Picture& picture, int x, int y);
 
-// Adds the pixels of a frame where the tube is known: its core as object, what is about it, as far as its map goes, as
-// surroundings. `margin`: px on either side of the tube's outline where that is not sure. `mask`: of the core only
-// what it holds; of that what has the rope's marks, where they are known (a hand may hide the rope). Nothing of the
-// rope's first diameter: the gripper hides it.
-void count_colors(Look& look, const Picture& picture, const Tube& tube, const Reach& where, const chain::Chain& chain,
-                  double margin, const capture::View* mask = nullptr);
+// Counts the pixels of a frame in which the tube is known: those inside it as object, those around it, within the reach
+// of its distance map, as surroundings. `margin`: px on either side of the outline that are left out as uncertain. Of
+// the inside only pixels in the `mask`, if there is one, and with the rope's marks, where these are known, count,
+// because a hand may hide the rope; the rope's first diameter never counts, because the gripper hides it.
+void count_colors(Look& appearance, const Picture& picture, const Tube& tube, const Reach& where,
+                  const chain::Chain& chain, double margin, const capture::View* mask = nullptr);
 
-// Median of the frames, where at least `least` of them show the background. `covered[i]`: tube of frame i, empty when
-// not known.
+// Returns the median of the frames where at least `least` of them show the background. `covered[i]`: tube of frame i,
+// empty when unknown.
 Background median_background(std::span<const Picture> frames, std::span<const Tube> covered, int least);
 
-// Noise as Background keeps it, gray levels.
+// Returns a standard deviation in gray levels as Background stores it.
 std::uint8_t noise_level(double deviation);
 
-// Log odds, rope against background, of a pixel for the difference from the background; 0 where it is not known.
+// Returns a pixel's log odds for the rope from its difference from the background; 0 where the background is unknown.
 double difference_odds(const Background& background, const Picture& picture, int x, int y);
 double color_odds(const Colors& colors, const std::uint8_t* rgb);
-void settle(Look& look);
+void settle(Look& appearance);
 
 }  // namespace chainsplat::masking

@@ -1,5 +1,5 @@
-// A whole capture: chains grown in some moments, what they tell of colors and background, then masks and chains in
-// turn.
+// The masks of a whole capture: chains grown in some moments, colors and background learned from them, then masks and
+// chains in turn.
 #include <algorithm>
 #include <atomic>
 #include <cmath>
@@ -16,27 +16,33 @@ using math::Vector2;
 
 namespace {
 
-// Whole frames of one camera that are held in memory at once. A block of a video is reached by decoding all before it:
-// small blocks would take a time that grows with the square of a recording's length.
+// Memory for the whole frames of one camera that are held at once. Reaching a block of a video means decoding all
+// before it, so that with small blocks the time would grow with the square of the recording's length.
 constexpr double kBlockBytes = 512.0 * 1024 * 1024;
-constexpr int kSamples = 48;                          // frames of a camera that background and colors are learned from,
+// what is learned from
+constexpr int kSamples = 48;  // frames per camera from which background and colors are learned,
 constexpr double kSampleBytes = 2048.0 * 1024 * 1024;  // fewer where those of all cameras would take more than this
-constexpr double kAboutPixels = 24.0;    // px about a tube that are told apart from what is far
-constexpr double kLeastUncovered = 0.2;  // of the samples that must show the background
+constexpr double kAboutPixels = 24.0;                  // px around a tube whose colors count as the rope's surroundings
+constexpr double kLeastUncovered = 0.2;                // share of the samples that must show a pixel's background
 constexpr int kLeastSamples = 4;
-constexpr double kLinkDiameters = 1.5;  // length of a link of the chain that is laid into the masks
+// the chain
+constexpr double kLinkDiameters = 1.5;  // length of a link in diameters, unless the number of joints hits its bounds
 constexpr int kFewestJoints = 8, kMostJoints = 16;
-constexpr double kSameMoment = 0.02;    // s between pictures of different cameras
-constexpr double kLeastEvidence = 0.1;  // nats a sample in the best moment: less was no rope
-constexpr double kTrusted = 0.75;       // share of the best moment's evidence from which colors are learned,
-constexpr double kUsable = 0.5;         // and from which a moment says where the rope is
-constexpr int kKnownSamples = 1000;     // that what other moments say of the colors counts for, on each side
-constexpr double kRoughPlace = 3.0;     // times the usual doubt about the place, before the chain is laid into masks
-constexpr double kGrownMargin = 0.4;    // radii, by which the tube of a grown chain may be off,
-constexpr double kFitMargin = 0.5;    // px, and that of a chain laid into masks: pixels at its outline show both sides
-constexpr int kRounds = 2;            // of learning, cutting and fitting
-constexpr double kCenter = 0.5;       // of the radius: deeper inside than this counts as the centerline
-constexpr double kLeastInside = 0.4;  // of the centerline within the masks, mean: less was no rope
+// chains grown in moments
+constexpr double kSameMoment = 0.02;    // s, largest difference in time between pictures of one moment
+constexpr double kLeastEvidence = 0.1;  // nats per sample in the best moment, below which there is no rope
+constexpr double kTrusted = 0.75;       // share of the best moment's evidence from which on colors are learned,
+constexpr double kUsable = 0.5;         // and from which on a moment's chain is used
+constexpr int kKnownSamples = 1000;     // number of samples per side as which the colors of other moments count
+// masks and chains in turn
+constexpr double kRoughPlace = 3.0;   // times the usual uncertainty of the place, as long as chains are grown ones
+constexpr double kGrownMargin = 0.4;  // radii, by which the tube of a grown chain may be off,
+// px, and that of a fitted chain, as pixels on its outline show both sides; a wider margin left the rope's dark
+// underside and its contact shadow unlearned
+constexpr double kFitMargin = 0.5;
+constexpr int kRounds = 2;            // of cutting, fitting and learning
+constexpr double kCenter = 0.5;       // of the radius; pixels deeper inside than this count as the centerline
+constexpr double kLeastInside = 0.4;  // mean share of the centerline in the masks, below which there is no rope
 
 struct Recording {
   const Path& path;
@@ -52,7 +58,7 @@ int frames_of(const Recording& recording, int camera) {
 
 double frame_bytes(const capture::Camera& camera) { return 4.0 * camera.width * camera.height; }
 
-// Whole undistorted frames of one camera, a block at a time.
+// Calls `body` with whole undistorted frames of one camera, block by block.
 void each_block(const Recording& recording, int camera, const std::function<void(std::vector<View>&)>& body) {
   const int begin = recording.first, end = begin + frames_of(recording, camera);
   const int most = static_cast<int>(std::clamp(kBlockBytes / frame_bytes(recording.capture.cameras[camera]), 1.0, 1e6));
@@ -71,7 +77,7 @@ void each_block(const Recording& recording, int camera, const std::function<void
 
 Picture picture_of(const View& view) { return {view.rgba.data(), view.width, view.height, 4}; }
 
-// Some whole frames of one camera, and what is learned from them.
+// Some whole frames of one camera, from which its appearance is learned.
 struct Samples {
   std::vector<View> frames;
   std::vector<Picture> pictures() const {
@@ -81,10 +87,12 @@ struct Samples {
   }
 };
 
-// Chains grown in the moments of the first camera that has samples, with what the others show then.
+// Grows a chain in each moment of the first camera that has samples, together with the other cameras' pictures of that
+// moment. Throws InputError where no moment shows a rope.
 chain::States grow_moments(const Recording& recording, const chain::Chain& chain,
                            const std::vector<capture::Camera>& cameras, const std::vector<Samples>& samples) {
   const capture::Capture& scene = recording.capture;
+  // collect the pictures of each moment
   const auto first = std::find_if(samples.begin(), samples.end(), [](const Samples& s) { return !s.frames.empty(); });
   struct Moment {
     double time = 0.0;
@@ -106,7 +114,7 @@ chain::States grow_moments(const Recording& recording, const chain::Chain& chain
     }
     moments.push_back(std::move(moment));
   }
-  // first by each moment's own colors; then with those of the moments that show the rope best
+  // first from each moment's own colors, then also from those of the moments that show the rope best
   std::vector<Tally> known(cameras.size());
   std::vector<Grown> grown(moments.size());
   double best = 0.0;
@@ -128,6 +136,7 @@ chain::States grow_moments(const Recording& recording, const chain::Chain& chain
         add(known[moments[i].cameras[k]], grown[i].tallies[k]);
     for (Tally& tally : known) tally = scaled(tally, kKnownSamples);
   }
+  // keep the moments with enough evidence
   chain::States states;
   for (std::size_t i = 0; i < moments.size(); ++i)
     if (grown[i].evidence > kUsable * best) {
@@ -137,7 +146,7 @@ chain::States grow_moments(const Recording& recording, const chain::Chain& chain
   return states;
 }
 
-// Held at the ends, since the first and last frames may lie outside.
+// The interpolated angles, constant beyond the ends, where the first and last frames may lie.
 math::VectorX at(const chain::States& states, double time) {
   return chain::interpolate(states, std::clamp(time, states.time.front(), states.time.back()));
 }
@@ -148,20 +157,20 @@ bool masked_at(const View& view, int x, int y) {
          view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] != 0;
 }
 
-// Share of the chain's centerline, where the camera can see it, that lies in the mask.
+// Returns the share of the chain's centerline within the image that lies in the mask.
 double share_inside(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta,
                     const capture::Camera& recorded, const View& mask) {
   capture::Camera camera = recorded;
-  camera.distortion = {};  // of the crop
+  camera.distortion = {};  // the crop has none
   const Tube place = tube(chain, base, theta, camera, 0.0, chain.length, 0.0);
-  int seen = 0, inside = 0;
+  int visible = 0, inside = 0;
   for (int y = place.box.y0; y < place.box.y1; ++y)
     for (int x = place.box.x0; x < place.box.x1; ++x)
-      if (place.at(x, y) < -kCenter * place.radius) ++seen, inside += masked_at(mask, x, y);
-  return seen ? inside / static_cast<double>(seen) : 1.0;
+      if (place.at(x, y) < -kCenter * place.radius) ++visible, inside += masked_at(mask, x, y);
+  return visible ? inside / static_cast<double>(visible) : 1.0;
 }
 
-// The picture's mask in recorded pixels.
+// Returns the mask of an undistorted crop as a whole image of recorded pixels.
 Image8 recorded_mask(const View& view, const capture::Camera& camera) {
   Image8 mask{camera.width, camera.height, 1, {}};
   mask.pixels.assign(static_cast<std::size_t>(camera.width) * camera.height, 0);
@@ -173,7 +182,7 @@ Image8 recorded_mask(const View& view, const capture::Camera& camera) {
         if (inside(x, y)) mask.pixels[static_cast<std::size_t>(y) * camera.width + x] = 255;
     return mask;
   }
-  // recorded pixels that the crop may show: its outline's images, and a little
+  // visit the recorded pixels that the crop may show, within the bounds of its distorted border, and sample the crop
   double x0 = 1e9, y0 = 1e9, x1 = -1e9, y1 = -1e9;
   const auto include = [&](int x, int y) {
     const Vector2 p = capture::distort(camera, Vector2(x, y));
@@ -196,6 +205,7 @@ Image8 recorded_mask(const View& view, const capture::Camera& camera) {
 }  // namespace
 
 Summary make(const Path& path, const Options& options, const Sink& sink) {
+  // the frames and the chain
   capture::LoadOptions headers;
   headers.images = false;
   capture::Capture scene = capture::load(path, headers);
@@ -211,7 +221,8 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
       chain::make_chain(scene.length, scene.diameter, scene.direction, scene.bending_axis, joints,
                         scene.tabletop ? chain::Bending::planar : chain::Bending::spatial, false);
 
-  std::vector<capture::Camera> pinholes = scene.cameras;  // of undistorted pictures
+  // sample frames of every camera
+  std::vector<capture::Camera> pinholes = scene.cameras;  // the cameras of undistorted pictures
   for (capture::Camera& camera : pinholes) camera.distortion = {};
   std::vector<Samples> samples(cameras);
   const std::int64_t work = static_cast<std::int64_t>(total) * (kRounds + 2);
@@ -230,6 +241,7 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
       tell("samples", views.size());
     });
   }
+  // learns every camera's appearance from its samples, with a chain for each and, if there are any, their masks
   std::vector<Look> looks(cameras);
   const auto learn = [&](const chain::States& states, const std::vector<View>* masks) {
     for (int c = 0; c < cameras; ++c) {
@@ -239,7 +251,7 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
       for (const View& view : samples[c].frames)
         tubes.push_back(tube(chain, scene.base.pose(view.time), at(states, view.time), pinholes[c], 0.0, chain.length,
                              kAboutPixels));
-      if (masks) looks[c].marks = marks(pictures, tubes, chain);  // a grown chain is too rough for these
+      if (masks) looks[c].marks = marks(pictures, tubes, chain);  // a grown chain is too inaccurate for marks
       for (std::size_t i = 0; i < tubes.size(); ++i) {
         const View& view = samples[c].frames[i];
         const View* mask = nullptr;
@@ -257,7 +269,8 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
   Summary summary;
   chain::States states = grow_moments(recording, chain, pinholes, samples);
   learn(states, nullptr);
-  const auto masks_by = [&](double place, const char* note, const std::function<void(std::vector<View>&)>& take) {
+  // cuts the masks of all frames about the chains and passes them to `consume` block by block
+  const auto masks_by = [&](double place, const char* note, const std::function<void(std::vector<View>&)>& consume) {
     for (int c = 0; c < cameras; ++c)
       each_block(recording, c, [&](std::vector<View>& views) {
         core::parallel_for(static_cast<std::int64_t>(views.size()), [&](std::int64_t i) {
@@ -269,9 +282,10 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
           view = std::move(masked);
           tell(note, 1);
         });
-        take(views);
+        consume(views);
       });
   };
+  // rounds of masks, chains fitted to them, and appearance learned from both
   for (int round = 0; round < kRounds; ++round) {
     capture::Capture masked = scene;
     masked.views.clear();
@@ -291,6 +305,7 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
     learn(states, &masked.views);
   }
   summary.inside = 0.0;
+  // the final masks
   masks_by(1.0, "cut", [&](std::vector<View>& views) {
     for (const View& view : views) {
       ++summary.frames;

@@ -10,13 +10,13 @@ using math::Vector3;
 
 namespace {
 
-constexpr double kSpacing = 0.003;  // m along the rope between the tube's samples: well under a radius,
-constexpr int kMostSamples = 4096;  // but no more than these in all, for ropes beyond 12 m,
-constexpr double kNotBelow = 0.05;  // and no nearer than this in diameters: each looks at all pixels about it
-constexpr double kNearest = 0.01;   // m, nothing nearer is in front of a camera (SPEC 2.5)
+constexpr double kSpacing = 0.003;  // m along the rope between the tube's samples, well below usual ropes' radius,
+constexpr int kMostSamples = 4096;  // but no more samples than this in all, which bounds ropes longer than 12 m,
+constexpr double kNotBelow = 0.05;  // and at least this many diameters apart, because each visits all pixels around it
+constexpr double kNearest = 0.01;   // m, the nearest depth in front of a camera (mathematics.md 2.5)
 
 struct Sample {
-  Vector2 at;
+  Vector2 at;        // px
   double radius;     // px
   double arclength;  // m
 };
@@ -26,6 +26,7 @@ struct Sample {
 Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta, const capture::Camera& camera,
           double from, double to, double reach) {
   Tube out;
+  // sample the centerline
   const double spacing = std::max(kSpacing, kNotBelow * chain.diameter);
   const int count = std::max(2, static_cast<int>(std::min<double>(kMostSamples, std::ceil((to - from) / spacing))) + 1);
   std::vector<double> arclengths(count);
@@ -34,9 +35,10 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
   math::MatrixX line = chain::centerline(chain, motions, arclengths);
   for (int i = 0; i < count; ++i)
     if (arclengths[i] > chain.length) line.col(i) = motions.back() * Vector3(arclengths[i] * chain.direction);
+  // project them, and bound the tube's pixels
   const math::Pose camera_from_world = camera.world_from_camera.inverse();
   std::vector<Sample> samples;
-  double bulge = 0.0;  // of the free end's disc, seen at an angle, in radii
+  double bulge = 0.0;  // radii, half the short axis of the free end's disc as an ellipse in the picture
   double x0 = 1e9, y0 = 1e9, x1 = -1e9, y1 = -1e9;
   for (int i = 0; i < count; ++i) {
     const Vector3 p = camera_from_world * Vector3(line.col(i));
@@ -61,17 +63,18 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
   out.outside.assign(static_cast<std::size_t>(out.box.width()) * out.box.height(), Tube::kFar);
   out.along.assign(out.outside.size(), 0.0f);
   out.left.assign(out.outside.size(), 0);
-  // px by which the disc reaches beyond its center, at `d` from that
+  // px by which the free end's disc reaches beyond its center along the rope, at offset `d` from the center
   const auto disc = [&](const Vector2& d, const Vector2& along, bool free_end, double radius) {
     const double share = (d.x() * along.y() - d.y() * along.x()) / radius;
     return free_end ? bulge * radius * std::sqrt(std::max(0.0, 1.0 - share * share)) : 0.0;
   };
-  // px along a segment beyond its end, up to which it is as near as the next one, on the outer side of the bend there
+  // px beyond a segment's end up to which its points are nearer than the next segment's, on the outer side of the bend
   const auto wedge = [&](std::size_t joint, double around) {
     const Vector2 before = samples[joint].at - samples[joint - 1].at, after = samples[joint + 1].at - samples[joint].at;
     const double cosine = before.dot(after) / std::max(1e-9, before.norm() * after.norm());
     return 1.0 + around * std::sqrt(0.5 * std::max(0.0, 1.0 - cosine));
   };
+  // keep for each pixel near a segment the least distance from the outline
   for (std::size_t i = 0; i + 1 < samples.size(); ++i) {
     const Vector2 a = samples[i].at, step = samples[i + 1].at - a;
     const double length = step.norm();
@@ -85,7 +88,7 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
     const int bottom = std::min(out.box.y1, static_cast<int>(std::max(a.y(), a.y() + step.y()) + around) + 1);
     const double first = begins ? -around : -wedge(i, around), last = length + (ends ? around : wedge(i + 1, around));
     for (int y = top; y < bottom; ++y) {
-      // only from `first` to `last` along the segment
+      // the row's pixels from `first` to `last` along the segment
       int x_begin = left, x_end = right;
       if (std::abs(along.x()) > 1e-6) {
         const double in_row = (y + 0.5 - a.y()) * along.y();
@@ -96,7 +99,7 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
       for (int x = x_begin; x < x_end; ++x) {
         const Vector2 d = Vector2(x + 0.5, y + 0.5) - a;
         const double t = d.dot(along);
-        // beyond an end the distance is along the rope; between segments round joints close the gaps
+        // beyond an end of the rope the distance is along it; between segments round joints close the gaps
         double distance;
         const double share = std::clamp(t / length, 0.0, 1.0);
         const double radius = samples[i].radius + share * (samples[i + 1].radius - samples[i].radius);
@@ -119,8 +122,8 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
       }
     }
   }
-  // near an end the inside is as deep as the end is near, and what lies beyond it is at least that far outside, though
-  // the round joint of the segment before reaches there
+  // near an end, pixels inside are no deeper than the end is near, and pixels beyond it are at least that far outside,
+  // even where the round joint of the previous segment reaches
   const auto cap = [&](const Sample& end, const Vector2& outward, bool free_end) {
     const double around = end.radius + reach;
     const double near = 2.0 * around * (samples.back().arclength - samples.front().arclength) /

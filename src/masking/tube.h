@@ -1,4 +1,4 @@
-// The chain's tube in a picture: how far each pixel is from its outline.
+// The chain's tube in a picture: the signed distance of each pixel from its outline.
 #pragma once
 #include <vector>
 
@@ -16,25 +16,26 @@ struct Box {  // pixels [x0, x1) x [y0, y1)
 
 struct Tube {
   Box box;
-  std::vector<float> outside;  // px to the outline, negative inside; kFar where farther than the reach asked for
+  std::vector<float> outside;  // px to the outline, negative inside; kFar beyond the requested reach
   std::vector<float> along;    // m, arclength of the nearest point of the centerline
-  std::vector<char> left;      // of the centerline, as it goes in the picture
+  std::vector<char> left;      // whether it is left of the centerline, seen toward the free end in the picture
   double radius = 0.0;         // px, mean along the rope
   float at(int x, int y) const {
     if (x < box.x0 || y < box.y0 || x >= box.x1 || y >= box.y1) return kFar;
     return outside[static_cast<std::size_t>(y - box.y0) * box.width() + (x - box.x0)];
   }
-  float arclength(int x, int y) const {  // of pixels in the box
+  float arclength(int x, int y) const {  // for pixels in the box
     return along[static_cast<std::size_t>(y - box.y0) * box.width() + (x - box.x0)];
   }
-  bool is_left(int x, int y) const {  // of pixels in the box
+  bool is_left(int x, int y) const {  // for pixels in the box
     return left[static_cast<std::size_t>(y - box.y0) * box.width() + (x - box.x0)] != 0;
   }
   static constexpr float kFar = 1e6f;
 };
 
-// A cylinder bent along the chain: flat where it begins, with the ellipse of its end disc where it ends. `from`, `to`:
-// arclengths, m; beyond the free end it goes on straight. `reach`: px beyond the outline. The camera has no distortion.
+// Projects a cylinder bent along the chain, flat where it begins and with the ellipse of its end disc where it ends.
+// `from`, `to`: arclengths in m; beyond the free end it continues straight. `reach`: px beyond the outline that are
+// filled in. The camera must have no distortion.
 Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta, const capture::Camera& camera,
           double from, double to, double reach);
 

@@ -7,10 +7,10 @@ namespace chainsplat::math {
 
 namespace {
 
-constexpr double kSmallAngle = 1e-2;  // rad; below it the series are exact to rounding (SPEC 1)
+constexpr double kSmallAngle = 1e-2;  // rad; below it the series are exact to rounding (mathematics.md 1)
 
 struct ExpCoefficients {
-  double a, b, c;  // sin x/x, (1-cos x)/x^2, (x-sin x)/x^3
+  double a, b, c;  // sin x / x, (1 - cos x)/x^2, (x - sin x)/x^3
 };
 
 ExpCoefficients exp_coefficients(double angle) {
@@ -19,7 +19,7 @@ ExpCoefficients exp_coefficients(double angle) {
     return {1 + x2 * (-1.0 / 6 + x2 * (1.0 / 120 - x2 / 5040)), 0.5 + x2 * (-1.0 / 24 + x2 * (1.0 / 720 - x2 / 40320)),
             1.0 / 6 + x2 * (-1.0 / 120 + x2 * (1.0 / 5040 - x2 / 362880))};
   }
-  // 1 - cos through the half angle keeps all digits for moderate angles
+  // 1 - cos x = 2 sin^2(x/2) has no cancellation
   const double half = std::sin(0.5 * angle);
   return {std::sin(angle) / angle, 2 * half * half / x2, (angle - std::sin(angle)) / (x2 * angle)};
 }
@@ -47,14 +47,14 @@ Pose exp_se3(const Vector6& twist) {
 }
 
 Vector3 log_so3(const Matrix3& rotation) {
-  // largest-pivot quaternion: no loss of digits near pi
+  // Eigen forms the quaternion with the largest pivot, so that no digits are lost near pi
   Eigen::Quaterniond q(rotation);
   q.normalize();
   if (q.w() < 0) q.coeffs() = -q.coeffs();
   const double sine = q.vec().norm();
   if (sine < 1e-7) return 2.0 / q.w() * (1.0 - sine * sine / (3.0 * q.w() * q.w())) * q.vec();
   Vector3 w = 2.0 * std::atan2(sine, q.w()) / sine * q.vec();
-  if (q.w() < 1e-15) {  // exactly pi: the sign is a convention, first non-zero component positive
+  if (q.w() < 1e-15) {  // at exactly pi the sign is a convention: the first non-zero component is positive
     for (int i = 0; i < 3; ++i) {
       if (w[i] != 0.0) {
         if (w[i] < 0.0) w = -w;
@@ -109,6 +109,7 @@ Vector6 transform_twist(const Pose& pose, const Vector6& twist) {
 
 Matrix3 orthonormalized(const Matrix3& almost_rotation) {
   const Eigen::JacobiSVD<Matrix3> svd(almost_rotation, Eigen::ComputeFullU | Eigen::ComputeFullV);
+  // turning the axis of the least singular value makes a rotation of a reflection
   Matrix3 sign = Matrix3::Identity();
   sign(2, 2) = (svd.matrixU() * svd.matrixV().transpose()).determinant() < 0 ? -1.0 : 1.0;
   return svd.matrixU() * sign * svd.matrixV().transpose();
@@ -117,6 +118,7 @@ Matrix3 orthonormalized(const Matrix3& almost_rotation) {
 bool is_covariance(const MatrixX& m) {
   if (m.rows() != m.cols() || !m.allFinite() || (m.diagonal().array() < 0.0).any()) return false;
   const VectorX deviation = m.diagonal().cwiseSqrt();
+  // the correlation matrix; a variable of zero variance must have zero covariances
   MatrixX correlation = m;
   for (Eigen::Index i = 0; i < m.rows(); ++i)
     for (Eigen::Index j = 0; j < m.cols(); ++j) {
@@ -137,7 +139,7 @@ std::vector<Eigen::Index> known_part(const MatrixX& covariance) {
   std::iota(kept.begin(), kept.end(), Eigen::Index{0});
   while (!kept.empty()) {
     const MatrixX part = covariance(kept, kept);
-    const auto unknown = (part.array() - part.array()).isNaN();  // of what is infinite, too
+    const auto unknown = (part.array() - part.array()).isNaN();  // true for infinite entries, too
     const Eigen::ArrayXi gaps = unknown.cast<int>().rowwise().sum() + unknown.cast<int>().colwise().sum().transpose();
     Eigen::Index emptiest = 0;
     if (gaps.maxCoeff(&emptiest) == 0) break;

@@ -1,4 +1,4 @@
-// The pixels that Gaussians can touch: EWA projection of SPEC 2.5, reach where alpha falls to 1/255 (SPEC 2.6).
+// The pixels that Gaussians can reach: EWA projection (mathematics.md 2.5), out to where alpha falls to 1/255 (2.6).
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -13,11 +13,12 @@ using math::Vector3;
 
 namespace {
 
-constexpr double kNear = 0.01;             // m, replicas nearer than this are not drawn
-constexpr double kLowPass = 0.3;           // px^2, added to the projected covariance
-constexpr double kClamp = 1.3;             // of the half image, for the projection's Jacobian
-constexpr double kLeastAlpha = 1.0 / 255;  // below it nothing is drawn
-constexpr double kFar = 1e6;               // px, keeps whole numbers in range for splats seen edge-on
+// as in shaders/inc/project.glsl and inc/alpha.glsl
+constexpr double kNear = 0.01;             // m; replicas nearer than this are not drawn
+constexpr double kLowPass = 0.3;           // px^2; added to the projected covariance
+constexpr double kClamp = 1.3;             // multiple of the half image at which the projection's Jacobian is clamped
+constexpr double kLeastAlpha = 1.0 / 255;  // splats of a lower alpha are not drawn
+constexpr double kFar = 1e6;               // px; keeps very large bounds in the range of int
 
 }  // namespace
 
@@ -30,6 +31,8 @@ Bounds reach(const splat::Gaussians& g, const std::vector<math::Pose>& motions, 
   constexpr double kInfinity = std::numeric_limits<double>::infinity();
   Vector2 low(kInfinity, kInfinity), high(-kInfinity, -kInfinity);
   std::vector<double> rho(g.links);
+
+  // bounds over all replicas that can be visible
   for (int i = 0; i < g.count; ++i) {
     const float* const logits = &g.link_logits[static_cast<std::size_t>(g.links) * i];
     const float largest = *std::max_element(logits, logits + g.links);
@@ -40,7 +43,7 @@ Bounds reach(const splat::Gaussians& g, const std::vector<math::Pose>& motions, 
     bool have_axes = false;
     for (int j = 0; j < g.links; ++j) {
       const double alpha = opacity * rho[j] / sum;
-      constexpr double kSlack = 0.999;  // the device decides in float
+      constexpr double kSlack = 0.999;  // allows for the device's float arithmetic
       if (alpha < kSlack * kLeastAlpha) continue;
       if (!have_axes) {
         const float* const q = &g.rotation[4 * i];
@@ -65,7 +68,7 @@ Bounds reach(const splat::Gaussians& g, const std::vector<math::Pose>& motions, 
   }
   if (!(low.x() <= high.x())) return {};
   const auto pixel = [](double value) { return static_cast<int>(std::clamp(value, -kFar, kFar)); };
-  // a pixel is drawn where its center is inside
+  // a pixel is drawn if its center is inside
   return {pixel(std::floor(low.x())), pixel(std::floor(low.y())), pixel(std::ceil(high.x())),
           pixel(std::ceil(high.y()))};
 }

@@ -9,10 +9,10 @@ using math::Vector2;
 
 namespace {
 
-constexpr std::size_t kBatchPixels = 2u << 20;  // of a batch: 32 MiB of float colors, several dozen frames of a rope
+constexpr std::size_t kBatchPixels = 2u << 20;  // per batch: 32 MiB of float colors, several dozen frames of a rope
 constexpr int kBorderStep = 8;                  // px between the border points that bound a warped rectangle
-constexpr double kTimeSlack = 1e-9;             // s, rounding of frame times
-constexpr float kSolid = 0.5f;                  // alpha from here on is object (INTERFACE 1)
+constexpr double kTimeSlack = 1e-9;             // s; covers the rounding of frame times
+constexpr float kSolid = 0.5f;                  // least alpha of the object (INTERFACE 1)
 
 Bounds cut(const Bounds& a, const Bounds& b) {
   return {std::max(a.x0, b.x0), std::max(a.y0, b.y0), std::min(a.x1, b.x1), std::min(a.y1, b.y1)};
@@ -24,7 +24,7 @@ Bounds grown(const Bounds& bounds, int margin) {
 
 Bounds image_of(const capture::Camera& camera) { return {0, 0, camera.width, camera.height}; }
 
-// The rectangle that holds the image of `bounds`' border under `map`.
+// The rectangle that encloses the image of the border of `bounds` under `map`.
 template <class Map>
 Bounds mapped(const Bounds& bounds, Map map) {
   Vector2 low(1e9, 1e9), high(-1e9, -1e9);
@@ -41,19 +41,20 @@ Bounds mapped(const Bounds& bounds, Map map) {
           static_cast<int>(std::ceil(high.x())), static_cast<int>(std::ceil(high.y()))};
 }
 
-// Where every recorded pixel's center lies in the undistorted image; made once a camera.
+// The position of every recorded pixel's center in the undistorted image; made once per camera.
 struct Lens {
   bool active = false;
-  Bounds seen;                    // undistorted rectangle that holds the whole recorded image
-  std::vector<Vector2> straight;  // width x height
+  Bounds field_of_view;           // undistorted rectangle that encloses the whole recorded image
+  std::vector<Vector2> straight;  // width x height, undistorted px
 };
 
 Lens make_lens(const capture::Camera& camera, bool undistorted) {
   Lens lens;
   lens.active = camera.distorted() && !undistorted;
-  lens.seen = image_of(camera);
+  lens.field_of_view = image_of(camera);
   if (!lens.active) return lens;
-  lens.seen = grown(mapped(image_of(camera), [&](const Vector2& p) { return capture::undistort(camera, p); }), 1);
+  lens.field_of_view =
+      grown(mapped(image_of(camera), [&](const Vector2& p) { return capture::undistort(camera, p); }), 1);
   lens.straight.resize(static_cast<std::size_t>(camera.width) * camera.height);
   core::parallel_for(camera.height, [&](std::int64_t y) {
     for (int x = 0; x < camera.width; ++x)
@@ -63,8 +64,8 @@ Lens make_lens(const capture::Camera& camera, bool undistorted) {
   return lens;
 }
 
-// The drawn rectangle (undistorted, at `drawn`) as recorded pixels of `frame`'s crop. Colors bilinear, black outside;
-// depth of the nearest pixel, because a mean across an edge is nowhere.
+// Warps the picture of the undistorted rectangle `drawn` to the recorded pixels of `crop`. Colors are interpolated
+// bilinearly, black outside; depth is that of the nearest pixel, because a mean across an edge lies on no surface.
 splat::Picture warp(const splat::Picture& from, const Bounds& drawn, const Bounds& crop, const Lens& lens,
                     int image_width) {
   splat::Picture to;
@@ -76,6 +77,7 @@ splat::Picture warp(const splat::Picture& from, const Bounds& drawn, const Bound
   const auto inside = [&](int x, int y) { return x >= 0 && y >= 0 && x < from.width && y < from.height; };
   for (int y = 0; y < to.height; ++y) {
     for (int x = 0; x < to.width; ++x) {
+      // where the pixel lies in the drawn picture
       const Vector2& position = lens.straight[static_cast<std::size_t>(crop.y0 + y) * image_width + crop.x0 + x];
       const double u = position.x() - drawn.x0 - 0.5, v = position.y() - drawn.y0 - 0.5;
       const int x0 = static_cast<int>(std::floor(u)), y0 = static_cast<int>(std::floor(v));
@@ -128,6 +130,8 @@ void for_batches(splat::Engine& engine, const splat::Gaussians& gaussians, const
                  const std::function<void(std::vector<Frame>& batch)>& use) {
   const double interval = options.interval > 0.0 ? options.interval : median_interval(times);
   const Lens lens = make_lens(camera, options.undistorted);
+
+  // plan every frame that the states cover: link motions and the rectangles to draw and to return
   struct Plan {
     Frame frame;
     Bounds drawn, crop;  // undistorted and recorded pixels
@@ -145,15 +149,17 @@ void for_batches(splat::Engine& engine, const splat::Gaussians& gaussians, const
   core::parallel_for(static_cast<std::int64_t>(plans.size()), [&](std::int64_t k) {
     Plan& plan = plans[k];
     plan.motions = chain::link_motions(chain, chain::interpolate(states, plan.frame.time), base.pose(plan.frame.time));
-    const Bounds content = cut(reach(gaussians, plan.motions, camera), grown(lens.seen, options.margin));
+    const Bounds content = cut(reach(gaussians, plan.motions, camera), grown(lens.field_of_view, options.margin));
     if (content.empty()) return;
     const auto to_recorded = [&](const Vector2& p) { return capture::distort(camera, p); };
     plan.drawn = lens.active ? content : cut(grown(content, options.margin), image_of(camera));
-    plan.crop = lens.active ? cut(grown(mapped(cut(content, lens.seen), to_recorded), options.margin), image_of(camera))
+    plan.crop = lens.active ? cut(grown(mapped(cut(content, lens.field_of_view), to_recorded), options.margin),
+                                  image_of(camera))
                             : plan.drawn;
     if (plan.crop.empty()) plan.drawn = plan.crop = {};
   });
 
+  // draw as many frames at a time as a batch may hold
   for (std::size_t first = 0; first < plans.size();) {
     std::size_t last = first, pixels = 0;
     std::vector<splat::ViewSpec> views;

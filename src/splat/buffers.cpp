@@ -1,4 +1,4 @@
-// buffers.cpp - room on the device, and what goes there and back.
+// buffers.cpp - device memory of the engine, and the transfers to and from it.
 #include <algorithm>
 #include <cstring>
 
@@ -7,10 +7,10 @@
 namespace chainsplat::splat {
 
 void Engine::State::need(Buffer& buffer, std::size_t bytes, const char* name) {
-  constexpr std::size_t kLeast = 256, kRow = sizeof(glm::vec4);  // kernels may take its last row as a whole
+  constexpr std::size_t kLeast = 256, kRow = sizeof(glm::vec4);  // kernels may access the last row as a whole
   bytes = std::max((bytes + kRow - 1) / kRow * kRow, kLeast);
   if (buffer.bytes() < bytes) {
-    buffer = Buffer();  // the old one goes first
+    buffer = Buffer();  // frees the old memory before the new is allocated
     buffer = Buffer(device, bytes, Domain::device, name);
   }
 }

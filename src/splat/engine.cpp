@@ -1,4 +1,4 @@
-// engine.cpp - what Engine offers, each as options of the same passes.
+// engine.cpp - the functions of Engine, each a choice of options for the same passes.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -10,7 +10,7 @@ namespace chainsplat::splat {
 
 namespace {
 
-constexpr double kClampMargin = 1.3;               // of the half image, for the projection's Jacobian (SPEC 2.5)
+constexpr double kClampMargin = 1.3;  // multiple of the half image at which the projection's Jacobian is clamped (3DGS)
 constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;  // Adam, as in 3DGS
 
 std::vector<int> everything(std::size_t count) {
@@ -34,8 +34,8 @@ void append(LossValues& values, const std::vector<ViewSums>& sums, const LossWei
 
 Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), commands(d) {
   const gpu::DeviceInfo& device_info = gpu::info(d);
-  // lavapipe: one subgroup of 8 lanes a tile, a column of 8 pixels each (loads are what costs there: DESIGN, 'The size
-  // of the work'); a GPU: one subgroup of 32 a tile, 2 pixels each
+  // lavapipe: one subgroup of 8 lanes per tile, with a column of 8 pixels per lane, because loads dominate the cost
+  // there (design.md, 'The size of the work'); a GPU: one subgroup of 32 lanes per tile, with 2 pixels per lane
   const int tile = settings.tile > 0 ? settings.tile : 8;
   const int pixels = settings.pixels_per_lane > 0 ? settings.pixels_per_lane : device_info.software ? 8 : 2;
   CHAINSPLAT_CHECK(tile % pixels == 0, std::to_string(tile) + " " + std::to_string(pixels));
@@ -48,6 +48,8 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   constexpr double kNoClamp = 1e6;
   clamp_margin = settings.projection_clamp ? kClampMargin : kNoClamp;
   range_limit = static_cast<std::size_t>(std::min<std::uint64_t>(device_info.max_storage_range, 1ull << 30));
+
+  // pipelines: splats, then losses, then colors
   const std::uint32_t cut = cutoffs ? 1 : 0;
   const std::size_t push = sizeof(SplatPush);
   replicate = gpu::Pipeline(d, "splat_replicate", 3, push, {cut});
@@ -90,7 +92,7 @@ void Engine::State::run_all(Scene& scene, std::span<const int> batch, const RunO
   timings.clear();
   std::size_t done = 0;
   while (done < batch.size()) {
-    // planned anew after every chunk: an overflow may have lowered most_views
+    // plan anew for every chunk: an overflow may have lowered most_views
     const std::vector<int> chunk = chunks(scene, batch.subspan(done), dssim).front();
     RunOptions with = options;
     with.accumulate = done > 0;
@@ -141,7 +143,7 @@ LossValues Engine::loss(const Gaussians& gaussians, std::span<const ViewSpec> vi
     std::fill(gradients->gaussians.rotation.begin(), gradients->gaussians.rotation.end(), 0.0f);
     gradients->link_twists.clear();
   }
-  // crops of different size have different means: one call a normalizer, summed here
+  // the means of crops of different sizes have different normalizers: one run per normalizer, summed here
   std::vector<float> total(s.scratch.parameter_count, 0.0f), part(s.scratch.parameter_count);
   const auto run_batch = [&](std::span<const int> batch, double pixels) {
     RunOptions options;
@@ -214,6 +216,8 @@ LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, 
   options.twists = twists != nullptr;
   if (twists) twists->clear();
   ++scene.step;
+
+  // Adam's constants; held link logits are the last section of the parameters and are left out
   AdamPush push{};
   push.gaussians = static_cast<std::uint32_t>(scene.count);
   push.links = static_cast<std::uint32_t>(scene.links);
@@ -232,6 +236,7 @@ LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, 
   push.beta2 = kBeta2;
   push.correction1 = static_cast<float>(1.0 / (1.0 - std::pow(kBeta1, scene.step)));
   push.correction2 = static_cast<float>(1.0 / (1.0 - std::pow(kBeta2, scene.step)));
+
   LossValues values;
   s.run_all(scene, batch, options, &push, [&](std::span<const int> chunk, std::size_t) {
     if (read_losses) append(values, s.sums(chunk.size()), weights, scene.normalizer);
@@ -254,11 +259,11 @@ std::vector<Picture> Engine::draw_views(std::span<const int> batch, bool depth) 
 }
 
 std::vector<ColorSums> Engine::color_sums(const chain::Chain& chain, std::span<const ViewSpec> views,
-                                          std::span<const std::vector<std::uint8_t>* const> seen) {
+                                          std::span<const std::vector<std::uint8_t>* const> observed) {
   State& s = *state_;
   CHAINSPLAT_CHECK(chain.links() == s.training.links,
                    std::to_string(chain.links()) + " " + std::to_string(s.training.links));
-  s.load_views(s.training, views, seen, Active::in_mask);
+  s.load_views(s.training, views, observed, Active::in_mask);
   RunOptions options;
   options.depth = true;
   options.chain = &chain;

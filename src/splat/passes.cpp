@@ -1,4 +1,4 @@
-// passes.cpp - one submission: its views laid out, room made, all passes recorded and run.
+// passes.cpp - one submission: lays out its views, makes room for them, records all passes and runs them.
 #include <algorithm>
 #include <array>
 #include <cstring>
@@ -10,14 +10,16 @@ namespace chainsplat::splat {
 
 namespace {
 
-constexpr std::uint32_t kTilesAPixelSlice = 4, kMostPixelSlices = 256;  // of color_pixels: enough groups for a GPU,
-constexpr std::uint32_t kTilesAnEquationSlice = 16, kMostEquationSlices = 64;  // few sums to read back
-constexpr std::uint32_t kFirstInstances = 8;                                   // tiles a splat touches, first guess
-constexpr std::uint32_t kRow = 32768;  // groups in x of a two-dimensional dispatch
+// Tiles per slice, and most slices of a view, of color_pixels (enough work groups for a GPU) and of color_equations
+// (few sums to read back).
+constexpr std::uint32_t kTilesAPixelSlice = 4, kMostPixelSlices = 256;
+constexpr std::uint32_t kTilesAnEquationSlice = 16, kMostEquationSlices = 64;
+constexpr std::uint32_t kFirstInstances = 8;  // first guess of the number of tiles that a splat touches
+constexpr std::uint32_t kRow = 32768;         // work groups in x of a two-dimensional dispatch (Vulkan allows 65535)
 
-// lavapipe gives every thread one stretch of a pass' groups. Neighbors in the list of tiles have alike work, those far
-// apart do not: so that every stretch has some of all, a pass goes through the list in steps of about its golden
-// section.
+// lavapipe gives each thread one contiguous range of a pass's work groups. Neighboring tiles need similar amounts of
+// work, distant ones do not. A pass therefore visits the list of tiles with a stride of about its golden section, which
+// gives every range some tiles of each kind.
 std::uint32_t spreading_stride(std::uint32_t count) {
   constexpr double kGoldenSection = 0.6180339887;
   auto stride = static_cast<std::uint32_t>(kGoldenSection * count);
@@ -57,6 +59,8 @@ Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, cons
   out.views = static_cast<std::uint32_t>(chunk.size());
   out.replicas = static_cast<std::size_t>(scene.count) * links;
   out.dssim = options.loss && options.weights.dssim > 0.0f;
+
+  // views: cameras, link motions and places in the buffers
   std::vector<SplatView> gpu_views(out.views);
   std::vector<glm::vec4> rows(static_cast<std::size_t>(out.views) * links * 3);
   std::vector<std::uint32_t> map;
@@ -92,6 +96,8 @@ Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, cons
                                              pose.translation[r]};
     }
     out.most_tiles = std::max(out.most_tiles, static_cast<std::uint32_t>(view.active.size()));
+
+    // axes of the links, for the normal equations of the colors
     if (!options.chain) continue;
     const chain::Chain& chain = *options.chain;
     const std::uint32_t first_tile = colored.empty() ? 0 : colored.back().first_tile + colored.back().tiles;
@@ -104,7 +110,8 @@ Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, cons
       axes.emplace_back(along.x(), along.y(), along.z(), 0.0);
     }
   }
-  // tiles with a D-SSIM term first, so that its passes run over a prefix of the list
+
+  // active tiles: those with a D-SSIM term first, so that its passes run over a prefix of the list
   for (const bool near : {true, false}) {
     for (std::uint32_t v = 0; v < out.views; ++v) {
       const SceneView& view = scene.views[chunk[v]];
@@ -131,6 +138,8 @@ Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, cons
 
 bool Engine::State::make_room(Submission& s) {
   const RunOptions& options = s.options;
+
+  // capacities: first guesses, kept within what one buffer may hold
   if (live_capacity == 0 || live_capacity > s.replicas)
     live_capacity = static_cast<std::uint32_t>(
         std::max<std::size_t>(1, std::min<std::size_t>(s.replicas, 2 * static_cast<std::size_t>(s.scene.count) + 256)));
@@ -142,10 +151,12 @@ bool Engine::State::make_room(Submission& s) {
   }
   if (instance_capacity == 0)
     instance_capacity = static_cast<std::uint32_t>(std::max<std::size_t>(1024, kFirstInstances * s.pairs / 2));
-  // what drawing had grown can be more than gradients have room for; an overflow then takes fewer views
+  // the capacity that drawing has reached may be too large for gradients; an overflow then lowers the number of views
   if (options.backward)
     instance_capacity = static_cast<std::uint32_t>(
         std::min<std::size_t>(instance_capacity, range_limit / (sizeof(glm::vec4) * shared::kPartialRows * slots)));
+
+  // buffers of the lists, the picture and the gradients
   const auto blocks = [](std::size_t n) { return n / shared::kScanBlock + 1; };
   need(replica_opacity, words(s.replicas), "replica opacity");
   need(live_flag, words(s.replicas), "live flag");
@@ -163,7 +174,7 @@ bool Engine::State::make_room(Submission& s) {
   need(tile_cursor, words(s.tiles), "tile cursor");
   need(tile_used, words(s.tiles), "tile used");
   need(tile_loss, 2 * vectors(s.tiles), "tile loss");
-  // a list at a place of its own needs no instances, which only gradients are summed by
+  // lists at fixed places have no instance numbers, which only the sums of gradients need
   if (options.chain && tile_capacity == 0) set_tile_capacity(kTileCapacity);
   s.own_places = options.chain && static_cast<std::size_t>(s.tiles) * tile_capacity <= kListEntries;
   const std::uint32_t list_entries = s.own_places ? std::max(kListEntries, instance_capacity) : instance_capacity;
@@ -228,7 +239,7 @@ bool Engine::State::make_room(Submission& s) {
 
 void Engine::State::record_lists(const Submission& s) {
   const Scene& scene = s.scene;
-  // what is live is known for as long as the Gaussians stay
+  // clear the counters; the live replicas are kept for as long as the Gaussians do not change
   const std::pair now{scene.version, live_capacity};
   const bool replicas_kept = replicated == now;
   replicated = now;
@@ -248,6 +259,8 @@ void Engine::State::record_lists(const Submission& s) {
   commands.no_barrier();
   commands.fill(tile_used, 0, 0, words(std::max(1u, s.tiles)));
   commands.stamp("clear");
+
+  // Gaussians to live replicas
   if (!replicas_kept) {
     SplatPush push = s.push;
     dispatch(replicate, {&scene.parameters, &replica_opacity, &live_flag}, push, groups(scene.count));
@@ -259,6 +272,8 @@ void Engine::State::record_lists(const Submission& s) {
              (replica_groups + kRow - 1) / kRow);
     commands.stamp("replicate");
   }
+
+  // live replicas to splats, and splats to the lists of the tiles that they touch
   dispatch_live(project,
                 {&scene.parameters, &replica_opacity, &live, &views, &motions, &tile_map, &counters, &splats,
                  &instance_count, &tile_count, &tile_hits, &entries},
@@ -280,6 +295,8 @@ void Engine::State::record_lists(const Submission& s) {
                   s.push);
     commands.stamp("bin");
   }
+
+  // every list by depth
   const Buffer &starts = s.own_places ? list_starts : tile_prefix, &blocks = s.own_places ? list_blocks : tile_block;
   dispatch(sort, {&starts, &blocks, &tile_count, &entries, &long_tiles, &sorted, &counters}, s.push, s.tiles);
   const std::array long_buffers = {static_cast<const Buffer*>(&starts),     static_cast<const Buffer*>(&blocks),
@@ -375,7 +392,7 @@ bool Engine::State::has_fitted(const Submission& s, const std::byte* read_counte
                     "use fewer or smaller Gaussians");
   not_finite = static_cast<int>(read[shared::kCounterNotFinite]);
   if (read[shared::kCounterOverflow] == 0) return true;
-  // raise what was too small, as far as one buffer may reach
+  // raise each capacity that was too small, within what one buffer may hold
   const std::size_t want_live = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantLive]) + 64;
   const std::size_t want_instances = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantInstances]) + 1024;
   if (read[shared::kCounterWantLive] > live_capacity)

@@ -1,4 +1,4 @@
-// read_back.cpp - what the host asks for of the last submission.
+// read_back.cpp - results of the last submission, fetched by the host.
 #include <algorithm>
 #include <cstring>
 
@@ -36,7 +36,7 @@ std::vector<Picture> Engine::State::pictures(const Scene& scene, std::span<const
       picture.depth.resize(pixels);
       gpu::download(device, depth_image, picture.depth.data(), pixels * sizeof(float), chunk_pixel[v] * sizeof(float));
     }
-    // what was not drawn holds pixels of an earlier batch
+    // clear the tiles that were not drawn: they hold pixels of an earlier batch
     std::vector<bool> drawn(static_cast<std::size_t>(view.tiles_x) * view.tiles_y, false);
     for (const std::uint32_t cell : view.active) drawn[cell] = true;
     for (std::size_t cell = 0; cell < drawn.size(); ++cell) {
@@ -55,13 +55,14 @@ std::vector<Picture> Engine::State::pictures(const Scene& scene, std::span<const
   const auto count = static_cast<std::int64_t>(chunk.size());
   if (image.mapped()) {
     core::parallel_for(count, fetch);
-  } else {  // through one staging buffer
+  } else {  // one after the other: there is one staging buffer
     for (std::int64_t v = 0; v < count; ++v) fetch(v);
   }
   return out;
 }
 
-// Device: moment about the view's base origin, camera frame. Out: world twist about the world origin (SPEC 2.3).
+// The device's moments are about the view's base origin, in the camera frame; the result is in world axes, about the
+// world origin (mathematics.md 2.3).
 std::vector<math::MatrixX> Engine::State::twists(const Scene& scene, std::span<const int> chunk) {
   std::vector<glm::vec4> rows(2 * chunk.size() * scene.links, glm::vec4(0.0f));
   if (scene.count > 0) gpu::download(device, link_twists, rows.data(), rows.size() * sizeof(glm::vec4));
@@ -82,7 +83,8 @@ std::vector<math::MatrixX> Engine::State::twists(const Scene& scene, std::span<c
   return out;
 }
 
-// Device: rows about the links' starts, camera frame. Out: world twists about the world origin.
+// The device's rows are about the links' starts, in the camera frame; the result is in world axes, about the world
+// origin.
 std::vector<ColorSums> Engine::State::colors(const Scene& scene, std::span<const int> chunk,
                                              const chain::Chain& chain) {
   const auto floats = [](const std::byte* bytes, std::size_t size) {
@@ -90,6 +92,7 @@ std::vector<ColorSums> Engine::State::colors(const Scene& scene, std::span<const
     std::memcpy(values.data(), bytes, size);
     return values;
   };
+  // sums over slices, in double
   const std::vector<float> of_pixels = floats(read_pixel_sums, pixel_sum_bytes);
   const std::vector<float> of_links = floats(read_link_sums, link_sum_bytes);
   const auto sum = [](const std::vector<float>& all, std::size_t at, std::size_t slices, std::size_t rows) {
@@ -102,14 +105,18 @@ std::vector<ColorSums> Engine::State::colors(const Scene& scene, std::span<const
   for (std::size_t v = 0; v < chunk.size(); ++v) {
     const SceneView& view = scene.views[chunk[v]];
     ColorSums sums;
+
+    // central moments of the colors, by the sums of color_pixels.comp (shared/color.h)
     const math::VectorX p = sum(of_pixels, v, color_push.pixel_slices, shared::kColorPixelRows);
     sums.pixels = static_cast<int>(p[5]);
     if (sums.pixels > 0) {
-      const math::Vector3 drawn = p.segment<3>(8), seen = p.segment<3>(12);
-      sums.covariance = p[6] - drawn.dot(seen) / sums.pixels;
+      const math::Vector3 drawn = p.segment<3>(8), observed = p.segment<3>(12);
+      sums.covariance = p[6] - drawn.dot(observed) / sums.pixels;
       sums.drawn_variance = p[7] - drawn.squaredNorm() / sums.pixels;
-      sums.seen_variance = p[11] - seen.squaredNorm() / sums.pixels;
+      sums.seen_variance = p[11] - observed.squaredNorm() / sums.pixels;
     }
+
+    // normal equations of each link, by the sums of color_equations.comp
     const math::Matrix3 world_from_camera = view.camera_from_world.rotation.transpose();
     for (int j = 0; j < scene.links; ++j) {
       const std::size_t at = v * scene.links + j;
@@ -129,7 +136,7 @@ std::vector<ColorSums> Engine::State::colors(const Scene& scene, std::span<const
       right << s.segment<6>(shared::kColorRight), e[3], e[4];
       sums.weight += e[2];
       sums.square += e[5];
-      // about the world origin: moment + start x force
+      // to the world frame and origin: moment + start x force
       const math::Vector3 start = view.motions[j] * math::Vector3(chain.link_start(j) * chain.direction);
       ColorSums::Matrix8 world = ColorSums::Matrix8::Identity();
       world.block<3, 3>(0, 0) = world.block<3, 3>(3, 3) = world_from_camera;

@@ -1,4 +1,4 @@
-// scene.cpp - Gaussians and views on their way to the device: which tiles are drawn, and which views go together.
+// scene.cpp - loads Gaussians and views: decides which tiles are active and which views go into one submission.
 #include <algorithm>
 
 #include "src/splat/engine.h"
@@ -7,17 +7,18 @@ namespace chainsplat::splat {
 
 namespace {
 
-constexpr int kActiveMargin = 16;            // px around the mask that training draws and charges
-constexpr int kDssimMargin = 10;             // px around the mask that get the D-SSIM term: SSIM's reach twice
-constexpr std::uint32_t kMostTiles = 60000;  // of one submission: below every device's group count limit (65535)
+constexpr int kActiveMargin = 16;            // px around the mask within which training has active tiles
+constexpr int kDssimMargin = 10;             // px around the mask with a D-SSIM term: twice the window's reach of 5 px
+constexpr std::uint32_t kMostTiles = 60000;  // per submission; below every device's limit of work groups (65535)
 
-// For every grid cell whether a mask pixel is within each of two margins (px) of it; `inner` <= `outer`.
+// Per grid cell, whether it has a mask pixel within each of two margins (px); `inner` <= `outer`.
 struct Nearness {
   std::vector<bool> inner, outer;
 };
 
 Nearness near_mask(const SceneView& view, const std::vector<std::uint8_t>& rgba, int tile_width, int tile_height,
                    int inner, int outer) {
+  // a summed-area table of the mask
   std::vector<std::uint32_t> sum(static_cast<std::size_t>(view.width + 1) * (view.height + 1), 0);
   const auto at = [&](int x, int y) -> std::uint32_t& {
     return sum[static_cast<std::size_t>(y) * (view.width + 1) + x];
@@ -44,7 +45,7 @@ Nearness near_mask(const SceneView& view, const std::vector<std::uint8_t>& rgba,
   return out;
 }
 
-// For every grid cell whether it has a mask pixel.
+// Per grid cell, whether it has a mask pixel.
 std::vector<bool> in_mask(const SceneView& view, const std::vector<std::uint8_t>& rgba, int tile_width,
                           int tile_height) {
   std::vector<bool> out(static_cast<std::size_t>(view.tiles_x) * view.tiles_y, false);
@@ -106,6 +107,8 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
   for (std::size_t v = 0; v < specs.size(); ++v) {
     const ViewSpec& spec = specs[v];
     SceneView view;
+
+    // camera of the crop, grid of tiles, target
     view.fx = spec.camera->fx;
     view.fy = spec.camera->fy;
     view.cx = spec.camera->cx - spec.x0;
@@ -126,6 +129,8 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
       if (active != Active::in_mask)
         for (std::size_t k = 3; k < target.size(); k += 4) object_pixels += target[k] >= 128 ? 1.0 : 0.0;
     }
+
+    // active tiles, those with a D-SSIM term first
     const auto cells = static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
     Nearness near{std::vector<bool>(cells, true), std::vector<bool>(cells, true)};
     if (active == Active::in_mask) {
@@ -152,7 +157,7 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
 
 std::vector<std::vector<int>> Engine::State::chunks(const Scene& scene, std::span<const int> batch, bool dssim) const {
   const std::size_t most_pixels = range_limit / sizeof(glm::vec4);
-  // the row sums of D-SSIM are the largest of what lies tile by tile
+  // the row sums of D-SSIM are the largest of the buffers that are laid out tile by tile
   const std::size_t most_tiles =
       dssim ? std::min<std::size_t>(kMostTiles, range_limit / (12 * sizeof(float) * tile_width * tile_height))
             : kMostTiles;

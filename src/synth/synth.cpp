@@ -12,10 +12,10 @@ using Json = nlohmann::ordered_json;
 
 namespace {
 
-constexpr double kDepthScale = 1e-4;  // m a unit: 16 bits reach 6.5 m
-constexpr int kTruePoints = 49;       // of a centerline
-constexpr double kEvenTimes = 1e-9;   // s, around start + k / rate
-constexpr double kUsualRate = 30.0;   // frames a second, where a single frame has none
+constexpr double kDepthScale = 1e-4;  // m per unit: 16 bits reach 6.5 m
+constexpr int kTruePoints = 49;       // per centerline
+constexpr double kEvenTimes = 1e-9;   // s; largest difference from start + k / rate of evenly spaced times
+constexpr double kUsualRate = 30.0;   // frames per second, for a camera with a single frame
 
 Json list(const math::Vector3& v) { return {v.x(), v.y(), v.z()}; }
 
@@ -51,6 +51,8 @@ Json camera_json(const capture::Camera& camera, const std::vector<double>& times
     out["depth"] = "depth/" + name + "/%06d.png";
     out["depth_scale"] = kDepthScale;
   }
+
+  // frame times by rate and start if they are even, else in a file
   const double rate =
       times.size() > 1 ? static_cast<double>(times.size() - 1) / (times.back() - times.front()) : kUsualRate;
   const double nominal = std::round(rate * 1000.0) / 1000.0;  // 30, not 29.999999999999996
@@ -83,9 +85,9 @@ Json scene_json(const twin::Twin& twin, const capture::Capture& scene, const Opt
     out["object"]["mass"] = dynamics::total_mass(*twin.parameters);
   }
   if (twin.tabletop) {
-    const capture::Table given = scene.table.value_or(capture::Table{});
-    out["table"] = {{"point", list(twin.table_point.value_or(given.point))},
-                    {"normal", list(twin.table_normal.value_or(given.normal))}};
+    const capture::Table table = scene.table.value_or(capture::Table{});
+    out["table"] = {{"point", list(twin.table_point.value_or(table.point))},
+                    {"normal", list(twin.table_normal.value_or(table.normal))}};
   }
   out["base"] = "base.tum";
   return out;
@@ -112,6 +114,7 @@ std::string true_centerline(const chain::Chain& chain, const chain::States& stat
 
 void write(splat::Engine& engine, const twin::Twin& twin, const chain::States& states, const capture::Capture& scene,
            const Path& folder, const Options& options) {
+  // frame times that the states cover, per camera
   std::vector<std::vector<double>> times(scene.cameras.size());
   std::size_t total = 0;
   for (std::size_t c = 0; c < scene.cameras.size(); ++c) {
@@ -124,13 +127,14 @@ void write(splat::Engine& engine, const twin::Twin& twin, const chain::States& s
     total += times[c].size();
   }
 
+  // images, masks and depth of each camera
   make_folder(folder);
   Json json = scene_json(twin, scene, options);
   json["cameras"] = Json::array();
   std::size_t done = 0;
   for (std::size_t c = 0; c < scene.cameras.size(); ++c) {
     const capture::Camera& camera = scene.cameras[c];
-    const std::string& name = camera.name;  // a capture's camera names can name files
+    const std::string& name = camera.name;  // loading has checked that it can be a file name
     make_folder(folder / "masks" / name);
     if (options.depth) make_folder(folder / "depth" / name);
     if (!options.video) make_folder(folder / name);
@@ -164,7 +168,7 @@ void write(splat::Engine& engine, const twin::Twin& twin, const chain::States& s
     }
   }
 
-  // the base as the frames were drawn with: smoothed, at the times of its samples
+  // the base trajectory that the frames were drawn with (smoothed, at its sample times), the truth, and capture.json
   std::vector<trajectory::Sample> samples = scene.base.samples();
   for (trajectory::Sample& sample : samples) sample.pose = scene.base.pose(sample.time);
   core::write_file(folder / "base.tum", trajectory::write_tum(samples));

@@ -11,25 +11,25 @@ namespace chainsplat::trajectory {
 namespace {
 
 constexpr int kDegree = 5;
-constexpr int kOrder = kDegree + 1;   // basis functions that live on one interval
+constexpr int kOrder = kDegree + 1;   // basis functions that are non-zero on one interval
 constexpr int kPenalized = 3;         // order of the penalized derivative
-constexpr double kKnotSpacing = 0.5;  // of the median sample interval: closer samples share a knot (conditioning)
-// Smoothing strengths tried, in units of (median interval)^5: the least passes everything below the Nyquist frequency,
-// the greatest leaves a parabola of some thousand samples (amplitude response 1 / (1 + lambda omega^6), omega in
-// radians a sample).
-constexpr double kLeastExponent = -4.0, kGreatestExponent = 12.0, kExponentStep = 0.25;  // powers of ten
-// Points and weights of Gauss-Legendre quadrature on [-1, 1]; three are exact for the squared quadratics f'''.
+constexpr double kKnotSpacing = 0.5;  // of the median sample interval; closer samples share a knot, for conditioning
+// Smoothing strengths tried, as powers of ten in units of (median interval)^5. The amplitude response is
+// 1 / (1 + lambda omega^6) with omega in radians per sample: the least passes everything below the Nyquist frequency,
+// the greatest leaves a parabola of some thousand samples.
+constexpr double kLeastExponent = -4.0, kGreatestExponent = 12.0, kExponentStep = 0.25;
+// Points and weights of Gauss-Legendre quadrature on [-1, 1]; three points are exact for |f'''|^2, of degree four.
 constexpr double kGaussPoint[3] = {-0.774596669241483377, 0.0, 0.774596669241483377};
 constexpr double kGaussWeight[3] = {5.0 / 9, 8.0 / 9, 5.0 / 9};
 
-// Index i of the interval [knot_i, knot_i+1) that holds `time`; the end intervals hold everything outside.
+// Returns the index i of the interval [knot_i, knot_i+1) that holds `time`; the end intervals hold everything outside.
 int find_interval(const std::vector<double>& knots, double time) {
   const auto first = knots.begin() + kOrder, last = knots.end() - kOrder;
   return static_cast<int>(std::upper_bound(first, last, time) - knots.begin()) - 1;
 }
 
-// Values (row vectors) of a spline of degree `degree` at `time` from the degree + 1 control rows of its interval: de
-// Boor. `knots` points at the interval's left knot.
+// De Boor's algorithm: the value (a row vector) of a spline of degree `degree` at `time` from the degree + 1 control
+// rows of its interval. `knots` points at the interval's left knot.
 template <class Rows>
 Eigen::RowVectorXd de_boor(Rows rows, int degree, const double* knots, double time) {
   for (int level = 1; level <= degree; ++level)
@@ -41,7 +41,7 @@ Eigen::RowVectorXd de_boor(Rows rows, int degree, const double* knots, double ti
   return rows.row(degree);
 }
 
-// Control rows of the derivative (one row fewer) of a spline of degree `degree`.
+// Returns the control rows of the derivative of a spline of degree `degree`; the rows from `degree` on are unused.
 template <class Rows>
 Rows differentiated(const Rows& rows, int degree, const double* knots) {
   Rows out = rows;
@@ -50,7 +50,7 @@ Rows differentiated(const Rows& rows, int degree, const double* knots) {
   return out;
 }
 
-// The six basis functions of the interval or their derivative of the given order.
+// Returns the six basis functions of the interval at `time`, or their derivative of the given order.
 Eigen::Matrix<double, 1, kOrder> basis(const std::vector<double>& knots, int interval, double time, int derivative) {
   Eigen::Matrix<double, kOrder, kOrder> rows = Eigen::Matrix<double, kOrder, kOrder>::Identity();
   const double* const left = knots.data() + interval;
@@ -62,12 +62,13 @@ Eigen::Matrix<double, 1, kOrder> basis(const std::vector<double>& knots, int int
 // Symmetric band matrix: column k of row i holds element (i, i + k).
 using Band = Eigen::Matrix<double, Eigen::Dynamic, kOrder, Eigen::RowMajor>;
 
+// Adds weight * row^T row to the block that begins at element (first, first).
 void add_outer(Band& band, int first, const Eigen::Matrix<double, 1, kOrder>& row, double weight) {
   for (int i = 0; i < kOrder; ++i)
     for (int j = i; j < kOrder; ++j) band(first + i, j - i) += weight * row[i] * row[j];
 }
 
-// L D L^T in place: column 0 holds D, column k of row i the element (i + k, i) of L.
+// Factors a band matrix as L D L^T in place: column 0 then holds D, column k of row i the element (i + k, i) of L.
 void factor(Band& a) {
   const int n = static_cast<int>(a.rows());
   for (int i = 0; i < n; ++i) {
@@ -80,6 +81,7 @@ void factor(Band& a) {
   }
 }
 
+// Solves with the factors of factor(), in place.
 void solve(const Band& factored, Points& x) {
   const int n = static_cast<int>(x.rows());
   for (int i = 0; i < n; ++i)
@@ -90,7 +92,7 @@ void solve(const Band& factored, Points& x) {
   }
 }
 
-// trace(A^-1 B) for band matrices, from the band of the inverse alone (Hutchinson & de Hoog 1985).
+// Returns trace(A^-1 B) for band matrices from the band of the inverse alone (Hutchinson & de Hoog 1985).
 double trace_of_inverse_times(const Band& factored, const Band& b) {
   const int n = static_cast<int>(factored.rows());
   Band inverse = Band::Zero(n, kOrder);
@@ -128,13 +130,14 @@ SplineFit fit_spline(const std::vector<double>& times, const Points& values) {
   const int samples = static_cast<int>(times.size());
   CHAINSPLAT_CHECK(samples >= 3 && values.rows() == samples, "samples " + std::to_string(samples));
 
-  // work in units of the median interval, where lambda has no dimension
+  // take the median interval as the unit of time, so that lambda has no dimension
   std::vector<double> intervals(samples - 1);
   for (int k = 0; k + 1 < samples; ++k) intervals[k] = times[k + 1] - times[k];
   std::nth_element(intervals.begin(), intervals.begin() + intervals.size() / 2, intervals.end());
   const double unit = intervals[intervals.size() / 2], origin = times.front();
   const auto scaled = [&](int k) { return (times[k] - origin) / unit; };
 
+  // place knots at the samples, except where they would be too close
   std::vector<double> knots(kOrder, 0.0);
   const double end = scaled(samples - 1);
   for (int k = 1; k + 1 < samples; ++k)
@@ -142,11 +145,12 @@ SplineFit fit_spline(const std::vector<double>& times, const Points& values) {
   knots.insert(knots.end(), kOrder, end);
   const int count = static_cast<int>(knots.size()) - kOrder;
 
+  // accumulate the normal matrix, its right-hand side and the penalty
   Band data = Band::Zero(count, kOrder), penalty = Band::Zero(count, kOrder);
   Points right = Points::Zero(count, 3);
   std::vector<int> first(samples);
   std::vector<Eigen::Matrix<double, 1, kOrder>> rows(samples);
-  const math::Vector3 offset = values.row(0).transpose();  // small numbers keep the digits
+  const math::Vector3 offset = values.row(0).transpose();  // subtracted, because small numbers keep more digits
   for (int k = 0; k < samples; ++k) {
     const int interval = find_interval(knots, scaled(k));
     first[k] = interval - kDegree;
@@ -161,6 +165,7 @@ SplineFit fit_spline(const std::vector<double>& times, const Points& values) {
                 half * kGaussWeight[g]);
   }
 
+  // solve for every smoothing strength and keep the one with the least cross-validation score
   SplineFit best;
   double best_score = std::numeric_limits<double>::infinity();
   for (double exponent = kLeastExponent; exponent <= kGreatestExponent; exponent += kExponentStep) {
@@ -174,7 +179,7 @@ SplineFit fit_spline(const std::vector<double>& times, const Points& values) {
           (rows[k] * coefficients.middleRows<kOrder>(first[k]) - (values.row(k) - offset.transpose())).squaredNorm();
     const double freedom = trace_of_inverse_times(normal, data);
     const double left_over = samples - freedom;
-    // with as many degrees of freedom as samples there is nothing to judge by; the first strength is the fallback
+    // with as many degrees of freedom as samples no residual is left to judge by; the first strength is the fallback
     const double score =
         left_over > 1e-9 * samples ? squares / (left_over * left_over) : std::numeric_limits<double>::infinity();
     if (!(score < best_score) && exponent > kLeastExponent) continue;
@@ -183,6 +188,7 @@ SplineFit fit_spline(const std::vector<double>& times, const Points& values) {
     best.noise = left_over > 1e-9 * samples ? std::sqrt(squares / (3.0 * left_over)) : 0.0;
     best.degrees_of_freedom = freedom;
   }
+  // return to seconds and to the values' own origin
   best.spline.coefficients.rowwise() += offset.transpose();
   for (double& knot : knots) knot = origin + unit * knot;
   best.spline.knots = std::move(knots);

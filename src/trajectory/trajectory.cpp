@@ -13,11 +13,11 @@ using math::Vector3;
 
 namespace {
 
-constexpr double kLongest = 86400.0;  // s; a rope is followed for hours, and what is integrated has a bound of its own
-constexpr double kFarthest = 1e6;     // m, from the origin: digits are left for what moves
+constexpr double kLongest = 86400.0;  // s; a rope may be followed for hours (the integration has a bound of its own)
+constexpr double kFarthest = 1e6;     // m from the origin; the remaining digits still resolve a rope's motion
 constexpr double kSeriesAngle = 0.1;  // rad; below it the series of the right Jacobian are exact to rounding
 
-// R = R_0 exp([r]): body angular velocity w = J_r(r) r' and its derivative, with the right Jacobian of exp,
+// For R = R_0 exp([r]), computes the body angular velocity w = J_r(r) r' and its derivative, with the right Jacobian
 //   J_r = I - b W + c W^2,  W = [r],  b = (1 - cos x)/x^2,  c = (x - sin x)/x^3,  x = |r|,
 //   J_r' = -b' W - b W' + c' W^2 + c (W' W + W W'),  b' = b_1 (r . r'),  c' = c_1 (r . r'),
 //   b_1 = (db/dx)/x = (sin x / x - 2 b)/x^2,  c_1 = (dc/dx)/x = (b - 3 c)/x^2.
@@ -45,10 +45,10 @@ void body_rotation(const Vector3& r, const Vector3& rate, const Vector3& rate_de
   acceleration = jacobian * rate_derivative + jacobian_rate * rate;
 }
 
-// Of the rotation vectors of one rotation, r (1 + 2 pi m / |r|), the one nearest to `previous`.
+// Returns the rotation vector nearest to `previous` among those of the same rotation, r (1 + 2 pi m / |r|).
 Vector3 nearest_turn(const Vector3& r, const Vector3& previous) {
   const double angle = r.norm();
-  // at a whole turn every axis is as good: keep the one that we came along
+  // at a whole turn the axis is arbitrary: keep the previous one
   constexpr double kWholeTurn = 1e-9;  // rad
   if (angle < kWholeTurn && previous.norm() < std::numbers::pi) return r;
   const Vector3 axis = angle < kWholeTurn ? previous.normalized() : Vector3(r / angle);
@@ -60,7 +60,7 @@ Vector3 nearest_turn(const Vector3& r, const Vector3& previous) {
 
 struct Trajectory::Data {
   std::vector<Sample> samples;
-  bool at_rest = true;  // a single sample: no splines
+  bool at_rest = true;  // a single sample, without splines
   Matrix3 reference = Matrix3::Identity();
   Spline position, rotation;
   double slack = 0.0;  // s, half the median sample interval
@@ -68,6 +68,7 @@ struct Trajectory::Data {
 };
 
 Trajectory fit(std::vector<Sample> samples, const std::string& where) {
+  // check what was read
   if (samples.empty()) throw InputError(where, "no pose in it", "give at least one");
   for (std::size_t k = 0; k < samples.size(); ++k) {
     const Sample& sample = samples[k];
@@ -91,19 +92,20 @@ Trajectory fit(std::vector<Sample> samples, const std::string& where) {
                        "write times in seconds, or split the recording");
   }
 
+  // coordinates to fit: positions, and rotation vectors from the first rotation continued beyond half a turn
   auto data = std::make_shared<Trajectory::Data>();
   data->samples = std::move(samples);
-  const std::vector<Sample>& given = data->samples;
-  data->reference = given.front().pose.rotation;
-  const int count = static_cast<int>(given.size());
+  const std::vector<Sample>& poses = data->samples;
+  data->reference = poses.front().pose.rotation;
+  const int count = static_cast<int>(poses.size());
   if (count > 1) {
     data->at_rest = false;
     std::vector<double> times;
     Points positions(count, 3), rotations(count, 3);
     for (int k = 0; k < count; ++k) {
-      times.push_back(given[k].time);
-      positions.row(k) = given[k].pose.translation.transpose();
-      const Vector3 r = math::log_so3(data->reference.transpose() * given[k].pose.rotation);
+      times.push_back(poses[k].time);
+      positions.row(k) = poses[k].pose.translation.transpose();
+      const Vector3 r = math::log_so3(data->reference.transpose() * poses[k].pose.rotation);
       rotations.row(k) = (k == 0 ? r : nearest_turn(r, rotations.row(k - 1).transpose())).transpose();
       if (k > 0 && (rotations.row(k) - rotations.row(k - 1)).norm() > std::numbers::pi)
         throw InputError(where + ": pose " + std::to_string(k + 1),
@@ -111,7 +113,7 @@ Trajectory fit(std::vector<Sample> samples, const std::string& where) {
                          "about a changing axis since the first",
                          "sample it more densely or split the recording");
     }
-    if (count == 2) {  // a straight line: the middle makes the parabola that no penalty reaches unique
+    if (count == 2) {  // the midpoint makes the fit unique: two points do not fix a parabola, which has no penalty
       times.insert(times.begin() + 1, 0.5 * (times[0] + times[1]));
       for (Points* points : {&positions, &rotations}) {
         const Points two = *points;
@@ -119,12 +121,13 @@ Trajectory fit(std::vector<Sample> samples, const std::string& where) {
         *points << two.row(0), 0.5 * (two.row(0) + two.row(1)), two.row(1);
       }
     }
+    // fit, and take half the median interval as the slack at the ends
     SplineFit position = fit_spline(times, positions), rotation = fit_spline(times, rotations);
     data->position = std::move(position.spline);
     data->rotation = std::move(rotation.spline);
     data->noise = position.noise;
     std::vector<double> intervals;
-    for (int k = 1; k < count; ++k) intervals.push_back(given[k].time - given[k - 1].time);
+    for (int k = 1; k < count; ++k) intervals.push_back(poses[k].time - poses[k - 1].time);
     std::nth_element(intervals.begin(), intervals.begin() + intervals.size() / 2, intervals.end());
     data->slack = 0.5 * intervals[intervals.size() / 2];
   }
@@ -142,6 +145,7 @@ BaseMotion Trajectory::at(double time) const {
   const Spline::Value position = data_->position.at(inside), rotation = data_->rotation.at(inside);
   motion.pose = {data_->reference * math::exp_so3(rotation.position), position.position};
   if (inside != time) return motion;
+  // world velocities to the body twist; the derivative of R^T p' is R^T p'' - w x v
   Vector3 w, w_rate;
   body_rotation(rotation.position, rotation.velocity, rotation.acceleration, w, w_rate);
   const Matrix3 to_base = motion.pose.rotation.transpose();

@@ -1,4 +1,4 @@
-// Trajectory files in the format of the TUM RGB-D benchmark: 'timestamp tx ty tz qx qy qz qw' a line.
+// Trajectory files in the format of the TUM RGB-D benchmark: one 'timestamp tx ty tz qx qy qz qw' per line.
 #include <charconv>
 #include <cmath>
 #include <string>
@@ -10,8 +10,8 @@ namespace chainsplat::trajectory {
 namespace {
 
 constexpr int kColumns = 8;
-constexpr std::size_t kMostPoses = 1000000;    // of a file: memory and the fit's time follow the number
-constexpr double kQuaternionTolerance = 1e-2;  // of its length: files with three digits pass, swapped columns rarely do
+constexpr std::size_t kMostPoses = 1000000;    // per file, because memory and the fit's time grow with the number
+constexpr double kQuaternionTolerance = 1e-2;  // of the length: files with three digits pass, swapped columns rarely do
 
 bool separates(char c) { return c == ' ' || c == '\t' || c == ',' || c == '\r'; }
 
@@ -28,6 +28,7 @@ std::vector<Sample> read_tum(const Path& file) {
     ++line_number;
     const std::string where = file.string() + ":" + std::to_string(line_number);
 
+    // read the line's numbers; a '+' before a number is allowed, which from_chars does not know
     double numbers[kColumns];
     int count = 0;
     const char* c = line.data();
@@ -48,7 +49,8 @@ std::vector<Sample> read_tum(const Path& file) {
       ++count;
       c = after;
     }
-    if (count == 0) continue;
+    if (count == 0) continue;  // blank, or a comment
+    // check them and append the pose
     if (count != kColumns)
       throw InputError(where, std::to_string(count) + " numbers instead of 8",
                        "write 'timestamp tx ty tz qx qy qz qw' on every line");

@@ -1,4 +1,4 @@
-// Gaussians in the PLY layout of 3DGS, with the link logits behind.
+// Gaussians in the PLY layout of 3DGS, followed by the link logits.
 #include <algorithm>
 #include <array>
 #include <bit>
@@ -16,9 +16,10 @@ static_assert(std::endian::native == std::endian::little, "PLY files are written
 
 namespace {
 
-constexpr int kMostProperties = 4096;  // a vertex; more is a damaged header
+constexpr int kMostProperties = 4096;  // per vertex; a header with more is damaged
 
-// f_rest_* is channel-major: coefficients 1.. of red, then of green, then of blue.
+// Index into Gaussians::sh. In the file f_rest_* is channel-major: coefficients 1.. of red, then of green, then of
+// blue.
 std::size_t rest_index(const splat::Gaussians& g, int gaussian, int channel, int coefficient) {
   return 3u * (static_cast<std::size_t>(g.sh_coefficients()) * gaussian + coefficient) + channel;
 }
@@ -42,15 +43,15 @@ int scalar_bytes(const std::string& type) {
 }
 
 struct Property {
-  std::size_t offset = 0;  // byte of a vertex
-  int index = 0;           // number of a vertex
+  std::size_t offset = 0;  // in bytes from the start of the vertex (binary)
+  int index = 0;           // among the properties of a vertex (ASCII)
   int bytes = 0;
-  bool real = false;
+  bool real = false;  // float or double
 };
 
 struct Header {
   std::string format;
-  std::size_t count = 0, stride = 0, data = 0;  // vertices; bytes a vertex; where they start
+  std::size_t count = 0, stride = 0, data = 0;  // number of vertices; bytes per vertex; offset of the first one
   std::map<std::string, Property> properties;   // of a vertex
   bool has_float(const std::string& name) const {
     const auto found = properties.find(name);
@@ -58,12 +59,14 @@ struct Header {
   }
 };
 
-// `things` are what the vertices are meant to be, `mend` how the file should be written.
+// `things` names the vertices in messages, `mend` says how the file should be written. Throws InputError.
 Header read_header(const std::string& bytes, const std::string& file, const char* things, const char* mend) {
   const auto fail = [&](const std::string& what) { throw InputError(file, what, mend); };
   Header header;
   std::size_t at = 0;
   bool in_vertex = false, seen_vertex = false;
+
+  // properties of the vertices, line by line
   for (int number = 0;; ++number) {
     const std::size_t end = bytes.find('\n', at);
     if (end == std::string::npos) fail(number == 0 ? "is not a PLY file" : "its header has no end");
@@ -85,7 +88,7 @@ Header read_header(const std::string& bytes, const std::string& file, const char
       long long count = -1;
       words >> name >> count;
       if (seen_vertex) {
-        in_vertex = false;  // what follows the vertices is not read
+        in_vertex = false;  // elements after the vertices are not read
         continue;
       }
       if (name != "vertex" || !words || count < 0) fail("its first element is not a number of vertices");
@@ -102,9 +105,11 @@ Header read_header(const std::string& bytes, const std::string& file, const char
       header.stride += static_cast<std::size_t>(size);
     }
   }
+
+  // the file must be long enough; in ASCII a number has at least a digit and a space, but for the last of the file
   if (header.format.empty() || !seen_vertex) fail("its header names no format or no vertices");
   header.data = at;
-  const bool ascii = header.format == "ascii";  // a digit and a space for every number, and the last line may be open
+  const bool ascii = header.format == "ascii";
   const std::size_t least = ascii ? 2 * header.properties.size() : header.stride;
   if (header.stride == 0 || header.count > (bytes.size() - at + (ascii ? 1 : 0)) / least)
     fail("ends before its " + std::to_string(header.count) + " " + things);
@@ -150,6 +155,7 @@ splat::Gaussians read_ply(const Path& path) {
   if (header.format != "binary_little_endian")
     throw InputError(file, "is in the format '" + header.format.substr(0, 30) + "'", mend);
 
+  // degree and number of links by the properties that are present
   int rest = 0, links = 0;
   while (header.has_float("f_rest_" + std::to_string(rest))) ++rest;
   while (header.has_float("link_" + std::to_string(links))) ++links;
@@ -168,12 +174,13 @@ splat::Gaussians read_ply(const Path& path) {
     offsets.push_back(normal ? 0 : header.properties.at(name).offset);
   }
 
+  // values, in the order of property_names()
   splat::Gaussians g;
   g.resize(static_cast<int>(header.count), links, degree);
   for (int i = 0; i < g.count; ++i) {
     const char* const vertex = bytes.data() + header.data + header.stride * i;
     std::size_t next = 0;
-    const auto take = [&]() {
+    const auto next_value = [&]() {
       float value = 0.0f;
       std::memcpy(&value, vertex + offsets[next], sizeof value);
       if (!std::isfinite(value))
@@ -182,19 +189,19 @@ splat::Gaussians read_ply(const Path& path) {
       ++next;
       return value;
     };
-    for (int c = 0; c < 3; ++c) g.mean[3 * i + c] = take();
+    for (int c = 0; c < 3; ++c) g.mean[3 * i + c] = next_value();
     next += 3;  // normals
-    for (int c = 0; c < 3; ++c) g.sh[rest_index(g, i, c, 0)] = take();
+    for (int c = 0; c < 3; ++c) g.sh[rest_index(g, i, c, 0)] = next_value();
     for (int c = 0; c < 3; ++c)
-      for (int l = 1; l < coefficients; ++l) g.sh[rest_index(g, i, c, l)] = take();
-    g.opacity_logit[i] = take();
-    for (int c = 0; c < 3; ++c) g.log_scale[3 * i + c] = take();
+      for (int l = 1; l < coefficients; ++l) g.sh[rest_index(g, i, c, l)] = next_value();
+    g.opacity_logit[i] = next_value();
+    for (int c = 0; c < 3; ++c) g.log_scale[3 * i + c] = next_value();
     float square = 0.0f;
-    for (int c = 0; c < 4; ++c) square += std::pow(g.rotation[4 * i + c] = take(), 2.0f);
+    for (int c = 0; c < 4; ++c) square += std::pow(g.rotation[4 * i + c] = next_value(), 2.0f);
     if (!(square > 0.0f))
       throw InputError(file, "rot_* of Gaussian " + std::to_string(i) + " has no length",
                        "write a quaternion w, x, y, z");
-    for (int j = 0; j < links; ++j) g.link_logits[static_cast<std::size_t>(links) * i + j] = take();
+    for (int j = 0; j < links; ++j) g.link_logits[static_cast<std::size_t>(links) * i + j] = next_value();
   }
   return g;
 }
@@ -207,6 +214,7 @@ math::MatrixX read_points(const Path& path) {
   const bool ascii = header.format == "ascii", big = header.format == "binary_big_endian";
   if (!ascii && !big && header.format != "binary_little_endian")
     throw InputError(file, "is in the format '" + header.format.substr(0, 30) + "'", mend);
+
   std::array<Property, 3> axes;
   for (int d = 0; d < 3; ++d) {
     const std::string name(1, "xyz"[d]);
@@ -216,6 +224,7 @@ math::MatrixX read_points(const Path& path) {
     axes[d] = found->second;
   }
 
+  // points; clouds of depth cameras have holes, which are not finite
   math::MatrixX points(3, static_cast<Eigen::Index>(header.count));
   Eigen::Index kept = 0;
   std::istringstream words(ascii ? bytes.substr(header.data) : std::string());
@@ -226,7 +235,7 @@ math::MatrixX read_points(const Path& path) {
     if (ascii) {
       for (double& number : numbers) {
         words >> word;
-        // not by the stream, which reads no nan
+        // from_chars, because a stream does not read "nan"
         if (!words || std::from_chars(word.data(), word.data() + word.size(), number).ec != std::errc())
           throw InputError(file, "point " + std::to_string(k) + " is not written in full", mend);
       }
@@ -243,7 +252,7 @@ math::MatrixX read_points(const Path& path) {
         if (axes[d].bytes == sizeof single) point[d] = static_cast<double>(single);
       }
     }
-    if (point.allFinite()) points.col(kept++) = point;  // a depth camera's clouds have holes
+    if (point.allFinite()) points.col(kept++) = point;
   }
   return points.leftCols(kept);
 }

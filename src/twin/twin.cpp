@@ -1,4 +1,4 @@
-// twin.json in and out; the run folder as a whole. The keys are documented in twin.h.
+// Reads and writes twin.json and the run folder as a whole. The keys are documented in twin.h.
 #include <algorithm>
 #include <array>
 #include <charconv>
@@ -18,15 +18,15 @@ namespace {
 
 constexpr const char* kFormat = "chainsplat-twin/1";
 constexpr const char *kGaussians = "gaussians.ply", *kStates = "states.csv", *kRollout = "rollout.csv";
-constexpr double kLengthTolerance = 1e-6;  // m, and of unit vectors' lengths: files edited by hand pass
+constexpr double kLengthTolerance = 1e-6;  // m, and for lengths of unit vectors; accepts files edited by hand
 
 const std::pair<dynamics::Integrator, const char*> kIntegrators[] = {
     {dynamics::Integrator::rodas3, "rodas3"},
     {dynamics::Integrator::implicit_velocity_euler, "implicit_velocity_euler"},
 };
 
-// The double at or next to `guess` for which `holds` is true, else `guess`: undoes the rounding of a number that was
-// stored as a difference or a quotient.
+// The double nearest to `guess`, within a few units in the last place, for which `holds` is true, else `guess`. This
+// undoes the rounding of a number that was stored as a difference or a quotient.
 template <class Predicate>
 double exact_near(double guess, Predicate holds) {
   constexpr int kReach = 4;  // units in the last place
@@ -41,7 +41,7 @@ double exact_near(double guess, Predicate holds) {
   return guess;
 }
 
-// The 6 numbers of a cylinder's inertia about its center of mass (SPEC 3.1): xx yy zz xy xz yz.
+// Inertia of a cylinder along d about its center of mass (mathematics.md 3.1): xx yy zz xy xz yz.
 std::array<double, 6> cylinder_inertia(double mass, double length, double radius, const Vector3& d) {
   const double across = mass * (length * length / 12.0 + 0.25 * radius * radius), along = 0.5 * mass * radius * radius;
   const math::Matrix3 i = across * (math::Matrix3::Identity() - d * d.transpose()) + along * d * d.transpose();
@@ -53,16 +53,16 @@ std::array<double, 6> cylinder_inertia(double mass, double length, double radius
 template <class Vector>
 Json list(const Vector& values) {
   Json out = Json::array();
-  for (const double value : values) out.push_back(value);  // what is not finite is written as null
+  for (const double value : values) out.push_back(value);  // nlohmann::json writes non-finite numbers as null
   return out;
 }
 
 Json list(const math::VectorX& values) { return list(std::vector<double>(values.begin(), values.end())); }
 
-// Bytes of file names that are not UTF-8 are replaced: JSON has no place for them.
+// JSON text of a value. Bytes of file names that are not UTF-8 are replaced, because JSON cannot represent them.
 std::string text_of(const Json& value) { return value.dump(-1, ' ', false, Json::error_handler_t::replace); }
 
-// Objects and lists of objects or lists over several lines, lists of numbers on one.
+// Prints objects, and lists of objects or of lists, over several lines, but a list of numbers on one line.
 void print(const Json& value, const std::string& indent, std::string& out) {
   const bool object = value.is_object();
   if (!object && !(value.is_array() && !value.empty() && value[0].is_structured())) {
@@ -81,7 +81,8 @@ void print(const Json& value, const std::string& indent, std::string& out) {
   out += object ? "}" : "]";
 }
 
-// Of the whole rope, N s/m^2 or N s^2/m^3. Exact where every link's value is one number times its length.
+// Drag of the whole rope, in N s/m^2 or N s^2/m^3. Reads back exactly if every link's value is one number times its
+// length.
 double drag_per_meter(const chain::Chain& chain, const std::vector<double>& by_link) {
   double sum = 0.0, length = 0.0;
   const auto link_length = [&](std::size_t j) {
@@ -109,6 +110,7 @@ Json chain_json(const Twin& twin) {
   if (twin.tabletop)
     out["table"] = {{"point", list(twin.table_point.value_or(Vector3::Zero()))},
                     {"normal", list(normal.value_or(Vector3::UnitZ()))}};
+
   out["joints"] = Json::array();
   for (int k = 0; k < chain.angles(); ++k) {
     Json joint{
@@ -121,6 +123,7 @@ Json chain_json(const Twin& twin) {
     }
     out["joints"].push_back(std::move(joint));
   }
+
   out["links"] = Json::array();
   for (int j = 0; j < chain.links(); ++j) {
     const double length = chain.link_end(j) - chain.link_start(j);
@@ -136,6 +139,7 @@ Json chain_json(const Twin& twin) {
     }
     out["links"].push_back(std::move(link));
   }
+
   if (p) {
     out["air_drag"] = {{"linear", drag_per_meter(chain, p->air_linear)},
                        {"quadratic", drag_per_meter(chain, p->air_quadratic)}};
@@ -173,7 +177,7 @@ Json identification_json(const Twin& twin) {
 
 // --- reading --------------------------------------------------------------------------------
 
-// A value of the file and where it is; every access checks and throws InputError.
+// A JSON value and its place in the file. Every access checks the value and throws InputError that names the place.
 class Node {
  public:
   Node(const Json& value, std::string file, std::string key)
@@ -230,7 +234,7 @@ class Node {
     if (!value_.is_string()) fail("is not a text", "write it in quotes");
     return value_.get<std::string>();
   }
-  // `count` < 0: any. `unknown`: null is NaN.
+  // `count` < 0 accepts any number of entries; `unknown` reads null as NaN.
   std::vector<double> numbers(int count, bool unknown = false) const {
     std::vector<double> out;
     for (const Node& entry : entries()) out.push_back(unknown ? entry.number_or_nan() : entry.number());
@@ -259,6 +263,7 @@ class Node {
   std::string file_, key_;
 };
 
+// Screw axis of a rotation about the unit vector w through a point.
 Vector6 space_axis(const Vector3& w, const Vector3& point) {
   Vector6 axis;
   axis << w, -w.cross(point);
@@ -273,6 +278,7 @@ chain::Chain read_chain(const Node& node, const Node& grasp) {
   chain.bending_axis = grasp["bending_axis"].unit();
   if (std::abs(chain.direction.dot(chain.bending_axis)) > kLengthTolerance)
     grasp["bending_axis"].fail("is not perpendicular to direction", "choose an axis across the rope");
+
   for (const Node& joint : node["joints"].entries()) {
     chain.axes.push_back(joint["axis"].vector(6));
     const int previous = chain.child_link.empty() ? 0 : chain.child_link.back();
@@ -285,13 +291,15 @@ chain::Chain read_chain(const Node& node, const Node& grasp) {
     node["links"].fail("has " + std::to_string(links.size()) + " entries, the joints name " +
                            std::to_string(chain.child_link.back() + 1),
                        "list the base link and every moving link");
+
+  // arclengths of the joints by the links' lengths, checked against the axes
   double end = 0.0;
   int k = 0;
   for (std::size_t j = 0; j + 1 < links.size(); ++j) {
     const double length = j == 0 ? links[j]["length"].not_negative() : links[j]["length"].positive();
     const int first = k;
     while (k < chain.angles() && chain.child_link[k] == static_cast<int>(j) + 1) ++k;
-    // the arclength that gives the axes bit by bit: a sum of differences may be off by rounding
+    // the arclength that reproduces the axes bit by bit, from which the sum of the lengths may differ by rounding
     const double start = end;
     end = exact_near(start + length, [&](double s) {
       for (int a = first; a < k; ++a)
@@ -313,23 +321,23 @@ chain::Chain read_chain(const Node& node, const Node& grasp) {
   return chain;
 }
 
-// The radius that the links' inertia was made with. Only uniform cylinders are known to the dynamics.
+// The radius from which the links' inertia was computed. The dynamics knows uniform cylinders only.
 double cylinder_radius(const chain::Chain& chain, const std::vector<double>& masses, const std::vector<Node>& links) {
   const auto fits = [&](double radius, double tolerance) {
     for (int j = 1; j < chain.links(); ++j) {
-      const std::vector<double> given = links[j]["inertia"].numbers(6);
+      const std::vector<double> stored = links[j]["inertia"].numbers(6);
       const std::array<double, 6> ours =
           cylinder_inertia(masses[j - 1], chain.link_end(j) - chain.link_start(j), radius, chain.direction);
       const double size = std::max({ours[0], ours[1], ours[2]});
       for (int i = 0; i < 6; ++i)
-        if (!(std::abs(given[i] - ours[i]) <= tolerance * size)) return false;
+        if (!(std::abs(stored[i] - ours[i]) <= tolerance * size)) return false;
     }
     return true;
   };
-  constexpr double kRounding = 1e-12, kByHand = 1e-3;  // relative
+  constexpr double kRounding = 1e-12, kByHand = 1e-3;  // relative tolerances: as written by save(), or edited by hand
   for (const double radius : {0.5 * chain.diameter, 0.0})
     if (fits(radius, kRounding)) return radius;
-  // about the rope's own axis: m r^2 / 2
+  // neither half the diameter nor 0: solve for it by the inertia about the rope's own axis, m r^2 / 2
   const std::vector<double> i = links[1]["inertia"].numbers(6);
   const Vector3& d = chain.direction;
   const double along = d[0] * d[0] * i[0] + d[1] * d[1] * i[1] + d[2] * d[2] * i[2] +
@@ -346,6 +354,7 @@ dynamics::Parameters read_parameters(const Node& node, const Twin& twin) {
   p.gravity = twin.gravity;
   if (twin.tabletop) p.table_normal = twin.table_normal;
   const std::vector<Node> links = node["links"].entries();
+
   for (const Node& joint : node["joints"].entries()) {
     p.stiffness.push_back(joint["stiffness"].not_negative());
     p.rest_angle.push_back(joint["rest_angle"].number());
@@ -356,6 +365,7 @@ dynamics::Parameters read_parameters(const Node& node, const Twin& twin) {
     node["joints"].fail(
         "has roll_lever for " + std::to_string(p.roll_lever.size()) + " joints of " + std::to_string(p.damping.size()),
         "give it for all or none");
+
   const double linear = node["air_drag"]["linear"].not_negative(),
                quadratic = node["air_drag"]["quadratic"].not_negative();
   for (int j = 1; j < twin.chain.links(); ++j) {
@@ -370,6 +380,7 @@ dynamics::Parameters read_parameters(const Node& node, const Twin& twin) {
       links[j]["center_of_mass"].fail("is not the middle of the link",
                                       "only uniform links are known; use tip_mass for the rest");
   }
+
   p.radius = cylinder_radius(twin.chain, p.link_mass, links);
   p.tip_mass = node["tip_mass"].not_negative();
   p.coulomb_speed = node["regularization"]["coulomb_speed"].positive();
@@ -407,7 +418,7 @@ dynamics::Estimates read_estimates(const Node& node) {
   if (!math::is_covariance(e.covariance(known, known)))
     node["covariance"].fail("is not symmetric and positive semidefinite", "restore it or identify again");
   for (const Node& held : node["held"].entries()) e.held.emplace_back(held["name"].text(), held["reason"].text());
-  if (node.has("weak"))  // absent in files of older versions
+  if (node.has("weak"))  // files of older versions have no such key
     for (const Node& weak : node["weak"].entries()) {
       e.weak.push_back({weak["singular_value"].number(), {}});
       for (const auto& [name, component] : weak["direction"].members())
@@ -416,7 +427,7 @@ dynamics::Estimates read_estimates(const Node& node) {
   return e;
 }
 
-// Options are texts; those that later work reads as numbers or as a choice are refused here where they are neither.
+// Options are stored as texts. Those that later commands parse as numbers or as a choice are checked here.
 void check_option(const std::string& name, const Node& node) {
   const std::string text = node.text();
   const auto refuse = [&](const std::string& what) {
@@ -454,7 +465,7 @@ Provenance read_provenance(const Node& node) {
   return p;
 }
 
-// The file that twin.json names by `key`; empty: it names none.
+// The file that twin.json names under `key`; empty if it names none.
 Path named_file(const Node& top, const char* key, const Path& run) {
   if (!top.has(key)) return {};
   const std::string name = top[key].text();
@@ -508,6 +519,7 @@ Twin load(const Path& run) {
   if (top["format"].text() != kFormat)
     top["format"].fail("is not '" + std::string(kFormat) + "'", "use the program that wrote it");
 
+  // scene and chain
   Twin twin;
   const Node node = top["chain"];
   const std::string scenario = node["scenario"].text();
@@ -519,6 +531,8 @@ Twin load(const Path& run) {
     twin.table_normal = node["table"]["normal"].unit();
   }
   twin.chain = read_chain(node, top["grasp"]);
+
+  // identification, initial state and provenance
   const Node identification = top["identification"];
   twin.known_mass = identification["known_mass"].boolean();
   if (node["links"].entries().back().has("mass")) {
@@ -532,6 +546,8 @@ Twin load(const Path& run) {
                                           initial["thetadot"].vector(angles)};
   }
   twin.provenance = read_provenance(top["provenance"]);
+
+  // the other files of the run folder
   if (const Path ply = named_file(top, "gaussians", run); !ply.empty()) {
     twin.gaussians = read_ply(ply);
     if (twin.gaussians.links != twin.chain.links())

@@ -1,8 +1,8 @@
-// The kernels that work in subgroups, on the host (lanes.h, kernels.h): sorting, blending and its backward pass, laid out
-// as the engine does for devices whose subgroups have 4 to 64 lanes, and run with subgroups of that width and wider ones,
-// against std::sort and the reference renderer.
+// Runs the kernels that use subgroups on the host (lanes.h, kernels.h): sorting, blending and its backward pass, and
+// the sums over colors. They are laid out as the engine does for devices whose subgroups have 4 to 64 lanes, run with
+// subgroups of that width and of larger ones, and compared with std::sort and the reference renderer.
 #include "kernels.h"
-// after kernels.h, which sets GLM up
+// after kernels.h, which configures GLM
 #include <doctest/doctest.h>
 
 #include <algorithm>
@@ -27,12 +27,12 @@ using std::uint32_t;
 
 namespace {
 
-constexpr uint32_t kWidths[] = {4, 8, 16, 32, 64};  // lanes of a subgroup: SwiftShader, lavapipe, Intel, NVIDIA, AMD
+constexpr uint32_t kWidths[] = {4, 8, 16, 32, 64};  // lanes per subgroup: SwiftShader, lavapipe, Intel, NVIDIA, AMD
 
-// Float rounding against a double, as in splat_test.cpp.
+// Tolerances for float rounding, as in splat_test.cpp.
 constexpr double kImageTolerance = 2e-5, kGradientTolerance = 1e-3;
 
-// Ways in which subgroups of `width` lanes can lie in a group, and run.
+// The ways in which subgroups of `width` lanes can be laid out in a work group and run.
 std::vector<Layout> layouts(uint32_t width) { return {{width, false, false}, {width, true, true}}; }
 
 uint32_t bits(float x) {
@@ -50,10 +50,10 @@ Bindings with(const Push& push) {
 
 // --- lists ----------------------------------------------------------------------------------------------------------
 
-struct Lists {  // as splat_bin leaves them
+struct Lists {  // the output of splat_bin.comp
   std::vector<uint32_t> prefix, block, count;
-  std::vector<uvec4> entries;  // depth's bits, replica, splat, instance
-  std::vector<uvec2> sorted;   // what the kernels made of them
+  std::vector<uvec4> entries;  // depth bits, replica, splat, instance
+  std::vector<uvec2> sorted;   // the output of the sorting kernels
 };
 
 std::vector<uvec2> sorted_by_standard(const Lists& lists, std::size_t tile) {
@@ -92,10 +92,10 @@ void sort(const Layout& layout, Lists& lists, uint32_t stride) {
     emulation::dispatch<kernels::SplatSortLong<kLaidOut.sort_lanes>>(layout, bound, counters[shared::kCounterLongTiles]);
 }
 
-// Lists of these lengths, their entries in any order, with runs of equal depths, short ones and some longer than any lane's.
+// Lists of these lengths with shuffled entries and runs of equal depths, short ones and some longer than a lane's part.
 Lists random_lists(const std::vector<uint32_t>& lengths, uint32_t seed) {
   std::mt19937 random(seed);
-  constexpr uint32_t kBefore = 3;  // what blocks of tiles before this one would hold
+  constexpr uint32_t kBefore = 3;  // entries of the blocks of tiles before this one
   Lists lists;
   lists.block = {kBefore};
   lists.entries.resize(kBefore);
@@ -110,7 +110,7 @@ Lists random_lists(const std::vector<uint32_t>& lengths, uint32_t seed) {
       list.emplace_back(bits(depth), k, 1000 + k, 5000 + k);
     }
     std::shuffle(list.begin(), list.end(), random);
-    for (uint32_t k = 0; k < length; ++k) list[k].y = (k * 7919u) % 32771u;  // replicas in another order than depths
+    for (uint32_t k = 0; k < length; ++k) list[k].y = (k * 7919u) % 32771u;  // orders replicas unlike depths
     lists.entries.insert(lists.entries.end(), list.begin(), list.end());
   }
   return lists;
@@ -119,7 +119,7 @@ Lists random_lists(const std::vector<uint32_t>& lengths, uint32_t seed) {
 template <bool kSoftware, uint32_t kAsked>
 void check_sort() {
   constexpr TileLanes kLaidOut = splat::tile_lanes(8, kSoftware ? 8 : 2, kAsked, kSoftware);
-  // around the lanes of a group, and around the limits of sorting by rank: that takes long, so the latter once
+  // lengths around the lanes of a work group and around the limits of sorting by rank; the latter take long
   const Lists few = random_lists({0, 1, 2, 7, 8, 31, 33, 64, 100}, kAsked);
   const Lists many = random_lists({191, 192, 193, 512, 513, 700}, kAsked);
   for (const uint32_t width : kWidths) {
@@ -151,7 +151,7 @@ struct View {
   std::vector<double> target;     // rgba
 };
 
-// A view with splats from faint to opaque, few of them small, and a target.
+// A view with splats from faint to opaque, few of which are small, and a target.
 View random_view(int width, int height, int count, uint32_t seed) {
   std::mt19937 generator(seed);
   const auto uniform = [&](double from, double to) {
@@ -184,9 +184,9 @@ std::vector<Reference> in_order(std::vector<Reference> splats) {
   return splats;
 }
 
-// Views whose pixels are all away from the rules' thresholds (reference::Doubt), where float and double may part.
+// Views whose pixels are all away from the rules' thresholds, where float and double may differ (reference::Doubt).
 std::vector<View> clear_views(int count) {
-  constexpr int kSizes[][2] = {{13, 11}, {20, 9}};  // no multiples of a tile
+  constexpr int kSizes[][2] = {{13, 11}, {20, 9}};  // not multiples of a tile
   std::vector<View> views;
   uint32_t seed = 0;
   for (const auto& size : kSizes) {
@@ -203,11 +203,11 @@ std::vector<View> clear_views(int count) {
 constexpr float kL1 = 0.7f, kMask = 0.4f;
 
 struct Wanted {
-  std::vector<reference::Picture> pictures;                // a view
-  std::vector<std::vector<std::array<double, 9>>> partial;  // a view, a splat: as a partial's floats
+  std::vector<reference::Picture> pictures;                // per view
+  std::vector<std::vector<std::array<double, 9>>> partial;  // per view and splat, in the order of a partial's floats
 };
 
-// What the D-SSIM passes could have left at a pixel.
+// Stands for the output of the D-SSIM passes at a pixel.
 vec4 dssim_gradient(std::size_t view, int x, int y) {
   return {0.3f * std::sin(static_cast<float>(x + 2 * y) + view), 0.2f * std::cos(static_cast<float>(3 * x - y)), -0.1f, 0};
 }
@@ -260,7 +260,7 @@ Wanted wanted_of(const std::vector<View>& views, int tile) {
     std::vector<std::array<double, 9>> partial(splats.size());
     for (const auto& s : splats) {
       const auto by = [&](const Variable& x) { return tape.adjoint(x.index); };
-      // of dL/dSigma' without the 1/2; both entries xy and yx make up its derivative by xy
+      // partials hold 2 dL/dSigma'; the tape's derivative by xy already contains both entries xy and yx
       partial[s.replica] = {by(s.center[0]),           by(s.center[1]),     by(s.opacity),
                             by(s.color[0]),            2 * by(s.covariance[0]), by(s.covariance[1]),
                             2 * by(s.covariance[2]), by(s.color[1]),      by(s.color[2])};
@@ -271,7 +271,7 @@ Wanted wanted_of(const std::vector<View>& views, int tile) {
   return wanted;
 }
 
-// The device's buffers for some views, every splat in the list of every tile of its view.
+// The device's buffers for some views; every splat is in the list of every tile of its view.
 struct Scene {
   std::vector<SplatTile> tiles;
   std::vector<SplatView> views;
@@ -279,7 +279,7 @@ struct Scene {
   std::vector<uint32_t> targets;
   std::vector<vec4> dssim;
   Lists lists;
-  std::vector<std::size_t> first_pixel, first_splat;  // a view
+  std::vector<std::size_t> first_pixel, first_splat;  // per view
   std::vector<std::size_t> splat_of_instance;
   uint32_t near_tiles = 0, pixels = 0;
 };
@@ -357,7 +357,7 @@ Drawn draw(const Layout& layout, Scene& scene) {
   Drawn out;
   out.image.assign(scene.pixels, vec4(-1));
   out.depth.assign(scene.pixels, -1.0f);
-  // what no lane writes must not look like a sum
+  // fill with a value that cannot pass for a sum that a lane has written
   out.partials.assign(4 * shared::kPartialRows * kLaidOut.slots * scene.splat_of_instance.size(), NAN);
   std::vector<uint32_t> counters(shared::kCounters, 0), used(tiles, 0);
   Bindings bound = with(push);
@@ -382,7 +382,7 @@ Drawn draw(const Layout& layout, Scene& scene) {
   return out;
 }
 
-// As splat_project_backward sums them.
+// Sums the partials as splat_project_backward.comp does.
 std::vector<std::array<double, 9>> summed(const Scene& scene, const Drawn& drawn, uint32_t slots) {
   std::vector<std::array<double, 9>> out(scene.splats.size() / shared::kSplatRows);
   for (std::size_t k = 0; k < scene.splat_of_instance.size() * slots; ++k)
@@ -418,7 +418,7 @@ void check_pictures() {
       CAPTURE(layout.backward);
       const Drawn drawn = draw<kLaidOut, kTile, kPixels, kDepth>(layout, scene);
       if (first.image.empty()) first = drawn;
-      CHECK(drawn.image == first.image);  // a pixel is one lane's, whatever subgroup that is in
+      CHECK(drawn.image == first.image);  // one lane computes a pixel, whatever its subgroup
       double worst = 0.0;
       for (std::size_t v = 0; v < scene.views.size(); ++v) {
         const reference::Picture& picture = wanted.pictures[v];
@@ -449,7 +449,7 @@ void check_pictures() {
 
 // --- sums over colors -----------------------------------------------------------------------------------------------
 
-// A rope of three links across a view, drawn and seen, by whole tiles.
+// A rope of three links across a view of whole tiles, drawn and observed.
 struct Colors {
   static constexpr uint32_t kWidth = 24, kHeight = 16, kTile = 8, kLinks = 3;
   std::vector<SplatTile> tiles;
@@ -528,7 +528,7 @@ void check_close(const std::vector<double>& got, const std::vector<double>& want
     largest = std::max(largest, std::abs(wanted[k]));
     worst = std::max(worst, std::isfinite(got[k]) ? std::abs(got[k] - wanted[k]) : INFINITY);
   }
-  constexpr double kRounding = 1e-6;  // of sums of a few hundred floats
+  constexpr double kRounding = 1e-6;  // for sums of a few hundred floats
   CHECK(worst <= kRounding * largest);
 }
 
@@ -601,7 +601,7 @@ TEST_CASE("blending and its backward pass equal the reference, laid out as on a 
   check_pictures<false, 16, 4, 64>();
 }
 
-// Against each other only: splat_colors_test.cpp holds widths that there are devices of against a host in double.
+// Compares subgroup widths with each other only; splat_colors_test.cpp compares the available device with the host.
 TEST_CASE("sums over colors do not depend on the subgroups") {
   Colors scene;
   const ColorResult narrow = color_sums<splat::tile_lanes(Colors::kTile, 2, 4, false)>({4, false, false}, scene);

@@ -1,9 +1,9 @@
-# glsl_to_cpp.sed - sed -E: what the kernels' GLSL writes otherwise than C++, so that the very files of shaders/ run on the
-# host (lanes.h, kernels.h). Lines stay where they are. A kernel becomes the body of a class template: file scope variables
-# are its members, specialization constants its arguments. By name and binding, not by a parser: a construct that is not
+# glsl_to_cpp.sed - translates the kernels' GLSL to C++ (sed -E), so that the very files of shaders/ run on the host
+# (lanes.h, kernels.h). Line numbers are kept. A kernel becomes the body of a class template: variables of file scope are
+# its members, specialization constants its arguments. These are substitutions, not a parser: a construct that is not
 # listed here does not compile.
 
-# the preprocessor's; shared headers are C++ already
+# preprocessor; shared headers are C++ already
 s/^#(version|extension) .*//
 s/^#include "shared\/.*//
 

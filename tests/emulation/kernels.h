@@ -1,7 +1,8 @@
-// kernels.h - kernels of shaders/, as C++: class templates by their specialization constants (glsl_to_cpp.sed, lanes.h).
+// kernels.h - kernels of shaders/ as C++: class templates over their specialization constants (glsl_to_cpp.sed,
+// lanes.h).
 #pragma once
 #include "lanes.h"
-// after lanes.h, which sets GLM up
+// after lanes.h, which configures GLM
 #include "shaders/shared/color.h"
 #include "shaders/shared/splat.h"
 
@@ -49,7 +50,7 @@ template <class T>
 T subgroupShuffleXor(T x, uint mask, Where where = Where::current()) {
   return subgroupShuffle(x, running->now->place ^ mask, where);
 }
-// Of the lanes that are there: the lane's own bit is among them.
+// Over the lanes that take part in it, the calling one included.
 inline bool subgroupAny(bool x, Where where = Where::current()) {
   Group& group = *running;
   group.now->offered = x ? 1 : 0;

@@ -1,7 +1,7 @@
-// lanes.h - what a kernel sees of a device, on the host: a work group whose lanes are fibers, in subgroups of any width.
-// A lane runs until an operation that others take part in, and goes on when they have come there too. Beyond what a device
-// does it tells when lanes meet at different operations, when one reads from a lane that is not there, when an index is
-// outside its buffer and when a group waits for ever. Lanes run in either order, so that a missing barrier shows.
+// lanes.h - emulates a device for a kernel on the host: a work group whose lanes are fibers, in subgroups of any width.
+// A lane runs until an operation that others take part in, and continues when they have arrived there too. Unlike a
+// device it reports lanes that meet at different operations, reads from a lane that does not take part, indices outside
+// a buffer and groups that wait forever. Lanes can run in either order, so that a missing barrier is noticed.
 #pragma once
 #include <ucontext.h>
 
@@ -28,14 +28,14 @@ namespace chainsplat::emulation {
 using glm::uvec3;
 using uint = std::uint32_t;
 
-// How a device lays a work group out.
+// How a device divides a work group into subgroups.
 struct Layout {
-  uint subgroup = 8;       // lanes of a subgroup
-  bool scattered = false;  // which invocation is which lane of which subgroup is not promised, where subgroups are full
+  uint subgroup = 8;       // lanes per subgroup
+  bool scattered = false;  // assigns invocations to lanes in another order, as devices may where subgroups are full
   bool backward = false;   // the last lane runs first
 };
 
-// What a dispatch binds.
+// Buffers and push constants of a dispatch.
 struct Bindings {
   std::map<uint, std::span<std::byte>> buffers;
   std::span<const std::byte> push;
@@ -46,7 +46,7 @@ struct Bindings {
   }
 };
 
-inline const Bindings* bindings = nullptr;  // of the dispatch that runs
+inline const Bindings* bindings = nullptr;  // of the current dispatch
 
 [[noreturn]] inline void fail(const std::string& what) { throw std::runtime_error(what); }
 
@@ -81,12 +81,12 @@ struct WorkGroupSize {
   uint x, y = 1, z = 1;
 };
 
-// Specialization constant `at`, or its default where fewer are given.
+// Specialization constant `at`, or `otherwise` if there are fewer.
 template <uint at, uint... kConstants>
 constexpr uint specialized(uint otherwise) {
-  constexpr std::array<uint, sizeof...(kConstants)> given{kConstants...};
-  if constexpr (at < given.size()) {
-    return given[at];
+  constexpr std::array<uint, sizeof...(kConstants)> constants{kConstants...};
+  if constexpr (at < constants.size()) {
+    return constants[at];
   } else {
     return otherwise;
   }
@@ -97,20 +97,20 @@ enum class Waits { no, at_subgroup, at_group, at_end };
 struct Lane {
   ucontext_t context{};
   std::vector<std::byte> stack;
-  uvec3 invocation{0};           // in the group
-  uint subgroup = 0, place = 0;  // and in the subgroup
+  uvec3 invocation{0};           // in the work group
+  uint subgroup = 0, place = 0;  // its subgroup, and the lane's number in it
   Waits waits = Waits::no;
   const char* operation = "";  // where it waits
   std::uint_least32_t line = 0;
-  uint offered = 0;  // what the others of the subgroup may read
+  uint offered = 0;  // the value that other lanes of the subgroup may read
 };
 
 struct Group {
   static constexpr std::size_t kStackBytes = 256 * 1024;
 
   std::vector<Lane> lanes;
-  std::vector<uint> offers;         // [subgroup][place]: of the last operation
-  std::vector<std::uint8_t> there;  // likewise: whether the lane took part in it
+  std::vector<uint> offers;         // [subgroup][place]: values offered in the last operation
+  std::vector<std::uint8_t> there;  // [subgroup][place]: whether the lane took part in it
   uint width = 1, subgroups = 0;
   uvec3 group{0}, groups{0};
   ucontext_t scheduler{};
@@ -141,8 +141,8 @@ inline void lane_main() {
   swapcontext(&group.now->context, &group.scheduler);
 }
 
-// True where all lanes of `chosen` (indices) wait at the same operation of the kind: they go on. A subgroup's may have
-// ended before; a barrier is everyone's.
+// Lets the lanes `chosen` (indices) continue if all of them wait at the same operation of the kind `at`; false if not.
+// Lanes that have ended do not take part in a subgroup's operation, but a barrier needs every lane.
 inline bool release(Group& group, std::span<const std::size_t> chosen, Waits at) {
   const Lane* first = nullptr;
   for (const std::size_t k : chosen) {
@@ -180,7 +180,7 @@ inline void run_group(Group& group, const Layout& layout, uint size) {
   for (uint k = 0; k < size; ++k) {
     Lane& lane = group.lanes[k];
     lane.invocation = {k, 0, 0};
-    constexpr uint kOdd = 5;  // coprime to every power of two: another order of all lanes
+    constexpr uint kOdd = 5;  // coprime to every power of two, so that this permutes the lanes
     const bool full = size % layout.subgroup == 0;
     const uint at = layout.scattered && full ? (kOdd * k + 3) % size : k;
     lane.subgroup = at / layout.subgroup;
@@ -211,7 +211,7 @@ inline void run_group(Group& group, const Layout& layout, uint size) {
   }
 }
 
-// All groups of a kernel, one after the other.
+// Runs all work groups of a kernel, one after the other.
 template <class Kernel>
 void dispatch(const Layout& layout, const Bindings& bound, uint x, uint y = 1, uint z = 1) {
   bindings = &bound;
@@ -219,7 +219,7 @@ void dispatch(const Layout& layout, const Bindings& bound, uint x, uint y = 1, u
   group.groups = {x, y, z};
   group.body = [](void* kernel) { static_cast<Kernel*>(kernel)->main(); };
   for (uint k = 0; k < x * y * z; ++k) {
-    const auto kernel = std::make_unique<Kernel>();  // its members are what the group shares
+    const auto kernel = std::make_unique<Kernel>();  // its members are the shared memory of the work group
     group.kernel = kernel.get();
     group.group = {k % x, k / x % y, k / (x * y)};
     run_group(group, layout, Kernel::gl_WorkGroupSize.x);

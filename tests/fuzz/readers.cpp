@@ -1,4 +1,5 @@
-// readers.cpp - one entry point for all readers of outside data: the environment variable CHAINSPLAT_READER names one.
+// readers.cpp - one fuzzing entry point for all readers of outside data. The environment variable CHAINSPLAT_READER
+// names the reader.
 #include "readers.h"
 
 #include <fcntl.h>
@@ -39,7 +40,7 @@ void put(const Path& file, std::string_view bytes) {
   if (opened >= 0) ::close(opened);
   if (!written) {
     std::fprintf(stderr, "%s cannot be written\n", file.c_str());
-    std::exit(1);  // of the machine, not of the reader
+    std::exit(1);  // the machine's failure, not the reader's
   }
 }
 
@@ -66,9 +67,10 @@ dynamics::Parameters parameters_of_two_joints() {
 
 namespace {
 
-constexpr std::string_view kBase = "0 0 0 0.55 0 0 0 1\n";  // at rest: more poses are fitted, which takes time
+constexpr std::string_view kBase = "0 0 0 0.55 0 0 0 1\n";  // a single pose, because fitting several takes time
 
-// A capture of four images, which are only counted, with all that capture.json may name beside it.
+// Makes a capture's folder with all files that capture.json may name; its four images are empty, since they are only
+// counted.
 Path small_capture(const char* name) {
   const Path capture = folder() / name;
   for (const char* images : {"cam0", "masks", "depth"}) {
@@ -80,7 +82,7 @@ Path small_capture(const char* name) {
   return capture;
 }
 
-// A capture's headers, without its images.
+// Loads a capture without its images.
 capture::Capture load_headers(const Path& capture) {
   capture::LoadOptions options;
   options.images = false;
@@ -122,12 +124,13 @@ void tum(std::string_view bytes) {
   put(file, trajectory::write_tum(samples));
   const std::vector<trajectory::Sample> again = trajectory::read_tum(file);
   require(again.size() == samples.size(), "as many poses come back");
-  constexpr double kTurn = 1e-9;  // of rotations as quaternions and back
+  constexpr double kTurn = 1e-9;  // error of a rotation that is written as a quaternion and read back
   for (std::size_t k = 0; k < samples.size(); ++k)
     require(again[k].time == samples[k].time && again[k].pose.translation == samples[k].pose.translation &&
                 (again[k].pose.rotation - samples[k].pose.rotation).cwiseAbs().maxCoeff() < kTurn,
             "the same poses come back");
-  constexpr std::size_t kMost = 32;  // fitting is no reading, a few poses show what it makes of them
+  // fit a few poses only, because the fit's time is not the reader's
+  constexpr std::size_t kMost = 32;
   if (samples.size() > kMost) return;
   const trajectory::Trajectory fitted = trajectory::fit(samples, "base.tum");
   for (const double time : {fitted.start(), 0.5 * fitted.start() + 0.5 * fitted.end(), fitted.end()}) {
@@ -165,7 +168,7 @@ void require_same(const chain::States& a, const chain::States& b) {
     require(same(a.thetadot[k], b.thetadot[k]), "the same rates come back");
 }
 
-// twin.json; what it names is whole.
+// Reads twin.json beside intact files that it names.
 void twin(std::string_view bytes) {
   static const Path run = [] {
     const Path made = folder() / "run";
@@ -205,7 +208,7 @@ void points(std::string_view bytes) {
   require(twin::read_points(file).allFinite(), "points are finite");
 }
 
-// As many angles as the first line names.
+// Reads states with as many angles as the first line names.
 void states(std::string_view bytes) {
   static const Path file = folder() / "states.csv";
   constexpr int kMost = 12;
@@ -240,7 +243,7 @@ void jobs(std::string_view bytes) {
     require(Path(job.name).filename() == job.name && job.name != "..", "a job's name is that of one folder");
 }
 
-// Texts of the command line; the first byte chooses which.
+// Parses texts of the command line; the first byte chooses the parser.
 void values(std::string_view bytes) {
   if (bytes.empty()) return;
   const std::string text(bytes.substr(1));
@@ -267,7 +270,7 @@ void values(std::string_view bytes) {
   }
 }
 
-// A PNG whose chunks have their right checksums: else no change of it would come past them.
+// Returns the PNG with correct checksums of its chunks, which otherwise would reject every change of it.
 std::string with_checksums(std::string bytes) {
   const auto sum = [](std::string_view data) {
     std::uint32_t crc = ~0u;
@@ -306,7 +309,7 @@ void video(std::string_view bytes) {
   capture::video_facts(file);
   capture::VideoReader reader(file);
   capture::Image8 picture;
-  constexpr int kMost = 8;  // frames
+  constexpr int kMost = 8;  // frames that are decoded
   for (int k = 0; k < kMost && reader.next(picture); ++k)
     require(picture.pixels.size() == static_cast<std::size_t>(picture.width) * picture.height * 3,
             "as many pixels as the size says");

@@ -1,8 +1,8 @@
-// tests/fuzz/readers.h - what the files of the fuzzed readers share.
+// tests/fuzz/readers.h - the declarations that the files of the fuzzed readers share.
 //
-// A reader takes bytes as they come from outside. It may throw InputError (and WorkError where its header says so);
-// anything else, a crash, five seconds or a gigabyte are defects. What is accepted is written and read again where that
-// is cheap. Readers that live in unnamed namespaces of tools/*.cpp are reached by including that file.
+// A reader takes bytes as they come from outside. It may throw InputError (and WorkError where its header says so); any
+// other exception, a crash, more than five seconds or more than a gigabyte are defects. Accepted input is written and
+// read again where that is cheap. Readers in unnamed namespaces of tools/*.cpp are reached by including that file.
 #pragma once
 #include <string_view>
 
@@ -11,13 +11,15 @@
 
 namespace chainsplat::fuzz {
 
-// A folder of this process under the system's temporary one (tools/fuzz puts that into memory), removed at the end.
+// Returns this process's folder under the system's temporary one (which tools/fuzz keeps in memory), removed at the
+// end.
 const Path& folder();
-// Writes in place, without core::write_file's fsync.
+// Writes a file in place, without core::write_file's fsync.
 void put(const Path& file, std::string_view bytes);
-// Throws std::logic_error: what was read does not come back, or is not what its reader promises.
+// Throws std::logic_error where the condition does not hold: input is not what its reader promises, or does not survive
+// writing and reading.
 void require(bool condition, const char* promise);
-// A chain of two planar joints, and what its dynamics need.
+// A chain of two planar joints, and parameters of its dynamics.
 const chain::Chain& two_joints();
 dynamics::Parameters parameters_of_two_joints();
 

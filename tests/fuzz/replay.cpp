@@ -1,5 +1,5 @@
-// replay.cpp - reads the corpora and the inputs that once crashed again, without a fuzzer: READER/* of every folder
-// named, each reader in a process of its own.
+// replay.cpp - reads the corpora and the inputs that once crashed again, without a fuzzer: READER/* in every folder
+// that the command line names, each reader in its own process.
 #include <sys/wait.h>
 #include <unistd.h>
 
@@ -21,9 +21,9 @@ namespace {
 
 namespace fs = std::filesystem;
 
-constexpr double kLongest = 5.0;  // s, of one input; tools/fuzz has the same bound
+constexpr double kLongest = 5.0;  // s per input; tools/fuzz has the same bound
 
-const char* current = "";  // input, for a process that dies of it
+const char* current = "";  // the current input, for the message of a process that crashes
 
 void say_which(int signal) {
   constexpr char kDied[] = "FAILED, died: ";
@@ -61,7 +61,7 @@ int main(int count, char** arguments) {
   const char* const chosen = std::getenv("CHAINSPLAT_READER");
   std::set<std::string> readers;
   for (int i = 1; i < count; ++i) {
-    if (!fs::is_directory(arguments[i])) continue;  // there may be no crashes
+    if (!fs::is_directory(arguments[i])) continue;  // the folder of crashes may be missing
     for (const auto& entry : fs::directory_iterator(arguments[i]))
       if (entry.is_directory()) readers.insert(entry.path().filename());
   }
@@ -78,7 +78,7 @@ int main(int count, char** arguments) {
     }
     const pid_t child = ::fork();
     if (child == 0) {
-      // begun anew: libraries have threads, which a mere fork would lack
+      // start the program anew, because a mere fork would lack the libraries' threads
       ::setenv("CHAINSPLAT_READER", reader.c_str(), 1);
       ::execv("/proc/self/exe", arguments);
       ::_exit(100);

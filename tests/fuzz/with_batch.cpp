@@ -1,4 +1,4 @@
-// The plan, the ends, the logs and the results that a batch finds in its folder.
+// Fuzzes the files that a batch finds in its folder: the plan, the ends and logs of jobs, and their results.
 #include "readers.h"
 #include "tools/batch_collect.cpp"
 #include "tools/cli.h"
@@ -7,7 +7,7 @@
 
 namespace chainsplat::tools {
 
-// A few options of train in the place of all of it: read_job_file() asks for their names and tries values.
+// Stands in for all options of train: read_job_file() needs their names and tries values on them.
 void add_training_commands(CLI::App& app, const Globals&, Job&) {
   static std::string capture, out, bending;
   static int joints, every;
@@ -25,7 +25,7 @@ void add_training_commands(CLI::App& app, const Globals&, Job&) {
 
 namespace chainsplat::fuzz {
 
-// The first byte chooses which file it is.
+// The first byte chooses the file.
 void batch(std::string_view bytes) {
   static const tools::BatchJob job{.name = "job", .capture = "a", .settings = "", .seed = 0, .arguments = {}};
   static const std::string end =

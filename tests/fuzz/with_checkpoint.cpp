@@ -1,4 +1,4 @@
-// Recognition's checkpoint, behind its checksum.
+// Fuzzes recognition's checkpoint behind its checksum, which otherwise would reject every change.
 #include "readers.h"
 #include "src/recognition/checkpoint.cpp"
 

@@ -1,4 +1,4 @@
-// metrics.json as diff reads it.
+// Fuzzes metrics.json as `diff` reads it.
 #include "readers.h"
 #include "tools/diff.cpp"
 

@@ -1,4 +1,4 @@
-// What force reads: the lines of estimate, and points of contact.
+// Fuzzes the input of `force`: the lines of `estimate`, and points of contact.
 #include "readers.h"
 #include "tools/force.cpp"
 
