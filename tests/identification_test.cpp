@@ -340,7 +340,7 @@ TEST_CASE("a rope that hangs still tells nothing of what acts on motion only") {
   Scene s = scene(false, chain::Bending::planar, 0.0, 3);
   s.base = trajectory::fit({trajectory::Sample{0.0, {math::Matrix3::Identity(), Vector3(0, 0, 0.5)}}}, "rest");
   const VectorX rest = s.clean.theta[0];
-  s.seen = {frames(20), std::vector<VectorX>(20, rest), {}};
+  s.seen = {frames(20), std::vector<VectorX>(20, rest), {}, {}};
   const Result result = identify(s.chain, s.base, s.seen, {});
   const auto weak = [&](const std::string& name) {
     for (const auto& direction : result.estimates.weak)
