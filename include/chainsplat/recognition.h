@@ -36,6 +36,8 @@ struct Result {
   chain::States states;                    // every frame time of the first camera, with thetadot
   std::vector<math::MatrixX> covariances;  // n x n of theta, a frame; may be empty
   silhouette::BendingChoice bending;
+  // Of the last refinement of all frames' angles together: one step per frame in `fast`, checked where it is long; rad.
+  solve::Summary summary;
 };
 
 // Throws WorkError (device lost, diverged), Interrupted after leaving a checkpoint. Reports progress in stage
@@ -59,11 +61,14 @@ struct AnglePrior {
 // What the silhouettes know.
 AnglePrior prior_of(const silhouette::SequenceFit& fit);
 
-// Gauss-Newton on every frame's angles with the Gaussians held, from `states`, which is updated. Returns the
-// covariances of theta, as in Result.
-std::vector<math::MatrixX> refine_states(gpu::Device& device, const capture::Capture& capture,
-                                         const chain::Chain& chain, const splat::Gaussians& gaussians,
-                                         const AnglePrior& prior, int iterations, chain::States& states);
+// Gauss-Newton on every frame's angles with the Gaussians held, from `states`, which is updated.
+struct RefinedStates {
+  std::vector<math::MatrixX> covariances;  // of theta, as in Result
+  solve::Summary summary;                  // of all frames together; rad
+};
+RefinedStates refine_states(gpu::Device& device, const capture::Capture& capture, const chain::Chain& chain,
+                            const splat::Gaussians& gaussians, const AnglePrior& prior, int iterations,
+                            chain::States& states);
 
 // Adam on the Gaussians with the angles held, views of every `every`-th frame in random batches.
 void polish(gpu::Device& device, const capture::Capture& capture, const chain::Chain& chain,

@@ -28,10 +28,11 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
 // Everything that the result depends on, to recognize a checkpoint of another job: a line 'NAME VALUE' each.
 std::string job_text(const capture::Capture& capture, const Options& options);
 
-// Improves every frame's angles with the Gaussians held. `frames` as assigned to states.time.
-std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain& chain, const capture::Capture& capture,
-                                      const std::vector<FrameViews>& frames, const splat::Gaussians& gaussians,
-                                      const std::vector<int>& selected, int iterations, const AnglePrior& prior,
-                                      chain::States& states);
+// Improves the angles of the `selected` frames with the Gaussians held. `frames` as assigned to states.time. One
+// covariance per selected frame.
+RefinedStates refine_all(splat::Engine& engine, const chain::Chain& chain, const capture::Capture& capture,
+                         const std::vector<FrameViews>& frames, const splat::Gaussians& gaussians,
+                         const std::vector<int>& selected, int iterations, const AnglePrior& prior,
+                         chain::States& states);
 
 }  // namespace chainsplat::recognition

@@ -72,13 +72,14 @@ void differentiate(chain::States& states) {
   }
 }
 
-std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain& chain, const capture::Capture& capture,
-                                      const std::vector<FrameViews>& frames, const splat::Gaussians& gaussians,
-                                      const std::vector<int>& selected, int iterations, const AnglePrior& prior,
-                                      chain::States& states) {
+RefinedStates refine_all(splat::Engine& engine, const chain::Chain& chain, const capture::Capture& capture,
+                         const std::vector<FrameViews>& frames, const splat::Gaussians& gaussians,
+                         const std::vector<int>& selected, int iterations, const AnglePrior& prior,
+                         chain::States& states) {
   // the targets of one part must fit one buffer on the smallest device
   constexpr std::size_t kPartPixels = 2u << 20;
-  std::vector<math::MatrixX> covariances;
+  RefinedStates out;
+  std::vector<solve::Summary> summaries;
   engine.set_gaussians(gaussians);
   std::size_t from = 0;
   while (from < selected.size()) {
@@ -112,11 +113,13 @@ std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain&
     refine.iterations = iterations;
     refine.mask_weight = kAngleMaskWeight;
     refine.trusted = kTrustedStep;
-    RefineSummary summary = refine_angles(chain, capture, frames, part, draw, refine, prior, states);
-    for (auto& covariance : summary.covariances) covariances.push_back(std::move(covariance));
+    Refined refined = refine_angles(chain, capture, frames, part, draw, refine, prior, states);
+    for (auto& covariance : refined.covariances) out.covariances.push_back(std::move(covariance));
+    summaries.push_back(refined.summary);
     from += part.size();
   }
-  return covariances;
+  out.summary = solve::together(summaries);
+  return out;
 }
 
 }  // namespace chainsplat::recognition

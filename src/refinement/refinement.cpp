@@ -152,7 +152,8 @@ Result refine(gpu::Device& device, const capture::Capture& capture, const chain:
     constexpr int kIterations = 2;  // of Gauss-Newton
     images.states = result.angles.states;
     images.covariances =
-        recognition::refine_states(device, capture, chain, result.gaussians, outline_prior, kIterations, images.states);
+        recognition::refine_states(device, capture, chain, result.gaussians, outline_prior, kIterations, images.states)
+            .covariances;
     result.rounds = round + 1;
   }
   return result;
