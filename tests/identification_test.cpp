@@ -56,7 +56,7 @@ Scene scene(bool table, chain::Bending bending, double noise, int count = 100) {
   if (table) p.table_normal = Vector3::UnitZ();
   s.base = swing(count / 30.0 + 0.1, Vector3(0, 0, 0.5));
   const dynamics::Model model = dynamics::make_model(s.chain, p);
-  VectorX theta = dynamics::static_equilibrium(model, s.base.pose(0.0)), thetadot = VectorX::Zero(n);
+  VectorX theta = dynamics::static_equilibrium(model, s.base.pose(0.0)).theta, thetadot = VectorX::Zero(n);
   if (bending == chain::Bending::spatial) thetadot[1] = 0.3;  // out of the plane of motion
   s.clean = dynamics::rollout(model, s.base, {0.0, theta, thetadot}, frames(count));
   s.seen = s.clean;

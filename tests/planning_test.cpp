@@ -45,7 +45,7 @@ Problem problem_of(chain::Bending bending, bool tabletop) {
   problem.base.translation = tabletop ? Vector3(0, -0.15, 0.0105) : Vector3(0, 0, 0.55);
   const int n = problem.model.chain.angles();
   problem.initial.theta =
-      tabletop ? VectorX(0.03 * VectorX::Ones(n)) : dynamics::static_equilibrium(problem.model, problem.base);
+      tabletop ? VectorX(0.03 * VectorX::Ones(n)) : dynamics::static_equilibrium(problem.model, problem.base).theta;
   problem.initial.thetadot = VectorX::Zero(n);
   return problem;
 }

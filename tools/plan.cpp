@@ -123,7 +123,7 @@ planning::Problem make_problem(const PlanRequest& request, const twin::Twin& twi
   } else if (twin.tabletop) {
     problem.initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
   } else {
-    problem.initial.theta = dynamics::static_equilibrium(problem.model, problem.base);
+    problem.initial.theta = dynamics::static_equilibrium(problem.model, problem.base).theta;
   }
   return problem;
 }

@@ -221,7 +221,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
     state = fit_state(truth.chain, dynamics::at_rest(problem.base), true_seen, shape, {},
                       VectorX::Zero(truth.chain.angles()));
   } else {
-    state.theta = dynamics::static_equilibrium(truth, problem.base);
+    state.theta = dynamics::static_equilibrium(truth, problem.base).theta;
   }
   state.thetadot = VectorX::Zero(truth.chain.angles());
   out.states.time.push_back(0.0), out.states.theta.push_back(state.theta),
