@@ -67,10 +67,14 @@ struct Markers {
 };
 
 // The smoothest chain through the markers at every time: least squares with priors on bending, on its differences from
-// joint to joint and from time to time, so that few markers suffice. `covariances`, where given, is filled with those
-// of theta, n x n. Throws InputError where arclengths, times or sizes do not fit, or a time shows no marker.
-chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers,
-                          std::vector<math::MatrixX>* covariances = nullptr);
+// joint to joint and from time to time, so that few markers suffice. Throws InputError where arclengths, times or sizes
+// do not fit, or a time shows no marker.
+struct MarkerFit {
+  chain::States states;
+  std::vector<math::MatrixX> covariances;  // of each theta, n x n
+  solve::Summary summary;                  // of all times together; rad
+};
+MarkerFit fit_markers(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers);
 
 // `recognized`: at least 3 times, increasing. `covariances`: of each theta, n x n, or empty. Throws InputError for too
 // little data, WorkError where no start gives a rollout that stays finite.

@@ -14,7 +14,8 @@
 //     initial_state* time, theta, thetadot
 //   identification  known_mass (false: masses are relative, forces per kilogram); names*, estimates*, standard_errors*,
 //                   covariance* (by rows), held* [ { name, reason } ]; null where a number is not known;
-//                   weak* [ { singular_value, direction { name: component } } ]: what the data cannot tell apart
+//                   weak* [ { singular_value, direction { name: component } } ]: what the data cannot tell apart;
+//                   solver* { reason, iterations, initial_cost, final_cost, worst_step }: how the fit ended (solve.h)
 //   gaussians, states, rollout   file names, each absent until that file is there
 //   provenance      version, capture, capture_hash, options, seed, device, driver, durations { stage: s }
 #pragma once

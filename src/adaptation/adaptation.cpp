@@ -178,6 +178,7 @@ bool Adaptation::observe(const Observation& seen, const dynamics::BaseFunction& 
 
 dynamics::Estimates Adaptation::estimates() const {
   dynamics::Estimates out = known_;
+  out.solver.reset();  // it is of another fit
   const int n = chain_.angles();
   const auto count = static_cast<Eigen::Index>(places_.size());
   out.covariance.setZero();
