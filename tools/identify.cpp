@@ -46,6 +46,7 @@ struct Request {
 };
 
 void adopt(twin::Twin& twin, identification::Result result) {
+  log_fit("identify", *result.estimates.solver);
   twin.parameters = std::move(result.parameters);
   twin.initial = std::move(result.initial);
   twin.estimates = std::move(result.estimates);
@@ -95,6 +96,7 @@ void identify_markers(twin::Twin& twin, const Request& request, std::uint64_t se
   }
   identification::MarkerFit fitted =
       identification::fit_markers(twin.chain, recordings[0].base, recordings[0].markers);
+  log_fit("markers", fitted.summary);
   twin.states = std::move(fitted.states);
   if (request.shape_only) {
     twin.parameters.reset(), twin.initial.reset();

@@ -20,8 +20,8 @@ void check_joint(const twin::Twin& twin, const std::vector<math::MatrixX>& covar
     throw InputError((run / kCovarianceFile).string(), "is missing", "run 'chainsplat recognize' again");
 }
 
-void joint_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, const capture::Capture& capture,
-                 gpu::Device& device, std::uint64_t seed) {
+solve::Summary joint_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, const capture::Capture& capture,
+                           gpu::Device& device, std::uint64_t seed) {
   const Stopwatch watch(twin, "joint");
   refinement::Options options;
   options.identification = identification_options(twin, false, seed);
@@ -35,6 +35,13 @@ void joint_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, cons
                 "joint: images %.1f times as uncertain as recognized, dynamics true to %.2f mm; %d rounds",
                 found.noise.image_scale, 1e3 * found.noise.model_error, found.rounds);
   say(text);
+  log_fit("joint", found.summary);
+  if (found.summary.reason == solve::Reason::last_iteration) {
+    std::snprintf(text, sizeof text,
+                  "joint: stopped at its last round, in which the dynamics still moved the nodes by %.3f mm",
+                  1e3 * found.summary.worst_step);
+    core::warn(text);
+  }
   twin.gaussians = std::move(found.gaussians);
   twin.states = std::move(found.angles.states);
   covariances = std::move(found.angles.covariances);
@@ -43,6 +50,7 @@ void joint_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, cons
   twin.estimates = std::move(found.identified.estimates);
   twin.rollout = std::move(found.identified.rollout);
   twin.provenance.options["joint"] = "yes";
+  return found.summary;
 }
 
 capture::Capture load_own_capture(const twin::Twin& twin, const Path& run) {

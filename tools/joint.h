@@ -11,7 +11,7 @@ void check_joint(const twin::Twin& twin, const std::vector<math::MatrixX>& covar
 // The frames that the twin in `run` was made from. Throws InputError where they are gone or have changed.
 capture::Capture load_own_capture(const twin::Twin& twin, const Path& run);
 // Refines an identified twin and its covariances with its capture's images (undistorted). The caller saves both.
-void joint_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, const capture::Capture& capture,
-                 gpu::Device& device, std::uint64_t seed);
+solve::Summary joint_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, const capture::Capture& capture,
+                           gpu::Device& device, std::uint64_t seed);
 
 }  // namespace chainsplat::tools
