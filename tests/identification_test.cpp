@@ -56,7 +56,7 @@ Scene scene(bool table, chain::Bending bending, double noise, int count = 100) {
   if (table) p.table_normal = Vector3::UnitZ();
   s.base = swing(count / 30.0 + 0.1, Vector3(0, 0, 0.5));
   const dynamics::Model model = dynamics::make_model(s.chain, p);
-  VectorX theta = dynamics::static_equilibrium(model, s.base.pose(0.0)), thetadot = VectorX::Zero(n);
+  VectorX theta = dynamics::static_equilibrium(model, s.base.pose(0.0)).theta, thetadot = VectorX::Zero(n);
   if (bending == chain::Bending::spatial) thetadot[1] = 0.3;  // out of the plane of motion
   s.clean = dynamics::rollout(model, s.base, {0.0, theta, thetadot}, frames(count));
   s.seen = s.clean;
@@ -121,6 +121,14 @@ TEST_CASE("the parameters of a simulated hanging rope are found again through no
   CHECK(spread < 3.0);
   CHECK(e.held.size() >= 1);
   CHECK(e.held[0].first == "total_mass");
+  REQUIRE(e.solver);
+  CHECK(solve::converged(*e.solver));
+  CHECK(e.solver->final_cost <= e.solver->initial_cost);
+
+  options.max_iterations = 1;  // one step per horizon is too little, and it says so
+  const Result stopped = identify(s.chain, s.base, s.seen, {}, options);
+  CHECK(stopped.estimates.solver->reason == solve::Reason::last_iteration);
+  CHECK(stopped.estimates.solver->worst_step > e.solver->worst_step);
 }
 
 TEST_CASE("how friction rolls a rope on a table is found again through noise, and carries over to another motion") {
@@ -292,8 +300,10 @@ TEST_CASE("markers alone tell the motion between and beyond them") {
     markers.time.push_back(s.clean.time[k]);
     markers.world.push_back(seen);
   }
-  const chain::States fitted = fit_markers(s.chain, s.base, markers);
-  CHECK(node_rms(s.chain, fitted, s.clean) < 2e-3);
+  const MarkerFit fitted = fit_markers(s.chain, s.base, markers);
+  CHECK(node_rms(s.chain, fitted.states, s.clean) < 2e-3);
+  CHECK(fitted.states.covariance.size() == fitted.states.theta.size());
+  CHECK(solve::converged(fitted.summary));
   Options options;
   options.mass = 0.06;
   const Result result = identify(s.chain, s.base, markers, options);
@@ -390,9 +400,9 @@ TEST_CASE("markers farther from the grasp than their arclength are refused") {
   markers.arclengths = {0.3};
   markers.time = frames(4);
   markers.world.assign(4, MatrixX(Vector3(0, 0, 0.2)));
-  CHECK(fit_markers(s.chain, s.base, markers).theta.size() == 4);
+  CHECK(fit_markers(s.chain, s.base, markers).states.theta.size() == 4);
   markers.world[2](2, 0) = -200.0;  // one slip of the tracker
-  CHECK(fit_markers(s.chain, s.base, markers).theta.size() == 4);
+  CHECK(fit_markers(s.chain, s.base, markers).states.theta.size() == 4);
   for (auto& at : markers.world) at(2, 0) = -200.0;  // millimeters, say
   CHECK_THROWS_AS(fit_markers(s.chain, s.base, markers), InputError);
 }
@@ -411,7 +421,7 @@ TEST_CASE("markers of strongly bent shapes that have nothing to do with each oth
     markers.time.push_back(10.0 * k);
     markers.world.push_back(chain::centerline(chain, chain::link_motions(chain, theta, {}), markers.arclengths));
   }
-  const chain::States found = fit_markers(chain, base, markers);
+  const chain::States found = fit_markers(chain, base, markers).states;
   for (std::size_t k = 0; k < found.theta.size(); ++k) {
     const MatrixX line = chain::centerline(chain, chain::link_motions(chain, found.theta[k], {}), markers.arclengths);
     CHECK((line - markers.world[k]).colwise().norm().maxCoeff() < 5e-3);

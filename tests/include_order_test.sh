@@ -3,8 +3,8 @@
 # A module may include those in its row, and what those may include.
 cd "$(dirname "$0")/.." || exit 1
 declare -A may=(
-  [core]="" [math]="core" [gpu]="core" [chain]="math" [trajectory]="math"
-  [capture]="chain trajectory" [silhouette]="capture" [masking]="silhouette" [splat]="capture gpu" [dynamics]="chain trajectory"
+  [core]="" [math]="core" [solve]="math" [gpu]="core" [chain]="math" [trajectory]="math"
+  [capture]="chain trajectory" [silhouette]="capture solve" [masking]="silhouette" [splat]="capture gpu" [dynamics]="chain trajectory solve"
   [recognition]="silhouette splat" [identification]="dynamics" [twin]="splat dynamics" [render]="twin"
   [refinement]="recognition identification" [eval]="render capture" [export]="render capture" [synth]="render capture"
   [estimation]="render silhouette" [force]="twin" [planning]="twin" [excitation]="planning" [adaptation]="dynamics"

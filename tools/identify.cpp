@@ -45,7 +45,8 @@ struct Request {
   bool shape_only = false, joint = false;
 };
 
-void take(twin::Twin& twin, identification::Result result) {
+void adopt(twin::Twin& twin, identification::Result result) {
+  log_fit("identify", *result.estimates.solver);
   twin.parameters = std::move(result.parameters);
   twin.initial = std::move(result.initial);
   twin.estimates = std::move(result.estimates);
@@ -93,7 +94,10 @@ void identify_markers(twin::Twin& twin, const Request& request, std::uint64_t se
     if (first_base.empty()) first_base = std::move(measured.base);
     names += (names.empty() ? "" : " ") + Path(file).filename().string();
   }
-  twin.states = identification::fit_markers(twin.chain, recordings[0].base, recordings[0].markers);
+  identification::MarkerFit fitted =
+      identification::fit_markers(twin.chain, recordings[0].base, recordings[0].markers);
+  log_fit("markers", fitted.summary);
+  twin.states = std::move(fitted.states);
   if (request.shape_only) {
     twin.parameters.reset(), twin.initial.reset();
     twin.estimates = {}, twin.rollout = {};
@@ -102,7 +106,7 @@ void identify_markers(twin::Twin& twin, const Request& request, std::uint64_t se
         identification::identify(twin.chain, recordings, identification_options(twin, false, seed));
     same_rope(twin.chain, found, request.markers);
     say_fit(found, request.markers);
-    take(twin, std::move(found[0]));
+    adopt(twin, std::move(found[0]));
   }
   twin.provenance.options["markers"] = names;
   core::write_file(Path(run) / kBaseFile, trajectory::write_tum(first_base));
@@ -157,7 +161,7 @@ void identify_several(std::vector<twin::Twin>& twins, const std::vector<std::str
   same_rope(twins[0].chain, found, runs);
   say_fit(found, runs);
   for (std::size_t i = 0; i < twins.size(); ++i) {
-    take(twins[i], std::move(found[i]));
+    adopt(twins[i], std::move(found[i]));
     twins[i].known_mass = options.mass.has_value();
     if (options.mass) twins[i].provenance.options["mass"] = core::exact(*options.mass);
   }
@@ -230,6 +234,7 @@ void identify(const Globals& globals, const Request& request) {
       for (const auto& [name, component] : weak.parts) direction[name] = component;
       document["weak"].push_back({{"singular_value", weak.singular_value}, {"direction", direction}});
     }
+    if (found.solver) document["solver"] = *found.solver;
     std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
     return;
   }
@@ -271,12 +276,7 @@ Stopwatch::~Stopwatch() {
 
 void identify_stage(twin::Twin& twin, const trajectory::Trajectory& base, bool paper, std::uint64_t seed) {
   const Stopwatch watch(twin, "identify");
-  identification::Result found =
-      identification::identify(twin.chain, base, twin.states, identification_options(twin, paper, seed));
-  twin.parameters = std::move(found.parameters);
-  twin.initial = std::move(found.initial);
-  twin.estimates = std::move(found.estimates);
-  twin.rollout = std::move(found.rollout);
+  adopt(twin, identification::identify(twin.chain, base, twin.states, identification_options(twin, paper, seed)));
 }
 
 void rollout_stage(twin::Twin& twin, const trajectory::Trajectory& base, const Path& out) {

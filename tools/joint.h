@@ -12,7 +12,6 @@ void check_joint(const twin::Twin& twin, const Path& run);
 capture::Capture load_own_capture(const twin::Twin& twin, const Path& run);
 // Refines an identified twin, the covariances of its states too, with its capture's images (undistorted). The caller
 // saves both.
-void joint_stage(twin::Twin& twin, const capture::Capture& capture,
-                 gpu::Device& device, std::uint64_t seed);
+solve::Summary joint_stage(twin::Twin& twin, const capture::Capture& capture, gpu::Device& device, std::uint64_t seed);
 
 }  // namespace chainsplat::tools

@@ -122,7 +122,7 @@ planning::Problem make_problem(const PlanRequest& request, const twin::Twin& twi
   } else if (twin.tabletop) {
     problem.initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
   } else {
-    problem.initial.theta = dynamics::static_equilibrium(problem.model, problem.base);
+    problem.initial.theta = dynamics::static_equilibrium(problem.model, problem.base).theta;
   }
   return problem;
 }
@@ -196,6 +196,7 @@ Json plan_json(const planning::Problem& problem, const planning::Options& option
   }
   out["starts"] = plan.starts;
   out["iterations"] = plan.iterations;
+  out["solver"] = plan.summary;
   out["seconds"] = plan.seconds;
   return out;
 }
@@ -252,6 +253,7 @@ Json loop_json(const planning::LoopResult& loop, double tolerance) {
     out["mean_replan_seconds"] = loop.mean_replan;
     out["longest_replan_seconds"] = loop.longest_replan;
     out["foretold_miss"] = loop.foretold;
+    out["solver"] = loop.summary;
   }
   return out;
 }
@@ -363,6 +365,7 @@ void plan(const Globals& globals, PlanRequest& request) {
                 request.out.c_str());
   say(text);
   if (!plan.reached) say(plan.reason);
+  if (!plan.reached && !solve::converged(plan.summary)) say("its last fit: " + solve::describe(plan.summary));
   for (const auto& [name, loop] : simulated.items()) {
     std::snprintf(text, sizeof text, "%s: miss %.2f mm", name.c_str(), 1e3 * loop["miss"].get<double>());
     say(text);

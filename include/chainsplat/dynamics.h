@@ -11,6 +11,7 @@
 #include <utility>
 #include <vector>
 #include "chainsplat/chain.h"
+#include "chainsplat/solve.h"
 #include "chainsplat/trajectory.h"
 
 namespace chainsplat::dynamics {
@@ -71,6 +72,9 @@ struct Estimates {
     std::vector<std::pair<std::string, double>> parts;  // name, large components of the unit vector
   };
   std::vector<Weak> weak;
+  // Of the fit over the whole recordings: whitened squares, halves, priors included; steps in the units of the names.
+  // None: a filter's estimates, or an older twin's.
+  std::optional<solve::Summary> solver;
 };
 
 using BaseFunction = std::function<trajectory::BaseMotion(double)>;  // base motion at a time, s
@@ -152,7 +156,11 @@ ClosedForm closed_form(const Model& model, const trajectory::BaseMotion& base, c
 double potential_energy(const Model& model, const math::Pose& base, const VectorX& theta);
 // The angles at rest under a base at rest: least potential energy by damped Newton from `start` (empty: the rest
 // angles). Friction is left out. Throws WorkError where no minimum was found.
-VectorX static_equilibrium(const Model& model, const math::Pose& base, const VectorX& start = {});
+struct Equilibrium {
+  VectorX theta;
+  solve::Summary summary;  // J, rad
+};
+Equilibrium static_equilibrium(const Model& model, const math::Pose& base, const VectorX& start = {});
 
 // The base motion on the integrator's own time grid, sampled once for many rollouts.
 struct BaseGrid {

@@ -77,7 +77,11 @@ struct Markers {
 // The smoothest chain through the markers at every time: least squares with priors on bending, on its differences from
 // joint to joint and from time to time, so that few markers suffice; with covariances. Throws InputError where
 // arclengths, times or sizes do not fit, or a time shows no marker.
-chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers);
+struct MarkerFit {
+  chain::States states;
+  solve::Summary summary;  // of all times together; rad
+};
+MarkerFit fit_markers(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers);
 
 // Of one recording. Throws InputError for too little data, WorkError where no start gives a rollout that stays finite.
 Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,

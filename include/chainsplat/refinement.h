@@ -42,6 +42,9 @@ struct Result {
   identification::Result identified;
   Noise noise;     // of the first round: later ones' images have been drawn with the dynamics' help
   int rounds = 0;  // in which the Gaussians were trained again
+  // Of the rounds: step m, RMS distance by which the dynamics moves the nodes after the last; costs those of
+  // `identified`, first and last.
+  solve::Summary summary;
 };
 
 // From what recognition found and the rollout identified from it. Throws what recognition and identification throw.

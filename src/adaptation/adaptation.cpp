@@ -210,6 +210,7 @@ Result ParameterFilter::result() const {
   Result out{b.now, b.known, {b.time, b.theta, b.thetadot}, b.used, b.left_out, b.restarts};
   dynamics::Estimates& e = out.estimates;
   const int n = b.chain.angles();
+  e.solver.reset();  // it is of another fit
   e.covariance.setZero();
   // the initial state of the old recording is what it was, and has nothing to do with the new frames
   e.covariance.diagonal() = b.known.covariance.diagonal();

@@ -412,7 +412,7 @@ Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras
                   : twin.states.theta.empty() ? VectorX::Zero(twin.chain.angles())
                                               : twin.states.theta.front();
   } else {
-    filter.rest = dynamics::static_equilibrium(filter.model, filter.base(base_start).pose);
+    filter.rest = dynamics::static_equilibrium(filter.model, filter.base(base_start).pose).theta;
   }
   return filter;
 }

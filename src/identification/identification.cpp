@@ -152,11 +152,6 @@ double loss_of(const std::vector<MatrixX>& values, double limit) {
   return loss;
 }
 
-struct Normal {
-  MatrixX hessian;   // J^T W J
-  VectorX gradient;  // J^T W r
-};
-
 // Whitened residuals of frame k and their derivatives by the unknowns, with the roots of Huber's weights.
 struct Rows {
   VectorX right;
@@ -183,26 +178,27 @@ void weighted_rows(const Part& part, const chain::States& states, const dynamics
   out.slopes.noalias() = by_angle * slopes.theta[k];
 }
 
-Normal normal_equations(const Part& part, const chain::States& states, const dynamics::Sensitivities& slopes,
-                        const std::vector<MatrixX>& values, double limit) {
+solve::NormalEquations normal_equations(const Part& part, const chain::States& states,
+                                        const dynamics::Sensitivities& slopes, const std::vector<MatrixX>& values,
+                                        double limit) {
   const Eigen::Index size = part.unknowns.size();
   const std::size_t frames = values.size();
   // blocks of frames, summed in fixed order: the result does not depend on the number of threads
   constexpr std::size_t kBlock = 10;
   const std::size_t blocks = (frames + kBlock - 1) / kBlock;
-  const Normal zero{MatrixX::Zero(size, size), VectorX::Zero(size)};
-  std::vector<Normal> sums(blocks, zero);
+  const solve::NormalEquations zero{MatrixX::Zero(size, size), VectorX::Zero(size)};
+  std::vector<solve::NormalEquations> sums(blocks, zero);
   core::parallel_for(static_cast<std::int64_t>(blocks), [&](std::int64_t block) {
     Rows rows;
     for (std::size_t k = block * kBlock; k < std::min(frames, (block + 1) * kBlock); ++k) {
       weighted_rows(part, states, slopes, values, limit, k, rows);
-      sums[block].hessian.selfadjointView<Eigen::Lower>().rankUpdate(rows.slopes.transpose());
+      sums[block].matrix.selfadjointView<Eigen::Lower>().rankUpdate(rows.slopes.transpose());
       sums[block].gradient.noalias() += rows.slopes.transpose() * rows.right;
     }
   });
-  Normal out = zero;
-  for (const Normal& sum : sums) out.hessian += sum.hessian, out.gradient += sum.gradient;
-  out.hessian = out.hessian.selfadjointView<Eigen::Lower>();
+  solve::NormalEquations out = zero;
+  for (const solve::NormalEquations& sum : sums) out.matrix += sum.matrix, out.gradient += sum.gradient;
+  out.matrix = out.matrix.selfadjointView<Eigen::Lower>();
   return out;
 }
 
@@ -277,69 +273,69 @@ void add_part(const Problem& problem, std::size_t index, const MatrixX& part, Ma
   all.block(first, first, own, own) += part.bottomRightCorner(own, own);
 }
 
-// Sums of all recordings in the order of the unknowns.
-Normal normal_equations(const Problem& problem, const Rollouts& rollouts, double limit) {
+// Of all recordings, without the prior: an initial state is a local block.
+solve::ArrowEquations normal_equations(const Problem& problem, const Rollouts& rollouts, double limit) {
   const int shared = problem.shared, own = problem.own();
-  Normal out{MatrixX::Zero(problem.mean.size(), problem.mean.size()), VectorX::Zero(problem.mean.size())};
+  solve::ArrowEquations out{MatrixX::Zero(shared, shared), VectorX::Zero(shared), {}};
   for (std::size_t i = 0; i < problem.parts.size(); ++i) {
-    const Normal part =
+    const solve::NormalEquations part =
         normal_equations(problem.parts[i], rollouts.states[i], rollouts.slopes[i], rollouts.values[i], limit);
-    add_part(problem, i, part.hessian, out.hessian);
-    out.gradient.head(shared) += part.gradient.head(shared);
-    out.gradient.segment(shared + static_cast<Eigen::Index>(i) * own, own) += part.gradient.tail(own);
+    out.shared += part.matrix.topLeftCorner(shared, shared);
+    out.gradient += part.gradient.head(shared);
+    if (own > 0)
+      out.local.push_back({part.matrix.bottomRightCorner(own, own), part.matrix.bottomLeftCorner(own, shared),
+                           part.gradient.tail(own)});
   }
   return out;
+}
+
+// Adds the prior at p. It links the shared unknowns with no initial state.
+void add_prior(const Problem& problem, const VectorX& p, solve::ArrowEquations& equations) {
+  const Eigen::Index shared = problem.shared, own = problem.own();
+  const VectorX pull = problem.precision * (p - problem.mean);
+  equations.shared += problem.precision.topLeftCorner(shared, shared);
+  equations.gradient += pull.head(shared);
+  Eigen::Index at = shared;
+  for (solve::ArrowEquations::Local& local : equations.local) {
+    local.matrix += problem.precision.block(at, at, own, own);
+    local.gradient += pull.segment(at, own);
+    at += own;
+  }
 }
 
 struct Fit {
   VectorX p;
   double cost = kInfinity;
   double limit = kInfinity;  // Huber's, of the root mean square of a whitened group
+  solve::Summary summary;    // of the last horizon
 };
 
 // Levenberg-Marquardt over the first `horizon` seconds of every recording.
 void improve(const Problem& problem, double horizon, bool fine, int iterations, Fit& fit) {
-  // relative, below which a horizon is done; on the way to the whole recording a start is enough
-  const double progress = fine ? 1e-6 : 1e-4;
-  Rollouts now(problem, horizon, fine), trial = now;
-  if (!now.run(problem, fit.p, true)) {
-    fit.cost = kInfinity;
-    return;
-  }
-  fit.limit = kHuber * std::max(median_rms(now.values) / kMedianRms, kLeastUsual);
-  fit.cost = now.cost(problem, fit.p, fit.limit);
-  double damping = 1e-3;
-  for (int iteration = 0; iteration < iterations; ++iteration) {
-    if (core::stop_requested()) throw Interrupted(core::stop_requested());
-    const Normal normal = normal_equations(problem, now, fit.limit);
-    const MatrixX hessian = normal.hessian + problem.precision;
-    const VectorX gradient = normal.gradient + problem.precision * (fit.p - problem.mean);
-    bool better = false;
-    double gained = 0.0;
-    for (int attempt = 0; attempt < 6 && !better; ++attempt) {
-      MatrixX damped = hessian;
-      damped.diagonal() *= 1.0 + damping;
-      VectorX step = damped.ldlt().solve(-gradient);
-      constexpr double kMaxStep = 1.0;  // of a log or an angle or rad/s: beyond, the linearization is worthless
-      const double largest = step.cwiseAbs().maxCoeff();
-      if (!(largest < kInfinity)) break;
-      if (largest > kMaxStep) step *= kMaxStep / largest;
-      const VectorX p = fit.p + step;
-      if (trial.run(problem, p, false)) {
-        const double cost = trial.cost(problem, p, fit.limit);
-        if (cost < fit.cost) {
-          gained = fit.cost - cost;
-          fit.p = p, fit.cost = cost;
-          better = true;
-          damping = std::max(0.1 * damping, 1e-9);
-          break;
-        }
-      }
-      damping = std::max(10.0 * damping, 1e-4);
+  Rollouts rollouts(problem, horizon, fine);
+  bool first = true;
+  const auto evaluate = [&](const VectorX& p, solve::ArrowEquations* equations) {
+    if (!rollouts.run(problem, p, equations != nullptr)) return kInfinity;
+    if (first) fit.limit = kHuber * std::max(median_rms(rollouts.values) / kMedianRms, kLeastUsual);
+    first = false;
+    if (equations) {
+      *equations = normal_equations(problem, rollouts, fit.limit);
+      add_prior(problem, p, *equations);
     }
-    if (!better || gained < progress * fit.cost) break;
-    if (!now.run(problem, fit.p, true)) break;
-  }
+    return rollouts.cost(problem, p, fit.limit);
+  };
+  solve::Options options;
+  options.steps = iterations;
+  options.attempts = 6;
+  // on the way to the whole recording a start is enough
+  options.cost_tolerance = fine ? 1e-6 : 1e-4;
+  options.longest = 1.0;  // of a log or an angle or rad/s: beyond, the linearization is worthless
+  options.cancellable = true;
+  options.damping.least_raised = 1e-4;
+  options.damping.least = 1e-9;
+  fit.summary = solve::least_squares(fit.p, evaluate, options);
+  if (fit.summary.reason == solve::Reason::cancelled) throw Interrupted(core::stop_requested());
+  fit.cost = fit.summary.final_cost;
 }
 
 // Local quadratic over the first frames: angle and velocity at the first time. Returns the standard deviation of one
@@ -576,11 +572,11 @@ Fit fit_centerline(const Problem& problem, const Options& options) {
 
 // [P]: Adam on half the squared angle differences, gradients by differences of rollouts.
 Fit fit_angles(const Problem& problem, const Options& options) {
-  constexpr double kRate = 0.05, kBeta1 = 0.9, kBeta2 = 0.999, kEpsilon = 1e-12;
   Fit best, fit;
   fit.p = problem.mean;
-  double rate = kRate;
-  VectorX first = VectorX::Zero(fit.p.size()), second = first;
+  solve::AdamOptions rates{.rate = 0.05, .epsilon = 1e-12};
+  solve::AdamState adam;
+  solve::Summary summary;
   Rollouts rollouts(problem, kInfinity, true);
   for (int iteration = 1; iteration <= options.adam_iterations; ++iteration) {
     if (core::stop_requested()) throw Interrupted(core::stop_requested());
@@ -590,8 +586,10 @@ Fit fit_angles(const Problem& problem, const Options& options) {
         fit.p.array() += 0.3;
       else
         fit.p = best.p;
-      rate *= 0.5;
-      first.setZero();
+      rates.rate *= 0.5;
+      adam.first = VectorX::Zero(fit.p.size());
+      if (adam.second.size() == 0) adam.second = adam.first;
+      ++adam.steps;
       continue;
     }
     double cost = 0.0;
@@ -604,11 +602,14 @@ Fit fit_angles(const Problem& problem, const Options& options) {
       }
     fit.cost = cost;
     if (cost < best.cost) best = fit;
-    first = kBeta1 * first + (1.0 - kBeta1) * gradient;
-    second = kBeta2 * second + (1.0 - kBeta2) * gradient.cwiseAbs2();
-    const double correction1 = 1.0 - std::pow(kBeta1, iteration), correction2 = 1.0 - std::pow(kBeta2, iteration);
-    fit.p.array() -= rate * (first.array() / correction1) / ((second.array() / correction2).sqrt() + kEpsilon);
+    if (std::isnan(summary.initial_cost)) summary.initial_cost = cost;
+    const VectorX before = fit.p;
+    solve::adam_step(adam, gradient, rates, fit.p);
+    summary.worst_step = (fit.p - before).cwiseAbs().maxCoeff();
+    summary.iterations = iteration;
   }
+  best.summary = summary;  // a number of steps, by design: it ends at the last
+  best.summary.final_cost = best.cost;
   return best;
 }
 
@@ -633,15 +634,13 @@ MatrixX covariance_of(const Problem& problem, const MatrixX& hessian, const Roll
 
 // Eigenvectors of the information about the shared unknowns, those of the initial states eliminated, in units of the
 // priors' deviations; the roots of its eigenvalues are the singular values of the weighted, scaled sensitivities.
-std::vector<dynamics::Estimates::Weak> weak_directions(const Problem& problem, const MatrixX& hessian) {
+std::vector<dynamics::Estimates::Weak> weak_directions(const Problem& problem, solve::ArrowEquations data) {
   const int shared = problem.shared, own = problem.own();
-  MatrixX information = hessian.topLeftCorner(shared, shared);
-  for (std::size_t i = 0; own > 0 && i < problem.parts.size(); ++i) {
+  for (std::size_t i = 0; i < data.local.size(); ++i) {
     const Eigen::Index first = shared + static_cast<Eigen::Index>(i) * own;
-    const MatrixX with_prior = hessian.block(first, first, own, own) + problem.precision.block(first, first, own, own);
-    const MatrixX cross = hessian.block(first, 0, own, shared);
-    information -= cross.transpose() * with_prior.ldlt().solve(cross);
+    data.local[i].matrix += problem.precision.block(first, first, own, own);
   }
+  const MatrixX information = solve::reduced(data).matrix;
   const MatrixX prior = problem.precision.topLeftCorner(shared, shared);
   const VectorX deviation = prior.ldlt().solve(MatrixX::Identity(shared, shared)).diagonal().cwiseMax(0.0).cwiseSqrt();
   if (!information.allFinite()) return {};  // its covariance is said not to be known
@@ -676,19 +675,21 @@ double alone_rms(const Problem& problem, std::size_t index, const VectorX& p) {
                                                                    : kInfinity;
 }
 
-std::vector<Result> solve(const chain::Chain& chain, std::vector<Part> parts, const Options& options) {
+std::vector<Result> fit_parts(const chain::Chain& chain, std::vector<Part> parts, const Options& options) {
   const Problem problem = make_problem(chain, std::move(parts));
   const Fit fit = options.paper ? fit_angles(problem, options) : fit_centerline(problem, options);
   Rollouts rollouts(problem, kInfinity, true);
   if (fit.cost == kInfinity || !rollouts.run(problem, fit.p, true))
     throw WorkError("identify", "no parameters gave a rollout that stays finite",
                     "check the base trajectory, the recognized angles and the object's length");
-  const Normal normal = normal_equations(problem, rollouts, fit.limit);
-  const MatrixX covariance = covariance_of(problem, normal.hessian, rollouts, fit.limit);
+  const solve::ArrowEquations data = normal_equations(problem, rollouts, fit.limit);
+  const MatrixX covariance = covariance_of(problem, solve::dense(data).matrix, rollouts, fit.limit);
+  if (fit.summary.reason == solve::Reason::last_iteration && !options.paper)
+    core::warn("identify: the fit " + solve::describe(fit.summary) + "; the parameters may not be the best ones yet");
   const Eigen::Index shared = problem.shared, own = problem.own();
 
   std::vector<Result> results(problem.parts.size());
-  const std::vector<dynamics::Estimates::Weak> weak = weak_directions(problem, normal.hessian);
+  const std::vector<dynamics::Estimates::Weak> weak = weak_directions(problem, data);
   for (std::size_t i = 0; i < results.size(); ++i) {
     Result& result = results[i];
     const Part& part = problem.parts[i];
@@ -703,6 +704,7 @@ std::vector<Result> solve(const chain::Chain& chain, std::vector<Part> parts, co
     dynamics::Estimates& e = result.estimates;
     e.names = part.unknowns.names();
     e.held = part.unknowns.held;
+    e.solver = fit.summary;
     e.weak = weak;
     e.values.assign(p.begin(), p.end());
     const Eigen::Index first = shared + static_cast<Eigen::Index>(i) * own;
@@ -719,15 +721,15 @@ std::vector<Result> solve(const chain::Chain& chain, std::vector<Part> parts, co
 std::vector<Result> identify(const chain::Chain& chain, std::span<const Recording> recordings, const Options& options) {
   std::vector<Part> parts;
   for (const Recording& r : recordings) parts.push_back(make_part(chain, r.base, r.recognized, options));
-  return solve(chain, std::move(parts), options);
+  return fit_parts(chain, std::move(parts), options);
 }
 
 std::vector<Result> identify(const chain::Chain& chain, std::span<const MarkerRecording> recordings,
                              const Options& options) {
   std::vector<Part> parts;
   for (const MarkerRecording& r : recordings)
-    parts.push_back(make_part(chain, r.base, fit_markers(chain, r.base, r.markers), options, &r.markers));
-  return solve(chain, std::move(parts), options);
+    parts.push_back(make_part(chain, r.base, fit_markers(chain, r.base, r.markers).states, options, &r.markers));
+  return fit_parts(chain, std::move(parts), options);
 }
 
 Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,

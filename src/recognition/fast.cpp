@@ -291,7 +291,8 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     if (std::find(training.frames.begin(), training.frames.end(), k) == training.frames.end())
       states.theta[k] = coarse[k] + chain::interpolate(correction, states.time[k]);
   }
-  refine_all(engine, chain, capture, frames, gaussians, all_frames, kFinalIterations, prior, states);
+  result.summary =
+      refine_all(engine, chain, capture, frames, gaussians, all_frames, kFinalIterations, prior, states);
   differentiate(states);
   result.gaussians = std::move(gaussians);
   result.states = std::move(states);

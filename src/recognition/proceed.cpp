@@ -17,15 +17,16 @@ AnglePrior prior_of(const silhouette::SequenceFit& fit) {
   return prior;
 }
 
-void refine_states(gpu::Device& device, const capture::Capture& capture, const chain::Chain& chain,
+solve::Summary refine_states(gpu::Device& device, const capture::Capture& capture, const chain::Chain& chain,
                    const splat::Gaussians& gaussians, const AnglePrior& prior, int iterations, chain::States& states) {
   const std::vector<FrameViews> frames = assign_views(capture, states.time);
   std::vector<int> seen;
   for (int k = 0; k < static_cast<int>(frames.size()); ++k)
     if (!frames[k].views.empty()) seen.push_back(k);
   splat::Engine engine(device);
-  refine_all(engine, chain, capture, frames, gaussians, seen, iterations, prior, states);
+  const solve::Summary summary = refine_all(engine, chain, capture, frames, gaussians, seen, iterations, prior, states);
   differentiate(states);
+  return summary;
 }
 
 void polish(gpu::Device& device, const capture::Capture& capture, const chain::Chain& chain,

@@ -130,7 +130,14 @@ Result refine(gpu::Device& device, const capture::Capture& capture, const chain:
     identify.model_error = noise.model_error;
     result.identified = identification::identify(chain, capture.base, scaled, identify);
     result.states = combine(chain, images, result.identified.rollout, noise);
-    if (round == options.rounds || node_distance(chain, images, result.states) < kSettled) break;
+    const double moved = node_distance(chain, images, result.states);
+    const double cost = result.identified.estimates.solver->final_cost;
+    if (round == 0) result.summary.initial_cost = cost;
+    result.summary.final_cost = cost;
+    result.summary.worst_step = moved;
+    result.summary.iterations = round;
+    if (moved < kSettled) result.summary.reason = solve::Reason::step;
+    if (round == options.rounds || moved < kSettled) break;
 
     core::report({"joint", round, options.rounds, NAN, NAN, "images"});
     recognition::polish(device, capture, chain, result.states, options.every, options.steps,
