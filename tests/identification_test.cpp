@@ -126,7 +126,7 @@ TEST_CASE("the parameters of a simulated hanging rope are found again through no
   CHECK(e.solver->final_cost <= e.solver->initial_cost);
 
   options.max_iterations = 1;  // one step per horizon is too little, and it says so
-  const Result stopped = identify(s.chain, s.base, s.seen, {}, options);
+  const Result stopped = identify(s.chain, s.base, s.seen, options);
   CHECK(stopped.estimates.solver->reason == solve::Reason::last_iteration);
   CHECK(stopped.estimates.solver->worst_step > e.solver->worst_step);
 }
