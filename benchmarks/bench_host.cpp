@@ -186,7 +186,7 @@ void identification(benchmark::State& state, chain::Bending bending, Surrounding
   options.tabletop = around == Surroundings::table;
   core::set_threads(1);
   double rms = 0.0;
-  for (auto _ : state) rms = identification::identify(truth.chain, base, seen, {}, options).node_rms;
+  for (auto _ : state) rms = identification::identify(truth.chain, base, seen, options).node_rms;
   state.counters["node_rms_mm"] = 1e3 * rms;
 }
 BENCHMARK_CAPTURE(identification, planar_air, chain::Bending::planar, Surroundings::air)

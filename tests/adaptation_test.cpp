@@ -1,4 +1,5 @@
 #include "chainsplat/adaptation.h"
+#include "chainsplat/dynamics/parametrization.h"
 
 #include <doctest/doctest.h>
 #include <cmath>
@@ -10,7 +11,9 @@ using math::VectorX;
 
 namespace {
 
-const std::vector<std::string> kNames = {"log_stiffness", "log_damping", "log_drag", "theta_1"};
+using dynamics::Quantity;
+const std::vector<dynamics::Unknown> kUnknowns = {
+    {Quantity::stiffness}, {Quantity::damping}, {Quantity::drag}, {Quantity::theta, 0}};
 
 dynamics::Parameters rope_parameters(const chain::Chain& chain) {
   const auto fill = [](int count, double value) { return std::vector<double>(count, value); };
@@ -34,7 +37,7 @@ trajectory::BaseMotion base_at(double t) {
 
 dynamics::Estimates estimates(double sd) {
   dynamics::Estimates e;
-  e.names = kNames;
+  for (const dynamics::Unknown& unknown : kUnknowns) e.names.push_back(dynamics::name_of(unknown));
   e.values = {std::log(0.012), std::log(6e-4), std::log(0.0144), 0.0};
   e.standard_errors.assign(4, sd);
   e.covariance = sd * sd * math::MatrixX::Identity(4, 4);
@@ -48,7 +51,7 @@ TEST_CASE("adapted parameters follow a rope that changes half-way, and without f
       chain::make_chain(0.3, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 5, chain::Bending::planar, false);
   const dynamics::Parameters before = rope_parameters(chain);
   const dynamics::Parameters after =
-      dynamics::moved(chain, before, kNames, (VectorX(4) << std::log(1.5), std::log(0.6), 0.0, 0.0).finished());
+      dynamics::moved(chain, before, kUnknowns, (VectorX(4) << std::log(1.5), std::log(0.6), 0.0, 0.0).finished());
   const VectorX rest = VectorX::Zero(5);
   constexpr int kFrames = 240;  // 8 s, 20 s
   std::vector<double> first, second;
@@ -65,22 +68,22 @@ TEST_CASE("adapted parameters follow a rope that changes half-way, and without f
     options.memory = memory;
     // a start that is 20 % off
     const dynamics::Parameters start =
-        dynamics::moved(chain, before, kNames, (VectorX(4) << 0.2, -0.2, 0.1, 0.0).finished());
-    adaptation::Adaptation online(chain, start, estimates(0.3), options);
+        dynamics::moved(chain, before, kUnknowns, (VectorX(4) << 0.2, -0.2, 0.1, 0.0).finished());
+    adaptation::ParameterFilter online(chain, start, estimates(0.3), options);
     core::Random random(5);
     const double sigma = 0.5 * M_PI / 180.0;
     for (std::size_t k = 0; k < states.time.size(); ++k) {
       adaptation::Observation seen{states.time[k], states.theta[k], {}, VectorX::Constant(5, sigma)};
       for (double& angle : seen.theta) angle += sigma * random.normal();
       online.observe(seen, base_at);
-      if (k == kFrames) old_error = std::log(online.parameters().stiffness[2] / before.stiffness[2]);
+      if (k == kFrames) old_error = std::log(online.result().parameters.stiffness[2] / before.stiffness[2]);
     }
-    CHECK(online.used() > 0.95 * static_cast<double>(states.time.size()));
-    CHECK(online.estimates().values[0] ==
-          doctest::Approx(std::log(0.012) + std::log(online.parameters().stiffness[2] / start.stiffness[2])));
-    CHECK(online.estimates().standard_errors[0] < 0.2);
-    CHECK(online.estimates().values[3] == 0.0);
-    return online.parameters();
+    CHECK(online.result().used > 0.95 * static_cast<double>(states.time.size()));
+    CHECK(online.result().estimates.values[0] ==
+          doctest::Approx(std::log(0.012) + std::log(online.result().parameters.stiffness[2] / start.stiffness[2])));
+    CHECK(online.result().estimates.standard_errors[0] < 0.2);
+    CHECK(online.result().estimates.values[3] == 0.0);
+    return online.result().parameters;
   };
   double old_error = 1.0, old_error_kept = 1.0;
   const dynamics::Parameters followed = run(3.0, old_error);
@@ -99,19 +102,19 @@ TEST_CASE("frames that do not fit are refused or left out") {
   const chain::Chain chain =
       chain::make_chain(0.3, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 3, chain::Bending::planar, false);
   const dynamics::Parameters p = rope_parameters(chain);
-  adaptation::Adaptation online(chain, p, estimates(0.3), {});
+  adaptation::ParameterFilter online(chain, p, estimates(0.3), {});
   const VectorX rest = VectorX::Zero(3);
   CHECK_THROWS_AS(online.observe({0.0, VectorX::Zero(4), {}, {}}, base_at), InputError);
   CHECK_THROWS_AS(online.observe({0.0, rest, {}, VectorX::Constant(3, -0.01)}, base_at), InputError);
   CHECK(online.observe({0.0, rest, rest, {}}, base_at));
   CHECK_THROWS_AS(online.observe({0.0, rest, {}, {}}, base_at), InputError);
   CHECK_FALSE(online.observe({1.0 / 30, VectorX::Constant(3, 2.0), {}, {}}, base_at));  // no rope turns that fast
-  CHECK(online.left_out() == 1);
+  CHECK(online.result().left_out == 1);
   CHECK(online.observe({1.0, rest, {}, {}}, base_at));  // after a gap
-  CHECK(online.restarts() == 1);
+  CHECK(online.result().restarts == 1);
   CHECK_THROWS_AS(online.observe({1.0 + 1.0 / 30, rest, {}, VectorX::Constant(3, 1e200)}, base_at), InputError);
-  CHECK_THROWS_AS(adaptation::Adaptation(chain, p, {}, {}), InputError);
+  CHECK_THROWS_AS(adaptation::ParameterFilter(chain, p, {}, {}), InputError);
   dynamics::Estimates indefinite = estimates(0.3);
   indefinite.covariance(0, 1) = indefinite.covariance(1, 0) = 1.0;
-  CHECK_THROWS_AS(adaptation::Adaptation(chain, p, indefinite, {}), InputError);
+  CHECK_THROWS_AS(adaptation::ParameterFilter(chain, p, indefinite, {}), InputError);
 }

@@ -290,7 +290,7 @@ TEST_CASE("energy is kept without losses and falls by what the dampers take") {
   fine.parameters.substeps = 64;
   const chain::States kept = rollout(fine, still, initial, {1.0});
   const double before = energy(free, initial.theta, initial.thetadot);
-  const double swing = before - potential_energy(free, Pose(), static_equilibrium(free, Pose()));
+  const double swing = before - potential_energy(free, Pose(), static_equilibrium(free, Pose()).theta);
   CHECK(swing > 1e-3);
   CHECK(std::abs(energy(free, kept.theta[0], kept.thetadot[0]) - before) < 1e-3 * swing);
 
@@ -401,7 +401,9 @@ TEST_CASE("static equilibrium hangs down, also from above, and is where a damped
   std::fill(p.stiffness.begin(), p.stiffness.end(), 0.0);
   const Model slack = make_model(model.chain, p);
   for (const Pose& pose : {Pose(), upside_down}) {
-    const VectorX theta = static_equilibrium(slack, pose);
+    const Equilibrium found = static_equilibrium(slack, pose);
+    CHECK(solve::converged(found.summary));
+    const VectorX& theta = found.theta;
     const auto nodes = chain::nodes(slack.chain, chain::link_motions(slack.chain, theta, pose));
     CHECK((nodes.col(nodes.cols() - 1) - Vector3(0, 0, -0.3)).norm() < 1e-6);
   }
@@ -410,7 +412,7 @@ TEST_CASE("static equilibrium hangs down, also from above, and is where a damped
   const Model damped = make_model(model.chain, p);
   const Pose tilted{math::exp_so3(Vector3(0.4, -0.7, 0.2)), Vector3(0.1, 0.2, 0.3)};
   const int n = model.chain.angles();
-  const VectorX theta = static_equilibrium(damped, tilted);
+  const VectorX theta = static_equilibrium(damped, tilted).theta;
   const chain::States end = rollout(damped, [&](double) { return at_rest(tilted); },
                                     {0.0, VectorX::Zero(n), VectorX::Zero(n)}, {60.0});  // its slowest mode takes 2.5 s
   const VectorX still = VectorX::Zero(n);

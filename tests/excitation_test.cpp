@@ -45,7 +45,7 @@ Recording record(const dynamics::Model& model, const dynamics::BaseFunction& mot
   for (int k = 0; k <= duration * 100 + 1e-9; ++k) samples.push_back({k / 100.0, motion(k / 100.0).pose});
   std::vector<double> times;
   for (int k = 0; k <= duration * 30 + 1e-9; ++k) times.push_back(k / 30.0);
-  const VectorX rest = dynamics::static_equilibrium(model, motion(0.0).pose);
+  const VectorX rest = dynamics::static_equilibrium(model, motion(0.0).pose).theta;
   dynamics::Model fine = model;
   fine.parameters.substeps = 16;
   Recording out{trajectory::fit(samples, "test"),
@@ -65,12 +65,12 @@ TEST_CASE("the proposed motion keeps the limits, tells more than the old one, an
   options.mass = 0.062;
   options.per_joint = false;
   const Recording old = record(model, gentle, 4.0, 1);
-  const identification::Result found = identification::identify(model.chain, old.base, old.states, {}, options);
+  const identification::Result found = identification::identify(model.chain, old.base, old.states, options);
 
   excitation::Problem problem;
   problem.model = dynamics::make_model(model.chain, found.parameters);
   problem.base = old.base.pose(0.0);
-  problem.initial = {0.0, dynamics::static_equilibrium(problem.model, problem.base), VectorX::Zero(5)};
+  problem.initial = {0.0, dynamics::static_equilibrium(problem.model, problem.base).theta, VectorX::Zero(5)};
   problem.estimates = found.estimates;
   problem.recorded = [&](double t) { return old.base.at(t); };
   problem.recorded_end = 4.0;
@@ -102,7 +102,7 @@ TEST_CASE("the proposed motion keeps the limits, tells more than the old one, an
     for (std::uint64_t seed = 10; seed < 14; ++seed) {
       const Recording recording = record(model, motion, 4.0, seed);
       const dynamics::Parameters q =
-          identification::identify(model.chain, recording.base, recording.states, {}, options).parameters;
+          identification::identify(model.chain, recording.base, recording.states, options).parameters;
       for (const double log : {std::log(q.stiffness[2] / 0.012), std::log(q.damping[2] / 6e-4),
                                std::log(q.air_quadratic[2] / model.parameters.air_quadratic[2])})
         sum += log * log;

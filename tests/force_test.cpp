@@ -75,7 +75,7 @@ force::Motion at_rest(const VectorX& theta, int count) {
     states.time.push_back(f / 30.0);
     states.theta.push_back(theta);
   }
-  return force::smooth(states, {});
+  return force::smooth(states);
 }
 
 VectorX bent(int angles) {
@@ -131,7 +131,7 @@ TEST_CASE("smoothing finds angle, rate and acceleration of a swing, and its own 
     states.time.push_back(t);
     states.theta.push_back(VectorX::Constant(1, 0.4 * std::sin(w * t) + noise * random.normal()));
   }
-  const force::Motion motion = force::smooth(states, {});
+  const force::Motion motion = force::smooth(states);
   double rate = 0.0, acceleration = 0.0;
   int inside = 0, used = 0;
   for (int f = 20; f + 20 < count; ++f) {
@@ -171,7 +171,7 @@ TEST_CASE("noise that two angles share is found as such") {
     const double common = 0.01 * random.normal(), own = 0.002 * random.normal();
     states.theta.push_back(math::Vector2(common, own - common));
   }
-  const MatrixX noise = force::smooth(states, {}).noise;
+  const MatrixX noise = force::smooth(states).noise;
   CHECK(std::sqrt(noise(0, 0)) == doctest::Approx(0.01).epsilon(0.15));
   CHECK(noise(0, 1) / std::sqrt(noise(0, 0) * noise(1, 1)) < -0.9);
 }
@@ -319,7 +319,7 @@ TEST_CASE("pushes on a swinging rope that is finer and more damped than its twin
   const Swing pushed = swing(rope_of(0.10), coarse, 0.08, 0.4, 150, place, push_at, random);
   identification::Options options;
   options.mass = mass;
-  const identification::Result twin = identification::identify(coarse, alone.base, alone.observed, {}, options);
+  const identification::Result twin = identification::identify(coarse, alone.base, alone.observed, options);
   const dynamics::Model model = dynamics::make_model(coarse, twin.parameters);
   const std::vector<dynamics::Model> deviations = force::deviations(model, twin.estimates);
   const auto base = [&](double time) { return pushed.base.at(time); };
@@ -341,7 +341,7 @@ TEST_CASE("pushes on a swinging rope that is finer and more damped than its twin
           found.push_back(*line);
       for (const force::Estimate& line : force::finish(follower)) found.push_back(line);
     } else {
-      found = force::estimate(model, deviations, base, force::smooth(pushed.observed, {}), {});
+      found = force::estimate(model, deviations, base, force::smooth(pushed.observed), {});
     }
     REQUIRE(found.size() == pushed.observed.time.size());
     std::vector<double> angle, share, away, feigned;

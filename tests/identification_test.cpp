@@ -56,7 +56,7 @@ Scene scene(bool table, chain::Bending bending, double noise, int count = 100) {
   if (table) p.table_normal = Vector3::UnitZ();
   s.base = swing(count / 30.0 + 0.1, Vector3(0, 0, 0.5));
   const dynamics::Model model = dynamics::make_model(s.chain, p);
-  VectorX theta = dynamics::static_equilibrium(model, s.base.pose(0.0)), thetadot = VectorX::Zero(n);
+  VectorX theta = dynamics::static_equilibrium(model, s.base.pose(0.0)).theta, thetadot = VectorX::Zero(n);
   if (bending == chain::Bending::spatial) thetadot[1] = 0.3;  // out of the plane of motion
   s.clean = dynamics::rollout(model, s.base, {0.0, theta, thetadot}, frames(count));
   s.seen = s.clean;
@@ -92,7 +92,7 @@ TEST_CASE("the parameters of a simulated hanging rope are found again through no
   const Scene s = scene(false, chain::Bending::spatial, 0.5 * kDegree);
   Options options;
   options.mass = 0.06;
-  const Result result = identify(s.chain, s.base, s.seen, {}, options);
+  const Result result = identify(s.chain, s.base, s.seen, options);
   CHECK(node_rms(s.chain, result.rollout, s.clean) < 1.2e-3);  // noise alone displaces the nodes by 3 mm
   CHECK(result.node_rms > 2e-3);
   CHECK(result.parameters.stiffness[6] / 0.012 == doctest::Approx(1.0).epsilon(0.15));
@@ -121,6 +121,14 @@ TEST_CASE("the parameters of a simulated hanging rope are found again through no
   CHECK(spread < 3.0);
   CHECK(e.held.size() >= 1);
   CHECK(e.held[0].first == "total_mass");
+  REQUIRE(e.solver);
+  CHECK(solve::converged(*e.solver));
+  CHECK(e.solver->final_cost <= e.solver->initial_cost);
+
+  options.max_iterations = 1;  // one step per horizon is too little, and it says so
+  const Result stopped = identify(s.chain, s.base, s.seen, options);
+  CHECK(stopped.estimates.solver->reason == solve::Reason::last_iteration);
+  CHECK(stopped.estimates.solver->worst_step > e.solver->worst_step);
 }
 
 TEST_CASE("how friction rolls a rope on a table is found again through noise, and carries over to another motion") {
@@ -136,7 +144,7 @@ TEST_CASE("how friction rolls a rope on a table is found again through noise, an
   Options options;
   options.tabletop = true;
   options.mass = 0.06;
-  const Result found = identify(s.chain, s.base, s.seen, {}, options);
+  const Result found = identify(s.chain, s.base, s.seen, options);
   double mean = 0.0;
   for (int k = 1; k < 6; ++k) mean += found.parameters.roll_lever[k] / 5.0;
   CHECK(mean == doctest::Approx(kLever).epsilon(0.25));
@@ -161,7 +169,7 @@ TEST_CASE("Coulomb friction of a rope on a table is found again through noise") 
   const Scene s = scene(true, chain::Bending::planar, 0.5 * kDegree);
   Options options;
   options.tabletop = true;
-  const Result result = identify(s.chain, s.base, s.seen, {}, options);
+  const Result result = identify(s.chain, s.base, s.seen, options);
   CHECK(node_rms(s.chain, result.rollout, s.clean) < 0.8e-3);
   double mean = 0.0;
   for (double c : result.parameters.coulomb_friction) mean += std::log(c) / 6.0;
@@ -176,9 +184,9 @@ TEST_CASE("Coulomb friction of a rope on a table is found again through noise") 
 TEST_CASE("the given mass only scales what has a unit of force") {
   const Scene s = scene(false, chain::Bending::planar, 0.0, 60);
   Options options;
-  const Result unit = identify(s.chain, s.base, s.seen, {}, options);
+  const Result unit = identify(s.chain, s.base, s.seen, options);
   options.mass = 0.06;
-  const Result scaled = identify(s.chain, s.base, s.seen, {}, options);
+  const Result scaled = identify(s.chain, s.base, s.seen, options);
   // the prior of the drag knows the air and is no ratio, so equality is not exact
   CHECK(scaled.parameters.stiffness[3] / unit.parameters.stiffness[3] == doctest::Approx(0.06).epsilon(0.05));
   CHECK(node_rms(s.chain, scaled.rollout, unit.rollout) < 2e-4);
@@ -186,13 +194,11 @@ TEST_CASE("the given mass only scales what has a unit of force") {
 
 TEST_CASE("frames that are declared uncertain do not count") {
   Scene s = scene(false, chain::Bending::planar, 0.0, 60);
-  std::vector<MatrixX> covariances(s.seen.theta.size(), 1e-6 * MatrixX::Identity(6, 6));
-  for (std::size_t k = 20; k < 40; ++k) {
-    s.seen.theta[k].array() += 0.3;
-    covariances[k] = 1.0 * MatrixX::Identity(6, 6);
-  }
-  const Result informed = identify(s.chain, s.base, s.seen, covariances, {});
-  const Result misled = identify(s.chain, s.base, s.seen, {}, {});
+  for (std::size_t k = 20; k < 40; ++k) s.seen.theta[k].array() += 0.3;
+  const Result misled = identify(s.chain, s.base, s.seen, {});
+  s.seen.covariance.assign(s.seen.theta.size(), 1e-6 * MatrixX::Identity(6, 6));
+  for (std::size_t k = 20; k < 40; ++k) s.seen.covariance[k] = MatrixX::Identity(6, 6);
+  const Result informed = identify(s.chain, s.base, s.seen, {});
   CHECK(node_rms(s.chain, informed.rollout, s.clean) < 1e-3);
   CHECK(node_rms(s.chain, misled.rollout, s.clean) > 2.0 * node_rms(s.chain, informed.rollout, s.clean));
 }
@@ -203,9 +209,9 @@ TEST_CASE("results do not depend on the number of threads") {
   options.tabletop = true;
   const int threads = core::threads();
   core::set_threads(1);
-  const Result one = identify(s.chain, s.base, s.seen, {}, options);
+  const Result one = identify(s.chain, s.base, s.seen, options);
   core::set_threads(3);
-  const Result three = identify(s.chain, s.base, s.seen, {}, options);
+  const Result three = identify(s.chain, s.base, s.seen, options);
   core::set_threads(threads);
   REQUIRE(one.estimates.values.size() == three.estimates.values.size());
   for (std::size_t i = 0; i < one.estimates.values.size(); ++i)
@@ -216,10 +222,10 @@ TEST_CASE("the paper's procedure runs, and is worse on an elastic rope") {
   const Scene s = scene(false, chain::Bending::planar, 0.0, 60);
   Options options;
   options.mass = 0.06;
-  const Result ours = identify(s.chain, s.base, s.seen, {}, options);
+  const Result ours = identify(s.chain, s.base, s.seen, options);
   options.paper = true;
   options.adam_iterations = 60;
-  const Result paper = identify(s.chain, s.base, s.seen, {}, options);
+  const Result paper = identify(s.chain, s.base, s.seen, options);
   for (double k : paper.parameters.stiffness) CHECK(k == 0.0);
   CHECK(paper.parameters.integrator == dynamics::Integrator::implicit_velocity_euler);
   CHECK(ours.node_rms < 0.5e-3);
@@ -266,7 +272,7 @@ TEST_CASE("a rope simulated by another program is followed open loop within half
   }
   Options options;
   options.mass = 0.06;
-  const Result result = identify(chain, base, states, {}, options);
+  const Result result = identify(chain, base, states, options);
   double sum = 0.0;
   for (std::size_t k = 0; k < truth.size(); ++k)
     sum += (chain::centerline(chain, chain::link_motions(chain, result.rollout.theta[k], base.pose(states.time[k])),
@@ -294,8 +300,10 @@ TEST_CASE("markers alone tell the motion between and beyond them") {
     markers.time.push_back(s.clean.time[k]);
     markers.world.push_back(seen);
   }
-  const chain::States fitted = fit_markers(s.chain, s.base, markers);
-  CHECK(node_rms(s.chain, fitted, s.clean) < 2e-3);
+  const MarkerFit fitted = fit_markers(s.chain, s.base, markers);
+  CHECK(node_rms(s.chain, fitted.states, s.clean) < 2e-3);
+  CHECK(fitted.states.covariance.size() == fitted.states.theta.size());
+  CHECK(solve::converged(fitted.summary));
   Options options;
   options.mass = 0.06;
   const Result result = identify(s.chain, s.base, markers, options);
@@ -320,14 +328,14 @@ TEST_CASE("two recordings of one rope give one set of parameters, better known t
   };
   Options options;
   options.mass = 0.06;
-  std::vector<Recording> recordings{{slow.base, slow.seen, {}}, {other.base, record(slow.truth), {}}};
+  std::vector<Recording> recordings{{slow.base, slow.seen}, {other.base, record(slow.truth)}};
   const std::vector<Result> both = identify(slow.chain, recordings, options);
   REQUIRE(both.size() == 2);
   CHECK(both[0].parameters.stiffness == both[1].parameters.stiffness);
   CHECK(both[1].initial.theta[5] == doctest::Approx(0.15).epsilon(0.3));
   CHECK(both[0].parameters.stiffness[3] / 0.012 == doctest::Approx(1.0).epsilon(0.15));
   for (const Result& r : both) CHECK(r.node_rms < 1.5 * r.alone_rms);
-  const Result one = identify(slow.chain, slow.base, slow.seen, {}, options);
+  const Result one = identify(slow.chain, slow.base, slow.seen, options);
   CHECK(both[0].estimates.names == one.estimates.names);
   CHECK(both[0].estimates.standard_errors[0] < one.estimates.standard_errors[0]);
 
@@ -342,8 +350,8 @@ TEST_CASE("a rope that hangs still tells nothing of what acts on motion only") {
   Scene s = scene(false, chain::Bending::planar, 0.0, 3);
   s.base = trajectory::fit({trajectory::Sample{0.0, {math::Matrix3::Identity(), Vector3(0, 0, 0.5)}}}, "rest");
   const VectorX rest = s.clean.theta[0];
-  s.seen = {frames(20), std::vector<VectorX>(20, rest), {}};
-  const Result result = identify(s.chain, s.base, s.seen, {}, {});
+  s.seen = {frames(20), std::vector<VectorX>(20, rest), {}, {}};
+  const Result result = identify(s.chain, s.base, s.seen, {});
   const auto weak = [&](const std::string& name) {
     for (const auto& direction : result.estimates.weak)
       for (const auto& part : direction.parts)
@@ -358,9 +366,9 @@ TEST_CASE("a rope that hangs still tells nothing of what acts on motion only") {
 
 TEST_CASE("whole turns in recognized angles change nothing") {
   Scene s = scene(false, chain::Bending::planar, 0.5 * kDegree, 40);
-  const Result as_is = identify(s.chain, s.base, s.seen, {}, {});
+  const Result as_is = identify(s.chain, s.base, s.seen, {});
   for (std::size_t k = 4; k < s.seen.theta.size(); ++k) s.seen.theta[k][2] += 2.0 * M_PI;
-  const Result turned = identify(s.chain, s.base, s.seen, {}, {});
+  const Result turned = identify(s.chain, s.base, s.seen, {});
   CHECK(node_rms(s.chain, as_is.rollout, turned.rollout) < 1e-6);
 }
 
@@ -392,9 +400,9 @@ TEST_CASE("markers farther from the grasp than their arclength are refused") {
   markers.arclengths = {0.3};
   markers.time = frames(4);
   markers.world.assign(4, MatrixX(Vector3(0, 0, 0.2)));
-  CHECK(fit_markers(s.chain, s.base, markers).theta.size() == 4);
+  CHECK(fit_markers(s.chain, s.base, markers).states.theta.size() == 4);
   markers.world[2](2, 0) = -200.0;  // one slip of the tracker
-  CHECK(fit_markers(s.chain, s.base, markers).theta.size() == 4);
+  CHECK(fit_markers(s.chain, s.base, markers).states.theta.size() == 4);
   for (auto& at : markers.world) at(2, 0) = -200.0;  // millimeters, say
   CHECK_THROWS_AS(fit_markers(s.chain, s.base, markers), InputError);
 }
@@ -413,7 +421,7 @@ TEST_CASE("markers of strongly bent shapes that have nothing to do with each oth
     markers.time.push_back(10.0 * k);
     markers.world.push_back(chain::centerline(chain, chain::link_motions(chain, theta, {}), markers.arclengths));
   }
-  const chain::States found = fit_markers(chain, base, markers);
+  const chain::States found = fit_markers(chain, base, markers).states;
   for (std::size_t k = 0; k < found.theta.size(); ++k) {
     const MatrixX line = chain::centerline(chain, chain::link_motions(chain, found.theta[k], {}), markers.arclengths);
     CHECK((line - markers.world[k]).colwise().norm().maxCoeff() < 5e-3);
@@ -424,21 +432,22 @@ TEST_CASE("too little or broken data are refused") {
   const Scene s = scene(false, chain::Bending::planar, 0.0, 5);
   chain::States few = s.seen;
   few.time.resize(2), few.theta.resize(2);
-  CHECK_THROWS_AS(identify(s.chain, s.base, few, {}, {}), InputError);
+  CHECK_THROWS_AS(identify(s.chain, s.base, few, {}), InputError);
   chain::States broken = s.seen;
   broken.theta[1][0] = NAN;
-  CHECK_THROWS_AS(identify(s.chain, s.base, broken, {}, {}), InputError);
+  CHECK_THROWS_AS(identify(s.chain, s.base, broken, {}), InputError);
   const Eigen::Index n = s.chain.angles();
-  std::vector<MatrixX> covariances(s.seen.time.size(), 1e-6 * MatrixX::Identity(n, n));
+  chain::States unsure = s.seen;
+  unsure.covariance.assign(s.seen.time.size(), 1e-6 * MatrixX::Identity(n, n));
   for (const double variance : {-1.0, static_cast<double>(NAN), static_cast<double>(INFINITY)}) {
-    covariances[2](1, 1) = variance;
-    CHECK_THROWS_AS(identify(s.chain, s.base, s.seen, covariances, {}), InputError);
+    unsure.covariance[2](1, 1) = variance;
+    CHECK_THROWS_AS(identify(s.chain, s.base, unsure, {}), InputError);
   }
   // times that no step count can bridge, and times between which nothing moves
   chain::States apart = s.seen;
   apart.time.back() = 1e300;
-  CHECK_THROWS_AS(identify(s.chain, s.base, apart, {}, {}), InputError);
+  CHECK_THROWS_AS(identify(s.chain, s.base, apart, {}), InputError);
   chain::States near = s.seen;
   for (std::size_t k = 0; k < near.time.size(); ++k) near.time[k] = 1e-300 * static_cast<double>(k);
-  CHECK_THROWS_AS(identify(s.chain, s.base, near, {}, {}), InputError);
+  CHECK_THROWS_AS(identify(s.chain, s.base, near, {}), InputError);
 }

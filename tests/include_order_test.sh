@@ -3,8 +3,8 @@
 # A module may include those in its row, and what those may include.
 cd "$(dirname "$0")/.." || exit 1
 declare -A may=(
-  [core]="" [math]="core" [gpu]="core" [chain]="math" [trajectory]="math"
-  [capture]="chain trajectory" [silhouette]="capture" [masking]="silhouette" [splat]="capture gpu" [dynamics]="chain trajectory"
+  [core]="" [math]="core" [solve]="math" [gpu]="core" [chain]="math" [trajectory]="math"
+  [capture]="chain trajectory" [silhouette]="capture solve" [masking]="silhouette" [splat]="capture gpu" [dynamics]="chain trajectory solve"
   [recognition]="silhouette splat" [identification]="dynamics" [twin]="splat dynamics" [render]="twin"
   [refinement]="recognition identification" [eval]="render capture" [export]="render capture" [synth]="render capture"
   [estimation]="render silhouette" [force]="twin" [planning]="twin" [excitation]="planning" [adaptation]="dynamics"
@@ -20,10 +20,10 @@ reach() {  # module
   done
 }
 failed=0
-for file in include/chainsplat/*.h src/*/*.h src/*/*.cpp; do
+for file in include/chainsplat/*.h include/chainsplat/*/*.h src/*/*.h src/*/*.cpp; do
   [ -e "$file" ] || continue
   case $file in
-    include/*) module=$(basename "$file" .h) ;;
+    include/*) module=${file#include/chainsplat/} module=${module%%[./]*} ;;
     *) module=$(basename "$(dirname "$file")") ;;
   esac
   if [ -z "${may[$module]+known}" ]; then
@@ -36,6 +36,6 @@ for file in include/chainsplat/*.h src/*/*.h src/*/*.cpp; do
     [[ ${all[$module]} == *" $used "* ]] && continue
     echo "$file: $module must not include chainsplat/$used.h"
     failed=1
-  done < <(sed -n 's|^ *# *include *"chainsplat/\([a-z_]*\)\.h".*|\1|p' "$file")
+  done < <(sed -n 's|^ *# *include *"chainsplat/\([a-z_]*\)[./].*".*|\1|p' "$file")
 done
 exit $failed

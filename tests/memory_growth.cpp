@@ -37,7 +37,7 @@ void train_once(int frames, int joints) {
   identify.gravity = capture.gravity;
   identify.mass = capture.mass;
   const identification::Result dynamics =
-      identification::identify(found.chain, capture.base, found.states, found.covariances, identify);
+      identification::identify(found.chain, capture.base, found.states, identify);
   load.depth = true;
   load.undistort = false;
   const capture::Capture recorded = capture::load(folder, load);

@@ -3,7 +3,7 @@
 #include <doctest/doctest.h>
 #include <cmath>
 
-#include "planning/adaptation.h"
+#include "planning/parameter_correction.h"
 #include "planning/search.h"
 
 using namespace chainsplat;
@@ -45,7 +45,7 @@ Problem problem_of(chain::Bending bending, bool tabletop) {
   problem.base.translation = tabletop ? Vector3(0, -0.15, 0.0105) : Vector3(0, 0, 0.55);
   const int n = problem.model.chain.angles();
   problem.initial.theta =
-      tabletop ? VectorX(0.03 * VectorX::Ones(n)) : dynamics::static_equilibrium(problem.model, problem.base);
+      tabletop ? VectorX(0.03 * VectorX::Ones(n)) : dynamics::static_equilibrium(problem.model, problem.base).theta;
   problem.initial.thetadot = VectorX::Zero(n);
   return problem;
 }
@@ -231,6 +231,8 @@ TEST_CASE("targets that a random motion passes are reached within the limits, th
     CHECK(one.peaks.over.empty());
     CHECK(one.peaks.velocity <= options.limits.velocity);
     CHECK(one.motion.pieces[0].weights == three.motion.pieces[0].weights);
+    CHECK(one.summary.final_cost == three.summary.final_cost);
+    CHECK(one.summary.final_cost <= one.summary.initial_cost);
 
     // judged by the rollout of dynamics itself, on a grid of its own
     std::vector<double> times;
@@ -386,10 +388,12 @@ TEST_CASE("the state of one chain is found from points of another") {
     return chain::centerline(coarse.chain, chain::link_motions(coarse.chain, angles, base.pose), s);
   };
   const MatrixX speed = (centerline(theta + 1e-6 * rate) - centerline(theta - 1e-6 * rate)) / 2e-6;
-  const auto own = fit_state(coarse.chain, base, s, centerline(theta), speed, VectorX::Zero(16));
+  const StateFit fit = fit_state(coarse.chain, base, s, centerline(theta), speed, VectorX::Zero(16));
+  CHECK(fit.summary.reason == solve::Reason::step);
+  const dynamics::InitialState& own = fit.state;
   CHECK((own.theta - theta).norm() < 1e-3);
   CHECK((own.thetadot - rate).norm() < 1e-2);
-  const auto other = fit_state(fine.chain, base, s, centerline(theta), {}, VectorX::Zero(48));
+  const auto other = fit_state(fine.chain, base, s, centerline(theta), {}, VectorX::Zero(48)).state;
   const MatrixX near = chain::centerline(fine.chain, chain::link_motions(fine.chain, other.theta, base.pose), s);
   CHECK((near - centerline(theta)).colwise().norm().maxCoeff() < 1e-3);
 }
@@ -432,19 +436,19 @@ TEST_CASE("what the rope does tells by how much its parameters are off") {
     std::vector<double> times;
     for (int k = 1; k <= 20; ++k) times.push_back(0.1 * k);
     const chain::States states = dynamics::rollout(truth, base, problem.initial, times);
-    Adaptation adaptation = start_adaptation(problem.model);
+    ParameterCorrection correction = start_correction(problem.model);
     dynamics::InitialState before = problem.initial;
     const std::vector<double> seen = chain::equal_arclengths(problem.model.chain, 17);
     for (std::size_t k = 0; k < times.size(); ++k) {
       const dynamics::InitialState after{times[k], states.theta[k], states.thetadot[k]};
-      adapt(adaptation, base, before, after, seen);
+      correct(correction, base, before, after, seen);
       before = after;
     }
     // stiffness, damping, then friction or drag
-    CHECK(std::exp(adaptation.factors[0]) == doctest::Approx(0.8).epsilon(0.03));
-    CHECK(std::exp(adaptation.factors[1]) == doctest::Approx(1.25).epsilon(0.06));
-    CHECK(std::exp(adaptation.factors[2]) == doctest::Approx(tabletop ? 1.2 : 1.0).epsilon(0.06));
-    CHECK(adaptation.covariance(0, 0) < 0.1 * 0.1);
+    CHECK(std::exp(correction.change[0]) == doctest::Approx(0.8).epsilon(0.03));
+    CHECK(std::exp(correction.change[1]) == doctest::Approx(1.25).epsilon(0.06));
+    CHECK(std::exp(correction.change[2]) == doctest::Approx(tabletop ? 1.2 : 1.0).epsilon(0.06));
+    CHECK(correction.covariance(0, 0) < 0.1 * 0.1);
   }
 }
 

@@ -128,8 +128,9 @@ TEST_CASE("refined angles come back to where the picture was drawn") {
   options.iterations = 12;
   options.smooth_sigma = 100.0;  // no prior
   const std::vector<int> selected{0};
-  const RefineSummary summary = refine_angles(chain, capture, frames, selected, draw, options, {}, states);
-  CHECK(summary.cost_after < 0.2 * summary.cost_before);
+  const solve::Summary summary = refine_angles(chain, capture, frames, selected, draw, options, {}, states).summary;
+  CHECK(summary.final_cost < 0.2 * summary.initial_cost);
+  CHECK(solve::converged(summary));
   CHECK((states.theta[0] - truth).lpNorm<Eigen::Infinity>() < 2e-3);
 
   // a step within what is trusted is taken as it is, and drawn but for the equations; a longer one is checked
@@ -142,7 +143,7 @@ TEST_CASE("refined angles come back to where the picture was drawn") {
   CHECK(draws == 2);
   options.trusted = 0.01;
   draws = 0;
-  CHECK(refine_angles(chain, capture, frames, selected, draw, options, {}, trusted).accepted == 1);
+  CHECK(refine_angles(chain, capture, frames, selected, draw, options, {}, trusted).steps == 1);
   CHECK(draws == 1);
   CHECK((trusted.theta[0] - truth).norm() < 0.5 * (near - truth).norm());
   CHECK(trusted.theta[0] == checked.theta[0]);

@@ -45,7 +45,6 @@ struct Case {
   chain::Chain chain =
       chain::make_chain(0.3, 0.02, -math::Vector3::UnitZ(), math::Vector3::UnitY(), 4, chain::Bending::spatial, false);
   chain::States truth, rollout, images;
-  std::vector<MatrixX> covariances;
   Case(double scale, double model, int frames, std::uint64_t seed) {
     core::Random random(seed);
     const int n = chain.angles();
@@ -61,7 +60,7 @@ struct Case {
       truth.time.push_back(time), truth.theta.push_back(theta);
       rollout.theta.push_back(theta + model * root * random_vector(random, n));
       images.theta.push_back(theta + scale * spread * random_vector(random, n));
-      covariances.push_back(spread * spread);
+      images.covariance.push_back(spread * spread);
     }
     rollout.time = images.time = truth.time;
   }
@@ -78,7 +77,7 @@ struct Case {
 TEST_CASE("how far images and dynamics are to be believed is found from their disagreement") {
   for (const auto& [scale, model] : {std::pair(3.0, 2e-4), std::pair(1.0, 1e-3), std::pair(0.6, 3e-3)}) {
     const Case c(scale, model, 150, 5);
-    const Noise noise = estimate_noise(c.chain, c.images, c.covariances, c.rollout);
+    const Noise noise = estimate_noise(c.chain, c.images, c.rollout);
     CHECK(noise.image_scale == doctest::Approx(scale).epsilon(0.15));
     CHECK(noise.model_error == doctest::Approx(model).epsilon(0.15));
   }
@@ -86,23 +85,23 @@ TEST_CASE("how far images and dynamics are to be believed is found from their di
 
 TEST_CASE("one wild frame does not change what is believed of the others") {
   Case c(1.0, 3e-4, 150, 6);
-  const Noise before = estimate_noise(c.chain, c.images, c.covariances, c.rollout);
+  const Noise before = estimate_noise(c.chain, c.images, c.rollout);
   c.images.theta[40].array() += 0.5;
-  const Noise after = estimate_noise(c.chain, c.images, c.covariances, c.rollout);
+  const Noise after = estimate_noise(c.chain, c.images, c.rollout);
   CHECK(after.image_scale == doctest::Approx(before.image_scale).epsilon(0.1));
   CHECK(after.model_error == doctest::Approx(before.model_error).epsilon(0.1));
 }
 
 TEST_CASE("combined angles are nearer to the truth than either side, as near as they say") {
   const Case c(3.0, 1e-3, 150, 7);
-  const Noise noise = estimate_noise(c.chain, c.images, c.covariances, c.rollout);
-  const Angles angles = combine(c.chain, c.images, c.covariances, c.rollout, noise);
-  CHECK(c.error(angles.states) < 0.8 * std::min(c.error(c.images), c.error(c.rollout)));
-  REQUIRE(angles.states.thetadot.size() == angles.states.theta.size());
+  const Noise noise = estimate_noise(c.chain, c.images, c.rollout);
+  const chain::States angles = combine(c.chain, c.images, c.rollout, noise);
+  CHECK(c.error(angles) < 0.8 * std::min(c.error(c.images), c.error(c.rollout)));
+  REQUIRE(angles.thetadot.size() == angles.theta.size());
   double deviation2 = 0.0;
   for (std::size_t k = 0; k < c.truth.theta.size(); ++k) {
-    const VectorX off = angles.states.theta[k] - c.truth.theta[k];
-    deviation2 += off.dot(angles.covariances[k].ldlt().solve(off)) / static_cast<double>(off.size());
+    const VectorX off = angles.theta[k] - c.truth.theta[k];
+    deviation2 += off.dot(angles.covariance[k].ldlt().solve(off)) / static_cast<double>(off.size());
   }
   CHECK(deviation2 / static_cast<double>(c.truth.theta.size()) == doctest::Approx(1.0).epsilon(0.15));
 }
@@ -110,15 +109,15 @@ TEST_CASE("combined angles are nearer to the truth than either side, as near as 
 TEST_CASE("combined angles are where the two sides' cost is least") {
   const Case c(2.0, 5e-4, 10, 8);
   const Noise noise{2.0, 5e-4};
-  const Angles angles = combine(c.chain, c.images, c.covariances, c.rollout, noise);
+  const chain::States angles = combine(c.chain, c.images, c.rollout, noise);
   for (std::size_t k = 0; k < c.truth.theta.size(); ++k) {
     const MatrixX slope = slope_of_ends(c.chain, c.rollout.theta[k]);
     const auto cost = [&](const VectorX& theta) {
       const VectorX off = theta - c.images.theta[k];
-      return 0.5 * off.dot(c.covariances[k].ldlt().solve(off)) / std::pow(noise.image_scale, 2) +
+      return 0.5 * off.dot(c.images.covariance[k].ldlt().solve(off)) / std::pow(noise.image_scale, 2) +
              0.5 * (slope * (theta - c.rollout.theta[k])).squaredNorm() / std::pow(noise.model_error, 2);
     };
-    const VectorX& least = angles.states.theta[k];
+    const VectorX& least = angles.theta[k];
     for (int i = 0; i < c.chain.angles(); ++i) {
       constexpr double kStep = 1e-5;
       const VectorX step = kStep * VectorX::Unit(c.chain.angles(), i);
@@ -143,10 +142,9 @@ TEST_CASE("a camera alone sees depth better with the dynamics; twice the same") 
   options.identification.mass = capture.mass;
   options.rounds = 1;
   const chain::States rollout =
-      identification::identify(found.chain, capture.base, found.states, found.covariances, options.identification)
-          .rollout;
+      identification::identify(found.chain, capture.base, found.states, options.identification).rollout;
   const auto refined = [&] {
-    return refine(*device, capture, found.chain, found.gaussians, {found.states, found.covariances}, rollout, options);
+    return refine(*device, capture, found.chain, found.gaussians, found.states, rollout, options);
   };
   const Result first = refined();
   const auto truth = capture::load_true_centerline(kDemo);
@@ -161,11 +159,11 @@ TEST_CASE("a camera alone sees depth better with the dynamics; twice the same") 
     return std::sqrt(squares / static_cast<double>(states.time.size() * truth->points[0].cols()));
   };
   MESSAGE("recognized ", 1e3 * error(found.states), " mm, rollout ", 1e3 * error(rollout), ", joint ",
-          1e3 * error(first.angles.states), ", its rollout ", 1e3 * error(first.identified.rollout));
-  CHECK(error(first.angles.states) < 0.9 * error(found.states));
+          1e3 * error(first.states), ", its rollout ", 1e3 * error(first.identified.rollout));
+  CHECK(error(first.states) < 0.9 * error(found.states));
   const Result second = refined();
   CHECK(first.gaussians.mean == second.gaussians.mean);
   for (std::size_t k = 0; k < found.states.time.size(); ++k)
-    CHECK(first.angles.states.theta[k] == second.angles.states.theta[k]);
+    CHECK(first.states.theta[k] == second.states.theta[k]);
   CHECK(gpu::validation_messages(*device) == 0);
 }

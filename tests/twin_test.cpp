@@ -52,6 +52,7 @@ twin::Twin full_twin() {
   twin.estimates.covariance(1, 0) = 1e-300;
   twin.estimates.weak = {{0.25, {{"rest_angle_3", 0.8}, {"log_stiffness", -0.6}}}};  // not in alphabetical order
   twin.estimates.held = {{"mass", "given by the capture"}, {"twist", "not observed, \"held\""}};
+  twin.estimates.solver = {solve::Reason::no_decrease, 7, std::numeric_limits<double>::quiet_NaN(), 2.0 / 3.0, 1e-300};
   twin.provenance = {"1.2.3",
                      "free \xc3\xa4",
                      "00ff",
@@ -113,6 +114,12 @@ TEST_CASE("a twin reads back bit by bit") {
   REQUIRE(read.estimates.weak.size() == 1);
   CHECK(read.estimates.weak[0].singular_value == 0.25);
   CHECK(read.estimates.weak[0].parts == twin.estimates.weak[0].parts);
+  REQUIRE(read.estimates.solver);
+  CHECK(read.estimates.solver->reason == solve::Reason::no_decrease);
+  CHECK(read.estimates.solver->iterations == 7);
+  CHECK(std::isnan(read.estimates.solver->initial_cost));
+  CHECK(read.estimates.solver->final_cost == 2.0 / 3.0);
+  CHECK(read.estimates.solver->worst_step == 1e-300);
   CHECK(read.provenance.capture == twin.provenance.capture);
   CHECK(read.provenance.options == twin.provenance.options);
   CHECK(read.provenance.seed == twin.provenance.seed);
@@ -278,6 +285,8 @@ TEST_CASE("damage to twin.json is named by file and key") {
       {"/identification/covariance/0/0", -0.1, "identification.covariance"},
       {"/identification/covariance/0/1", 0.1, "identification.covariance"},
       {"/identification/held/0/reason", removed, "identification.held[0].reason"},
+      {"/identification/solver/reason", "tired", "identification.solver.reason"},
+      {"/identification/solver/iterations", -1, "identification.solver.iterations"},
       {"/provenance/seed", -1, "provenance.seed"},
       {"/provenance/options/mass", "abc", "provenance.options.mass"},
       {"/provenance/options/mass", "", "provenance.options.mass"},

@@ -302,7 +302,7 @@ Json bench_capture(gpu::Device& device, const Path& folder, std::uint64_t seed) 
   twin.chain = std::move(found.chain);
   twin.gaussians = std::move(found.gaussians);
   twin.states = std::move(found.states);
-  identify_stage(twin, capture.base, found.covariances, false, seed);
+  identify_stage(twin, capture.base, false, seed);
   lap("identify");
   {
     const capture::Capture recorded = capture::load_recorded(capture, folder);

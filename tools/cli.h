@@ -11,6 +11,9 @@
 namespace CLI {
 class App;
 }
+namespace chainsplat::solve {
+struct Summary;
+}
 
 namespace chainsplat::tools {
 
@@ -46,6 +49,8 @@ void add_bench_command(CLI::App& app, const Globals& globals, Job& job);
 void start_listening(const Globals& globals);
 // One JSON record an interval is added to `file` from now on. Throws InputError when it cannot be opened.
 void log_to(const Path& file);
+// Adds a record {"stage", "solver", "seconds"} of how a stage's fit ended to the logs; with -v also a message.
+void log_fit(const std::string& stage, const solve::Summary& summary);
 void end_progress();                     // leaves the redrawn line
 void say(const std::string& line);       // a message on standard error, unless -q
 void say_more(const std::string& line);  // only with -v

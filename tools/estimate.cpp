@@ -171,9 +171,7 @@ bool black_about(const capture::Image8& picture) {
 // As an arrow from the contact; a force as large as the rope's weight is half as long as the rope.
 void show_force(const force::Estimate& f, const twin::Twin& twin, const dynamics::Model& model,
                 const capture::Camera& camera, Shown& shown) {
-  double mass = model.parameters.tip_mass;
-  for (const double m : model.parameters.link_mass) mass += m;
-  const double weight = mass * model.parameters.gravity.norm();
+  const double weight = dynamics::total_mass(model.parameters) * model.parameters.gravity.norm();
   // along the force: across it there may be directions that nobody sees
   const double deviation = f.force.cwiseProduct(f.sigma).norm() / std::max(f.force.norm(), 1e-9);
   char text[80];

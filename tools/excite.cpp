@@ -101,7 +101,7 @@ void excite(const Globals& globals, Request& request) {
   if (twin.tabletop)
     problem.initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
   else
-    problem.initial.theta = dynamics::static_equilibrium(problem.model, problem.base);
+    problem.initial.theta = dynamics::static_equilibrium(problem.model, problem.base).theta;
   problem.recorded = [&](double t) { return base.at(t); };
   problem.recorded_start = twin.states.time.front();
   problem.recorded_end = twin.states.time.back();

@@ -210,16 +210,15 @@ void force(const Globals& globals, const ForceRequest& request) {
     if (live.contact) check_near();
   } else {
     chain::States states;
-    std::vector<math::MatrixX> standing;
     each_state(request, twin.chain, [&](const State& state) {
       states.time.push_back(state.time);
       states.theta.push_back(state.theta);
-      if (state.standing.size() > 0) standing.push_back(state.standing);
+      if (state.standing.size() > 0) states.covariance.push_back(state.standing);
     });
     const std::size_t count = states.time.size();
     if (count < 3) throw InputError(source, few, more);
     check_time(states.time.front(), states.time.back());
-    const force::Motion motion = force::smooth(states, standing);
+    const force::Motion motion = force::smooth(states);
     const ContactAt contact =
         with_near(contact_of(request, nearest, (states.time.back() - states.time.front()) / (count - 1.0)));
     std::vector<std::optional<force::Contact>> contacts;

@@ -45,7 +45,8 @@ struct Request {
   bool shape_only = false, joint = false;
 };
 
-void take(twin::Twin& twin, identification::Result result) {
+void adopt(twin::Twin& twin, identification::Result result) {
+  log_fit("identify", *result.estimates.solver);
   twin.parameters = std::move(result.parameters);
   twin.initial = std::move(result.initial);
   twin.estimates = std::move(result.estimates);
@@ -93,8 +94,10 @@ void identify_markers(twin::Twin& twin, const Request& request, std::uint64_t se
     if (first_base.empty()) first_base = std::move(measured.base);
     names += (names.empty() ? "" : " ") + Path(file).filename().string();
   }
-  std::vector<math::MatrixX> covariances;
-  twin.states = identification::fit_markers(twin.chain, recordings[0].base, recordings[0].markers, &covariances);
+  identification::MarkerFit fitted =
+      identification::fit_markers(twin.chain, recordings[0].base, recordings[0].markers);
+  log_fit("markers", fitted.summary);
+  twin.states = std::move(fitted.states);
   if (request.shape_only) {
     twin.parameters.reset(), twin.initial.reset();
     twin.estimates = {}, twin.rollout = {};
@@ -103,11 +106,11 @@ void identify_markers(twin::Twin& twin, const Request& request, std::uint64_t se
         identification::identify(twin.chain, recordings, identification_options(twin, false, seed));
     same_rope(twin.chain, found, request.markers);
     say_fit(found, request.markers);
-    take(twin, std::move(found[0]));
+    adopt(twin, std::move(found[0]));
   }
   twin.provenance.options["markers"] = names;
   core::write_file(Path(run) / kBaseFile, trajectory::write_tum(first_base));
-  core::write_file(Path(run) / kCovarianceFile, covariance_csv(twin.states, covariances));
+  core::write_file(Path(run) / kCovarianceFile, covariance_csv(twin.states));
 }
 
 // Throws where two twins cannot be of one rope.
@@ -143,12 +146,12 @@ void identify_several(std::vector<twin::Twin>& twins, const std::vector<std::str
   std::vector<identification::Recording> recordings;
   identification::Options options = identification_options(twins[0], false, seed);
   for (std::size_t i = 0; i < twins.size(); ++i) {
-    const twin::Twin& twin = twins[i];
+    twin::Twin& twin = twins[i];
     if (i > 0) same_chain(twins[0], runs[0], twin, runs[i]);
     // a mass that one capture knows is that of all
     if (!options.mass) options.mass = identification_options(twin, false, seed).mass;
-    recordings.push_back(
-        {own_base(runs[i], twin.states), twin.states, read_covariances(Path(runs[i]) / kCovarianceFile, twin.states)});
+    twin.states.covariance = read_covariances(Path(runs[i]) / kCovarianceFile, twin.states);
+    recordings.push_back({own_base(runs[i], twin.states), twin.states});
   }
   std::vector<identification::Result> found;
   {
@@ -158,7 +161,7 @@ void identify_several(std::vector<twin::Twin>& twins, const std::vector<std::str
   same_rope(twins[0].chain, found, runs);
   say_fit(found, runs);
   for (std::size_t i = 0; i < twins.size(); ++i) {
-    take(twins[i], std::move(found[i]));
+    adopt(twins[i], std::move(found[i]));
     twins[i].known_mass = options.mass.has_value();
     if (options.mass) twins[i].provenance.options["mass"] = core::exact(*options.mass);
   }
@@ -190,19 +193,19 @@ void identify(const Globals& globals, const Request& request) {
     } else {
       const trajectory::Trajectory base = own_base(runs[0], twins[0].states);
       const Path covariance_file = Path(runs[0]) / kCovarianceFile;
-      std::vector<math::MatrixX> covariances = read_covariances(covariance_file, twins[0].states);
+      twins[0].states.covariance = read_covariances(covariance_file, twins[0].states);
       capture::Capture capture;
       gpu::DevicePtr device;
       if (request.joint) {
-        check_joint(twins[0], covariances, runs[0]);
+        check_joint(twins[0], runs[0]);
         capture = load_own_capture(twins[0], runs[0]);
         device = gpu::open_device({.selector = globals.device});
       }
-      identify_stage(twins[0], base, covariances, paper, globals.seed);
-      if (request.joint) joint_stage(twins[0], covariances, capture, *device, globals.seed);
+      identify_stage(twins[0], base, paper, globals.seed);
+      if (request.joint) joint_stage(twins[0], capture, *device, globals.seed);
       rollout_stage(twins[0], base, runs[0]);
       // last, when nothing can fail but the disk: covariances and states belong together
-      if (request.joint) core::write_file(covariance_file, covariance_csv(twins[0].states, covariances));
+      if (request.joint) core::write_file(covariance_file, covariance_csv(twins[0].states));
     }
   }
   for (std::size_t i = 0; i < runs.size(); ++i) {
@@ -231,6 +234,7 @@ void identify(const Globals& globals, const Request& request) {
       for (const auto& [name, component] : weak.parts) direction[name] = component;
       document["weak"].push_back({{"singular_value", weak.singular_value}, {"direction", direction}});
     }
+    if (found.solver) document["solver"] = *found.solver;
     std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
     return;
   }
@@ -270,15 +274,9 @@ Stopwatch::~Stopwatch() {
   say_more(stage_ + text);
 }
 
-void identify_stage(twin::Twin& twin, const trajectory::Trajectory& base, const std::vector<math::MatrixX>& covariances,
-                    bool paper, std::uint64_t seed) {
+void identify_stage(twin::Twin& twin, const trajectory::Trajectory& base, bool paper, std::uint64_t seed) {
   const Stopwatch watch(twin, "identify");
-  identification::Result found =
-      identification::identify(twin.chain, base, twin.states, covariances, identification_options(twin, paper, seed));
-  twin.parameters = std::move(found.parameters);
-  twin.initial = std::move(found.initial);
-  twin.estimates = std::move(found.estimates);
-  twin.rollout = std::move(found.rollout);
+  adopt(twin, identification::identify(twin.chain, base, twin.states, identification_options(twin, paper, seed)));
 }
 
 void rollout_stage(twin::Twin& twin, const trajectory::Trajectory& base, const Path& out) {

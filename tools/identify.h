@@ -27,8 +27,7 @@ class Stopwatch {
 // What the twin and its capture say of how to identify it.
 identification::Options identification_options(const twin::Twin& twin, bool paper, std::uint64_t seed);
 // `twin`: recognized. Fills in parameters, initial state, estimates and rollout.
-void identify_stage(twin::Twin& twin, const trajectory::Trajectory& base, const std::vector<math::MatrixX>& covariances,
-                    bool paper, std::uint64_t seed);
+void identify_stage(twin::Twin& twin, const trajectory::Trajectory& base, bool paper, std::uint64_t seed);
 // Rolls the identified twin out over its recognized times. `out`: its run folder, for messages.
 void rollout_stage(twin::Twin& twin, const trajectory::Trajectory& base, const Path& out);
 

@@ -7,7 +7,7 @@
 
 namespace chainsplat::tools {
 
-void check_joint(const twin::Twin& twin, const std::vector<math::MatrixX>& covariances, const Path& run) {
+void check_joint(const twin::Twin& twin, const Path& run) {
   const auto& options = twin.provenance.options;
   const auto mode = options.find("mode");
   if (mode != options.end() && mode->second == "paper")
@@ -16,33 +16,39 @@ void check_joint(const twin::Twin& twin, const std::vector<math::MatrixX>& covar
     throw InputError(run.string(), "is refined already", "begin again with 'chainsplat train --joint --force'");
   if (twin.gaussians.count == 0)
     throw InputError(run.string(), "has no Gaussians to compare with images", "leave --joint out");
-  if (covariances.empty())
+  if (twin.states.covariance.empty())
     throw InputError((run / kCovarianceFile).string(), "is missing", "run 'chainsplat recognize' again");
 }
 
-void joint_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, const capture::Capture& capture,
-                 gpu::Device& device, std::uint64_t seed) {
+solve::Summary joint_stage(twin::Twin& twin, const capture::Capture& capture, gpu::Device& device, std::uint64_t seed) {
   const Stopwatch watch(twin, "joint");
   refinement::Options options;
   options.identification = identification_options(twin, false, seed);
   options.seed = seed;
   const auto every = twin.provenance.options.find("every");
   if (every != twin.provenance.options.end()) options.every = std::stoi(every->second);
-  refinement::Result found = refinement::refine(device, capture, twin.chain, twin.gaussians, {twin.states, covariances},
-                                                twin.rollout, options);
+  refinement::Result found =
+      refinement::refine(device, capture, twin.chain, twin.gaussians, twin.states, twin.rollout, options);
   char text[160];
   std::snprintf(text, sizeof text,
                 "joint: images %.1f times as uncertain as recognized, dynamics true to %.2f mm; %d rounds",
                 found.noise.image_scale, 1e3 * found.noise.model_error, found.rounds);
   say(text);
+  log_fit("joint", found.summary);
+  if (found.summary.reason == solve::Reason::last_iteration) {
+    std::snprintf(text, sizeof text,
+                  "joint: stopped at its last round, in which the dynamics still moved the nodes by %.3f mm",
+                  1e3 * found.summary.worst_step);
+    core::warn(text);
+  }
   twin.gaussians = std::move(found.gaussians);
-  twin.states = std::move(found.angles.states);
-  covariances = std::move(found.angles.covariances);
+  twin.states = std::move(found.states);
   twin.parameters = std::move(found.identified.parameters);
   twin.initial = std::move(found.identified.initial);
   twin.estimates = std::move(found.identified.estimates);
   twin.rollout = std::move(found.identified.rollout);
   twin.provenance.options["joint"] = "yes";
+  return found.summary;
 }
 
 capture::Capture load_own_capture(const twin::Twin& twin, const Path& run) {

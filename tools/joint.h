@@ -7,11 +7,11 @@
 namespace chainsplat::tools {
 
 // Throws InputError unless `twin` can be refined: recognized fast, with covariances, not refined before.
-void check_joint(const twin::Twin& twin, const std::vector<math::MatrixX>& covariances, const Path& run);
+void check_joint(const twin::Twin& twin, const Path& run);
 // The frames that the twin in `run` was made from. Throws InputError where they are gone or have changed.
 capture::Capture load_own_capture(const twin::Twin& twin, const Path& run);
-// Refines an identified twin and its covariances with its capture's images (undistorted). The caller saves both.
-void joint_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, const capture::Capture& capture,
-                 gpu::Device& device, std::uint64_t seed);
+// Refines an identified twin, the covariances of its states too, with its capture's images (undistorted). The caller
+// saves both.
+solve::Summary joint_stage(twin::Twin& twin, const capture::Capture& capture, gpu::Device& device, std::uint64_t seed);
 
 }  // namespace chainsplat::tools

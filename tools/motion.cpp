@@ -58,7 +58,7 @@ dynamics::InitialState start_of(const RolloutRequest& request, const twin::Twin&
       throw InputError(request.run, "holds no state to start from on the table", "give --initial");
     initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
   } else {
-    initial.theta = dynamics::static_equilibrium(model, base.pose(base.start()));
+    initial.theta = dynamics::static_equilibrium(model, base.pose(base.start())).theta;
   }
   return initial;
 }

@@ -22,7 +22,7 @@ void identify_online(const Globals& globals, const OnlineRequest& request) {
   const dynamics::BaseFunction base_at = [&](double time) { return base.at(time); };
   adaptation::Options options;
   options.memory = request.memory;
-  adaptation::Adaptation online(twin.chain, *twin.parameters, twin.estimates, options);
+  adaptation::ParameterFilter filter(twin.chain, *twin.parameters, twin.estimates, options);
 
   std::ifstream file;
   if (request.file != "-") {
@@ -44,7 +44,7 @@ void identify_online(const Globals& globals, const OnlineRequest& request) {
     before_line = read->time;
     const adaptation::Observation seen{read->time, read->theta, read->thetadot, read->sigma};
     try {
-      online.observe(seen, base_at);
+      filter.observe(seen, base_at);
     } catch (const InputError& error) {
       const std::string text = error.what();  // WHERE: WHAT; HOW TO MEND
       const std::size_t colon = text.find(": "), mend = text.rfind("; ");
@@ -53,17 +53,18 @@ void identify_online(const Globals& globals, const OnlineRequest& request) {
     if (std::isnan(first)) first = seen.time;
     last = seen.time;
   }
-  if (online.used() == 0)
+  const adaptation::Result online = filter.result();
+  if (online.used == 0)
     throw InputError(request.file, "has no two frames in a row that fit the twin",
                      "check that it is of this rope and of this base motion");
-  if (!math::is_covariance(online.estimates().covariance))
+  if (!math::is_covariance(online.estimates.covariance))
     throw WorkError(request.file, "leads to parameters whose covariance has no meaning",
                     "check that it is of this rope; the twin is as it was");
   const dynamics::Estimates before = twin.estimates;
   const dynamics::Integrator integrator = twin.parameters->integrator;
-  twin.parameters = online.parameters();
+  twin.parameters = online.parameters;
   twin.parameters->integrator = integrator;
-  twin.estimates = online.estimates();
+  twin.estimates = online.estimates;
   twin.provenance.options["online"] = request.file == "-" ? "-" : Path(request.file).filename().string();
   twin::save(twin, request.run);
 
@@ -72,8 +73,8 @@ void identify_online(const Globals& globals, const OnlineRequest& request) {
     nlohmann::ordered_json document;
     document["run"] = request.run;
     document["from"] = first, document["to"] = last;
-    document["frames"] = online.used(), document["left_out"] = online.left_out();
-    document["restarts"] = online.restarts();
+    document["frames"] = online.used, document["left_out"] = online.left_out;
+    document["restarts"] = online.restarts;
     document["names"] = now.names;
     document["before"] = before.values;
     document["estimates"] = now.values;
@@ -89,8 +90,8 @@ void identify_online(const Globals& globals, const OnlineRequest& request) {
                   now.values[i], now.standard_errors[i]);
     std::cout << text;
   }
-  std::snprintf(text, sizeof text, "%d frames from %g to %g s used, %d left out, %d restarts; twin: ", online.used(),
-                first, last, online.left_out(), online.restarts());
+  std::snprintf(text, sizeof text, "%d frames from %g to %g s used, %d left out, %d restarts; twin: ", online.used,
+                first, last, online.left_out, online.restarts);
   std::cout << text << request.run << "\n";
 }
 

@@ -12,6 +12,7 @@
 #include "base_motion_files.h"
 #include "chainsplat/capture.h"
 #include "chainsplat/estimation.h"
+#include "chainsplat/identification.h"
 #include "chainsplat/planning.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
@@ -37,26 +38,24 @@ struct PlanRequest {
 constexpr const char* kAssumed =
     "mass, stiffness, damping and friction are assumed, and the rope may miss by centimeters";
 
-// Planning needs numbers for everything: what identification starts from, for a 60 g/m rope where the mass is unknown.
+// Planning needs numbers for everything: a mass of 60 g per 30 cm and the centers of identification's priors, alike at
+// all joints.
 dynamics::Parameters assumed_parameters(const twin::Twin& twin) {
-  constexpr double kMass = 0.2;                   // kg/m
-  constexpr double kStiffness = 0.1;              // of weight times length, N m/rad at a joint
-  constexpr double kRetardation = 0.07;           // s, damping over stiffness
-  constexpr double kCoulomb = 0.3, kDrag = 0.72;  // -, N s^2/m^3 per meter of diameter
+  constexpr double kMass = 0.2;  // kg/m
   const chain::Chain& chain = twin.chain;
   dynamics::Parameters p;
-  const double torque = kStiffness * kMass * chain.length * twin.gravity.norm() * chain.length;
+  const double torque = identification::kStiffnessPart * kMass * chain.length * twin.gravity.norm() * chain.length;
   for (int link = 1; link < chain.links(); ++link) {
     const double length = chain.link_end(link) - chain.link_start(link);
     p.link_mass.push_back(kMass * length);
     p.viscous_friction.push_back(0.0);
-    p.coulomb_friction.push_back(twin.tabletop ? kCoulomb : 0.0);
+    p.coulomb_friction.push_back(twin.tabletop ? identification::kCoulombMean : 0.0);
     p.air_linear.push_back(0.0);
-    p.air_quadratic.push_back(twin.tabletop ? 0.0 : kDrag * chain.diameter * length);
+    p.air_quadratic.push_back(twin.tabletop ? 0.0 : identification::kDragPerDiameter * chain.diameter * length);
   }
   p.stiffness.assign(chain.angles(), torque);
   p.rest_angle.assign(chain.angles(), 0.0);
-  p.damping.assign(chain.angles(), kRetardation * torque);
+  p.damping.assign(chain.angles(), identification::kRetardation * torque);
   p.radius = 0.5 * chain.diameter;
   p.gravity = twin.gravity;
   if (twin.tabletop) p.table_normal = twin.table_normal.value_or(math::Vector3::UnitZ());
@@ -123,7 +122,7 @@ planning::Problem make_problem(const PlanRequest& request, const twin::Twin& twi
   } else if (twin.tabletop) {
     problem.initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
   } else {
-    problem.initial.theta = dynamics::static_equilibrium(problem.model, problem.base);
+    problem.initial.theta = dynamics::static_equilibrium(problem.model, problem.base).theta;
   }
   return problem;
 }
@@ -197,6 +196,7 @@ Json plan_json(const planning::Problem& problem, const planning::Options& option
   }
   out["starts"] = plan.starts;
   out["iterations"] = plan.iterations;
+  out["solver"] = plan.summary;
   out["seconds"] = plan.seconds;
   return out;
 }
@@ -253,6 +253,7 @@ Json loop_json(const planning::LoopResult& loop, double tolerance) {
     out["mean_replan_seconds"] = loop.mean_replan;
     out["longest_replan_seconds"] = loop.longest_replan;
     out["foretold_miss"] = loop.foretold;
+    out["solver"] = loop.summary;
   }
   return out;
 }
@@ -364,6 +365,7 @@ void plan(const Globals& globals, PlanRequest& request) {
                 request.out.c_str());
   say(text);
   if (!plan.reached) say(plan.reason);
+  if (!plan.reached && !solve::converged(plan.summary)) say("its last fit: " + solve::describe(plan.summary));
   for (const auto& [name, loop] : simulated.items()) {
     std::snprintf(text, sizeof text, "%s: miss %.2f mm", name.c_str(), 1e3 * loop["miss"].get<double>());
     say(text);

@@ -18,6 +18,7 @@
 #include <string>
 #include <vector>
 
+#include "chainsplat/solve.h"
 #include "cli.h"
 
 namespace chainsplat::tools {
@@ -188,6 +189,13 @@ void log_to(const Path& file) {
   if (!stream)
     throw InputError(file.string(), "the log cannot be opened for writing", "name a file that can be written");
   screen.logs.push_back(std::move(stream));
+}
+
+void log_fit(const std::string& stage, const solve::Summary& summary) {
+  nlohmann::ordered_json record{{"stage", stage}, {"solver", summary}};
+  record["seconds"] = std::round((core::seconds_now() - screen.origin) * 1e3) / 1e3;
+  for (std::ofstream& file : screen.logs) file << record.dump() << std::endl;
+  say_more(stage + ": " + solve::describe(summary));
 }
 
 void end_progress() {

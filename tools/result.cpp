@@ -36,7 +36,7 @@ chain::States rollout_on(const twin::Twin& twin, const Path& run, const capture:
   initial.time = std::min(capture.base.start(), times.front());
   initial.thetadot = math::VectorX::Zero(twin.chain.angles());
   initial.theta = twin.tabletop ? (twin.initial ? twin.initial->theta : twin.states.theta.front())
-                                : dynamics::static_equilibrium(model, capture.base.pose(initial.time));
+                                : dynamics::static_equilibrium(model, capture.base.pose(initial.time)).theta;
   return dynamics::rollout(model, capture.base, initial, times);
 }
 

@@ -143,18 +143,18 @@ dynamics::Model model_of(const twin::Twin& twin, const Path& run) {
   return dynamics::make_model(twin.chain, *twin.parameters);
 }
 
-std::string covariance_csv(const chain::States& states, const std::vector<math::MatrixX>& covariances) {
+std::string covariance_csv(const chain::States& states) {
   std::string text = "time";
-  const Eigen::Index angles = covariances.front().rows();
+  const Eigen::Index angles = states.covariance.front().rows();
   for (Eigen::Index row = 0; row < angles; ++row)
     for (Eigen::Index column = 0; column <= row; ++column)
       text.append(",c_").append(std::to_string(row + 1)).append("_").append(std::to_string(column + 1));
   text += "\n";
-  for (std::size_t k = 0; k < covariances.size(); ++k) {
+  for (std::size_t k = 0; k < states.covariance.size(); ++k) {
     text += core::exact(states.time[k]);
     for (Eigen::Index row = 0; row < angles; ++row)
       for (Eigen::Index column = 0; column <= row; ++column)
-        text.append(",").append(core::exact(covariances[k](row, column)));
+        text.append(",").append(core::exact(states.covariance[k](row, column)));
     text += "\n";
   }
   return text;

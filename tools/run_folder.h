@@ -56,7 +56,7 @@ trajectory::Trajectory own_base(const Path& run, const chain::States& states);
 dynamics::Model model_of(const twin::Twin& twin, const Path& run);  // throws InputError before identification
 
 // 'time,c_1_1,c_2_1,c_2_2,...': the lower triangle of every frame's covariance of theta, rad^2.
-std::string covariance_csv(const chain::States& states, const std::vector<math::MatrixX>& covariances);
+std::string covariance_csv(const chain::States& states);
 // Empty where the file is missing. Throws InputError where it does not fit the states or holds no covariances.
 std::vector<math::MatrixX> read_covariances(const Path& file, const chain::States& states);
 

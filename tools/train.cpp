@@ -84,21 +84,26 @@ recognition::Options settings_of(const Request& request, const Globals& globals)
   return options;
 }
 
-void recognize_stage(twin::Twin& twin, std::vector<math::MatrixX>& covariances, gpu::Device& device,
-                     const capture::Capture& capture, const Request& request, const recognition::Options& settings) {
+// How the fits of the stages that ran ended, by stage.
+using Fits = std::vector<std::pair<std::string, solve::Summary>>;
+
+solve::Summary recognize_stage(twin::Twin& twin, gpu::Device& device, const capture::Capture& capture,
+                               const Request& request, const recognition::Options& settings) {
   const Stopwatch watch(twin, "recognize");
   recognition::Result found = recognition::recognize(device, capture, settings);
   twin.chain = std::move(found.chain);
   twin.gaussians = std::move(found.gaussians);
   twin.states = std::move(found.states);
-  covariances = std::move(found.covariances);
   // exactly symmetric, as they are read back
-  for (math::MatrixX& covariance : covariances) covariance = math::MatrixX(covariance.selfadjointView<Eigen::Lower>());
+  for (math::MatrixX& covariance : twin.states.covariance)
+    covariance = math::MatrixX(covariance.selfadjointView<Eigen::Lower>());
   if (request.bending == "auto" && request.mode == "fast") {
     char text[96];
     std::snprintf(text, sizeof text, " bending (out of plane: %.2f mm)", 1e3 * found.bending.out_of_plane_rms);
     say((found.bending.bending == chain::Bending::planar ? "planar" : "spatial") + std::string(text));
   }
+  log_fit("recognize", found.summary);
+  return found.summary;
 }
 
 // What the capture and the command line say of a new twin.
@@ -135,7 +140,7 @@ void check_same_work(const twin::Twin& twin, const capture::Capture& capture, co
 }
 
 Json summary_json(const twin::Twin& twin, const Path& out, const eval::Metrics* recognized,
-                  const eval::Metrics* rollout) {
+                  const eval::Metrics* rollout, const Fits& fits) {
   Json document;
   document["run"] = out.string();
   document["capture"] = twin.provenance.capture;
@@ -145,6 +150,7 @@ Json summary_json(const twin::Twin& twin, const Path& out, const eval::Metrics* 
   document["gaussians"] = twin.gaussians.count;
   for (const auto& [name, metrics] : {std::pair("recognized", recognized), std::pair("rollout", rollout)})
     if (metrics) document[name] = Json::parse(eval::to_json(*metrics))["mean"];
+  for (const auto& [stage, summary] : fits) document["solver"][stage] = summary;
   document["seconds"] = twin.provenance.seconds;
   return document;
 }
@@ -230,9 +236,8 @@ void train(const Globals& globals, const Request& request) {
                      "give the same --frames as then");
   const recognition::Options settings = settings_of(request, globals);
   if (recognize) recognition::check_checkpoint(capture, settings);
-  std::vector<math::MatrixX> covariances;
-  if (continued && (identify || joint)) covariances = read_covariances(out / kCovarianceFile, twin.states);
-  if (continued && joint) check_joint(twin, covariances, out);
+  if (continued && (identify || joint)) twin.states.covariance = read_covariances(out / kCovarianceFile, twin.states);
+  if (continued && joint) check_joint(twin, out);
   gpu::DevicePtr device;
   if (recognize || joint || stages.evaluate) {
     device = gpu::open_device({.selector = globals.device});
@@ -260,21 +265,23 @@ void train(const Globals& globals, const Request& request) {
   try {
     log_to(out / kLogFile);
     core::write_file(out / kBaseFile, trajectory::write_tum(capture.base.samples()));
+    Fits fits;
     if (recognize) {
-      recognize_stage(twin, covariances, *device, capture, request, settings);
+      fits.emplace_back("recognize", recognize_stage(twin, *device, capture, request, settings));
       trim_memory();  // or the next stage's need comes on top
-      if (!covariances.empty()) core::write_file(out / kCovarianceFile, covariance_csv(twin.states, covariances));
+      if (!twin.states.covariance.empty()) core::write_file(out / kCovarianceFile, covariance_csv(twin.states));
       save();  // what comes later can fail without losing this
       stop_if_asked();
     }
     if (identify) {
-      identify_stage(twin, capture.base, covariances, request.mode == "paper", globals.seed);
+      identify_stage(twin, capture.base, request.mode == "paper", globals.seed);
+      fits.emplace_back("identify", *twin.estimates.solver);
       save();
       stop_if_asked();
     }
     if (joint) {
-      joint_stage(twin, covariances, capture, *device, globals.seed);
-      core::write_file(out / kCovarianceFile, covariance_csv(twin.states, covariances));
+      fits.emplace_back("joint", joint_stage(twin, capture, *device, globals.seed));
+      core::write_file(out / kCovarianceFile, covariance_csv(twin.states));
       save();
       stop_if_asked();
     }
@@ -302,7 +309,7 @@ void train(const Globals& globals, const Request& request) {
     const eval::Metrics* const shown[] = {stages.evaluate ? &recognized : nullptr,
                                           stages.evaluate && has_rollout ? &rolled_out : nullptr};
     if (globals.json) {
-      std::cout << summary_json(twin, out, shown[0], shown[1]).dump(1) << "\n";
+      std::cout << summary_json(twin, out, shown[0], shown[1], fits).dump(1) << "\n";
     } else {
       std::vector<MetricsRow> rows;
       if (shown[0]) rows.push_back({"recognized", shown[0]->mean});

@@ -1,12 +1,11 @@
-// chainsplat/adaptation.h - parameters that follow a rope while it is estimated (identification, recursive).
+// chainsplat/adaptation.h - the recursive parameter filter: parameters that follow a rope while it is estimated.
 //
 // An extended Kalman filter on (theta, thetadot, parameters): the rope is predicted from frame to frame with the
 // derivatives of the variational equation, and each estimated theta corrects state and parameters together. Old frames
 // are forgotten: with every second the parameters' information fades by exp(-1/memory) towards what a rope of this kind
 // is expected to keep, so that a direction that nothing excites returns to that and not beyond.
 #pragma once
-#include <string>
-#include <vector>
+#include <memory>
 
 #include "chainsplat/dynamics.h"
 
@@ -32,42 +31,28 @@ struct Observation {
   VectorX theta, thetadot, sigma;  // rad, rad/s, rad; thetadot and sigma may be empty
 };
 
-class Adaptation {
+// What the frames so far have told.
+struct Result {
+  dynamics::Parameters parameters;
+  // Those of the start with values, standard errors and covariance brought up to date.
+  dynamics::Estimates estimates;
+  dynamics::InitialState state;                // of the rope, now
+  int used = 0, left_out = 0, restarts = 0;  // frames; restarts of the state
+};
+
+class ParameterFilter {
  public:
   // `estimates`: the start, names and covariance. Throws InputError where they have no parameter.
-  Adaptation(const chain::Chain& chain, const dynamics::Parameters& parameters, const dynamics::Estimates& estimates,
-             const Options& options);
+  ParameterFilter(const chain::Chain& chain, const dynamics::Parameters& parameters,
+                  const dynamics::Estimates& estimates, const Options& options);
+  ~ParameterFilter();
   // Throws InputError where times do not increase or sizes do not fit. False where the frame was left out (gate).
   bool observe(const Observation& seen, const dynamics::BaseFunction& base);
-
-  const dynamics::Parameters& parameters() const { return now_; }
-  // The given ones with values, standard errors and covariance brought up to date.
-  dynamics::Estimates estimates() const;
-  dynamics::InitialState state() const { return {time_, theta_, thetadot_}; }
-  int used() const { return used_; }
-  int left_out() const { return left_out_; }
-  int restarts() const { return restarts_; }
+  Result result() const;
 
  private:
-  void start(const Observation& seen);
-  void forget(double interval);
-  bool predict(double time, const dynamics::BaseFunction& base);
-  VectorX sigma_of(const Observation& seen) const;
-
-  chain::Chain chain_;
-  dynamics::Parameters first_, now_;
-  dynamics::Estimates known_;
-  Options options_;
-  std::vector<std::string> names_;    // of the parameters among the estimates
-  std::vector<Eigen::Index> places_;  // of those in the estimates
-  VectorX change_;                    // of the parameters since the start
-  MatrixX covariance_;                // of (theta, thetadot, change)
-  VectorX expected_;                  // variance when all is forgotten
-  VectorX theta_, thetadot_;
-  double time_ = 0.0;
-  bool started_ = false;
-  int used_ = 0, left_out_ = 0, restarts_ = 0;
-  int rejected_in_a_row_ = 0;
+  struct Belief;
+  std::unique_ptr<Belief> belief_;
 };
 
 }  // namespace chainsplat::adaptation

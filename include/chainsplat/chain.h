@@ -52,6 +52,31 @@ MatrixX world_axes(const Chain& chain, const VectorX& theta, const Pose& base);
 // from the world axes: column k is s_k^w x x + s_k^v for k <= last_angle(link), else 0.
 MatrixX point_jacobian(const Chain& chain, const MatrixX& world_axes, int link, const Vector3& world_point);
 
+// A point fixed to a link, `home` its place at theta = 0 in the base frame, m.
+struct MaterialPoint {
+  int link = 0;
+  Vector3 home = Vector3::Zero();
+};
+MaterialPoint centerline_point(const Chain& chain, double arclength);
+// What tells a shape: every link's end, and its middle before it if asked for; where the rope can twist, then also a
+// point per link on its surface at the end.
+std::vector<MaterialPoint> shape_points(const Chain& chain, bool middles);
+// point_jacobian() of each, 3 x n. `axes` and `motions` are those of one state.
+std::vector<MatrixX> point_jacobians(const Chain& chain, const MatrixX& world_axes, const std::vector<Pose>& motions,
+                                     const std::vector<MaterialPoint>& points);
+// The same of the ends of links 1.. : the joints after the first and the free end.
+std::vector<MatrixX> link_end_jacobians(const Chain& chain, const MatrixX& world_axes,
+                                        const std::vector<Pose>& motions);
+std::vector<MatrixX> link_end_jacobians(const Chain& chain, const VectorX& theta, const Pose& base);
+// Sum of weight J^T J (weight 1 where none are given), n x n: the squared displacement of points by a change of the
+// angles, and the covariance of the torques that random forces there cause, alike in all directions.
+MatrixX displacement_metric(const std::vector<MatrixX>& jacobians, const VectorX& weights = {});
+
+// Does this angle turn the rope about itself instead of bending it? The axes of a joint are perpendicular, so anything
+// between 0 and 1 tells them apart.
+bool is_twist(const Chain& chain, int angle);
+bool has_twist(const Chain& chain);
+
 // Link that carries the material point at `arclength` (a joint belongs to the link it starts).
 int link_at(const Chain& chain, double arclength);
 
@@ -69,11 +94,12 @@ std::vector<double> equal_arclengths(const Chain& chain, int count);
 // dl/dtheta from dl/d(link motion): g is 6 x links, world twists about the world origin (SPEC 2.3): suffix sums.
 VectorX theta_gradient(const Chain& chain, const MatrixX& world_axes, const MatrixX& link_twist_gradient);
 
-// Angles along time. `thetadot` is empty or as long as `theta`.
+// Angles along time. `thetadot` and `covariance` are empty or as long as `theta`.
 struct States {
-  std::vector<double> time;       // s
-  std::vector<VectorX> theta;     // rad, n each
-  std::vector<VectorX> thetadot;  // rad/s
+  std::vector<double> time;         // s
+  std::vector<VectorX> theta;       // rad, n each
+  std::vector<VectorX> thetadot;    // rad/s
+  std::vector<MatrixX> covariance;  // rad^2, n x n, of theta
 };
 // theta at any time: cubic (Catmull-Rom on the given times), clamped outside by linear extrapolation of at most one
 // interval.

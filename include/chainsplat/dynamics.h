@@ -11,6 +11,7 @@
 #include <utility>
 #include <vector>
 #include "chainsplat/chain.h"
+#include "chainsplat/solve.h"
 #include "chainsplat/trajectory.h"
 
 namespace chainsplat::dynamics {
@@ -49,13 +50,17 @@ struct Parameters {
   int substeps = 4;  // a frame of 1/30 s
 };
 
+// Of all links and the tip, kg.
+double total_mass(const Parameters& parameters);
+
 // State at one time: where a rollout starts.
 struct InitialState {
   double time = 0.0;
   VectorX theta, thetadot;  // rad, rad/s
 };
 
-// What identification says of its numbers; one entry a fitted parameter, in the order of the covariance.
+// What identification says of its numbers; one entry per fitted number, in the order of the covariance. Names are those
+// of files and may be of another program; dynamics/parametrization.h says what they mean.
 struct Estimates {
   std::vector<std::string> names;               // e.g. "log_stiffness", "rest_angle_3": a log where the name says so
   std::vector<double> values, standard_errors;  // in the units of the name
@@ -67,6 +72,9 @@ struct Estimates {
     std::vector<std::pair<std::string, double>> parts;  // name, large components of the unit vector
   };
   std::vector<Weak> weak;
+  // Of the fit over the whole recordings: whitened squares, halves, priors included; steps in the units of the names.
+  // None: a filter's estimates, or an older twin's.
+  std::optional<solve::Summary> solver;
 };
 
 using BaseFunction = std::function<trajectory::BaseMotion(double)>;  // base motion at a time, s
@@ -130,25 +138,6 @@ struct BaseSlopes {
 BaseSlopes base_slopes(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                        const VectorX& thetadot);
 
-// linearize() and base_slopes() at one state after another without allocation: for integrators and derivatives outside
-// of this module. `model` must outlive it.
-class Engine;
-class Linearizer {
- public:
-  explicit Linearizer(const Model& model);
-  ~Linearizer();
-  // Fills `out`; without `slopes` its acceleration only. False where M is not positive definite.
-  bool at(const trajectory::BaseMotion& base, const Vector6& base_jerk, const VectorX& theta, const VectorX& thetadot,
-          bool slopes, Linearization& out);
-  // Where at() was with `slopes`.
-  void base_slopes(BaseSlopes& out) const;
-  // x = M^-1 x where at() was.
-  void solve_mass(MatrixX& x) const;
-
- private:
-  std::unique_ptr<Engine> engine_;
-};
-
 // The stacked matrices of SPEC 3.5 (paper, "Closed-form dynamics", corrected): for reading and checking, O(n^3),
 // viscous and other wrenches as in 3.3. M thetaddot + coriolis + gravity + base - friction = -K(theta - theta_0) - D
 // thetadot.
@@ -167,7 +156,11 @@ ClosedForm closed_form(const Model& model, const trajectory::BaseMotion& base, c
 double potential_energy(const Model& model, const math::Pose& base, const VectorX& theta);
 // The angles at rest under a base at rest: least potential energy by damped Newton from `start` (empty: the rest
 // angles). Friction is left out. Throws WorkError where no minimum was found.
-VectorX static_equilibrium(const Model& model, const math::Pose& base, const VectorX& start = {});
+struct Equilibrium {
+  VectorX theta;
+  solve::Summary summary;  // J, rad
+};
+Equilibrium static_equilibrium(const Model& model, const math::Pose& base, const VectorX& start = {});
 
 // The base motion on the integrator's own time grid, sampled once for many rollouts.
 struct BaseGrid {
@@ -180,24 +173,19 @@ struct BaseGrid {
   };
   std::vector<Node> nodes;
 };
+// Steps for an interval of seconds with `substeps` per 1/30 s, at least one.
+int step_count(double interval, int substeps);
 // From `start` through all `times` (increasing, the first >= start), `substeps` a 1/30 s, equal within each interval.
 BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<double>& times, int substeps);
 
-// One unknown's derivative: d(Parameters) and d(initial state). Empty arrays mean zeros.
+// One unknown's derivative: d(Parameters) and d(initial state). Empty arrays mean zeros. dynamics/parametrization.h
+// makes them.
 struct Tangent {
   std::vector<double> link_mass, viscous_friction, coulomb_friction, air_linear, air_quadratic;  // a link
   std::vector<double> stiffness, rest_angle, damping, roll_lever;                                // an angle
   double tip_mass = 0.0;
   VectorX theta, thetadot;
 };
-// `parameters` after the numbers that identification calls `names` (Estimates) have changed by `change`: an addition to
-// a log or logit, to a rest angle or a lever. The total mass stays. Names of initial states change nothing.
-Parameters moved(const chain::Chain& chain, const Parameters& parameters, std::span<const std::string> names,
-                 const VectorX& change);
-// The derivatives of that, and of the initial state for names theta_k and thetadot_k.
-std::vector<Tangent> tangents(const chain::Chain& chain, const Parameters& parameters,
-                              std::span<const std::string> names);
-bool is_parameter(const Tangent& tangent);  // it changes parameters, not an initial state alone
 // d(joint law - tau_ID) / d unknowns at fixed thetaddot = a, n x unknowns; M^-1 of it is da / d unknowns. The tangents'
 // initial states have no part in it.
 MatrixX unknown_forces(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
@@ -221,6 +209,19 @@ struct Divergence {
 bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta, const VectorX& thetadot,
               chain::States& states, std::span<const Tangent> unknowns = {}, Sensitivities* sensitivities = nullptr,
               Divergence* divergence = nullptr);
+
+// Unknowns that shape the base motion. `after`: s past a node of the grid, or before it, far less than a step.
+struct BaseUnknowns {
+  Eigen::Index count = 0;
+  // The base motion there.
+  std::function<trajectory::BaseMotion(std::size_t node, double after)> motion;
+  // Sets `torques`, n x count, to d tau_ID / d unknowns there: the sums of `slopes` times the motion's derivatives.
+  std::function<void(std::size_t node, double after, const BaseSlopes& slopes, MatrixX& torques)> torques;
+};
+// The same rollout with its derivatives by those; RODAS3 only. `exact`: those of the discrete map, stage by stage; else
+// by the trapezoidal rule as above, of second order and several times faster, enough for a Gauss-Newton step.
+bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta, const VectorX& thetadot,
+              chain::States& states, const BaseUnknowns& unknowns, bool exact, Sensitivities& sensitivities);
 
 // One evaluation or one step at a time, without allocation: for loops that cannot wait for a rollout (filters,
 // control). `model` must outlive it.

@@ -6,9 +6,11 @@
 // maximizes log det(what is known + that): the volume of what remains uncertain shrinks most.
 #pragma once
 #include <optional>
+#include <span>
 #include <string>
 #include <vector>
 
+#include "chainsplat/dynamics/parametrization.h"
 #include "chainsplat/planning.h"
 
 namespace chainsplat::excitation {
@@ -63,7 +65,7 @@ Result excite(const Problem& problem, const Options& options);
 // Information about `names` (initial states left out of the sum) in a recording under `base` at `times`, with noise of
 // the given sd on points of the centerline, and the initial state known as well as recognition knows it. Empty where
 // the rollout diverges. `states`: filled where given.
-MatrixX information(const dynamics::Model& model, const std::vector<std::string>& names,
+MatrixX information(const dynamics::Model& model, std::span<const dynamics::Unknown> parameters,
                     const dynamics::BaseFunction& base, const dynamics::InitialState& initial,
                     const std::vector<double>& times, double noise, chain::States* states = nullptr);
 

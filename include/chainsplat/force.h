@@ -36,9 +36,9 @@ struct Motion {
 
 // Smooths every angle by a Kalman filter and Rauch-Tung-Striebel smoother under random jerk. The sizes of jerk and
 // noise and the correlations of the angles' errors are found by maximum likelihood; the ratio of jerk and noise is the
-// same for all angles. `standing`: covariances of the angles' lasting errors, one n x n per time, or empty. Throws
-// InputError for fewer than three times.
-Motion smooth(const chain::States& states, std::span<const MatrixX> standing);
+// same for all angles. The covariances of `states`, if any, are those of the angles' lasting errors. Throws InputError
+// for fewer than three times.
+Motion smooth(const chain::States& states);
 
 // Returns the covariance of angles of which only the standard deviations are known. Cameras observe positions: the
 // errors of the links' ends are independent, so that those of neighboring angles cancel.
@@ -126,7 +126,6 @@ struct Live {
   std::function<std::optional<Contact>(double time, const VectorX& theta)> contact;
   Options options;
   chain::States states;              // of the last seconds
-  std::vector<MatrixX> standing;     // one per state, or empty
   VectorX belief;                    // about the contact's place at the last estimate's time; empty before the first
   std::size_t lines = 0, taken = 0;  // numbers of estimates returned and of states received
 };

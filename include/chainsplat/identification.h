@@ -11,15 +11,24 @@
 #include <string>
 #include <vector>
 
-#include "chainsplat/dynamics.h"
+#include "chainsplat/dynamics/parametrization.h"
 
 namespace chainsplat::identification {
 
-// What is known of a parameter beforehand: takes the place of its prior. `name` as in Estimates::names, or without the
-// number at its end for all of a kind ("rest_angle").
+// Centers of the priors where nothing is known of a rope, and starts. Stiffness is relative to weight times length.
+inline constexpr double kStiffnessPart = 0.1;
+inline constexpr double kRetardation = 0.07;   // s, damping over stiffness
+inline constexpr double kDampingPart = 0.004;  // s, damping over weight times length, where there is no stiffness
+// N s^2/m^3 per meter of diameter: half the density of air times the coefficient of a cylinder across the flow
+inline constexpr double kDragPerDiameter = 0.5 * 1.2 * 1.2;
+inline constexpr double kTipPart = 0.03;
+inline constexpr double kCoulombMean = 0.3;
+inline constexpr double kViscousRate = 3.0;  // 1/s, friction over mass
+
+// What is known of an unknown beforehand: takes the place of its prior. The index can be dynamics::kEvery.
 struct Prior {
-  std::string name;
-  double mean = 0.0, deviation = 1e-4;  // in units of the name
+  dynamics::Unknown unknown;
+  double mean = 0.0, deviation = 1e-4;  // in units of the unknown
 };
 
 struct Options {
@@ -37,7 +46,7 @@ struct Options {
   double start_factor = 1.0;  // stiffness, damping, drag and friction of the first starts, to what is usual
   std::uint64_t seed = 0;     // of further starts where the first ones fit poorly
   int max_iterations = 25;    // of Levenberg-Marquardt, a horizon
-  double model_error = 1e-3;  // m, of one coordinate of a point of the chain, beside what `covariances` say
+  double model_error = 1e-3;  // m, of one coordinate of a point of the chain, beside what the states' covariances say
   int adam_iterations = 300;  // paper
 };
 
@@ -54,8 +63,7 @@ struct Result {
 // A recording of the rope: how its base moved and what was seen of it.
 struct Recording {
   trajectory::Trajectory base;
-  chain::States recognized;                // at least 3 times, increasing
-  std::vector<math::MatrixX> covariances;  // of each theta, n x n, or empty
+  chain::States recognized;  // at least 3 times, increasing; what has covariances counts by them
 };
 
 // Measured world positions of material points on the centerline, e.g. motion-capture markers.
@@ -67,15 +75,17 @@ struct Markers {
 };
 
 // The smoothest chain through the markers at every time: least squares with priors on bending, on its differences from
-// joint to joint and from time to time, so that few markers suffice. `covariances`, where given, is filled with those
-// of theta, n x n. Throws InputError where arclengths, times or sizes do not fit, or a time shows no marker.
-chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers,
-                          std::vector<math::MatrixX>* covariances = nullptr);
+// joint to joint and from time to time, so that few markers suffice; with covariances. Throws InputError where
+// arclengths, times or sizes do not fit, or a time shows no marker.
+struct MarkerFit {
+  chain::States states;
+  solve::Summary summary;  // of all times together; rad
+};
+MarkerFit fit_markers(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers);
 
-// `recognized`: at least 3 times, increasing. `covariances`: of each theta, n x n, or empty. Throws InputError for too
-// little data, WorkError where no start gives a rollout that stays finite.
+// Of one recording. Throws InputError for too little data, WorkError where no start gives a rollout that stays finite.
 Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,
-                std::span<const math::MatrixX> covariances, const Options& options);
+                const Options& options);
 // The same with fit_markers() as the start and the markers themselves as residuals. `node_rms` is that of the markers.
 Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers,
                 const Options& options);

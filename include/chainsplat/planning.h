@@ -114,6 +114,7 @@ struct Plan {
   std::string reason;  // why not
   Peaks peaks;
   int starts = 0, iterations = 0;
+  solve::Summary summary;  // of the last fit of each stretch together; m^2, m (norm of the weights)
   double seconds = 0.0;
 };
 
@@ -137,9 +138,13 @@ std::vector<dynamics::Parameters> draw_parameters(const chain::Chain& chain, con
 
 // The angles of `chain` whose centerline comes nearest to `points` (3 x count, world) at `arclengths`, from `start`, by
 // Gauss-Newton; and with the points' velocities the rates that go with them.
-dynamics::InitialState fit_state(const chain::Chain& chain, const trajectory::BaseMotion& base,
-                                 const std::vector<double>& arclengths, const MatrixX& points,
-                                 const MatrixX& velocities, const VectorX& start);
+struct StateFit {
+  dynamics::InitialState state;
+  solve::Summary summary;  // m^2, rad (norm)
+};
+StateFit fit_state(const chain::Chain& chain, const trajectory::BaseMotion& base,
+                   const std::vector<double>& arclengths, const MatrixX& points, const MatrixX& velocities,
+                   const VectorX& start);
 
 // Replanning while another chain plays the rope's part. What is seen of it are points of its centerline and their
 // speeds, without noise; from them come the twin's state and, by what the model did not foretell since the last look,
@@ -160,6 +165,8 @@ struct LoopResult {
   double longest_replan = 0.0, mean_replan = 0.0;  // s of one core
   double foretold = 0.0;                           // m, miss as the last replan expected it
   double out_of_reach = 0.0;                       // m, unreachable_distance() of the target as it moves, at best
+  // Of the replans together: two steps each, so most end at the last. Without feedback 0 iterations.
+  solve::Summary summary;
 };
 // Plays `plan` (of one target) on `truth`, from rest: in free space in its own equilibrium, on a table with the shape
 // of the problem's initial state.

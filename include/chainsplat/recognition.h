@@ -33,9 +33,10 @@ struct Options {
 struct Result {
   chain::Chain chain;
   splat::Gaussians gaussians;
-  chain::States states;                    // every frame time of the first camera, with thetadot
-  std::vector<math::MatrixX> covariances;  // n x n of theta, a frame; may be empty
+  chain::States states;  // every frame time of the first camera, with thetadot and, if known, covariances
   silhouette::BendingChoice bending;
+  // Of the last refinement of all frames' angles together: one step per frame in `fast`, checked where it is long; rad.
+  solve::Summary summary;
 };
 
 // Throws WorkError (device lost, diverged), Interrupted after leaving a checkpoint. Reports progress in stage
@@ -59,11 +60,11 @@ struct AnglePrior {
 // What the silhouettes know.
 AnglePrior prior_of(const silhouette::SequenceFit& fit);
 
-// Gauss-Newton on every frame's angles with the Gaussians held, from `states`, which is updated. Returns the
-// covariances of theta, as in Result.
-std::vector<math::MatrixX> refine_states(gpu::Device& device, const capture::Capture& capture,
-                                         const chain::Chain& chain, const splat::Gaussians& gaussians,
-                                         const AnglePrior& prior, int iterations, chain::States& states);
+// Gauss-Newton on every frame's angles with the Gaussians held, from `states`, which is updated with its covariances.
+// Returns how all frames ended together; rad.
+solve::Summary refine_states(gpu::Device& device, const capture::Capture& capture, const chain::Chain& chain,
+                             const splat::Gaussians& gaussians, const AnglePrior& prior, int iterations,
+                             chain::States& states);
 
 // Adam on the Gaussians with the angles held, views of every `every`-th frame in random batches.
 void polish(gpu::Device& device, const capture::Capture& capture, const chain::Chain& chain,

@@ -8,7 +8,6 @@
 // every frame's most likely angles; Adam on the Gaussians with these; the images' angles again about them.
 #pragma once
 #include <cstdint>
-#include <span>
 #include <vector>
 
 #include "chainsplat/identification.h"
@@ -22,17 +21,12 @@ struct Noise {
 };
 
 // The most likely noise (variance components by expectation maximization). Frames far worse than the others count
-// less. All sequences have the same length.
-Noise estimate_noise(const chain::Chain& chain, const chain::States& images, std::span<const math::MatrixX> covariances,
-                     const chain::States& rollout);
+// less. All sequences have the same length, `images` has covariances.
+Noise estimate_noise(const chain::Chain& chain, const chain::States& images, const chain::States& rollout);
 
 // The most likely angles between images and rollout, frame by frame, and their covariances.
-struct Angles {
-  chain::States states;
-  std::vector<math::MatrixX> covariances;  // n x n of theta, a frame
-};
-Angles combine(const chain::Chain& chain, const chain::States& images, std::span<const math::MatrixX> covariances,
-               const chain::States& rollout, const Noise& noise);
+chain::States combine(const chain::Chain& chain, const chain::States& images, const chain::States& rollout,
+                      const Noise& noise);
 
 struct Options {
   identification::Options identification;
@@ -44,16 +38,19 @@ struct Options {
 
 struct Result {
   splat::Gaussians gaussians;
-  Angles angles;
+  chain::States states;
   identification::Result identified;
   Noise noise;     // of the first round: later ones' images have been drawn with the dynamics' help
   int rounds = 0;  // in which the Gaussians were trained again
+  // Of the rounds: step m, RMS distance by which the dynamics moves the nodes after the last; costs those of
+  // `identified`, first and last.
+  solve::Summary summary;
 };
 
 // From what recognition found and the rollout identified from it. Throws what recognition and identification throw.
 // Reports progress in stage "joint".
 Result refine(gpu::Device& device, const capture::Capture& capture, const chain::Chain& chain,
-              const splat::Gaussians& gaussians, const Angles& recognized, const chain::States& rollout,
+              const splat::Gaussians& gaussians, const chain::States& recognized, const chain::States& rollout,
               const Options& options);
 
 }  // namespace chainsplat::refinement

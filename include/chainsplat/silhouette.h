@@ -10,6 +10,7 @@
 #include <vector>
 #include "chainsplat/capture.h"
 #include "chainsplat/chain.h"
+#include "chainsplat/solve.h"
 
 namespace chainsplat::silhouette {
 
@@ -41,6 +42,7 @@ struct FrameFit {
   double edge_offset = 0.0;      // px by which the masks are wider than the tube on each side
   math::VectorX mask_shift;      // px, x and y of each view; empty where the prior says nothing about it
   math::MatrixX covariance;  // of theta, rad^2, then mask_shift; directions that the views do not fix have the prior's
+  solve::Summary summary;    // of the fine stage; costs px^2, mean of the outline's squared distances, capped; steps rad
 };
 
 // One frame: all views taken at (nearly) one time. `views` must be undistorted crops with masks, which may be empty.
@@ -56,6 +58,7 @@ FrameFit fit_frame(const chain::Chain& chain, const math::Pose& base, std::span<
 struct SequenceFit {
   chain::States states;          // theta (smoothed over time) and thetadot
   std::vector<FrameFit> frames;  // each frame's own fit
+  solve::Summary summary;        // of all frames that show the object together
 };
 SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capture, const Options& options = {});
 

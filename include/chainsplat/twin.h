@@ -19,7 +19,8 @@
 //   identification  known_mass (false: masses are relative, forces are per kilogram); names*, estimates*,
 //                   standard_errors*, covariance* (by rows), held* [ { name, reason } ]; null for an unknown number;
 //                   weak* [ { singular_value, direction { name: component } } ]: combinations of parameters that the
-//                   data hardly determine
+//                   data hardly determine;
+//                   solver* { reason, iterations, initial_cost, final_cost, worst_step }: how the fit ended (solve.h)
 //   gaussians, states, rollout   file names, each absent until the file exists
 //   provenance      version, capture, capture_hash, options, seed, device, driver, durations { stage: s }
 #pragma once

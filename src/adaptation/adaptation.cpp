@@ -3,11 +3,11 @@
 #include <algorithm>
 #include <cmath>
 
+#include "chainsplat/dynamics/parametrization.h"
+
 namespace chainsplat::adaptation {
 namespace {
 
-constexpr double kRestSpread = 0.2;   // rad of a rest angle a unit of `spread`
-constexpr double kRollSpread = 0.01;  // m of a lever
 constexpr double kRateSd = 1.0;       // rad/s, of the first frame's rates
 constexpr int kMaxRejected = 5;       // frames in a row, after which the state starts anew
 constexpr double kMaxStep = 0.3;      // of a log in one frame: beyond, the linearization is worthless
@@ -16,62 +16,90 @@ MatrixX symmetric(const MatrixX& m) { return 0.5 * (m + m.transpose()); }
 
 }  // namespace
 
-Adaptation::Adaptation(const chain::Chain& chain, const dynamics::Parameters& parameters,
-                       const dynamics::Estimates& estimates, const Options& options)
-    : chain_(chain), first_(parameters), now_(parameters), known_(estimates), options_(options) {
+struct ParameterFilter::Belief {
+  // what does not change
+  chain::Chain chain;
+  dynamics::Parameters first;
+  dynamics::Estimates known;
+  Options options;
+  std::vector<Eigen::Index> places;         // of the parameters among the estimates
+  std::vector<dynamics::Unknown> unknowns;  // those
+  VectorX expected;                         // variance when all is forgotten
+
+  // what is believed
+  dynamics::Parameters now;
+  VectorX change;      // of the parameters since the start
+  MatrixX covariance;  // of (theta, thetadot, change)
+  VectorX theta, thetadot;
+  double time = 0.0;
+  bool started = false;
+  int used = 0, left_out = 0, restarts = 0, rejected_in_a_row = 0;
+
+  VectorX sigma_of(const Observation& seen) const;
+  void start(const Observation& seen);
+  void forget(double interval);
+  bool predict(double later, const dynamics::BaseFunction& base);
+  bool observe(const Observation& seen, const dynamics::BaseFunction& base);
+};
+
+ParameterFilter::~ParameterFilter() = default;
+
+ParameterFilter::ParameterFilter(const chain::Chain& chain, const dynamics::Parameters& parameters,
+                                 const dynamics::Estimates& estimates, const Options& options)
+    : belief_(std::make_unique<Belief>()) {
   const auto size = static_cast<Eigen::Index>(estimates.names.size());
   if (size == 0 || !math::is_covariance(estimates.covariance) || estimates.covariance.rows() != size)
     throw InputError("identify --online", "the twin knows no covariance of its parameters", "identify it first");
   if (!(options.memory > 0.0)) throw InputError("--memory", "is not above 0", "give seconds, for example 5");
-  const auto all = dynamics::tangents(chain, parameters, estimates.names);
-  for (Eigen::Index i = 0; i < size; ++i)
-    if (dynamics::is_parameter(all[i])) places_.push_back(i), names_.push_back(estimates.names[i]);
-  if (places_.empty()) throw InputError("identify --online", "the twin has no parameter to adapt", "identify it first");
+  const std::vector<dynamics::Unknown> all = dynamics::unknowns_of(chain, estimates);
+  const std::vector<Eigen::Index> places = dynamics::parameters_among(all);
+  if (places.empty()) throw InputError("identify --online", "the twin has no parameter to adapt", "identify it first");
+  Belief& b = *belief_;
+  b.chain = chain, b.known = estimates, b.options = options, b.places = places;
+  b.now = parameters;
   // a diverging sensitivity of the Euler step is no use here: the variational equation needs RODAS3
-  now_.integrator = dynamics::Integrator::rodas3;
-  first_ = now_;
+  b.now.integrator = dynamics::Integrator::rodas3;
+  b.first = b.now;
 
   const int n = chain.angles();
-  const auto count = static_cast<Eigen::Index>(places_.size());
-  change_ = VectorX::Zero(count);
-  expected_.resize(count);
+  const auto count = static_cast<Eigen::Index>(places.size());
+  b.change = VectorX::Zero(count);
+  b.expected.resize(count);
   for (Eigen::Index i = 0; i < count; ++i) {
-    const double unit = names_[i].rfind("rest_angle", 0) == 0   ? kRestSpread
-                        : names_[i].rfind("roll_lever", 0) == 0 ? kRollSpread
-                                                                : 1.0;
-    const double sd = options.spread * unit;
-    expected_[i] = sd * sd;
+    b.unknowns.push_back(all[places[i]]);
+    const double sd = options.spread * dynamics::scale_of(b.unknowns[i].quantity);
+    b.expected[i] = sd * sd;
   }
-  covariance_ = MatrixX::Zero(2 * n + count, 2 * n + count);
-  covariance_.bottomRightCorner(count, count) = symmetric(estimates.covariance(places_, places_));
+  b.covariance = MatrixX::Zero(2 * n + count, 2 * n + count);
+  b.covariance.bottomRightCorner(count, count) = symmetric(estimates.covariance(places, places));
 }
 
-VectorX Adaptation::sigma_of(const Observation& seen) const {
-  if (seen.sigma.size() == 0) return VectorX::Constant(chain_.angles(), std::max(options_.least_sigma, 0.01));
-  return (options_.inflation * seen.sigma).cwiseMax(options_.least_sigma);
+VectorX ParameterFilter::Belief::sigma_of(const Observation& seen) const {
+  if (seen.sigma.size() == 0) return VectorX::Constant(chain.angles(), std::max(options.least_sigma, 0.01));
+  return (options.inflation * seen.sigma).cwiseMax(options.least_sigma);
 }
 
 // The state from the frame alone; the parameters stay as they are.
-void Adaptation::start(const Observation& seen) {
-  const int n = chain_.angles();
-  theta_ = seen.theta;
-  thetadot_ = seen.thetadot.size() ? seen.thetadot : VectorX::Zero(n).eval();
-  time_ = seen.time;
-  covariance_.topRows(2 * n).setZero();
-  covariance_.leftCols(2 * n).setZero();
-  covariance_.topLeftCorner(n, n) = sigma_of(seen).cwiseAbs2().asDiagonal();
-  covariance_.block(n, n, n, n).diagonal().setConstant(kRateSd * kRateSd);
-  started_ = true;
-  rejected_in_a_row_ = 0;
+void ParameterFilter::Belief::start(const Observation& seen) {
+  const int n = chain.angles();
+  theta = seen.theta;
+  thetadot = seen.thetadot.size() ? seen.thetadot : VectorX::Zero(n).eval();
+  time = seen.time;
+  covariance.topRows(2 * n).setZero();
+  covariance.leftCols(2 * n).setZero();
+  covariance.topLeftCorner(n, n) = sigma_of(seen).cwiseAbs2().asDiagonal();
+  covariance.block(n, n, n, n).diagonal().setConstant(kRateSd * kRateSd);
+  started = true;
+  rejected_in_a_row = 0;
 }
 
-void Adaptation::forget(double interval) {
-  if (!std::isfinite(options_.memory)) return;
-  const Eigen::Index count = change_.size();
-  const double keep = std::exp(-interval / options_.memory);
-  auto block = covariance_.bottomRightCorner(count, count);
+void ParameterFilter::Belief::forget(double interval) {
+  if (!std::isfinite(options.memory)) return;
+  const Eigen::Index count = change.size();
+  const double keep = std::exp(-interval / options.memory);
+  auto block = covariance.bottomRightCorner(count, count);
   // in units of what is expected, the information of the eigenvector with variance v fades towards 1
-  const VectorX unit = expected_.cwiseSqrt();
+  const VectorX unit = expected.cwiseSqrt();
   const Eigen::SelfAdjointEigenSolver<MatrixX> eigen(
       symmetric(unit.cwiseInverse().asDiagonal() * block * unit.cwiseInverse().asDiagonal()));
   VectorX grown = eigen.eigenvalues();
@@ -83,38 +111,35 @@ void Adaptation::forget(double interval) {
            unit.asDiagonal();
 }
 
-bool Adaptation::predict(double time, const dynamics::BaseFunction& base) {
-  const int n = chain_.angles();
-  const Eigen::Index count = change_.size(), size = 2 * n + count;
-  std::vector<dynamics::Tangent> unknowns(2 * n);
-  for (int k = 0; k < n; ++k) {
-    unknowns[k].theta = VectorX::Unit(n, k);
-    unknowns[n + k].thetadot = VectorX::Unit(n, k);
-  }
-  for (dynamics::Tangent& d : dynamics::tangents(chain_, now_, names_)) unknowns.push_back(std::move(d));
-  const dynamics::Model model = dynamics::make_model(chain_, now_);
+bool ParameterFilter::Belief::predict(double later, const dynamics::BaseFunction& base) {
+  const int n = chain.angles();
+  const Eigen::Index count = change.size(), size = 2 * n + count;
+  std::vector<dynamics::Unknown> all = dynamics::initial_state_unknowns(chain);
+  all.insert(all.end(), unknowns.begin(), unknowns.end());
+  const std::vector<dynamics::Tangent> tangents = dynamics::tangents(chain, now, all);
+  const dynamics::Model model = dynamics::make_model(chain, now);
   chain::States states;
   dynamics::Sensitivities slopes;
-  const dynamics::BaseGrid grid = dynamics::sample_base(base, time_, {time}, now_.substeps);
-  if (!dynamics::simulate(model, grid, theta_, thetadot_, states, unknowns, &slopes)) return false;
+  const dynamics::BaseGrid grid = dynamics::sample_base(base, time, {later}, now.substeps);
+  if (!dynamics::simulate(model, grid, theta, thetadot, states, tangents, &slopes)) return false;
   MatrixX transition = MatrixX::Identity(size, size);
   transition.topRows(n) = slopes.theta[0];
   transition.middleRows(n, n) = slopes.thetadot[0];
-  covariance_ = transition * covariance_ * transition.transpose();
+  covariance = transition * covariance * transition.transpose();
   // an acceleration that is constant within a frame and unknown from frame to frame
-  const double h = time - time_, a2 = options_.disturbance * options_.disturbance;
+  const double h = later - time, a2 = options.disturbance * options.disturbance;
   for (int k = 0; k < n; ++k) {
-    covariance_(k, k) += 0.25 * a2 * h * h * h * h;
-    covariance_(n + k, n + k) += a2 * h * h;
-    covariance_(k, n + k) += 0.5 * a2 * h * h * h;
-    covariance_(n + k, k) += 0.5 * a2 * h * h * h;
+    covariance(k, k) += 0.25 * a2 * h * h * h * h;
+    covariance(n + k, n + k) += a2 * h * h;
+    covariance(k, n + k) += 0.5 * a2 * h * h * h;
+    covariance(n + k, k) += 0.5 * a2 * h * h * h;
   }
-  theta_ = states.theta[0], thetadot_ = states.thetadot[0], time_ = time;
+  theta = states.theta[0], thetadot = states.thetadot[0], time = later;
   return true;
 }
 
-bool Adaptation::observe(const Observation& seen, const dynamics::BaseFunction& base) {
-  const int n = chain_.angles();
+bool ParameterFilter::Belief::observe(const Observation& seen, const dynamics::BaseFunction& base) {
+  const int n = chain.angles();
   if (seen.theta.size() != n || (seen.thetadot.size() && seen.thetadot.size() != n) ||
       (seen.sigma.size() && seen.sigma.size() != n))
     throw InputError("identify --online",
@@ -127,68 +152,75 @@ bool Adaptation::observe(const Observation& seen, const dynamics::BaseFunction& 
     throw InputError("identify --online",
                      "a standard deviation of the frame at " + core::exact(seen.time) + " s is negative",
                      "give what 'estimate' prints for this rope");
-  if (started_ && !(seen.time > time_))
+  if (started && !(seen.time > time))
     throw InputError("identify --online", "times go backwards at " + core::exact(seen.time) + " s",
                      "give the frames in their order");
-  if (!started_ || seen.time - time_ > options_.longest_gap) {
-    restarts_ += started_;
+  if (!started || seen.time - time > options.longest_gap) {
+    restarts += started;
     start(seen);
     return true;
   }
-  forget(seen.time - time_);
+  forget(seen.time - time);
   if (!predict(seen.time, base)) {
-    ++restarts_;
+    ++restarts;
     start(seen);
     return true;
   }
 
   // theta is measured: H = (I 0 0)
-  const VectorX innovation = seen.theta - theta_;
+  const VectorX innovation = seen.theta - theta;
   const VectorX sigma = sigma_of(seen);
-  MatrixX spread = covariance_.topLeftCorner(n, n);
+  MatrixX spread = covariance.topLeftCorner(n, n);
   spread.diagonal() += sigma.cwiseAbs2();
   for (int k = 0; k < n; ++k)
-    if (!(innovation[k] * innovation[k] <= options_.gate * options_.gate * spread(k, k))) {
-      ++left_out_;
-      if (++rejected_in_a_row_ >= kMaxRejected) {
-        ++restarts_;
+    if (!(innovation[k] * innovation[k] <= options.gate * options.gate * spread(k, k))) {
+      ++left_out;
+      if (++rejected_in_a_row >= kMaxRejected) {
+        ++restarts;
         start(seen);
       }
       return false;
     }
-  rejected_in_a_row_ = 0;
+  rejected_in_a_row = 0;
   const Eigen::LDLT<MatrixX> factor(spread);
   if (!math::is_positive(factor))
     throw InputError("identify --online", "the standard deviations at " + core::exact(seen.time) + " s are too large",
                      "leave frames out that tell nothing");
-  const MatrixX gain = factor.solve(covariance_.topRows(n)).transpose();
+  const MatrixX gain = factor.solve(covariance.topRows(n)).transpose();
   const VectorX step = gain * innovation;
-  theta_ += step.head(n);
-  thetadot_ += step.segment(n, n);
+  theta += step.head(n);
+  thetadot += step.segment(n, n);
   // Joseph's form stays positive
   MatrixX left = MatrixX::Identity(gain.rows(), gain.rows());
   left.leftCols(n) -= gain;
-  covariance_ =
-      symmetric(left * covariance_ * left.transpose() + gain * sigma.cwiseAbs2().asDiagonal() * gain.transpose());
-  change_ += step.tail(change_.size()).cwiseMax(-kMaxStep).cwiseMin(kMaxStep);
-  now_ = dynamics::moved(chain_, first_, names_, change_);
-  ++used_;
+  covariance =
+      symmetric(left * covariance * left.transpose() + gain * sigma.cwiseAbs2().asDiagonal() * gain.transpose());
+  change += step.tail(change.size()).cwiseMax(-kMaxStep).cwiseMin(kMaxStep);
+  now = dynamics::moved(chain, first, unknowns, change);
+  ++used;
   return true;
 }
 
-dynamics::Estimates Adaptation::estimates() const {
-  dynamics::Estimates out = known_;
-  const int n = chain_.angles();
-  const auto count = static_cast<Eigen::Index>(places_.size());
-  out.covariance.setZero();
+bool ParameterFilter::observe(const Observation& seen, const dynamics::BaseFunction& base) {
+  return belief_->observe(seen, base);
+}
+
+Result ParameterFilter::result() const {
+  const Belief& b = *belief_;
+  Result out{b.now, b.known, {b.time, b.theta, b.thetadot}, b.used, b.left_out, b.restarts};
+  dynamics::Estimates& e = out.estimates;
+  const int n = b.chain.angles();
+  e.solver.reset();  // it is of another fit
+  e.covariance.setZero();
   // the initial state of the old recording is what it was, and has nothing to do with the new frames
-  for (Eigen::Index i = 0; i < out.covariance.rows(); ++i) out.covariance(i, i) = known_.covariance(i, i);
+  e.covariance.diagonal() = b.known.covariance.diagonal();
+  const auto count = static_cast<Eigen::Index>(b.places.size());
+  e.covariance(b.places, b.places) = b.covariance.bottomRightCorner(count, count);
   for (Eigen::Index i = 0; i < count; ++i) {
-    for (Eigen::Index j = 0; j < count; ++j) out.covariance(places_[i], places_[j]) = covariance_(2 * n + i, 2 * n + j);
-    const double variance = covariance_(2 * n + i, 2 * n + i);
-    if (places_[i] < static_cast<Eigen::Index>(out.values.size())) out.values[places_[i]] += change_[i];
-    if (places_[i] < static_cast<Eigen::Index>(out.standard_errors.size()))
-      out.standard_errors[places_[i]] = std::sqrt(std::max(0.0, variance));
+    const auto place = static_cast<std::size_t>(b.places[i]);
+    const double variance = b.covariance(2 * n + i, 2 * n + i);
+    if (place < e.values.size()) e.values[place] += b.change[i];
+    if (place < e.standard_errors.size()) e.standard_errors[place] = std::sqrt(std::max(0.0, variance));
   }
   return out;
 }

@@ -76,6 +76,60 @@ MatrixX point_jacobian(const Chain& chain, const MatrixX& world_axes, int link, 
   return jacobian;
 }
 
+MaterialPoint centerline_point(const Chain& chain, double arclength) {
+  return {link_at(chain, arclength), arclength * chain.direction};
+}
+
+std::vector<MaterialPoint> shape_points(const Chain& chain, bool middles) {
+  std::vector<MaterialPoint> points;
+  for (int link = 1; link < chain.links(); ++link) {
+    if (middles) points.push_back({link, 0.5 * (chain.link_start(link) + chain.link_end(link)) * chain.direction});
+    points.push_back({link, chain.link_end(link) * chain.direction});
+  }
+  for (int link = 1; has_twist(chain) && link < chain.links(); ++link)
+    points.push_back({link, chain.link_end(link) * chain.direction + 0.5 * chain.diameter * chain.bending_axis});
+  return points;
+}
+
+std::vector<MatrixX> point_jacobians(const Chain& chain, const MatrixX& world_axes, const std::vector<Pose>& motions,
+                                     const std::vector<MaterialPoint>& points) {
+  std::vector<MatrixX> jacobians;
+  for (const MaterialPoint& point : points)
+    jacobians.push_back(point_jacobian(chain, world_axes, point.link, motions[point.link] * point.home));
+  return jacobians;
+}
+
+std::vector<MatrixX> link_end_jacobians(const Chain& chain, const MatrixX& world_axes,
+                                        const std::vector<Pose>& motions) {
+  const MatrixX ends = nodes(chain, motions).rightCols(chain.links() - 1);
+  std::vector<MatrixX> jacobians;
+  for (int link = 1; link < chain.links(); ++link)
+    jacobians.push_back(point_jacobian(chain, world_axes, link, ends.col(link - 1)));
+  return jacobians;
+}
+
+std::vector<MatrixX> link_end_jacobians(const Chain& chain, const VectorX& theta, const Pose& base) {
+  return link_end_jacobians(chain, chain::world_axes(chain, theta, base), link_motions(chain, theta, base));
+}
+
+MatrixX displacement_metric(const std::vector<MatrixX>& jacobians, const VectorX& weights) {
+  CHAINSPLAT_CHECK(!jacobians.empty(), "no points");
+  MatrixX sum = MatrixX::Zero(jacobians[0].cols(), jacobians[0].cols());
+  for (std::size_t i = 0; i < jacobians.size(); ++i)
+    sum.noalias() += (weights.size() ? weights[i] : 1.0) * jacobians[i].transpose() * jacobians[i];
+  return sum;
+}
+
+bool is_twist(const Chain& chain, int angle) {
+  return std::abs(chain.axes[angle].head<3>().dot(chain.direction)) > 0.5;
+}
+
+bool has_twist(const Chain& chain) {
+  for (int k = 0; k < chain.angles(); ++k)
+    if (is_twist(chain, k)) return true;
+  return false;
+}
+
 int link_at(const Chain& chain, double arclength) {
   const auto end = std::upper_bound(chain.joint_arclength.begin(), chain.joint_arclength.end(), arclength);
   return static_cast<int>(end - chain.joint_arclength.begin());

@@ -317,6 +317,11 @@ void Engine::accelerate() {
   }
 }
 
+void Engine::solve_mass(MatrixX& x) const {
+  cholesky.triangularView<Eigen::Lower>().solveInPlace(x);
+  cholesky.transpose().triangularView<Eigen::Upper>().solveInPlace(x);
+}
+
 void Engine::inverse_torque() {
   Vector6 added = Vector6::Zero();
   for (int j = 0; j < link_count; ++j) {

@@ -69,6 +69,7 @@ class Engine {
   virtual void place(const trajectory::BaseMotion& base, const VectorX& theta, const VectorX& thetadot, bool slopes);
   bool factor_mass();  // false, and `singular_angle`, where M is not positive definite
   void accelerate();   // acceleration = M^-1 force
+  void solve_mass(MatrixX& x) const;  // x = M^-1 x
   // Adds `acceleration` to the placed bodies (once a place): fills body_force and `inverse`.
   void inverse_torque();
   // inverse_torque, then stiffness, damping and drive_rate (needs place with slopes).

@@ -102,6 +102,12 @@ void check_state(const Model& model, const VectorX& theta, const VectorX& thetad
 
 }  // namespace
 
+double total_mass(const Parameters& parameters) {
+  double mass = parameters.tip_mass;
+  for (const double m : parameters.link_mass) mass += m;
+  return mass;
+}
+
 trajectory::BaseMotion at_rest(const math::Pose& pose) {
   trajectory::BaseMotion base;
   base.pose = pose;
@@ -209,30 +215,6 @@ BaseSlopes base_slopes(const Model& model, const trajectory::BaseMotion& base, c
   return slopes;
 }
 
-Linearizer::Linearizer(const Model& model) : engine_(make_engine(model)) {}
-Linearizer::~Linearizer() = default;
-
-bool Linearizer::at(const trajectory::BaseMotion& base, const Vector6& base_jerk, const VectorX& theta,
-                    const VectorX& thetadot, bool slopes, Linearization& out) {
-  Engine& engine = *engine_;
-  engine.place(base, theta, thetadot, slopes);
-  if (!engine.factor_mass()) return false;
-  engine.accelerate();
-  out.acceleration = engine.acceleration;
-  if (!slopes) return true;
-  engine.linearize(base_jerk);
-  out.mass = engine.mass, out.stiffness = engine.stiffness, out.damping = engine.damping;
-  out.drive_rate = engine.drive_rate;
-  return true;
-}
-
-void Linearizer::base_slopes(BaseSlopes& out) const { engine_->base_slopes(out); }
-
-void Linearizer::solve_mass(MatrixX& x) const {
-  engine_->cholesky.triangularView<Eigen::Lower>().solveInPlace(x);
-  engine_->cholesky.transpose().triangularView<Eigen::Upper>().solveInPlace(x);
-}
-
 MatrixX unknown_forces(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                        const VectorX& thetadot, std::span<const Tangent> unknowns) {
   check_state(model, theta, thetadot);
@@ -266,59 +248,59 @@ double potential_energy(const Model& model, const math::Pose& base, const Vector
   return energy;
 }
 
-VectorX static_equilibrium(const Model& model, const math::Pose& base, const VectorX& start) {
-  constexpr int kMaxIterations = 1000;
-  constexpr double kMaxTurn = 0.5;      // rad an iteration
+Equilibrium static_equilibrium(const Model& model, const math::Pose& base, const VectorX& start) {
   constexpr double kRounding = 1e-12;   // of the torque scale: what energies and curvatures are known to
-  constexpr double kConverged = 1e-11;  // rad, Newton step at the minimum
+  constexpr double kLeastShift = 1e-6;  // of the torque scale
+  constexpr int kMostSaddles = 100;     // that are left again
   const int n = model.chain.angles();
   const Parameters& p = model.parameters;
   const VectorX rest = VectorX::Zero(n);
-  VectorX theta = start.size() == n ? start : Eigen::Map<const VectorX>(p.rest_angle.data(), n).eval();
+  Equilibrium out{start.size() == n ? start : Eigen::Map<const VectorX>(p.rest_angle.data(), n).eval(), {}};
   double scale = p.tip_mass;
   for (double m : p.link_mass) scale += m;
   scale *= p.gravity.norm() * model.chain.length;
   for (double k : p.stiffness) scale += k;
-  if (!(scale > 0.0)) return theta;
+  if (!(scale > 0.0)) {  // nothing pulls: it rests where it is
+    out.summary.reason = solve::Reason::gradient;
+    return out;
+  }
 
   Engine engine(model);
-  double energy = potential_energy(model, base, theta), shift = 0.0;
-  for (int iteration = 0; iteration < kMaxIterations; ++iteration) {
-    engine.place(at_rest(base), theta, rest, true);
-    engine.acceleration = rest;
-    engine.linearize(Vector6::Zero());
-    const VectorX gradient = engine.bias - engine.torque;
-    MatrixX hessian = 0.5 * (engine.stiffness + engine.stiffness.transpose());
-    hessian.diagonal().array() += kRounding * scale;
-    if (gradient.norm() <= kRounding * scale) {
-      // at rest; where the potential curves down it is a saddle (a rope standing upright): leave it
-      const Eigen::SelfAdjointEigenSolver<MatrixX> curvature(hessian);
-      if (curvature.eigenvalues()[0] >= 0.0) return theta;
-      theta += 0.1 * curvature.eigenvectors().col(0);
-      energy = potential_energy(model, base, theta);
-      continue;
+  MatrixX hessian;
+  const auto evaluate = [&](const VectorX& theta, solve::NormalEquations* equations) {
+    if (equations) {
+      engine.place(at_rest(base), theta, rest, true);
+      engine.acceleration = rest;
+      engine.linearize(Vector6::Zero());
+      hessian = 0.5 * (engine.stiffness + engine.stiffness.transpose());
+      hessian.diagonal().array() += kRounding * scale;
+      *equations = {hessian, engine.bias - engine.torque};
     }
-    for (;; shift = std::max(4.0 * shift, 1e-6 * scale)) {
-      MatrixX shifted = hessian;
-      shifted.diagonal().array() += shift;
-      const Eigen::LLT<MatrixX> factor(shifted);
-      if (factor.info() != Eigen::Success) continue;
-      VectorX step = factor.solve(-gradient);
-      const double largest = step.cwiseAbs().maxCoeff();
-      if (shift == 0.0 && largest < kConverged) return theta + step;
-      if (largest > kMaxTurn) step *= kMaxTurn / largest;
-      const double next = potential_energy(model, base, theta + step);
-      if (next <= energy + kRounding * scale || largest < kConverged) {
-        theta += step;
-        energy = next;
-        break;
-      }
-      if (!(shift < 1e12 * scale)) break;
-    }
-    shift = shift < 1e-5 * scale ? 0.0 : 0.1 * shift;
-    if (!theta.allFinite()) break;
+    return potential_energy(model, base, theta);
+  };
+  solve::Options options;
+  options.steps = 1000;
+  options.attempts = 30;  // up to a shift of 1e12 of the torque scale
+  options.rounding = options.gradient_tolerance = kRounding * scale;
+  options.trusted = 1e-11;  // rad, Newton step at the minimum
+  options.longest = 0.5;    // rad
+  options.damping = {.rule = solve::Damping::Rule::shift,
+                     .first = 0.0,
+                     .raise = 4.0,
+                     .lower = 0.1,
+                     .least_raised = kLeastShift * scale,
+                     .least = kLeastShift * scale};
+  for (int saddles = 0; saddles < kMostSaddles; ++saddles) {
+    out.summary = solve::least_squares(out.theta, evaluate, options);
+    if (out.summary.reason == solve::Reason::step) return out;
+    if (out.summary.reason != solve::Reason::gradient) break;
+    // at rest; where the potential curves down it is a saddle (a rope standing upright): leave it
+    const Eigen::SelfAdjointEigenSolver<MatrixX> curvature(hessian);
+    if (curvature.eigenvalues()[0] >= 0.0) return out;
+    out.theta += 0.1 * curvature.eigenvectors().col(0);
   }
-  throw WorkError("static equilibrium", "no minimum of the potential energy found", "check masses and stiffnesses");
+  throw WorkError("static equilibrium", "no minimum of the potential energy found: " + solve::describe(out.summary),
+                  "check masses and stiffnesses");
 }
 
 }  // namespace chainsplat::dynamics

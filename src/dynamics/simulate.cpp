@@ -1,4 +1,4 @@
-// RODAS3 and the implicit-in-velocity Euler step (SPEC 4), with the variational equation beside.
+// Rollouts, with their derivatives beside (mathematics.md 4).
 #include <cmath>
 
 #include "step.h"
@@ -11,36 +11,12 @@ constexpr int kMaxRefinement = 32;     // of the steps of a diverging rollout
 constexpr int kMostSteps = 4000000;     // a step is kept with its motion: 1 GiB. At 8 steps a frame more than four hours
 constexpr double kJerkStep = 0.01;     // of a step, for the one-sided difference of the base acceleration
 
-// S' = J S + b by the trapezoidal rule; X = d theta / d unknowns, Y = X', acceleration = Y'.
-struct Variation {
-  MatrixX x, y, acceleration, forces, right, predicted_x, predicted_y;
-  bool started = false;
-
-  Variation(std::span<const Tangent> unknowns, int n) {
-    const auto columns = static_cast<Eigen::Index>(unknowns.size());
-    for (MatrixX* m : {&x, &y, &acceleration, &forces, &right, &predicted_x, &predicted_y}) m->setZero(n, columns);
-    for (Eigen::Index p = 0; p < columns; ++p) {
-      if (unknowns[p].theta.size()) x.col(p) = unknowns[p].theta;
-      if (unknowns[p].thetadot.size()) y.col(p) = unknowns[p].thetadot;
-    }
-  }
-
-  // The engine is linearized at the new node; `factor` holds M + g damping + g^2 stiffness there, g half the step
-  // before.
-  void advance(Engine& engine, const Factor& factor, std::span<const Tangent> unknowns, double g) {
-    engine.unknown_forces(unknowns, forces);
-    predicted_y = y + g * acceleration;
-    predicted_x = x + (2.0 * g) * y + (g * g) * acceleration;
-    acceleration.noalias() = -engine.stiffness * predicted_x;
-    acceleration.noalias() -= engine.damping * predicted_y;
-    acceleration += forces;
-    for (Eigen::Index p = 0; p < acceleration.cols(); ++p) factor.solve(acceleration.col(p));
-    y = predicted_y + g * acceleration;
-    x = predicted_x + (g * g) * acceleration;
-  }
-};
-
 }  // namespace
+
+int step_count(double interval, int substeps) {
+  constexpr double kRounding = 1e-6;  // times are rounded in files
+  return std::max(1, static_cast<int>(std::ceil(interval / kFrame * substeps - kRounding)));
+}
 
 BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<double>& times, int substeps) {
   BaseGrid grid;
@@ -62,11 +38,10 @@ BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<d
     if (!(interval > 0.0) || !std::isfinite(interval))
       throw InputError("rollout", "output times do not increase at " + core::exact(times[i]) + " s",
                        "give increasing times from the initial state's time on");
-    const double wanted = interval / kFrame * substeps;
-    if (!(wanted < kMostSteps))
+    if (!(interval / kFrame * substeps < kMostSteps))
       throw InputError("rollout", "from " + core::exact(now) + " to " + core::exact(times[i]) + " s are too many steps",
                        "give times nearer to each other");
-    const int steps = std::max(1, static_cast<int>(std::ceil(wanted - 1e-6)));  // 1e-6: times are rounded in files
+    const int steps = step_count(interval, substeps);
     for (int s = 1; s <= steps; ++s) {
       BaseGrid::Node& last = grid.nodes.back();
       const double next = s == steps ? times[i] : now + interval * s / steps;
@@ -82,17 +57,16 @@ BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<d
   return grid;
 }
 
-bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta0, const VectorX& thetadot0,
-              chain::States& states, std::span<const Tangent> unknowns, Sensitivities* sensitivities,
-              Divergence* divergence) {
+namespace {
+
+bool integrate(const Model& model, const BaseGrid& grid, const VectorX& theta0, const VectorX& thetadot0,
+               chain::States& states, Variation* variation, Sensitivities* sensitivities, Divergence* divergence) {
   const int n = model.chain.angles();
   CHAINSPLAT_CHECK(theta0.size() == n && thetadot0.size() == n, std::to_string(theta0.size()));
-  const bool vary = sensitivities != nullptr && !unknowns.empty();
-  CHAINSPLAT_CHECK(!vary || model.parameters.integrator == Integrator::rodas3,
+  CHAINSPLAT_CHECK(!variation || model.parameters.integrator == Integrator::rodas3,
                    "variational equation with the Euler step");
   Step step(model);
   Factor other_factor(n);
-  Variation variation(vary ? unknowns : std::span<const Tangent>{}, n);
   VectorX theta = theta0, thetadot = thetadot0;
 
   std::size_t count = 0;
@@ -101,16 +75,16 @@ bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta0, c
       states.time.emplace_back(), states.theta.emplace_back(), states.thetadot.emplace_back();
     if (states.thetadot.size() <= count) states.thetadot.resize(count + 1);
     states.time[count] = time, states.theta[count] = theta, states.thetadot[count] = thetadot;
-    if (vary) {
+    if (variation) {
       if (sensitivities->theta.size() <= count)
         sensitivities->theta.emplace_back(), sensitivities->thetadot.emplace_back();
-      sensitivities->theta[count] = variation.x, sensitivities->thetadot[count] = variation.y;
+      sensitivities->theta[count] = variation->x, sensitivities->thetadot[count] = variation->y;
     }
     ++count;
   };
   const auto finish = [&](bool good) {
     states.time.resize(count), states.theta.resize(count), states.thetadot.resize(count);
-    if (vary) sensitivities->theta.resize(count), sensitivities->thetadot.resize(count);
+    if (variation) sensitivities->theta.resize(count), sensitivities->thetadot.resize(count);
     return good;
   };
 
@@ -123,33 +97,52 @@ bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta0, c
       return finish(false);
     };
     if (!step.bounded(theta, thetadot)) return failed();
-    if (!last || vary) {
-      if (!step.linearize(now, theta, thetadot)) return failed();
-      if (vary) {
-        if (node == 0) {
-          step.engine.unknown_forces(unknowns, variation.forces);
-          variation.acceleration =
-              variation.forces - step.engine.stiffness * variation.x - step.engine.damping * variation.y;
-          other_factor.matrix = step.engine.mass;
-          if (!other_factor.factor()) return failed();
-          for (Eigen::Index p = 0; p < variation.acceleration.cols(); ++p)
-            other_factor.solve(variation.acceleration.col(p));
-        } else if (!last && std::abs(last_step - now.step) <= 1e-9 * now.step) {
-          variation.advance(step.engine, step.factor, unknowns, 0.5 * last_step);
-        } else {
-          const double half = 0.5 * last_step;
-          other_factor.matrix = step.engine.mass + half * step.engine.damping + (half * half) * step.engine.stiffness;
-          if (!other_factor.factor()) return failed();
-          variation.advance(step.engine, other_factor, unknowns, half);
-        }
+    if ((!last || variation) && !step.linearize(now, theta, thetadot)) return failed();
+    if (variation && (node == 0 || variation->exact)) {
+      if (!variation->start(step.engine, node)) return failed();
+    } else if (variation) {
+      const double half = 0.5 * last_step;
+      const bool same = !last && std::abs(last_step - now.step) <= 1e-9 * now.step;
+      if (!same) {
+        other_factor.matrix = step.engine.mass + half * step.engine.damping + (half * half) * step.engine.stiffness;
+        if (!other_factor.factor()) return failed();
       }
+      variation->advance(step.engine, same ? step.factor : other_factor, node, half);
     }
     if (now.output) write(now.time);
     if (last) break;
     last_step = now.step;
-    if (!step.advance(now.step, grid.nodes[node + 1].motion, theta, thetadot)) return failed();
+    if (!step.advance(now.step, grid.nodes[node + 1].motion, theta, thetadot, variation, node)) return failed();
   }
   return finish(true);
+}
+
+}  // namespace
+
+bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta, const VectorX& thetadot,
+              chain::States& states, std::span<const Tangent> unknowns, Sensitivities* sensitivities,
+              Divergence* divergence) {
+  if (!sensitivities || unknowns.empty())
+    return integrate(model, grid, theta, thetadot, states, nullptr, nullptr, divergence);
+  const auto forces = [&](Engine& engine, std::size_t, double, MatrixX& out) { engine.unknown_forces(unknowns, out); };
+  Variation variation(model.chain.angles(), static_cast<Eigen::Index>(unknowns.size()), forces, {}, false);
+  for (Eigen::Index p = 0; p < variation.x.cols(); ++p) {
+    if (unknowns[p].theta.size()) variation.x.col(p) = unknowns[p].theta;
+    if (unknowns[p].thetadot.size()) variation.y.col(p) = unknowns[p].thetadot;
+  }
+  return integrate(model, grid, theta, thetadot, states, &variation, sensitivities, divergence);
+}
+
+bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta, const VectorX& thetadot,
+              chain::States& states, const BaseUnknowns& unknowns, bool exact, Sensitivities& sensitivities) {
+  BaseSlopes slopes;
+  const auto forces = [&](Engine& engine, std::size_t node, double after, MatrixX& out) {
+    engine.base_slopes(slopes);
+    unknowns.torques(node, after, slopes, out);
+    out = -out;
+  };
+  Variation variation(model.chain.angles(), unknowns.count, forces, unknowns.motion, exact);
+  return integrate(model, grid, theta, thetadot, states, &variation, &sensitivities, nullptr);
 }
 
 chain::States rollout(const Model& model, const BaseFunction& base, const InitialState& initial,

@@ -1,4 +1,4 @@
-// RODAS3 and the implicit-in-velocity Euler step (SPEC 4).
+// RODAS3 and the implicit-in-velocity Euler step (mathematics.md 4), with their derivatives.
 #include "step.h"
 
 #include <cmath>
@@ -8,6 +8,18 @@ namespace {
 
 constexpr double kAngleBound = 1e3;  // rad, beyond which a motion counts as diverged
 constexpr double kRateBound = 1e5;   // rad/s
+constexpr double kProbe = 3e-6;      // e of the second derivatives: truncation and rounding both below 1e-8
+
+// RODAS3 (mathematics.md 4): stage i adds gamma_i h f_t, and the stages before it as history() says.
+constexpr double kTimeWeight[4] = {0.5, 1.5, 0.0, 0.0};  // gamma_i
+
+// What stage i takes of the stages before it, of the angles, the rates or their derivatives.
+template <class Value>
+void add_history(int i, double h, const Value (&k)[4], Value& to) {
+  if (i == 1) to += (4.0 / h) * k[0];
+  if (i == 2) to += (k[0] - k[1]) / h;
+  if (i == 3) to += (k[0] - k[1] - (8.0 / 3.0) * k[2]) / h;
+}
 
 }  // namespace
 
@@ -52,11 +64,12 @@ bool Step::linearize(const BaseGrid::Node& now, const VectorX& theta, const Vect
 }
 
 // Acceleration at the stage's state under the base motion of the next node.
-bool Step::evaluate(const trajectory::BaseMotion& motion) {
+bool Step::evaluate(const trajectory::BaseMotion& motion, bool slopes) {
   if (!bounded(stage_theta_, stage_thetadot_)) return false;
-  stage_->place(motion, stage_theta_, stage_thetadot_, false);
+  stage_->place(motion, stage_theta_, stage_thetadot_, slopes);
   if (!factor_mass(*stage_)) return false;
   stage_->accelerate();
+  if (slopes) stage_->linearize(Vector6::Zero());
   return true;
 }
 
@@ -69,7 +82,40 @@ void Step::solve_stage(int i, double g) {
   k_theta_[i] = g * (right_theta_ + work_);
 }
 
-bool Step::advance(double h, const trajectory::BaseMotion& next, VectorX& theta, VectorX& thetadot) {
+// The derivatives of stage i, of which the stages before it and the value k_i are there.
+bool Step::vary_stage(int i, double h, std::size_t node, const VectorX& theta, const VectorX& thetadot, Variation& v) {
+  const double g = 0.5 * h;
+  // of the right side but for the second derivatives; the part of the rates times M^-1
+  if (i < 2) {
+    v.right = v.y, v.work = v.acceleration;
+  } else {
+    v.right = v.stage_y;
+    v.force(*stage_, node + 1, 0.0, v.stage_x, v.stage_y, v.work);
+    stage_->solve_mass(v.work);
+  }
+  add_history(i, h, v.k_x, v.right);
+  add_history(i, h, v.k_y, v.work);
+  for (const double e : {kProbe, -kProbe}) {
+    const double after = e * h * kTimeWeight[i];
+    v.probe_theta = theta + e * k_theta_[i], v.probe_rate = thetadot + e * k_rate_[i];
+    stage_->place(v.base(node, after), v.probe_theta, v.probe_rate, true);
+    if (!factor_mass(*stage_)) return false;
+    stage_->accelerate();
+    stage_->linearize(Vector6::Zero());
+    v.force(*stage_, node, after, v.x, v.y, v.k_y[i]);
+    stage_->solve_mass(v.k_y[i]);
+    v.work += v.k_y[i] / (2.0 * e);
+  }
+  v.k_y[i].noalias() = engine.mass * v.work;
+  v.k_y[i].noalias() -= g * (engine.stiffness * v.right);
+  v.k_y[i] *= g;
+  for (Eigen::Index p = 0; p < v.k_y[i].cols(); ++p) factor.solve(v.k_y[i].col(p));
+  v.k_x[i] = g * (v.right + v.k_y[i]);
+  return true;
+}
+
+bool Step::advance(double h, const trajectory::BaseMotion& next, VectorX& theta, VectorX& thetadot,
+                   Variation* variation, std::size_t node) {
   const double g = 0.5 * h;
   if (!rodas_) {
     work_ = h * engine.force;
@@ -78,33 +124,67 @@ bool Step::advance(double h, const trajectory::BaseMotion& next, VectorX& theta,
     theta += h * thetadot;
     return true;
   }
+  Variation* const v = variation && variation->exact ? variation : nullptr;
   // stages 1 and 2: f = (thetadot, a), f_t = (0, M^-1 drive_rate)
-  right_theta_ = thetadot;
-  work_ = engine.force + (0.5 * h) * engine.drive_rate;
-  solve_stage(0, g);
-  right_theta_ = thetadot + (4.0 / h) * k_theta_[0];
-  work_ = engine.force + (1.5 * h) * engine.drive_rate;
-  work_.noalias() += (4.0 / h) * (engine.mass * k_rate_[0]);
-  solve_stage(1, g);
-  // stage 3
+  for (int i = 0; i < 2; ++i) {
+    right_theta_ = thetadot;
+    add_history(i, h, k_theta_, right_theta_);
+    work_ = engine.force + (kTimeWeight[i] * h) * engine.drive_rate;
+    if (i == 1) work_.noalias() += (4.0 / h) * (engine.mass * k_rate_[0]);
+    solve_stage(i, g);
+    if (v && !vary_stage(i, h, node, theta, thetadot, *v)) return false;
+  }
+  // stages 3 and 4: f at states of their own
   stage_theta_ = theta + 2.0 * k_theta_[0];
   stage_thetadot_ = thetadot + 2.0 * k_rate_[0];
-  if (!evaluate(next)) return false;
-  right_theta_ = stage_thetadot_ + (k_theta_[0] - k_theta_[1]) / h;
-  stage_acceleration_ = stage_->acceleration + (k_rate_[0] - k_rate_[1]) / h;
-  work_.noalias() = engine.mass * stage_acceleration_;
-  solve_stage(2, g);
-  // stage 4
-  stage_theta_ += k_theta_[2];
-  stage_thetadot_ += k_rate_[2];
-  if (!evaluate(next)) return false;
-  right_theta_ = stage_thetadot_ + (k_theta_[0] - k_theta_[1] - (8.0 / 3.0) * k_theta_[2]) / h;
-  stage_acceleration_ = stage_->acceleration + (k_rate_[0] - k_rate_[1] - (8.0 / 3.0) * k_rate_[2]) / h;
-  work_.noalias() = engine.mass * stage_acceleration_;
-  solve_stage(3, g);
-  theta = stage_theta_ + k_theta_[3];
-  thetadot = stage_thetadot_ + k_rate_[3];
+  if (v) v->stage_x = v->x + 2.0 * v->k_x[0], v->stage_y = v->y + 2.0 * v->k_y[0];
+  for (int i = 2; i < 4; ++i) {
+    if (!evaluate(next, v)) return false;
+    right_theta_ = stage_thetadot_;
+    add_history(i, h, k_theta_, right_theta_);
+    stage_acceleration_ = stage_->acceleration;
+    add_history(i, h, k_rate_, stage_acceleration_);
+    work_.noalias() = engine.mass * stage_acceleration_;
+    solve_stage(i, g);
+    if (v && !vary_stage(i, h, node, theta, thetadot, *v)) return false;
+    stage_theta_ += k_theta_[i];
+    stage_thetadot_ += k_rate_[i];
+    if (v) v->stage_x += v->k_x[i], v->stage_y += v->k_y[i];
+  }
+  theta = stage_theta_, thetadot = stage_thetadot_;
+  if (v) v->x = v->stage_x, v->y = v->stage_y;
   return true;
+}
+
+Variation::Variation(int n, Eigen::Index unknowns, Forces forces, Base base_motion, bool is_exact)
+    : forces_of(std::move(forces)), base(std::move(base_motion)), exact(is_exact), mass_(n) {
+  for (MatrixX* m : {&x, &y, &acceleration, &forces_, &predicted_x_, &predicted_y_}) m->setZero(n, unknowns);
+}
+
+void Variation::force(Engine& engine, std::size_t node, double after, const MatrixX& s_x, const MatrixX& s_y,
+                      MatrixX& forces) {
+  forces_of(engine, node, after, forces_);
+  forces.noalias() = forces_ - engine.stiffness * s_x - engine.damping * s_y;
+}
+
+bool Variation::start(Engine& engine, std::size_t node) {
+  force(engine, node, 0.0, x, y, acceleration);
+  mass_.matrix = engine.mass;
+  if (!mass_.factor()) return false;
+  for (Eigen::Index p = 0; p < acceleration.cols(); ++p) mass_.solve(acceleration.col(p));
+  return true;
+}
+
+void Variation::advance(Engine& engine, const Factor& factor, std::size_t node, double g) {
+  forces_of(engine, node, 0.0, forces_);
+  predicted_y_ = y + g * acceleration;
+  predicted_x_ = x + (2.0 * g) * y + (g * g) * acceleration;
+  acceleration.noalias() = -engine.stiffness * predicted_x_;
+  acceleration.noalias() -= engine.damping * predicted_y_;
+  acceleration += forces_;
+  for (Eigen::Index p = 0; p < acceleration.cols(); ++p) factor.solve(acceleration.col(p));
+  y = predicted_y_ + g * acceleration;
+  x = predicted_x_ + (g * g) * acceleration;
 }
 
 Stepper::Stepper(const Model& model) : step_(std::make_unique<Step>(model)) {}

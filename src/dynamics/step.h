@@ -1,7 +1,8 @@
-// Private to dynamics: one step of the integrators (SPEC 4) and the factorization that its parts share. No allocation
-// after construction.
+// Private to dynamics: one step of the integrators (mathematics.md 4), the factorization that its parts share, and the
+// derivatives that go along. No allocation after construction.
 #pragma once
 #include <cmath>
+#include <functional>
 #include <vector>
 
 #include "planar.h"
@@ -52,6 +53,41 @@ class Factor {
   std::vector<double> inverse_;  // of the pivots
 };
 
+// A rollout's derivatives by unknowns, at the present node: S' = J S + b with S = (x, y), all n x unknowns. `start`, then
+// `advance` from node to node, is the trapezoidal rule. Where `exact`, Step::advance takes x and y along instead: then
+// they are the derivatives of the discrete RODAS3 map. A Rosenbrock stage (1/G - J) k_i = r_i has
+//   (1/G - J) dk_i = dr_i + d/de [J(s + e k_i, t + e H gamma_i) S + b(same)],  s = (theta, thetadot):
+// the second derivatives enter only along k_i, two further linearizations per stage.
+struct Variation {
+  // d(joint law - tau_ID) / d unknowns where `engine` is linearized: `after` s past a node.
+  using Forces = std::function<void(Engine& engine, std::size_t node, double after, MatrixX& forces)>;
+  // The base motion there.
+  using Base = std::function<trajectory::BaseMotion(std::size_t node, double after)>;
+
+  Forces forces_of;
+  Base base;  // for `exact`
+  bool exact = false;
+  MatrixX x, y;          // d theta / d unknowns, d thetadot / d unknowns
+  MatrixX acceleration;  // y'
+
+  Variation(int n, Eigen::Index unknowns, Forces forces_of, Base base, bool exact);
+  // The acceleration at a node where the engine is linearized. False where the mass matrix is singular.
+  bool start(Engine& engine, std::size_t node);
+  // The engine is linearized at the new node; `factor` holds M + g damping + g^2 stiffness there, g half the step
+  // before.
+  void advance(Engine& engine, const Factor& factor, std::size_t node, double g);
+
+  // Step's own, for `exact`: what multiplies 1/G - J, and the stages
+  MatrixX right, work, stage_x, stage_y, k_x[4], k_y[4];
+  VectorX probe_theta, probe_rate;
+  // forces = b + J S at (s_x, s_y): forces_of - stiffness s_x - damping s_y
+  void force(Engine& engine, std::size_t node, double after, const MatrixX& s_x, const MatrixX& s_y, MatrixX& forces);
+
+ private:
+  Factor mass_;
+  MatrixX forces_, predicted_x_, predicted_y_;
+};
+
 class Step {
   std::unique_ptr<Engine> engine_, stage_;
 
@@ -59,8 +95,9 @@ class Step {
   explicit Step(const Model& model);
   // Linearizes at the node and factors M + G C (+ G^2 K). With the last node's step of 0 there is no factor.
   bool linearize(const BaseGrid::Node& now, const VectorX& theta, const VectorX& thetadot);
-  // From the linearized node to the next.
-  bool advance(double h, const trajectory::BaseMotion& next, VectorX& theta, VectorX& thetadot);
+  // From the linearized node to the next, with what `variation` has to take along.
+  bool advance(double h, const trajectory::BaseMotion& next, VectorX& theta, VectorX& thetadot,
+               Variation* variation = nullptr, std::size_t node = 0);
 
   Engine& engine;  // at the node
   Factor factor;   // M + G C + G^2 K (Euler: M + h C)
@@ -73,8 +110,9 @@ class Step {
 
  private:
   bool factor_mass(Engine& at);
-  bool evaluate(const trajectory::BaseMotion& motion);
+  bool evaluate(const trajectory::BaseMotion& motion, bool slopes);
   void solve_stage(int i, double g);
+  bool vary_stage(int i, double h, std::size_t node, const VectorX& theta, const VectorX& thetadot, Variation& v);
 
   bool rodas_;
   VectorX right_theta_, stage_theta_, stage_thetadot_, stage_acceleration_, work_;

@@ -1,18 +1,11 @@
 // The paper's state estimation, for comparison.
-#include <cmath>
-
+#include "chainsplat/solve.h"
 #include "src/estimation/start.h"
 
 namespace chainsplat::estimation {
 
 using math::MatrixX;
 using math::VectorX;
-
-namespace {
-
-constexpr double kBeta1 = 0.9, kBeta2 = 0.999, kEpsilon = 1e-15;  // as in 3DGS and in recognition
-
-}  // namespace
 
 AdamFollower start_adam(const Filter& filter, LinkGradient gradient, const AdamOptions& options) {
   AdamFollower out;
@@ -37,8 +30,7 @@ Estimate update(AdamFollower& follower, std::span<const capture::View* const> vi
   for (const capture::View* const view : views) out.seen = out.seen || has_mask(*view);
   VectorX theta = first ? VectorX(first_belief(filter, time).mean.head(n)) : follower.theta;
   const int steps = !out.seen ? 0 : first ? follower.options.first_steps : follower.options.steps;
-  // Adam on the sum of the views' losses
-  VectorX mean = VectorX::Zero(n), square = VectorX::Zero(n);
+  solve::AdamState moments;
   for (int step = 1; step <= steps; ++step) {
     VectorX gradient = VectorX::Zero(n);
     for (const capture::View* const view : views) {
@@ -48,11 +40,7 @@ Estimate update(AdamFollower& follower, std::span<const capture::View* const> vi
       gradient += chain::theta_gradient(chain, chain::world_axes(chain, theta, base), twists);
     }
     if (!gradient.allFinite()) throw WorkError("estimate", "the gradient is not finite", "train the twin again");
-    mean = kBeta1 * mean + (1.0 - kBeta1) * gradient;
-    square = kBeta2 * square + (1.0 - kBeta2) * gradient.cwiseAbs2();
-    const VectorX first_moment = mean / (1.0 - std::pow(kBeta1, step));
-    const VectorX second_moment = square / (1.0 - std::pow(kBeta2, step));
-    theta.array() -= follower.options.rate * first_moment.array() / (second_moment.array().sqrt() + kEpsilon);
+    solve::adam_step(moments, gradient, {.rate = follower.options.rate}, theta);
   }
   // report, with rates by differences
   out.theta = theta;

@@ -8,6 +8,7 @@
 #include <nlohmann/json.hpp>
 #include <numeric>
 
+#include "chainsplat/dynamics/parametrization.h"
 #include "src/estimation/color.h"
 #include "src/estimation/start.h"
 
@@ -83,36 +84,11 @@ bool identified_shifts(const dynamics::Parameters& parameters) {
          std::all_of(parameters.stiffness.begin(), parameters.stiffness.end(), [](double k) { return k > 0.0; });
 }
 
-double total_mass(const dynamics::Parameters& parameters) {
-  double mass = parameters.tip_mass;
-  for (const double m : parameters.link_mass) mass += m;
-  return mass;
-}
-
-// Returns the position Jacobians (3 x n) of the ends of links 1, 2, ...: the joints after the first, and the free end.
-std::vector<MatrixX> link_end_jacobians(const chain::Chain& chain, const Pose& base, const VectorX& theta) {
-  const MatrixX axes = chain::world_axes(chain, theta, base);
-  const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, base));
-  std::vector<MatrixX> jacobians;
-  for (int link = 1; link < chain.links(); ++link)
-    jacobians.push_back(chain::point_jacobian(chain, axes, link, nodes.col(link + 1)));
-  return jacobians;
-}
-
-// Returns the weighted sum of J^T J, the covariance of the torques that random isotropic forces of these variances
-// cause.
-MatrixX torque_covariance(const std::vector<MatrixX>& jacobians, const VectorX& weights) {
-  MatrixX sum = MatrixX::Zero(jacobians[0].cols(), jacobians[0].cols());
-  for (std::size_t i = 0; i < jacobians.size(); ++i)
-    sum.noalias() += weights[i] * jacobians[i].transpose() * jacobians[i];
-  return sum;
-}
-
 // Returns the covariance of the shifts of the rest angles that stand for a random force of `deviation` N on the rope,
 // which acts at the links' ends with the shares `place`.
 MatrixX shift_covariance(const Filter& filter, const Pose& base, const VectorX& theta, double deviation,
                          const VectorX& place) {
-  MatrixX out = torque_covariance(link_end_jacobians(filter.model.chain, base, theta), place);
+  MatrixX out = chain::displacement_metric(chain::link_end_jacobians(filter.model.chain, theta, base), place);
   out *= deviation * deviation;
   for (int k = 0; k < out.rows(); ++k) {
     out.row(k) /= filter.model.parameters.stiffness[k];
@@ -130,10 +106,10 @@ struct FoundForce {
 FoundForce found_force(const Filter& filter, const Belief& belief) {
   const int n = filter.model.chain.angles();
   const std::vector<MatrixX> jacobians =
-      link_end_jacobians(filter.model.chain, filter.base(belief.time).pose, belief.mean.head(n));
+      chain::link_end_jacobians(filter.model.chain, belief.mean.head(n), filter.base(belief.time).pose);
   VectorX torque = belief.mean.segment(2 * n, n);
   for (int k = 0; k < n; ++k) torque[k] *= filter.model.parameters.stiffness[k];
-  MatrixX covariance = torque_covariance(jacobians, filter.place);
+  MatrixX covariance = chain::displacement_metric(jacobians, filter.place);
   covariance.diagonal().array() += kPlaceRidge * covariance.trace() / n;
   const VectorX weighted = covariance.ldlt().solve(torque);
   FoundForce out;
@@ -167,7 +143,7 @@ MatrixX shape_covariance(const chain::Chain& chain, const std::vector<double>& v
   const int n = chain.angles();
   VectorX weights(variances.size());
   for (std::size_t i = 0; i < variances.size(); ++i) weights[i] = 1.0 / variances[i];
-  MatrixX information = torque_covariance(link_end_jacobians(chain, Pose{}, theta), weights);
+  MatrixX information = chain::displacement_metric(chain::link_end_jacobians(chain, theta, Pose{}), weights);
   information.diagonal().array() += 1.0 / (kUnseenAngle * kUnseenAngle);
   const Eigen::LLT<MatrixX> factor(information);
   CHAINSPLAT_CHECK(math::is_positive(factor), "angles that are not finite");
@@ -178,7 +154,7 @@ MatrixX shape_covariance(const chain::Chain& chain, const std::vector<double>& v
 // shape variances, which include directions in which no angle moves a link.
 double centerline_deviation(const chain::Chain& chain, const VectorX& theta, const MatrixX& covariance,
                             const std::vector<double>& shape) {
-  const std::vector<MatrixX> jacobians = link_end_jacobians(chain, Pose{}, theta);
+  const std::vector<MatrixX> jacobians = chain::link_end_jacobians(chain, theta, Pose{});
   // a link's end stands for half of each adjacent link
   double variance = 0.0;
   for (std::size_t i = 0; i < jacobians.size(); ++i) {
@@ -201,7 +177,7 @@ void learn_force(Filter& filter, double time) {
   filter.place += kPlaceRate * (found.shares - filter.place);
   filter.place.array() += kPlaceFloor;
   filter.place /= filter.place.sum();
-  const double weight = filter.model.parameters.gravity.norm() * total_mass(filter.model.parameters);
+  const double weight = filter.model.parameters.gravity.norm() * dynamics::total_mass(filter.model.parameters);
   if (found.sum.norm() > kContactForce * weight)
     filter.contact_until = std::max(filter.contact_until, time + kContactMemory);
 }
@@ -211,7 +187,7 @@ void learn_force(Filter& filter, double time) {
 std::vector<VectorX> stopping_shifts(const Filter& filter, const trajectory::BaseMotion& base, const VectorX& theta,
                                      const VectorX& thetadot, const MatrixX& rate_by_shift) {
   const chain::Chain& chain = filter.model.chain;
-  const std::vector<MatrixX> jacobians = link_end_jacobians(chain, base.pose, theta);
+  const std::vector<MatrixX> jacobians = chain::link_end_jacobians(chain, theta, base.pose);
   const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, base.pose));
   std::vector<VectorX> shifts;
   for (std::size_t i = 0; i < jacobians.size(); ++i) {
@@ -263,18 +239,13 @@ Motion move(const Filter& filter, const Belief& belief, double time) {
   if (filter.identified) {
     dynamics::Model model = filter.model;
     for (int k = 0; k < n; ++k) model.parameters.rest_angle[k] += belief.mean[2 * n + k];
-    std::vector<dynamics::Tangent> unknowns(filter.shifts ? 3 * n : 2 * n);
-    for (int k = 0; k < n; ++k) {
-      unknowns[k].theta = VectorX::Unit(n, k);
-      unknowns[n + k].thetadot = VectorX::Unit(n, k);
-      if (!filter.shifts) continue;
-      unknowns[2 * n + k].rest_angle.assign(n, 0.0);
-      unknowns[2 * n + k].rest_angle[k] = 1.0;
-    }
+    std::vector<dynamics::Unknown> unknowns = dynamics::initial_state_unknowns(model.chain);
+    for (int k = 0; filter.shifts && k < n; ++k) unknowns.push_back({dynamics::Quantity::rest_angle, k});
+    const std::vector<dynamics::Tangent> tangents = dynamics::tangents(model.chain, model.parameters, unknowns);
     const dynamics::BaseGrid grid = dynamics::sample_base(filter.base, belief.time, {time}, model.parameters.substeps);
     chain::States states;
     dynamics::Sensitivities sensitivities;
-    if (dynamics::simulate(model, grid, belief.mean.head(n), belief.mean.segment(n, n), states, unknowns,
+    if (dynamics::simulate(model, grid, belief.mean.head(n), belief.mean.segment(n, n), states, tangents,
                            &sensitivities)) {
       out.theta = states.theta.back();
       out.thetadot = states.thetadot.back();
@@ -441,7 +412,7 @@ Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras
                   : twin.states.theta.empty() ? VectorX::Zero(twin.chain.angles())
                                               : twin.states.theta.front();
   } else {
-    filter.rest = dynamics::static_equilibrium(filter.model, filter.base(base_start).pose);
+    filter.rest = dynamics::static_equilibrium(filter.model, filter.base(base_start).pose).theta;
   }
   return filter;
 }
@@ -470,7 +441,7 @@ Belief first_belief(const Filter& filter, double time) {
   if (filter.shifts)
     belief.covariance.block(2 * n, 2 * n, n, n) =
         shift_covariance(filter, filter.base(time).pose, belief.mean.head(n),
-                         kFirstForce * total_mass(filter.model.parameters), filter.everywhere);
+                         kFirstForce * dynamics::total_mass(filter.model.parameters), filter.everywhere);
   belief.covariance.diagonal().tail(size - 3 * n).setConstant(kMaskShift * kMaskShift);
   belief.covariance.diagonal().array() += kLeastVariance;
   return belief;
@@ -511,7 +482,7 @@ Belief predict(const Filter& filter, const Belief& belief, double time, Contact 
   // add the random walk of the force, and the blows that stop a link's end
   if (filter.shifts) {
     const double force = (touched ? filter.options.contact_force : filter.options.model_force) *
-                         total_mass(filter.model.parameters) * std::sqrt(h);
+                         dynamics::total_mass(filter.model.parameters) * std::sqrt(h);
     const MatrixX shift = shift_covariance(filter, filter.base(time).pose, motion.theta, force,
                                            touched ? filter.place : filter.everywhere);
     // the force changes during the step: in the mean square a third of the change acts throughout

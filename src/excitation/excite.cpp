@@ -63,7 +63,7 @@ double log_det(const MatrixX& positive) {
 
 // Of the estimates that are parameters.
 struct Known {
-  std::vector<std::string> names;
+  std::vector<dynamics::Unknown> unknowns;
   MatrixX covariance, information;
 };
 
@@ -72,11 +72,10 @@ Known known_parameters(const Problem& problem) {
   const auto size = static_cast<Eigen::Index>(e.names.size());
   if (size == 0 || e.covariance.rows() != size || e.covariance.cols() != size || !e.covariance.allFinite())
     throw InputError("excite", "the twin knows no covariance of its parameters", "identify it first");
-  const auto all = dynamics::tangents(problem.model.chain, problem.model.parameters, e.names);
-  std::vector<Eigen::Index> kept;
+  const std::vector<dynamics::Unknown> all = dynamics::unknowns_of(problem.model.chain, e);
+  const std::vector<Eigen::Index> kept = dynamics::parameters_among(all);
   Known known;
-  for (Eigen::Index i = 0; i < size; ++i)
-    if (dynamics::is_parameter(all[i])) kept.push_back(i), known.names.push_back(e.names[i]);
+  for (Eigen::Index i : kept) known.unknowns.push_back(all[i]);
   if (kept.empty()) throw InputError("excite", "the twin has no identified parameter", "identify it first");
   known.covariance = e.covariance(kept, kept);
   known.covariance = (0.5 * (known.covariance + known.covariance.transpose())).eval();
@@ -124,7 +123,7 @@ Result excite(const Problem& problem, const Options& options) {
     for (; softer < kMaxSofter && !simulate(c.motion, states); ++softer) scale(c.motion, kSofter, kSofter);
     if (softer == kMaxSofter) return;
     const MatrixX told = information(
-        problem.model, known.names, [&](double t) { return planning::base_at(c.motion, t); }, initial, times,
+        problem.model, known.unknowns, [&](double t) { return planning::base_at(c.motion, t); }, initial, times,
         options.noise);
     if (told.size()) c.value = log_det(known.information + told);
   };
@@ -185,7 +184,7 @@ Result excite(const Problem& problem, const Options& options) {
   Result result;
   result.motion = best.motion;
   result.peaks = planning::peaks(best.motion, 0.0, options.duration, options.limits);
-  const auto size = static_cast<double>(known.names.size());
+  const auto size = static_cast<double>(known.unknowns.size());
   const auto errors = [](const MatrixX& information) {
     const MatrixX covariance = information.ldlt().solve(MatrixX::Identity(information.rows(), information.cols()));
     std::vector<double> out;
@@ -193,10 +192,10 @@ Result excite(const Problem& problem, const Options& options) {
     return out;
   };
   Prediction& p = result.prediction;
-  p.names = known.names;
+  for (const dynamics::Unknown& unknown : known.unknowns) p.names.push_back(dynamics::name_of(unknown));
   p.now = errors(known.information);
   const MatrixX told = information(
-      problem.model, known.names, [&](double t) { return planning::base_at(best.motion, t); }, initial, times,
+      problem.model, known.unknowns, [&](double t) { return planning::base_at(best.motion, t); }, initial, times,
       options.noise, &result.states);
   p.excited = errors(known.information + told);
   p.gain = (best.value - known_log_det) / size;
@@ -207,7 +206,8 @@ Result excite(const Problem& problem, const Options& options) {
     initial.time = problem.recorded_start;
     const MatrixX again = old.size() < 2
                               ? MatrixX()
-                              : information(problem.model, known.names, problem.recorded, initial, old, options.noise);
+                              : information(problem.model, known.unknowns, problem.recorded, initial, old,
+                                            options.noise);
     if (again.size()) {
       p.repeated = errors(known.information + again);
       p.repeated_gain = (log_det(known.information + again) - known_log_det) / size;

@@ -12,24 +12,22 @@ constexpr double kRateSd = 0.5;    // rad/s
 
 }  // namespace
 
-MatrixX information(const dynamics::Model& model, const std::vector<std::string>& names,
+MatrixX information(const dynamics::Model& model, std::span<const dynamics::Unknown> parameters,
                     const dynamics::BaseFunction& base, const dynamics::InitialState& initial,
                     const std::vector<double>& times, double noise, chain::States* states) {
   const chain::Chain& chain = model.chain;
   const int n = chain.angles();
-  const auto size = static_cast<Eigen::Index>(names.size());
-  std::vector<dynamics::Tangent> unknowns = dynamics::tangents(chain, model.parameters, names);
-  for (int i = 0; i < 2 * n; ++i) {
-    dynamics::Tangent start;
-    (i < n ? start.theta : start.thetadot) = VectorX::Unit(n, i % n);
-    unknowns.push_back(start);
-  }
+  const auto size = static_cast<Eigen::Index>(parameters.size());
+  std::vector<dynamics::Unknown> unknowns(parameters.begin(), parameters.end());
+  for (const dynamics::Unknown& state : dynamics::initial_state_unknowns(chain)) unknowns.push_back(state);
+  const std::vector<dynamics::Tangent> tangents = dynamics::tangents(chain, model.parameters, unknowns);
   chain::States rolled;
   chain::States& motion = states ? *states : rolled;
   dynamics::Sensitivities slopes;
   const dynamics::BaseGrid grid = dynamics::sample_base(base, initial.time, times, model.parameters.substeps);
-  if (!dynamics::simulate(model, grid, initial.theta, initial.thetadot, motion, unknowns, &slopes)) return {};
+  if (!dynamics::simulate(model, grid, initial.theta, initial.thetadot, motion, tangents, &slopes)) return {};
 
+  const std::vector<chain::MaterialPoint> points = chain::shape_points(chain, true);
   MatrixX sum = MatrixX::Zero(size + 2 * n, size + 2 * n);
   for (int k = 0; k < n; ++k) {
     sum(size + k, size + k) = 1.0 / (kThetaSd * kThetaSd);
@@ -38,13 +36,7 @@ MatrixX information(const dynamics::Model& model, const std::vector<std::string>
   for (std::size_t k = 0; k < motion.theta.size(); ++k) {
     const auto poses = chain::link_motions(chain, motion.theta[k], {});
     const MatrixX axes = chain::world_axes(chain, motion.theta[k], {});
-    MatrixX by_angle = MatrixX::Zero(n, n);  // J^T J of the points
-    for (int link = 1; link < chain.links(); ++link)
-      for (const double part : {0.5, 1.0}) {
-        const double s = chain.link_start(link) + part * (chain.link_end(link) - chain.link_start(link));
-        const MatrixX jacobian = chain::point_jacobian(chain, axes, link, poses[link] * (s * chain.direction));
-        by_angle += jacobian.transpose() * jacobian;
-      }
+    const MatrixX by_angle = chain::displacement_metric(chain::point_jacobians(chain, axes, poses, points));
     sum += kShare / (noise * noise) * slopes.theta[k].transpose() * by_angle * slopes.theta[k];
   }
   const MatrixX cross = sum.topRightCorner(size, 2 * n);

@@ -6,6 +6,7 @@
 #include <nlohmann/json.hpp>
 #include <numeric>
 
+#include "chainsplat/dynamics/parametrization.h"
 #include "force/track.h"
 
 namespace chainsplat::force {
@@ -32,12 +33,6 @@ constexpr double kUnknownDeviation = 0.2;  // of a joint's stiffness and damping
 // s of states that a live smoother uses. The size of the jerk changes with a push, so that 1 s fits it better than 4 s.
 constexpr double kLiveWindow = 1.0;
 
-double total_mass(const dynamics::Parameters& parameters) {
-  double mass = parameters.tip_mass;
-  for (const double m : parameters.link_mass) mass += m;
-  return mass;
-}
-
 // The data of one time: the residual torque, its covariance, and the rope's configuration.
 struct Frame {
   VectorX residual;
@@ -51,16 +46,6 @@ struct Frame {
   Contact named;               // the contact that the user names, valid if `is_named`
   bool is_named = false;
 };
-
-// Returns the position Jacobians (3 x n) of the ends of links 1, 2, ...: the joints after the first, and the free end.
-std::vector<MatrixX> link_end_jacobians(const chain::Chain& chain, const MatrixX& axes,
-                                        const std::vector<Pose>& motions) {
-  const MatrixX nodes = chain::nodes(chain, motions);
-  std::vector<MatrixX> jacobians;
-  for (int link = 1; link < chain.links(); ++link)
-    jacobians.push_back(chain::point_jacobian(chain, axes, link, nodes.col(link + 1)));
-  return jacobians;
-}
 
 Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> deviations,
                const trajectory::BaseMotion& base, const Motion& motion, std::size_t f, const Options& options) {
@@ -81,7 +66,6 @@ Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> de
   for (int a = 0; a < 3; ++a)
     for (int b = 0; b < 3; ++b)
       out.covariance.noalias() += motion.covariance[f](a, b) * *by[a] * motion.noise * by[b]->transpose();
-  const std::vector<MatrixX> jacobians = link_end_jacobians(chain, out.axes, out.motions);
   if (!motion.standing.empty())
     out.covariance.noalias() += at.stiffness * motion.standing[f] * at.stiffness.transpose();
   // from the parameters',
@@ -90,16 +74,17 @@ Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> de
     out.covariance.noalias() += off * off.transpose();
   }
   // from the joint laws',
-  const double moment = total_mass(p) * p.gravity.norm() * chain.length;
+  const double moment = dynamics::total_mass(p) * p.gravity.norm() * chain.length;
   for (int k = 0; k < n; ++k) {
     const double spring = options.relative_deviation * p.stiffness[k] * (theta[k] - p.rest_angle[k]);
     const double damper = options.relative_deviation * p.damping[k] * thetadot[k];
     out.covariance(k, k) += spring * spring + damper * damper + std::pow(kLeastTorque * moment, 2);
   }
   // and an error that grows toward the grasp, as a small force at every joint and at the free end would cause
-  const double error = options.gravity_deviation * total_mass(p) * p.gravity.norm();
+  const double error = options.gravity_deviation * dynamics::total_mass(p) * p.gravity.norm();
   const MatrixX nodes = chain::nodes(chain, out.motions);
-  for (const MatrixX& jacobian : jacobians) out.covariance.noalias() += error * error * jacobian.transpose() * jacobian;
+  out.covariance += error * error *
+                    chain::displacement_metric(chain::link_end_jacobians(chain, out.axes, out.motions));
 
   out.sliding_covariance = out.covariance;
   // friction at rest balances any force up to its limit; neighbors are correlated, as they were dragged there together
@@ -168,7 +153,7 @@ struct Touch {
 
 Touch touch_at(const dynamics::Model& model, const Frame& frame, const Contact& contact, const Options& options) {
   const chain::Chain& chain = model.chain;
-  const double across = options.force_scale * total_mass(model.parameters) / kPushedMass,
+  const double across = options.force_scale * dynamics::total_mass(model.parameters) / kPushedMass,
                along = options.along * across;
   const Vector3 tangent = frame.motions[contact.link].rotation * chain.direction;
   Touch out;
@@ -186,7 +171,8 @@ Touch touch_on_surface(const dynamics::Model& model, const Frame& frame, double 
   const Touch axis = touch_at(model, frame, contact_at(chain, arclength), options);
   const Vector3 push = frame.motions[axis.contact.link].rotation.transpose() * axis.fit.force;
   const Vector3 across = push - chain.direction.dot(push) * chain.direction;
-  if (across.norm() <= kTouchingWeight * total_mass(model.parameters) * model.parameters.gravity.norm()) return axis;
+  const double weight = dynamics::total_mass(model.parameters) * model.parameters.gravity.norm();
+  if (across.norm() <= kTouchingWeight * weight) return axis;
   Contact contact = axis.contact;
   contact.home -= 0.5 * chain.diameter * across.normalized();
   return touch_at(model, frame, contact, options);
@@ -271,7 +257,7 @@ Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, 
     e.force = believed * force;
     e.sigma = (variance + believed * (1.0 - believed) * force.cwiseProduct(force)).cwiseSqrt();
     e.observed = (Vector3::Ones() - variance.cwiseQuotient(touch.prior.diagonal())).cwiseMax(0.0);
-    e.touching = e.probability > 0.5 && e.force.norm() > kTouchingWeight * total_mass(p) * p.gravity.norm();
+    e.touching = e.probability > 0.5 && e.force.norm() > kTouchingWeight * dynamics::total_mass(p) * p.gravity.norm();
     // friction at rest may balance any force up to its limit: bounds around the force if it balanced none
     const Fit sliding = solve(touch.jacobian, frame.residual, frame.sliding_covariance, touch.prior);
     const double limit = std::accumulate(frame.hidden.begin(), frame.hidden.end(), 0.0);
@@ -292,7 +278,7 @@ Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, 
 
 // The parameters of known covariance.
 struct Uncertainty {
-  std::vector<std::string> names;
+  std::vector<dynamics::Unknown> unknowns;
   MatrixX covariance;
 };
 
@@ -300,20 +286,17 @@ struct Uncertainty {
 std::optional<Uncertainty> known_uncertainty(const dynamics::Model& model, const dynamics::Estimates& estimates) {
   const auto all = static_cast<Eigen::Index>(estimates.names.size());
   if (all == 0 || estimates.covariance.rows() != all || estimates.covariance.cols() != all) return {};
-  const std::vector<dynamics::Tangent> tangents = dynamics::tangents(model.chain, model.parameters, estimates.names);
-  std::vector<Eigen::Index> of;
-  for (Eigen::Index i = 0; i < all; ++i)
-    if (dynamics::is_parameter(tangents[i])) of.push_back(i);
+  const std::vector<dynamics::Unknown> unknowns = dynamics::unknowns_of(model.chain, estimates);
+  const std::vector<Eigen::Index> of = dynamics::parameters_among(unknowns);
   const MatrixX covariance = estimates.covariance(of, of);
   const std::vector<Eigen::Index> known = math::known_part(covariance);
   Uncertainty out{{}, covariance(known, known)};
   std::string unknown;
   for (std::size_t i = 0; i < of.size(); ++i) {
-    const std::string& name = estimates.names[of[i]];
     if (std::binary_search(known.begin(), known.end(), static_cast<Eigen::Index>(i)))
-      out.names.push_back(name);
+      out.unknowns.push_back(unknowns[of[i]]);
     else
-      unknown += (unknown.empty() ? "" : ", ") + name;
+      unknown += (unknown.empty() ? "" : ", ") + estimates.names[of[i]];
   }
   if (unknown.empty()) return out;
   core::warn(
@@ -326,7 +309,7 @@ std::optional<Uncertainty> known_uncertainty(const dynamics::Model& model, const
 // Returns the estimate of state `at` of a live window, which ends with the newest state.
 Estimate live_line(Live& live, std::size_t at) {
   const bool automatic = !live.contact;
-  const Motion motion = smooth(live.states, live.standing);
+  const Motion motion = smooth(live.states);
   const double time = motion.time[at];
   Frame frame = frame_of(live.model, live.deviations, live.base(time), motion, at, live.options);
   if (!automatic)
@@ -345,10 +328,7 @@ Estimate live_line(Live& live, std::size_t at) {
 }  // namespace
 
 MatrixX angle_covariance(const chain::Chain& chain, const VectorX& theta, const VectorX& sigma) {
-  const MatrixX axes = chain::world_axes(chain, theta, Pose{});
-  MatrixX information = MatrixX::Zero(sigma.size(), sigma.size());
-  for (const MatrixX& jacobian : link_end_jacobians(chain, axes, chain::link_motions(chain, theta, Pose{})))
-    information.noalias() += jacobian.transpose() * jacobian;
+  MatrixX information = chain::displacement_metric(chain::link_end_jacobians(chain, theta, Pose{}));
   information.diagonal().array() += std::pow(kUnseenLever * chain.diameter, 2);
   const Eigen::LLT<MatrixX> factor(information);
   CHAINSPLAT_CHECK(math::is_positive(factor), "angles that are not finite");
@@ -416,19 +396,19 @@ std::vector<dynamics::Model> deviations(const dynamics::Model& model, const dyna
   std::optional<Uncertainty> known = known_uncertainty(model, estimates);
   if (!known) {
     known.emplace();
-    for (const char* const name : {"log_stiffness_joint_", "log_damping_joint_"})
-      for (int joint = 1; joint < chain.links(); ++joint) known->names.push_back(name + std::to_string(joint));
-    const auto count = static_cast<Eigen::Index>(known->names.size());
+    for (const auto quantity : {dynamics::Quantity::joint_stiffness, dynamics::Quantity::joint_damping})
+      for (int joint = 0; joint + 1 < chain.links(); ++joint) known->unknowns.push_back({quantity, joint});
+    const auto count = static_cast<Eigen::Index>(known->unknowns.size());
     known->covariance = kUnknownDeviation * kUnknownDeviation * MatrixX::Identity(count, count);
   }
-  const auto& [names, covariance] = *known;
+  const auto& [unknowns, covariance] = *known;
   const Eigen::SelfAdjointEigenSolver<MatrixX> principal(covariance);
   std::vector<dynamics::Model> out;
   for (Eigen::Index i = 0; i < covariance.rows(); ++i) {
     const double variance = principal.eigenvalues()[i];
     if (!(variance > 0.0)) continue;
     const VectorX change = std::sqrt(variance) * principal.eigenvectors().col(i);
-    out.push_back(dynamics::make_model(chain, dynamics::moved(chain, model.parameters, names, change)));
+    out.push_back(dynamics::make_model(chain, dynamics::moved(chain, model.parameters, unknowns, change)));
   }
   return out;
 }
@@ -477,14 +457,14 @@ std::vector<Estimate> estimate(const dynamics::Model& model, std::span<const dyn
 std::optional<Estimate> update(Live& live, double time, const VectorX& theta, const MatrixX& standing) {
   live.states.time.push_back(time);
   live.states.theta.push_back(theta);
-  if (standing.size() > 0) live.standing.push_back(standing);
+  if (standing.size() > 0) live.states.covariance.push_back(standing);
   ++live.taken;
   // the window keeps the states that the next estimate and the speed before it need
   std::size_t old = 0;
   while (live.states.time.size() - old > kLiveLag + 3 && live.states.time[old] < time - kLiveWindow) ++old;
   live.states.time.erase(live.states.time.begin(), live.states.time.begin() + old);
   live.states.theta.erase(live.states.theta.begin(), live.states.theta.begin() + old);
-  if (!live.standing.empty()) live.standing.erase(live.standing.begin(), live.standing.begin() + old);
+  if (!live.states.covariance.empty()) live.states.covariance.erase(live.states.covariance.begin(), live.states.covariance.begin() + old);
   if (live.taken <= kLiveLag) return {};
   return live_line(live, live.states.time.size() - 1 - kLiveLag);
 }

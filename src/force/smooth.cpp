@@ -87,7 +87,7 @@ Filtered filter(const std::vector<double>& time, const std::vector<VectorX>& the
 
 }  // namespace
 
-Motion smooth(const chain::States& states, std::span<const MatrixX> standing) {
+Motion smooth(const chain::States& states) {
   const std::size_t count = states.time.size();
   if (count < 3) throw InputError("states", "are fewer than three", "give more: forces need accelerations");
   // choose the ratio by maximum likelihood
@@ -105,7 +105,7 @@ Motion smooth(const chain::States& states, std::span<const MatrixX> standing) {
   out.thetaddot.resize(count);
   out.covariance.resize(count);
   out.noise = best.noise;
-  out.standing.assign(standing.begin(), standing.end());
+  out.standing = states.covariance;
   MatrixX mean = best.mean.back();
   Matrix3 covariance = best.covariance.back();
   for (std::size_t back = 0; back < count; ++back) {

@@ -10,6 +10,7 @@ namespace chainsplat::identification {
 namespace {
 
 using dynamics::BaseGrid;
+using dynamics::Quantity;
 using math::Vector3;
 
 constexpr double kHorizons[] = {1.0 / 3, 2.0 / 3, 4.0 / 3};  // s, then doubled until everything is within
@@ -29,10 +30,9 @@ struct Part {
   const chain::Chain& chain;
   Unknowns unknowns;
   std::vector<double> times;
-  std::vector<int> links;       // of each compared point: middles and ends of the links, two a link, then
-  std::vector<Vector3> home;    // where the rope can twist a point of its surface a link; base frame, at theta = 0
-  std::vector<MatrixX> target;  // a frame: 3 x points, base frame
-  std::vector<VectorX> theta;   // recognized
+  std::vector<chain::MaterialPoint> points;  // that are compared
+  std::vector<MatrixX> target;               // per frame: 3 x points, base frame
+  std::vector<VectorX> theta;                // recognized
   // a frame: of the angles, n x n, in the metric of the points; of markers, 3 x 3 blocks side by side
   std::vector<MatrixX> whitening;
   BaseGrid grids[2];                  // half the substeps, for the way to the minimum, and all of them
@@ -60,14 +60,11 @@ struct Problem {
 // Points of the centerline in the base frame and, where asked, their derivatives by theta.
 void place_points(const Part& part, const VectorX& theta, MatrixX& points, std::vector<MatrixX>* slopes) {
   const auto motions = chain::link_motions(part.chain, theta, {});
-  const std::size_t count = part.home.size();
-  points.resize(3, count);
-  for (std::size_t i = 0; i < count; ++i) points.col(i) = motions[part.links[i]] * part.home[i];
-  if (!slopes) return;
-  const MatrixX axes = chain::world_axes(part.chain, theta, {});
-  slopes->resize(count);
-  for (std::size_t i = 0; i < count; ++i)
-    (*slopes)[i] = chain::point_jacobian(part.chain, axes, part.links[i], points.col(i));
+  points.resize(3, part.points.size());
+  for (std::size_t i = 0; i < part.points.size(); ++i)
+    points.col(i) = motions[part.points[i].link] * part.points[i].home;
+  if (slopes)
+    *slopes = chain::point_jacobians(part.chain, chain::world_axes(part.chain, theta, {}), motions, part.points);
 }
 
 BaseGrid prefix(const Part& part, std::size_t frames, bool fine) {
@@ -88,12 +85,13 @@ bool simulate(const Part& part, const BaseGrid& grid, const VectorX& p, chain::S
               dynamics::Sensitivities* sensitivities = nullptr) {
   const State state = apply(part.chain, part.unknowns, p);
   const dynamics::Model model = dynamics::make_model(part.chain, state.parameters);
-  if (!sensitivities) return dynamics::simulate(model, grid, state.theta, state.thetadot, states);
+  if (!sensitivities) return dynamics::simulate(model, grid, state.initial.theta, state.initial.thetadot, states);
   const auto unknowns = tangents(part.chain, part.unknowns, p);
   if (model.parameters.integrator == dynamics::Integrator::rodas3)
-    return dynamics::simulate(model, grid, state.theta, state.thetadot, states, unknowns, sensitivities);
+    return dynamics::simulate(model, grid, state.initial.theta, state.initial.thetadot, states, unknowns,
+                              sensitivities);
   // the Euler step has no variational equation: differences of rollouts
-  if (!dynamics::simulate(model, grid, state.theta, state.thetadot, states)) return false;
+  if (!dynamics::simulate(model, grid, state.initial.theta, state.initial.thetadot, states)) return false;
   const std::size_t frames = states.theta.size();
   const int size = static_cast<int>(p.size());
   sensitivities->theta.assign(frames, MatrixX::Zero(part.chain.angles(), size));
@@ -104,8 +102,8 @@ bool simulate(const Part& part, const BaseGrid& grid, const VectorX& p, chain::S
     moved[i] += kStep;
     const State shifted = apply(part.chain, part.unknowns, moved);
     chain::States out;
-    if (!dynamics::simulate(dynamics::make_model(part.chain, shifted.parameters), grid, shifted.theta, shifted.thetadot,
-                            out))
+    if (!dynamics::simulate(dynamics::make_model(part.chain, shifted.parameters), grid, shifted.initial.theta,
+                            shifted.initial.thetadot, out))
       return;
     good[i] = 1;
     for (std::size_t k = 0; k < frames; ++k) sensitivities->theta[k].col(i) = (out.theta[k] - states.theta[k]) / kStep;
@@ -154,11 +152,6 @@ double loss_of(const std::vector<MatrixX>& values, double limit) {
   return loss;
 }
 
-struct Normal {
-  MatrixX hessian;   // J^T W J
-  VectorX gradient;  // J^T W r
-};
-
 // Whitened residuals of frame k and their derivatives by the unknowns, with the roots of Huber's weights.
 struct Rows {
   VectorX right;
@@ -185,26 +178,27 @@ void weighted_rows(const Part& part, const chain::States& states, const dynamics
   out.slopes.noalias() = by_angle * slopes.theta[k];
 }
 
-Normal normal_equations(const Part& part, const chain::States& states, const dynamics::Sensitivities& slopes,
-                        const std::vector<MatrixX>& values, double limit) {
+solve::NormalEquations normal_equations(const Part& part, const chain::States& states,
+                                        const dynamics::Sensitivities& slopes, const std::vector<MatrixX>& values,
+                                        double limit) {
   const Eigen::Index size = part.unknowns.size();
   const std::size_t frames = values.size();
   // blocks of frames, summed in fixed order: the result does not depend on the number of threads
   constexpr std::size_t kBlock = 10;
   const std::size_t blocks = (frames + kBlock - 1) / kBlock;
-  const Normal zero{MatrixX::Zero(size, size), VectorX::Zero(size)};
-  std::vector<Normal> sums(blocks, zero);
+  const solve::NormalEquations zero{MatrixX::Zero(size, size), VectorX::Zero(size)};
+  std::vector<solve::NormalEquations> sums(blocks, zero);
   core::parallel_for(static_cast<std::int64_t>(blocks), [&](std::int64_t block) {
     Rows rows;
     for (std::size_t k = block * kBlock; k < std::min(frames, (block + 1) * kBlock); ++k) {
       weighted_rows(part, states, slopes, values, limit, k, rows);
-      sums[block].hessian.selfadjointView<Eigen::Lower>().rankUpdate(rows.slopes.transpose());
+      sums[block].matrix.selfadjointView<Eigen::Lower>().rankUpdate(rows.slopes.transpose());
       sums[block].gradient.noalias() += rows.slopes.transpose() * rows.right;
     }
   });
-  Normal out = zero;
-  for (const Normal& sum : sums) out.hessian += sum.hessian, out.gradient += sum.gradient;
-  out.hessian = out.hessian.selfadjointView<Eigen::Lower>();
+  solve::NormalEquations out = zero;
+  for (const solve::NormalEquations& sum : sums) out.matrix += sum.matrix, out.gradient += sum.gradient;
+  out.matrix = out.matrix.selfadjointView<Eigen::Lower>();
   return out;
 }
 
@@ -279,69 +273,69 @@ void add_part(const Problem& problem, std::size_t index, const MatrixX& part, Ma
   all.block(first, first, own, own) += part.bottomRightCorner(own, own);
 }
 
-// Sums of all recordings in the order of the unknowns.
-Normal normal_equations(const Problem& problem, const Rollouts& rollouts, double limit) {
+// Of all recordings, without the prior: an initial state is a local block.
+solve::ArrowEquations normal_equations(const Problem& problem, const Rollouts& rollouts, double limit) {
   const int shared = problem.shared, own = problem.own();
-  Normal out{MatrixX::Zero(problem.mean.size(), problem.mean.size()), VectorX::Zero(problem.mean.size())};
+  solve::ArrowEquations out{MatrixX::Zero(shared, shared), VectorX::Zero(shared), {}};
   for (std::size_t i = 0; i < problem.parts.size(); ++i) {
-    const Normal part =
+    const solve::NormalEquations part =
         normal_equations(problem.parts[i], rollouts.states[i], rollouts.slopes[i], rollouts.values[i], limit);
-    add_part(problem, i, part.hessian, out.hessian);
-    out.gradient.head(shared) += part.gradient.head(shared);
-    out.gradient.segment(shared + static_cast<Eigen::Index>(i) * own, own) += part.gradient.tail(own);
+    out.shared += part.matrix.topLeftCorner(shared, shared);
+    out.gradient += part.gradient.head(shared);
+    if (own > 0)
+      out.local.push_back({part.matrix.bottomRightCorner(own, own), part.matrix.bottomLeftCorner(own, shared),
+                           part.gradient.tail(own)});
   }
   return out;
+}
+
+// Adds the prior at p. It links the shared unknowns with no initial state.
+void add_prior(const Problem& problem, const VectorX& p, solve::ArrowEquations& equations) {
+  const Eigen::Index shared = problem.shared, own = problem.own();
+  const VectorX pull = problem.precision * (p - problem.mean);
+  equations.shared += problem.precision.topLeftCorner(shared, shared);
+  equations.gradient += pull.head(shared);
+  Eigen::Index at = shared;
+  for (solve::ArrowEquations::Local& local : equations.local) {
+    local.matrix += problem.precision.block(at, at, own, own);
+    local.gradient += pull.segment(at, own);
+    at += own;
+  }
 }
 
 struct Fit {
   VectorX p;
   double cost = kInfinity;
   double limit = kInfinity;  // Huber's, of the root mean square of a whitened group
+  solve::Summary summary;    // of the last horizon
 };
 
 // Levenberg-Marquardt over the first `horizon` seconds of every recording.
 void improve(const Problem& problem, double horizon, bool fine, int iterations, Fit& fit) {
-  // relative, below which a horizon is done; on the way to the whole recording a start is enough
-  const double progress = fine ? 1e-6 : 1e-4;
-  Rollouts now(problem, horizon, fine), trial = now;
-  if (!now.run(problem, fit.p, true)) {
-    fit.cost = kInfinity;
-    return;
-  }
-  fit.limit = kHuber * std::max(median_rms(now.values) / kMedianRms, kLeastUsual);
-  fit.cost = now.cost(problem, fit.p, fit.limit);
-  double damping = 1e-3;
-  for (int iteration = 0; iteration < iterations; ++iteration) {
-    if (core::stop_requested()) throw Interrupted(core::stop_requested());
-    const Normal normal = normal_equations(problem, now, fit.limit);
-    const MatrixX hessian = normal.hessian + problem.precision;
-    const VectorX gradient = normal.gradient + problem.precision * (fit.p - problem.mean);
-    bool better = false;
-    double gained = 0.0;
-    for (int attempt = 0; attempt < 6 && !better; ++attempt) {
-      MatrixX damped = hessian;
-      damped.diagonal() *= 1.0 + damping;
-      VectorX step = damped.ldlt().solve(-gradient);
-      constexpr double kMaxStep = 1.0;  // of a log or an angle or rad/s: beyond, the linearization is worthless
-      const double largest = step.cwiseAbs().maxCoeff();
-      if (!(largest < kInfinity)) break;
-      if (largest > kMaxStep) step *= kMaxStep / largest;
-      const VectorX p = fit.p + step;
-      if (trial.run(problem, p, false)) {
-        const double cost = trial.cost(problem, p, fit.limit);
-        if (cost < fit.cost) {
-          gained = fit.cost - cost;
-          fit.p = p, fit.cost = cost;
-          better = true;
-          damping = std::max(0.1 * damping, 1e-9);
-          break;
-        }
-      }
-      damping = std::max(10.0 * damping, 1e-4);
+  Rollouts rollouts(problem, horizon, fine);
+  bool first = true;
+  const auto evaluate = [&](const VectorX& p, solve::ArrowEquations* equations) {
+    if (!rollouts.run(problem, p, equations != nullptr)) return kInfinity;
+    if (first) fit.limit = kHuber * std::max(median_rms(rollouts.values) / kMedianRms, kLeastUsual);
+    first = false;
+    if (equations) {
+      *equations = normal_equations(problem, rollouts, fit.limit);
+      add_prior(problem, p, *equations);
     }
-    if (!better || gained < progress * fit.cost) break;
-    if (!now.run(problem, fit.p, true)) break;
-  }
+    return rollouts.cost(problem, p, fit.limit);
+  };
+  solve::Options options;
+  options.steps = iterations;
+  options.attempts = 6;
+  // on the way to the whole recording a start is enough
+  options.cost_tolerance = fine ? 1e-6 : 1e-4;
+  options.longest = 1.0;  // of a log or an angle or rad/s: beyond, the linearization is worthless
+  options.cancellable = true;
+  options.damping.least_raised = 1e-4;
+  options.damping.least = 1e-9;
+  fit.summary = solve::least_squares(fit.p, evaluate, options);
+  if (fit.summary.reason == solve::Reason::cancelled) throw Interrupted(core::stop_requested());
+  fit.cost = fit.summary.final_cost;
 }
 
 // Local quadratic over the first frames: angle and velocity at the first time. Returns the standard deviation of one
@@ -373,7 +367,8 @@ double initial_motion(const chain::States& states, VectorX& theta, VectorX& thet
 }
 
 Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,
-               std::span<const MatrixX> covariances, const Options& options, const Markers* markers = nullptr) {
+               const Options& options, const Markers* markers = nullptr) {
+  const std::vector<MatrixX>& covariances = recognized.covariance;
   const std::size_t frames = recognized.time.size();
   if (frames < 3 || recognized.theta.size() != frames)
     throw InputError("identify", std::to_string(frames) + " recognized states", "give at least 3 with their times");
@@ -382,30 +377,15 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
       throw InputError("identify", "a recognized state is not finite or of another chain", "recognize again");
   CHAINSPLAT_CHECK(covariances.empty() || covariances.size() == frames, std::to_string(covariances.size()));
 
-  Part part{chain, {}, recognized.time, {}, {}, {}, recognized.theta, {}, {}, {}};
+  Part part{chain, {}, recognized.time, {}, {}, recognized.theta, {}, {}, {}};
   for (std::size_t k = 1; k < frames; ++k)  // angles are known up to whole turns: the nearest to the frame before
     for (Eigen::Index i = 0; i < part.theta[k].size(); ++i)
       part.theta[k][i] -= 2.0 * M_PI * std::round((part.theta[k][i] - part.theta[k - 1][i]) / (2.0 * M_PI));
   part.has_markers = markers != nullptr;
-  for (int link = 1; !markers && link < chain.links(); ++link) {
-    part.home.push_back(0.5 * (chain.link_start(link) + chain.link_end(link)) * chain.direction);
-    part.home.push_back(chain.link_end(link) * chain.direction);
-    part.links.insert(part.links.end(), 2, link);
-  }
-  const bool twists = std::any_of(chain.axes.begin(), chain.axes.end(), [&](const math::Vector6& axis) {
-    return std::abs(axis.head<3>().dot(chain.direction)) > 0.5;
-  });
-  for (int link = 1; !markers && twists && link < chain.links(); ++link) {
-    part.home.push_back(chain.link_end(link) * chain.direction + 0.5 * chain.diameter * chain.bending_axis);
-    part.links.push_back(link);
-  }
-
-  for (std::size_t i = 0; markers && i < markers->arclengths.size(); ++i) {
-    part.home.push_back(markers->arclengths[i] * chain.direction);
-    part.links.push_back(chain::link_at(chain, markers->arclengths[i]));
-  }
-
-  const std::size_t points = part.home.size();
+  if (!markers) part.points = chain::shape_points(chain, true);
+  for (std::size_t i = 0; markers && i < markers->arclengths.size(); ++i)
+    part.points.push_back(chain::centerline_point(chain, markers->arclengths[i]));
+  const std::size_t points = part.points.size();
   std::vector<MatrixX> jacobians;
   for (std::size_t k = 0; k < frames; ++k) {
     if (markers) {
@@ -426,8 +406,7 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
     MatrixX target;
     place_points(part, recognized.theta[k], target, &jacobians);
     // what the model's error of the points is in angles, and the recognized angles' own
-    MatrixX normal = MatrixX::Zero(chain.angles(), chain.angles());
-    for (const MatrixX& jacobian : jacobians) normal += jacobian.transpose() * jacobian;
+    const MatrixX normal = chain::displacement_metric(jacobians);
     const MatrixX unit = MatrixX::Identity(chain.angles(), chain.angles());
     const Eigen::LDLT<MatrixX> by_points(normal);
     MatrixX covariance = kCorrelated * options.model_error * options.model_error * by_points.solve(unit);
@@ -442,7 +421,7 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
   }
 
   VectorX theta, thetadot, theta_sd = VectorX::Constant(chain.angles(), kThetaSd);
-  const double thetadot_sd = initial_motion({part.times, part.theta, {}}, theta, thetadot);
+  const double thetadot_sd = initial_motion({part.times, part.theta, {}, {}}, theta, thetadot);
   if (!theta.allFinite() || !thetadot.allFinite() || !std::isfinite(thetadot_sd))
     throw InputError("identify", "the first times tell no velocity: they are too near or too far from each other",
                      "give frames of a video");
@@ -457,7 +436,7 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
                        thetadot.cwiseAbs().maxCoeff() < std::max(kRopeAtRest, kSignificant * thetadot_sd);
   if (at_rest) thetadot.setZero();
   part.unknowns = make_unknowns(chain, options, theta, thetadot, theta_sd, at_rest ? kAtRestSd : kRateSd);
-  const int substeps = part.unknowns.fixed.substeps;
+  const int substeps = part.unknowns.reference.substeps;
   for (bool fine : {false, true}) {
     BaseGrid& grid = part.grids[fine];
     grid = dynamics::sample_base([&](double t) { return base.at(t); }, recognized.time[0], recognized.time,
@@ -470,7 +449,7 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
 
 Problem make_problem(const chain::Chain& chain, std::vector<Part> parts) {
   const Unknowns& first = parts.front().unknowns;
-  const int shared = first.theta < 0 ? first.size() : first.theta;
+  const int theta = first.first(Quantity::theta), shared = theta < 0 ? first.size() : theta;
   Problem problem{chain, std::move(parts), shared, {}, {}};
   const int own = problem.own();
   const Eigen::Index size = shared + own * static_cast<Eigen::Index>(problem.parts.size());
@@ -519,18 +498,21 @@ Fit fit_centerline(const Problem& problem, const Options& options) {
 
   const auto start = [&](int index) {
     VectorX p = problem.mean;
-    for (int i : {u.stiffness, u.damping, u.drag})
-      if (i >= 0) p[i] += std::log(options.start_factor);
-    for (int j = 0; u.coulomb >= 0 && j < problem.chain.links() - 1; ++j)
-      p[u.coulomb + j] += std::log(options.start_factor);
+    const int coulomb = u.first(Quantity::coulomb_friction), links = coulomb < 0 ? 0 : problem.chain.links() - 1;
+    const auto scale = [&](std::initializer_list<Quantity> quantities, const auto& by) {
+      for (const Quantity quantity : quantities)
+        if (const int i = u.first(quantity); i >= 0) p[i] += by();
+    };
+    const auto factor = [&] { return std::log(options.start_factor); };
+    scale({Quantity::stiffness, Quantity::damping, Quantity::drag}, factor);
+    for (int j = 0; j < links; ++j) p[coulomb + j] += factor();
     if (index < 3) {
-      for (int i : {u.stiffness, u.damping})
-        if (i >= 0) p[i] += std::log(kScales[index]);
+      scale({Quantity::stiffness, Quantity::damping}, [&] { return std::log(kScales[index]); });
     } else {
       core::Random random(options.seed * 1000003u + static_cast<std::uint64_t>(index));
-      for (int i : {u.stiffness, u.damping, u.drag, u.tip})
-        if (i >= 0) p[i] += 1.5 * random.normal();
-      for (int j = 0; u.coulomb >= 0 && j < problem.chain.links() - 1; ++j) p[u.coulomb + j] += random.normal();
+      scale({Quantity::stiffness, Quantity::damping, Quantity::drag, Quantity::tip_mass},
+            [&] { return 1.5 * random.normal(); });
+      for (int j = 0; j < links; ++j) p[coulomb + j] += random.normal();
     }
     return p;
   };
@@ -590,11 +572,11 @@ Fit fit_centerline(const Problem& problem, const Options& options) {
 
 // [P]: Adam on half the squared angle differences, gradients by differences of rollouts.
 Fit fit_angles(const Problem& problem, const Options& options) {
-  constexpr double kRate = 0.05, kBeta1 = 0.9, kBeta2 = 0.999, kEpsilon = 1e-12;
   Fit best, fit;
   fit.p = problem.mean;
-  double rate = kRate;
-  VectorX first = VectorX::Zero(fit.p.size()), second = first;
+  solve::AdamOptions rates{.rate = 0.05, .epsilon = 1e-12};
+  solve::AdamState adam;
+  solve::Summary summary;
   Rollouts rollouts(problem, kInfinity, true);
   for (int iteration = 1; iteration <= options.adam_iterations; ++iteration) {
     if (core::stop_requested()) throw Interrupted(core::stop_requested());
@@ -604,8 +586,10 @@ Fit fit_angles(const Problem& problem, const Options& options) {
         fit.p.array() += 0.3;
       else
         fit.p = best.p;
-      rate *= 0.5;
-      first.setZero();
+      rates.rate *= 0.5;
+      adam.first = VectorX::Zero(fit.p.size());
+      if (adam.second.size() == 0) adam.second = adam.first;
+      ++adam.steps;
       continue;
     }
     double cost = 0.0;
@@ -618,11 +602,14 @@ Fit fit_angles(const Problem& problem, const Options& options) {
       }
     fit.cost = cost;
     if (cost < best.cost) best = fit;
-    first = kBeta1 * first + (1.0 - kBeta1) * gradient;
-    second = kBeta2 * second + (1.0 - kBeta2) * gradient.cwiseAbs2();
-    const double correction1 = 1.0 - std::pow(kBeta1, iteration), correction2 = 1.0 - std::pow(kBeta2, iteration);
-    fit.p.array() -= rate * (first.array() / correction1) / ((second.array() / correction2).sqrt() + kEpsilon);
+    if (std::isnan(summary.initial_cost)) summary.initial_cost = cost;
+    const VectorX before = fit.p;
+    solve::adam_step(adam, gradient, rates, fit.p);
+    summary.worst_step = (fit.p - before).cwiseAbs().maxCoeff();
+    summary.iterations = iteration;
   }
+  best.summary = summary;  // a number of steps, by design: it ends at the last
+  best.summary.final_cost = best.cost;
   return best;
 }
 
@@ -647,15 +634,13 @@ MatrixX covariance_of(const Problem& problem, const MatrixX& hessian, const Roll
 
 // Eigenvectors of the information about the shared unknowns, those of the initial states eliminated, in units of the
 // priors' deviations; the roots of its eigenvalues are the singular values of the weighted, scaled sensitivities.
-std::vector<dynamics::Estimates::Weak> weak_directions(const Problem& problem, const MatrixX& hessian) {
+std::vector<dynamics::Estimates::Weak> weak_directions(const Problem& problem, solve::ArrowEquations data) {
   const int shared = problem.shared, own = problem.own();
-  MatrixX information = hessian.topLeftCorner(shared, shared);
-  for (std::size_t i = 0; own > 0 && i < problem.parts.size(); ++i) {
+  for (std::size_t i = 0; i < data.local.size(); ++i) {
     const Eigen::Index first = shared + static_cast<Eigen::Index>(i) * own;
-    const MatrixX with_prior = hessian.block(first, first, own, own) + problem.precision.block(first, first, own, own);
-    const MatrixX cross = hessian.block(first, 0, own, shared);
-    information -= cross.transpose() * with_prior.ldlt().solve(cross);
+    data.local[i].matrix += problem.precision.block(first, first, own, own);
   }
+  const MatrixX information = solve::reduced(data).matrix;
   const MatrixX prior = problem.precision.topLeftCorner(shared, shared);
   const VectorX deviation = prior.ldlt().solve(MatrixX::Identity(shared, shared)).diagonal().cwiseMax(0.0).cwiseSqrt();
   if (!information.allFinite()) return {};  // its covariance is said not to be known
@@ -670,7 +655,7 @@ std::vector<dynamics::Estimates::Weak> weak_directions(const Problem& problem, c
     if (vector[largest] < 0.0) vector = -vector;
     for (int k = 0; k < shared; ++k)
       if (k == largest || std::abs(vector[k]) >= kLarge)
-        direction.parts.emplace_back(problem.parts[0].unknowns.names[k], vector[k]);
+        direction.parts.emplace_back(dynamics::name_of(problem.parts[0].unknowns.list[k]), vector[k]);
     std::stable_sort(direction.parts.begin(), direction.parts.end(),
                      [](const auto& a, const auto& b) { return std::abs(a.second) > std::abs(b.second); });
     weak.push_back(std::move(direction));
@@ -690,33 +675,36 @@ double alone_rms(const Problem& problem, std::size_t index, const VectorX& p) {
                                                                    : kInfinity;
 }
 
-std::vector<Result> solve(const chain::Chain& chain, std::vector<Part> parts, const Options& options) {
+std::vector<Result> fit_parts(const chain::Chain& chain, std::vector<Part> parts, const Options& options) {
   const Problem problem = make_problem(chain, std::move(parts));
   const Fit fit = options.paper ? fit_angles(problem, options) : fit_centerline(problem, options);
   Rollouts rollouts(problem, kInfinity, true);
   if (fit.cost == kInfinity || !rollouts.run(problem, fit.p, true))
     throw WorkError("identify", "no parameters gave a rollout that stays finite",
                     "check the base trajectory, the recognized angles and the object's length");
-  const Normal normal = normal_equations(problem, rollouts, fit.limit);
-  const MatrixX covariance = covariance_of(problem, normal.hessian, rollouts, fit.limit);
+  const solve::ArrowEquations data = normal_equations(problem, rollouts, fit.limit);
+  const MatrixX covariance = covariance_of(problem, solve::dense(data).matrix, rollouts, fit.limit);
+  if (fit.summary.reason == solve::Reason::last_iteration && !options.paper)
+    core::warn("identify: the fit " + solve::describe(fit.summary) + "; the parameters may not be the best ones yet");
   const Eigen::Index shared = problem.shared, own = problem.own();
 
   std::vector<Result> results(problem.parts.size());
-  const std::vector<dynamics::Estimates::Weak> weak = weak_directions(problem, normal.hessian);
+  const std::vector<dynamics::Estimates::Weak> weak = weak_directions(problem, data);
   for (std::size_t i = 0; i < results.size(); ++i) {
     Result& result = results[i];
     const Part& part = problem.parts[i];
     const VectorX p = problem.of_part(fit.p, i);
     const State state = apply(chain, part.unknowns, p);
     result.parameters = state.parameters;
-    result.initial = {part.times[0], state.theta, state.thetadot};
+    result.initial = {part.times[0], state.initial.theta, state.initial.thetadot};
     result.rollout = std::move(rollouts.states[i]);
     result.node_rms = result.alone_rms = rms_of(part, result.rollout);
     if (results.size() > 1 && !options.paper)
       result.alone_rms = std::min(result.node_rms, alone_rms(problem, i, fit.p));
     dynamics::Estimates& e = result.estimates;
-    e.names = part.unknowns.names;
+    e.names = part.unknowns.names();
     e.held = part.unknowns.held;
+    e.solver = fit.summary;
     e.weak = weak;
     e.values.assign(p.begin(), p.end());
     const Eigen::Index first = shared + static_cast<Eigen::Index>(i) * own;
@@ -732,24 +720,21 @@ std::vector<Result> solve(const chain::Chain& chain, std::vector<Part> parts, co
 
 std::vector<Result> identify(const chain::Chain& chain, std::span<const Recording> recordings, const Options& options) {
   std::vector<Part> parts;
-  for (const Recording& r : recordings) parts.push_back(make_part(chain, r.base, r.recognized, r.covariances, options));
-  return solve(chain, std::move(parts), options);
+  for (const Recording& r : recordings) parts.push_back(make_part(chain, r.base, r.recognized, options));
+  return fit_parts(chain, std::move(parts), options);
 }
 
 std::vector<Result> identify(const chain::Chain& chain, std::span<const MarkerRecording> recordings,
                              const Options& options) {
   std::vector<Part> parts;
-  for (const MarkerRecording& r : recordings) {
-    std::vector<MatrixX> covariances;
-    const chain::States fitted = fit_markers(chain, r.base, r.markers, &covariances);
-    parts.push_back(make_part(chain, r.base, fitted, covariances, options, &r.markers));
-  }
-  return solve(chain, std::move(parts), options);
+  for (const MarkerRecording& r : recordings)
+    parts.push_back(make_part(chain, r.base, fit_markers(chain, r.base, r.markers).states, options, &r.markers));
+  return fit_parts(chain, std::move(parts), options);
 }
 
 Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,
-                std::span<const MatrixX> covariances, const Options& options) {
-  const Recording recording{base, recognized, {covariances.begin(), covariances.end()}};
+                const Options& options) {
+  const Recording recording{base, recognized};
   return std::move(identify(chain, std::span(&recording, 1), options).front());
 }
 

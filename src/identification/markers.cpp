@@ -89,23 +89,31 @@ VectorX along_polygon(const chain::Chain& chain, const math::Pose& pose, const M
     const int last = chain.last_angle(link);
     int count = 0;
     while (last - count >= 0 && chain.child_link[last - count] == link) ++count;
-    for (int iteration = 0; iteration < kAimIterations; ++iteration) {
+    const auto evaluate = [&](const VectorX& joint, solve::NormalEquations* equations) {
+      theta.segment(last - count + 1, count) = joint;
       const math::Pose motion = chain::link_motions(chain, theta, pose)[link];
-      const Vector3 direction = motion.rotation * chain.direction;
+      const Vector3 off = motion.rotation * chain.direction - aim;
       const MatrixX axes = chain::world_axes(chain, theta, pose);
       MatrixX slope(3, count);
-      for (int c = 0; c < count; ++c) slope.col(c) = axes.col(last - count + 1 + c).head<3>().cross(direction);
-      const MatrixX normal = slope.transpose() * slope + kAimDamping * MatrixX::Identity(count, count);
-      theta.segment(last - count + 1, count) += normal.ldlt().solve(slope.transpose() * (aim - direction));
-    }
+      for (int c = 0; c < count; ++c)
+        slope.col(c) = axes.col(last - count + 1 + c).head<3>().cross(motion.rotation * chain.direction);
+      *equations = {slope.transpose() * slope, slope.transpose() * off};
+      return 0.5 * off.squaredNorm();
+    };
+    VectorX joint = theta.segment(last - count + 1, count);
+    solve::least_squares(
+        joint, evaluate,
+        {.steps = kAimIterations,
+         .checked = false,
+         .damping = {.rule = solve::Damping::Rule::fixed, .first = kAimDamping}});
+    theta.segment(last - count + 1, count) = joint;
   }
   return theta;
 }
 
 }  // namespace
 
-chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers,
-                          std::vector<MatrixX>* covariances) {
+MarkerFit fit_markers(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers) {
   check(chain, base, markers);
   const int n = chain.angles();
   MatrixX shape = MatrixX::Identity(n, n) / (kBendSd * kBendSd);
@@ -116,24 +124,26 @@ chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajector
       const double weight = 1.0 / (kSmoothSd * kSmoothSd);
       shape(i, i) += weight, shape(k, k) += weight, shape(i, k) -= weight, shape(k, i) -= weight;
     }
-  if (covariances) covariances->clear();
-  chain::States states;
+  MarkerFit out;
+  std::vector<solve::Summary> summaries;
+  solve::Options options;
+  options.steps = options.trials = kIterations;
+  options.ties = true;
+  options.step_tolerance = kConverged;
   VectorX theta = VectorX::Zero(n);
   for (std::size_t frame = 0; frame < markers.time.size(); ++frame) {
     const math::Pose pose = base.pose(markers.time[frame]);
     const VectorX before = theta;
     const double step_sd = frame == 0 ? 0.0 : kRateSd * (markers.time[frame] - markers.time[frame - 1]);
     const double hold = frame == 0 ? 0.0 : 1.0 / (step_sd * step_sd);
-    MatrixX hessian;
     double squares = 0.0;  // m^2, of the markers that are seen
-    const auto cost_at = [&](const VectorX& angles, VectorX* gradient) {
+    const auto evaluate = [&](const VectorX& angles, solve::NormalEquations* equations) {
       const auto motions = chain::link_motions(chain, angles, pose);
       const MatrixX axes = chain::world_axes(chain, angles, pose);
       double cost = 0.5 * angles.dot(shape * angles) + 0.5 * hold * (angles - before).squaredNorm();
-      if (gradient) {
-        hessian = shape;
-        hessian.diagonal().array() += hold;
-        *gradient = shape * angles + hold * (angles - before);
+      if (equations) {
+        *equations = {shape, shape * angles + hold * (angles - before)};
+        equations->matrix.diagonal().array() += hold;
       }
       squares = 0.0;
       const double weight = 1.0 / (markers.deviation * markers.deviation);
@@ -143,52 +153,41 @@ chain::States fit_markers(const chain::Chain& chain, const trajectory::Trajector
         const int link = chain::link_at(chain, markers.arclengths[i]);
         const math::Vector3 point = motions[link] * (markers.arclengths[i] * chain.direction);
         squares += (point - seen).squaredNorm();
-        if (!gradient) continue;
+        if (!equations) continue;
         const MatrixX slope = chain::point_jacobian(chain, axes, link, point);
-        hessian += weight * slope.transpose() * slope;
-        *gradient += weight * slope.transpose() * (point - seen);
+        equations->matrix += weight * slope.transpose() * slope;
+        equations->gradient += weight * slope.transpose() * (point - seen);
       }
       return cost + 0.5 * weight * squares;
     };
-    const auto descend = [&](VectorX angles) {
-      double damping = 1e-3;
-      for (int iteration = 0; iteration < kIterations; ++iteration) {
-        VectorX gradient;
-        const double cost = cost_at(angles, &gradient);
-        MatrixX damped = hessian;
-        damped.diagonal() *= 1.0 + damping;
-        const VectorX step = damped.ldlt().solve(-gradient);
-        if (cost_at(angles + step, nullptr) <= cost) {
-          angles += step;
-          damping = std::max(0.1 * damping, 1e-12);
-        } else {
-          damping *= 10.0;
-        }
-        if (step.cwiseAbs().maxCoeff() < kConverged) break;
-      }
-      return angles;
-    };
-    theta = descend(before);
-    const double cost = cost_at(theta, nullptr);
+    summaries.push_back(solve::least_squares(theta, evaluate, options));
+    const double cost = evaluate(theta, nullptr);
     const double seen = static_cast<double>(markers.world[frame].array().isFinite().count());
     if (squares > kDoubt * kDoubt * markers.deviation * markers.deviation * seen) {
-      const VectorX other = descend(along_polygon(chain, pose, markers, frame));
-      if (cost_at(other, nullptr) < cost) theta = other;
+      VectorX other = along_polygon(chain, pose, markers, frame);
+      const solve::Summary summary = solve::least_squares(other, evaluate, options);
+      if (evaluate(other, nullptr) < cost) theta = other, summaries.back() = summary;
     }
-    VectorX gradient;
-    cost_at(theta, &gradient);  // the hessian there
-    states.time.push_back(markers.time[frame]);
-    states.theta.push_back(theta);
-    if (covariances) {
-      const Eigen::LDLT<MatrixX> factor(hessian);
-      if (!math::is_positive(factor))
-        throw InputError("markers", "at " + core::exact(markers.time[frame]) + " s they tell no shape of the rope",
-                         "correct their positions there");
-      const MatrixX inverse = factor.solve(MatrixX::Identity(n, n));
-      covariances->push_back(0.5 * (inverse + inverse.transpose()));
-    }
+    solve::NormalEquations found;
+    evaluate(theta, &found);
+    out.states.time.push_back(markers.time[frame]);
+    out.states.theta.push_back(theta);
+    const Eigen::LDLT<MatrixX> factor(found.matrix);
+    if (!math::is_positive(factor))
+      throw InputError("markers", "at " + core::exact(markers.time[frame]) + " s they tell no shape of the rope",
+                       "correct their positions there");
+    const MatrixX inverse = factor.solve(MatrixX::Identity(n, n));
+    out.states.covariance.push_back(0.5 * (inverse + inverse.transpose()));
   }
-  return states;
+  out.summary = solve::together(summaries);
+  const auto unfinished = std::count_if(summaries.begin(), summaries.end(), [](const solve::Summary& summary) {
+    return summary.reason == solve::Reason::last_iteration;
+  });
+  if (unfinished > 0)
+    core::warn("markers: at " + std::to_string(unfinished) + " of " + std::to_string(summaries.size()) +
+               " times the fit of the chain stopped at its last iteration (" + std::to_string(kIterations) +
+               "); all together: cost " + core::exact(out.summary.final_cost));
+  return out;
 }
 
 }  // namespace chainsplat::identification

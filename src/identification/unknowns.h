@@ -10,25 +10,20 @@ namespace chainsplat::identification {
 using math::MatrixX;
 using math::VectorX;
 
-// The unknowns p in one vector, with prior N(mean, inverse(precision)).
+// The unknowns p in one vector, with prior N(mean, inverse(precision)). Parameters of one kind stand side by side.
 struct Unknowns {
-  std::vector<std::string> names;
+  std::vector<dynamics::Unknown> list;
   VectorX mean;
   MatrixX precision;
   std::vector<std::pair<std::string, std::string>> held;
-
-  // first index of each group in p, -1 where the group is held
-  int stiffness = -1, twist_stiffness = -1, grasp_stiffness = -1, damping = -1, drag = -1, tip = -1, coulomb = -1,
-      viscous = -1;
-  int joint_stiffness = -1, joint_damping = -1, link_mass = -1, rest = -1, roll = -1, theta = -1, thetadot = -1;
-  int first_roll = 0;  // the angle of unknown `roll`
+  // What p = 0 stands for: units, so that a logarithm is that of the number itself; what is not fitted, as it is.
+  dynamics::Parameters reference;
+  dynamics::InitialState initial;
   double total_mass = 1.0;
-  std::vector<double> compliance;  // an angle: reference over tributary length, times the shared stiffness and damping
-  std::vector<bool> twist;         // an angle: turns about the rope
-  dynamics::Parameters fixed;      // everything that is not fitted
-  VectorX first_theta, first_thetadot;  // used where the initial state is held
 
-  int size() const { return static_cast<int>(names.size()); }
+  int size() const { return static_cast<int>(list.size()); }
+  int first(dynamics::Quantity quantity) const;  // its first index in p, -1 where it is held
+  std::vector<std::string> names() const;
 };
 
 inline constexpr double kThetaSd = 0.02;   // rad, initial angles about the recognized ones without covariances
@@ -41,7 +36,7 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
 
 struct State {
   dynamics::Parameters parameters;
-  VectorX theta, thetadot;
+  dynamics::InitialState initial;
 };
 State apply(const chain::Chain& chain, const Unknowns& unknowns, const VectorX& p);
 // d State / d p_i for every unknown.

@@ -5,7 +5,7 @@
 #include <cmath>
 #include <limits>
 
-#include "adaptation.h"
+#include "parameter_correction.h"
 #include "search.h"
 
 namespace chainsplat::planning {
@@ -37,6 +37,7 @@ constexpr double kLeastPiece = 0.35;  // s, of a correction
 constexpr double kPieceMargin = 1.6;  // its length over the time to the hit, in free space
 constexpr int kReplanNodes = 60;      // of its rollout, where the substeps allow
 constexpr int kFitIterations = 20;
+constexpr double kFitConverged = 1e-9;  // rad
 constexpr double kFitStiffness = 1e-5;  // m/rad: angles that the points leave open stay as they are
 constexpr int kSeenPoints = 33;         // of the rope's centerline
 
@@ -70,18 +71,16 @@ MatrixX centerline_velocity(const chain::Chain& chain, const VectorX& theta, con
 
 }  // namespace
 
-dynamics::InitialState fit_state(const chain::Chain& chain, const trajectory::BaseMotion& base,
-                                 const std::vector<double>& arclengths, const MatrixX& points,
-                                 const MatrixX& velocities, const VectorX& start) {
+StateFit fit_state(const chain::Chain& chain, const trajectory::BaseMotion& base,
+                   const std::vector<double>& arclengths, const MatrixX& points, const MatrixX& velocities,
+                   const VectorX& start) {
   const int n = chain.angles();
-  dynamics::InitialState out;
-  out.theta = start, out.thetadot = VectorX::Zero(n);
   const Eigen::Index rows = 3 * static_cast<Eigen::Index>(arclengths.size());
   MatrixX jacobian(rows, n);
   VectorX residual(rows);
-  const auto place = [&] {
-    const auto motions = chain::link_motions(chain, out.theta, base.pose);
-    const MatrixX axes = chain::world_axes(chain, out.theta, base.pose);
+  const auto place = [&](const VectorX& theta) {
+    const auto motions = chain::link_motions(chain, theta, base.pose);
+    const MatrixX axes = chain::world_axes(chain, theta, base.pose);
     for (std::size_t i = 0; i < arclengths.size(); ++i) {
       const int link = chain::link_at(chain, arclengths[i]);
       const Vector3 point = motions[link] * (arclengths[i] * chain.direction);
@@ -90,23 +89,28 @@ dynamics::InitialState fit_state(const chain::Chain& chain, const trajectory::Ba
       residual.segment<3>(row) = points.col(static_cast<Eigen::Index>(i)) - point;
     }
   };
-  const double ridge = kFitStiffness * kFitStiffness * static_cast<double>(arclengths.size());
-  const auto solve = [&](const VectorX& right) -> VectorX {
-    MatrixX normal = jacobian.transpose() * jacobian;
-    normal.diagonal().array() += ridge;
-    return normal.ldlt().solve(jacobian.transpose() * right);
+  const auto evaluate = [&](const VectorX& theta, solve::NormalEquations* equations) {
+    place(theta);
+    *equations = {jacobian.transpose() * jacobian, -(jacobian.transpose() * residual)};
+    return 0.5 * residual.squaredNorm();
   };
-  for (int i = 0; i < kFitIterations; ++i) {
-    place();
-    const VectorX step = solve(residual);
-    out.theta += step;
-    if (step.norm() < 1e-9) break;
-  }
+  const solve::Damping ridge{.rule = solve::Damping::Rule::fixed,
+                             .first = kFitStiffness * kFitStiffness * static_cast<double>(arclengths.size())};
+  StateFit out;
+  out.state.theta = start, out.state.thetadot = VectorX::Zero(n);
+  out.summary = solve::least_squares(out.state.theta, evaluate,
+                                     {.steps = kFitIterations,
+                                      .checked = false,
+                                      .step_tolerance = kFitConverged,
+                                      .euclidean = true,
+                                      .damping = ridge});
   if (velocities.cols() == points.cols()) {
-    place();
-    const MatrixX rest = centerline_velocity(chain, out.theta, VectorX::Zero(n), base, arclengths);
+    place(out.state.theta);
+    const MatrixX rest = centerline_velocity(chain, out.state.theta, VectorX::Zero(n), base, arclengths);
     const MatrixX relative = velocities - rest;
-    out.thetadot = solve(Eigen::Map<const VectorX>(relative.data(), relative.size()));
+    const Eigen::Map<const VectorX> right(relative.data(), relative.size());
+    const solve::NormalEquations equations{jacobian.transpose() * jacobian, -(jacobian.transpose() * right)};
+    solve::damped_step(equations, ridge, ridge.first, out.state.thetadot);
   }
   return out;
 }
@@ -206,6 +210,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
   std::vector<double> true_seen = seen;  // the same parts of a rope of another length
   for (double& s : true_seen) s *= truth.chain.length / chain.length;
   LoopResult out;
+  std::vector<solve::Summary> summaries;
   out.motion = plan.motion;
   const double end = out.motion.end();
   const auto base = [&](double time) { return base_at(out.motion, time); };
@@ -219,9 +224,10 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
     const MatrixX shape =
         chain::centerline(chain, chain::link_motions(chain, problem.initial.theta, problem.base), seen);
     state = fit_state(truth.chain, dynamics::at_rest(problem.base), true_seen, shape, {},
-                      VectorX::Zero(truth.chain.angles()));
+                      VectorX::Zero(truth.chain.angles()))
+                .state;
   } else {
-    state.theta = dynamics::static_equilibrium(truth, problem.base);
+    state.theta = dynamics::static_equilibrium(truth, problem.base).theta;
   }
   state.thetadot = VectorX::Zero(truth.chain.angles());
   out.states.time.push_back(0.0), out.states.theta.push_back(state.theta),
@@ -232,7 +238,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
   core::Random random(options.seed + 3);
   double foretold = std::numeric_limits<double>::infinity();  // miss, by the last replan
   bool elsewhere = false;
-  Adaptation adaptation = start_adaptation(problem.model);
+  ParameterCorrection corrected = start_correction(problem.model);
   dynamics::InitialState last_seen = problem.initial;
   last_seen.time = 0.0;
   // the twin's state from the points of the rope that a camera could follow
@@ -241,7 +247,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
     const MatrixX points =
         chain::centerline(truth.chain, chain::link_motions(truth.chain, state.theta, here.pose), true_seen);
     const MatrixX speeds = centerline_velocity(truth.chain, state.theta, state.thetadot, here, true_seen);
-    dynamics::InitialState found = fit_state(chain, here, seen, points, speeds, last_seen.theta);
+    dynamics::InitialState found = fit_state(chain, here, seen, points, speeds, last_seen.theta).state;
     found.time = now;
     return found;
   };
@@ -253,7 +259,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
     if (loop.feedback && k > 0 && left > kShortest) {
       const double begin = core_time();
       const dynamics::InitialState estimate = look(now);
-      adapt(adaptation, base, last_seen, estimate, seen);
+      correct(corrected, base, last_seen, estimate, seen);
       last_seen = estimate;
       const double rest = end - now;
       const double length = problem.tabletop ? rest : std::min(rest, std::max(kLeastPiece, kPieceMargin * left));
@@ -261,7 +267,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
       append_piece(motion, now, length);
       const int full = problem.model.parameters.substeps;
       const int substeps = std::clamp(static_cast<int>(kReplanNodes / (30.0 * length)), full > 4 ? 2 : 1, full);
-      Task task = make_task(problem, options, {&adaptation.model}, motion, estimate, problem.targets.front(), substeps);
+      Task task = make_task(problem, options, {&corrected.model}, motion, estimate, problem.targets.front(), substeps);
       task.exact = false;
       task.target = target_at(now);
       task.target_velocity = loop.target_velocity;
@@ -272,16 +278,17 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
         Motion motion;
         Samples samples;
         double miss, time;
+        solve::Summary summary;
       };
       const auto correction = [&](VectorX q, const Effort& effort) {
-        if (effort.steps > 0) minimize(task, q, {kReplanSharpness, kReplanSmoothness}, effort);
-        Correction c{motion, samples, std::numeric_limits<double>::infinity(), hit_time};
+        Correction c{motion, samples, std::numeric_limits<double>::infinity(), hit_time, {}};
+        if (effort.steps > 0) c.summary = minimize(task, q, {kReplanSharpness, kReplanSmoothness}, effort);
         set_unknowns(c.motion, q);
         // what asks too much of the arm is taken in part
         c.samples.take_within(c.motion, options.limits);
         Rollout rollout;
-        if (roll_out(adaptation.model, task.motion, task.grid, unknowns_of(c.motion), estimate, false, rollout)) {
-          const Hit hit = measure(task, adaptation.model, rollout);
+        if (roll_out(corrected.model, task.motion, task.grid, unknowns_of(c.motion), estimate, false, rollout)) {
+          const Hit hit = measure(task, corrected.model, rollout);
           c.miss = hit.miss, c.time = hit.time;
         }
         return c;
@@ -301,14 +308,16 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
           if (const Evaluation e = evaluate(other, start, soft, false); e.good && e.value < least)
             least = e.value, q = start;
         if (q.size() > 0) {
-          minimize(other, q, soft, kOtherEffort);
+          const solve::Summary summary = minimize(other, q, soft, kOtherEffort);
           Correction c = correction(std::move(q), {.steps = 0});
+          c.summary = summary;
           if (c.miss < kClearlyBetter * best.miss) best = std::move(c);
         }
       }
       out.motion = std::move(best.motion);
       samples = std::move(best.samples);
       hit_time = best.time;
+      summaries.push_back(best.summary);
       // the next one looks elsewhere where this one, with all its steps, did not help
       elsewhere = best.miss > kStuck && best.miss > kProgress * foretold && left > kLeastOther;
       foretold = best.miss;
@@ -357,6 +366,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
   for (double part = problem.tabletop ? 1.0 : 0.0; part <= 1.0; part += 0.01)
     out.out_of_reach = std::min(out.out_of_reach, unreachable_distance(problem, options, target_at(part * end)));
   out.peaks = peaks(out.motion, 0.0, end, options.limits);
+  out.summary = solve::together(summaries);
   return out;
 }
 

@@ -128,8 +128,14 @@ struct Found {
   Peaks peaks;
   double clearance = 0.0;
   bool good = false;  // finite, within the limits, clear of the obstacles
-  int iterations = 0;
+  int iterations = 0;  // evaluations spent on it
+  solve::Summary summary;
 };
+
+void improve(const Task& task, const Sharpness& sharpness, const Effort& effort, Found& found) {
+  found.summary = minimize(task, found.unknowns, sharpness, effort);
+  found.iterations += 1 + found.summary.iterations;
+}
 
 // Full steps, fine peaks, all samples.
 void judge(const Task& task, Found& found) {
@@ -174,8 +180,8 @@ Found approach(const Task& coarse, VectorX unknowns) {
   Found found;
   found.unknowns = std::move(unknowns);
   for (const auto& stage : kCoarse)
-    found.iterations += minimize(coarse, found.unknowns, {stage.sharpness, stage.smoothness},
-                                 {.steps = stage.steps, .evaluations = generous(coarse) * stage.evaluations});
+    improve(coarse, {stage.sharpness, stage.smoothness},
+            {.steps = stage.steps, .evaluations = generous(coarse) * stage.evaluations}, found);
   judge(coarse, found);
   return found;
 }
@@ -187,15 +193,13 @@ void finish(const Task& fine, Found& found) {
   quick.exact = false;
   const Sharpness last{kFinalSharpness, kFinalSmoothness};
   const double enough = kEnough * options.tolerance;
-  found.iterations +=
-      minimize(quick, found.unknowns, last,
-               {.steps = kFinalSteps, .evaluations = generous(fine) * kFinalEvaluations, .enough = enough});
+  improve(quick, last, {.steps = kFinalSteps, .evaluations = generous(fine) * kFinalEvaluations, .enough = enough},
+          found);
   judge(fine, found);
   if (!std::isfinite(found.hit.miss)) return;
   if (!found.good) {  // a far target pulls harder than the limits push: once more with limits that count more
     quick.limit_weight = kStrictLimits;
-    found.iterations += minimize(quick, found.unknowns, last,
-                                 {.steps = kFinalSteps, .evaluations = generous(fine) * kFinalEvaluations});
+    improve(quick, last, {.steps = kFinalSteps, .evaluations = generous(fine) * kFinalEvaluations}, found);
     judge(fine, found);
   }
   if (found.good && merit(found, options) <= kGoodMiss * options.tolerance) return;
@@ -205,7 +209,7 @@ void finish(const Task& fine, Found& found) {
   exact.limit_weight = quick.limit_weight;
   Found polished = found;
   const Effort dear{.steps = kPolishSteps, .evaluations = 3 * kPolishSteps, .hopeful = false, .enough = enough};
-  polished.iterations += minimize(exact, polished.unknowns, {kSharpest, kFinalSmoothness}, dear);
+  improve(exact, {kSharpest, kFinalSmoothness}, dear, polished);
   judge(fine, polished);
   found.iterations = polished.iterations;
   if (better(polished, found, options)) found = std::move(polished);
@@ -349,6 +353,7 @@ Plan plan(const Problem& problem, const Options& options) {
   }
 
   Plan plan;
+  std::vector<solve::Summary> summaries;
   plan.motion = empty_motion(problem, options);
   plan.reached = true;
   dynamics::InitialState state = problem.initial;
@@ -380,6 +385,7 @@ Plan plan(const Problem& problem, const Options& options) {
     set_unknowns(motion, best.unknowns);
     plan.motion = std::move(motion);
     plan.hits.push_back(best.hit);
+    summaries.push_back(best.summary);
     if (!best.good || !(best.hit.miss <= options.tolerance)) {
       plan.reached = false;
       const std::string which = problem.targets.size() > 1 ? "target " + std::to_string(t + 1) + ": " : "";
@@ -401,6 +407,7 @@ Plan plan(const Problem& problem, const Options& options) {
       state.time = end.time.back(), state.theta = end.theta.back(), state.thetadot = end.thetadot.back();
     }
   }
+  plan.summary = solve::together(summaries);
   plan.peaks = peaks(plan.motion, 0.0, plan.motion.end(), options.limits);
   plan.seconds = core::seconds_now() - begin;
   return plan;

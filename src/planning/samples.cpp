@@ -1,4 +1,5 @@
 // Parameter sets drawn from what identification knows (SPEC 8, robustness).
+#include "chainsplat/dynamics/parametrization.h"
 #include "chainsplat/planning.h"
 
 namespace chainsplat::planning {
@@ -13,12 +14,13 @@ std::vector<dynamics::Parameters> draw_parameters(const chain::Chain& chain, con
   // a covariance that was written and read may be off positive by rounding
   const Eigen::SelfAdjointEigenSolver<MatrixX> eigen(0.5 * (estimates.covariance + estimates.covariance.transpose()));
   const MatrixX root = eigen.eigenvectors() * eigen.eigenvalues().cwiseMax(0.0).cwiseSqrt().asDiagonal();
+  const std::vector<dynamics::Unknown> unknowns = dynamics::unknowns_of(chain, estimates);
   core::Random random(seed);
   std::vector<dynamics::Parameters> out;
   for (int sample = 0; sample < count; ++sample) {
     VectorX z(size);
     for (Eigen::Index i = 0; i < size; ++i) z[i] = random.normal();
-    out.push_back(dynamics::moved(chain, parameters, estimates.names, root * z));
+    out.push_back(dynamics::moved(chain, parameters, unknowns, root * z));
   }
   return out;
 }

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 namespace chainsplat::planning {
 namespace {
@@ -76,12 +77,7 @@ Task make_task(const Problem& problem, const Options& options, const std::vector
   return task;
 }
 
-int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, const Effort& effort) {
-  const auto done = [&](const Evaluation& e) {
-    return e.good && e.miss < effort.enough && e.violation < effort.enough * effort.enough;
-  };
-  Evaluation now = evaluate(task, unknowns, sharpness, true);
-  if (!now.good || done(now)) return 1;
+solve::Summary minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, const Effort& effort) {
   // unit of the damping: acceleration, so that a step changes the motion as little as it can
   MatrixX metric = MatrixX::Zero(unknowns.size(), unknowns.size());
   for (const Basis& b : task.grid.basis)
@@ -92,46 +88,48 @@ int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, co
   for (Eigen::Index i = 0; i < unknowns.size(); ++i)
     if (task.held[i]) metric.row(i).setZero(), metric.col(i).setZero(), metric(i, i) = 1.0;
   metric /= metric.trace();
-  double damping = effort.damping;
-  int count = 1, idle = 0;
+
+  Evaluation now, next;
+  int idle = 0;
   const bool around = !task.options->spheres.empty() || !task.options->boxes.empty();
-  for (int taken = 0; taken < effort.steps; ++taken) {
-    const bool last = taken + 1 == effort.steps;
+  solve::Callbacks callbacks;
+  callbacks.evaluate = [&](const VectorX& q, bool derivatives) {
+    next = evaluate(task, q, sharpness, derivatives);
+    return next.good ? next.value : std::numeric_limits<double>::infinity();
+  };
+  callbacks.step = [&](double damping, VectorX& step) {
     const double scale = now.curvature.trace();
-    VectorX step;
-    Evaluation next;
-    double foretold = 0.0;
-    for (int trial = 0;; ++trial) {
-      if (count >= effort.evaluations) return count;
-      MatrixX matrix = now.curvature + damping * scale * metric;
-      // the metric has no part in directions without acceleration; held unknowns have no row
-      matrix.diagonal().array() += 1e-12 * scale;
-      step = -matrix.ldlt().solve(now.gradient);
-      for (Eigen::Index i = 0; i < step.size(); ++i)
-        if (task.held[i]) step[i] = 0.0;
-      if (const double length = step.norm(); length > effort.longest) step *= effort.longest / length;
-      foretold = -step.dot(now.gradient + 0.5 * (now.curvature * step));
-      // where the first trial is mostly good it brings the derivatives along
-      const bool ahead = effort.hopeful && trial == 0 && !last;
-      next = evaluate(task, unknowns + step, sharpness, ahead);
-      ++count;
-      if (next.good && next.value < now.value) {
-        if (!ahead && !last) next = evaluate(task, unknowns + step, sharpness, true);
-        break;
-      }
-      if (!(foretold > kNothing)) return count;
-      damping *= effort.more_damping;
-    }
-    const double decrease = now.value - next.value;
-    idle = decrease < kIdle * (next.miss * next.miss + next.violation) ? idle + 1 : 0;
-    unknowns += step;
+    MatrixX matrix = now.curvature + damping * scale * metric;
+    // the metric has no part in directions without acceleration; held unknowns have no row
+    matrix.diagonal().array() += 1e-12 * scale;
+    step = -matrix.ldlt().solve(now.gradient);
+    for (Eigen::Index i = 0; i < step.size(); ++i)
+      if (task.held[i]) step[i] = 0.0;
+    return true;
+  };
+  callbacks.accepted = [&](double decrease) -> std::optional<solve::Reason> {
     now = std::move(next);
-    damping = std::max(kLeastDamping, kLessDamping * damping);
-    if (done(now) || decrease < kNothing || decrease < kConverged * std::abs(now.value) ||
-        idle == (around ? effort.steps : kIdleSteps))
-      break;
-  }
-  return count;
+    if (now.miss < effort.enough && now.violation < effort.enough * effort.enough) return solve::Reason::goal;
+    idle = decrease < kIdle * (now.miss * now.miss + now.violation) ? idle + 1 : 0;
+    if (decrease < kNothing || idle == (around ? effort.steps : kIdleSteps)) return solve::Reason::cost;
+    return {};
+  };
+  callbacks.rejected = [&](const VectorX& step) -> std::optional<solve::Reason> {
+    const double foretold = -step.dot(now.gradient + 0.5 * (now.curvature * step));
+    if (!(foretold > kNothing)) return solve::Reason::no_decrease;
+    return {};
+  };
+  solve::Options options;
+  options.steps = effort.steps;
+  options.trials = effort.evaluations - 1;
+  options.attempts = solve::Options::kAny;
+  options.cost_tolerance = kConverged;
+  options.longest = effort.longest;
+  options.euclidean = true;
+  options.eager = effort.hopeful;
+  options.damping = {.first = effort.damping, .raise = effort.more_damping, .lower = kLessDamping,
+                     .least = kLeastDamping};
+  return solve::least_squares(unknowns, callbacks, options);
 }
 
 double load(const Task& task, const VectorX& unknowns) {

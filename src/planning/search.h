@@ -27,8 +27,9 @@ struct Effort {
   bool hopeful = true;               // evaluate the derivatives with a step's first trial
   double enough = 0.0;  // m; ends where the miss is smaller, limits and obstacles kept, the rope at rest (table)
 };
-// Damped Gauss-Newton; ends where nothing changes any more. Returns the evaluations.
-int minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, const Effort& effort);
+// Damped Gauss-Newton; ends where nothing changes any more. Costs m^2, steps m (norm of the weights). The evaluations are
+// one more than its iterations.
+solve::Summary minimize(const Task& task, VectorX& unknowns, const Sharpness& sharpness, const Effort& effort);
 
 // A random motion whose largest peak is `fraction` of its limit.
 VectorX random_unknowns(const Task& task, core::Random& random, double fraction);

@@ -1,8 +1,4 @@
 // Private to planning: the rope's motion and its derivative with respect to a stretch of base motion.
-//
-// The derivative is that of the discrete RODAS3 map, stage by stage. A Rosenbrock stage (1/G - J) k_i = r_i gives
-//   (1/G - J) dk_i = dr_i + d/de [J(y + e k_i, t + e H gamma_i) S + f_w(same)],  S = dy/dw:
-// the second derivatives enter only along k_i, one further linearization of the equations of motion a stage.
 #pragma once
 #include "base_motion.h"
 
@@ -20,7 +16,7 @@ struct Grid {
 };
 // What all pieces do together where the last one has these unknowns.
 Coordinates moved(const Motion& motion, const VectorX& unknowns, const Basis& basis, const Coordinates& fixed);
-// `substeps` a 1/30 s.
+// `substeps` per 1/30 s.
 Grid make_grid(const Motion& motion, int substeps);
 
 // Everything at the nodes; columns of the derivatives: axis by axis, kPerAxis each.
@@ -29,9 +25,8 @@ struct Rollout {
   std::vector<VectorX> theta, thetadot;
   std::vector<MatrixX> theta_slope, thetadot_slope;  // n x unknowns; empty without derivatives
 };
-// `unknowns` of the last piece, kPerAxis an axis. False where the motion diverges. Without derivatives it is
-// dynamics::simulate on this grid. Not `exact`: the variational equation by the trapezoidal rule, with the step's own
-// factorization; of second order, seven times faster, enough for a Gauss-Newton step.
+// dynamics::simulate on this grid; `unknowns` of the last piece, kPerAxis per axis, and the derivatives by them, `exact`
+// or of second order as described there. False where the motion diverges.
 bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& grid, const VectorX& unknowns,
               const dynamics::InitialState& initial, bool derivatives, Rollout& out, bool exact = true);
 

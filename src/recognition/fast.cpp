@@ -291,10 +291,8 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     if (std::find(training.frames.begin(), training.frames.end(), k) == training.frames.end())
       states.theta[k] = coarse[k] + chain::interpolate(correction, states.time[k]);
   }
-  const auto covariances =
+  result.summary =
       refine_all(engine, chain, capture, frames, gaussians, all_frames, kFinalIterations, prior, states);
-  result.covariances.assign(frames.size(), math::MatrixX::Identity(chain.angles(), chain.angles()));
-  for (std::size_t i = 0; i < all_frames.size(); ++i) result.covariances[all_frames[i]] = covariances[i];
   differentiate(states);
   result.gaussians = std::move(gaussians);
   result.states = std::move(states);

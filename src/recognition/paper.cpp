@@ -19,13 +19,6 @@ constexpr float kResetOpacity = 0.01f;
 constexpr int kLinkResets[] = {1500, 4500, 7500, 10500};
 constexpr float kMeanRateFirst = 1.6e-4f, kMeanRateLast = 1.6e-6f;  // of the scene's extent
 constexpr double kAngleRate = 0.01;                                 // rad
-constexpr double kBeta1 = 0.9, kBeta2 = 0.999, kEpsilon = 1e-15;
-
-// Adam of one time step's angles; its counter counts the visits of that step.
-struct AngleMoments {
-  math::VectorX first, second;
-  int visits = 0;
-};
 
 capture::View padded(const capture::View& view, int x0, int y0, int width, int height) {
   capture::View out = view;
@@ -149,7 +142,7 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
   splat::Engine engine(device);
   engine.set_views(specs, targets, true);
 
-  std::vector<AngleMoments> moments(frames.size());
+  std::vector<solve::AdamState> moments(frames.size());  // of each time step's angles; steps: its visits
   for (auto& m : moments) m.first = m.second = math::VectorX::Zero(chain.angles());
   core::Random random(options.seed * 1000003 + 7);
   int first = 0;
@@ -165,7 +158,7 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
     for (auto& m : moments) {
       m.first = Eigen::Map<const math::VectorX>(from, chain.angles());
       m.second = Eigen::Map<const math::VectorX>(from + chain.angles(), chain.angles());
-      m.visits = static_cast<int>(from[2 * chain.angles()]);
+      m.steps = static_cast<int>(from[2 * chain.angles()]);
       from += 2 * chain.angles() + 1;
     }
   } else {
@@ -203,7 +196,7 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
     for (const auto& m : moments) {
       c.extra.insert(c.extra.end(), m.first.data(), m.first.data() + m.first.size());
       c.extra.insert(c.extra.end(), m.second.data(), m.second.data() + m.second.size());
-      c.extra.push_back(m.visits);
+      c.extra.push_back(m.steps);
     }
     save_checkpoint(c, options.checkpoint);
   };
@@ -247,16 +240,9 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
           {"recognize", iteration, options.paper_iterations, values.total, values.psnr_object[0], "paper mode"});
     // Adam on this time step's angles
     const int k = frame_of[v];
-    AngleMoments& m = moments[k];
     const math::VectorX gradient = chain::theta_gradient(
         chain, chain::world_axes(chain, states.theta[k], capture.base.pose(views[v].time)), twists[0]);
-    if (gradient.allFinite()) {
-      ++m.visits;
-      m.first = kBeta1 * m.first + (1 - kBeta1) * gradient;
-      m.second = kBeta2 * m.second + (1 - kBeta2) * gradient.cwiseAbs2();
-      const double c1 = 1 - std::pow(kBeta1, m.visits), c2 = 1 - std::pow(kBeta2, m.visits);
-      states.theta[k].array() -= kAngleRate * (m.first.array() / c1) / ((m.second.array() / c2).sqrt() + kEpsilon);
-    }
+    if (gradient.allFinite()) solve::adam_step(moments[k], gradient, {.rate = kAngleRate}, states.theta[k]);
     const int done = iteration + 1;
     if (done % kOpacityReset == 0 && done <= kLastOpacityReset) engine.reset_opacity(kResetOpacity);
     if (std::find(std::begin(kLinkResets), std::end(kLinkResets), done) != std::end(kLinkResets)) engine.reset_links();
@@ -279,7 +265,8 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
     if (!frames[k].views.empty()) others.push_back(k);
   }
   constexpr int kIterations = 8;  // Gauss-Newton steps from the interpolated angles
-  refine_all(engine, chain, capture, frames, result.gaussians, others, kIterations, {}, states);
+  result.summary = refine_all(engine, chain, capture, frames, result.gaussians, others, kIterations, {}, states);
+  states.covariance.clear();  // nothing says how sure the training frames are
   differentiate(states);
   result.states = std::move(states);
   return result;

@@ -17,20 +17,16 @@ AnglePrior prior_of(const silhouette::SequenceFit& fit) {
   return prior;
 }
 
-std::vector<math::MatrixX> refine_states(gpu::Device& device, const capture::Capture& capture,
-                                         const chain::Chain& chain, const splat::Gaussians& gaussians,
-                                         const AnglePrior& prior, int iterations, chain::States& states) {
+solve::Summary refine_states(gpu::Device& device, const capture::Capture& capture, const chain::Chain& chain,
+                   const splat::Gaussians& gaussians, const AnglePrior& prior, int iterations, chain::States& states) {
   const std::vector<FrameViews> frames = assign_views(capture, states.time);
   std::vector<int> seen;
   for (int k = 0; k < static_cast<int>(frames.size()); ++k)
     if (!frames[k].views.empty()) seen.push_back(k);
   splat::Engine engine(device);
-  const std::vector<math::MatrixX> found =
-      refine_all(engine, chain, capture, frames, gaussians, seen, iterations, prior, states);
+  const solve::Summary summary = refine_all(engine, chain, capture, frames, gaussians, seen, iterations, prior, states);
   differentiate(states);
-  std::vector<math::MatrixX> covariances(frames.size(), math::MatrixX::Identity(chain.angles(), chain.angles()));
-  for (std::size_t i = 0; i < seen.size(); ++i) covariances[seen[i]] = found[i];
-  return covariances;
+  return summary;
 }
 
 void polish(gpu::Device& device, const capture::Capture& capture, const chain::Chain& chain,

@@ -72,13 +72,14 @@ void differentiate(chain::States& states) {
   }
 }
 
-std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain& chain, const capture::Capture& capture,
-                                      const std::vector<FrameViews>& frames, const splat::Gaussians& gaussians,
-                                      const std::vector<int>& selected, int iterations, const AnglePrior& prior,
-                                      chain::States& states) {
+solve::Summary refine_all(splat::Engine& engine, const chain::Chain& chain, const capture::Capture& capture,
+                          const std::vector<FrameViews>& frames, const splat::Gaussians& gaussians,
+                          const std::vector<int>& selected, int iterations, const AnglePrior& prior,
+                          chain::States& states) {
   // the targets of one part must fit one buffer on the smallest device
   constexpr std::size_t kPartPixels = 2u << 20;
-  std::vector<math::MatrixX> covariances;
+  states.covariance.assign(states.time.size(), math::MatrixX::Identity(chain.angles(), chain.angles()));
+  std::vector<solve::Summary> summaries;
   engine.set_gaussians(gaussians);
   std::size_t from = 0;
   while (from < selected.size()) {
@@ -112,11 +113,12 @@ std::vector<math::MatrixX> refine_all(splat::Engine& engine, const chain::Chain&
     refine.iterations = iterations;
     refine.mask_weight = kAngleMaskWeight;
     refine.trusted = kTrustedStep;
-    RefineSummary summary = refine_angles(chain, capture, frames, part, draw, refine, prior, states);
-    for (auto& covariance : summary.covariances) covariances.push_back(std::move(covariance));
+    Refined refined = refine_angles(chain, capture, frames, part, draw, refine, prior, states);
+    for (std::size_t i = 0; i < part.size(); ++i) states.covariance[part[i]] = std::move(refined.covariances[i]);
+    summaries.push_back(refined.summary);
     from += part.size();
   }
-  return covariances;
+  return solve::together(summaries);
 }
 
 }  // namespace chainsplat::recognition

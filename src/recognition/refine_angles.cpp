@@ -133,16 +133,26 @@ LinkEquations link_equations(const chain::Chain& chain, const capture::Camera& c
 namespace {
 
 struct FrameState {
-  math::VectorX theta, trial;
-  math::MatrixX normal;
-  math::VectorX right;
-  double cost = std::numeric_limits<double>::infinity();
-  double damping = 1e-3;
-  bool done = false;
+  solve::Descent descent;
+  solve::NormalEquations equations;  // about descent.x
 };
 
-double smoothness(const chain::Chain& chain, const math::VectorX& theta, double sigma, math::MatrixX* normal,
-                  math::VectorX* right) {
+solve::Options solver_options(const RefineOptions& options) {
+  solve::Options out;
+  out.steps = solve::Options::kAny;
+  out.trials = options.iterations;
+  out.trusted = options.trusted;
+  out.negligible = 2e-5;  // rad: 6 micrometers at the end of a 30 cm rope
+  out.longest = 0.3;      // rad: beyond it the linearization means nothing
+  out.damping.first = 0.3 * 1e-3;
+  out.damping.lower = 0.3;
+  out.damping.least = 1e-6;
+  return out;
+}
+
+// Adds to the equations; returns the cost.
+double smoothness(const chain::Chain& chain, const math::VectorX& theta, double sigma,
+                  solve::NormalEquations& equations) {
   // differences of neighboring joints' angles about the same axis direction
   const int a_joint = chain.angles() / (chain.links() - 1);
   const double weight = 1.0 / (sigma * sigma);
@@ -150,36 +160,35 @@ double smoothness(const chain::Chain& chain, const math::VectorX& theta, double 
   for (int k = a_joint; k < chain.angles(); ++k) {
     const double difference = theta[k] - theta[k - a_joint];
     cost += 0.5 * weight * difference * difference;
-    if (!normal) continue;
-    (*normal)(k, k) += weight;
-    (*normal)(k - a_joint, k - a_joint) += weight;
-    (*normal)(k, k - a_joint) -= weight;
-    (*normal)(k - a_joint, k) -= weight;
-    (*right)[k] += weight * difference;
-    (*right)[k - a_joint] -= weight * difference;
+    equations.matrix(k, k) += weight;
+    equations.matrix(k - a_joint, k - a_joint) += weight;
+    equations.matrix(k, k - a_joint) -= weight;
+    equations.matrix(k - a_joint, k) -= weight;
+    equations.gradient[k] += weight * difference;
+    equations.gradient[k - a_joint] -= weight * difference;
   }
   return cost;
 }
 
 }  // namespace
 
-RefineSummary refine_angles(const chain::Chain& chain, const capture::Capture& capture,
-                            const std::vector<FrameViews>& frames, std::span<const int> selected, const Draw& draw,
-                            const RefineOptions& options, const AnglePrior& prior, chain::States& states) {
-  RefineSummary summary;
+Refined refine_angles(const chain::Chain& chain, const capture::Capture& capture, const std::vector<FrameViews>& frames,
+                      std::span<const int> selected, const Draw& draw, const RefineOptions& options,
+                      const AnglePrior& prior, chain::States& states) {
+  const solve::Options solver = solver_options(options);
   std::vector<FrameState> work(selected.size());
-  for (std::size_t f = 0; f < selected.size(); ++f) work[f].trial = work[f].theta = states.theta[selected[f]];
+  for (std::size_t f = 0; f < selected.size(); ++f) work[f].descent = solve::begin(states.theta[selected[f]], solver);
 
-  for (int iteration = 0; iteration <= options.iterations; ++iteration) {
+  for (;;) {
     // draw every trial
     std::vector<int> views;
     std::vector<std::vector<math::Pose>> motions;
     for (std::size_t f = 0; f < selected.size(); ++f) {
-      if (work[f].done) continue;
+      if (work[f].descent.done) continue;
       for (const int v : frames[selected[f]].views) {
         views.push_back(v);
-        motions.push_back(
-            view_motions(chain, capture, states, frames[selected[f]], selected[f], work[f].trial, capture.views[v]));
+        motions.push_back(view_motions(chain, capture, states, frames[selected[f]], selected[f], work[f].descent.trial,
+                                       capture.views[v]));
       }
     }
     if (views.empty()) break;
@@ -190,75 +199,62 @@ RefineSummary refine_angles(const chain::Chain& chain, const capture::Capture& c
       equations[s] =
           link_equations(chain, capture.cameras[view.camera], view, motions[s], pictures[s], options.mask_weight);
     });
-    // one Levenberg-Marquardt decision a frame
+    // one Levenberg-Marquardt decision per frame
     std::size_t s = 0;
     for (std::size_t f = 0; f < selected.size(); ++f) {
       FrameState& state = work[f];
-      if (state.done) continue;
+      solve::Descent& descent = state.descent;
+      if (descent.done) continue;
       const int n = chain.angles();
-      math::MatrixX normal = math::MatrixX::Zero(n, n);
-      math::VectorX right = math::VectorX::Zero(n);
+      solve::NormalEquations next{math::MatrixX::Zero(n, n), math::VectorX::Zero(n)};
       double cost = 0.0;
       for (const int v : frames[selected[f]].views) {
         const LinkEquations& view_equations = equations[s];
-        const math::MatrixX axes = chain::world_axes(chain, state.trial, capture.base.pose(capture.views[v].time));
+        const math::MatrixX axes = chain::world_axes(chain, descent.trial, capture.base.pose(capture.views[v].time));
         for (int j = 1; j < chain.links(); ++j) {
           const int columns = chain.last_angle(j) + 1;
           const auto moved = axes.leftCols(columns);
-          normal.topLeftCorner(columns, columns).noalias() += moved.transpose() * view_equations.normal[j] * moved;
-          right.head(columns).noalias() += moved.transpose() * view_equations.right[j];
+          next.matrix.topLeftCorner(columns, columns).noalias() += moved.transpose() * view_equations.normal[j] * moved;
+          next.gradient.head(columns).noalias() += moved.transpose() * view_equations.right[j];
         }
         cost += view_equations.cost;
         ++s;
       }
-      cost += smoothness(chain, state.trial, options.smooth_sigma, &normal, &right);
+      cost += smoothness(chain, descent.trial, options.smooth_sigma, next);
       if (!prior.mean.empty()) {
-        const math::VectorX away = state.trial - prior.mean[selected[f]];
+        const math::VectorX away = descent.trial - prior.mean[selected[f]];
         const math::VectorX pull = prior.information[selected[f]] * away;
         cost += 0.5 * away.dot(pull);
-        normal += prior.information[selected[f]];
-        right += pull;
+        next.matrix += prior.information[selected[f]];
+        next.gradient += pull;
       }
-      if (iteration == 0) summary.cost_before += cost;
-      const bool better = cost < state.cost;
-      if (better) {
-        if (iteration > 0) ++summary.accepted;
-        state.theta = state.trial;
-        state.cost = cost;
-        state.normal = normal;
-        state.right = right;
-        state.damping = std::max(1e-6, 0.3 * state.damping);
-      } else {
-        ++summary.rejected;
-        state.damping *= 10.0;
-      }
-      math::MatrixX damped = state.normal;
-      damped.diagonal() *= 1.0 + state.damping;
-      damped.diagonal().array() += 1e-9 * (1.0 + state.normal.diagonal().maxCoeff());
-      const math::VectorX move = -damped.ldlt().solve(state.right);
-      constexpr double kConverged = 2e-5;  // rad: 6 micrometers at the end of a 30 cm rope
-      constexpr double kLongest = 0.3;     // rad: beyond it the linearization means nothing
-      const double longest = move.lpNorm<Eigen::Infinity>();
-      if (!(longest > kConverged)) state.done = true;
-      state.trial = state.theta + move * std::min(1.0, kLongest / std::max(longest, 1e-12));
-      if (better && !state.done && longest <= options.trusted && iteration < options.iterations) {
-        ++summary.accepted;
-        state.theta = state.trial;
-        state.done = true;
-      }
+      if (solve::judge(descent, cost, solver)) state.equations = std::move(next);
+      if (descent.done) continue;
+      const auto step = [&](double damping, math::VectorX& move) {
+        math::MatrixX damped = state.equations.matrix;
+        damped.diagonal() *= 1.0 + damping;
+        // an angle that no view shows has no row
+        damped.diagonal().array() += 1e-9 * (1.0 + state.equations.matrix.diagonal().maxCoeff());
+        move = -damped.ldlt().solve(state.equations.gradient);
+        return true;
+      };
+      solve::propose(descent, step, solver);
     }
   }
+  Refined out;
+  std::vector<solve::Summary> summaries;
   for (std::size_t f = 0; f < selected.size(); ++f) {
-    states.theta[selected[f]] = work[f].theta;
-    summary.cost_after += work[f].cost;
+    states.theta[selected[f]] = work[f].descent.x;
+    summaries.push_back(work[f].descent.summary);
+    out.steps += work[f].descent.taken;
+    const math::MatrixX& normal = work[f].equations.matrix;
     const math::MatrixX unit = math::MatrixX::Identity(chain.angles(), chain.angles());
-    summary.covariances.push_back(work[f].normal.size() > 0 ? math::MatrixX((work[f].normal + 1e-6 * unit).inverse())
-                                                            : unit);
+    out.covariances.push_back(normal.size() > 0 ? math::MatrixX((normal + 1e-6 * unit).inverse()) : unit);
     // where a part of the rope is hardly seen, elimination without symmetry loses the sign of small variances
-    if (!math::is_covariance(summary.covariances.back()))
-      summary.covariances.back() = (work[f].normal + 1e-6 * unit).ldlt().solve(unit);
+    if (!math::is_covariance(out.covariances.back())) out.covariances.back() = (normal + 1e-6 * unit).ldlt().solve(unit);
   }
-  return summary;
+  out.summary = solve::together(summaries);
+  return out;
 }
 
 }  // namespace chainsplat::recognition

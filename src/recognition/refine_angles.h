@@ -12,6 +12,7 @@
 #include "chainsplat/capture.h"
 #include "chainsplat/chain.h"
 #include "chainsplat/recognition.h"
+#include "chainsplat/solve.h"
 #include "chainsplat/splat.h"
 #include "src/recognition/frames.h"
 
@@ -34,9 +35,9 @@ struct RefineOptions {
   double trusted = 0.0;  // rad: a step that changes no angle by more is a frame's last and not drawn to be checked
 };
 
-struct RefineSummary {
-  double cost_before = 0.0, cost_after = 0.0;
-  int accepted = 0, rejected = 0;
+struct Refined {
+  solve::Summary summary;  // of all frames together; steps in rad
+  int steps = 0;           // that were taken, of all frames
   std::vector<math::MatrixX> covariances;  // of each refined frame
 };
 
@@ -45,8 +46,8 @@ using Draw = std::function<std::vector<splat::Picture>(std::span<const int> view
                                                        std::span<const std::vector<math::Pose>> motions)>;
 
 // Improves states.theta of the `selected` frames, each on its own (Levenberg-Marquardt, all frames drawn together).
-RefineSummary refine_angles(const chain::Chain& chain, const capture::Capture& capture,
-                            const std::vector<FrameViews>& frames, std::span<const int> selected, const Draw& draw,
-                            const RefineOptions& options, const AnglePrior& prior, chain::States& states);
+Refined refine_angles(const chain::Chain& chain, const capture::Capture& capture, const std::vector<FrameViews>& frames,
+                      std::span<const int> selected, const Draw& draw, const RefineOptions& options,
+                      const AnglePrior& prior, chain::States& states);
 
 }  // namespace chainsplat::recognition

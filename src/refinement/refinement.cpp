@@ -15,30 +15,17 @@ namespace {
 constexpr double kLeastModelError = 5e-5;  // m: straight links do not follow a bent rope closer than this
 constexpr double kSettled = 5e-5;          // m, RMS over nodes: a thirtieth of a pixel at 1 m
 
-// J^T J over the links' ends: squared movement of the nodes by a change of theta, m^2/rad^2. A chain that twists needs
-// a point of its surface a link beside.
+// Squared movement of the nodes by a change of theta, m^2/rad^2; of a chain that twists also of points of its surface.
 MatrixX node_metric(const chain::Chain& chain, const VectorX& theta) {
   const auto motions = chain::link_motions(chain, theta, {});
   const MatrixX axes = chain::world_axes(chain, theta, {});
-  const bool twists = std::any_of(chain.axes.begin(), chain.axes.end(), [&](const math::Vector6& axis) {
-    return std::abs(axis.head<3>().dot(chain.direction)) > 0.5;
-  });
-  MatrixX metric = MatrixX::Zero(chain.angles(), chain.angles());
-  const auto add = [&](int link, const Vector3& home) {
-    const MatrixX jacobian = chain::point_jacobian(chain, axes, link, motions[link] * home);
-    metric.noalias() += jacobian.transpose() * jacobian;
-  };
-  for (int link = 1; link < chain.links(); ++link) {
-    const Vector3 end = chain.link_end(link) * chain.direction;
-    add(link, end);
-    if (twists) add(link, end + 0.5 * chain.diameter * chain.bending_axis);
-  }
-  return metric;
+  return chain::displacement_metric(
+      chain::point_jacobians(chain, axes, motions, chain::shape_points(chain, false)));
 }
 
-void check_sizes(const chain::States& images, std::span<const MatrixX> covariances, const chain::States& rollout) {
-  CHAINSPLAT_CHECK(images.theta.size() == covariances.size() && images.theta.size() == rollout.theta.size(),
-                   std::to_string(images.theta.size()) + ", " + std::to_string(covariances.size()) + ", " +
+void check_sizes(const chain::States& images, const chain::States& rollout) {
+  CHAINSPLAT_CHECK(images.theta.size() == images.covariance.size() && images.theta.size() == rollout.theta.size(),
+                   std::to_string(images.theta.size()) + ", " + std::to_string(images.covariance.size()) + ", " +
                        std::to_string(rollout.theta.size()));
 }
 
@@ -54,9 +41,8 @@ double node_distance(const chain::Chain& chain, const chain::States& a, const ch
 
 }  // namespace
 
-Noise estimate_noise(const chain::Chain& chain, const chain::States& images, std::span<const MatrixX> covariances,
-                     const chain::States& rollout) {
-  check_sizes(images, covariances, rollout);
+Noise estimate_noise(const chain::Chain& chain, const chain::States& images, const chain::States& rollout) {
+  check_sizes(images, rollout);
   const std::size_t frames = images.theta.size();
   const int n = chain.angles();
   // images - rollout has covariance s^2 Sigma + sigma^2 metric^-1: diagonal for all s and sigma in the generalized
@@ -64,7 +50,7 @@ Noise estimate_noise(const chain::Chain& chain, const chain::States& images, std
   std::vector<VectorX> lambda(frames), square(frames);
   core::parallel_for(static_cast<std::int64_t>(frames), [&](std::int64_t k) {
     const MatrixX inverse = node_metric(chain, rollout.theta[k]).ldlt().solve(MatrixX::Identity(n, n));
-    const Eigen::GeneralizedSelfAdjointEigenSolver<MatrixX> eigen(covariances[k],
+    const Eigen::GeneralizedSelfAdjointEigenSolver<MatrixX> eigen(images.covariance[k],
                                                                   0.5 * (inverse + inverse.transpose()));
     lambda[k] = eigen.eigenvalues().cwiseMax(0.0);
     square[k] = (eigen.eigenvectors().transpose() * (images.theta[k] - rollout.theta[k])).cwiseAbs2();
@@ -98,19 +84,19 @@ Noise estimate_noise(const chain::Chain& chain, const chain::States& images, std
   return {std::sqrt(image), std::sqrt(model)};
 }
 
-Angles combine(const chain::Chain& chain, const chain::States& images, std::span<const MatrixX> covariances,
-               const chain::States& rollout, const Noise& noise) {
-  check_sizes(images, covariances, rollout);
+chain::States combine(const chain::Chain& chain, const chain::States& images, const chain::States& rollout,
+                      const Noise& noise) {
+  check_sizes(images, rollout);
   const std::size_t frames = images.theta.size();
   const int n = chain.angles();
-  Angles out{images, std::vector<MatrixX>(frames)};
+  chain::States out = images;
   core::parallel_for(static_cast<std::int64_t>(frames), [&](std::int64_t k) {
-    const MatrixX image = noise.image_scale * noise.image_scale * covariances[k];
+    const MatrixX image = noise.image_scale * noise.image_scale * images.covariance[k];
     const MatrixX model = noise.model_error * noise.model_error *
                           node_metric(chain, rollout.theta[k]).ldlt().solve(MatrixX::Identity(n, n));
     // gain of the images over the rollout: model (image + model)^-1
     const MatrixX gain = (image + model).ldlt().solve(model).transpose();
-    out.states.theta[k] = rollout.theta[k] + gain * (images.theta[k] - rollout.theta[k]);
+    out.theta[k] = rollout.theta[k] + gain * (images.theta[k] - rollout.theta[k]);
     MatrixX covariance = gain * image;
     covariance = 0.5 * (covariance + covariance.transpose()).eval();
     // where the two differ by many orders of magnitude, only Joseph's form keeps small variances positive
@@ -118,41 +104,47 @@ Angles combine(const chain::Chain& chain, const chain::States& images, std::span
       const MatrixX rest = MatrixX::Identity(n, n) - gain;
       covariance = gain * image * gain.transpose() + rest * model * rest.transpose();
     }
-    out.covariances[k] = covariance;
+    out.covariance[k] = covariance;
   });
-  recognition::differentiate(out.states);
+  recognition::differentiate(out);
   return out;
 }
 
 Result refine(gpu::Device& device, const capture::Capture& capture, const chain::Chain& chain,
-              const splat::Gaussians& gaussians, const Angles& recognized, const chain::States& rollout,
+              const splat::Gaussians& gaussians, const chain::States& recognized, const chain::States& rollout,
               const Options& options) {
   const silhouette::SequenceFit outlines = silhouette::fit_sequence(chain, capture);
   const recognition::AnglePrior outline_prior = recognition::prior_of(outlines);
   Result result;
   result.gaussians = gaussians;
   result.identified.rollout = rollout;
-  Angles images = recognized;
+  chain::States images = recognized;
   for (int round = 0;; ++round) {
     if (const int signal = core::stop_requested()) throw Interrupted(signal);
     core::report({"joint", round, options.rounds, NAN, NAN, "dynamics"});
-    const Noise noise = estimate_noise(chain, images.states, images.covariances, result.identified.rollout);
+    const Noise noise = estimate_noise(chain, images, result.identified.rollout);
     if (round == 0) result.noise = noise;
-    std::vector<MatrixX> scaled = images.covariances;
-    for (MatrixX& covariance : scaled) covariance *= noise.image_scale * noise.image_scale;
+    chain::States scaled = images;
+    for (MatrixX& covariance : scaled.covariance) covariance *= noise.image_scale * noise.image_scale;
     identification::Options identify = options.identification;
     identify.model_error = noise.model_error;
-    result.identified = identification::identify(chain, capture.base, images.states, scaled, identify);
-    result.angles = combine(chain, images.states, images.covariances, result.identified.rollout, noise);
-    if (round == options.rounds || node_distance(chain, images.states, result.angles.states) < kSettled) break;
+    result.identified = identification::identify(chain, capture.base, scaled, identify);
+    result.states = combine(chain, images, result.identified.rollout, noise);
+    const double moved = node_distance(chain, images, result.states);
+    const double cost = result.identified.estimates.solver->final_cost;
+    if (round == 0) result.summary.initial_cost = cost;
+    result.summary.final_cost = cost;
+    result.summary.worst_step = moved;
+    result.summary.iterations = round;
+    if (moved < kSettled) result.summary.reason = solve::Reason::step;
+    if (round == options.rounds || moved < kSettled) break;
 
     core::report({"joint", round, options.rounds, NAN, NAN, "images"});
-    recognition::polish(device, capture, chain, result.angles.states, options.every, options.steps,
+    recognition::polish(device, capture, chain, result.states, options.every, options.steps,
                         options.seed + static_cast<std::uint64_t>(round), result.gaussians);
     constexpr int kIterations = 2;  // of Gauss-Newton
-    images.states = result.angles.states;
-    images.covariances =
-        recognition::refine_states(device, capture, chain, result.gaussians, outline_prior, kIterations, images.states);
+    images = result.states;
+    recognition::refine_states(device, capture, chain, result.gaussians, outline_prior, kIterations, images);
     result.rounds = round + 1;
   }
   return result;

@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 #include "src/silhouette/observations.h"
 
@@ -68,33 +69,6 @@ MatrixX joint_prior(const chain::Chain& chain, const Options& options) {
   return information;
 }
 
-// One step from `theta` and the masks' shifts (and `offset`, when it has a weight) for the equations and priors.
-// Returns the largest change of an angle.
-double step(Problem& problem, const MatrixX& prior, const VectorX& prior_pull, double variance, double offset_weight,
-            double offset_pull, VectorX& theta, double& offset) {
-  const int n = static_cast<int>(theta.size()), last = problem.unknowns() - 1;
-  problem.normal.topLeftCorner(last, last) += variance * prior;
-  problem.right.head(last) += variance * prior_pull;
-  problem.normal(last, last) += offset_weight;
-  problem.right[last] += offset_pull;
-  for (int k = 0; k <= last; ++k) {
-    if (k < n ? !problem.held[k] : k < last || offset_weight > 0.0) continue;
-    problem.normal.row(k).setZero();
-    problem.normal.col(k).setZero();
-    problem.normal(k, k) = 1.0;
-    problem.right[k] = 0.0;
-  }
-  const VectorX change = problem.normal.ldlt().solve(problem.right);
-  if (!change.allFinite()) return 0.0;
-  const double largest = change.head(n).cwiseAbs().maxCoeff();
-  const double scale = largest > kLongestStep ? kLongestStep / largest : 1.0;
-  theta += scale * change.head(n);
-  offset += scale * change[last];
-  for (std::size_t v = 0; problem.shifts && v < problem.views.size(); ++v)
-    problem.views[v].shift += scale * change.segment<2>(n + 2 * static_cast<int>(v));
-  return largest;
-}
-
 // What is believed before looking, as information.
 struct Belief {
   MatrixX joints;         // between neighbors, and that angles are small
@@ -103,28 +77,70 @@ struct Belief {
   VectorX pull(const VectorX& state) const { return weighted_mean - all * state; }
 };
 
-// The angles, and what else has a prior: the masks' shifts.
-VectorX state_of(const Problem& problem, const VectorX& theta) {
-  VectorX state(problem.unknowns() - 1);
-  state.head(theta.size()) = theta;
+// Puts the chain and the masks where the unknowns say: the angles, with `shifts` two numbers per view, the edge offset.
+void place(Problem& problem, const VectorX& unknowns) {
+  const int n = problem.chain->angles();
   for (std::size_t v = 0; problem.shifts && v < problem.views.size(); ++v)
-    state.segment<2>(theta.size() + 2 * static_cast<int>(v)) = problem.views[v].shift;
-  return state;
+    problem.views[v].shift = unknowns.segment<2>(n + 2 * static_cast<int>(v));
+  pose(problem, unknowns.head(n));
+}
+
+// What is known of the masks' edge offset. Without weight it is held.
+struct OffsetBelief {
+  double mean = 0.0, weight = 0.0;
+};
+
+// Adds priors to the equations of the masks, and takes the unknowns that are held out of them.
+void add_priors(Problem& problem, const Belief& belief, double variance, const OffsetBelief& offset,
+                const VectorX& unknowns) {
+  const int n = problem.chain->angles(), last = problem.unknowns() - 1;
+  problem.normal.topLeftCorner(last, last) += variance * belief.all;
+  problem.right.head(last) += variance * belief.pull(unknowns.head(last));
+  problem.normal(last, last) += offset.weight;
+  problem.right[last] += offset.weight * (offset.mean - unknowns[last]);
+  for (int k = 0; k <= last; ++k) {
+    if (k < n ? !problem.held[k] : k < last || offset.weight > 0.0) continue;
+    problem.normal.row(k).setZero();
+    problem.normal.col(k).setZero();
+    problem.normal(k, k) = 1.0;
+    problem.right[k] = 0.0;
+  }
+}
+
+// Gauss-Newton. `equations` puts the unknowns in place, fills the equations with priors and returns the cost.
+template <class Equations>
+solve::Summary gauss_newton(Problem& problem, int steps, double step_tolerance, Equations&& equations,
+                            VectorX& unknowns) {
+  if (steps < 1) return {};
+  solve::Callbacks callbacks;
+  callbacks.evaluate = [&](const VectorX& at, bool) { return equations(at); };
+  callbacks.step = [&](double, VectorX& step) {
+    step = problem.normal.ldlt().solve(problem.right);
+    return true;
+  };
+  return solve::least_squares(unknowns, callbacks,
+                              {.steps = steps,
+                               .checked = false,
+                               .step_tolerance = step_tolerance,
+                               .longest = kLongestStep,
+                               .measured = problem.chain->angles()});
 }
 
 void coarse_stage(Problem& problem, const Belief& belief, int iterations, bool choose, const Options& options,
-                  VectorX& theta) {
-  double offset = 0.0;
-  for (int i = 0; i < iterations; ++i) {
-    pose(problem, theta);
+                  VectorX& unknowns) {
+  int i = 0;
+  const int far = static_cast<int>(std::ceil(kFarShare * iterations));
+  const auto equations = [&](const VectorX& at) {
+    place(problem, at);
     if (choose) choose_blobs(problem, i == 0 ? kReach : kReach + (kLastReach - kReach) * i / iterations);
-    const double cut = i < kFarShare * iterations ? kFarHuber : options.huber_pixels;
-    coarse_equations(problem, cut);
-    if (step(problem, belief.all, belief.pull(state_of(problem, theta)), kCoarseVariance, 0.0, 0.0, theta, offset) <
-            kCoarseStep &&
-        cut == options.huber_pixels)
-      break;
-  }
+    coarse_equations(problem, i < far ? kFarHuber : options.huber_pixels);
+    add_priors(problem, belief, kCoarseVariance, {}, at);
+    ++i;
+    return std::numeric_limits<double>::quiet_NaN();  // the blobs and the loss change from step to step
+  };
+  gauss_newton(problem, far, 0.0, equations, unknowns);
+  i = far;
+  gauss_newton(problem, iterations - far, kCoarseStep, equations, unknowns);
 }
 
 double median(std::vector<double>& values) {
@@ -148,7 +164,7 @@ std::vector<VectorX> cold_starts(const chain::Chain& chain, const VectorX& start
   const int joints = chain.links() - 1;
   for (const int axis : first) {
     const Vector3 about = chain.axes[axis].head<3>();
-    if (std::abs(about.dot(chain.direction)) > kSameAxis) continue;
+    if (chain::is_twist(chain, axis)) continue;
     for (const double sign : {1.0, -1.0}) {
       VectorX bent = VectorX::Zero(chain.angles());
       for (int k = 0; k < chain.angles(); ++k)
@@ -167,7 +183,7 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
   Problem problem;
   problem.chain = &chain;
   problem.held.assign(n, 0);
-  for (int k = 0; k < n; ++k) problem.held[k] = std::abs(chain.axes[k].head<3>().dot(chain.direction)) > kSameAxis;
+  for (int k = 0; k < n; ++k) problem.held[k] = chain::is_twist(chain, k);
   for (const FrameView& view : views) {
     ViewWork work;
     work.view = &view;
@@ -198,69 +214,71 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
     belief.weighted_mean.head(n) += weight * start;
   }
 
-  const double offset_weight = 1.0 / (options.edge_offset_deviation * options.edge_offset_deviation);
+  const OffsetBelief offset{options.edge_offset,
+                            1.0 / (options.edge_offset_deviation * options.edge_offset_deviation)};
   const double variance = kEdgeDeviation * kEdgeDeviation;
-  double offset = 0.0, cut = kFirstCut;
   FineSums total;
-  const auto expected_shifts = [&] {
-    for (std::size_t v = 0; problem.shifts && v < views.size(); ++v)
-      problem.views[v].shift = options.prior.mean.segment<2>(n + 2 * static_cast<int>(v));
-  };
-  const auto fine_stage = [&](VectorX& theta) {  // leaves the equations at its result in `problem`
-    expected_shifts();
-    pose(problem, theta);
-    choose_blobs(problem, kLastReach);
-    offset = options.edge_offset;
-    cut = kFirstCut;
-    for (int i = 0; i < std::max(1, options.iterations - options.iterations / 2); ++i) {
-      pose(problem, theta);
-      fine_equations(problem, offset, cut);
-      cut = next_cut(problem, cut);
-      if (step(problem, belief.all, belief.pull(state_of(problem, theta)), variance, offset_weight,
-               offset_weight * (options.edge_offset - offset), theta, offset) < kFineStep)
-        break;
-    }
-    pose(problem, theta);
-    total = fine_equations(problem, offset, cut);
-  };
   // tells apart fits that cover the masks alike
   const auto edge_cost = [&] { return total.length > 0 ? total.capped_square / total.length : 0.0; };
-
   FrameSolution out;
+  VectorX unknowns = VectorX::Zero(problem.unknowns());
+  if (problem.shifts) unknowns.segment(n, last - n) = options.prior.mean.tail(last - n);
+  const auto fine_stage = [&](const VectorX& theta) {  // leaves the equations at its result in `problem`
+    unknowns.head(n) = theta;
+    if (problem.shifts) unknowns.segment(n, last - n) = options.prior.mean.tail(last - n);
+    unknowns[last] = offset.mean;
+    place(problem, unknowns);
+    choose_blobs(problem, kLastReach);
+    double cut = kFirstCut;
+    const auto equations = [&](const VectorX& at) {
+      place(problem, at);
+      total = fine_equations(problem, at[last], cut);
+      cut = next_cut(problem, cut);
+      add_priors(problem, belief, variance, offset, at);
+      return edge_cost();
+    };
+    out.fit.summary = gauss_newton(problem, std::max(1, options.iterations - options.iterations / 2), kFineStep,
+                                   equations, unknowns);
+    place(problem, unknowns);
+    total = fine_equations(problem, unknowns[last], cut);
+    out.fit.summary.final_cost = edge_cost();
+  };
+
   VectorX theta = start;
-  expected_shifts();
   if (warm) {
-    coarse_stage(problem, belief, std::max(1, options.iterations / 2), true, options, theta);
+    unknowns.head(n) = start;
+    coarse_stage(problem, belief, std::max(1, options.iterations / 2), true, options, unknowns);
+    theta = unknowns.head(n);
   } else {
     std::vector<VectorX> found;
     std::vector<double> costs;
-    for (VectorX& tried : cold_starts(chain, start)) {
+    for (const VectorX& cold : cold_starts(chain, start)) {
       // first what hangs together with the grasp, whatever its distance; then what lies near the rope found
-      pose(problem, tried);
+      unknowns.head(n) = cold;
+      place(problem, unknowns);
       choose_blobs(problem, 0.0);
-      coarse_stage(problem, belief, options.first_iterations, false, options, tried);
-      coarse_stage(problem, belief, std::max(1, options.iterations / 2), true, options, tried);
-      pose(problem, tried);
+      coarse_stage(problem, belief, options.first_iterations, false, options, unknowns);
+      coarse_stage(problem, belief, std::max(1, options.iterations / 2), true, options, unknowns);
+      place(problem, unknowns);
       judge(problem, out);
-      found.push_back(tried);
+      found.push_back(unknowns.head(n));
       costs.push_back(out.cost);
     }
     const double best = *std::min_element(costs.begin(), costs.end());
     double best_edge_cost = 1e300;
     for (std::size_t i = 0; i < found.size(); ++i) {
       if (costs[i] > kAlike * best + kAlikePixels) continue;
-      VectorX tried = found[i];
-      fine_stage(tried);
+      fine_stage(found[i]);
       if (edge_cost() < best_edge_cost) {
         best_edge_cost = edge_cost();
-        theta = tried;
+        theta = unknowns.head(n);
       }
     }
   }
   fine_stage(theta);
 
-  const double offset_normal = problem.normal(last, last) + offset_weight;
-  const double offset_right = problem.right[last] + offset_weight * (options.edge_offset - offset);
+  const double offset_normal = problem.normal(last, last) + offset.weight;
+  const double offset_right = problem.right[last] + offset.weight * (offset.mean - unknowns[last]);
   const VectorX coupling = problem.normal.col(last).head(last);
   out.information =
       (problem.normal.topLeftCorner(last, last) - coupling * coupling.transpose() / offset_normal) / variance;
@@ -272,15 +290,15 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
     out.gradient[k] = 0.0;
   }
   out.information += belief.joints;
-  out.gradient -= belief.joints * state_of(problem, theta);
+  out.gradient -= belief.joints * VectorX(unknowns.head(last));
   MatrixX posterior = out.information;
   for (int k = 0; k < n; ++k)
     if (problem.held[k]) posterior(k, k) += 1.0 / (kTwist * kTwist);
   if (given_prior) posterior += options.prior.information;
-  out.fit.theta = theta;
-  if (problem.shifts) out.fit.mask_shift = state_of(problem, theta).tail(last - n);
+  out.fit.theta = unknowns.head(n);
+  if (problem.shifts) out.fit.mask_shift = unknowns.segment(n, last - n);
   out.fit.covariance = posterior.ldlt().solve(MatrixX::Identity(last, last));
-  out.fit.edge_offset = offset;
+  out.fit.edge_offset = unknowns[last];
   out.fit.residual_pixels = total.weight > 0 ? std::sqrt(total.weighted_square / total.weight) : 0.0;
   judge(problem, out);
   return out;

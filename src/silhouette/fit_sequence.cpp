@@ -243,7 +243,12 @@ SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capt
   }
 
   out.states.time = frames.times;
-  for (FrameSolution& s : solutions) out.frames.push_back(s.fit);
+  std::vector<solve::Summary> summaries;
+  for (int f = 0; f < count; ++f) {
+    out.frames.push_back(solutions[f].fit);
+    if (seen[f]) summaries.push_back(solutions[f].fit.summary);
+  }
+  out.summary = solve::together(summaries);
   if (!unseen.empty()) {
     const int last = unseen.back();
     core::warn(capture.name + ": " + std::to_string(unseen.size()) + " of " + std::to_string(count) +

@@ -82,9 +82,7 @@ Json scene_json(const twin::Twin& twin, const capture::Capture& scene, const Opt
            {"object", {{"length", chain.length}, {"diameter", chain.diameter}}},
            {"grasp", {{"direction", list(chain.direction)}, {"bending_axis", list(chain.bending_axis)}}}};
   if (twin.known_mass && twin.parameters) {
-    double mass = twin.parameters->tip_mass;
-    for (const double link : twin.parameters->link_mass) mass += link;
-    out["object"]["mass"] = mass;
+    out["object"]["mass"] = dynamics::total_mass(*twin.parameters);
   }
   if (twin.tabletop) {
     const capture::Table table = scene.table.value_or(capture::Table{});

@@ -172,6 +172,7 @@ Json identification_json(const Twin& twin) {
     for (const auto& [name, component] : weak.parts) parts[name] = component;
     out["weak"].push_back({{"singular_value", weak.singular_value}, {"direction", parts}});
   }
+  if (e.solver) out["solver"] = *e.solver;
   return out;
 }
 
@@ -424,6 +425,14 @@ dynamics::Estimates read_estimates(const Node& node) {
       for (const auto& [name, component] : weak["direction"].members())
         e.weak.back().parts.emplace_back(name, component.number());
     }
+  if (node.has("solver")) {
+    const Node solver = node["solver"];
+    const auto reason = solve::reason_of(solver["reason"].text());
+    if (!reason) solver["reason"].fail("is not known", "restore it or identify again");
+    e.solver = {*reason, solver["iterations"].whole(0, std::numeric_limits<int>::max()),
+                solver["initial_cost"].number_or_nan(), solver["final_cost"].number_or_nan(),
+                solver["worst_step"].number_or_nan()};
+  }
   return e;
 }
 

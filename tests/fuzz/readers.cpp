@@ -224,10 +224,10 @@ void states(std::string_view bytes) {
 
 void covariance(std::string_view bytes) {
   static const Path file = folder() / "covariance.csv";
-  const chain::States states{{0.0, 0.1, 0.2}, std::vector<math::VectorX>(3, math::VectorX::Zero(2)), {}};
+  chain::States states{{0.0, 0.1, 0.2}, std::vector<math::VectorX>(3, math::VectorX::Zero(2)), {}, {}};
   put(file, bytes);
-  const std::vector<math::MatrixX> read = tools::read_covariances(file, states);
-  put(file, tools::covariance_csv(states, read));
+  const std::vector<math::MatrixX> read = states.covariance = tools::read_covariances(file, states);
+  put(file, tools::covariance_csv(states));
   const std::vector<math::MatrixX> again = tools::read_covariances(file, states);
   for (std::size_t k = 0; k < read.size(); ++k) require(again[k] == read[k], "the same covariances come back");
 }

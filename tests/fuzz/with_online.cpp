@@ -10,7 +10,6 @@ void online(std::string_view bytes) {
   known.values = {-7.0};
   known.standard_errors = {0.1};
   known.covariance = math::MatrixX::Constant(1, 1, 0.01);
-  static const adaptation::Adaptation fresh(two_joints(), parameters_of_two_joints(), known, {});
   adaptation::Observation observation;
 #if __has_include("tools/estimate_lines.h")
   const auto line = tools::read_estimate_line(std::string(bytes), "line", two_joints().angles(), -1e300);
@@ -19,8 +18,8 @@ void online(std::string_view bytes) {
 #else
   if (!tools::read_line(std::string(bytes), "line", observation)) return;
 #endif
-  adaptation::Adaptation adaptation = fresh;
-  adaptation.observe(observation, [](double) { return dynamics::at_rest({}); });
+  adaptation::ParameterFilter filter(two_joints(), parameters_of_two_joints(), known, {});
+  filter.observe(observation, [](double) { return dynamics::at_rest({}); });
 }
 
 }  // namespace chainsplat::fuzz
