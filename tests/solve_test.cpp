@@ -306,7 +306,9 @@ TEST_CASE("many fits evaluated at once, each by its own loop, are those one by o
       NormalEquations next;
       const double cost = rosenbrock(fits[i].trial, &next);
       if (judge(fits[i], cost, options)) now[i] = next;
-      const auto step = [&](double damping, VectorX& out) { return damped_step(now[i], options.damping, damping, out); };
+      const auto step = [&](double damping, VectorX& out) {
+        return damped_step(now[i], options.damping, damping, out);
+      };
       if (!fits[i].done) propose(fits[i], step, options);
     }
   for (std::size_t i = 0; i < starts.size(); ++i) {

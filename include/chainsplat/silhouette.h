@@ -42,7 +42,7 @@ struct FrameFit {
   double edge_offset = 0.0;      // px by which the masks are wider than the tube on each side
   math::VectorX mask_shift;      // px, x and y of each view; empty where the prior says nothing about it
   math::MatrixX covariance;  // of theta, rad^2, then mask_shift; directions that the views do not fix have the prior's
-  solve::Summary summary;    // of the fine stage; costs px^2, mean of the outline's squared distances, capped; steps rad
+  solve::Summary summary;    // of the fine stage, rad; cost: outline's mean capped square, px^2, nearly what it fits
 };
 
 // One frame: all views taken at (nearly) one time. `views` must be undistorted crops with masks, which may be empty.

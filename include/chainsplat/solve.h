@@ -1,9 +1,9 @@
-// chainsplat/solve.h - damped least squares and Adam: the loops that fit something, and what they say of how they ended.
+// chainsplat/solve.h - damped least squares and Adam: the loops that fit something, and what they say of their end.
 //
 // The caller builds its normal equations itself, J^T W J and J^T W r with robust weights and priors: what is summed in
 // which order, and on how many threads, is its own. Here is what follows: damping (Levenberg, Marquardt), the linear
-// solve, which step is taken, when to stop, and a Summary of it. Nothing here runs on several threads. Callbacks say that
-// a place cannot be evaluated by a cost that is not finite (as Ceres' do, by a return value), never by an exception.
+// solve, which step is taken, when to stop, and a Summary of it. Nothing here runs on several threads. A place that
+// cannot be evaluated has a cost that is not finite (a returned value, as with Ceres); it is no exception.
 #pragma once
 #include <functional>
 #include <limits>
@@ -20,7 +20,7 @@ namespace chainsplat::solve {
 using math::MatrixX;
 using math::VectorX;
 
-// --- how a fit ended ---------------------------------------------------------------------------------------------------
+// --- how a fit ended -------------------------------------------------------------------------------------------------
 
 // From the best to the worst.
 enum class Reason {
@@ -28,7 +28,7 @@ enum class Reason {
   gradient,        // converged: the gradient is below the tolerance
   step,            // converged: the step is below the tolerance
   cost,            // converged: the step lowered the cost by less than the tolerance
-  no_decrease,     // no step, however damped, lowered the cost: at a minimum up to rounding, or the derivatives are wrong
+  no_decrease,     // no step, however damped, lowered the cost: a minimum up to rounding, or wrong derivatives
   last_iteration,  // not converged within the iterations that were allowed
   singular,        // no damping made the equations positive definite
   not_finite,      // the cost at the start, or a step, is not finite
@@ -53,7 +53,7 @@ void to_json(nlohmann::ordered_json& out, const Summary& summary);
 // Several fits told as one: the worst reason, the most iterations, the sums of the costs, the longest last step.
 Summary together(std::span<const Summary> fits);
 
-// --- options -----------------------------------------------------------------------------------------------------------
+// --- options ---------------------------------------------------------------------------------------------------------
 
 struct Damping {
   enum class Rule {
@@ -85,7 +85,7 @@ struct Options {
   double longest = std::numeric_limits<double>::infinity();  // longer steps are shortened to it
   bool euclidean = false;    // the length of a step is its Euclidean norm; else its largest component
   int measured = 0;          // so many unknowns, the first, make the length; 0: all
-  bool eager = false;        // derivatives are asked for with each first trial from a place: worth it where most succeed
+  bool eager = false;        // derivatives are asked for with each first trial: worth it where most succeed
   bool cancellable = false;  // ends where core::stop_requested()
   Damping damping{};
 };
@@ -93,7 +93,7 @@ struct Options {
 // Throws InputError that names the field with a value that means nothing.
 void check(const Options& options);
 
-// --- equations ---------------------------------------------------------------------------------------------------------
+// --- equations -------------------------------------------------------------------------------------------------------
 
 struct NormalEquations {
   MatrixX matrix;    // J^T W J, symmetric
@@ -116,14 +116,14 @@ NormalEquations dense(const ArrowEquations& arrow);
 // What is left of the shared block when the local unknowns are eliminated: the Schur complement and its gradient.
 NormalEquations reduced(const ArrowEquations& arrow);
 
-// -(matrix + damping)^-1 gradient by L D L^T, with `shift` by L L^T. False: with this damping the matrix is not positive
-// definite (`shift` only).
+// -(matrix + damping)^-1 gradient by L D L^T, with `shift` by L L^T. False: with this damping the matrix is not
+// positive definite (`shift` only).
 bool damped_step(const NormalEquations& equations, const Damping& rule, double damping, VectorX& step);
 // The same by the Schur complement, the blocks in their order: time is linear in their number. One block alone is
 // solved as a dense matrix.
 bool damped_step(const ArrowEquations& equations, const Damping& rule, double damping, VectorX& step);
 
-// --- least squares -----------------------------------------------------------------------------------------------------
+// --- least squares ---------------------------------------------------------------------------------------------------
 
 // Finds the least cost from `x` on, and leaves it there. `evaluate` gives the cost at x, and fills the equations about
 // x where asked to (null: the cost alone).
@@ -165,7 +165,7 @@ Descent begin(const VectorX& x, const Options& options);
 bool judge(Descent& descent, double cost, const Options& options);
 void propose(Descent& descent, const std::function<bool(double damping, VectorX& step)>& step, const Options& options);
 
-// --- Adam (Kingma and Ba 2015, Algorithm 1) ----------------------------------------------------------------------------
+// --- Adam (Kingma and Ba 2015, Algorithm 1) --------------------------------------------------------------------------
 
 struct AdamOptions {
   double rate = 1e-3;                  // alpha, in the unknowns' units
