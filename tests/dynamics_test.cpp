@@ -707,7 +707,7 @@ TEST_CASE("a diverging step is halved, then RODAS3 takes over, and both are said
   p.integrator = Integrator::implicit_velocity_euler;
   p.substeps = 1;
   p.table_normal.reset();
-  std::fill(p.stiffness.begin(), p.stiffness.end(), 0.05);  // SPEC 4: beyond the Euler step at 30 Hz
+  std::fill(p.stiffness.begin(), p.stiffness.end(), 0.05);  // mathematics.md 4: beyond the Euler step at 30 Hz
   const BaseFunction base = base_of(load("chain_planar_8"));
   const InitialState rest{0.0, VectorX::Zero(8), VectorX::Zero(8)};
   const std::vector<double> times = {0.5, 1.0, 5.0};

@@ -615,7 +615,7 @@ TEST_CASE("the tube covers its own mask, and half of it when the other half is h
         doctest::Approx(whole * kept / mask).epsilon(0.05));
 }
 
-TEST_CASE("a line of JSON holds what INTERFACE 5 names") {
+TEST_CASE("a line of JSON holds what formats.md 3.1 names") {
   estimation::Estimate e;
   e.frame = 12;
   e.time = 0.4;

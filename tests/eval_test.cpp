@@ -205,7 +205,7 @@ TEST_CASE("metrics of a frame, by hand") {
   CHECK(std::isnan(spurious.psnr_object));
 }
 
-TEST_CASE("alpha and colors are clamped and thresholded as SPEC 9 says") {
+TEST_CASE("alpha and colors are clamped and thresholded as mathematics.md 9 says") {
   const capture::Camera camera = small_camera();
   const capture::View view = rectangle_view(10, 8, 20, 14, 255, 0.0f);
   render::Frame frame = rectangle_frame(10, 8, 20, 14, 1.7f, 0.0f);

@@ -19,7 +19,7 @@ dynamics::Model rope() {
   p.link_mass = fill(5, 0.012), p.viscous_friction = p.coulomb_friction = p.air_linear = fill(5, 0.0);
   p.air_quadratic = fill(5, 0.0144 * 0.06);
   p.stiffness = fill(5, 0.012), p.damping = fill(5, 6e-4), p.rest_angle = fill(5, 0.02);
-  p.stiffness[0] *= 2.0, p.damping[0] *= 2.0;  // the first joint stands for half a link (SPEC 3.2)
+  p.stiffness[0] *= 2.0, p.damping[0] *= 2.0;  // the first joint stands for half a link (mathematics.md 3.2)
   p.radius = 0.01, p.tip_mass = 0.002;
   return dynamics::make_model(chain, p);
 }

@@ -39,7 +39,8 @@ struct Truth {
   chain::States states;
 };
 
-// 15 cm to either side along x at 0.4 Hz, eased in over the first half second: the motion of DYNAMICS_FIGURES 4.
+// 15 cm to either side along x at 0.4 Hz, eased in over the first half second: the motion of design.md,
+// 'Identification'.
 trajectory::BaseMotion base_at(double t) {
   constexpr double kAmplitude = 0.15, kRate = 2.0 * M_PI * 0.4, kRamp = 0.5;
   const double u = std::clamp(t / kRamp, 0.0, 1.0), s = std::sin(kRate * t), c = std::cos(kRate * t);
@@ -62,7 +63,7 @@ Truth make_truth(const Case& what) {
   p.link_mass = fill((kMass - p.tip_mass) / 8.0);
   p.viscous_friction = p.air_linear = p.air_quadratic = p.coulomb_friction = p.rest_angle = fill(0.0);
   p.stiffness = fill(what.stiff ? kStiffness : 0.0), p.damping = fill(kDamping);
-  p.stiffness[0] *= 2.0, p.damping[0] *= 2.0;  // the first joint stands for half a link (SPEC 3.2)
+  p.stiffness[0] *= 2.0, p.damping[0] *= 2.0;  // the first joint stands for half a link (mathematics.md 3.2)
   p.radius = 0.01;
   p.substeps = 32;
   auto& v = truth.values;

@@ -213,7 +213,7 @@ std::vector<Motion<S>> link_motions(const std::vector<math::Vector6>& axes, cons
 
 // --- forward ---------------------------------------------------------------------------------------------------------
 
-// Real spherical harmonics in the order and signs of 3DGS (vectors/README.md); r is a unit vector.
+// Real spherical harmonics in the order and signs of 3DGS (design.md, 'Reference vectors'); r is a unit vector.
 template <class S>
 std::vector<S> sh_basis(int degree, const Vec3<S>& r) {
   const S x = r[0], y = r[1], z = r[2], xx = x * x, yy = y * y, zz = z * z;

@@ -375,7 +375,7 @@ TEST_CASE("the demo capture is recognized to a fraction of a millimeter, whateve
   const auto chain_of = [&](Bending bending) {
     return chain::make_chain(demo.length, demo.diameter, demo.direction, demo.bending_axis, 8, bending, false);
   };
-  // floors of eight joints: 0.26 mm (joints at L/9, captures/README) spatial, 3.27 mm planar
+  // floors of eight joints: 0.26 mm (first joint at the grasp; design.md, 'The simulated captures') spatial, 3.27 mm planar
   const Chain spatial = chain_of(Bending::spatial), planar = chain_of(Bending::planar);
   const int threads = core::threads();
   core::set_threads(1);

@@ -30,7 +30,7 @@ namespace {
 
 // Float rounding (6e-8) of pixel coordinates up to 50 px, through conics up to 1/0.3 px^-2, summed over the entries.
 constexpr double kImageTolerance = 2e-5;
-// Relative to the largest entry of a kind (vectors/README.md): the same rounding, through quotients and cancellation.
+// Relative to the largest entry of a kind (design.md, 'Reference vectors'): the same rounding, through quotients and cancellation.
 constexpr double kGradientTolerance = 1e-3;
 // Relative to the largest entry of one Gaussian's row, so that an error of a weak Gaussian does not hide behind a
 // strong one; plus kRowFloor of the kind's largest entry, since cancellation leaves much smaller rows no digits.

@@ -18,7 +18,7 @@ namespace fs = std::filesystem;
 using Json = nlohmann::ordered_json;
 using Kind = JobState::Kind;
 
-// SPEC 9, in the order of the paper's tables and then ours.
+// mathematics.md 9, in the order of the paper's tables and then ours.
 struct Column {
   const char* key;
   const char* title;

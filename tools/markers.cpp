@@ -56,7 +56,8 @@ MarkerFile read_markers(const Path& file) {
           refuse("there are two columns '" + cells[i] + "'", "give every column its own name");
       const auto find = [&](const std::string& name) {
         const auto at = column.find(name);
-        if (at == column.end()) refuse("there is no column '" + name + "'", "give it in the header, see INTERFACE 7");
+        if (at == column.end())
+          refuse("there is no column '" + name + "'", "give it in the header, see formats.md 4.1");
         return at->second;
       };
       for (const char* name : {"time", "bx", "by", "bz", "bqw", "bqx", "bqy", "bqz"})

@@ -1,4 +1,4 @@
-// markers.h - measured marker positions as a file (INTERFACE 7).
+// markers.h - measured marker positions as a file (formats.md 4.1).
 #pragma once
 #include <vector>
 

@@ -20,7 +20,7 @@ namespace {
 namespace fs = std::filesystem;
 using Json = nlohmann::ordered_json;
 
-constexpr std::uint8_t kInside = 128;  // mask values from here on are object (INTERFACE 2)
+constexpr std::uint8_t kInside = 128;  // mask values from here on are object (formats.md 1.5)
 constexpr std::string_view kImageName = "{image}", kMaskName = "{mask}";  // in the line of a command
 constexpr double kDoubtful = 0.85;     // share of the chain's centerline in the masks under which they may be wrong
 

@@ -30,7 +30,7 @@ struct RolloutRequest {
   double rate = 30.0;
 };
 
-// Where the rollout starts (INTERFACE 1, rollout).
+// Where the rollout starts (formats.md 2.4, rollout).
 dynamics::InitialState start_of(const RolloutRequest& request, const twin::Twin& twin, const dynamics::Model& model,
                                 const trajectory::Trajectory& base) {
   const int angles = twin.chain.angles();

@@ -201,7 +201,7 @@ Json plan_json(const planning::Problem& problem, const planning::Options& option
   return out;
 }
 
-// CHAIN.json is the chain object of a twin.json (INTERFACE 3), held as `twin`'s rope is: read as a twin of its own.
+// CHAIN.json is the chain object of a twin.json (formats.md 2.10), held as `twin`'s rope is: read as a twin of its own.
 dynamics::Model read_truth(const std::string& file, const Path& run) {
   Json chain;
   try {

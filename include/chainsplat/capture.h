@@ -1,5 +1,5 @@
 // chainsplat/capture.h - a recording of a rope: cameras, object-masked image crops, depth and base trajectory
-// (INTERFACE 2). It is where the data flow begins: a folder or a live camera in, checked and masked views out.
+// (formats.md 1). It is where the data flow begins: a folder or a live camera in, checked and masked views out.
 //
 // Everything downstream works on crops, because a rope covers 1-3 % of an image. Loading masks the images (black
 // outside the object), optionally undistorts them once, and crops every view to its mask's bounds plus a margin.

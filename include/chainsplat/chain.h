@@ -1,4 +1,5 @@
-// chainsplat/chain.h - an open chain of screw joints and where its links are (SPEC 2.1-2.3; paper, "Chain kinematics").
+// chainsplat/chain.h - an open chain of screw joints and where its links are (mathematics.md 2.1-2.3; paper, "Chain
+// kinematics").
 //
 // Home configuration (theta = 0): the rope lies straight from the base origin along `direction`. Link 0 is fixed to the
 // base. A joint is one, two or three angles with coincident axes (bending; second bending; twist); the bodies between
@@ -36,16 +37,16 @@ struct Chain {
   int last_angle(int link) const;  // k(j): index of the last angle that moves `link`, -1 for link 0
 };
 
-// `joints` joints at s_j = (j - 1) L / joints (SPEC 2.1 [D]). Axes a joint: a; a, b = d x a; with twist also d.
-// `first_joint` moves the first one: s_j = first_joint + (j-1)(L - first_joint)/joints.
+// `joints` joints at s_j = (j - 1) L / joints (mathematics.md 2.1 [D]). Axes a joint: a; a, b = d x a; with twist also
+// d. `first_joint` moves the first one: s_j = first_joint + (j-1)(L - first_joint)/joints.
 Chain make_chain(double length, double diameter, const Vector3& direction, const Vector3& bending_axis, int joints,
                  Bending bending, bool twist, double first_joint = 0.0);
 
 // E_j for j = 0..n_l: world pose that carries home coordinates (base frame) of link j to the world. E_0 = base.
-// SPEC 2.2.
+// mathematics.md 2.2.
 std::vector<Pose> link_motions(const Chain& chain, const VectorX& theta, const Pose& base);
 
-// s_k, world-frame screw axes at theta, 6 x n (columns). SPEC 2.3.
+// s_k, world-frame screw axes at theta, 6 x n (columns). mathematics.md 2.3.
 MatrixX world_axes(const Chain& chain, const VectorX& theta, const Pose& base);
 
 // World position of the home point X (base frame) of link j, and its 3 x n Jacobian with respect to theta (base fixed)
@@ -80,18 +81,19 @@ bool has_twist(const Chain& chain);
 // Link that carries the material point at `arclength` (a joint belongs to the link it starts).
 int link_at(const Chain& chain, double arclength);
 
-// World points of the centerline at the given arclengths (straight links; SPEC 2.2), 3 x count.
+// World points of the centerline at the given arclengths (straight links; mathematics.md 2.2), 3 x count.
 MatrixX centerline(const Chain& chain, const std::vector<Pose>& motions, const std::vector<double>& arclengths);
 // Length of rope whose bending joint j = 1.. stands for, m: from the middle of the link before it to the middle of its
-// own (SPEC 3.2). A first joint on the clamp has only the half behind it; where a base link reaches from the clamp to
-// the first joint, that joint also stands for all of it. Stiffness is EI over this length.
+// own (mathematics.md 3.2). A first joint on the clamp has only the half behind it; where a base link reaches from the
+// clamp to the first joint, that joint also stands for all of it. Stiffness is EI over this length.
 double bent_length(const Chain& chain, int joint);
 // The nodes: grasp, every joint, free end, 3 x (n_l + 2). Where s_1 = 0 the first two coincide.
 MatrixX nodes(const Chain& chain, const std::vector<Pose>& motions);
 // `count` equally spaced arclengths from 0 to the length.
 std::vector<double> equal_arclengths(const Chain& chain, int count);
 
-// dl/dtheta from dl/d(link motion): g is 6 x links, world twists about the world origin (SPEC 2.3): suffix sums.
+// dl/dtheta from dl/d(link motion): g is 6 x links, world twists about the world origin (mathematics.md 2.3): suffix
+// sums.
 VectorX theta_gradient(const Chain& chain, const MatrixX& world_axes, const MatrixX& link_twist_gradient);
 
 // Angles along time. `thetadot` and `covariance` are empty or as long as `theta`.

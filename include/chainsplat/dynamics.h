@@ -1,7 +1,8 @@
-// chainsplat/dynamics.h - motion of the chain under gravity, stiffness, damping, friction, drag and a moving base (SPEC
-// 3, 4).
+// chainsplat/dynamics.h - motion of the chain under gravity, stiffness, damping, friction, drag and a moving base
+// (mathematics.md 3, 4).
 //
-// Twists and wrenches are (angular, linear), in the frame of their link. Equations are named by SPEC's numbers.
+// Twists and wrenches are (angular, linear), in the frame of their link. Equations are named by the numbers of
+// mathematics.md.
 #pragma once
 #include <functional>
 #include <memory>
@@ -22,9 +23,10 @@ using math::Vector3;
 using math::Vector6;
 using math::VectorX;
 
-enum class Integrator { rodas3, implicit_velocity_euler };  // SPEC 4 [D], [P] (corrected, base motion at t_k)
+enum class Integrator { rodas3, implicit_velocity_euler };  // mathematics.md 4 [D], [P] (corrected, base motion at t_k)
 
-// The numbers of SPEC 3.1. Arrays per moving link j = 1..n_l are indexed j - 1; per angle k = 1..n are indexed k - 1.
+// The numbers of mathematics.md 3.1. Arrays per moving link j = 1..n_l are indexed j - 1; per angle k = 1..n are
+// indexed k - 1.
 struct Parameters {
   std::vector<double> link_mass;         // kg
   std::vector<double> viscous_friction;  // N s/m a link, against the table
@@ -79,8 +81,8 @@ struct Estimates {
 
 using BaseFunction = std::function<trajectory::BaseMotion(double)>;  // base motion at a time, s
 
-// A chain and its parameters, with the constants that follow from them. {i} is the link frame of angle i (SPEC 2.2);
-// bodies between the coincident axes of one joint have no mass and no length.
+// A chain and its parameters, with the constants that follow from them. {i} is the link frame of angle i
+// (mathematics.md 2.2); bodies between the coincident axes of one joint have no mass and no length.
 struct Model {
   chain::Chain chain;
   Parameters parameters;
@@ -96,27 +98,27 @@ Model make_model(const chain::Chain& chain, const Parameters& parameters);
 // The base at rest in `pose`.
 trajectory::BaseMotion at_rest(const math::Pose& pose);
 
-// tau_i = A_i^T F_i of SPEC 3.2, external wrenches of SPEC 3.3 included, joint law not. n, N m.
+// tau_i = A_i^T F_i of mathematics.md 3.2, external wrenches of mathematics.md 3.3 included, joint law not. n, N m.
 VectorX inverse_dynamics(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                          const VectorX& thetadot, const VectorX& thetaddot);
 // -K (theta - theta_0) - D thetadot. n, N m.
 VectorX joint_law(const Model& model, const VectorX& theta, const VectorX& thetadot);
-// M(theta), n x n, kg m^2. SPEC 3.4.
+// M(theta), n x n, kg m^2. mathematics.md 3.4.
 MatrixX mass_matrix(const Model& model, const VectorX& theta);
 // thetaddot of the free motion: dense M and Cholesky. Throws InputError, with the joint, where M is not positive
 // definite.
 VectorX forward_dynamics(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                          const VectorX& thetadot);
-// The same by the articulated body algorithm, O(n). SPEC 3.4.
+// The same by the articulated body algorithm, O(n). mathematics.md 3.4.
 VectorX forward_dynamics_articulated(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                                      const VectorX& thetadot);
-// W_i of SPEC 3.3 on every body, in {i}; and body twists V_i in {i}. 6 x n.
+// W_i of mathematics.md 3.3 on every body, in {i}; and body twists V_i in {i}. 6 x n.
 MatrixX external_wrenches(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                           const VectorX& thetadot);
 MatrixX body_twists(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                     const VectorX& thetadot);
 
-// What the implicit integrators need at one state (SPEC 3.6): M a = torque - bias with
+// What the implicit integrators need at one state (mathematics.md 3.6): M a = torque - bias with
 // da/dtheta = -M^-1 stiffness, da/dthetadot = -M^-1 damping, da/dt = M^-1 drive_rate (through the base motion only).
 struct Linearization {
   VectorX acceleration;  // a
@@ -138,9 +140,9 @@ struct BaseSlopes {
 BaseSlopes base_slopes(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                        const VectorX& thetadot);
 
-// The stacked matrices of SPEC 3.5 (paper, "Closed-form dynamics", corrected): for reading and checking, O(n^3),
-// viscous and other wrenches as in 3.3. M thetaddot + coriolis + gravity + base - friction = -K(theta - theta_0) - D
-// thetadot.
+// The stacked matrices of mathematics.md 3.5 (paper, "Closed-form dynamics", corrected): for reading and checking,
+// O(n^3), viscous and other wrenches as in 3.3. M thetaddot + coriolis + gravity + base - friction = -K(theta -
+// theta_0) - D thetadot.
 struct ClosedForm {
   MatrixX mass;               // A^T L^T G L A
   VectorX coriolis;           // C thetadot, base at rest
@@ -203,9 +205,9 @@ struct Divergence {
 };
 
 // Integrates over the grid and fills `states` at the output nodes (allocated once, reused). False where the motion left
-// all bounds (then `states` is shorter). With `unknowns`, the variational equation is integrated beside (SPEC 4; RODAS3
-// only): trapezoidal rule with the factorization of the step, second order, not the exact derivative of the discrete
-// map.
+// all bounds (then `states` is shorter). With `unknowns`, the variational equation is integrated beside (mathematics.md
+// 4; RODAS3 only): trapezoidal rule with the factorization of the step, second order, not the exact derivative of the
+// discrete map.
 bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta, const VectorX& thetadot,
               chain::States& states, std::span<const Tangent> unknowns = {}, Sensitivities* sensitivities = nullptr,
               Divergence* divergence = nullptr);

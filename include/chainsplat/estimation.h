@@ -151,7 +151,7 @@ bool has_mask(const capture::View& view);
 double tube_iou(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta,
                 const capture::View& view, const capture::Camera& camera);
 
-// Returns the line of INTERFACE 5, without line feed; numbers that are not finite become null. `latency`: s.
+// Returns the line of formats.md 3.1, without line feed; numbers that are not finite become null. `latency`: s.
 // "covariance" is the lower triangle of theta's covariance, row by row; with `rates` it is that of (theta, thetadot),
 // which begins with the same numbers.
 std::string to_json(const Estimate& estimate, double latency, bool rates = false);

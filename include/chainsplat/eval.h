@@ -1,4 +1,4 @@
-// chainsplat/eval.h - metrics of how well Gaussians and states reproduce a capture (mathematics.md 9, INTERFACE 4).
+// chainsplat/eval.h - metrics of how well Gaussians and states reproduce a capture (mathematics.md 9, formats.md 2.7).
 //
 // It draws the states through the cameras of the capture and compares the pictures with the recorded, masked images,
 // and the centerlines with the truth where the capture has one. Colors are in [0, 1], distances in m.
@@ -36,8 +36,8 @@ Metrics evaluate(splat::Engine& engine, const splat::Gaussians& gaussians, const
 // All metrics of one frame but centerline_rms and tip_rms; both pictures in recorded pixels.
 FrameMetrics compare(const render::Frame& drawn, const capture::View& view, const capture::Camera& camera);
 
-// The object M of metrics.json (INTERFACE 4) as JSON text, without metrics that do not apply; and "empty_clouds" if it
-// is not 0.
+// The object M of metrics.json (formats.md 2.7) as JSON text, without metrics that do not apply; and "empty_clouds" if
+// it is not 0.
 std::string to_json(const Metrics& metrics);
 
 // Mean SSIM (mathematics.md 2.7) of two images of `full_pixels` pixels, of which both are black outside a crop; on the

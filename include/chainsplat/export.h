@@ -1,4 +1,5 @@
-// chainsplat/export.h - writes a finished twin in formats of other programs, chosen by the file's ending (INTERFACE 1).
+// chainsplat/export.h - writes a finished twin in formats of other programs, chosen by the file's ending
+// (formats.md 5.5).
 //
 //   .glb .gltf  glTF 2.0 with KHR_gaussian_splatting: a root node (turns z-up to glTF's y-up) and below it the chain,
 //               with one node per link (each the child of the one before) in the link frames of mathematics.md 2.2 (a

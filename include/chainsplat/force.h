@@ -137,7 +137,7 @@ std::vector<Estimate> finish(Live& live);
 
 // Returns false where too large numbers or a twin without mass leave no finite force.
 bool is_finite(const Estimate& estimate);
-// Returns the line of INTERFACE 5, without line feed; numbers that are not finite become null. `known_mass` false:
+// Returns the line of formats.md 3.2, without line feed; numbers that are not finite become null. `known_mass` false:
 // forces are per kilogram of rope, and the line's unit is N/kg.
 std::string to_json(const Estimate& estimate, bool known_mass);
 

@@ -1,5 +1,5 @@
-// chainsplat/identification.h - recognized angles and the base's motion -> masses, stiffness, damping, friction (SPEC
-// 5).
+// chainsplat/identification.h - recognized angles and the base's motion -> masses, stiffness, damping, friction
+// (mathematics.md 5).
 //
 // The whole capture is one open-loop rollout. Its centerline, relative to the base, is fitted to the recognized one by
 // Levenberg-Marquardt over a growing horizon, with priors on everything and sensitivities from the variational

@@ -1,5 +1,5 @@
-// chainsplat/masking.h - object masks without prompts or a model file (INTERFACE 1, mask): whole images and the base's
-// pose in, masks of the rope out, for a whole capture or live.
+// chainsplat/masking.h - object masks without prompts or a model file (formats.md 1.5, mask): whole images and the
+// base's pose in, masks of the rope out, for a whole capture or live.
 //
 // The method uses that the rope is a tube of known length and diameter that begins at the base's pose, seen by known
 // cameras. In some moments a chain is grown from the grasp so that its tube best separates the colors inside from those

@@ -1,5 +1,5 @@
-// chainsplat/planning.h - base motions that bring the rope to a target (SPEC 8; paper, "Model-based trajectory
-// optimization").
+// chainsplat/planning.h - base motions that bring the rope to a target (mathematics.md 8; paper, "Model-based
+// trajectory optimization").
 //
 // The base moves along world axes and turns about the vertical, from rest to rest, in a stretch of radial basis
 // functions for every target. The rope follows by the identified dynamics; the weights are found by Gauss-Newton on a
@@ -20,8 +20,8 @@ using math::VectorX;
 
 enum class Axis { x, y, z, yaw };
 
-// s^3 (1 - s)^3 with a quintic between the ends: starts and ends without acceleration (SPEC 8 [D]); or s^2 (1 - s)^2
-// with a cubic, as in the paper.
+// s^3 (1 - s)^3 with a quintic between the ends: starts and ends without acceleration (mathematics.md 8 [D]); or s^2 (1
+// - s)^2 with a cubic, as in the paper.
 enum class Window { smooth, paper };
 
 // What the arm can do. Speeds are of the translation (norm of the vector); those of yaw are separate. Stroke: farthest
@@ -31,7 +31,7 @@ struct Limits {
   double yaw_velocity = 3.1, yaw_acceleration = 20.0, yaw_jerk = 400.0, turn = 1.6;  // rad, s
 };
 
-inline constexpr int kBasisCount = 8;  // B of SPEC 8
+inline constexpr int kBasisCount = 8;  // B of mathematics.md 8
 
 // One stretch: coordinate c moves by terminal[c] * blend(s) + scale * window(s) * sum_i phi_i(s) weights(i, c).
 struct Piece {

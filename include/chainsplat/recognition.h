@@ -1,4 +1,5 @@
-// chainsplat/recognition.h - masked frames -> link-aware Gaussians and joint angles (paper, "Recognition"; SPEC 2.9).
+// chainsplat/recognition.h - masked frames -> link-aware Gaussians and joint angles (paper, "Recognition";
+// mathematics.md 2.9).
 //
 // `fast`: silhouettes give every frame's angles; Gaussians are placed along the links and then refined in turn with the
 // angles (Adam on the Gaussians with angles held, Gauss-Newton on each frame's angles with Gaussians held). `paper`:
@@ -17,7 +18,7 @@ enum class Mode { fast, paper };
 
 struct Options {
   int joints = 8;
-  std::optional<chain::Bending> bending;  // none: auto (INTERFACE 1)
+  std::optional<chain::Bending> bending;  // none: auto (design.md, 'Recognition')
   bool twist = false;
   int every = 5;  // frames that train the Gaussians
   Mode mode = Mode::fast;

@@ -1,10 +1,12 @@
-// chainsplat/silhouette.h - masks and a chain -> joint angles: the coarse step of recognition and estimation (SPEC 6).
+// chainsplat/silhouette.h - masks and a chain -> joint angles: the coarse step of recognition and estimation
+// (mathematics.md 6).
 //
 // A frame in two stages, Gauss-Newton over all its views at once. Coarse: sampled mask pixels are drawn to the
 // projected centerline along its normal (those past the free end with the whole vector) and centerline samples into the
 // mask: this finds the rope from afar. Fine: the mask's outline, to a fraction of a pixel, is put at the tube's radius
 // from the centerline on either side, and its end at the free end. A sequence is warm-started frame by frame, repaired
-// where that failed, and smoothed over time with each frame's own normal equations as weights. DESIGN, 'Recognition'.
+// where that failed, and smoothed over time with each frame's own normal equations as weights. design.md,
+// 'Recognition'.
 #pragma once
 #include <span>
 #include <vector>
@@ -62,8 +64,8 @@ struct SequenceFit {
 };
 SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capture, const Options& options = {});
 
-// INTERFACE 1, --bending auto: on a table planar; in free space spatial unless the out-of-plane RMS of a spatial fit is
-// under 1 mm or three of its standard deviations.
+// design.md, 'Recognition', --bending auto: on a table planar; in free space spatial unless the out-of-plane RMS of a
+// spatial fit is under 1 mm or three of its standard deviations.
 struct BendingChoice {
   chain::Bending bending = chain::Bending::spatial;
   double out_of_plane_rms = 0.0;  // m; 0 when not measured

@@ -1,4 +1,4 @@
-// chainsplat/synth.h - draws a capture from a twin, with its truth, for tests and what-if studies (INTERFACE 1, 2). The
+// chainsplat/synth.h - draws a capture from a twin, with its truth, for tests and what-if studies (formats.md 5.6). The
 // result is a capture folder like that of a real recording (capture.h), which every stage can read.
 #pragma once
 #include <string>

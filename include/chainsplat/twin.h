@@ -1,4 +1,4 @@
-// chainsplat/twin.h - the result of training as one value, and its run folder (INTERFACE 3).
+// chainsplat/twin.h - the result of training as one value, and its run folder (formats.md 2).
 //
 // Recognition provides the chain, the Gaussians and the states, identification the parameters. Rollout, rendering,
 // estimation, planning and export start from a twin.

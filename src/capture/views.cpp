@@ -13,7 +13,7 @@ using math::Vector2;
 
 namespace {
 
-constexpr std::uint8_t kInside = 128;  // mask values from here on mean the object (INTERFACE 2)
+constexpr std::uint8_t kInside = 128;  // mask values from here on mean the object (formats.md 1.5)
 // Without masks, pixels brighter than this in any channel are the object. Lossy coding does not keep black at 0.
 constexpr std::uint8_t kBlackLossless = 0, kBlackLossy = 16;
 constexpr double kMostCovered = 0.5;  // share of an image; more means that nothing was masked

@@ -1,5 +1,5 @@
-// The stacked matrices of SPEC 3.5 and 3.6, written as they are printed: to be read beside the paper, and a formulation
-// of its own to check the recursions against.
+// The stacked matrices of mathematics.md 3.5 and 3.6, written as they are printed: to be read beside the paper, and a
+// formulation of its own to check the recursions against.
 #include <algorithm>
 #include <cmath>
 
@@ -11,8 +11,8 @@ namespace {
 using math::hat;
 using math::Matrix6;
 
-// W_i and dW_i/dV_i of SPEC 3.3 in {i}, for link j (from 1) with body twist v; `normal` is N, zero without a table.
-// `across`, and its slope by v: the friction across the link of the velocity in the plane of bending.
+// W_i and dW_i/dV_i of mathematics.md 3.3 in {i}, for link j (from 1) with body twist v; `normal` is N, zero without a
+// table. `across`, and its slope by v: the friction across the link of the velocity in the plane of bending.
 void link_wrench(const Model& model, int j, const Vector6& v, const Vector3& normal, double normal_gravity,
                  Vector6& wrench, Matrix6& slope, double& across_friction, Vector6& across_slope) {
   const Parameters& p = model.parameters;

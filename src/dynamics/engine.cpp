@@ -6,7 +6,7 @@
 namespace chainsplat::dynamics {
 namespace {
 
-// Three-point Gauss-Legendre rule on [0, 1] (SPEC 3.3).
+// Three-point Gauss-Legendre rule on [0, 1] (mathematics.md 3.3).
 const double kGaussPoint[3] = {0.5 * (1.0 - std::sqrt(0.6)), 0.5, 0.5 * (1.0 + std::sqrt(0.6))};
 constexpr double kSingular = 1e-13;  // of an angle's own inertia: less is rounding
 constexpr double kGaussWeight[3] = {5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0};
@@ -89,7 +89,8 @@ Engine::Engine(const Model& m) : model(m), angles(m.chain.angles()), link_count(
   unit_.resize(link_count), slope_.resize(link_count), turning_.resize(link_count);
 }
 
-// W_j (SPEC 3.3) in world axes; with `slopes`, subtracts dW/dV from slope_[j] and sets turning_[j] = (dW/dN)[N].
+// W_j (mathematics.md 3.3) in world axes; with `slopes`, subtracts dW/dV from slope_[j] and sets turning_[j] =
+// (dW/dN)[N].
 void Engine::friction(int j, bool slopes) {
   const LinkConstants& link = links[j];
   wrench[j].setZero();
@@ -470,7 +471,7 @@ void Engine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces) 
   }
 }
 
-// SPEC 3.4, in world axes: X = I, and the massless bodies of a joint take part with zero own inertia.
+// mathematics.md 3.4, in world axes: X = I, and the massless bodies of a joint take part with zero own inertia.
 bool Engine::articulated_acceleration() {
   std::vector<Vector6> u_vector(angles);
   VectorX pivot(angles), u(angles);

@@ -1,10 +1,11 @@
 // Private to dynamics: one evaluation of the equations of motion, without allocation.
 //
 // Everything is resolved in world axes about the instantaneous base origin, an inertial frame at that instant. There
-// all bodies share one frame, so that the neighbor transforms of SPEC 3.2 vanish and the tangents of SPEC 3.6 become
-// sums over links: a unit turn of angle k displaces all outer links rigidly by s_k; seen from the displaced links only
-// the inner velocity and acceleration have changed, by u = V x s_k and psi = dV x s_k + V x u, and the table's normal.
-// With composite inertia I, velocity product matrix E = 2B - dW/dV and table term N of the links outside of i,
+// all bodies share one frame, so that the neighbor transforms of mathematics.md 3.2 vanish and the tangents of
+// mathematics.md 3.6 become sums over links: a unit turn of angle k displaces all outer links rigidly by s_k; seen from
+// the displaced links only the inner velocity and acceleration have changed, by u = V x s_k and psi = dV x s_k + V x u,
+// and the table's normal. With composite inertia I, velocity product matrix E = 2B - dW/dV and table term N of the
+// links outside of i,
 //   i >= k:  d tau_i / d theta_k = s_i^T (I_i psi_k + E_i u_k - N_i omega_k)
 //   i <  k:  d tau_i / d theta_k = s_i^T (I_k psi_k + E_k u_k - N_k omega_k + s_k x* F_k)
 //   with respect to dtheta_k the same with (psi, u) = (2 u_k, s_k) and neither N nor F.

@@ -73,7 +73,7 @@ bool Step::evaluate(const trajectory::BaseMotion& motion, bool slopes) {
   return true;
 }
 
-// (1/G - J) k = r for r = (right_theta, M^-1 of `work`), G = gamma H: SPEC 4
+// (1/G - J) k = r for r = (right_theta, M^-1 of `work`), G = gamma H: mathematics.md 4
 void Step::solve_stage(int i, double g) {
   work_.noalias() -= g * (engine.stiffness * right_theta_);
   work_ *= g;

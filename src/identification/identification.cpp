@@ -21,7 +21,7 @@ constexpr double kCorrelated = 9.0;  // model errors of neighbors in space and t
 constexpr double kHuber = 1.75;      // times the usual root mean square of a group of residuals
 constexpr double kLeastUsual = 0.1;  // of the standard deviation expected: a closer fit does not make outliers
 constexpr double kMedianRms = 0.9;   // median of the root mean square of a few unit normals
-constexpr int kLag = 10;             // frames over which residuals are taken to be correlated (SPEC 5)
+constexpr int kLag = 10;             // frames over which residuals are taken to be correlated (mathematics.md 5)
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 constexpr double kUnknown = std::numeric_limits<double>::quiet_NaN();
 
@@ -112,7 +112,7 @@ bool simulate(const Part& part, const BaseGrid& grid, const VectorX& p, chain::S
 }
 
 // Whitened residuals of a frame in groups, its columns: all angles at once, or a marker each. The angles' weights are
-// those of the centerline's points near the recognized shape (SPEC 5), so that they need no points here.
+// those of the centerline's points near the recognized shape (mathematics.md 5), so that they need no points here.
 void residuals(const Part& part, const chain::States& states, std::vector<MatrixX>& out) {
   out.resize(states.theta.size());
   MatrixX points;
@@ -202,9 +202,9 @@ solve::NormalEquations normal_equations(const Part& part, const chain::States& s
   return out;
 }
 
-// J^T G J, G the covariance of the weighted residuals: frames up to kLag apart are correlated (SPEC 5), every residual
-// alike. The autocovariance is that of all residuals together: of one unknown's score alone, which a few frames may
-// decide, it would be mostly chance.
+// J^T G J, G the covariance of the weighted residuals: frames up to kLag apart are correlated (mathematics.md 5), every
+// residual alike. The autocovariance is that of all residuals together: of one unknown's score alone, which a few
+// frames may decide, it would be mostly chance.
 MatrixX covariance_of_scores(const Part& part, const chain::States& states, const dynamics::Sensitivities& slopes,
                              const std::vector<MatrixX>& values, double limit) {
   const std::size_t frames = values.size();

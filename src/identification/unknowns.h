@@ -30,7 +30,7 @@ inline constexpr double kThetaSd = 0.02;   // rad, initial angles about the reco
 inline constexpr double kRateSd = 0.5;     // rad/s, initial velocity about the differences of the recognized angles
 inline constexpr double kAtRestSd = 1e-4;  // rad/s, of a rope on a table under a base at rest: friction holds it
 
-// Priors follow SPEC 5. `theta_sd` per angle, rad; `rate_sd` of the initial velocities, rad/s.
+// Priors follow mathematics.md 5. `theta_sd` per angle, rad; `rate_sd` of the initial velocities, rad/s.
 Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const VectorX& theta, const VectorX& thetadot,
                        const VectorX& theta_sd, double rate_sd = kRateSd);
 

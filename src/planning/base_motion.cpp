@@ -40,7 +40,7 @@ Basis basis(Window window, double start, double duration, double time) {
     b[2] = 6.0 - 12.0 * s;
     b[3] = -12.0;
   }
-  constexpr double kSharpness = kBasisCount * kBasisCount;  // B^2 of SPEC 8
+  constexpr double kSharpness = kBasisCount * kBasisCount;  // B^2 of mathematics.md 8
   for (int i = 0; i < kBasisCount; ++i) {
     const double u = s - i / (kBasisCount - 1.0), q = 2.0 * kSharpness * u;
     double f[4];

@@ -25,7 +25,7 @@ struct Task {
 
 struct Sharpness {
   double soft_minimum = 1e5;  // nu, m^-2
-  double smoothness = 1e-7;   // alpha, beta of SPEC 8, of the mean squared acceleration, s^4
+  double smoothness = 1e-7;   // alpha, beta of mathematics.md 8, of the mean squared acceleration, s^4
 };
 
 struct Evaluation {
@@ -38,7 +38,7 @@ struct Evaluation {
 };
 Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& sharpness, bool derivatives);
 
-// Point of the rope nearest to `target` among the candidates of SPEC 8.
+// Point of the rope nearest to `target` among the candidates of mathematics.md 8.
 struct Nearest {
   int link = 0;
   Vector3 point = Vector3::Zero();

@@ -9,7 +9,7 @@
 namespace chainsplat::planning {
 namespace {
 
-// Annealing of the soft minimum (SPEC 8), with the steps for each.
+// Annealing of the soft minimum (mathematics.md 8), with the steps for each.
 constexpr struct {
   double sharpness, smoothness;
   int steps, evaluations;

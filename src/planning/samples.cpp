@@ -1,4 +1,4 @@
-// Parameter sets drawn from what identification knows (SPEC 8, robustness).
+// Parameter sets drawn from what identification knows (mathematics.md 8, robustness).
 #include "chainsplat/dynamics/parametrization.h"
 #include "chainsplat/planning.h"
 

@@ -15,7 +15,7 @@ namespace {
 constexpr int kRounds = 4;
 constexpr int kSteps = 100;  // Adam steps a round
 constexpr double kGaussiansADiameter =
-    100.0;                           // of the rope's length, when no budget is given: more gain little (DESIGN)
+    100.0;  // of the rope's length, when no budget is given: more gain little (design.md, 'Recognition')
 constexpr double kFirstShare = 0.8;  // of the budget, placed at the start; the rest goes where the images ask
 constexpr int kAngleIterations = 1;  // Gauss-Newton steps a round and frame
 constexpr int kFinalIterations = 1;  // for every frame, at the end
@@ -34,7 +34,7 @@ splat::AdamRates rates(double fraction, double scale) {
   r.opacity = 0.08f * fall;
   r.sh0 = 0.06f * fall;  // 0.017 in color
   r.sh_rest = 0.01f * fall;
-  r.link_logits = 0.0f;  // hard on their link: soft gained nothing (DESIGN, 'Recognition')
+  r.link_logits = 0.0f;  // hard on their link: soft gained nothing (design.md, 'Recognition')
   return r;
 }
 

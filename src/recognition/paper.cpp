@@ -1,6 +1,6 @@
 // The paper's procedure, so that it can be compared with the fast one in one table: random Gaussians with uniform link
 // probabilities, all angles zero, Adam on one random view an iteration, two asynchronous resets. What the paper does
-// not print is 3DGS' and ScrewSplat's (INTERFACE 1, `--mode paper`). SH degree 0.
+// not print is 3DGS' and ScrewSplat's (design.md, 'Recognition', `--mode paper`). SH degree 0.
 #include <algorithm>
 #include <cmath>
 #include <numeric>

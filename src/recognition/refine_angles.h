@@ -1,4 +1,4 @@
-// refine_angles.h - Gauss-Newton on each frame's joint angles with the Gaussians held (DESIGN, 'Recognition').
+// refine_angles.h - Gauss-Newton on each frame's joint angles with the Gaussians held (design.md, 'Recognition').
 //
 // A drawn rope moves in the image with its surface: where pixel p shows the surface point x of link j, a twist xi of
 // that link moves the picture by the flow du = dpi/dx (w x x + v), so dI^/dxi = -grad I^ . du. Color and mask residuals

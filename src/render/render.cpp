@@ -12,7 +12,7 @@ namespace {
 constexpr std::size_t kBatchPixels = 2u << 20;  // per batch: 32 MiB of float colors, several dozen frames of a rope
 constexpr int kBorderStep = 8;                  // px between the border points that bound a warped rectangle
 constexpr double kTimeSlack = 1e-9;             // s; covers the rounding of frame times
-constexpr float kSolid = 0.5f;                  // least alpha of the object (INTERFACE 1)
+constexpr float kSolid = 0.5f;                  // least alpha of the object (formats.md 5.4)
 
 Bounds cut(const Bounds& a, const Bounds& b) {
   return {std::max(a.x0, b.x0), std::max(a.y0, b.y0), std::min(a.x1, b.x1), std::min(a.y1, b.y1)};

@@ -9,7 +9,7 @@ namespace chainsplat::silhouette {
 
 namespace {
 
-constexpr int kInside = 128;            // coverage from here on is object (INTERFACE 2)
+constexpr int kInside = 128;            // coverage from here on is object (formats.md 1.5)
 constexpr double kLevel = 127.5;        // coverage at the outline
 constexpr double kSpeck = 0.02;         // share of the largest blob's area under which a blob is noise
 constexpr int kSpeckPixels = 4;         // px, the same for small masks

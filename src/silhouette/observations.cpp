@@ -261,7 +261,7 @@ void eliminate_link_offsets(LinkSums& sums) {
   }
 }
 
-// Normal equations of the angles from those of the links, by suffix sums (SPEC 2.3).
+// Normal equations of the angles from those of the links, by suffix sums (mathematics.md 2.3).
 void assemble(Problem& problem) {
   const chain::Chain& chain = *problem.chain;
   const int n = chain.angles();

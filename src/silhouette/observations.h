@@ -6,7 +6,7 @@
 
 namespace chainsplat::silhouette {
 
-constexpr double kNear = 0.01;        // m, nothing nearer than this is in front of a camera (SPEC 2.5)
+constexpr double kNear = 0.01;        // m, nothing nearer than this is in front of a camera (mathematics.md 2.5)
 constexpr double kLargestCut = 12.0;  // px, no outline point farther from the tube counts
 
 using Vector9 = Eigen::Matrix<double, 9, 1>;
@@ -22,7 +22,7 @@ struct Segment {
 };
 
 // Normal equations of one view by link, in camera coordinates: a row is (x cross g, g, derivatives by the edge offset
-// and by the mask's shift in x and y), SPEC 2.3.
+// and by the mask's shift in x and y), mathematics.md 2.3.
 struct LinkSums {
   std::vector<Matrix9> normal;
   std::vector<Vector9> right;
