@@ -13,11 +13,11 @@
 
 #include "chainsplat/capture.h"
 #include "src/capture/image_files.h"
-#include "tools/base_motion_files.h"
-#include "tools/batch.h"
-#include "tools/cli.h"
-#include "tools/markers.h"
-#include "tools/run_folder.h"
+#include "tools/chainsplat/base_motion_files.h"
+#include "tools/chainsplat/batch.h"
+#include "tools/chainsplat/cli.h"
+#include "tools/chainsplat/markers.h"
+#include "tools/chainsplat/run_folder.h"
 
 namespace chainsplat::fuzz {
 

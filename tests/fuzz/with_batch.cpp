@@ -1,7 +1,7 @@
 // The plan, the ends, the logs and the results that a batch finds in its folder.
 #include "readers.h"
-#include "tools/batch_collect.cpp"
-#include "tools/cli.h"
+#include "tools/chainsplat/batch_collect.cpp"
+#include "tools/chainsplat/cli.h"
 
 #include <CLI/CLI.hpp>
 

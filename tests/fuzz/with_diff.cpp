@@ -1,6 +1,6 @@
 // metrics.json as diff reads it.
 #include "readers.h"
-#include "tools/diff.cpp"
+#include "tools/chainsplat/diff.cpp"
 
 namespace chainsplat::fuzz {
 

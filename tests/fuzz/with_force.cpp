@@ -1,10 +1,10 @@
 // What force reads: the lines of estimate, and points of contact.
 #include "readers.h"
-#include "tools/force.cpp"
+#include "tools/chainsplat/force.cpp"
 
 namespace chainsplat::fuzz {
 
-#if __has_include("tools/estimate_lines.h")
+#if __has_include("tools/chainsplat/estimate_lines.h")
 using tools::read_estimate_line;
 #else
 std::optional<tools::State> read_estimate_line(const std::string& line, const std::string& where, int, double before) {
