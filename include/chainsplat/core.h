@@ -3,7 +3,7 @@
 //
 // Errors are two exceptions, because they decide the exit code: InputError (2: the request or its input is wrong,
 // nothing was written) and WorkError (1: the work failed, what exists is kept). The library never prints and never
-// aborts; the tools catch both and print one line.
+// aborts; the program catches both and prints one line.
 #pragma once
 #include <cstdint>
 #include <filesystem>
@@ -24,16 +24,25 @@ namespace core {
 std::string printable(std::string_view text);
 }  // namespace core
 
-// One line for the user: WHERE: WHAT; HOW TO MEND. Bytes that cannot be printed are escaped.
-struct InputError : std::runtime_error {
-  InputError(const std::string& where, const std::string& what, const std::string& mend)
-      : std::runtime_error(core::printable(where + ": " + what + "; " + mend)) {}
+// What went wrong, in three fields; what() is one line of them for the user, WHERE: PROBLEM; MEND, in which bytes that
+// cannot be printed are escaped. Where an option of a call is meant, its field stands in backquotes: `frames`.
+struct Error : std::runtime_error {
+  Error(const std::string& at, const std::string& wrong, const std::string& advice)
+      : std::runtime_error(core::printable(at + ": " + wrong + "; " + advice)),
+        where(at),
+        problem(wrong),
+        mend(advice) {}
+  std::string where, problem, mend;
 };
 
-// The work failed half-way (device lost, disk full, diverged). Same form.
-struct WorkError : std::runtime_error {
-  WorkError(const std::string& where, const std::string& what, const std::string& mend)
-      : std::runtime_error(core::printable(where + ": " + what + "; " + mend)) {}
+// The request or its input is wrong; nothing was written.
+struct InputError : Error {
+  using Error::Error;
+};
+
+// The work failed half-way (device lost, disk full, diverged); what exists is kept.
+struct WorkError : Error {
+  using Error::Error;
 };
 
 // Thrown by long work when stop_requested() turns true, after it has left a checkpoint.
@@ -61,19 +70,39 @@ struct Progress {
   std::string note;   // what is being done, a few words
 };
 
-// Where warnings and progress go. Set once by the tool; the default swallows both. Thread-safe to call.
+// Who is told of long work, and may stop it. What is empty is not told. One thread at a time calls these; they must not
+// call warn(), say(), say_more() or report() themselves.
 struct Listener {
-  std::function<void(const std::string&)> warning;
+  std::function<void(const std::string&)> warning;  // one line, what was assumed
   std::function<void(const Progress&)> progress;
+  std::function<void(const std::string&)> message;  // one line, what was found or done
+  std::function<void(const std::string&)> detail;   // the same for who wants to know more: seconds of a stage, the device
+  std::function<bool()> stop;  // asked after every progress: true ends the work as SIGINT does, with a checkpoint
 };
+// One listener for the whole process; the default hears nothing. Thread-safe.
 void set_listener(Listener listener);
-void warn(const std::string& line);  // one line, says what was assumed
+// Listens for as long as it lives, then the listener before does again. A stop that `listener` asked for ends with it.
+class ListenerScope {
+ public:
+  explicit ListenerScope(Listener listener);
+  ~ListenerScope();
+  ListenerScope(const ListenerScope&) = delete;
+  ListenerScope& operator=(const ListenerScope&) = delete;
+
+ private:
+  Listener before_;
+  bool may_stop_;
+};
+void warn(const std::string& line);
+void say(const std::string& line);
+void say_more(const std::string& line);
 void report(const Progress& progress);
 
 // Set by the signal handler of the tool; long work polls it between steps.
 void request_stop(int signal) noexcept;
 int stop_requested() noexcept;  // 0 or the signal
 void clear_stop() noexcept;
+void stop_if_requested();  // throws Interrupted
 
 // Number of host threads for parallel_for: --threads, else the number of cores. Results never depend on it.
 void set_threads(int threads);
@@ -84,6 +113,8 @@ void parallel_for(std::int64_t count, const std::function<void(std::int64_t)>& b
 // Writes `bytes` as `path` in one step (temporary file in the same folder, fsync, rename). Throws WorkError (disk full,
 // ...).
 void write_file(const Path& path, std::string_view bytes);
+// Makes a folder and those above it. Throws WorkError.
+void make_folder(const Path& folder);
 // The whole file. Throws InputError naming `path` when it is missing, unreadable or larger than 1 GiB (a pipe or device
 // may never end).
 std::string read_file(const Path& path);
@@ -108,6 +139,8 @@ std::vector<double> table_numbers(const Path& file, const TableLine& line, std::
 std::string exact(double value);
 // Seconds on a steady clock since an arbitrary origin.
 double seconds_now();
+// Gives memory that was freed back to the system, where it can be told to.
+void trim_memory();
 // 64-bit FNV-1a, for capture hashes and checkpoints' checksums.
 std::uint64_t fnv1a(std::string_view bytes, std::uint64_t hash = 14695981039346656037ull);
 
