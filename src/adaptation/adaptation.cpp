@@ -21,12 +21,12 @@ Adaptation::Adaptation(const chain::Chain& chain, const dynamics::Parameters& pa
     : chain_(chain), first_(parameters), now_(parameters), known_(estimates), options_(options) {
   const auto size = static_cast<Eigen::Index>(estimates.names.size());
   if (size == 0 || !math::is_covariance(estimates.covariance) || estimates.covariance.rows() != size)
-    throw InputError("identify --online", "the twin knows no covariance of its parameters", "identify it first");
-  if (!(options.memory > 0.0)) throw InputError("--memory", "is not above 0", "give seconds, for example 5");
+    throw InputError("`online`", "the twin knows no covariance of its parameters", "identify it first");
+  if (!(options.memory > 0.0)) throw InputError("`memory`", "is not above 0", "give seconds, for example 5");
   const auto all = dynamics::tangents(chain, parameters, estimates.names);
   for (Eigen::Index i = 0; i < size; ++i)
     if (dynamics::is_parameter(all[i])) places_.push_back(i), names_.push_back(estimates.names[i]);
-  if (places_.empty()) throw InputError("identify --online", "the twin has no parameter to adapt", "identify it first");
+  if (places_.empty()) throw InputError("`online`", "the twin has no parameter to adapt", "identify it first");
   // a diverging sensitivity of the Euler step is no use here: the variational equation needs RODAS3
   now_.integrator = dynamics::Integrator::rodas3;
   first_ = now_;
@@ -117,18 +117,18 @@ bool Adaptation::observe(const Observation& seen, const dynamics::BaseFunction& 
   const int n = chain_.angles();
   if (seen.theta.size() != n || (seen.thetadot.size() && seen.thetadot.size() != n) ||
       (seen.sigma.size() && seen.sigma.size() != n))
-    throw InputError("identify --online",
+    throw InputError("`online`",
                      "a frame has " + std::to_string(seen.theta.size()) + " angles, the twin " + std::to_string(n),
                      "give what 'estimate' prints for this rope");
   if (!std::isfinite(seen.time) || !seen.theta.allFinite() || !seen.thetadot.allFinite() || !seen.sigma.allFinite())
-    throw InputError("identify --online", "a number of the frame at " + core::exact(seen.time) + " s is not finite",
+    throw InputError("`online`", "a number of the frame at " + core::exact(seen.time) + " s is not finite",
                      "leave lost frames out");
   if ((seen.sigma.array() < 0.0).any())
-    throw InputError("identify --online",
+    throw InputError("`online`",
                      "a standard deviation of the frame at " + core::exact(seen.time) + " s is negative",
                      "give what 'estimate' prints for this rope");
   if (started_ && !(seen.time > time_))
-    throw InputError("identify --online", "times go backwards at " + core::exact(seen.time) + " s",
+    throw InputError("`online`", "times go backwards at " + core::exact(seen.time) + " s",
                      "give the frames in their order");
   if (!started_ || seen.time - time_ > options_.longest_gap) {
     restarts_ += started_;
@@ -159,7 +159,7 @@ bool Adaptation::observe(const Observation& seen, const dynamics::BaseFunction& 
   rejected_in_a_row_ = 0;
   const Eigen::LDLT<MatrixX> factor(spread);
   if (!math::is_positive(factor))
-    throw InputError("identify --online", "the standard deviations at " + core::exact(seen.time) + " s are too large",
+    throw InputError("`online`", "the standard deviations at " + core::exact(seen.time) + " s are too large",
                      "leave frames out that tell nothing");
   const MatrixX gain = factor.solve(covariance_.topRows(n)).transpose();
   const VectorX step = gain * innovation;

@@ -2,7 +2,7 @@
 //
 // A reader takes bytes as they come from outside. It may throw InputError (and WorkError where its header says so);
 // anything else, a crash, five seconds or a gigabyte are defects. What is accepted is written and read again where that
-// is cheap. Readers that live in unnamed namespaces of tools/chainsplat/*.cpp are reached by including that file.
+// is cheap. Readers that live in unnamed namespaces are reached by including that file.
 #pragma once
 #include <string_view>
 

@@ -9,7 +9,7 @@ void metrics(std::string_view bytes) {
     std::filesystem::create_directories(folder() / "metrics");
     return folder() / "metrics";
   }();
-  put(run / tools::kMetricsFile, bytes);
+  put(run / pipeline::kMetricsFile, bytes);
   const tools::Json read = tools::mean_metrics(run);
   tools::Comparison comparison;
   tools::compare_metrics(comparison, read, tools::Json::object());

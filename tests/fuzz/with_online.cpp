@@ -1,6 +1,7 @@
 // The lines of estimate as identify --online reads them.
 #include "readers.h"
-#include "tools/chainsplat/online.cpp"
+#include "chainsplat/adaptation.h"
+#include "chainsplat/estimate_lines.h"
 
 namespace chainsplat::fuzz {
 
@@ -12,13 +13,9 @@ void online(std::string_view bytes) {
   known.covariance = math::MatrixX::Constant(1, 1, 0.01);
   static const adaptation::Adaptation fresh(two_joints(), parameters_of_two_joints(), known, {});
   adaptation::Observation seen;
-#if __has_include("tools/chainsplat/estimate_lines.h")
-  const auto line = tools::read_estimate_line(std::string(bytes), "line", two_joints().angles(), -1e300);
+  const auto line = estimation::read_estimate_line(std::string(bytes), "line", two_joints().angles(), -1e300);
   if (!line) return;
   seen = {line->time, line->theta, line->thetadot, line->sigma};
-#else
-  if (!tools::read_line(std::string(bytes), "line", seen)) return;
-#endif
   adaptation::Adaptation adaptation = fresh;
   adaptation.observe(seen, [](double) { return dynamics::at_rest({}); });
 }

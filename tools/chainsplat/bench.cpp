@@ -19,13 +19,12 @@
 
 #include "chainsplat/estimation.h"
 #include "chainsplat/eval.h"
+#include "chainsplat/pipeline.h"
 #include "chainsplat/recognition.h"
 #include "chainsplat/render.h"
+#include "chainsplat/run_folder.h"
 #include "chainsplat/splat.h"
 #include "cli.h"
-#include "identify.h"
-#include "memory.h"
-#include "run_folder.h"
 
 namespace chainsplat::tools {
 
@@ -177,7 +176,7 @@ double peak_memory_mib() {
 // What the process holds now, MiB; 0 where the system does not say. What was freed is handed back first: how much of it
 // malloc keeps for later changes from time to time.
 double memory_mib() {
-  trim_memory();
+  core::trim_memory();
   std::ifstream file("/proc/self/statm");
   double all = 0.0, resident = 0.0;
   file >> all >> resident;
@@ -298,11 +297,11 @@ Json bench_capture(gpu::Device& device, const Path& folder, std::uint64_t seed) 
   options.seed = seed;
   recognition::Result found = recognition::recognize(device, capture, options);
   lap("recognize");
-  twin::Twin twin = twin_in_scene(capture);
+  twin::Twin twin = pipeline::twin_in_scene(capture);
   twin.chain = std::move(found.chain);
   twin.gaussians = std::move(found.gaussians);
   twin.states = std::move(found.states);
-  identify_stage(twin, capture.base, found.covariances, false, seed);
+  pipeline::identify_states(twin, capture.base, found.covariances, false, seed);
   lap("identify");
   {
     const capture::Capture recorded = capture::load_recorded(capture, folder);

@@ -1,12 +1,14 @@
 // chainsplat.cpp - the program: global options, commands, and what becomes of an error.
+#include <malloc.h>
+
 #include <CLI/CLI.hpp>
 #include <csignal>
 #include <cstdio>
 #include <cstdlib>
 #include <system_error>
 
+#include "chainsplat/run_folder.h"
 #include "cli.h"
-#include "memory.h"
 
 using namespace chainsplat;
 
@@ -14,8 +16,17 @@ namespace {
 
 constexpr int kDone = 0, kWorkFailed = 1, kWrongRequest = 2;
 
+// Memory that short-lived threads have freed stays in their arenas: 0.8 MiB more a training in one process with glibc's
+// eight a core, 0.1 MiB with one.
+void keep_memory_together() {
+#ifdef __GLIBC__
+  mallopt(M_ARENA_MAX, 1);
+#endif
+}
+
 // The one line that every failure ends with.
-int fail(int code, std::string text) {
+int fail(int code, const std::string& message) {
+  std::string text = tools::with_options(message);
   for (char& letter : text)
     if (letter == '\n' || letter == '\r') letter = ' ';
   if (text.starts_with(": ")) text.insert(0, "''");  // an empty file name
@@ -109,7 +120,7 @@ int run(int argc, char** argv) {
   // the CPU driver of Mesa has threads of its own
   if (globals.threads > 0) setenv("LP_NUM_THREADS", std::to_string(globals.threads).c_str(), 0);
   if (!globals.log.empty()) {
-    tools::check_output_file(globals.log);
+    pipeline::check_output_file(globals.log);
     tools::log_to(globals.log);
   }
   job();
@@ -121,7 +132,7 @@ int run(int argc, char** argv) {
 }  // namespace
 
 int main(int argc, char** argv) {
-  tools::keep_memory_together();
+  keep_memory_together();
   tools::prepare_output();
   std::signal(SIGXFSZ, SIG_IGN);  // a file size limit is an error of write(), not an end without a word
   try {

@@ -2,7 +2,6 @@
 #pragma once
 #include <cstdint>
 #include <functional>
-#include <iosfwd>
 #include <string>
 #include <vector>
 
@@ -10,6 +9,9 @@
 
 namespace CLI {
 class App;
+}
+namespace chainsplat::eval {
+struct FrameMetrics;
 }
 
 namespace chainsplat::tools {
@@ -42,8 +44,11 @@ void add_mask_command(CLI::App& app, const Globals& globals, Job& job);
 void add_bench_command(CLI::App& app, const Globals& globals, Job& job);
 
 // --- progress.cpp --------------------------------------------------------------------------------
-// Warnings and progress go to standard error from now on: a redrawn line on a terminal, else a plain line every 5 s.
+// Warnings, messages and progress go to standard error from now on, progress as a redrawn line on a terminal, else as a
+// plain line every 5 s.
 void start_listening(const Globals& globals);
+// The same, for a call of the library.
+core::Listener terminal();
 // One JSON record an interval is added to `file` from now on. Throws InputError when it cannot be opened.
 void log_to(const Path& file);
 void end_progress();                     // leaves the redrawn line
@@ -58,30 +63,26 @@ void prepare_output();
 // What was printed is out. Throws Interrupted (SIGPIPE) where nobody reads it any more, else WorkError.
 void flush_output();
 
+// --- options.cpp ----------------------------------------------------------------------------------
+// A text of the library, in which fields of options structs stand in backquotes, with the options of the command line
+// in their place: `frames` becomes --frames.
+std::string with_options(const std::string& text);
+
 // --- results.cpp --------------------------------------------------------------------------------
 // "-" is standard input.
 Path input_path(const std::string& name);
-// The next line; false at the end. Throws InputError where it is longer than any that is meant (a device may never end
-// one).
-bool next_line(std::istream& in, std::string& line, const std::string& where);
 // "X,Y,Z": numbers between commas, `count` of them (0: one or more). Throws InputError with `where`.
 std::vector<double> numbers(const std::string& text, const std::string& where, std::size_t count);
 // Writes `bytes` to standard output ("-"), into a device or pipe that exists, else as a file in one step.
 void write_result(const std::string& name, const std::string& bytes);
-// Throws InputError unless `folder` can be filled: it is absent or empty, or `overwrite`. Makes nothing.
-void check_output_folder(const Path& folder, bool overwrite, const std::string& mend);
-// Throws InputError where `folder`, that results go to, is the folder of the capture they are made from.
-void check_not_capture(const Path& folder, const Path& capture);
-// Throws InputError unless `file` can be made: its folder exists and it is no folder itself.
-void check_output_file(const std::string& file);
-// Makes a folder and those above it. Throws WorkError.
-void make_folder(const Path& folder);
-// What an error is once work has begun, an input's fault too: exit code 1, and `kept` says what there is.
-WorkError broken_off(const std::runtime_error& error, const std::string& kept);
 // CAPTURE[:camera] as the two; the second is empty for all cameras. A folder whose own name has a colon is taken as it
 // is.
 std::pair<std::string, std::string> split_camera(const std::string& text);
-// "A:B", "A:" or ":B" as [first, last); last = -1: to the end. Throws InputError; `where` says whose text it is.
-std::pair<int, int> parse_frames(const std::string& text, const std::string& where = "--frames");
+// One named row of metrics a line, with the head line; NaN as '-'.
+struct MetricsRow {
+  std::string name;
+  const eval::FrameMetrics* metrics;
+};
+std::string metrics_table(const std::vector<MetricsRow>& rows);
 
 }  // namespace chainsplat::tools

@@ -8,8 +8,8 @@
 #include <nlohmann/json.hpp>
 #include <set>
 
+#include "chainsplat/run_folder.h"
 #include "cli.h"
-#include "run_folder.h"
 
 namespace chainsplat::tools {
 
@@ -52,14 +52,15 @@ void compare_provenance(Comparison& out, const twin::Provenance& a, const twin::
   out.put("capture", a.capture, b.capture);
   out.put("capture hash", a.capture_hash, b.capture_hash);
   out.put("seed", std::to_string(a.seed), std::to_string(b.seed));
+  const std::map<std::string, std::string> options = option_texts(a), other_options = option_texts(b);
   std::set<std::string> names;
-  for (const auto& [name, value] : a.options) names.insert(name);
-  for (const auto& [name, value] : b.options) names.insert(name);
-  const auto get = [](const auto& options, const std::string& name) {
-    const auto at = options.find(name);
-    return at == options.end() ? std::string() : at->second.empty() ? std::string("(all)") : at->second;
+  for (const auto& [name, value] : options) names.insert(name);
+  for (const auto& [name, value] : other_options) names.insert(name);
+  const auto get = [](const auto& texts, const std::string& name) {
+    const auto at = texts.find(name);
+    return at == texts.end() ? std::string() : at->second.empty() ? std::string("(all)") : at->second;
   };
-  for (const std::string& name : names) out.put("option " + name, get(a.options, name), get(b.options, name));
+  for (const std::string& name : names) out.put("option " + name, get(options, name), get(other_options, name));
 }
 
 double rms_angle(const chain::States& a, const chain::States& b) {
@@ -120,10 +121,10 @@ void compare_chain(Comparison& out, const twin::Twin& a, const twin::Twin& b) {
 
 Json mean_metrics(const Path& run) {
   std::error_code error;
-  if (!fs::exists(run / kMetricsFile, error)) return Json::object();
-  const Json document = core::parse_json_or_discard(core::read_file(run / kMetricsFile));
+  if (!fs::exists(run / pipeline::kMetricsFile, error)) return Json::object();
+  const Json document = core::parse_json_or_discard(core::read_file(run / pipeline::kMetricsFile));
   const auto require = [&](bool sound, const std::string& what) {
-    if (!sound) throw InputError((run / kMetricsFile).string(), what, "run 'chainsplat eval' again");
+    if (!sound) throw InputError((run / pipeline::kMetricsFile).string(), what, "run 'chainsplat eval' again");
   };
   require(document.is_object(), "is not JSON or is cut off");
   Json means = Json::object();

@@ -7,11 +7,11 @@
 #include <memory>
 #include <nlohmann/json.hpp>
 
-#include "base_motion_files.h"
 #include "chainsplat/excitation.h"
+#include "chainsplat/motion_files.h"
+#include "chainsplat/run_folder.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
-#include "run_folder.h"
 
 namespace chainsplat::tools {
 
@@ -80,20 +80,20 @@ Json document_of(const excitation::Result& result, const Request& request) {
 void excite(const Globals& globals, Request& request) {
   watch_signals();
   excitation::Options& options = request.options;
-  check_rate(request.rate, options.duration, "give rows a second, for example 100");
+  planning::check_rate(request.rate, options.duration, "give rows a second, for example 100");
   options.seed = globals.seed;
-  if (!request.axes.empty()) options.axes = parse_axes(request.axes);
+  if (!request.axes.empty()) options.axes = planning::parse_axes(request.axes);
   const Path out = request.out;
   const bool single = out.extension() == ".tum";
   if (single)
-    check_output_file(request.out);
+    pipeline::check_output_file(request.out);
   else
-    check_output_folder(request.out, request.force, "name another folder or give --force to write into it");
+    pipeline::check_output_folder(request.out, request.force, "name another folder or give --force to write into it");
 
-  const twin::Twin twin = load_twin(request.run);
-  const trajectory::Trajectory base = own_base(request.run);
+  const twin::Twin twin = pipeline::load_twin(request.run);
+  const trajectory::Trajectory base = pipeline::own_base(request.run);
   excitation::Problem problem;
-  problem.model = model_of(twin, request.run);
+  problem.model = pipeline::model_of(twin, request.run);
   problem.tabletop = twin.tabletop;
   problem.base = base.pose(base.start());
   problem.estimates = twin.estimates;
@@ -116,14 +116,14 @@ void excite(const Globals& globals, Request& request) {
 
   const excitation::Result result = excitation::excite(problem, options);
   end_progress();
-  const std::vector<double> times = row_times(options.duration, request.rate);
+  const std::vector<double> times = planning::row_times(options.duration, request.rate);
   const Json document = document_of(result, request);
   const auto beside = [&](const char* name, const char* extension) {
     return single ? Path(out).replace_extension(extension) : out / name;
   };
-  if (!single) make_folder(out);
-  core::write_file(beside("base.tum", ".tum"), motion_tum(result.motion, times));
-  core::write_file(beside("base.csv", ".csv"), motion_csv(result.motion, times));
+  if (!single) core::make_folder(out);
+  core::write_file(beside("base.tum", ".tum"), planning::motion_tum(result.motion, times));
+  core::write_file(beside("base.csv", ".csv"), planning::motion_csv(result.motion, times));
   if (!single) {
     core::write_file(out / "states.csv", twin::states_csv(result.states));
     core::write_file(out / "excite.json", document.dump(1) + "\n");

@@ -10,11 +10,11 @@
 #include <memory>
 #include <sstream>
 
+#include "chainsplat/estimate_lines.h"
 #include "chainsplat/force.h"
+#include "chainsplat/run_folder.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
-#include "estimate_lines.h"
-#include "run_folder.h"
 
 namespace chainsplat::tools {
 
@@ -38,7 +38,7 @@ struct State {
 // A line of `estimate`; none where it is lost. `before`: time of the state before.
 std::optional<State> read_estimate(const std::string& text, const std::string& where, const chain::Chain& chain,
                                    double before) {
-  const std::optional<EstimateLine> line = read_estimate_line(text, where, chain.angles(), before);
+  const std::optional<estimation::EstimateLine> line = estimation::read_estimate_line(text, where, chain.angles(), before);
   if (!line) return {};
   State out{line->time, line->theta, {}};
   if (line->sigma.size() == 0) return out;  // as estimate's solver adam writes it
@@ -59,7 +59,7 @@ void each_state(const ForceRequest& request, const chain::Chain& chain, const st
   double before = -std::numeric_limits<double>::infinity();
   std::optional<bool> known;  // whether the lines have deviations
   std::string line;
-  for (int number = 1; next_line(in, line, request.estimate); ++number) {
+  for (int number = 1; estimation::next_line(in, line, request.estimate); ++number) {
     if (line.empty()) continue;
     const auto state = read_estimate(line, request.estimate + ": line " + std::to_string(number), chain, before);
     if (!state) continue;
@@ -133,9 +133,9 @@ void force(const Globals& globals, const ForceRequest& request) {
     throw InputError("--json", "force writes one JSON line a time step, not one document", "leave it out");
   if (request.states.empty() == request.estimate.empty())
     throw InputError("--states, --estimate", "one of the two is needed", "give the angles over time");
-  const twin::Twin twin = load_twin(request.run);
-  const dynamics::Model model = model_of(twin, request.run);
-  const trajectory::Trajectory base = request.base.empty() ? own_base(request.run) : read_base(request.base);
+  const twin::Twin twin = pipeline::load_twin(request.run);
+  const dynamics::Model model = pipeline::model_of(twin, request.run);
+  const trajectory::Trajectory base = request.base.empty() ? pipeline::own_base(request.run) : pipeline::read_base(input_path(request.base));
   if (request.base.empty()) core::warn("--base: is missing; the base motion of the twin's own capture is assumed");
   const std::string source = request.estimate.empty() ? request.states : request.estimate;
   const std::string where = !request.hand.empty()                            ? request.hand
@@ -205,7 +205,7 @@ void force(const Globals& globals, const ForceRequest& request) {
       for (const force::Estimate& line : force::finish(live)) write(line);
     } catch (const InputError& error) {
       if (lines == 0) throw;
-      throw broken_off(error, "the lines so far are kept");
+      throw pipeline::broken_off(error, "the lines so far are kept");
     }
     if (live.contact) check_near();
   } else {

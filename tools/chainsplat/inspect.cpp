@@ -42,7 +42,7 @@ void check(const Globals& globals, const std::string& path) {
 void doctor(const Globals& globals) {
   const gpu::Doctor found = gpu::examine(globals.device);
   if (!globals.json) {
-    std::cout << "chainsplat " CHAINSPLAT_VERSION "\n" << gpu::doctor_text(found);
+    std::cout << "chainsplat " CHAINSPLAT_VERSION "\n" << with_options(gpu::doctor_text(found));
     return;
   }
   Json document;
@@ -67,7 +67,7 @@ void doctor(const Globals& globals) {
     document["devices"].push_back(entry);
   }
   document["chosen"] = found.chosen >= 0 ? Json(found.chosen) : Json(nullptr);
-  document["reason"] = found.reason;
+  document["reason"] = with_options(found.reason);
   document["missing"] = found.missing;
   document["validation_layer"] = found.validation_layer;
   document["pipeline_cache"] = found.pipeline_cache;

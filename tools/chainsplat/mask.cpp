@@ -11,6 +11,7 @@
 
 #include "chainsplat/capture.h"
 #include "chainsplat/masking.h"
+#include "chainsplat/run_folder.h"
 #include "cli.h"
 
 namespace chainsplat::tools {
@@ -149,7 +150,7 @@ double iou(const capture::Image8& mask, const capture::Image8& other) {
 }
 
 void make_masks(const Globals& globals, const Request& request) {
-  const auto [first, last] = parse_frames(request.frames);
+  const auto [first, last] = capture::read_frame_range(request.frames, "--frames");
   const bool in_place = request.out.empty();
   if (in_place && !request.frames.empty())
     throw InputError("--frames", "a capture needs a mask of every frame", "give -o FOLDER for some of them");
@@ -188,7 +189,7 @@ void make_masks(const Globals& globals, const Request& request) {
   if (in_place && ::access(scene.folder.c_str(), W_OK) != 0)
     throw InputError(scene.folder.string(), "cannot be written", "give -o FOLDER");
   if (!in_place)
-    check_output_folder(request.out, request.force, "use --force to write into it, or name another folder");
+    pipeline::check_output_folder(request.out, request.force, "use --force to write into it, or name another folder");
   const std::size_t cameras = scene.cameras.size();
   // a link can lead out of the folder, and neither is a mask written there nor read from there
   const Path into_folder = in_place ? scene.folder : Path(request.out);
@@ -211,7 +212,7 @@ void make_masks(const Globals& globals, const Request& request) {
         ++agreement.frames[camera];
       }
     }
-    make_folder(target.parent_path());
+    core::make_folder(target.parent_path());
     capture::write_png(target, mask);
   };
 

@@ -7,14 +7,12 @@
 #include <memory>
 #include <nlohmann/json.hpp>
 
-#include "base_motion_files.h"
 #include "chainsplat/capture.h"
-#include "chainsplat/dynamics.h"
+#include "chainsplat/pipeline.h"
 #include "chainsplat/render.h"
+#include "chainsplat/run_folder.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
-#include "picture.h"
-#include "run_folder.h"
 
 namespace chainsplat::tools {
 
@@ -23,65 +21,22 @@ namespace {
 namespace fs = std::filesystem;
 using Json = nlohmann::ordered_json;
 
-constexpr double kTimeSlack = 1e-6;  // s: times in text files are rounded
-
 struct RolloutRequest {
   std::string run, base, out, centerline, initial;
   double rate = 30.0;
 };
 
-// Where the rollout starts (INTERFACE 1, rollout).
-dynamics::InitialState start_of(const RolloutRequest& request, const twin::Twin& twin, const dynamics::Model& model,
-                                const trajectory::Trajectory& base) {
-  const int angles = twin.chain.angles();
-  dynamics::InitialState initial;
-  initial.time = base.start();
-  initial.thetadot = math::VectorX::Zero(angles);
-  if (!request.initial.empty()) {
-    const chain::States given = twin::read_states(input_path(request.initial), angles);
-    if (given.time.empty()) throw InputError(request.initial, "has no rows", "give at least one");
-    // the states of the twin's own motion keep their time
-    if (request.base.empty() && given.time[0] >= base.start() && given.time[0] < base.end())
-      initial.time = given.time[0];
-    initial.theta = given.theta[0];
-    if (!given.thetadot.empty())
-      initial.thetadot = given.thetadot[0];
-    else
-      core::warn(request.initial + ": no thetadot columns; the rope is assumed to start at rest");
-  } else if (request.base.empty()) {
-    if (!twin.initial)
-      throw InputError(request.run + "/twin.json", "has no initial state",
-                       "run 'chainsplat identify' or give --initial");
-    initial = *twin.initial;
-  } else if (twin.tabletop) {
-    if (!twin.initial && twin.states.theta.empty())
-      throw InputError(request.run, "holds no state to start from on the table", "give --initial");
-    initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
-  } else {
-    initial.theta = dynamics::static_equilibrium(model, base.pose(base.start()));
-  }
-  return initial;
-}
-
 void rollout(const Globals& globals, const RolloutRequest& request) {
-  constexpr const char* kExample = "give rows a second, for example 30";
-  check_rate(request.rate, 0.0, kExample);
+  pipeline::RolloutOptions options;
+  if (!request.base.empty()) options.base = input_path(request.base);
+  if (!request.initial.empty()) options.initial = input_path(request.initial);
+  options.rate = request.rate;
+  options.check();
   if (globals.json && (request.out == "-" || request.centerline == "-"))
     throw InputError("--json", "standard output is wanted by '-' too", "name a file");
-  check_output_file(request.out);
-  if (!request.centerline.empty()) check_output_file(request.centerline);
-  const twin::Twin twin = twin::load(request.run);
-  const dynamics::Model model = model_of(twin, request.run);
-  const trajectory::Trajectory base = request.base.empty() ? own_base(request.run) : read_base(request.base);
-  const dynamics::InitialState initial = start_of(request, twin, model, base);
-  check_rate(request.rate, base.end() - initial.time, kExample);
-  std::vector<double> times;
-  for (int k = 0; initial.time + k / request.rate <= base.end() + kTimeSlack; ++k)
-    times.push_back(initial.time + k / request.rate);
-  if (times.empty())
-    throw InputError(request.base.empty() ? request.run : request.base, "the base motion ends before the start",
-                     "give a base motion that goes on after it");
-  const chain::States states = dynamics::rollout(model, base, initial, times);
+  pipeline::check_output_file(request.out);
+  if (!request.centerline.empty()) pipeline::check_output_file(request.centerline);
+  const auto [twin, base, states] = pipeline::rollout(request.run, options, terminal());
   write_result(request.out, twin::states_csv(states));
   if (!request.centerline.empty()) write_result(request.centerline, twin::centerline_csv(twin.chain, states, base));
   if (!globals.json) {
@@ -102,27 +57,6 @@ struct RenderRequest {
   bool mask = false, depth = false, undistorted = false, force = false;
 };
 
-std::vector<float> whole_depth(const render::Frame& frame, const capture::Camera& camera) {
-  std::vector<float> meters(static_cast<std::size_t>(camera.width) * camera.height, 0.0f);
-  const splat::Picture& p = frame.picture;
-  for (int y = std::max(0, -frame.y0); y < p.height && frame.y0 + y < camera.height; ++y)
-    for (int x = std::max(0, -frame.x0); x < p.width && frame.x0 + x < camera.width; ++x)
-      meters[static_cast<std::size_t>(frame.y0 + y) * camera.width + frame.x0 + x] =
-          p.depth[static_cast<std::size_t>(y) * p.width + x];
-  return meters;
-}
-
-capture::Image8 whole_mask(const render::Frame& frame, const capture::Camera& camera) {
-  capture::Image8 mask{camera.width, camera.height, 1, {}};
-  mask.pixels.assign(static_cast<std::size_t>(camera.width) * camera.height, 0);
-  const splat::Picture& p = frame.picture;
-  for (int y = std::max(0, -frame.y0); y < p.height && frame.y0 + y < camera.height; ++y)
-    for (int x = std::max(0, -frame.x0); x < p.width && frame.x0 + x < camera.width; ++x)
-      if (p.rgba[4 * (static_cast<std::size_t>(y) * p.width + x) + 3] >= 0.5f)
-        mask.pixels[static_cast<std::size_t>(frame.y0 + y) * camera.width + frame.x0 + x] = 255;
-  return mask;
-}
-
 std::string frame_name(int frame, const char* ending) {
   char text[64];
   std::snprintf(text, sizeof text, "%06d%s", frame, ending);
@@ -134,29 +68,29 @@ void render(const Globals& globals, const RenderRequest& request) {
   const bool video = out.extension() == ".mp4";
   const auto [folder, camera_name] = split_camera(request.camera);
   if (video) {
-    check_output_file(request.out);
+    pipeline::check_output_file(request.out);
     if (request.mask || request.depth)
       throw InputError("--mask, --depth", "go with a folder of frames, not with a video",
                        "let -o end in another way than .mp4");
   } else {
-    check_output_folder(out, request.force, "name another folder or give --force to write into it");
+    pipeline::check_output_folder(out, request.force, "name another folder or give --force to write into it");
   }
-  const twin::Twin twin = load_twin(request.run);
-  check_drawable(twin, request.run);
+  const twin::Twin twin = pipeline::load_twin(request.run);
+  pipeline::check_drawable(twin, request.run);
   const chain::States states =
       request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
   capture::LoadOptions load;
   load.images = false;
   load.camera = camera_name;
   const capture::Capture capture = capture::load(folder, load);
-  const trajectory::Trajectory base = request.base.empty() ? capture.base : read_base(request.base);
+  const trajectory::Trajectory base = request.base.empty() ? capture.base : pipeline::read_base(input_path(request.base));
   if (video && capture.cameras.size() != 1)
     throw InputError(request.camera, "has " + std::to_string(capture.cameras.size()) + " cameras and a video shows one",
                      "name it, for example " + folder + ":" + capture.cameras.front().name);
   if (!video) {
-    check_not_capture(out, capture.folder);
+    pipeline::check_not_capture(out, capture.folder);
     for (const capture::Camera& camera : capture.cameras)
-      check_output_folder(out / camera.name, true, "");  // may be a file
+      pipeline::check_output_folder(out / camera.name, true, "");  // may be a file
   }
   // before the first camera's frames are written
   for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
@@ -182,19 +116,19 @@ void render(const Globals& globals, const RenderRequest& request) {
         render::frames(engine, twin.gaussians, twin.chain, states, base, camera, static_cast<int>(c), times, options);
     if (video) {
       std::vector<capture::Image8> images;
-      for (const render::Frame& frame : frames) images.push_back(whole_image(frame, camera));
+      for (const render::Frame& frame : frames) images.push_back(render::color_image(frame, camera));
       const double rate = times.size() > 1 ? double(times.size() - 1) / (times.back() - times.front()) : 30.0;
       capture::write_video(out, rate, images);
     } else {
-      make_folder(out / camera.name);
+      core::make_folder(out / camera.name);
       for (std::size_t f = 0; f < frames.size(); ++f) {
         const render::Frame& frame = frames[f];
         const Path stem = out / camera.name;
-        capture::write_png(stem / frame_name(frame.frame, ".png"), whole_image(frame, camera));
-        if (request.mask) capture::write_png(stem / frame_name(frame.frame, ".mask.png"), whole_mask(frame, camera));
+        capture::write_png(stem / frame_name(frame.frame, ".png"), render::color_image(frame, camera));
+        if (request.mask) capture::write_png(stem / frame_name(frame.frame, ".mask.png"), render::mask_image(frame, camera));
         if (request.depth)
           capture::write_depth_exr(stem / frame_name(frame.frame, ".depth.exr"), camera.width, camera.height,
-                                   whole_depth(frame, camera));
+                                   render::depth_image(frame, camera));
         core::report({"write " + camera.name, static_cast<std::int64_t>(f + 1),
                       static_cast<std::int64_t>(frames.size()), NAN, NAN, ""});
       }

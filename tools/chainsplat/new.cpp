@@ -4,14 +4,14 @@
 #include <memory>
 #include <nlohmann/json.hpp>
 
-#include "chainsplat/twin.h"
+#include "chainsplat/pipeline.h"
+#include "chainsplat/run_folder.h"
 #include "cli.h"
 
 namespace chainsplat::tools {
 
 namespace {
 
-constexpr int kMostJoints = 64;
 constexpr double kPerpendicular = 1e-6;  // largest cosine between direction and bending axis that is taken as 0
 
 struct Request {
@@ -55,7 +55,7 @@ void make_new(const Globals& globals, const Request& request) {
     throw InputError("--bending-stiffness", "moves nothing without a mass", "give --mass too");
   if (request.retardation > 0.0 && request.bending_stiffness < 0.0)
     throw InputError("--retardation", "is damping over stiffness, and there is none", "give --bending-stiffness too");
-  check_output_folder(request.out, request.force, "name another folder, or give --force");
+  pipeline::check_output_folder(request.out, request.force, "name another folder, or give --force");
   const math::Vector3 direction = unit_of(request.direction, "--direction");
   math::Vector3 bending_axis;
   if (request.bending_axis.empty()) {
@@ -74,7 +74,7 @@ void make_new(const Globals& globals, const Request& request) {
   twin.chain = chain::make_chain(request.length, request.diameter, direction, bending_axis, request.joints,
                                  request.bending == "planar" ? chain::Bending::planar : chain::Bending::spatial, false);
   twin.known_mass = request.mass > 0.0;
-  if (twin.known_mass) twin.provenance.options["mass"] = core::exact(request.mass);
+  if (twin.known_mass) twin.provenance.mass = request.mass;
   if (request.bending_stiffness >= 0.0) twin.parameters = rod(twin.chain, request, twin.gravity);
   twin.provenance.version = CHAINSPLAT_VERSION;
   twin.provenance.seed = globals.seed;
@@ -105,7 +105,7 @@ void add_new_command(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("M");
   command->add_option("--diameter", request->diameter, "m (default 0.02)")->check(CLI::PositiveNumber)->type_name("M");
   command->add_option("--joints", request->joints, "Joints along the rope (default 8)")
-      ->check(CLI::Range(1, kMostJoints))
+      ->check(CLI::Range(1, pipeline::kMostJoints))
       ->type_name("N");
   command->add_option("--bending", request->bending, "Axes a joint: planar (one) or spatial (two, default)")
       ->check(CLI::IsMember({"planar", "spatial"}))

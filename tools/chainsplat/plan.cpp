@@ -9,13 +9,13 @@
 #include <memory>
 #include <nlohmann/json.hpp>
 
-#include "base_motion_files.h"
 #include "chainsplat/capture.h"
 #include "chainsplat/estimation.h"
+#include "chainsplat/motion_files.h"
 #include "chainsplat/planning.h"
+#include "chainsplat/run_folder.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
-#include "run_folder.h"
 
 namespace chainsplat::tools {
 
@@ -108,7 +108,7 @@ planning::Problem make_problem(const PlanRequest& request, const twin::Twin& twi
   problem.model = dynamics::make_model(twin.chain, parameters);
   problem.tabletop = twin.tabletop;
   problem.table_point = twin.table_point;
-  const trajectory::Trajectory base = own_base(request.run);
+  const trajectory::Trajectory base = pipeline::own_base(request.run);
   problem.base = base.pose(base.start());
   problem.estimates = twin.estimates;
   const int angles = twin.chain.angles();
@@ -128,79 +128,6 @@ planning::Problem make_problem(const PlanRequest& request, const twin::Twin& twi
   return problem;
 }
 
-Json json_of(const math::Vector3& v) { return {v.x(), v.y(), v.z()}; }
-
-Json plan_json(const planning::Problem& problem, const planning::Options& options, const planning::Plan& plan,
-               const std::string& horizon) {
-  Json out;
-  out["targets"] = Json::array();
-  for (const math::Vector3& target : problem.targets) out["targets"].push_back(json_of(target));
-  // of several targets the worst
-  const planning::Hit* worst = &plan.hits.front();
-  for (const planning::Hit& hit : plan.hits)
-    if (hit.miss > worst->miss) worst = &hit;
-  out["miss"] = worst->miss;
-  out["miss_time"] = worst->time;
-  out["miss_point"] = json_of(worst->point);
-  out["reached"] = plan.reached;
-  if (!plan.reached) out["reason"] = plan.reason;
-  out["tolerance"] = options.tolerance;
-  if (plan.hits.size() > 1) {
-    out["hits"] = Json::array();
-    for (const planning::Hit& hit : plan.hits)
-      out["hits"].push_back({{"miss", hit.miss}, {"miss_time", hit.time}, {"miss_point", json_of(hit.point)}});
-  }
-  if (options.samples > 0) {
-    out["samples"] = options.samples;
-    out["expected_miss"] = worst->mean_miss;
-    out["worst_miss"] = worst->worst_miss;
-  }
-  const bool yaw = std::find(plan.motion.axes.begin(), plan.motion.axes.end(), Axis::yaw) != plan.motion.axes.end();
-  out["peak_velocity"] = plan.peaks.velocity;
-  out["peak_acceleration"] = plan.peaks.acceleration;
-  out["peak_jerk"] = plan.peaks.jerk;
-  out["peak_stroke"] = plan.peaks.stroke;
-  if (yaw) {
-    out["peak_yaw_velocity"] = plan.peaks.yaw_velocity;
-    out["peak_yaw_acceleration"] = plan.peaks.yaw_acceleration;
-    out["peak_yaw_jerk"] = plan.peaks.yaw_jerk;
-    out["peak_turn"] = plan.peaks.turn;
-  }
-  const planning::Limits& l = options.limits;
-  out["limits"] = {{"velocity", l.velocity}, {"acceleration", l.acceleration}, {"jerk", l.jerk}, {"stroke", l.stroke}};
-  if (yaw) {
-    out["limits"]["yaw_velocity"] = l.yaw_velocity;
-    out["limits"]["yaw_acceleration"] = l.yaw_acceleration;
-    out["limits"]["yaw_jerk"] = l.yaw_jerk;
-    out["limits"]["turn"] = l.turn;
-  }
-  constexpr const char* kNames[] = {"x", "y", "z", "yaw"};
-  out["axes"] = Json::array();
-  for (Axis axis : plan.motion.axes) out["axes"].push_back(kNames[static_cast<int>(axis)]);
-  out["horizon"] = horizon;
-  out["window"] = options.window == planning::Window::smooth ? "smooth" : "paper";
-  // a stretch for each target: rows of weights by axis
-  out["weights"] = Json::array();
-  out["terminal"] = Json::array();
-  out["stretches"] = Json::array();
-  for (const planning::Piece& piece : plan.motion.pieces) {
-    Json weights = Json::array(), terminal = Json::array();
-    for (Eigen::Index a = 0; a < piece.terminal.size(); ++a) {
-      Json row = Json::array();
-      for (int i = 0; i < planning::kBasisCount; ++i) row.push_back(piece.weights(i, a));
-      weights.push_back(row);
-      terminal.push_back(piece.terminal[a]);
-    }
-    out["weights"].push_back(weights);
-    out["terminal"].push_back(terminal);
-    out["stretches"].push_back({{"start", piece.start}, {"duration", piece.duration}});
-  }
-  out["starts"] = plan.starts;
-  out["iterations"] = plan.iterations;
-  out["seconds"] = plan.seconds;
-  return out;
-}
-
 // CHAIN.json is the chain object of a twin.json (INTERFACE 3), held as `twin`'s rope is: read as a twin of its own.
 dynamics::Model read_truth(const std::string& file, const Path& run) {
   Json chain;
@@ -214,7 +141,7 @@ dynamics::Model read_truth(const std::string& file, const Path& run) {
   document["chain"] = std::move(chain);
   for (const char* key : {"gaussians", "states", "rollout"}) document.erase(key);
   const Path folder = std::filesystem::temp_directory_path() / ("chainsplat_simulate_" + std::to_string(::getpid()));
-  make_folder(folder);
+  core::make_folder(folder);
   struct Remove {
     Path path;
     ~Remove() {
@@ -228,39 +155,17 @@ dynamics::Model read_truth(const std::string& file, const Path& run) {
     if (!truth.parameters) throw InputError(file, "has no masses, stiffness and damping", "give an identified chain");
     return dynamics::make_model(truth.chain, *truth.parameters);
   } catch (const InputError& error) {
-    // name the file that the user knows, not the copy: WHERE: WHAT; HOW TO MEND
-    const std::string text = error.what(), inner = (folder / "twin.json").string();
-    const std::size_t at = text.find(inner), where = text.find(": ", at == std::string::npos ? 0 : at + inner.size());
-    const std::size_t mend = text.rfind("; ");
-    if (at == std::string::npos || where == std::string::npos || mend == std::string::npos || where > mend) throw;
-    std::string place = file;
-    place.append(text, at + inner.size(), where - at - inner.size());
-    throw InputError(place, text.substr(where + 2, mend - where - 2), text.substr(mend + 2));
+    // name the file that the user knows, not the copy
+    const std::string copy = (folder / "twin.json").string();
+    if (!error.where.starts_with(copy)) throw;
+    throw InputError(file + error.where.substr(copy.size()), error.problem, error.mend);
   }
-}
-
-Json loop_json(const planning::LoopResult& loop, double tolerance) {
-  Json out{{"miss", loop.hit.miss},
-           {"miss_time", loop.hit.time},
-           {"miss_point", json_of(loop.hit.point)},
-           {"peak_velocity", loop.peaks.velocity},
-           {"peak_acceleration", loop.peaks.acceleration},
-           {"peak_jerk", loop.peaks.jerk}};
-  if (!loop.peaks.over.empty()) out["over_limit"] = loop.peaks.over;
-  if (loop.out_of_reach > tolerance) out["out_of_reach"] = loop.out_of_reach;
-  if (loop.replans > 0) {
-    out["replans"] = loop.replans;
-    out["mean_replan_seconds"] = loop.mean_replan;
-    out["longest_replan_seconds"] = loop.longest_replan;
-    out["foretold_miss"] = loop.foretold;
-  }
-  return out;
 }
 
 void plan(const Globals& globals, PlanRequest& request) {
   planning::Options& options = request.options;
   options.seed = globals.seed;
-  if (!request.axes.empty()) options.axes = parse_axes(request.axes);
+  if (!request.axes.empty()) options.axes = planning::parse_axes(request.axes);
   options.window = request.window == "paper" ? planning::Window::paper : planning::Window::smooth;
   constexpr double kLongestFree = 4.0;  // s, of a free horizon
   if (request.horizon == "free") {
@@ -280,7 +185,7 @@ void plan(const Globals& globals, PlanRequest& request) {
                      core::exact(request.loop.rate) + " replans a second are more than " + core::exact(kMostReplans) +
                          ", and each is an optimization",
                      "give for example 10");
-  check_rate(request.rate, options.horizon * static_cast<double>(request.targets.size()),
+  planning::check_rate(request.rate, options.horizon * static_cast<double>(request.targets.size()),
              "give rows a second, for example 100");
   if (!request.terminal.empty()) {
     const std::vector<double> values = numbers(request.terminal, "--terminal", 0);
@@ -295,8 +200,8 @@ void plan(const Globals& globals, PlanRequest& request) {
     options.boxes.push_back({{v[0], v[1], v[2]}, {v[3], v[4], v[5]}});
   }
   const std::string mend = "name another folder or give --force to write into it";
-  check_output_folder(request.out, request.force, mend);
-  const twin::Twin twin = load_twin(request.run);
+  pipeline::check_output_folder(request.out, request.force, mend);
+  const twin::Twin twin = pipeline::load_twin(request.run);
   planning::Problem problem = make_problem(request, twin);
   for (const std::string& text : request.targets) {
     const std::string random = "random:";
@@ -331,45 +236,42 @@ void plan(const Globals& globals, PlanRequest& request) {
   }
   const planning::Plan plan = planning::plan(problem, options);
   planning::Motion played = plan.motion;
-  Json simulated;
-  if (truth) {
-    request.loop.feedback = false;
-    simulated["without_feedback"] =
-        loop_json(planning::closed_loop(problem, options, plan, *truth, request.loop), options.tolerance);
-    if (request.mpc) {
-      request.loop.feedback = true;
-      const planning::LoopResult loop = planning::closed_loop(problem, options, plan, *truth, request.loop);
-      simulated["with_feedback"] = loop_json(loop, options.tolerance);
-      played = loop.motion;
-    }
+  std::vector<planning::Simulated> simulated;
+  const auto play = [&](const char* name, bool feedback) {
+    request.loop.feedback = feedback;
+    simulated.push_back({name, planning::closed_loop(problem, options, plan, *truth, request.loop)});
+  };
+  if (truth) play("without_feedback", false);
+  if (truth && request.mpc) {
+    play("with_feedback", true);
+    played = simulated.back().loop.motion;
   }
   const Path out = request.out;
-  make_folder(out);
-  const std::vector<double> times = row_times(plan.motion.end(), request.rate);
-  core::write_file(out / "base.tum", motion_tum(played, times));
-  core::write_file(out / "base.csv", motion_csv(played, times));
+  core::make_folder(out);
+  const std::vector<double> times = planning::row_times(plan.motion.end(), request.rate);
+  core::write_file(out / "base.tum", planning::motion_tum(played, times));
+  core::write_file(out / "base.csv", planning::motion_csv(played, times));
   core::write_file(out / "states.csv", twin::states_csv(planning::predict(problem, played, times)));
   core::write_file(out / "picture.svg", planning::picture_svg(problem, options, plan));
-  Json document = plan_json(problem, options, plan, request.horizon);
-  if (truth) document["simulated"] = simulated;
-  core::write_file(out / "plan.json", document.dump(1) + "\n");
+  const std::string document = planning::plan_json(problem, options, plan, request.horizon, simulated);
+  core::write_file(out / "plan.json", document);
   if (globals.json) {
-    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+    std::cout << document;
     return;
   }
   char text[256];
+  const planning::Hit& worst = planning::worst_hit(plan);
   std::snprintf(text, sizeof text, "%s: miss %.2f mm at %.2f s, peak %.2f m/s and %.1f m/s^2, %.2f s: %s",
-                plan.reached ? "reached" : "cannot reach", 1e3 * document["miss"].get<double>(),
-                document["miss_time"].get<double>(), plan.peaks.velocity, plan.peaks.acceleration, plan.seconds,
-                request.out.c_str());
+                plan.reached ? "reached" : "cannot reach", 1e3 * worst.miss, worst.time, plan.peaks.velocity,
+                plan.peaks.acceleration, plan.seconds, request.out.c_str());
   say(text);
   if (!plan.reached) say(plan.reason);
-  for (const auto& [name, loop] : simulated.items()) {
-    std::snprintf(text, sizeof text, "%s: miss %.2f mm", name.c_str(), 1e3 * loop["miss"].get<double>());
+  for (const auto& [name, loop] : simulated) {
+    std::snprintf(text, sizeof text, "%s: miss %.2f mm", name.c_str(), 1e3 * loop.hit.miss);
     say(text);
-    if (!loop.contains("out_of_reach")) continue;
+    if (!(loop.out_of_reach > options.tolerance)) continue;
     std::snprintf(text, sizeof text, "%s: the target moves at least %.1f mm out of reach", name.c_str(),
-                  1e3 * loop["out_of_reach"].get<double>());
+                  1e3 * loop.out_of_reach);
     say(text);
   }
 }

@@ -10,14 +10,13 @@
 #include <csignal>
 #include <cstdio>
 #include <cstdlib>
-#include <fstream>
 #include <iostream>
 #include <mutex>
-#include <nlohmann/json.hpp>
+#include <optional>
 #include <set>
 #include <string>
-#include <vector>
 
+#include "chainsplat/run_folder.h"
 #include "cli.h"
 
 namespace chainsplat::tools {
@@ -26,7 +25,6 @@ namespace {
 
 constexpr double kRedrawSeconds = 0.1;  // a faster line flickers
 constexpr double kPlainSeconds = 5.0;   // between lines where standard error is no terminal
-constexpr double kLogSeconds = 1.0;     // between records of one stage
 constexpr int kBarCells = 12;
 constexpr int kDefaultColumns = 80;
 
@@ -34,11 +32,10 @@ constexpr int kDefaultColumns = 80;
 struct Screen {
   bool quiet = false, verbose = false, progress = true, terminal = false, bold = false;
   bool line_open = false;  // a redrawn line stands on the terminal
-  double origin = 0.0;     // s, start of the program
   std::string stage;
-  double stage_start = 0.0, last_shown = 0.0, last_logged = 0.0;
+  double stage_start = 0.0, last_shown = 0.0;
   std::int64_t first_step = 0;  // of this stage in this process: a resumed one does not begin at 0
-  std::vector<std::ofstream> logs;
+  std::optional<pipeline::ProgressLog> log;
 };
 Screen screen;
 
@@ -112,19 +109,6 @@ void show(const core::Progress& progress, double now, bool last) {
   screen.line_open = true;
 }
 
-void log(const core::Progress& progress, double now, bool last) {
-  if (screen.logs.empty() || (now - screen.last_logged < kLogSeconds && !last)) return;
-  screen.last_logged = now;
-  nlohmann::ordered_json record;
-  record["stage"] = progress.stage;
-  record["iteration"] = progress.step;
-  record["total"] = progress.total;
-  record["loss"] = progress.loss;  // NaN is written as null
-  record["psnr"] = progress.psnr;
-  record["seconds"] = std::round((now - screen.origin) * 1e3) / 1e3;
-  for (std::ofstream& file : screen.logs) file << record.dump(-1, ' ', false, nlohmann::json::error_handler_t::replace) << std::endl;
-}
-
 void on_progress(const core::Progress& progress) {
   const double now = core::seconds_now();
   const bool fresh = progress.stage != screen.stage;
@@ -133,11 +117,10 @@ void on_progress(const core::Progress& progress) {
     screen.stage = progress.stage;
     screen.stage_start = now;
     screen.first_step = progress.step;
-    screen.last_logged = screen.last_shown = 0.0;
+    screen.last_shown = 0.0;
   }
-  const bool last = progress.total > 0 && progress.step >= progress.total;
-  show(progress, now, last);
-  log(progress, now, fresh || last);
+  show(progress, now, progress.total > 0 && progress.step >= progress.total);
+  if (screen.log) screen.log->write(progress);
 }
 
 constexpr double kOneSignal = 0.1;  // s; timeout(1) and schedulers send to the process and to its group: twice at once
@@ -166,7 +149,10 @@ void start_listening(const Globals& globals) {
   screen.progress = !globals.quiet && !globals.no_progress;
   screen.terminal = isatty(STDERR_FILENO) && !(kind && std::string(kind) == "dumb");
   screen.bold = screen.terminal && !std::getenv("NO_COLOR");
-  screen.origin = core::seconds_now();
+  core::set_listener(terminal());
+}
+
+core::Listener terminal() {
   core::Listener listener;
   listener.warning = [](const std::string& line) {
     // a capture may be opened several times; its doubts are told once
@@ -177,18 +163,15 @@ void start_listening(const Globals& globals) {
       if (!told.insert(line).second) return;
     }
     clear_line();
-    std::fprintf(stderr, "chainsplat: warning: %s\n", core::printable(line).c_str());
+    std::fprintf(stderr, "chainsplat: warning: %s\n", core::printable(with_options(line)).c_str());
   };
   listener.progress = on_progress;
-  core::set_listener(std::move(listener));
+  listener.message = say;
+  listener.detail = say_more;
+  return listener;
 }
 
-void log_to(const Path& file) {
-  std::ofstream stream(file, std::ios::app);
-  if (!stream)
-    throw InputError(file.string(), "the log cannot be opened for writing", "name a file that can be written");
-  screen.logs.push_back(std::move(stream));
-}
+void log_to(const Path& file) { screen.log.emplace(file); }
 
 void end_progress() {
   if (screen.line_open) std::fputc('\n', stderr);
@@ -198,7 +181,7 @@ void end_progress() {
 void say(const std::string& line) {
   if (screen.quiet) return;
   end_progress();
-  std::fprintf(stderr, "%s\n", core::printable(line).c_str());
+  std::fprintf(stderr, "%s\n", core::printable(with_options(line)).c_str());
 }
 
 void say_more(const std::string& line) {

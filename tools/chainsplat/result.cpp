@@ -6,13 +6,12 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/capture.h"
-#include "chainsplat/dynamics.h"
 #include "chainsplat/eval.h"
 #include "chainsplat/export.h"
+#include "chainsplat/pipeline.h"
+#include "chainsplat/run_folder.h"
 #include "chainsplat/synth.h"
 #include "cli.h"
-#include "picture.h"
-#include "run_folder.h"
 
 namespace chainsplat::tools {
 
@@ -24,51 +23,18 @@ struct EvalRequest {
   std::string run, capture, out, picture, frames;
 };
 
-// The twin set in motion by another capture's base, at the times of its first camera that the base covers.
-chain::States rollout_on(const twin::Twin& twin, const Path& run, const capture::Capture& capture) {
-  const dynamics::Model model = model_of(twin, run);
-  dynamics::InitialState initial;
-  std::vector<double> times;
-  for (const double time : capture.times.front())
-    if (time >= capture.base.start() && time <= capture.base.end()) times.push_back(time);
-  if (times.empty())
-    throw InputError(capture.folder.string(), "its base motion covers none of its frames", "correct base.tum");
-  initial.time = std::min(capture.base.start(), times.front());
-  initial.thetadot = math::VectorX::Zero(twin.chain.angles());
-  initial.theta = twin.tabletop ? (twin.initial ? twin.initial->theta : twin.states.theta.front())
-                                : dynamics::static_equilibrium(model, capture.base.pose(initial.time));
-  return dynamics::rollout(model, capture.base, initial, times);
-}
-
 void evaluate(const Globals& globals, const EvalRequest& request) {
-  if (!request.out.empty()) check_output_file(request.out);
-  if (!request.picture.empty()) check_output_file(request.picture);
+  if (!request.out.empty()) pipeline::check_output_file(request.out);
+  if (!request.picture.empty()) pipeline::check_output_file(request.picture);
   if (globals.json && request.out == "-")
     throw InputError("--json", "standard output is wanted by '-o -' too", "leave one of them out");
-  twin::Twin twin = load_twin(request.run);
-  check_drawable(twin, request.run);
-  const auto [first, last] = parse_frames(request.frames);
-  capture::LoadOptions load;
-  load.first = first;
-  load.last = last;
-  load.undistort = false;
-  load.depth = true;
-  const capture::Capture recorded = capture::load(request.capture, load);
-  const bool own = twin.provenance.capture_hash == hash_text(recorded.hash);
-  if (!own) {
-    say("another capture than the twin's own: only the rollout is evaluated, from rest");
-    twin.states = {};
-    twin.rollout = rollout_on(twin, request.run, recorded);
-  }
-  const gpu::DevicePtr device = gpu::open_device({.selector = globals.device});
-  splat::Engine engine(*device);
-  eval::Metrics recognized, rollout;
-  const bool has_rollout = !twin.rollout.time.empty();
-  if (own) recognized = eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, recorded);
-  if (has_rollout) rollout = eval::evaluate(engine, twin.gaussians, twin.chain, twin.rollout, recorded);
-  const std::string json = metrics_json(own ? &recognized : nullptr, has_rollout ? &rollout : nullptr);
+  const pipeline::Evaluation found =
+      pipeline::evaluate(request.run, request.capture,
+                         {capture::read_frame_range(request.frames, "--frames"), request.picture, globals.device}, terminal());
+  const eval::Metrics *recognized = found.recognized ? &*found.recognized : nullptr,
+                      *rollout = found.rollout ? &*found.rollout : nullptr;
+  const std::string json = pipeline::metrics_json(recognized, rollout);
   if (!request.out.empty()) write_result(request.out, json);
-  if (!request.picture.empty()) capture::write_png(request.picture, comparison(engine, twin, recorded));
   end_progress();
   if (globals.json) {
     std::cout << json;
@@ -76,12 +42,11 @@ void evaluate(const Globals& globals, const EvalRequest& request) {
   }
   if (request.out == "-") return;
   std::vector<MetricsRow> rows;
-  for (const auto& [name, metrics, there] :
-       {std::tuple("recognized", &recognized, own), std::tuple("rollout", &rollout, has_rollout)}) {
-    if (!there) continue;
+  for (const auto& [name, metrics] : {std::pair("recognized", recognized), std::pair("rollout", rollout)}) {
+    if (!metrics) continue;
     for (std::size_t c = 0; c < metrics->cameras.size(); ++c)
-      rows.push_back({std::string(name) + " " + metrics->camera_names[c], metrics->cameras[c]});
-    rows.push_back({std::string(name) + " mean", metrics->mean});
+      rows.push_back({std::string(name) + " " + metrics->camera_names[c], &metrics->cameras[c]});
+    rows.push_back({std::string(name) + " mean", &metrics->mean});
   }
   std::cout << metrics_table(rows);
   if (!request.picture.empty()) std::cout << "picture: " << request.picture << "\n";
@@ -98,11 +63,11 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
     for (const std::string& ending : known) list += (list.empty() ? "" : ", ") + ending;
     throw InputError(request.out, "its ending is not known", "use one of " + list);
   }
-  check_output_file(request.out);
-  const twin::Twin twin = load_twin(request.run);
+  pipeline::check_output_file(request.out);
+  const twin::Twin twin = pipeline::load_twin(request.run);
   const chain::States motion =
       request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
-  exports::write(twin, motion, request.base.empty() ? own_base(request.run) : read_base(request.base), request.out);
+  exports::write(twin, motion, request.base.empty() ? pipeline::own_base(request.run) : pipeline::read_base(input_path(request.base)), request.out);
   if (globals.json)
     std::cout << nlohmann::ordered_json{{"output", request.out}}.dump(-1, ' ', false,
                                                                       nlohmann::ordered_json::error_handler_t::replace)
@@ -118,22 +83,21 @@ struct SynthRequest {
 
 void synthesize(const Globals& globals, const SynthRequest& request) {
   const Path out = request.out;
-  check_output_folder(out, request.force, "name another folder or give --force to write into it");
-  const twin::Twin twin = load_twin(request.run);
-  check_drawable(twin, request.run);
+  pipeline::check_output_folder(out, request.force, "name another folder or give --force to write into it");
+  const twin::Twin twin = pipeline::load_twin(request.run);
+  pipeline::check_drawable(twin, request.run);
   auto [folder, camera] = split_camera(request.camera);
   if (folder.empty()) {
-    const auto path = twin.provenance.options.find("path");
-    if (path == twin.provenance.options.end())
+    if (!twin.provenance.path)
       throw InputError(request.run, "does not say which capture it was made from", "give --camera with a capture");
-    folder = (Path(request.run) / path->second).lexically_normal().string();
+    folder = (Path(request.run) / *twin.provenance.path).lexically_normal().string();
   }
   capture::LoadOptions load;
   load.images = false;
   load.camera = camera;
   capture::Capture scene = capture::load(folder, load);
-  check_not_capture(out, scene.folder);
-  if (!request.base.empty()) scene.base = read_base(request.base);
+  pipeline::check_not_capture(out, scene.folder);
+  if (!request.base.empty()) scene.base = pipeline::read_base(input_path(request.base));
   const chain::States states = !request.states.empty()
                                    ? twin::read_states(input_path(request.states), twin.chain.angles())
                                : twin.rollout.time.empty() ? twin.states

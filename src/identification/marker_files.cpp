@@ -1,4 +1,4 @@
-#include "markers.h"
+#include "chainsplat/marker_files.h"
 
 #include <algorithm>
 #include <cmath>
@@ -6,7 +6,7 @@
 #include <map>
 #include <sstream>
 
-namespace chainsplat::tools {
+namespace chainsplat::identification {
 
 namespace {
 
@@ -96,4 +96,4 @@ MarkerFile read_markers(const Path& file) {
   return out;
 }
 
-}  // namespace chainsplat::tools
+}  // namespace chainsplat::identification

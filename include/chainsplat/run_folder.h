@@ -1,5 +1,6 @@
-// run_folder.h - what the program keeps in a run folder beside the twin, and how it tells of the result.
+// chainsplat/run_folder.h - what is kept in a run folder beside the twin: base motion, covariances, metrics, log, lock.
 #pragma once
+#include <fstream>
 #include <string>
 #include <vector>
 
@@ -7,7 +8,7 @@
 #include "chainsplat/eval.h"
 #include "chainsplat/twin.h"
 
-namespace chainsplat::tools {
+namespace chainsplat::pipeline {
 
 inline constexpr const char* kBaseFile = "base.tum";              // the capture's own base motion
 inline constexpr const char* kCovarianceFile = "covariance.csv";  // of the recognized angles
@@ -42,13 +43,25 @@ void remove_checkpoint_folder(const Path& run);
 // Removes what a killed process left half-written of a run's files and checkpoints (core::write_file's temporary files).
 void remove_half_written(const Path& run);
 
+// The log of a run: a JSON record per interval with stage, iteration, total, loss, psnr and the seconds since it was
+// opened. Lines are added to a file that exists.
+class ProgressLog {
+ public:
+  explicit ProgressLog(const Path& file);  // throws InputError where it cannot be opened
+  void write(const core::Progress& progress);
+
+ private:
+  std::ofstream file_;
+  std::string stage_;
+  double opened_ = core::seconds_now(), last_ = 0.0;
+};
+
 // A twin that knows what the capture says of its scene, and nothing yet of the rope.
 twin::Twin twin_in_scene(const capture::Capture& capture);
 // The twin in `run` with something recognized in it. Throws InputError.
 twin::Twin load_twin(const Path& run);
 void check_drawable(const twin::Twin& twin, const Path& run);  // throws InputError where it has no Gaussians
-// The base motion of `file` ("-": standard input).
-trajectory::Trajectory read_base(const std::string& file);
+trajectory::Trajectory read_base(const Path& file);  // a TUM file as a fitted motion; throws InputError
 // The base motion of the capture that the twin was made from, as kept in its folder. Throws InputError.
 trajectory::Trajectory own_base(const Path& run);
 // The same, for work on the states: throws InputError too where the base does not cover their times.
@@ -62,13 +75,18 @@ std::vector<math::MatrixX> read_covariances(const Path& file, const chain::State
 
 std::string hash_text(std::uint64_t hash);
 
-// One named row of metrics a line, with the head line; NaN as '-'.
-struct MetricsRow {
-  std::string name;
-  eval::FrameMetrics metrics;
-};
-std::string metrics_table(const std::vector<MetricsRow>& rows);
 // { "recognized": M, "rollout": M }; null pointers are left out.
 std::string metrics_json(const eval::Metrics* recognized, const eval::Metrics* rollout);
 
-}  // namespace chainsplat::tools
+// --- where results may go --------------------------------------------------------------------------------------------
+
+// Throws InputError unless `folder` can be filled: it is absent or empty, or `overwrite`. Makes nothing.
+void check_output_folder(const Path& folder, bool overwrite, const std::string& mend);
+// Throws InputError where `folder`, that results go to, is the folder of the capture they are made from.
+void check_not_capture(const Path& folder, const Path& capture);
+// Throws InputError unless `file` can be made: its folder exists and it is no folder itself. "-": standard output.
+void check_output_file(const std::string& file);
+// What an error is once work has begun, an input's fault too; `kept` says what there is.
+WorkError broken_off(const Error& error, const std::string& kept);
+
+}  // namespace chainsplat::pipeline

@@ -1,14 +1,13 @@
 // batch_state.cpp - how far the jobs of a batch are.
 #include <array>
 #include <cmath>
-#include <cstdio>
 #include <fstream>
 #include <nlohmann/json.hpp>
 
-#include "batch.h"
-#include "run_folder.h"
+#include "chainsplat/batch.h"
+#include "chainsplat/run_folder.h"
 
-namespace chainsplat::tools {
+namespace chainsplat::pipeline {
 
 namespace {
 
@@ -94,35 +93,4 @@ JobState state_of(const Path& folder, const BatchJob& job) {
   return state;
 }
 
-std::string status_text(const BatchPlan& plan, const Path& folder) {
-  std::array<int, 5> count{};
-  std::string lines;
-  for (const BatchJob& job : plan.jobs) {
-    const JobState state = state_of(folder, job);
-    ++count[static_cast<std::size_t>(state.kind)];
-    char head[96];
-    std::snprintf(head, sizeof head, "%-8s %8.1f s  ", kind_name(state.kind), state.seconds);
-    lines += head + core::printable(job.name + (state.detail.empty() ? "" : "  " + state.detail)) + "\n";
-  }
-  std::string total = std::to_string(plan.jobs.size()) + " jobs";
-  for (std::size_t k = 0; k < count.size(); ++k)
-    if (count[k] > 0) total += ", " + std::to_string(count[k]) + " " + kind_name(static_cast<Kind>(k));
-  return lines + total + "\n";
-}
-
-std::string status_json(const BatchPlan& plan, const Path& folder) {
-  Json jobs = Json::array();
-  for (const BatchJob& job : plan.jobs) {
-    const JobState state = state_of(folder, job);
-    jobs.push_back({{"name", job.name},
-                    {"state", kind_name(state.kind)},
-                    {"detail", state.detail},
-                    {"seconds", state.seconds},
-                    {"capture", job.capture},
-                    {"settings", job.settings},
-                    {"seed", job.seed}});
-  }
-  return Json{{"folder", folder.string()}, {"jobs", jobs}}.dump(1, ' ', false, Json::error_handler_t::replace) + "\n";
-}
-
-}  // namespace chainsplat::tools
+}  // namespace chainsplat::pipeline

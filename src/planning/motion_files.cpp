@@ -1,17 +1,15 @@
-#include "base_motion_files.h"
+#include "chainsplat/motion_files.h"
 
 #include <cmath>
 #include <sstream>
 
-namespace chainsplat::tools {
-
-using planning::Axis;
+namespace chainsplat::planning {
 
 void check_rate(double rate, double seconds, const char* example) {
-  if (!(rate > 0.0) || !std::isfinite(rate)) throw InputError("--rate", "must be above 0", example);
+  if (!(rate > 0.0) || !std::isfinite(rate)) throw InputError("`rate`", "must be above 0", example);
   constexpr int kMostRows = 1000000;  // some 400 bytes each in memory, more as text
   if (rate * seconds > kMostRows)
-    throw InputError("--rate",
+    throw InputError("`rate`",
                      core::exact(rate) + " rows a second for " + core::exact(seconds) + " s are more than the " +
                          std::to_string(kMostRows) + " rows that are written at most, since all are held in memory",
                      example);
@@ -25,16 +23,16 @@ std::vector<double> row_times(double end, double rate) {
   return times;
 }
 
-std::string motion_tum(const planning::Motion& motion, const std::vector<double>& times) {
+std::string motion_tum(const Motion& motion, const std::vector<double>& times) {
   std::vector<trajectory::Sample> samples;
-  for (double time : times) samples.push_back({time, planning::base_at(motion, time).pose});
+  for (double time : times) samples.push_back({time, base_at(motion, time).pose});
   return trajectory::write_tum(samples);
 }
 
-std::string motion_csv(const planning::Motion& motion, const std::vector<double>& times) {
+std::string motion_csv(const Motion& motion, const std::vector<double>& times) {
   std::string csv = "time,x,y,z,vx,vy,vz,ax,ay,az,yaw,yaw_velocity,yaw_acceleration\n";
   for (double time : times) {
-    const planning::Coordinates c = planning::coordinates(motion, time);
+    const Coordinates c = coordinates(motion, time);
     csv += core::exact(time);
     const auto field = [&csv](double value) {
       csv += ',';
@@ -62,8 +60,8 @@ std::vector<Axis> parse_axes(const std::string& text) {
     else if (word == "yaw")
       out.push_back(Axis::yaw);
     else
-      throw InputError("--axes", "'" + word + "' is no axis", "give some of x,y,z,yaw");
+      throw InputError("`axes`", "'" + word + "' is no axis", "give some of x,y,z,yaw");
   return out;
 }
 
-}  // namespace chainsplat::tools
+}  // namespace chainsplat::planning

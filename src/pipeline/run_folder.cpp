@@ -1,4 +1,4 @@
-#include "run_folder.h"
+#include "chainsplat/run_folder.h"
 
 #include <fcntl.h>
 #include <sys/file.h>
@@ -11,12 +11,11 @@
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
-#include <sstream>
+#include <nlohmann/json.hpp>
 
 #include "chainsplat/recognition.h"
-#include "cli.h"
 
-namespace chainsplat::tools {
+namespace chainsplat::pipeline {
 
 twin::Twin twin_in_scene(const capture::Capture& capture) {
   twin::Twin twin;
@@ -27,7 +26,7 @@ twin::Twin twin_in_scene(const capture::Capture& capture) {
     twin.table_normal = capture.table->normal;
   }
   twin.known_mass = capture.mass.has_value();
-  if (capture.mass) twin.provenance.options["mass"] = core::exact(*capture.mass);
+  twin.provenance.mass = capture.mass;
   return twin;
 }
 
@@ -109,18 +108,15 @@ void check_drawable(const twin::Twin& twin, const Path& run) {
     throw InputError(run.string(), "has no Gaussians to draw", "recognize it from images first");
 }
 
-trajectory::Trajectory read_base(const std::string& file) {
-  const Path path = input_path(file);
-  return trajectory::fit(trajectory::read_tum(path), path.string());
-}
+trajectory::Trajectory read_base(const Path& file) { return trajectory::fit(trajectory::read_tum(file), file.string()); }
 
 trajectory::Trajectory own_base(const Path& run) {
   const Path file = run / kBaseFile;
   std::error_code error;
   if (!std::filesystem::exists(file, error))
     throw InputError(file.string(), "is missing",
-                     "give --base with the base motion, or copy the capture's base file there");
-  return read_base(file.string());
+                     "give the base motion as `base`, or copy the capture's base file there");
+  return read_base(file);
 }
 
 trajectory::Trajectory own_base(const Path& run, const chain::States& states) {
@@ -194,32 +190,6 @@ std::string hash_text(std::uint64_t hash) {
   return text;
 }
 
-std::string metrics_table(const std::vector<MetricsRow>& rows) {
-  constexpr double kMillimeters = 1e3;
-  std::string text = "                    PSNR dB  object dB    SSIM     IoU  Chamfer mm  centerline mm\n";
-  const auto cell = [&](int width, int digits, double value) {
-    char out[64];
-    if (std::isfinite(value))
-      std::snprintf(out, sizeof out, "%*.*f", width, digits, value);
-    else
-      std::snprintf(out, sizeof out, "%*s", width, "-");
-    text += out;
-  };
-  for (const MetricsRow& row : rows) {
-    char name[64];
-    std::snprintf(name, sizeof name, "%-18.40s", row.name.c_str());
-    text += name;
-    cell(9, 2, row.metrics.psnr);
-    cell(11, 2, row.metrics.psnr_object);
-    cell(8, 4, row.metrics.ssim);
-    cell(8, 3, row.metrics.iou);
-    cell(12, 2, kMillimeters * row.metrics.chamfer);
-    cell(15, 2, kMillimeters * row.metrics.centerline_rms);
-    text += "\n";
-  }
-  return text;
-}
-
 std::string metrics_json(const eval::Metrics* recognized, const eval::Metrics* rollout) {
   std::string text = "{";
   if (recognized) text += "\"recognized\": " + eval::to_json(*recognized);
@@ -228,4 +198,61 @@ std::string metrics_json(const eval::Metrics* recognized, const eval::Metrics* r
   return text + "}\n";
 }
 
-}  // namespace chainsplat::tools
+void check_output_folder(const Path& folder, bool overwrite, const std::string& mend) {
+  std::error_code error;
+  if (std::filesystem::exists(folder, error) && !std::filesystem::is_directory(folder, error))
+    throw InputError(folder.string(), "is a file, not a folder", "name another folder");
+  if (std::filesystem::is_symlink(folder, error) && !std::filesystem::exists(folder, error))
+    throw InputError(folder.string(), "is a link to nothing", "name another folder");
+  if (std::filesystem::is_directory(folder, error) && !std::filesystem::is_empty(folder, error) && !overwrite)
+    throw InputError(folder.string(), "is there already and not empty", mend);
+  Path above = std::filesystem::absolute(folder).lexically_normal();
+  while (!std::filesystem::exists(above, error) && above.has_relative_path()) above = above.parent_path();
+  if (!std::filesystem::is_directory(above, error) || ::access(above.c_str(), W_OK | X_OK) != 0)
+    throw InputError(folder.string(), "cannot be made in " + above.string(), "name a folder that can be written");
+}
+
+void check_not_capture(const Path& folder, const Path& capture) {
+  std::error_code error;
+  if (std::filesystem::equivalent(folder, capture, error))
+    throw InputError(folder.string(), "is the capture's own folder", "name another folder");
+}
+
+void check_output_file(const std::string& file) {
+  std::error_code error;
+  if (file == "-") return;
+  if (std::filesystem::is_directory(file, error)) throw InputError(file, "is a folder, not a file", "name a file");
+  const Path folder = std::filesystem::absolute(file).parent_path();
+  if (!std::filesystem::is_directory(folder, error))
+    throw InputError(file, "its folder does not exist", "make the folder or name another file");
+  if (::access(folder.c_str(), W_OK | X_OK) != 0 && !std::filesystem::exists(file, error))
+    throw InputError(file, "its folder cannot be written", "name another file");
+}
+
+WorkError broken_off(const Error& error, const std::string& kept) {
+  return {error.where, error.problem, error.mend + "; " + kept};
+}
+
+ProgressLog::ProgressLog(const Path& file) : file_(file, std::ios::app) {
+  if (!file_)
+    throw InputError(file.string(), "the log cannot be opened for writing", "name a file that can be written");
+}
+
+void ProgressLog::write(const core::Progress& progress) {
+  constexpr double kInterval = 1.0;  // s, between records of one stage
+  const double now = core::seconds_now();
+  const bool fresh = progress.stage != stage_, last = progress.total > 0 && progress.step >= progress.total;
+  if (!fresh && !last && now - last_ < kInterval) return;
+  stage_ = progress.stage;
+  last_ = now;
+  nlohmann::ordered_json record;
+  record["stage"] = progress.stage;
+  record["iteration"] = progress.step;
+  record["total"] = progress.total;
+  record["loss"] = progress.loss;  // NaN is written as null
+  record["psnr"] = progress.psnr;
+  record["seconds"] = std::round((now - opened_) * 1e3) / 1e3;
+  file_ << record.dump(-1, ' ', false, nlohmann::json::error_handler_t::replace) << std::endl;
+}
+
+}  // namespace chainsplat::pipeline

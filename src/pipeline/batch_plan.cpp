@@ -4,16 +4,16 @@
 #define TOML_MAX_NESTED_VALUES 16  // lists in lists; a document is freed by recursion
 #define TOML_ASSERT(expression) static_cast<void>(0)  // they fail for text from outside, which it then refuses
 #include <toml++/toml.h>
-#include <CLI/CLI.hpp>
+
 #include <algorithm>
 #include <map>
 #include <nlohmann/json.hpp>
 #include <set>
 
-#include "batch.h"
-#include "cli.h"
+#include "chainsplat/batch.h"
+#include "chainsplat/pipeline.h"
 
-namespace chainsplat::tools {
+namespace chainsplat::pipeline {
 
 namespace {
 
@@ -29,15 +29,6 @@ struct Value {
   bool in_name = false;  // the file lists several
 };
 using Combination = std::vector<Value>;
-
-// The program's own train command, to ask for its options and to try values.
-struct Trainer {
-  Globals globals;
-  Job job;
-  CLI::App app{"", "chainsplat"};
-  Trainer() { add_training_commands(app, globals, job); }
-  CLI::App& command() { return *app.get_subcommand("train"); }
-};
 
 std::size_t edit_distance(const std::string& a, const std::string& b) {
   std::vector<std::size_t> row(b.size() + 1);
@@ -63,14 +54,12 @@ InputError unknown_key(const std::string& where, const std::string& key, const s
   return {where, "unknown key '" + key + "'", "the nearest one is '" + *nearest + "'; there are " + all};
 }
 
-// Options of train that a batch sets itself.
+// Fields of TrainOptions and arguments of train that a batch sets itself.
 const std::set<std::string> kOwn = {"output", "force", "resume", "picture", "help"};
 
-std::vector<std::string> setting_names(CLI::App& command) {
+std::vector<std::string> setting_names() {
   std::vector<std::string> names;
-  for (const CLI::Option* option : command.get_options())
-    if (!option->get_lnames().empty() && !kOwn.count(option->get_lnames().front()))
-      names.push_back(option->get_lnames().front());
+  for (const Setting& setting : settings()) names.push_back(setting.name);
   return names;
 }
 
@@ -83,10 +72,10 @@ std::string scalar_text(const toml::node& node, const std::string& where) {
 }
 
 // All combinations of one [settings] table.
-std::vector<Combination> grid(const toml::table& settings, const std::string& file, Trainer& trainer) {
+std::vector<Combination> grid(const toml::table& table, const std::string& file) {
   std::vector<Combination> all = {{}};
-  const std::vector<std::string> known = setting_names(trainer.command());
-  for (const auto& [key_node, node] : settings) {
+  const std::vector<std::string> known = setting_names();
+  for (const auto& [key_node, node] : table) {
     const std::string key(key_node.str());
     const std::string where = file + ": settings." + key;
     if (key == "seed") throw InputError(where, "is not a setting", "write seeds = [0, 1] above the settings");
@@ -111,27 +100,23 @@ std::vector<Combination> grid(const toml::table& settings, const std::string& fi
   return all;
 }
 
-std::vector<std::string> arguments_of(const Combination& combination, const std::string& file, Trainer& trainer) {
+// The combination as arguments of train. Throws InputError where train would refuse it.
+std::vector<std::string> arguments_of(const Combination& combination, const std::string& file) {
   std::vector<std::string> arguments;
+  TrainOptions options;
   for (const Value& value : combination) {
-    const CLI::Option* option = trainer.command().get_option("--" + value.key);
-    if (option->get_expected_max() == 0) {
-      if (value.text != "true" && value.text != "false")
-        throw InputError(file + ": settings." + value.key, "is '" + value.text + "'", "write true or false");
-      if (value.text == "true") arguments.push_back("--" + value.key);
-    } else {
-      // by '=': the value can begin with a dash
-      arguments.push_back("--" + value.key + "=" + value.text);
-    }
+    set(options, value.key, value.text, file + ": settings." + value.key);
+    const auto setting = std::find_if(settings().begin(), settings().end(),
+                                      [&](const Setting& s) { return s.name == value.key; });
+    if (!setting->flag)
+      arguments.push_back("--" + value.key + "=" + value.text);  // by '=': the value can begin with a dash
+    else if (value.text == "true")
+      arguments.push_back("--" + value.key);
   }
-  // train itself says whether it takes these
-  std::vector<std::string> line = arguments;
-  line.insert(line.begin(), {"train", "capture", "--output=run"});
-  std::reverse(line.begin(), line.end());
   try {
-    trainer.app.parse(line);
-  } catch (const CLI::ParseError& error) {
-    throw InputError(file + ": settings", error.what(), "see 'chainsplat train --help'");
+    options.check();
+  } catch (const InputError& error) {
+    throw InputError(file + ": settings", error.where + " " + error.problem, error.mend);
   }
   return arguments;
 }
@@ -224,16 +209,15 @@ BatchPlan read_job_file(const Path& file) {
       throw InputError(name + ": seeds", "is no list of whole numbers from 0 on", "write seeds = [0, 1, 2]");
   }
 
-  Trainer trainer;
   std::vector<Combination> combinations;
-  const toml::node* settings = document.get("settings");
-  if (!settings) {
+  const toml::node* const tables_node = document.get("settings");
+  if (!tables_node) {
     combinations = {{}};
-  } else if (const toml::table* table = settings->as_table()) {
-    combinations = grid(*table, name, trainer);
-  } else if (const toml::array* tables = settings->as_array(); tables && tables->is_array_of_tables()) {
+  } else if (const toml::table* table = tables_node->as_table()) {
+    combinations = grid(*table, name);
+  } else if (const toml::array* tables = tables_node->as_array(); tables && tables->is_array_of_tables()) {
     for (const toml::node& one : *tables) {
-      const auto more = grid(*one.as_table(), name, trainer);
+      const auto more = grid(*one.as_table(), name);
       combinations.insert(combinations.end(), more.begin(), more.end());
     }
     // which of the tables a job is of must be in its name
@@ -254,7 +238,7 @@ BatchPlan read_job_file(const Path& file) {
           job.capture = capture.string();
           job.name = capture.filename().string();
           job.seed = seed;
-          job.arguments = arguments_of(combination, name, trainer);
+          job.arguments = arguments_of(combination, name);
           for (const Value& value : combination)
             if (value.in_name) {
               job.name += "-" + value.key + "_" + word_for_a_name(value.text);
@@ -287,7 +271,7 @@ BatchPlan load_plan(const Path& folder) {
   const Path file = folder / kPlanFile;
   std::error_code error;
   if (!fs::exists(file, error))
-    throw InputError(folder.string(), "is not the folder of a batch", "run 'chainsplat batch JOBS.toml -o' it first");
+    throw InputError(folder.string(), "is not the folder of a batch", "run 'chainsplat batch' into it first");
   BatchPlan plan;
   try {
     const Json document = core::parse_json(core::read_file(file));
@@ -298,11 +282,11 @@ BatchPlan load_plan(const Path& folder) {
       if (job.name.empty() || job.name.find_first_of(std::string_view("/\0", 2)) != std::string::npos ||
           job.name == "." || job.name == "..")
         throw InputError(file.string(), "a job's name is '" + job.name + "', which is no folder's",
-                         "run 'chainsplat batch JOBS.toml -o' again, it is made anew");
+                         "run 'chainsplat batch' again, it is made anew");
   } catch (const Json::exception&) {
-    throw InputError(file.string(), "is damaged", "run 'chainsplat batch JOBS.toml -o' again, it is made anew");
+    throw InputError(file.string(), "is damaged", "run 'chainsplat batch' again, it is made anew");
   }
   return plan;
 }
 
-}  // namespace chainsplat::tools
+}  // namespace chainsplat::pipeline

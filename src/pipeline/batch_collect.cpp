@@ -7,10 +7,10 @@
 #include <nlohmann/json.hpp>
 #include <optional>
 
-#include "batch.h"
-#include "run_folder.h"
+#include "chainsplat/batch.h"
+#include "chainsplat/run_folder.h"
 
-namespace chainsplat::tools {
+namespace chainsplat::pipeline {
 
 namespace {
 
@@ -130,7 +130,7 @@ Row read_row(const BatchJob& job, const Path& folder) {
     row.version = twin.at("provenance").value("version", "");
     row.device = twin.at("provenance").value("device", "");
     file = run / kMetricsFile;
-    if (!fs::exists(file, error)) return row;  // --stages without evaluate
+    if (!fs::exists(file, error)) return row;  // stages without evaluate
     const Json metrics = core::parse_json(core::read_file(file));
     for (std::size_t p = 0; p < kParts.size(); ++p)
       for (std::size_t c = 0; c < kColumns.size(); ++c)
@@ -404,4 +404,4 @@ void collect(const BatchPlan& plan, const Path& folder) {
   core::write_file(folder / "results.html", html(rows, groups));
 }
 
-}  // namespace chainsplat::tools
+}  // namespace chainsplat::pipeline

@@ -1,11 +1,13 @@
-// estimate_lines.h - lines of 'chainsplat estimate' read back, by force and by identify --online.
+// chainsplat/estimate_lines.h - the JSON lines of estimation::to_json() read back: by force, and by parameters that
+// follow a rope.
 #pragma once
+#include <iosfwd>
 #include <optional>
 #include <string>
 
 #include "chainsplat/math.h"
 
-namespace chainsplat::tools {
+namespace chainsplat::estimation {
 
 // Where a line leaves something out it is empty.
 struct EstimateLine {
@@ -19,4 +21,8 @@ struct EstimateLine {
 std::optional<EstimateLine> read_estimate_line(const std::string& line, const std::string& where, int angles,
                                                double before);
 
-}  // namespace chainsplat::tools
+// The next line; false at the end. Throws InputError where it is longer than any that is meant (a device may never end
+// one), or cannot be read.
+bool next_line(std::istream& in, std::string& line, const std::string& where);
+
+}  // namespace chainsplat::estimation

@@ -1,12 +1,13 @@
-#include "estimate_lines.h"
+#include "chainsplat/estimate_lines.h"
 
 #include <cmath>
+#include <istream>
 #include <nlohmann/json.hpp>
 #include <vector>
 
 #include "chainsplat/core.h"
 
-namespace chainsplat::tools {
+namespace chainsplat::estimation {
 
 namespace {
 
@@ -81,4 +82,17 @@ std::optional<EstimateLine> read_estimate_line(const std::string& line, const st
   return out;
 }
 
-}  // namespace chainsplat::tools
+bool next_line(std::istream& in, std::string& line, const std::string& where) {
+  constexpr std::size_t kLongest = 64 << 20;  // bytes; an estimate of a thousand angles, with covariance, has half of it
+  line.clear();
+  for (char letter = 0; in.get(letter);) {
+    if (letter == '\n') return true;
+    if (line.size() == kLongest)
+      throw InputError(where, "has a line of more than 64 MiB", "give the output of 'chainsplat estimate'");
+    line += letter;
+  }
+  if (in.bad()) throw InputError(where, "cannot be read", "give the output of 'chainsplat estimate'");
+  return !line.empty();
+}
+
+}  // namespace chainsplat::estimation

@@ -1,9 +1,9 @@
-#include "picture.h"
+#include "chainsplat/comparison.h"
 
 #include <algorithm>
 #include <cmath>
 
-namespace chainsplat::tools {
+namespace chainsplat::eval {
 
 using capture::Image8;
 
@@ -139,4 +139,4 @@ Image8 comparison(splat::Engine& engine, const twin::Twin& twin, const capture::
   return enlarged(sheet, std::clamp(kSheetWidth / sheet.width, 1, kMostZoom));
 }
 
-}  // namespace chainsplat::tools
+}  // namespace chainsplat::eval

@@ -1,19 +1,19 @@
-// markers.h - measured marker positions as a file (INTERFACE 7).
+// chainsplat/marker_files.h - measured marker positions as a file (INTERFACE 7).
 #pragma once
 #include <vector>
 
 #include "chainsplat/identification.h"
 #include "chainsplat/trajectory.h"
 
-namespace chainsplat::tools {
+namespace chainsplat::identification {
 
 struct MarkerFile {
   std::vector<trajectory::Sample> base;  // every row
-  identification::Markers markers;       // rows at most kMarkerRate a second
+  Markers markers;                       // rows at most 30 a second
 };
 
 // '# marker NAME ARCLENGTH' lines, then 'time,bx,by,bz,bqw,bqx,bqy,bqz,NAME_x,NAME_y,NAME_z,...' and rows; empty or
 // 'nan' where a marker is not seen. m, s. Throws InputError with file and line.
 MarkerFile read_markers(const Path& file);
 
-}  // namespace chainsplat::tools
+}  // namespace chainsplat::identification

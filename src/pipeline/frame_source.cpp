@@ -1,5 +1,4 @@
-#include "frame_source.h"
-
+// frame_source.cpp - frames from a capture, a video, a device or standard input.
 #include <poll.h>
 #include <unistd.h>
 
@@ -7,13 +6,13 @@
 #include <cerrno>
 #include <chrono>
 #include <cmath>
-#include <cstdlib>
 #include <cstring>
 #include <limits>
 
-#include "cli.h"
+#include "chainsplat/follow.h"
+#include "pipeline/bright_view.h"
 
-namespace chainsplat::tools {
+namespace chainsplat::pipeline {
 
 namespace {
 
@@ -22,14 +21,6 @@ constexpr int kMargin = 24;        // px about what a frame shows
 constexpr int kMostStale = 30;     // frames of a device in a row whose time stamps do not increase
 constexpr double kTogether = 0.5;  // of a frame's interval: frames of several cameras nearer than that are one moment
 
-double seconds(const std::string& text) {
-  char* end = nullptr;
-  const double value = std::strtod(text.c_str(), &end);
-  if (text.empty() || *end || !std::isfinite(value))
-    throw InputError("--start", "'" + text + "' is no time", "give seconds, or 'unix' for a device");
-  return value;
-}
-
 // Raw RGB24 from standard input; an incomplete last frame ends the work. Throws Interrupted where it waits.
 bool read_raw(const capture::Camera& camera, capture::Image8& image) {
   constexpr int kAttention = 50;  // ms, to a request to stop
@@ -37,7 +28,7 @@ bool read_raw(const capture::Camera& camera, capture::Image8& image) {
   image.pixels.resize(3 * static_cast<std::size_t>(camera.width) * camera.height);
   std::size_t got = 0;
   while (got < image.pixels.size()) {
-    if (const int signal = core::stop_requested()) throw Interrupted(signal);
+    core::stop_if_requested();
     pollfd input{STDIN_FILENO, POLLIN, 0};
     if (::poll(&input, 1, kAttention) <= 0) continue;
     const ssize_t count = ::read(STDIN_FILENO, &image.pixels[got], image.pixels.size() - got);
@@ -63,18 +54,16 @@ double until_unix(double stamp) {
 }
 
 // A capture, loaded and checked as a whole.
-FrameSource open_capture(const SourceRequest& request) {
-  const auto [folder, name] = split_camera(request.camera);
+FrameSource open_capture(const SourceOptions& options) {
   capture::LoadOptions load;
-  load.camera = name;
-  load.first = request.first;
-  load.last = request.last;
-  const auto recorded = std::make_shared<const capture::Capture>(capture::load(folder, load));
+  load.camera = options.camera;
+  load.first = options.frames.first, load.last = options.frames.last;
+  const auto recorded = std::make_shared<const capture::Capture>(capture::load(options.source, load));
   std::shared_ptr<const capture::Capture> whole;
-  if (request.pictures) {
+  if (options.pictures) {
     load.camera = recorded->cameras.front().name;
     load.masked = load.undistort = false;
-    whole = std::make_shared<const capture::Capture>(capture::load(folder, load));
+    whole = std::make_shared<const capture::Capture>(capture::load(options.source, load));
   }
   FrameSource source;
   source.cameras = recorded->cameras;
@@ -112,36 +101,37 @@ FrameSource open_capture(const SourceRequest& request) {
 }
 
 // Frames of one camera whose calibration is given: from a file, a device or standard input.
-FrameSource open_stream(const SourceRequest& request) {
-  const capture::Calibration calibration = capture::read_calibration(request.calibration);
-  double rate = request.rate > 0.0 ? request.rate : calibration.rate, start = calibration.start;
+FrameSource open_stream(const SourceOptions& options) {
+  const capture::Calibration calibration = capture::read_calibration(options.calibration);
+  const bool standard_input = options.source == "-";
+  double rate = options.rate > 0.0 ? options.rate : calibration.rate, start = calibration.start;
   FrameSource source;
   source.cameras = {calibration.camera};
   std::shared_ptr<capture::VideoReader> reader;
-  if (request.camera != "-") {
+  if (!standard_input) {
     const capture::Camera& camera = source.cameras[0];
     reader = std::make_shared<capture::VideoReader>(
-        request.camera, 1, capture::DeviceFormat{.width = camera.width, .height = camera.height, .rate = rate});
+        options.source, 1, capture::DeviceFormat{.width = camera.width, .height = camera.height, .rate = rate});
     if (rate <= 0.0) rate = reader->rate();
   }
   const bool device = reader && reader->device();
   if (!device && rate <= 0.0)
-    throw InputError("--rate", "is needed to know the frames' times", "give frames a second, for example 30");
-  const bool unix = request.start == "unix";
-  if (unix && !device) throw InputError("--start", "only a device stamps its frames", "give seconds");
-  if (!request.start.empty() && !unix) start = seconds(request.start);
-  const std::string where = request.camera == "-" ? "standard input" : request.camera;
+    throw InputError("`rate`", "is needed to know the frames' times", "give frames a second, for example 30");
+  const bool unix = options.unix_time;
+  if (unix && !device) throw InputError("`start`", "only a device stamps its frames", "give seconds");
+  if (options.start) start = *options.start;
+  const std::string where = standard_input ? "standard input" : options.source.string();
   // a device has a clock of its own, so that frames which were passed over leave a gap in time
   std::optional<double> offset;  // from that clock to ours
   double stamp = -std::numeric_limits<double>::infinity();  // s, the last frame's by that clock
-  source.next = [camera = source.cameras[0], request, reader, rate, start, where, device, unix, offset, stamp,
-                 count = 0](LiveFrame& frame) mutable {
+  source.next = [camera = source.cameras[0], frames = options.frames, reader, rate, start, where, device, unix, offset,
+                 stamp, count = 0](LiveFrame& frame) mutable {
     int stale = 0;  // in a row: some drivers' stamps jitter, others' are none
     do {
-      if (request.last >= 0 && count >= request.last) return false;
+      if (frames.last >= 0 && count >= frames.last) return false;
       if (!(reader ? reader->next(frame.picture) : read_raw(camera, frame.picture))) return false;
       frame.frame = device ? reader->frames() - 1 : count;
-      if (request.last >= 0 && frame.frame >= request.last) return false;
+      if (frames.last >= 0 && frame.frame >= frames.last) return false;
       if (frame.picture.width != camera.width || frame.picture.height != camera.height)
         throw WorkError(where,
                         "frame " + std::to_string(frame.frame) + " has " + std::to_string(frame.picture.width) + "x" +
@@ -153,7 +143,7 @@ FrameSource open_stream(const SourceRequest& request) {
       if (stale > kMostStale)
         throw WorkError(where, "its time stamps do not increase, from frame " + std::to_string(frame.frame - stale + 1),
                         "check the camera and its driver; the states so far are kept");
-    } while (frame.frame < request.first || stale > 0);
+    } while (frame.frame < frames.first || stale > 0);
     if (device) stamp = reader->time();
     if (device && !offset) offset = unix ? until_unix(reader->time()) : start - reader->first_time();
     frame.time = device ? reader->time() + *offset : start + frame.frame / rate;
@@ -166,18 +156,18 @@ FrameSource open_stream(const SourceRequest& request) {
 
 }  // namespace
 
-FrameSource open_frames(const SourceRequest& request) {
-  if (request.calibration.empty()) {
+FrameSource open_frames(const SourceOptions& options) {
+  if (options.calibration.empty()) {
     std::error_code error;
-    const Path file = request.camera;
-    const bool none = request.camera == "-" || std::filesystem::is_character_file(file, error) ||
+    const Path& file = options.source;
+    const bool none = file == "-" || std::filesystem::is_character_file(file, error) ||
                       (std::filesystem::is_regular_file(file, error) && file.extension() != ".json");
     if (none)
-      throw InputError("--calibration", "is needed with " + request.camera + ", which is no capture",
+      throw InputError("`calibration`", "is needed with " + file.string() + ", which is no capture",
                        "give a camera object as in capture.json");
-    if (!request.start.empty()) throw InputError("--start", "a capture has times of its own", "leave it out");
+    if (options.start || options.unix_time) throw InputError("`start`", "a capture has times of its own", "leave it out");
   }
-  return request.calibration.empty() ? open_capture(request) : open_stream(request);
+  return options.calibration.empty() ? open_capture(options) : open_stream(options);
 }
 
 capture::View bright_view(const capture::Image8& picture, const capture::Camera& camera) {
@@ -215,4 +205,4 @@ capture::View bright_view(const capture::Image8& picture, const capture::Camera&
   return view;
 }
 
-}  // namespace chainsplat::tools
+}  // namespace chainsplat::pipeline

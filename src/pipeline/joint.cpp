@@ -1,0 +1,53 @@
+// joint.cpp - angles, Gaussians and dynamics refined together: what follows identification in train and identify.
+#include <cstdio>
+
+#include "chainsplat/refinement.h"
+#include "chainsplat/run_folder.h"
+#include "pipeline/stages.h"
+
+namespace chainsplat::pipeline {
+
+void check_joint(const twin::Twin& twin, const std::vector<math::MatrixX>& covariances, const Path& run) {
+  if (twin.provenance.mode == twin::Mode::paper)
+    throw InputError("`joint`", "goes with `mode` fast", "leave one of them out");
+  if (twin.provenance.joint)
+    throw InputError(run.string(), "is refined already", "train it again with `joint` and `force`");
+  if (twin.gaussians.count == 0)
+    throw InputError(run.string(), "has no Gaussians to compare with images", "leave `joint` out");
+  if (covariances.empty())
+    throw InputError((run / kCovarianceFile).string(), "is missing", "run 'chainsplat recognize' again");
+}
+
+void refine(twin::Twin& twin, std::vector<math::MatrixX>& covariances, const capture::Capture& capture,
+            gpu::Device& device, std::uint64_t seed) {
+  const Stopwatch watch(twin, "joint");
+  refinement::Options options;
+  options.identification = identification_options(twin, false, seed);
+  options.seed = seed;
+  if (twin.provenance.every) options.every = *twin.provenance.every;
+  refinement::Result found = refinement::refine(device, capture, twin.chain, twin.gaussians, {twin.states, covariances},
+                                                twin.rollout, options);
+  char text[160];
+  std::snprintf(text, sizeof text,
+                "joint: images %.1f times as uncertain as recognized, dynamics true to %.2f mm; %d rounds",
+                found.noise.image_scale, 1e3 * found.noise.model_error, found.rounds);
+  core::say(text);
+  twin.gaussians = std::move(found.gaussians);
+  twin.states = std::move(found.angles.states);
+  covariances = std::move(found.angles.covariances);
+  adopt(twin, std::move(found.identified));
+  twin.provenance.joint = true;
+}
+
+capture::Capture load_own_capture(const twin::Twin& twin, const Path& run) {
+  if (!twin.provenance.path)
+    throw InputError(run.string(), "does not say which capture it was made from", "train it again with `joint`");
+  capture::LoadOptions load;
+  if (const auto& frames = twin.provenance.frames) load.first = frames->first, load.last = frames->last;
+  capture::Capture capture = capture::load((run / *twin.provenance.path).lexically_normal(), load);
+  if (twin.provenance.capture_hash != hash_text(capture.hash))
+    throw InputError(capture.folder.string(), "has changed since " + run.string() + " was made", "train it again");
+  return capture;
+}
+
+}  // namespace chainsplat::pipeline

@@ -1,0 +1,41 @@
+// stages.h - the stages of train and identify, on a twin in memory.
+#pragma once
+#include <string>
+#include <vector>
+
+#include "chainsplat/gpu.h"
+#include "chainsplat/identification.h"
+#include "chainsplat/pipeline.h"
+
+namespace chainsplat::pipeline {
+
+// Measures its own life and adds it to the seconds of the stage.
+class Stopwatch {
+ public:
+  Stopwatch(twin::Twin& twin, std::string stage) : twin_(twin), stage_(std::move(stage)), start_(core::seconds_now()) {}
+  ~Stopwatch();
+  Stopwatch(const Stopwatch&) = delete;
+  Stopwatch& operator=(const Stopwatch&) = delete;
+
+ private:
+  twin::Twin& twin_;
+  std::string stage_;
+  double start_;
+};
+
+// What the twin and its capture say of how to identify it.
+identification::Options identification_options(const twin::Twin& twin, bool paper, std::uint64_t seed);
+void adopt(twin::Twin& twin, identification::Result found);
+
+// Rolls the identified twin out over its recognized times. `run`: its folder, for messages.
+void roll_out(twin::Twin& twin, const trajectory::Trajectory& base, const Path& run);
+
+// Throws InputError unless `twin` can be refined: recognized fast, with covariances, not refined before.
+void check_joint(const twin::Twin& twin, const std::vector<math::MatrixX>& covariances, const Path& run);
+// The frames that the twin in `run` was made from. Throws InputError where they are gone or have changed.
+capture::Capture load_own_capture(const twin::Twin& twin, const Path& run);
+// Refines an identified twin and its covariances with its capture's images (undistorted). The caller saves both.
+void refine(twin::Twin& twin, std::vector<math::MatrixX>& covariances, const capture::Capture& capture,
+            gpu::Device& device, std::uint64_t seed);
+
+}  // namespace chainsplat::pipeline
