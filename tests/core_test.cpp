@@ -82,3 +82,35 @@ TEST_CASE("an error's line holds no control character and no broken UTF-8, and k
 TEST_CASE("a file without end is refused instead of filling the memory") {
   CHECK_THROWS_WITH_AS(core::read_file("/dev/zero"), doctest::Contains("larger than 1 GiB"), InputError);
 }
+
+TEST_CASE("errors keep their fields") {
+  const InputError error("a: b", "is; wrong", "mend\n");
+  CHECK(error.where == "a: b");
+  CHECK(error.problem == "is; wrong");
+  CHECK(error.mend == "mend\n");
+  CHECK(std::string(error.what()) == "a: b: is; wrong; mend\\x0a");
+}
+
+TEST_CASE("a listener hears what is said in its scope, and may stop the work") {
+  std::vector<std::string> outer, inner;
+  core::Listener before;
+  before.message = [&](const std::string& line) { outer.push_back(line); };
+  core::set_listener(before);
+  {
+    core::Listener listener;
+    listener.message = [&](const std::string& line) { inner.push_back(line); };
+    listener.stop = [&] { return inner.size() > 1; };
+    const core::ListenerScope scope(listener);
+    core::say("one");
+    core::report({"stage", 1, 2, 0.0, 0.0, ""});
+    core::stop_if_requested();
+    core::say("two");
+    core::report({"stage", 2, 2, 0.0, 0.0, ""});
+    CHECK_THROWS_AS(core::stop_if_requested(), Interrupted);
+  }
+  core::stop_if_requested();  // the stop was the listener's
+  core::say("three");
+  CHECK(inner == std::vector<std::string>{"one", "two"});
+  CHECK(outer == std::vector<std::string>{"three"});
+  core::set_listener({});
+}

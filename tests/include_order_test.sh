@@ -1,41 +1,51 @@
 #!/bin/bash
-# Modules include only what is below them: reads all #include "chainsplat/..." lines and compares them with this table.
-# A module may include those in its row, and what those may include.
+# Modules include only what is below them: reads all #include "chainsplat/..." lines and compares them with the table of
+# modules in docs/architecture.md. A module may include the headers of those in its row, and of what those may use.
 cd "$(dirname "$0")/.." || exit 1
-declare -A may=(
-  [core]="" [math]="core" [solve]="math" [gpu]="core" [chain]="math" [trajectory]="math"
-  [capture]="chain trajectory" [silhouette]="capture solve" [masking]="silhouette" [splat]="capture gpu" [dynamics]="chain trajectory solve"
-  [recognition]="silhouette splat" [identification]="dynamics" [twin]="splat dynamics" [render]="twin"
-  [refinement]="recognition identification" [eval]="render capture" [export]="render capture" [synth]="render capture"
-  [estimation]="render silhouette" [force]="twin" [planning]="twin" [excitation]="planning" [adaptation]="dynamics"
-)
-declare -A all  # module -> everything it may include
+declare -A may=() module_of=() all=()  # module -> what it may use; header -> module; module -> all that it may include
+while IFS='|' read -r _ level module _ uses headers _; do
+  [[ $level =~ ^\ *[0-9]+\ *$ ]] || continue
+  module=${module// /}
+  may[$module]=$uses
+  for header in $headers; do module_of[$header]=$module; done
+done <docs/architecture.md
+failed=0
+complain() {  # line
+  echo "$1"
+  failed=1
+}
+
 reach() {  # module
   local below
   [ -n "${all[$1]+known}" ] && return
   all[$1]=" $1 "
   for below in ${may[$1]}; do
+    [ -n "${may[$below]+known}" ] || complain "docs/architecture.md: $1 may use '$below', which is no module"
     reach "$below"
     all[$1]+="${all[$below]}"
   done
 }
-failed=0
+
+[ ${#may[@]} -gt 0 ] || complain 'docs/architecture.md: no table of modules'
+for module in "${!may[@]}"; do
+  reach "$module"
+  [ -d "src/$module" ] || complain "docs/architecture.md: there is no src/$module"
+done
+for header in "${!module_of[@]}"; do
+  [ -e "include/chainsplat/$header" ] || complain "docs/architecture.md: there is no include/chainsplat/$header"
+done
 for file in include/chainsplat/*.h include/chainsplat/*/*.h src/*/*.h src/*/*.cpp; do
   [ -e "$file" ] || continue
   case $file in
-    include/*) module=${file#include/chainsplat/} module=${module%%[./]*} ;;
+    include/*) module=${module_of[${file#include/chainsplat/}]:-} ;;
     *) module=$(basename "$(dirname "$file")") ;;
   esac
-  if [ -z "${may[$module]+known}" ]; then
-    echo "$file: module '$module' is not in the table"
-    failed=1
+  if [ -z "$module" ] || [ -z "${may[$module]+known}" ]; then
+    complain "$file: is not in the table of docs/architecture.md"
     continue
   fi
-  reach "$module"
   while read -r used; do
-    [[ ${all[$module]} == *" $used "* ]] && continue
-    echo "$file: $module must not include chainsplat/$used.h"
-    failed=1
-  done < <(sed -n 's|^ *# *include *"chainsplat/\([a-z_]*\)[./].*".*|\1|p' "$file")
+    [[ ${all[$module]} == *" ${module_of[$used]:-?} "* ]] || complain "$file: $module must not include chainsplat/$used"
+  done < <(sed -n 's|^ *# *include *"chainsplat/\([a-z_/]*\.h\)".*|\1|p' "$file")
 done
 exit $failed

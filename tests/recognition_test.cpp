@@ -231,7 +231,7 @@ TEST_CASE("a damaged checkpoint gives way to the one before; one of another job 
     return "";
   };
   CHECK(refusal(c.job).empty());
-  CHECK(refusal("frames 0:20\n--joints 4\n--seed 1\n").find("(--joints 3, not 4); ") != std::string::npos);
+  CHECK(refusal("frames 0:20\n--joints 4\n--seed 1\n").find("(`joints` 3, not 4); ") != std::string::npos);
   CHECK(refusal("frames 10:30\n--joints 3\n--seed 0\n").find("(frames 0:20, not 10:30); ") != std::string::npos);
   core::write_file(folder / "other/notes.txt", "somebody else's");
   remove_checkpoint(folder / "other");

@@ -53,14 +53,12 @@ twin::Twin full_twin() {
   twin.estimates.weak = {{0.25, {{"rest_angle_3", 0.8}, {"log_stiffness", -0.6}}}};  // not in alphabetical order
   twin.estimates.held = {{"mass", "given by the capture"}, {"twist", "not observed, \"held\""}};
   twin.estimates.solver = {solve::Reason::no_decrease, 7, std::numeric_limits<double>::quiet_NaN(), 2.0 / 3.0, 1e-300};
-  twin.provenance = {"1.2.3",
-                     "free \xc3\xa4",
-                     "00ff",
-                     "llvmpipe",
-                     "Mesa",
-                     {{"joints", "5"}, {"every", "5"}},
-                     std::numeric_limits<std::uint64_t>::max(),
-                     {{"recognize", 61.25}, {"identify", 1.0 / 3.0}}};
+  twin::Provenance& p = twin.provenance;
+  p.version = "1.2.3", p.capture = "free \xc3\xa4", p.capture_hash = "00ff", p.device = "llvmpipe", p.driver = "Mesa";
+  p.mass = 1.0 / 3.0, p.frames = {12, -1}, p.every = 5, p.mode = twin::Mode::paper, p.path = "../captures/a", p.joint = true;
+  p.options = {{"joints", "5"}};
+  p.seed = std::numeric_limits<std::uint64_t>::max();
+  p.seconds = {{"recognize", 61.25}, {"identify", 1.0 / 3.0}};
   return twin;
 }
 
@@ -121,7 +119,20 @@ TEST_CASE("a twin reads back bit by bit") {
   CHECK(read.estimates.solver->final_cost == 2.0 / 3.0);
   CHECK(read.estimates.solver->worst_step == 1e-300);
   CHECK(read.provenance.capture == twin.provenance.capture);
+  CHECK(read.provenance.mass == twin.provenance.mass);
+  CHECK(read.provenance.frames == twin.provenance.frames);
+  CHECK(read.provenance.every == twin.provenance.every);
+  CHECK(read.provenance.mode == twin.provenance.mode);
+  CHECK(read.provenance.path == twin.provenance.path);
+  CHECK(read.provenance.joint);
   CHECK(read.provenance.options == twin.provenance.options);
+  CHECK(twin::option_texts(read.provenance) == std::map<std::string, std::string>{{"every", "5"},
+                                                                                  {"frames", "12:"},
+                                                                                  {"joint", "yes"},
+                                                                                  {"joints", "5"},
+                                                                                  {"mass", core::exact(1.0 / 3.0)},
+                                                                                  {"mode", "paper"},
+                                                                                  {"path", "../captures/a"}});
   CHECK(read.provenance.seed == twin.provenance.seed);
   CHECK(read.provenance.seconds == twin.provenance.seconds);
 
@@ -298,6 +309,7 @@ TEST_CASE("damage to twin.json is named by file and key") {
       {"/provenance/options/every", "0", "provenance.options.every"},
       {"/provenance/options/every", "99999999999", "provenance.options.every"},
       {"/provenance/options/mode", "slow", "provenance.options.mode"},
+      {"/provenance/options/frames", "12", "provenance.options.frames"},
       {"/gaussians", "../elsewhere.ply", "gaussians"},
       {"/states", "absent.csv", "absent.csv"},
   };

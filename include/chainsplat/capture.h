@@ -70,6 +70,15 @@ constexpr double kSlowestRate = 0.1, kFastestRate = 1e6;  // frames per second
 constexpr int kMostFrames = 1000000;                      // per camera
 constexpr int kMostPixels = 1 << 27;                      // per image
 
+// Frames [first, last) of every camera, by its own numbering; last < 0: to the end.
+struct FrameRange {
+  int first = 0, last = -1;
+  bool operator==(const FrameRange&) const = default;
+};
+// "A:B", "A:" or ":B"; empty: all. Throws InputError, which says by `where` whose text it is.
+FrameRange read_frame_range(const std::string& text, const std::string& where);
+std::string frame_range_text(const FrameRange& range);  // as it is read; empty: all
+
 struct LoadOptions {
   bool images = true;     // false: read capture.json and the base only
   bool undistort = true;  // false: keep the recorded pixels (for evaluation)

@@ -2,7 +2,8 @@
 //
 // The module depends on no other. A failure is one of two exceptions, because the two lead to different exit codes:
 // InputError (2: the request or its input is wrong, nothing was written) and WorkError (1: the work failed, what exists
-// is kept). The library never prints and never aborts; the tools catch both and print one line. Times are in seconds.
+// is kept). The library never prints and never aborts; the program catches both and prints one line. Times are in
+// seconds.
 #pragma once
 #include <cstdint>
 #include <filesystem>
@@ -23,17 +24,25 @@ namespace core {
 std::string printable(std::string_view text);
 }  // namespace core
 
-// The request or its input is wrong. The text is one line for the user, 'WHERE: WHAT; HOW TO MEND', with unprintable
-// bytes escaped.
-struct InputError : std::runtime_error {
-  InputError(const std::string& where, const std::string& what, const std::string& mend)
-      : std::runtime_error(core::printable(where + ": " + what + "; " + mend)) {}
+// What went wrong, in three fields; what() is one line of them for the user, 'WHERE: PROBLEM; MEND', with unprintable
+// bytes escaped. Where an option of a call is meant, its field stands in backquotes: `frames`.
+struct Error : std::runtime_error {
+  Error(const std::string& at, const std::string& wrong, const std::string& advice)
+      : std::runtime_error(core::printable(at + ": " + wrong + "; " + advice)),
+        where(at),
+        problem(wrong),
+        mend(advice) {}
+  std::string where, problem, mend;
 };
 
-// The work failed half-way (device lost, disk full, divergence). The text has the same form as InputError's.
-struct WorkError : std::runtime_error {
-  WorkError(const std::string& where, const std::string& what, const std::string& mend)
-      : std::runtime_error(core::printable(where + ": " + what + "; " + mend)) {}
+// The request or its input is wrong; nothing was written.
+struct InputError : Error {
+  using Error::Error;
+};
+
+// The work failed half-way (device lost, disk full, divergence); what exists is kept.
+struct WorkError : Error {
+  using Error::Error;
 };
 
 // Thrown by long work when stop_requested() is not 0, after it has saved a checkpoint if it keeps one.
@@ -62,20 +71,41 @@ struct Progress {
   std::string note;   // the current activity in a few words
 };
 
-// The receiver of warnings and progress. The tool sets it once; the default discards both. set_listener(), warn() and
-// report() may be called from any thread.
+// Who is told of long work, and may stop it. What is empty is not told. One thread at a time calls these; they must not
+// call warn(), say(), say_more(), record() or report() themselves.
 struct Listener {
-  std::function<void(const std::string&)> warning;
+  std::function<void(const std::string&)> warning;  // one line, what was assumed
   std::function<void(const Progress&)> progress;
+  std::function<void(const std::string&)> message;  // one line, what was found or done
+  std::function<void(const std::string&)> detail;   // the same for who wants to know more: seconds of a stage, the device
+  std::function<void(const nlohmann::ordered_json&)> record;  // for a log, beside progress: how a stage's fit ended
+  std::function<bool()> stop;  // asked after every progress: true ends the work as SIGINT does, with a checkpoint
 };
+// One listener for the whole process; the default hears nothing. May be called from any thread, as those below.
 void set_listener(Listener listener);
+// Listens for as long as it lives, then the listener before does again. A stop that `listener` asked for ends with it.
+class ListenerScope {
+ public:
+  explicit ListenerScope(Listener listener);
+  ~ListenerScope();
+  ListenerScope(const ListenerScope&) = delete;
+  ListenerScope& operator=(const ListenerScope&) = delete;
+
+ private:
+  Listener before_;
+  bool may_stop_;
+};
 void warn(const std::string& line);  // one line that names the assumption made
+void say(const std::string& line);
+void say_more(const std::string& line);
+void record(const nlohmann::ordered_json& entry);
 void report(const Progress& progress);
 
 // The tool's signal handler sets the request, and long work polls it between its steps.
 void request_stop(int signal) noexcept;
 int stop_requested() noexcept;  // the signal, or 0 when no stop is requested
 void clear_stop() noexcept;
+void stop_if_requested();  // throws Interrupted
 
 // Number of host threads that parallel_for uses: the value set last, or the number of cores where none or 0 was set.
 // Results never depend on it.
@@ -88,6 +118,8 @@ void parallel_for(std::int64_t count, const std::function<void(std::int64_t)>& b
 // Writes `bytes` as `path` in one step (temporary file in the same folder, fsync, rename), so that a reader never finds
 // half a file. Throws WorkError when the disk is full or the folder cannot be written.
 void write_file(const Path& path, std::string_view bytes);
+// Makes a folder and those above it. Throws WorkError.
+void make_folder(const Path& folder);
 // Returns the whole file. Throws InputError that names `path` when the file is missing, unreadable or larger than 1 GiB
 // (the bound exists because a pipe or device may never end).
 std::string read_file(const Path& path);
@@ -114,6 +146,8 @@ std::vector<double> table_numbers(const Path& file, const TableLine& line, std::
 std::string exact(double value);
 // Returns seconds on a steady clock since an arbitrary origin.
 double seconds_now();
+// Gives memory that was freed back to the system, where it can be told to.
+void trim_memory();
 // 64-bit FNV-1a, which captures' hashes and checkpoints' checksums use. `hash` continues an earlier one.
 std::uint64_t fnv1a(std::string_view bytes, std::uint64_t hash = 14695981039346656037ull);
 

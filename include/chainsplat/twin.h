@@ -28,6 +28,7 @@
 #include <optional>
 #include <string>
 #include <vector>
+#include "chainsplat/capture.h"
 #include "chainsplat/chain.h"
 #include "chainsplat/core.h"
 #include "chainsplat/dynamics.h"
@@ -35,12 +36,24 @@
 
 namespace chainsplat::twin {
 
+enum class Mode { fast, paper };  // of recognition and identification
+std::string mode_text(Mode mode);
+
+// How the twin was made. What later work goes by has a type of its own; absent: not known, or it does not apply.
 struct Provenance {
   std::string version, capture, capture_hash, device, driver;
-  std::map<std::string, std::string> options;
+  std::optional<double> mass;                 // kg, of the rope
+  std::optional<capture::FrameRange> frames;  // of the capture that were recognized
+  std::optional<int> every;                   // frames between those that trained the Gaussians
+  std::optional<Mode> mode;
+  std::optional<std::string> path;             // of the capture, from the run folder
+  bool joint = false;                          // refined by images and dynamics together
+  std::map<std::string, std::string> options;  // further ones, for a reader
   std::uint64_t seed = 0;
   std::map<std::string, double> seconds;  // per stage
 };
+// All options as texts, as twin.json has them under provenance.options.
+std::map<std::string, std::string> option_texts(const Provenance& provenance);
 
 struct Twin {
   bool tabletop = false;

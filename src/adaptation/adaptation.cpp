@@ -49,11 +49,11 @@ ParameterFilter::ParameterFilter(const chain::Chain& chain, const dynamics::Para
     : belief_(std::make_unique<Belief>()) {
   const auto size = static_cast<Eigen::Index>(estimates.names.size());
   if (size == 0 || !math::is_covariance(estimates.covariance) || estimates.covariance.rows() != size)
-    throw InputError("identify --online", "the twin knows no covariance of its parameters", "identify it first");
-  if (!(options.memory > 0.0)) throw InputError("--memory", "is not above 0", "give seconds, for example 5");
+    throw InputError("`online`", "the twin knows no covariance of its parameters", "identify it first");
+  if (!(options.memory > 0.0)) throw InputError("`memory`", "is not above 0", "give seconds, for example 5");
   const std::vector<dynamics::Unknown> all = dynamics::unknowns_of(chain, estimates);
   const std::vector<Eigen::Index> places = dynamics::parameters_among(all);
-  if (places.empty()) throw InputError("identify --online", "the twin has no parameter to adapt", "identify it first");
+  if (places.empty()) throw InputError("`online`", "the twin has no parameter to adapt", "identify it first");
   Belief& b = *belief_;
   b.chain = chain, b.known = estimates, b.options = options, b.places = places;
   b.now = parameters;
@@ -142,18 +142,18 @@ bool ParameterFilter::Belief::observe(const Observation& seen, const dynamics::B
   const int n = chain.angles();
   if (seen.theta.size() != n || (seen.thetadot.size() && seen.thetadot.size() != n) ||
       (seen.sigma.size() && seen.sigma.size() != n))
-    throw InputError("identify --online",
+    throw InputError("`online`",
                      "a frame has " + std::to_string(seen.theta.size()) + " angles, the twin " + std::to_string(n),
                      "give what 'estimate' prints for this rope");
   if (!std::isfinite(seen.time) || !seen.theta.allFinite() || !seen.thetadot.allFinite() || !seen.sigma.allFinite())
-    throw InputError("identify --online", "a number of the frame at " + core::exact(seen.time) + " s is not finite",
+    throw InputError("`online`", "a number of the frame at " + core::exact(seen.time) + " s is not finite",
                      "leave lost frames out");
   if ((seen.sigma.array() < 0.0).any())
-    throw InputError("identify --online",
+    throw InputError("`online`",
                      "a standard deviation of the frame at " + core::exact(seen.time) + " s is negative",
                      "give what 'estimate' prints for this rope");
   if (started && !(seen.time > time))
-    throw InputError("identify --online", "times go backwards at " + core::exact(seen.time) + " s",
+    throw InputError("`online`", "times go backwards at " + core::exact(seen.time) + " s",
                      "give the frames in their order");
   if (!started || seen.time - time > options.longest_gap) {
     restarts += started;
@@ -184,7 +184,7 @@ bool ParameterFilter::Belief::observe(const Observation& seen, const dynamics::B
   rejected_in_a_row = 0;
   const Eigen::LDLT<MatrixX> factor(spread);
   if (!math::is_positive(factor))
-    throw InputError("identify --online", "the standard deviations at " + core::exact(seen.time) + " s are too large",
+    throw InputError("`online`", "the standard deviations at " + core::exact(seen.time) + " s are too large",
                      "leave frames out that tell nothing");
   const MatrixX gain = factor.solve(covariance.topRows(n)).transpose();
   const VectorX step = gain * innovation;

@@ -1,6 +1,7 @@
 #include "chainsplat/core.h"
 
 #include <fcntl.h>
+#include <malloc.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -9,6 +10,7 @@
 #include <charconv>
 #include <chrono>
 #include <cmath>
+#include <csignal>
 #include <cstdio>
 #include <cstring>
 #include <exception>
@@ -16,6 +18,7 @@
 #include <mutex>
 #include <sstream>
 #include <thread>
+#include <utility>
 
 namespace chainsplat::core {
 
@@ -75,19 +78,54 @@ void set_listener(Listener listener) {
   current_listener = std::move(listener);
 }
 
+ListenerScope::ListenerScope(Listener listener) : may_stop_(static_cast<bool>(listener.stop)) {
+  std::lock_guard lock(listener_mutex);
+  before_ = std::exchange(current_listener, std::move(listener));
+}
+
+ListenerScope::~ListenerScope() {
+  if (may_stop_) clear_stop();
+  set_listener(std::move(before_));
+}
+
 void warn(const std::string& line) {
   std::lock_guard lock(listener_mutex);
   if (current_listener.warning) current_listener.warning(line);
 }
 
+void say(const std::string& line) {
+  std::lock_guard lock(listener_mutex);
+  if (current_listener.message) current_listener.message(line);
+}
+
+void say_more(const std::string& line) {
+  std::lock_guard lock(listener_mutex);
+  if (current_listener.detail) current_listener.detail(line);
+}
+
+void record(const nlohmann::ordered_json& entry) {
+  std::lock_guard lock(listener_mutex);
+  if (current_listener.record) current_listener.record(entry);
+}
+
 void report(const Progress& progress) {
   std::lock_guard lock(listener_mutex);
   if (current_listener.progress) current_listener.progress(progress);
+  if (current_listener.stop && current_listener.stop()) request_stop(SIGINT);
 }
 
 void request_stop(int signal) noexcept { stop_signal.store(signal); }
 int stop_requested() noexcept { return stop_signal.load(); }
 void clear_stop() noexcept { stop_signal.store(0); }
+void stop_if_requested() {
+  if (const int signal = stop_requested()) throw Interrupted(signal);
+}
+
+void trim_memory() {
+#ifdef __GLIBC__
+  ::malloc_trim(0);
+#endif
+}
 
 void set_threads(int threads) { thread_count.store(threads); }
 
@@ -155,6 +193,14 @@ void write_file(const Path& path, std::string_view bytes) {
   }
   ::close(file);
   if (::rename(temporary.c_str(), path.c_str()) != 0) fail("renaming");
+}
+
+void make_folder(const Path& folder) {
+  std::error_code error;
+  std::filesystem::create_directories(folder, error);
+  if (error)
+    throw WorkError(folder.string(), "cannot be made (" + error.message() + ")",
+                    "make room or choose a folder that can be written");
 }
 
 std::string read_file(const Path& path) {

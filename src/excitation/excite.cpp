@@ -92,7 +92,7 @@ Known known_parameters(const Problem& problem) {
 
 Result excite(const Problem& problem, const Options& options) {
   if (!(options.duration >= 0.5 && options.duration <= 120.0))
-    throw InputError("--duration", "is " + core::exact(options.duration) + " s", "give 0.5 to 120 s");
+    throw InputError("`duration`", "is " + core::exact(options.duration) + " s", "give 0.5 to 120 s");
   if (!(options.noise > 0.0) || !(options.frame_rate > 0.0) || !(options.max_bend > 0.0))
     throw InputError("excite", "noise, frame rate or largest bend is not above 0", "give numbers above 0");
   const planning::Limits& l = options.limits;
@@ -159,7 +159,7 @@ Result excite(const Problem& problem, const Options& options) {
   Candidate best = best_of(candidates);
   if (!std::isfinite(best.value))
     throw WorkError("excite", "no motion keeps every joint within " + core::exact(options.max_bend) + " rad",
-                    "raise --max-bend or lower --acceleration");
+                    "raise `max_bend` or lower `acceleration`");
   double change = kFirstChange;
   for (int generation = 0; generation < options.generations; ++generation) {
     if (core::stop_requested()) throw Interrupted(core::stop_requested());

@@ -21,7 +21,7 @@ void write(const twin::Twin& twin, const chain::States& motion, const trajectory
   }
   if (ending == ".csv") {
     if (motion.time.empty())
-      throw InputError(file.string(), "the twin has no motion yet", "train it, or give one with --states");
+      throw InputError(file.string(), "the twin has no motion yet", "train it, or give one with `states`");
     core::write_file(file, twin::states_csv(motion));
     const trajectory::Trajectory at_rest = trajectory::fit({trajectory::Sample{}}, "rest");
     Path centerline = file;

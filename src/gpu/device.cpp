@@ -338,7 +338,7 @@ std::size_t choose(const std::vector<DeviceInfo>& devices, const std::string& se
   const char* variable = std::getenv("CHAINSPLAT_DEVICE");
   const bool from_variable = selector.empty() && variable && *variable;
   const std::string wanted = from_variable ? variable : selector;
-  const std::string where = from_variable ? "CHAINSPLAT_DEVICE" : wanted.empty() ? "device" : "--device";
+  const std::string where = from_variable ? "CHAINSPLAT_DEVICE" : wanted.empty() ? "device" : "`device`";
   if (devices.empty()) {
     throw InputError("device", why_none.empty() ? "there is no Vulkan device" : why_none,
                      "install a Vulkan 1.3 driver (Debian: mesa-vulkan-drivers brings a CPU device)");
@@ -381,7 +381,7 @@ std::size_t choose(const std::vector<DeviceInfo>& devices, const std::string& se
     throw InputError(where, devices[best].name + " cannot be used: " + join(devices[best].refused, ", "),
                      "choose one of: " + list_text(devices));
   }
-  if (reason) *reason = how + ", from " + (from_variable ? "CHAINSPLAT_DEVICE" : "--device");
+  if (reason) *reason = how + ", from " + (from_variable ? "CHAINSPLAT_DEVICE" : "`device`");
   return best;
 }
 
@@ -402,12 +402,12 @@ void Device::check(VkResult result, const char* what) const {
   const std::string where = "device " + info.name;
   if (result == VK_ERROR_DEVICE_LOST) {
     throw WorkError(where, std::string("was lost while it should ") + what,
-                    "run again (--resume continues); the usual cause is a driver that stops long work, or its fault");
+                    "run again (`resume` continues); the usual cause is a driver that stops long work, or its fault");
   }
   throw WorkError(where, std::string("could not ") + what + " (" + result_name(result) + ")",
                   result == VK_ERROR_OUT_OF_DEVICE_MEMORY || result == VK_ERROR_OUT_OF_HOST_MEMORY
                       ? "use a smaller picture, fewer Gaussians or a device with more memory"
-                      : "choose another device with --device, or update the driver");
+                      : "choose another device with `device`, or update the driver");
 }
 
 void Device::name(VkObjectType type, std::uint64_t object, const char* text) const {

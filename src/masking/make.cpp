@@ -129,7 +129,7 @@ chain::States grow_moments(const Recording& recording, const chain::Chain& chain
     for (const Grown& one : grown) best = std::max(best, one.evidence);
     if (best < kLeastEvidence)
       throw InputError(recording.path.string(), "nothing like the rope is found at the grasp",
-                       "check cameras, base, length and direction (chainsplat check), or use --command");
+                       "check cameras, base, length and direction (chainsplat check), or use `command`");
     if (pass == 1) break;
     for (std::size_t i = 0; i < moments.size(); ++i)
       for (std::size_t k = 0; grown[i].evidence > kTrusted * best && k < moments[i].cameras.size(); ++k)
@@ -300,7 +300,7 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
     if (!fit.frames.empty()) summary.inside /= static_cast<double>(fit.frames.size());
     if (summary.inside < kLeastInside)
       throw InputError(path.string(), "nothing like the rope is found at the grasp",
-                       "check cameras, base, length and direction (chainsplat check), or use --command");
+                       "check cameras, base, length and direction (chainsplat check), or use `command`");
     states = fit.states;
     learn(states, &masked.views);
   }

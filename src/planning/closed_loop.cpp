@@ -199,12 +199,12 @@ class Samples {
 
 LoopResult closed_loop(const Problem& problem, const Options& options, const Plan& plan, const dynamics::Model& truth,
                        const LoopOptions& loop) {
-  if (plan.hits.size() != 1) throw InputError("--simulate", "plays one target only", "give one --target");
+  if (plan.hits.size() != 1) throw InputError("`targets`", "feedback is for one of them", "give one target");
   if (!(loop.rate > 0.0) || !std::isfinite(loop.rate))
-    throw InputError("--mpc-rate", "must be above 0", "give replans a second, for example 10");
-  if (!loop.target_velocity.allFinite()) throw InputError("--target-velocity", "is not finite", "give VX,VY,VZ in m/s");
+    throw InputError("`loop.rate`", "must be above 0", "give replans a second, for example 10");
+  if (!loop.target_velocity.allFinite()) throw InputError("`loop.target_velocity`", "is not finite", "give VX,VY,VZ in m/s");
   if (truth.chain.direction != problem.model.chain.direction)
-    throw InputError("--simulate", "the chain leaves the gripper in another direction", "give one of the same grasp");
+    throw InputError("`truth`", "the chain leaves the gripper in another direction", "give one of the same grasp");
   const chain::Chain& chain = problem.model.chain;
   const std::vector<double> seen = chain::equal_arclengths(chain, kSeenPoints);
   std::vector<double> true_seen = seen;  // the same parts of a rope of another length

@@ -46,7 +46,7 @@ void validate(const Problem& problem, const Options& options) {
       throw InputError(name, "is " + core::exact(value), "give a number above 0");
   };
   const Limits& limits = options.limits;
-  positive(options.horizon, "--horizon");
+  positive(options.horizon, "`horizon`");
   positive(limits.velocity, "velocity limit");
   positive(limits.acceleration, "acceleration limit");
   positive(limits.jerk, "jerk limit");
@@ -55,32 +55,32 @@ void validate(const Problem& problem, const Options& options) {
   positive(limits.yaw_acceleration, "yaw acceleration limit");
   positive(limits.yaw_jerk, "yaw jerk limit");
   positive(limits.turn, "turn limit");
-  positive(options.tolerance, "--tolerance");
-  if (problem.targets.empty()) throw InputError("--target", "no target is given", "give X,Y,Z");
+  positive(options.tolerance, "`tolerance`");
+  if (problem.targets.empty()) throw InputError("`targets`", "no target is given", "give X,Y,Z");
   const std::vector<Axis> axes = options.axes.empty() ? default_axes(problem.model.chain) : options.axes;
   for (std::size_t i = 0; i < axes.size(); ++i)
     if (std::find(axes.begin() + i + 1, axes.end(), axes[i]) != axes.end())
-      throw InputError("--axes", "an axis is named twice", "name each of x, y, z, yaw once at most");
+      throw InputError("`axes`", "an axis is named twice", "name each of x, y, z, yaw once at most");
   if (problem.tabletop && problem.model.parameters.table_normal)
     for (Axis axis : axes)
       if (axis != Axis::yaw &&
           std::abs(problem.model.parameters.table_normal->operator[](static_cast<int>(axis))) > 0.1)
-        throw InputError("--axes", "one leaves the table and the rope is known on the table only", "leave it out");
+        throw InputError("`axes`", "one leaves the table and the rope is known on the table only", "leave it out");
   for (const Vector3& target : problem.targets) {
     if (!target.allFinite())
-      throw InputError("--target", "a coordinate is not a finite number", "give X,Y,Z in meters");
+      throw InputError("`targets`", "a coordinate is not a finite number", "give X,Y,Z in meters");
     if (problem.tabletop && problem.table_point && problem.model.parameters.table_normal &&
         problem.model.parameters.table_normal->dot(target - *problem.table_point) < -kTableSlack)
-      throw InputError("--target", "lies under the table", "give a point on the table or above it");
+      throw InputError("`targets`", "lies under the table", "give a point on the table or above it");
   }
   if (options.terminal) {
     if (options.terminal->size() != static_cast<Eigen::Index>(axes.size()) || !options.terminal->allFinite())
-      throw InputError("--terminal", "has " + std::to_string(options.terminal->size()) + " numbers",
+      throw InputError("`terminal`", "has " + std::to_string(options.terminal->size()) + " numbers",
                        "give an offset for each of the " + std::to_string(axes.size()) + " axes");
     for (std::size_t a = 0; a < axes.size(); ++a)
       if (std::abs((*options.terminal)[static_cast<Eigen::Index>(a)]) >
           (axes[a] == Axis::yaw ? limits.turn : limits.stroke))
-        throw InputError("--terminal", "is outside the stroke", "raise the stroke limit or end nearer to the start");
+        throw InputError("`terminal`", "is outside the stroke", "raise the stroke limit or end nearer to the start");
     // from rest to rest: half the time faster and half slower, each limit alone
     const double time = options.horizon * static_cast<double>(problem.targets.size());
     for (std::size_t a = 0; a < axes.size(); ++a) {
@@ -98,16 +98,16 @@ void validate(const Problem& problem, const Options& options) {
         what += core::exact(time);
         what += " s within the ";
         what += limit;
-        throw InputError("--terminal", what + " limit", "give a longer horizon, a nearer end or a higher limit");
+        throw InputError("`terminal`", what + " limit", "give a longer horizon, a nearer end or a higher limit");
       }
     }
   }
   for (const Sphere& s : options.spheres)
     if (!s.center.allFinite() || !(s.radius > 0.0))
-      throw InputError("--keep-out-sphere", "is no sphere", "give X,Y,Z,RADIUS with a radius above 0");
+      throw InputError("`spheres`", "is no sphere", "give X,Y,Z,RADIUS with a radius above 0");
   for (const Box& b : options.boxes)
     if (!b.low.allFinite() || !b.high.allFinite() || !((b.high - b.low).minCoeff() > 0.0))
-      throw InputError("--keep-out-box", "is no box", "give the lower corner, then the upper corner");
+      throw InputError("`boxes`", "is no box", "give the lower corner, then the upper corner");
   if (!options.spheres.empty() || !options.boxes.empty()) {
     Motion motion = empty_motion(problem, options);
     append_piece(motion, 0.0, options.horizon);
@@ -116,9 +116,9 @@ void validate(const Problem& problem, const Options& options) {
     Rollout start;
     start.base = {task.grid.fixed[0]}, start.theta = {problem.initial.theta};
     if (clearance(task, problem.model, start) < 0.0)
-      throw InputError(options.spheres.empty() ? "--keep-out-box" : "--keep-out-sphere",
+      throw InputError(options.spheres.empty() ? "`boxes`" : "`spheres`",
                        "rope or gripper touch it at the start",
-                       "move it, or give the gripper's size with --gripper-radius");
+                       "move it, or give the gripper's size with `gripper_radius`");
   }
 }
 

@@ -9,8 +9,8 @@ std::vector<dynamics::Parameters> draw_parameters(const chain::Chain& chain, con
   const auto size = static_cast<Eigen::Index>(estimates.names.size());
   if (size == 0 || estimates.covariance.rows() != size || estimates.covariance.cols() != size ||
       !estimates.covariance.allFinite())
-    throw InputError("--samples", "the twin knows no covariance of its parameters",
-                     "identify it again or leave --samples out");
+    throw InputError("`samples`", "the twin knows no covariance of its parameters",
+                     "identify it again or leave `samples` out");
   // a covariance that was written and read may be off positive by rounding
   const Eigen::SelfAdjointEigenSolver<MatrixX> eigen(0.5 * (estimates.covariance + estimates.covariance.transpose()));
   const MatrixX root = eigen.eigenvectors() * eigen.eigenvalues().cwiseMax(0.0).cwiseSqrt().asDiagonal();

@@ -128,7 +128,7 @@ std::optional<Checkpoint> parse(const std::string& bytes) {
   }
 }
 
-// The first line in which two jobs differ: 'NAME VALUE, not VALUE'.
+// The first line in which two jobs differ: 'NAME VALUE, not VALUE'; a name that begins with dashes is a field's.
 std::string difference(const std::string& had, const std::string& asked) {
   std::istringstream had_lines(had), asked_lines(asked);
   std::string before, now;
@@ -137,7 +137,10 @@ std::string difference(const std::string& had, const std::string& asked) {
     std::getline(asked_lines, now);
   } while (before == now && had_lines && asked_lines);
   const std::size_t value = now.rfind(' ') + 1;
-  return before + ", not " + (before.compare(0, value, now, 0, value) == 0 ? now.substr(value) : now);
+  const std::string other = before.compare(0, value, now, 0, value) == 0 ? now.substr(value) : now;
+  if (const std::size_t end = before.find(' '); before.starts_with("--") && end != std::string::npos)
+    before = "`" + before.substr(2, end - 2) + "`" + before.substr(end);
+  return before + ", not " + other;
 }
 
 }  // namespace
@@ -185,7 +188,7 @@ std::optional<Checkpoint> load_checkpoint(const Path& folder, const std::string&
     if (found && found->job != job)
       throw InputError(file.string(), "the checkpoint is of another job (" + difference(found->job, job) + ")",
                        "resume with the capture, the frames and the options that it was begun with, or begin again "
-                       "with --force");
+                       "with `force`");
     if (found) return found;
     damaged = true;
     core::warn(file.string() + ": the checkpoint is damaged or of another version and is passed over");

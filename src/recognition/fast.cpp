@@ -131,7 +131,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   const std::vector<FrameViews> frames = assign_views(capture, states.time);
   const TrainingViews training = training_views(capture, frames, std::max(1, options.every));
   if (training.views.empty())
-    throw WorkError(capture.name, "no training frame shows the object", "use --every 1 or check the masks");
+    throw WorkError(capture.name, "no training frame shows the object", "use `every` 1 or check the masks");
   const chain::Chain& chain = result.chain;
 
   splat::Engine engine(device);

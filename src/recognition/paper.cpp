@@ -110,7 +110,7 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
   for (int k = 0; k < static_cast<int>(frames.size()); k += std::max(1, options.every))
     if (!frames[k].views.empty()) training.push_back(k);
   if (training.empty())
-    throw WorkError(capture.name, "no training frame shows the object", "use --every 1 or check the masks");
+    throw WorkError(capture.name, "no training frame shows the object", "use `every` 1 or check the masks");
 
   // views on the union of their camera's crops
   std::vector<int> x0(capture.cameras.size(), 1 << 30), y0 = x0, x1(capture.cameras.size(), 0), y1 = x1;
@@ -234,7 +234,7 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
     if (watch_gradients(watch, values.not_finite, iteration + 1) == Course::diverged ||
         (read && !std::isfinite(values.total)))
       throw WorkError("recognize", "losses or gradients are not finite at iteration " + std::to_string(iteration + 1),
-                      "try --mode fast or another --seed");
+                      "try `mode` fast or another `seed`");
     if (read)
       core::report(
           {"recognize", iteration, options.paper_iterations, values.total, values.psnr_object[0], "paper mode"});

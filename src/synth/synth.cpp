@@ -25,13 +25,6 @@ std::string number(int frame) {
   return text;
 }
 
-void make_folder(const Path& folder) {
-  std::error_code error;
-  std::filesystem::create_directories(folder, error);
-  if (error)
-    throw WorkError(folder.string(), "cannot be made (" + error.message() + ")", "choose a folder that can be written");
-}
-
 Json camera_json(const capture::Camera& camera, const std::vector<double>& times, const Options& options,
                  const Path& folder) {
   const std::string& name = camera.name;
@@ -128,16 +121,16 @@ void write(splat::Engine& engine, const twin::Twin& twin, const chain::States& s
   }
 
   // images, masks and depth of each camera
-  make_folder(folder);
+  core::make_folder(folder);
   Json json = scene_json(twin, scene, options);
   json["cameras"] = Json::array();
   std::size_t done = 0;
   for (std::size_t c = 0; c < scene.cameras.size(); ++c) {
     const capture::Camera& camera = scene.cameras[c];
     const std::string& name = camera.name;  // loading has checked that it can be a file name
-    make_folder(folder / "masks" / name);
-    if (options.depth) make_folder(folder / "depth" / name);
-    if (!options.video) make_folder(folder / name);
+    core::make_folder(folder / "masks" / name);
+    if (options.depth) core::make_folder(folder / "depth" / name);
+    if (!options.video) core::make_folder(folder / name);
     json["cameras"].push_back(camera_json(camera, times[c], options, folder));
     render::Options drawing;
     drawing.depth = options.depth;
@@ -172,7 +165,7 @@ void write(splat::Engine& engine, const twin::Twin& twin, const chain::States& s
   std::vector<trajectory::Sample> samples = scene.base.samples();
   for (trajectory::Sample& sample : samples) sample.pose = scene.base.pose(sample.time);
   core::write_file(folder / "base.tum", trajectory::write_tum(samples));
-  make_folder(folder / "truth");
+  core::make_folder(folder / "truth");
   core::write_file(folder / "truth" / "centreline.csv", true_centerline(twin.chain, states, scene.base, times[0]));
   core::write_file(folder / "capture.json", json.dump(1) + "\n");
 }

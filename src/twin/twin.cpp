@@ -185,8 +185,9 @@ class Node {
       : value_(value), file_(std::move(file)), key_(std::move(key)) {}
 
   [[noreturn]] void fail(const std::string& what, const std::string& mend) const {
-    throw InputError(key_.empty() ? file_ : file_ + ": " + key_, what, mend);
+    throw InputError(where(), what, mend);
   }
+  std::string where() const { return key_.empty() ? file_ : file_ + ": " + key_; }
   bool has(const char* key) const { return value_.is_object() && value_.contains(key); }
   Node operator[](const char* key) const {
     if (!value_.is_object()) fail("is not an object", "restore it from a run that works");
@@ -436,25 +437,33 @@ dynamics::Estimates read_estimates(const Node& node) {
   return e;
 }
 
-// Options are stored as texts. Those that later commands parse as numbers or as a choice are checked here.
-void check_option(const std::string& name, const Node& node) {
+// Reads an option, stored as text, into its field. Throws InputError where the text cannot be parsed as what it is.
+void read_option(const std::string& name, const Node& node, Provenance& p) {
   const std::string text = node.text();
   const auto refuse = [&](const std::string& what) {
     constexpr std::size_t kShown = 40;  // characters
     node.fail("'" + text.substr(0, kShown) + "' is " + what, "correct it, or train again");
   };
-  const char* const end = text.data() + text.size();
+  const auto number = [&](auto& value, const std::string& what) {
+    const char* const end = text.data() + text.size();
+    const auto [after, error] = std::from_chars(text.data(), end, value);
+    if (error != std::errc() || after != end || !std::isfinite(static_cast<double>(value)) || !(value > 0)) refuse(what);
+  };
   if (name == "mass") {
-    double mass = 0.0;
-    const auto [after, error] = std::from_chars(text.data(), end, mass);
-    if (error != std::errc() || after != end || !std::isfinite(mass) || mass <= 0.0)
-      refuse("not a positive number, the mass in kg");
+    number(p.mass.emplace(), "not a positive number, the mass in kg");
   } else if (name == "every") {
-    int every = 0;
-    const auto [after, error] = std::from_chars(text.data(), end, every);
-    if (error != std::errc() || after != end || every < 1) refuse("not a whole number >= 1");
-  } else if (name == "mode" && text != "fast" && text != "paper") {
-    refuse("neither fast nor paper");
+    number(p.every.emplace(), "not a whole number >= 1");
+  } else if (name == "mode") {
+    if (text != "fast" && text != "paper") refuse("neither fast nor paper");
+    p.mode = text == "paper" ? Mode::paper : Mode::fast;
+  } else if (name == "frames") {
+    p.frames = capture::read_frame_range(text, node.where());
+  } else if (name == "path") {
+    p.path = text;
+  } else if (name == "joint") {
+    p.joint = true;
+  } else {
+    p.options[name] = text;
   }
 }
 
@@ -463,10 +472,7 @@ Provenance read_provenance(const Node& node) {
   p.version = node["version"].text();
   p.capture = node["capture"].text();
   p.capture_hash = node["capture_hash"].text();
-  for (const auto& [name, value] : node["options"].members()) {
-    check_option(name, value);
-    p.options[name] = value.text();
-  }
+  for (const auto& [name, value] : node["options"].members()) read_option(name, value, p);
   p.seed = node["seed"].unsigned_number();
   p.device = node["device"].text();
   p.driver = node["driver"].text();
@@ -484,6 +490,19 @@ Path named_file(const Node& top, const char* key, const Path& run) {
 }
 
 }  // namespace
+
+std::string mode_text(Mode mode) { return mode == Mode::paper ? "paper" : "fast"; }
+
+std::map<std::string, std::string> option_texts(const Provenance& p) {
+  std::map<std::string, std::string> texts = p.options;
+  if (p.mass) texts["mass"] = core::exact(*p.mass);
+  if (p.frames) texts["frames"] = capture::frame_range_text(*p.frames);
+  if (p.every) texts["every"] = std::to_string(*p.every);
+  if (p.mode) texts["mode"] = mode_text(*p.mode);
+  if (p.path) texts["path"] = *p.path;
+  if (p.joint) texts["joint"] = "yes";
+  return texts;
+}
 
 void save(const Twin& twin, const Path& run) {
   std::error_code error;
@@ -506,7 +525,7 @@ void save(const Twin& twin, const Path& run) {
   out["provenance"] = {{"version", p.version},
                        {"capture", p.capture},
                        {"capture_hash", p.capture_hash},
-                       {"options", Json(p.options)},
+                       {"options", Json(option_texts(p))},
                        {"seed", p.seed},
                        {"device", p.device},
                        {"driver", p.driver},

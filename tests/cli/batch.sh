@@ -17,7 +17,7 @@ captures = ["captures/*"]
 [settings]
 joint_count = 8
 E1
-refused 'settings: --mode: .*paper' <<'E1'
+refused 'settings\.mode: .*paper' <<'E1'
 captures = ["captures/*"]
 [settings]
 mode = ["fast", "papr"]

@@ -12,13 +12,13 @@
 #include <map>
 #include <memory>
 
+#include "chainsplat/batch.h"
 #include "chainsplat/capture.h"
+#include "chainsplat/marker_files.h"
+#include "chainsplat/motion_files.h"
+#include "chainsplat/run_folder.h"
 #include "src/capture/image_files.h"
-#include "tools/base_motion_files.h"
-#include "tools/batch.h"
-#include "tools/cli.h"
-#include "tools/markers.h"
-#include "tools/run_folder.h"
+#include "tools/chainsplat/cli.h"
 
 namespace chainsplat::fuzz {
 
@@ -153,7 +153,7 @@ void truth(std::string_view bytes) {
 void markers(std::string_view bytes) {
   static const Path file = folder() / "markers.csv";
   put(file, bytes);
-  const tools::MarkerFile read = tools::read_markers(file);
+  const identification::MarkerFile read = identification::read_markers(file);
   for (const math::MatrixX& world : read.markers.world)
     require(world.cols() == static_cast<Eigen::Index>(read.markers.arclengths.size()), "a point a marker");
 }
@@ -226,9 +226,9 @@ void covariance(std::string_view bytes) {
   static const Path file = folder() / "covariance.csv";
   chain::States states{{0.0, 0.1, 0.2}, std::vector<math::VectorX>(3, math::VectorX::Zero(2)), {}, {}};
   put(file, bytes);
-  const std::vector<math::MatrixX> read = states.covariance = tools::read_covariances(file, states);
-  put(file, tools::covariance_csv(states));
-  const std::vector<math::MatrixX> again = tools::read_covariances(file, states);
+  const std::vector<math::MatrixX> read = states.covariance = pipeline::read_covariances(file, states);
+  put(file, pipeline::covariance_csv(states));
+  const std::vector<math::MatrixX> again = pipeline::read_covariances(file, states);
   for (std::size_t k = 0; k < read.size(); ++k) require(again[k] == read[k], "the same covariances come back");
 }
 
@@ -238,8 +238,8 @@ void jobs(std::string_view bytes) {
     return folder() / "jobs" / "jobs.toml";
   }();
   put(file, bytes);
-  const tools::BatchPlan plan = tools::read_job_file(file);
-  for (const tools::BatchJob& job : plan.jobs)
+  const pipeline::BatchPlan plan = pipeline::read_job_file(file);
+  for (const pipeline::BatchJob& job : plan.jobs)
     require(Path(job.name).filename() == job.name && job.name != "..", "a job's name is that of one folder");
 }
 
@@ -249,7 +249,7 @@ void values(std::string_view bytes) {
   const std::string text(bytes.substr(1));
   switch (bytes[0]) {
     case 'f': {
-      const auto [first, last] = tools::parse_frames(text);
+      const auto [first, last] = capture::read_frame_range(text, "frames");
       require(first >= 0 && (last == -1 || last > first), "a range of frames");
       break;
     }
@@ -257,7 +257,7 @@ void values(std::string_view bytes) {
       tools::split_camera(text);
       break;
     case 'a':
-      tools::parse_axes(text);
+      planning::parse_axes(text);
       break;
     case 'n':
       require(tools::numbers(text, "--target", 3).size() == 3, "as many numbers as were asked for");
@@ -346,9 +346,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
   try {
     read({reinterpret_cast<const char*>(data), size});
   } catch (const InputError& error) {
-    const std::string text = error.what();
-    const std::size_t what = text.find(": "), mend = text.rfind("; ");
-    fuzz::require(what != std::string::npos && mend != std::string::npos && what < mend, "WHERE: WHAT; HOW TO MEND");
+    fuzz::require(!error.where.empty() && !error.problem.empty() && !error.mend.empty(), "WHERE: PROBLEM; MEND");
   }
   return 0;
 }

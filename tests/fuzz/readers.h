@@ -2,7 +2,7 @@
 //
 // A reader takes bytes as they come from outside. It may throw InputError (and WorkError where its header says so); any
 // other exception, a crash, more than five seconds or more than a gigabyte are defects. Accepted input is written and
-// read again where that is cheap. Readers in unnamed namespaces of tools/*.cpp are reached by including that file.
+// read again where that is cheap. Readers in unnamed namespaces are reached by including their file.
 #pragma once
 #include <string_view>
 

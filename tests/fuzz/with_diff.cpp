@@ -1,6 +1,6 @@
 // Fuzzes metrics.json as `diff` reads it.
 #include "readers.h"
-#include "tools/diff.cpp"
+#include "tools/chainsplat/diff.cpp"
 
 namespace chainsplat::fuzz {
 
@@ -9,7 +9,7 @@ void metrics(std::string_view bytes) {
     std::filesystem::create_directories(folder() / "metrics");
     return folder() / "metrics";
   }();
-  put(run / tools::kMetricsFile, bytes);
+  put(run / pipeline::kMetricsFile, bytes);
   const tools::Json read = tools::mean_metrics(run);
   tools::Comparison comparison;
   tools::compare_metrics(comparison, read, tools::Json::object());

@@ -1,22 +1,14 @@
 // Fuzzes the input of `force`: the lines of `estimate`, and points of contact.
 #include "readers.h"
-#include "tools/force.cpp"
+#include "tools/chainsplat/force.cpp"
 
 namespace chainsplat::fuzz {
-
-#if __has_include("tools/estimate_lines.h")
-using tools::read_estimate_line;
-#else
-std::optional<tools::State> read_estimate_line(const std::string& line, const std::string& where, int, double before) {
-  return tools::read_estimate(line, where, two_joints(), before);
-}
-#endif
 
 void estimates(std::string_view bytes) {
   std::istringstream lines{std::string(bytes)};
   double before = -std::numeric_limits<double>::infinity();
   for (std::string line; std::getline(lines, line);) {
-    const auto state = read_estimate_line(line, "line", two_joints().angles(), before);
+    const auto state = estimation::read_estimate_line(line, "line", two_joints().angles(), before);
     if (!state) continue;
     before = state->time;
     require(state->theta.size() == 2 && state->theta.allFinite(), "finite angles of the twin");

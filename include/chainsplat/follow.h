@@ -1,0 +1,94 @@
+// chainsplat/follow.h - a rope followed frame by frame: frames from a capture, a video, a V4L2 device or standard input,
+// and an estimate for each.
+#pragma once
+#include <functional>
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "chainsplat/capture.h"
+#include "chainsplat/dynamics.h"
+
+namespace chainsplat::estimation {
+struct Estimate;
+}
+namespace chainsplat::twin {
+struct Twin;
+}
+
+namespace chainsplat::pipeline {
+
+// One moment. A recorded capture has views, everything else a picture.
+struct LiveFrame {
+  int frame = 0;
+  double time = 0.0;                 // s
+  std::vector<capture::View> views;  // undistorted crops with masks, of one camera or several at nearly one time
+  capture::Image8 picture;  // whole, RGB as recorded, of the first camera; empty for a capture unless asked for
+  double arrived = 0.0;     // core::seconds_now() when it was decoded
+};
+
+struct SourceOptions {
+  Path source;         // a capture; with `calibration` a video file, a device under /dev or "-": raw RGB24, standard input
+  std::string camera;  // of a capture, by its name; empty: all of them together
+  Path calibration;    // camera object as in capture.json
+  double rate = 0.0;   // frames per second; 0: the calibration's, else the video's
+  std::optional<double> start;  // s, of the first frame; none: the calibration's
+  bool unix_time = false;       // a device's own stamps in Unix time, in place of `start`
+  capture::FrameRange frames;
+  bool pictures = false;  // whole frames of a capture too (its first camera)
+};
+
+struct FrameSource {
+  std::vector<capture::Camera> cameras;
+  std::optional<trajectory::Trajectory> base;  // a capture's own
+  bool masked = false;                         // the frames have views
+  // The next frame; false at the end. Throws InputError or WorkError where the frames end in another way, Interrupted
+  // where a stop is requested while it waits.
+  std::function<bool(LiveFrame&)> next;
+};
+
+// Throws InputError.
+FrameSource open_frames(const SourceOptions& options);
+
+// newton: outlines, then the colors inside them, drawn on the device; silhouette: outlines alone, without a device; adam:
+// the paper's, ten Adam steps on the rendering loss from the last frame's angles, without deviations.
+enum class Solver { newton, silhouette, adam };
+
+struct FollowOptions {
+  SourceOptions source;
+  Path base;                     // base motion, TUM; empty: the capture's, else at rest
+  std::optional<Solver> solver;  // none: newton, and silhouette where there is no device
+  int drop = 1;                  // every n-th frame is used
+  std::string device;            // Vulkan device, its number or a part of its name; empty: chosen
+
+  void check() const;
+};
+
+// What one frame came to.
+struct Followed {
+  const LiveFrame& frame;
+  const std::vector<capture::View>& views;  // what was looked at: the frame's own, or made of its picture
+  const estimation::Estimate& estimate;
+  double latency;  // s, from the decoded frame until now
+};
+
+class Follower {
+ public:
+  // The twin in `run`, the source and the device, all of them opened and checked.
+  Follower(const Path& run, const FollowOptions& options);
+  ~Follower();
+  // Frame by frame until the source ends; `each` is called after every one. Throws Interrupted where a stop is requested.
+  void follow(const std::function<void(const Followed&)>& each);
+
+  const twin::Twin& twin() const;
+  const dynamics::Model& model() const;
+  const trajectory::Trajectory& base() const;
+  const std::vector<capture::Camera>& cameras() const;
+
+ private:
+  struct Implementation;
+  std::unique_ptr<Implementation> implementation_;
+};
+
+}  // namespace chainsplat::pipeline

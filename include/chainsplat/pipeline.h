@@ -1,0 +1,140 @@
+// chainsplat/pipeline.h - what the commands of the program do, each as one call.
+//
+// A call takes folders and an options struct, whose check() throws an InputError that names the wrong field; it reports
+// to `listener` (core.h), which may stop it, and returns its results as values. One call at a time in a process: there is
+// one listener. Every call throws InputError where the request or its input is wrong, and then nothing was written;
+// WorkError where the work failed, and then what exists is kept; Interrupted where it was stopped. Files: run_folder.h.
+#pragma once
+#include <cstdint>
+#include <iosfwd>
+#include <optional>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "chainsplat/eval.h"
+#include "chainsplat/solve.h"
+#include "chainsplat/twin.h"
+
+namespace chainsplat::pipeline {
+
+inline constexpr int kMostJoints = 64;
+inline constexpr std::size_t kLeastFrames = 3;  // that identification needs (chainsplat/identification.h)
+
+// --- train: recognize, identify, roll out, evaluate ------------------------------------------------------------------
+
+enum class Stage { recognize, identify, rollout, evaluate };
+
+struct TrainOptions {
+  int joints = 8;
+  std::optional<chain::Bending> bending;  // none: planar on a table; in free space spatial unless the rope stays in a plane
+  bool twist = false;                     // also a twist axis per joint
+  int every = 5;                          // the Gaussians are trained on every n-th frame
+  capture::FrameRange frames;
+  twin::Mode mode = twin::Mode::fast;
+  std::vector<Stage> stages;  // empty: all that are not done. A stage that is named is done again, but recognition
+  bool joint = false;         // refine angles, Gaussians and dynamics together after identification
+  bool resume = false;        // go on in a run folder that was left unfinished
+  bool force = false;         // begin again in a run folder that is not empty
+  Path picture;               // PNG of observed beside rendered frames; empty: none
+  std::uint64_t seed = 0;
+  std::string device;  // Vulkan device, its number or a part of its name; empty: chosen
+
+  void check() const;
+};
+
+struct TrainResult {
+  twin::Twin twin;
+  std::optional<eval::Metrics> recognized, rollout;  // none unless evaluated
+  // How the fits of the stages that ran ended: "recognize", "identify", "joint".
+  std::vector<std::pair<std::string, solve::Summary>> fits;
+};
+
+// Makes the twin of the capture (its folder or capture.json) in the folder `run`. Reports in stages "recognize",
+// "identify", "joint", "rollout", "evaluate", and writes them to log.jsonl. A call that was stopped goes on with `resume`,
+// with the same bits as if nothing had happened.
+TrainResult train(const Path& capture, const Path& run, const TrainOptions& options, const core::Listener& listener = {});
+
+// The fields of TrainOptions that a batch may set, by name, and a value of one from its text ("true" or "false" for a
+// flag, commas between stages). Throws InputError, which says by `where` whose text it is.
+struct Setting {
+  std::string name;
+  bool flag = false;
+};
+const std::vector<Setting>& settings();
+void set(TrainOptions& options, const std::string& name, const std::string& text, const std::string& where);
+std::vector<Stage> read_stages(const std::string& text, const std::string& where);  // empty text: none
+const char* stage_text(Stage stage);
+
+// --- identify --------------------------------------------------------------------------------------------------------
+
+struct IdentifyOptions {
+  bool joint = false;  // refine angles, Gaussians and dynamics together afterwards; one run, whose capture is there
+  std::uint64_t seed = 0;
+  std::string device;
+};
+
+struct IdentifyResult {
+  std::vector<twin::Twin> twins;   // one per run, as saved
+  std::vector<Path> lost_metrics;  // runs whose metrics.json was of the old parameters, and is removed
+};
+
+// Dynamics from recognized states; several runs of one rope get one set of parameters.
+IdentifyResult identify(const std::vector<Path>& runs, const IdentifyOptions& options,
+                        const core::Listener& listener = {});
+
+struct MarkerOptions {
+  bool shape_only = false;  // fit the states, identify nothing
+  std::uint64_t seed = 0;
+};
+// Dynamics from marker files (marker_files.h). The twin, which may be an empty one, keeps the motion of the first file.
+IdentifyResult identify_markers(const Path& run, const std::vector<Path>& files, const MarkerOptions& options,
+                                const core::Listener& listener = {});
+
+struct OnlineOptions {
+  Path base;            // the base's motion meanwhile, TUM; empty: the capture's own
+  double memory = 5.0;  // s, in which old frames fade; infinite: never
+};
+struct OnlineResult {
+  dynamics::Estimates before, now;
+  double from = 0.0, to = 0.0;  // s
+  int frames = 0, left_out = 0, restarts = 0;
+};
+// Parameters that follow the rope through the lines of estimates (estimate_lines.h) until they end or a stop is
+// requested. `name`: of the lines, for messages.
+OnlineResult identify_online(const Path& run, std::istream& lines, const std::string& name, const OnlineOptions& options,
+                             const core::Listener& listener = {});
+
+// The stage alone, without files: fills in parameters, initial state, estimates and rollout of a recognized twin.
+// The states count by their covariances where they have them. `paper`: the paper's procedure.
+void identify_states(twin::Twin& twin, const trajectory::Trajectory& base, bool paper, std::uint64_t seed);
+
+// --- rollout, evaluate -----------------------------------------------------------------------------------------------
+
+struct RolloutOptions {
+  Path base;           // base motion, TUM; empty: the capture's own
+  Path initial;        // states.csv to start from, its first row; empty: the identified state, with `base` at rest
+  double rate = 30.0;  // rows per second
+
+  void check() const;
+};
+struct RolloutResult {
+  twin::Twin twin;
+  trajectory::Trajectory base;
+  chain::States states;
+};
+RolloutResult rollout(const Path& run, const RolloutOptions& options, const core::Listener& listener = {});
+
+struct EvaluateOptions {
+  capture::FrameRange frames;
+  Path picture;  // PNG of observed beside rendered frames; empty: none
+  std::string device;
+};
+struct Evaluation {
+  std::optional<eval::Metrics> recognized, rollout;
+};
+// How well the twin explains a capture: its own, or another one of the same rope (the rollout only, from rest).
+Evaluation evaluate(const Path& run, const Path& capture, const EvaluateOptions& options,
+                    const core::Listener& listener = {});
+
+}  // namespace chainsplat::pipeline

@@ -1,0 +1,98 @@
+#include "chainsplat/estimate_lines.h"
+
+#include <cmath>
+#include <istream>
+#include <nlohmann/json.hpp>
+#include <vector>
+
+#include "chainsplat/core.h"
+
+namespace chainsplat::estimation {
+
+namespace {
+
+using Json = nlohmann::ordered_json;
+
+// No rope turns so far or so fast, and no clock runs so long: far below, squares and products could overflow.
+constexpr double kMostAngle = 1e6;  // rad, rad/s
+constexpr double kMostTime = 1e12;  // s, thirty thousand years
+
+[[noreturn]] void refuse(const std::string& where, const char* field, const std::string& what) {
+  throw InputError(where + ": " + field, what, "give the output of 'chainsplat estimate'");
+}
+
+double number(const Json& value, const std::string& where, const char* field, double most) {
+  if (!value.is_number()) refuse(where, field, "is no finite number");
+  const double out = value.get<double>();
+  if (!(std::abs(out) <= most)) refuse(where, field, core::exact(out) + " is beyond " + core::exact(most));
+  return out;
+}
+
+// Empty where the field is missing.
+math::VectorX numbers(const Json& object, const std::string& where, const char* field, double most) {
+  const auto found = object.find(field);
+  if (found == object.end()) return {};
+  if (!found->is_array()) refuse(where, field, "is no list of numbers");
+  math::VectorX out(static_cast<Eigen::Index>(found->size()));
+  for (Eigen::Index i = 0; i < out.size(); ++i)
+    out[i] = number((*found)[static_cast<std::size_t>(i)], where, field, most);
+  return out;
+}
+
+}  // namespace
+
+std::optional<EstimateLine> read_estimate_line(const std::string& line, const std::string& where, int angles,
+                                               double before) {
+  const Json object = core::parse_json_or_discard(line);
+  if (!object.is_object())
+    throw InputError(where, "is no line of 'chainsplat estimate'", "give its output: a JSON object a frame");
+  if (const auto lost = object.find("lost"); lost != object.end()) {
+    if (!lost->is_boolean()) refuse(where, "lost", "is not true or false");
+    if (lost->get<bool>()) return {};
+  }
+  for (const char* field : {"time", "theta"})
+    if (!object.contains(field)) refuse(where, field, "is missing");
+  EstimateLine out;
+  out.time = number(object["time"], where, "time", kMostTime);
+  if (!(out.time > before))
+    throw InputError(where + ": time",
+                     core::exact(out.time) + " s is not after the " + core::exact(before) + " s of the line before",
+                     "give the lines in order");
+  out.theta = numbers(object, where, "theta", kMostAngle);
+  out.thetadot = numbers(object, where, "thetadot", kMostAngle);
+  out.sigma = numbers(object, where, "sigma", kMostAngle);
+  for (const auto& [field, values] :
+       {std::pair("theta", &out.theta), {"thetadot", &out.thetadot}, {"sigma", &out.sigma}})
+    if (values->size() != angles && (values->size() > 0 || values == &out.theta))
+      throw InputError(where + ": " + field,
+                       "has " + std::to_string(values->size()) + " angles, the twin " + std::to_string(angles),
+                       "give estimates of this twin");
+  if ((out.sigma.array() < 0.0).any()) refuse(where, "sigma", "is negative");
+
+  const math::VectorX triangle = numbers(object, where, "covariance", kMostAngle * kMostAngle);
+  if (triangle.size() == 0) return out;
+  const Eigen::Index own = angles, all = 2 * own;  // with the rates: their rows follow
+  if (triangle.size() != own * (own + 1) / 2 && triangle.size() != all * (all + 1) / 2)
+    refuse(where, "covariance", "is no lower triangle of the angles");
+  out.covariance.resize(own, own);
+  for (Eigen::Index row = 0, i = 0; row < own; ++row)
+    for (Eigen::Index column = 0; column <= row; ++column, ++i)
+      out.covariance(row, column) = out.covariance(column, row) = triangle[i];
+  if (!math::is_covariance(out.covariance)) refuse(where, "covariance", "is not positive semidefinite");
+  return out;
+}
+
+bool next_line(std::istream& in, std::string& line, const std::string& where) {
+  constexpr std::size_t kLongest = 64 << 20;  // bytes; an estimate of a thousand angles, with covariance, has half of it
+  line.clear();
+  for (char letter = 0; in.get(letter);) {
+    if (letter == '\n') return true;
+    if (line.size() == kLongest)
+      throw InputError(where, "has a line of more than 64 MiB", "give the output of 'chainsplat estimate'");
+    line += letter;
+  }
+  if (in.bad()) throw InputError(where, "cannot be read", "give the output of 'chainsplat estimate'");
+  return !line.empty();
+}
+
+}  // namespace chainsplat::estimation

@@ -1,0 +1,116 @@
+// evaluate.cpp - a twin set in motion, and measured against a capture.
+#include <algorithm>
+
+#include "chainsplat/comparison.h"
+#include "chainsplat/gpu.h"
+#include "chainsplat/motion_files.h"
+#include "chainsplat/pipeline.h"
+#include "chainsplat/run_folder.h"
+
+namespace chainsplat::pipeline {
+
+namespace {
+
+constexpr double kTimeSlack = 1e-6;  // s: times in text files are rounded
+constexpr const char* kExampleRate = "give rows a second, for example 30";
+
+// Where the rollout starts (formats.md 2.4, rollout).
+dynamics::InitialState start_of(const Path& run, const RolloutOptions& options, const twin::Twin& twin,
+                                const dynamics::Model& model, const trajectory::Trajectory& base) {
+  const int angles = twin.chain.angles();
+  dynamics::InitialState initial;
+  initial.time = base.start();
+  initial.thetadot = math::VectorX::Zero(angles);
+  if (!options.initial.empty()) {
+    const chain::States states = twin::read_states(options.initial, angles);
+    if (states.time.empty()) throw InputError(options.initial.string(), "has no rows", "give at least one");
+    // the states of the twin's own motion keep their time
+    if (options.base.empty() && states.time[0] >= base.start() && states.time[0] < base.end())
+      initial.time = states.time[0];
+    initial.theta = states.theta[0];
+    if (!states.thetadot.empty())
+      initial.thetadot = states.thetadot[0];
+    else
+      core::warn(options.initial.string() + ": no thetadot columns; the rope is assumed to start at rest");
+  } else if (options.base.empty()) {
+    if (!twin.initial)
+      throw InputError(run.string() + "/twin.json", "has no initial state",
+                       "run 'chainsplat identify' or give `initial`");
+    initial = *twin.initial;
+  } else if (twin.tabletop) {
+    if (!twin.initial && twin.states.theta.empty())
+      throw InputError(run.string(), "holds no state to start from on the table", "give `initial`");
+    initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
+  } else {
+    initial.theta = dynamics::static_equilibrium(model, base.pose(base.start())).theta;
+  }
+  return initial;
+}
+
+// The twin set in motion by another capture's base, at the times of its first camera that the base covers.
+chain::States rollout_on(const twin::Twin& twin, const Path& run, const capture::Capture& capture) {
+  const dynamics::Model model = model_of(twin, run);
+  dynamics::InitialState initial;
+  std::vector<double> times;
+  for (const double time : capture.times.front())
+    if (time >= capture.base.start() && time <= capture.base.end()) times.push_back(time);
+  if (times.empty())
+    throw InputError(capture.folder.string(), "its base motion covers none of its frames", "correct base.tum");
+  initial.time = std::min(capture.base.start(), times.front());
+  initial.thetadot = math::VectorX::Zero(twin.chain.angles());
+  initial.theta = twin.tabletop ? (twin.initial ? twin.initial->theta : twin.states.theta.front())
+                                : dynamics::static_equilibrium(model, capture.base.pose(initial.time)).theta;
+  return dynamics::rollout(model, capture.base, initial, times);
+}
+
+}  // namespace
+
+void RolloutOptions::check() const { planning::check_rate(rate, 0.0, kExampleRate); }
+
+RolloutResult rollout(const Path& run, const RolloutOptions& options, const core::Listener& listener) {
+  const core::ListenerScope scope(listener);
+  options.check();
+  RolloutResult result{twin::load(run), {}, {}};
+  const dynamics::Model model = model_of(result.twin, run);
+  result.base = options.base.empty() ? own_base(run) : read_base(options.base);
+  const trajectory::Trajectory& base = result.base;
+  const dynamics::InitialState initial = start_of(run, options, result.twin, model, base);
+  planning::check_rate(options.rate, base.end() - initial.time, kExampleRate);
+  std::vector<double> times;
+  for (int k = 0; initial.time + k / options.rate <= base.end() + kTimeSlack; ++k)
+    times.push_back(initial.time + k / options.rate);
+  if (times.empty())
+    throw InputError((options.base.empty() ? run : options.base).string(), "the base motion ends before the start",
+                     "give a base motion that goes on after it");
+  result.states = dynamics::rollout(model, base, initial, times);
+  return result;
+}
+
+Evaluation evaluate(const Path& run, const Path& capture, const EvaluateOptions& options,
+                    const core::Listener& listener) {
+  const core::ListenerScope scope(listener);
+  if (!options.picture.empty()) check_output_file(options.picture.string());
+  twin::Twin twin = load_twin(run);
+  check_drawable(twin, run);
+  capture::LoadOptions load;
+  load.first = options.frames.first, load.last = options.frames.last;
+  load.undistort = false;
+  load.depth = true;
+  const capture::Capture recorded = capture::load(capture, load);
+  const bool own = twin.provenance.capture_hash == hash_text(recorded.hash);
+  if (!own) {
+    core::say("another capture than the twin's own: only the rollout is evaluated, from rest");
+    twin.states = {};
+    twin.rollout = rollout_on(twin, run, recorded);
+  }
+  const gpu::DevicePtr device = gpu::open_device({.selector = options.device});
+  splat::Engine engine(*device);
+  Evaluation found;
+  if (own) found.recognized = eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, recorded);
+  if (!twin.rollout.time.empty())
+    found.rollout = eval::evaluate(engine, twin.gaussians, twin.chain, twin.rollout, recorded);
+  if (!options.picture.empty()) capture::write_png(options.picture, eval::comparison(engine, twin, recorded));
+  return found;
+}
+
+}  // namespace chainsplat::pipeline

@@ -1,0 +1,282 @@
+// follow.cpp - frame by frame: the mask where there is none, the estimate, and whoever wants it.
+#include "chainsplat/follow.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <span>
+
+#include "chainsplat/estimation.h"
+#include "chainsplat/gpu.h"
+#include "chainsplat/masking.h"
+#include "chainsplat/run_folder.h"
+#include "pipeline/bright_view.h"
+
+namespace chainsplat::pipeline {
+
+namespace {
+
+using Views = std::span<const capture::View* const>;
+
+// Colors of a twin's Gaussians, as seen from the sides: what the rope looks like before the first frame.
+std::vector<std::uint8_t> twin_colors(const twin::Twin& twin) {
+  constexpr float kOpaque = 0.0f;  // logit of one half
+  std::vector<std::uint8_t> rgb;
+  const math::Vector3 across = twin.chain.direction.cross(twin.chain.bending_axis);
+  for (int i = 0; i < twin.gaussians.count; ++i) {
+    if (twin.gaussians.opacity_logit[i] < kOpaque) continue;
+    for (const math::Vector3& from : {across, math::Vector3(-across), twin.chain.bending_axis}) {
+      const math::Vector3 color = splat::sh_color(twin.gaussians, i, from);
+      for (int c = 0; c < 3; ++c)
+        rgb.push_back(static_cast<std::uint8_t>(std::lround(255.0 * std::clamp(color[c], 0.0, 1.0))));
+    }
+  }
+  return rgb;
+}
+
+// The twin drawn into a crop (x0, y0, width, height; without size the whole picture).
+capture::View drawn_view(splat::Engine& engine, const twin::Twin& twin, const capture::Camera& camera,
+                         const math::Pose& base, const math::VectorX& theta, const std::array<int, 4>& crop) {
+  capture::View view;
+  view.width = camera.width, view.height = camera.height;
+  if (crop[2] > 0 && crop[3] > 0) view.x0 = crop[0], view.y0 = crop[1], view.width = crop[2], view.height = crop[3];
+  const splat::ViewSpec spec{&camera,    view.x0,     view.y0,
+                             view.width, view.height, chain::link_motions(twin.chain, theta, base)};
+  const splat::Picture drawn = std::move(engine.draw(twin.gaussians, {&spec, 1}, false).front());
+  for (const float value : drawn.rgba)
+    view.rgba.push_back(static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(value, 0.0f, 1.0f))));
+  return view;
+}
+
+// Whether a picture was masked before: most of it is black.
+bool black_about(const capture::Image8& picture) {
+  constexpr int kBlack = 16;  // of 255: lossy coding does not keep black black
+  std::size_t black = 0;
+  for (std::size_t i = 0; i + 2 < picture.pixels.size(); i += 3)
+    black += std::max({picture.pixels[i], picture.pixels[i + 1], picture.pixels[i + 2]}) <= kBlack;
+  return 2 * black > picture.pixels.size() / 3;
+}
+
+// The device's kernels are made at their first use, and its buffers grow, which no frame shall wait for: it is shown
+// masks that fill the pictures, which no frame does, and masks of a size that a rope's may have.
+void warm_up(const estimation::Filter& filter, double start) {
+  constexpr int kMostWidth = 2048, kMostHeight = 1536;  // px; larger masks can be more than the device takes at once
+  const std::vector<math::Pose> rest = chain::link_motions(filter.model.chain, filter.rest, filter.base(start).pose);
+  for (const int share : {1, 4}) {
+    std::vector<capture::View> views;
+    std::vector<const capture::View*> pointers;
+    for (const capture::Camera& camera : filter.cameras) {
+      capture::View& view = views.emplace_back();
+      view.camera = static_cast<int>(views.size()) - 1;
+      view.width = std::min(camera.width, kMostWidth);
+      view.height = std::min(camera.height, kMostHeight);
+      view.rgba.assign(4 * static_cast<std::size_t>(view.width) * view.height, 0);
+      const int wide = view.width / share, left = (view.width - wide) / 2;
+      for (int y = 0; y < view.height; ++y)
+        std::fill_n(&view.rgba[4 * (static_cast<std::size_t>(y) * view.width + left)], 4 * wide, std::uint8_t{255});
+    }
+    for (const capture::View& view : views) pointers.push_back(&view);
+    filter.compare_colors(pointers, std::vector<std::vector<math::Pose>>(views.size(), rest));
+  }
+}
+
+std::string name_of(const SourceOptions& source) {
+  return source.source.string() + (source.camera.empty() ? "" : ":" + source.camera);
+}
+
+}  // namespace
+
+void FollowOptions::check() const {
+  if (drop < 1) throw InputError("`drop`", "must be 1 or more", "give 2 for every second frame");
+}
+
+struct Follower::Implementation {
+  Implementation(const Path& folder, const FollowOptions& wanted);
+
+  Path run;
+  FollowOptions options;
+  std::string source_name, base_name;
+  twin::Twin twin;
+  FrameSource source;
+  trajectory::Trajectory base;
+  estimation::Filter filter;
+  gpu::DevicePtr device;
+  std::optional<splat::Engine> engine;  // none: outlines alone
+  std::optional<estimation::AdamFollower> adam;
+  std::optional<bool> masked_before;         // by the first picture
+  std::optional<masking::Live> live;         // masks made here
+  std::array<int, 4> masked = {0, 0, 0, 0};  // crop of the last mask: x0, y0, width, height
+
+  void open_base();
+  void open_engine();
+  void look_at_colors();
+  void start_adam();
+  void look_at_first_picture(const capture::Image8& picture);
+  capture::View mask(const capture::Image8& picture, const math::Pose& pose, const std::optional<math::VectorX>& theta);
+  void check_time(const LiveFrame& frame, bool first) const;
+
+  estimation::Estimate update(Views views) {
+    return adam ? estimation::update(*adam, views) : estimation::update(filter, views);
+  }
+  // Where the rope is expected at `time`; none where that is not known.
+  std::optional<math::VectorX> expected(double time) const {
+    if (!adam) return estimation::expected(filter, time);
+    return adam->theta.size() > 0 ? std::optional<math::VectorX>(adam->theta) : std::nullopt;
+  }
+};
+
+Follower::Implementation::Implementation(const Path& folder, const FollowOptions& wanted)
+    : run(folder),
+      options(wanted),
+      source_name(name_of(wanted.source)),
+      base_name(wanted.base.empty() ? source_name : wanted.base.string()) {
+  options.check();
+  twin = load_twin(run);
+  if (!twin.parameters)
+    core::warn(run.string() + ": its dynamics are not identified; angles are assumed to go on at constant rate");
+  source = open_frames(options.source);
+  open_base();
+  filter = estimation::start(
+      twin, source.cameras, [this](double time) { return base.at(time); }, base.start());
+  open_engine();
+  if (options.solver == Solver::adam)
+    start_adam();
+  else if (engine)
+    look_at_colors();
+}
+
+void Follower::Implementation::open_base() {
+  if (!options.base.empty()) {
+    base = read_base(options.base);
+  } else if (source.base) {
+    base = *source.base;
+  } else {
+    const trajectory::Trajectory own = own_base(run);
+    base = trajectory::fit({{own.start(), own.pose(own.start())}}, run.string());
+    core::warn("`base`: is missing; the base is assumed to rest where the twin's capture began");
+  }
+}
+
+void Follower::Implementation::open_engine() {
+  if (options.solver != Solver::silhouette && twin.gaussians.count > 0) {
+    try {
+      device = gpu::open_device({.selector = options.device});
+      engine.emplace(*device);
+    } catch (const InputError& error) {
+      if (options.solver || !options.device.empty()) throw;  // asked for
+      core::warn(std::string(error.what()) + "; the rope is followed by its outline alone");
+    }
+  }
+  if (options.solver == Solver::adam && !engine)
+    throw InputError("`solver`", "adam draws the twin, and " + run.string() + " has no Gaussians", "train it first");
+}
+
+void Follower::Implementation::look_at_colors() {
+  engine->set_gaussians(twin.gaussians);
+  filter.compare_colors = [this](Views views, std::span<const std::vector<math::Pose>> motions) {
+    std::vector<splat::ViewSpec> specs;
+    std::vector<const std::vector<std::uint8_t>*> pixels;
+    for (std::size_t v = 0; v < views.size(); ++v) {
+      const capture::View& view = *views[v];
+      specs.push_back({&source.cameras.at(view.camera), view.x0, view.y0, view.width, view.height, motions[v]});
+      pixels.push_back(&view.rgba);
+    }
+    return engine->color_sums(twin.chain, specs, pixels);
+  };
+  warm_up(filter, base.start());
+}
+
+void Follower::Implementation::start_adam() {
+  adam = estimation::start_adam(filter, [this](const capture::View& view, const std::vector<math::Pose>& motions) {
+    const capture::Camera& camera = source.cameras.at(view.camera);
+    const splat::ViewSpec spec{&camera, view.x0, view.y0, view.width, view.height, motions};
+    const std::vector<std::uint8_t>* const target = &view.rgba;
+    splat::Gradients gradients;
+    engine->loss(twin.gaussians, {&spec, 1}, {&target, 1}, {}, static_cast<double>(camera.width) * camera.height,
+                 &gradients);
+    return std::move(gradients.link_twists.front());
+  });
+}
+
+// The first picture shows whether masks have to be made.
+void Follower::Implementation::look_at_first_picture(const capture::Image8& picture) {
+  masked_before = black_about(picture);
+  if (*masked_before) return;
+  filter.options = estimation::options_for_live_masks(twin.tabletop);
+  const std::vector<std::uint8_t> colors = twin_colors(twin);
+  if (colors.empty())
+    core::warn(source_name + ": is not masked, and the twin has no colors to find the rope by; what is " +
+               "not black is taken for the rope");
+  else
+    live = masking::start(source.cameras[0], twin.chain, colors);
+}
+
+// The mask of a picture; `theta` is where the rope is expected, none when that is not known.
+capture::View Follower::Implementation::mask(const capture::Image8& picture, const math::Pose& pose,
+                                             const std::optional<math::VectorX>& theta) {
+  if (!masked_before) look_at_first_picture(picture);
+  if (!live) return bright_view(picture, source.cameras[0]);
+  constexpr int kMarksEvery = 10;  // frames; the rope shows nearly the same side
+  if (engine && live->frames % kMarksEvery == 0) {
+    const math::VectorX near = theta.value_or(filter.rest);  // marks stay on the rope wherever it lies
+    masking::learn_marks(*live, drawn_view(*engine, twin, source.cameras[0], pose, near, masked), pose, near);
+  }
+  capture::View view = masking::mask(*live, picture, pose, theta);
+  masked = {view.x0, view.y0, view.width, view.height};
+  return view;
+}
+
+// Whether the base's motion is known then.
+void Follower::Implementation::check_time(const LiveFrame& frame, bool first) const {
+  constexpr double kSlack = 1.0 / 30.0;        // s, a frame beyond the first or last sample
+  if (base.samples().size() <= 1) return;  // it rests
+  if (first && frame.time < base.start() - kSlack)
+    core::warn(base_name + ": the base motion begins " + core::exact(base.start() - frame.time) +
+               " s after the first frame; until then the base is assumed to rest where it begins");
+  if (frame.time > base.end() + kSlack)
+    throw WorkError(base_name,
+                    "the base motion ends at " + core::exact(base.end()) + " s, before frame " +
+                        std::to_string(frame.frame),
+                    "give a base motion as long as the frames; the states so far are kept");
+}
+
+Follower::Follower(const Path& run, const FollowOptions& options)
+    : implementation_(std::make_unique<Implementation>(run, options)) {}
+Follower::~Follower() = default;
+
+void Follower::follow(const std::function<void(const Followed&)>& each) {
+  Implementation& f = *implementation_;
+  LiveFrame frame;
+  std::vector<capture::View> made;
+  double last = -std::numeric_limits<double>::infinity();  // s
+  for (int read = 0; f.source.next(frame); ++read) {
+    core::stop_if_requested();
+    if (!(frame.time > last))
+      throw WorkError(f.source_name,
+                      "frame " + std::to_string(frame.frame) + " is at " + core::exact(frame.time) +
+                          " s, not after the one before",
+                      "give times that increase, and near enough to 0 that a frame's interval is told; the states so "
+                      "far are kept");
+    last = frame.time;
+    if (read % f.options.drop != 0) continue;
+    f.check_time(frame, read == 0);
+    if (!f.source.masked) {
+      made.assign(1, f.mask(frame.picture, f.base.pose(frame.time), f.expected(frame.time)));
+      made[0].frame = frame.frame;
+      made[0].time = frame.time;
+    }
+    const std::vector<capture::View>& views = f.source.masked ? frame.views : made;
+    std::vector<const capture::View*> pointers;
+    for (const capture::View& view : views) pointers.push_back(&view);
+    const estimation::Estimate estimate = f.update(pointers);
+    each({frame, views, estimate, core::seconds_now() - frame.arrived});
+  }
+}
+
+const twin::Twin& Follower::twin() const { return implementation_->twin; }
+const dynamics::Model& Follower::model() const { return implementation_->filter.model; }
+const trajectory::Trajectory& Follower::base() const { return implementation_->base; }
+const std::vector<capture::Camera>& Follower::cameras() const { return implementation_->source.cameras; }
+
+}  // namespace chainsplat::pipeline

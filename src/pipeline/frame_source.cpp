@@ -1,0 +1,208 @@
+// frame_source.cpp - frames from a capture, a video, a device or standard input.
+#include <poll.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cerrno>
+#include <chrono>
+#include <cmath>
+#include <cstring>
+#include <limits>
+
+#include "chainsplat/follow.h"
+#include "pipeline/bright_view.h"
+
+namespace chainsplat::pipeline {
+
+namespace {
+
+constexpr int kBlack = 16;         // brightness up to which a pixel of a masked video is background (lossy coding)
+constexpr int kMargin = 24;        // px about what a frame shows
+constexpr int kMostStale = 30;     // frames of a device in a row whose time stamps do not increase
+constexpr double kTogether = 0.5;  // of a frame's interval: frames of several cameras nearer than that are one moment
+
+// Raw RGB24 from standard input; an incomplete last frame ends the work. Throws Interrupted where it waits.
+bool read_raw(const capture::Camera& camera, capture::Image8& image) {
+  constexpr int kAttention = 50;  // ms, to a request to stop
+  image.width = camera.width, image.height = camera.height, image.channels = 3;
+  image.pixels.resize(3 * static_cast<std::size_t>(camera.width) * camera.height);
+  std::size_t got = 0;
+  while (got < image.pixels.size()) {
+    core::stop_if_requested();
+    pollfd input{STDIN_FILENO, POLLIN, 0};
+    if (::poll(&input, 1, kAttention) <= 0) continue;
+    const ssize_t count = ::read(STDIN_FILENO, &image.pixels[got], image.pixels.size() - got);
+    if (count < 0 && errno != EINTR && errno != EAGAIN)
+      throw WorkError("standard input", std::string("cannot be read (") + std::strerror(errno) + ")",
+                      "the states so far are kept");
+    if (count == 0) break;
+    got += static_cast<std::size_t>(std::max<ssize_t>(0, count));
+  }
+  if (got == image.pixels.size()) return true;
+  if (got != 0)
+    throw WorkError("standard input", "ends within a frame",
+                    "send whole frames of the calibration's size; the states so far are kept");
+  return false;
+}
+
+// What to add to a device's time stamp to have it in Unix time. Most drivers stamp by the monotonic clock, some in Unix
+// time already.
+double until_unix(double stamp) {
+  const auto seconds = [](auto time) { return std::chrono::duration<double>(time.time_since_epoch()).count(); };
+  const double monotonic = seconds(std::chrono::steady_clock::now()), unix = seconds(std::chrono::system_clock::now());
+  return std::abs(stamp - monotonic) < std::abs(stamp - unix) ? unix - monotonic : 0.0;
+}
+
+// A capture, loaded and checked as a whole.
+FrameSource open_capture(const SourceOptions& options) {
+  capture::LoadOptions load;
+  load.camera = options.camera;
+  load.first = options.frames.first, load.last = options.frames.last;
+  const auto recorded = std::make_shared<const capture::Capture>(capture::load(options.source, load));
+  std::shared_ptr<const capture::Capture> whole;
+  if (options.pictures) {
+    load.camera = recorded->cameras.front().name;
+    load.masked = load.undistort = false;
+    whole = std::make_shared<const capture::Capture>(capture::load(options.source, load));
+  }
+  FrameSource source;
+  source.cameras = recorded->cameras;
+  source.base = recorded->base;
+  source.masked = true;
+  source.next = [recorded, whole, at = std::size_t{0}](LiveFrame& frame) mutable {
+    // the first camera sets the pace, the others' nearest frames join
+    if (at >= recorded->views.size() || recorded->views[at].camera != 0) return false;
+    const capture::View& leader = recorded->views[at];
+    frame.frame = leader.frame;
+    frame.time = leader.time;
+    frame.views.assign(1, leader);
+    const std::vector<double>& times = recorded->times[0];
+    const double interval = times.size() > 1 ? (times.back() - times.front()) / (times.size() - 1.0) : 0.0;
+    for (int c = 1; c < static_cast<int>(recorded->cameras.size()); ++c) {
+      const capture::View* nearest = nullptr;
+      for (const capture::View& view : recorded->views)
+        if (view.camera == c && std::abs(view.time - leader.time) <= kTogether * interval &&
+            (!nearest || std::abs(view.time - leader.time) < std::abs(nearest->time - leader.time)))
+          nearest = &view;
+      if (nearest) frame.views.push_back(*nearest);
+    }
+    if (whole) {
+      const capture::View& view = whole->views.at(at);
+      frame.picture.width = view.width, frame.picture.height = view.height, frame.picture.channels = 3;
+      frame.picture.pixels.resize(view.rgba.size() / 4 * 3);
+      for (std::size_t i = 0; i < view.rgba.size() / 4; ++i)
+        std::copy_n(&view.rgba[4 * i], 3, &frame.picture.pixels[3 * i]);
+    }
+    ++at;
+    frame.arrived = core::seconds_now();
+    return true;
+  };
+  return source;
+}
+
+// Frames of one camera whose calibration is given: from a file, a device or standard input.
+FrameSource open_stream(const SourceOptions& options) {
+  const capture::Calibration calibration = capture::read_calibration(options.calibration);
+  const bool standard_input = options.source == "-";
+  double rate = options.rate > 0.0 ? options.rate : calibration.rate, start = calibration.start;
+  FrameSource source;
+  source.cameras = {calibration.camera};
+  std::shared_ptr<capture::VideoReader> reader;
+  if (!standard_input) {
+    const capture::Camera& camera = source.cameras[0];
+    reader = std::make_shared<capture::VideoReader>(
+        options.source, 1, capture::DeviceFormat{.width = camera.width, .height = camera.height, .rate = rate});
+    if (rate <= 0.0) rate = reader->rate();
+  }
+  const bool device = reader && reader->device();
+  if (!device && rate <= 0.0)
+    throw InputError("`rate`", "is needed to know the frames' times", "give frames a second, for example 30");
+  const bool unix = options.unix_time;
+  if (unix && !device) throw InputError("`start`", "only a device stamps its frames", "give seconds");
+  if (options.start) start = *options.start;
+  const std::string where = standard_input ? "standard input" : options.source.string();
+  // a device has a clock of its own, so that frames which were passed over leave a gap in time
+  std::optional<double> offset;  // from that clock to ours
+  double stamp = -std::numeric_limits<double>::infinity();  // s, the last frame's by that clock
+  source.next = [camera = source.cameras[0], frames = options.frames, reader, rate, start, where, device, unix, offset,
+                 stamp, count = 0](LiveFrame& frame) mutable {
+    int stale = 0;  // in a row: some drivers' stamps jitter, others' are none
+    do {
+      if (frames.last >= 0 && count >= frames.last) return false;
+      if (!(reader ? reader->next(frame.picture) : read_raw(camera, frame.picture))) return false;
+      frame.frame = device ? reader->frames() - 1 : count;
+      if (frames.last >= 0 && frame.frame >= frames.last) return false;
+      if (frame.picture.width != camera.width || frame.picture.height != camera.height)
+        throw WorkError(where,
+                        "frame " + std::to_string(frame.frame) + " has " + std::to_string(frame.picture.width) + "x" +
+                            std::to_string(frame.picture.height) + " pixels, the calibration says " +
+                            std::to_string(camera.width) + "x" + std::to_string(camera.height),
+                        "give the calibration of this camera; the states so far are kept");
+      count = frame.frame + 1;
+      stale = device && !(reader->time() > stamp) ? stale + 1 : 0;
+      if (stale > kMostStale)
+        throw WorkError(where, "its time stamps do not increase, from frame " + std::to_string(frame.frame - stale + 1),
+                        "check the camera and its driver; the states so far are kept");
+    } while (frame.frame < frames.first || stale > 0);
+    if (device) stamp = reader->time();
+    if (device && !offset) offset = unix ? until_unix(reader->time()) : start - reader->first_time();
+    frame.time = device ? reader->time() + *offset : start + frame.frame / rate;
+    frame.views.clear();
+    frame.arrived = core::seconds_now();
+    return true;
+  };
+  return source;
+}
+
+}  // namespace
+
+FrameSource open_frames(const SourceOptions& options) {
+  if (options.calibration.empty()) {
+    std::error_code error;
+    const Path& file = options.source;
+    const bool none = file == "-" || std::filesystem::is_character_file(file, error) ||
+                      (std::filesystem::is_regular_file(file, error) && file.extension() != ".json");
+    if (none)
+      throw InputError("`calibration`", "is needed with " + file.string() + ", which is no capture",
+                       "give a camera object as in capture.json");
+    if (options.start || options.unix_time) throw InputError("`start`", "a capture has times of its own", "leave it out");
+  }
+  return options.calibration.empty() ? open_capture(options) : open_stream(options);
+}
+
+capture::View bright_view(const capture::Image8& picture, const capture::Camera& camera) {
+  std::vector<std::int32_t> from(static_cast<std::size_t>(camera.width) * camera.height, -1);  // pixel; black: -1
+  const bool distorted = camera.distorted();
+  int x0 = camera.width, y0 = camera.height, x1 = 0, y1 = 0;
+  for (int y = 0; y < camera.height; ++y)
+    for (int x = 0; x < camera.width; ++x) {
+      int u = x, v = y;
+      if (distorted) {
+        const math::Vector2 at = capture::distort(camera, math::Vector2(x + 0.5, y + 0.5));
+        u = static_cast<int>(std::floor(at.x())), v = static_cast<int>(std::floor(at.y()));
+        if (u < 0 || v < 0 || u >= camera.width || v >= camera.height) continue;
+      }
+      const std::int32_t pixel = v * camera.width + u;
+      const std::uint8_t* const rgb = &picture.pixels[3 * static_cast<std::size_t>(pixel)];
+      if (std::max({rgb[0], rgb[1], rgb[2]}) <= kBlack) continue;
+      from[static_cast<std::size_t>(y) * camera.width + x] = pixel;
+      x0 = std::min(x0, x), x1 = std::max(x1, x + 1), y0 = std::min(y0, y), y1 = y + 1;
+    }
+  capture::View view;
+  if (x1 <= x0) return view;
+  view.x0 = std::max(0, x0 - kMargin), view.y0 = std::max(0, y0 - kMargin);
+  view.width = std::min(camera.width, x1 + kMargin) - view.x0;
+  view.height = std::min(camera.height, y1 + kMargin) - view.y0;
+  view.rgba.assign(4 * static_cast<std::size_t>(view.width) * view.height, 0);
+  for (int y = 0; y < view.height; ++y)
+    for (int x = 0; x < view.width; ++x) {
+      const std::int32_t pixel = from[static_cast<std::size_t>(view.y0 + y) * camera.width + view.x0 + x];
+      if (pixel < 0) continue;
+      std::uint8_t* const rgba = &view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x)];
+      std::copy_n(&picture.pixels[3 * static_cast<std::size_t>(pixel)], 3, rgba);
+      rgba[3] = 255;
+    }
+  return view;
+}
+
+}  // namespace chainsplat::pipeline

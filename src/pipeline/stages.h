@@ -1,0 +1,45 @@
+// stages.h - the stages of train and identify, on a twin in memory.
+#pragma once
+#include <string>
+#include <vector>
+
+#include "chainsplat/gpu.h"
+#include "chainsplat/identification.h"
+#include "chainsplat/pipeline.h"
+#include "chainsplat/solve.h"
+
+namespace chainsplat::pipeline {
+
+// Measures its own life and adds it to the seconds of the stage.
+class Stopwatch {
+ public:
+  Stopwatch(twin::Twin& twin, std::string stage) : twin_(twin), stage_(std::move(stage)), start_(core::seconds_now()) {}
+  ~Stopwatch();
+  Stopwatch(const Stopwatch&) = delete;
+  Stopwatch& operator=(const Stopwatch&) = delete;
+
+ private:
+  twin::Twin& twin_;
+  std::string stage_;
+  double start_;
+};
+
+// What the twin and its capture say of how to identify it.
+identification::Options identification_options(const twin::Twin& twin, bool paper, std::uint64_t seed);
+void adopt(twin::Twin& twin, identification::Result found);
+
+// Tells the listener how a stage's fit ended: a record {"stage", "solver"} and a detail.
+void tell_fit(const std::string& stage, const solve::Summary& summary);
+
+// Rolls the identified twin out over its recognized times. `run`: its folder, for messages.
+void roll_out(twin::Twin& twin, const trajectory::Trajectory& base, const Path& run);
+
+// Throws InputError unless `twin` can be refined: recognized fast, with covariances, not refined before.
+void check_joint(const twin::Twin& twin, const Path& run);
+// The frames that the twin in `run` was made from. Throws InputError where they are gone or have changed.
+capture::Capture load_own_capture(const twin::Twin& twin, const Path& run);
+// Refines an identified twin, the covariances of its states too, with its capture's images (undistorted). The caller
+// saves both.
+solve::Summary refine(twin::Twin& twin, const capture::Capture& capture, gpu::Device& device, std::uint64_t seed);
+
+}  // namespace chainsplat::pipeline

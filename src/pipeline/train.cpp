@@ -1,0 +1,349 @@
+// train.cpp - load -> recognize -> identify -> refine -> roll out -> evaluate -> save.
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <nlohmann/json.hpp>
+
+#include "chainsplat/comparison.h"
+#include "chainsplat/recognition.h"
+#include "chainsplat/run_folder.h"
+#include "pipeline/stages.h"
+
+namespace chainsplat::pipeline {
+
+namespace {
+
+namespace fs = std::filesystem;
+
+// All that one call works on.
+struct Training {
+  Path capture_path, run;
+  TrainOptions options;
+  capture::LoadOptions load;
+  capture::Capture capture;
+  twin::Twin twin;
+  gpu::DevicePtr device;
+  bool continued = false;  // the twin was in the run folder
+  bool recognize = false, identify = false, joint = false, roll_out = false, evaluate = false;  // what is to be done
+  bool saved = false;  // from then on nothing is removed, whatever happens
+  TrainResult result;
+};
+
+bool asked_for(const Training& t, Stage stage) {
+  const std::vector<Stage>& stages = t.options.stages;
+  return stages.empty() || std::find(stages.begin(), stages.end(), stage) != stages.end();
+}
+
+recognition::Options recognition_options(const Training& t) {
+  recognition::Options options;
+  options.joints = t.options.joints;
+  options.bending = t.options.bending;
+  options.twist = t.options.twist;
+  options.every = t.options.every;
+  options.mode = t.options.mode == twin::Mode::paper ? recognition::Mode::paper : recognition::Mode::fast;
+  options.seed = t.options.seed;
+  options.checkpoint = t.run / kCheckpointFolder;
+  options.resume = t.options.resume;
+  return options;
+}
+
+// What recognition depends on, as provenance.
+twin::Provenance recognition_provenance(const TrainOptions& options) {
+  twin::Provenance p;
+  p.seed = options.seed;
+  p.every = options.every;
+  p.frames = options.frames;
+  p.mode = options.mode;
+  p.options = {{"joints", std::to_string(options.joints)},
+               {"bending", !options.bending                                   ? "auto"
+                           : *options.bending == chain::Bending::planar ? "planar"
+                                                                              : "spatial"},
+               {"twist", options.twist ? "yes" : "no"}};
+  return p;
+}
+
+// What the capture and the options say of a new twin.
+twin::Twin new_twin(const Training& t) {
+  twin::Twin twin = twin_in_scene(t.capture);
+  const std::optional<double> mass = twin.provenance.mass;
+  twin.provenance = recognition_provenance(t.options);
+  twin.provenance.mass = mass;
+  twin.provenance.version = CHAINSPLAT_VERSION;
+  twin.provenance.capture = t.capture.name;
+  twin.provenance.capture_hash = hash_text(t.capture.hash);
+  // from the run folder, so that the two can be moved together
+  twin.provenance.path =
+      fs::proximate(fs::absolute(t.capture_path), fs::absolute(t.run)).lexically_normal().generic_string();
+  return twin;
+}
+
+// --- what can be wrong with the request is found before anything is written ------------------------------------------
+
+void check_outputs(const Training& t) {
+  check_output_folder(t.run, t.options.force || t.options.resume,
+                      "name another folder, or give `force` to begin again or `resume` to continue");
+  check_run_files(t.run);
+  if (!t.options.picture.empty()) check_output_file(t.options.picture.string());
+}
+
+// Throws InputError where the frames asked for do not exist, or a camera shows nothing of the object in them.
+void check_views(const Training& t) {
+  const capture::Capture& capture = t.capture;
+  if (capture.views.empty())
+    throw InputError("`frames`", "'" + capture::frame_range_text(t.options.frames) + "' holds none of the capture's frames",
+                     capture.cameras.front().name + " has " + std::to_string(capture.times.front().size()));
+  for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
+    const auto sees = [&](const capture::View& view) {
+      if (view.camera != static_cast<int>(c)) return false;
+      for (std::size_t i = 3; i < view.rgba.size(); i += 4)
+        if (view.rgba[i] != 0) return true;
+      return false;
+    };
+    if (std::none_of(capture.views.begin(), capture.views.end(), sees))
+      throw InputError(t.capture_path.string(), capture.cameras[c].name + " never sees the object in these frames",
+                       "correct its masks, or take the camera out of capture.json");
+  }
+}
+
+void load_capture(Training& t) {
+  t.load.first = t.options.frames.first, t.load.last = t.options.frames.last;
+  // read now, because a file that is wrong must not end a work that is done
+  t.load.depth = asked_for(t, Stage::evaluate);
+  t.capture = capture::load(t.capture_path, t.load);
+  check_not_capture(t.run, t.capture.folder);
+  if (asked_for(t, Stage::recognize)) check_views(t);
+  if (asked_for(t, Stage::evaluate)) capture::load_true_centerline(t.capture.folder);  // to find what is wrong with it
+}
+
+// Throws InputError where the run folder's twin is not what is asked for now.
+void check_same_work(const Training& t) {
+  const twin::Provenance &had = t.twin.provenance, wanted = recognition_provenance(t.options);
+  if (had.capture_hash != hash_text(t.capture.hash))
+    throw InputError(t.run.string(), "was made from another capture (" + had.capture + ") or it has changed since",
+                     "name that one, or begin again with `force`");
+  if (!asked_for(t, Stage::recognize)) return;
+  const auto compare = [&](const std::string& name, const std::string& before, const std::string& now) {
+    if (before != now)
+      throw InputError(t.run.string(), "was begun with `" + name + "` '" + before + "', not '" + now + "'",
+                       "give the same options, or begin again with `force`");
+  };
+  const std::map<std::string, std::string> before = option_texts(had);
+  for (const auto& [name, text] : option_texts(wanted))
+    if (const auto at = before.find(name); at != before.end()) compare(name, at->second, text);
+  compare("seed", std::to_string(had.seed), std::to_string(wanted.seed));
+}
+
+// The twin that the folder holds where the work goes on from there, else a new one.
+void begin_or_continue(Training& t) {
+  std::error_code error;
+  t.continued = t.options.resume && fs::exists(t.run / "twin.json", error);
+  if (t.options.resume && !t.continued && fs::exists(t.run, error) && !fs::is_empty(t.run, error) &&
+      !fs::exists(t.run / kCheckpointFolder, error))
+    throw InputError(t.run.string(), "holds no run to resume, but other files",
+                     "name another folder, or begin in this one with `force`");
+  t.twin = t.continued ? load_twin(t.run) : new_twin(t);
+  if (t.continued) check_same_work(t);
+  if (t.continued && asked_for(t, Stage::evaluate)) check_drawable(t.twin, t.run);
+  if (!t.continued && !asked_for(t, Stage::recognize))
+    throw InputError(t.run.string(), "holds no recognized twin to go on from",
+                     "add recognize to `stages`, or give `resume`");
+}
+
+// Times of the first camera's frames that were asked for: those of the states.
+std::vector<double> times_of(const capture::Capture& capture) {
+  std::vector<double> times;
+  for (const capture::View& view : capture.views)
+    if (view.camera == 0) times.push_back(view.time);
+  return times;
+}
+
+void choose_work(Training& t) {
+  const bool named = !t.options.stages.empty();
+  t.recognize = asked_for(t, Stage::recognize) && !t.continued;
+  t.identify = asked_for(t, Stage::identify) && (named || t.recognize || !t.twin.parameters);
+  t.joint = t.options.joint && !t.twin.provenance.joint;
+  if (t.joint && !t.identify && !t.twin.parameters)
+    throw InputError("`joint`", "needs identified dynamics", "add identify to `stages`");
+  if (t.joint && t.options.mode == twin::Mode::paper)
+    throw InputError("`joint`", "goes with `mode` fast", "leave one of them out");
+  t.roll_out = asked_for(t, Stage::rollout) && (named || t.identify || t.joint || t.twin.rollout.time.empty());
+  if (t.roll_out && !t.identify && !(t.twin.parameters && t.twin.initial))
+    throw InputError("`stages`", "nothing is identified that could be rolled out", "add identify");
+  t.evaluate = asked_for(t, Stage::evaluate);
+}
+
+void check_work(Training& t) {
+  const std::vector<double> times = t.recognize ? times_of(t.capture) : t.twin.states.time;
+  const bool all_frames = t.options.frames == capture::FrameRange{};
+  if ((t.identify || t.joint) && times.size() < kLeastFrames)
+    throw InputError(all_frames ? t.capture_path.string() : "`frames`",
+                     "identification needs " + std::to_string(kLeastFrames) + " frames of " +
+                         t.capture.cameras.front().name + " or more, and there are " + std::to_string(times.size()),
+                     "give more frames, or leave identification out with `stages` recognize,evaluate");
+  if (t.continued && t.joint && times_of(t.capture) != times)
+    throw InputError("`frames`", "`joint` needs the frames that " + t.run.string() + " was recognized from",
+                     "give the same `frames` as then");
+  if (t.recognize) recognition::check_checkpoint(t.capture, recognition_options(t));
+  if (t.continued && (t.identify || t.joint))
+    t.twin.states.covariance = read_covariances(t.run / kCovarianceFile, t.twin.states);
+  if (t.continued && t.joint) check_joint(t.twin, t.run);
+}
+
+void open_device(Training& t) {
+  if (!t.recognize && !t.joint && !t.evaluate) return;
+  t.device = gpu::open_device({.selector = t.options.device});
+  const gpu::DeviceInfo& info = gpu::info(*t.device);
+  t.twin.provenance.device = info.name;
+  t.twin.provenance.driver = info.driver;
+  core::say_more("device " + std::to_string(info.index) + ": " + info.name + " (" + info.type + ", " + info.driver + ")");
+}
+
+void prepare(Training& t) {
+  const double start = core::seconds_now();
+  load_capture(t);
+  begin_or_continue(t);
+  t.twin.provenance.seconds["load"] += core::seconds_now() - start;
+  choose_work(t);
+  check_work(t);
+  open_device(t);
+  core::stop_if_requested();
+}
+
+// --- the stages ------------------------------------------------------------------------------------------------------
+
+void save(Training& t) {
+  t.saved = true;
+  twin::save(t.twin, t.run);
+}
+
+// What comes later can fail without losing this.
+void save_and_go_on(Training& t) {
+  save(t);
+  core::stop_if_requested();
+}
+
+void write_covariances(const Training& t) {
+  if (!t.twin.states.covariance.empty()) core::write_file(t.run / kCovarianceFile, covariance_csv(t.twin.states));
+}
+
+void recognize(Training& t) {
+  const Stopwatch watch(t.twin, "recognize");
+  recognition::Result found = recognition::recognize(*t.device, t.capture, recognition_options(t));
+  t.twin.chain = std::move(found.chain);
+  t.twin.gaussians = std::move(found.gaussians);
+  t.twin.states = std::move(found.states);
+  // exactly symmetric, as they are read back
+  for (math::MatrixX& covariance : t.twin.states.covariance)
+    covariance = math::MatrixX(covariance.selfadjointView<Eigen::Lower>());
+  if (!t.options.bending && t.options.mode == twin::Mode::fast) {
+    char text[96];
+    std::snprintf(text, sizeof text, " bending (out of plane: %.2f mm)", 1e3 * found.bending.out_of_plane_rms);
+    core::say((found.bending.bending == chain::Bending::planar ? "planar" : "spatial") + std::string(text));
+  }
+  tell_fit("recognize", found.summary);
+  t.result.fits.emplace_back("recognize", found.summary);
+}
+
+void evaluate(Training& t) {
+  const Stopwatch watch(t.twin, "evaluate");
+  core::report({"evaluate", 0, 0, NAN, NAN, "drawing every frame and comparing"});
+  const twin::Twin& twin = t.twin;
+  const capture::Capture recorded = capture::load_recorded(std::move(t.capture), t.capture_path, t.load);
+  splat::Engine engine(*t.device);
+  TrainResult& r = t.result;
+  r.recognized = eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, recorded);
+  if (!twin.rollout.time.empty())
+    r.rollout = eval::evaluate(engine, twin.gaussians, twin.chain, twin.rollout, recorded);
+  core::write_file(t.run / kMetricsFile, metrics_json(&*r.recognized, r.rollout ? &*r.rollout : nullptr));
+  if (!t.options.picture.empty()) capture::write_png(t.options.picture, eval::comparison(engine, twin, recorded));
+}
+
+void run_stages(Training& t) {
+  core::write_file(t.run / kBaseFile, trajectory::write_tum(t.capture.base.samples()));
+  if (t.recognize) {
+    recognize(t);
+    core::trim_memory();  // or the next stage's need comes on top
+    write_covariances(t);
+    save_and_go_on(t);
+  }
+  if (t.identify) {
+    identify_states(t.twin, t.capture.base, t.options.mode == twin::Mode::paper, t.options.seed);
+    t.result.fits.emplace_back("identify", *t.twin.estimates.solver);
+    save_and_go_on(t);
+  }
+  if (t.joint) {
+    t.result.fits.emplace_back("joint", refine(t.twin, t.capture, *t.device, t.options.seed));
+    write_covariances(t);
+    save_and_go_on(t);
+  }
+  if (t.roll_out) {
+    roll_out(t.twin, t.capture.base, t.run);
+    save_and_go_on(t);
+  }
+  if (t.evaluate) evaluate(t);
+  save(t);  // with all durations
+  remove_checkpoint_folder(t.run);
+}
+
+// The stages with their log, and what becomes of the folder where they fail. `was_there`: before this call.
+void run_logged(Training& t, bool was_there, core::Listener listener) {
+  const std::string kept = "what exists so far is kept in " + t.run.string() + ", and `resume` goes on from there";
+  try {
+    ProgressLog log(t.run / kLogFile);
+    const auto shown = listener.progress;
+    listener.progress = [&](const core::Progress& progress) {
+      if (shown) shown(progress);
+      log.write(progress);
+    };
+    const auto recorded = listener.record;
+    listener.record = [&](const nlohmann::ordered_json& entry) {
+      if (recorded) recorded(entry);
+      log.write(entry);
+    };
+    const core::ListenerScope logged(listener);
+    run_stages(t);
+  } catch (const Interrupted&) {
+    core::say("stopped; a checkpoint is in " + t.run.string() + ": the same with `resume` continues");
+    throw;
+  } catch (const InputError& wrong) {
+    if (t.saved || was_there) throw broken_off(wrong, kept);
+    // nothing is left where nothing was
+    std::error_code ignored;
+    remove_run_files(t.run);
+    remove_checkpoint_folder(t.run);
+    fs::remove(t.run, ignored);
+    throw;
+  } catch (const WorkError& failure) {
+    throw broken_off(failure, kept);
+  } catch (const std::bad_alloc&) {
+    throw WorkError("memory", "there is not enough of it", "use fewer `frames` or a machine with more; " + kept);
+  } catch (const std::exception& defect) {
+    throw WorkError("internal", defect.what(), "this is a defect, please report the command; " + kept);
+  }
+}
+
+}  // namespace
+
+TrainResult train(const Path& capture, const Path& run, const TrainOptions& options, const core::Listener& listener) {
+  const core::ListenerScope scope(listener);
+  Training t;
+  t.capture_path = capture, t.run = run, t.options = options;
+  options.check();
+  check_outputs(t);
+  prepare(t);
+  std::error_code error;
+  const bool was_there = fs::exists(run, error);
+  core::make_folder(run / kCheckpointFolder);
+  const FolderLock lock(run / kLockFile);
+  remove_half_written(run);
+  if (options.force) {
+    remove_run_files(run);
+    recognition::remove_checkpoint(run / kCheckpointFolder);
+  }
+  t.saved = t.continued;
+  run_logged(t, was_there, listener);
+  t.result.twin = std::move(t.twin);
+  return std::move(t.result);
+}
+
+}  // namespace chainsplat::pipeline

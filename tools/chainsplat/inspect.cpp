@@ -1,0 +1,90 @@
+// inspect.cpp - check and doctor: what is in a capture, what this machine can do.
+#include <CLI/CLI.hpp>
+#include <iostream>
+#include <memory>
+#include <nlohmann/json.hpp>
+
+#include "chainsplat/capture.h"
+#include "chainsplat/gpu.h"
+#include "cli.h"
+
+namespace chainsplat::tools {
+
+namespace {
+
+using Json = nlohmann::ordered_json;
+
+void check(const Globals& globals, const std::string& path) {
+  const capture::CheckReport report = capture::check(path);
+  if (globals.json) {
+    Json document;
+    document["capture"] = path;
+    document["facts"] = report.facts;
+    document["doubts"] = report.doubts;
+    document["problems"] = report.problems;
+    document["usable"] = report.problems.empty();
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+  } else {
+    // names come from the files
+    for (const std::string& line : report.facts) std::cout << core::printable(line) << "\n";
+    for (const std::string& line : report.doubts) std::cout << "doubt: " << core::printable(line) << "\n";
+    for (const std::string& line : report.problems) std::cout << "problem: " << core::printable(line) << "\n";
+    if (report.problems.empty())
+      std::cout << (report.doubts.empty() ? "Nothing is wrong with it.\n" : "It can be used; see the doubts.\n");
+  }
+  if (report.problems.empty()) return;
+  std::cout.flush();
+  throw InputError(path,
+                   std::to_string(report.problems.size()) + (report.problems.size() == 1 ? " problem" : " problems"),
+                   "mend what is listed as a problem");
+}
+
+void doctor(const Globals& globals) {
+  const gpu::Doctor found = gpu::examine(globals.device);
+  if (!globals.json) {
+    std::cout << "chainsplat " CHAINSPLAT_VERSION "\n" << with_options(gpu::doctor_text(found));
+    return;
+  }
+  Json document;
+  document["version"] = CHAINSPLAT_VERSION;
+  document["devices"] = Json::array();
+  for (const gpu::DeviceInfo& device : found.devices) {
+    Json entry;
+    entry["index"] = device.index;
+    entry["name"] = device.name;
+    entry["driver"] = device.driver;
+    entry["type"] = device.type;
+    entry["api_version"] = device.api_version;
+    entry["subgroup_size"] = device.subgroup_size;
+    entry["max_workgroup_invocations"] = device.max_workgroup_invocations;
+    entry["shared_memory_bytes"] = device.shared_memory_bytes;
+    entry["max_storage_range"] = device.max_storage_range;
+    entry["heap_bytes"] = device.heap_bytes;
+    entry["software"] = device.software;
+    entry["unified_memory"] = device.unified_memory;
+    entry["timestamps"] = device.timestamps;
+    entry["refused"] = device.refused;
+    document["devices"].push_back(entry);
+  }
+  document["chosen"] = found.chosen >= 0 ? Json(found.chosen) : Json(nullptr);
+  document["reason"] = with_options(found.reason);
+  document["missing"] = found.missing;
+  document["validation_layer"] = found.validation_layer;
+  document["pipeline_cache"] = found.pipeline_cache;
+  std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+}
+
+}  // namespace
+
+void add_inspection_commands(CLI::App& app, const Globals& globals, Job& job) {
+  CLI::App* checker = app.add_subcommand("check", "Say what is in a capture, and what is wrong with it");
+  auto path = std::make_shared<std::string>();
+  checker->add_option("CAPTURE", *path, "The capture's folder or its capture.json")->required();
+  checker->callback([&globals, &job, path] { job = [&globals, path] { check(globals, *path); }; });
+
+  CLI::App* examiner =
+      app.add_subcommand("doctor", "List the Vulkan devices, which is chosen and why, what is missing");
+  examiner->callback([&globals, &job] { job = [&globals] { doctor(globals); }; });
+}
+
+}  // namespace chainsplat::tools

@@ -1,0 +1,188 @@
+// motion.cpp - rollout and render: a twin set in motion, and drawn.
+#include <CLI/CLI.hpp>
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <iostream>
+#include <memory>
+#include <nlohmann/json.hpp>
+
+#include "chainsplat/capture.h"
+#include "chainsplat/pipeline.h"
+#include "chainsplat/render.h"
+#include "chainsplat/run_folder.h"
+#include "chainsplat/twin.h"
+#include "cli.h"
+
+namespace chainsplat::tools {
+
+namespace {
+
+namespace fs = std::filesystem;
+using Json = nlohmann::ordered_json;
+
+struct RolloutRequest {
+  std::string run, base, out, centerline, initial;
+  double rate = 30.0;
+};
+
+void rollout(const Globals& globals, const RolloutRequest& request) {
+  pipeline::RolloutOptions options;
+  if (!request.base.empty()) options.base = input_path(request.base);
+  if (!request.initial.empty()) options.initial = input_path(request.initial);
+  options.rate = request.rate;
+  options.check();
+  if (globals.json && (request.out == "-" || request.centerline == "-"))
+    throw InputError("--json", "standard output is wanted by '-' too", "name a file");
+  pipeline::check_output_file(request.out);
+  if (!request.centerline.empty()) pipeline::check_output_file(request.centerline);
+  const auto [twin, base, states] = pipeline::rollout(request.run, options, terminal());
+  write_result(request.out, twin::states_csv(states));
+  if (!request.centerline.empty()) write_result(request.centerline, twin::centerline_csv(twin.chain, states, base));
+  if (!globals.json) {
+    say(std::to_string(states.time.size()) + " rows" + (request.out == "-" ? "" : ": " + request.out));
+    return;
+  }
+  Json document;
+  document["states"] = request.out;
+  if (!request.centerline.empty()) document["centerline"] = request.centerline;
+  document["rows"] = states.time.size();
+  document["start"] = states.time.front();
+  document["end"] = states.time.back();
+  std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+}
+
+struct RenderRequest {
+  std::string run, states, base, camera, out;
+  bool mask = false, depth = false, undistorted = false, force = false;
+};
+
+std::string frame_name(int frame, const char* ending) {
+  char text[64];
+  std::snprintf(text, sizeof text, "%06d%s", frame, ending);
+  return text;
+}
+
+void render(const Globals& globals, const RenderRequest& request) {
+  const Path out = request.out;
+  const bool video = out.extension() == ".mp4";
+  const auto [folder, camera_name] = split_camera(request.camera);
+  if (video) {
+    pipeline::check_output_file(request.out);
+    if (request.mask || request.depth)
+      throw InputError("--mask, --depth", "go with a folder of frames, not with a video",
+                       "let -o end in another way than .mp4");
+  } else {
+    pipeline::check_output_folder(out, request.force, "name another folder or give --force to write into it");
+  }
+  const twin::Twin twin = pipeline::load_twin(request.run);
+  pipeline::check_drawable(twin, request.run);
+  const chain::States states =
+      request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
+  capture::LoadOptions load;
+  load.images = false;
+  load.camera = camera_name;
+  const capture::Capture capture = capture::load(folder, load);
+  const trajectory::Trajectory base = request.base.empty() ? capture.base : pipeline::read_base(input_path(request.base));
+  if (video && capture.cameras.size() != 1)
+    throw InputError(request.camera, "has " + std::to_string(capture.cameras.size()) + " cameras and a video shows one",
+                     "name it, for example " + folder + ":" + capture.cameras.front().name);
+  if (!video) {
+    pipeline::check_not_capture(out, capture.folder);
+    for (const capture::Camera& camera : capture.cameras)
+      pipeline::check_output_folder(out / camera.name, true, "");  // may be a file
+  }
+  // before the first camera's frames are written
+  for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
+    const double interval = render::median_interval(capture.times[c]);
+    if (std::none_of(capture.times[c].begin(), capture.times[c].end(),
+                     [&](double time) { return render::covered(states, time, interval); }))
+      throw InputError(request.states.empty() ? request.run : request.states,
+                       "covers none of the times of " + capture.cameras[c].name, "give states at the camera's times");
+  }
+  const gpu::DevicePtr device = gpu::open_device({.selector = globals.device});
+  splat::Engine engine(*device);
+  render::Options options;
+  options.depth = request.depth;
+  options.undistorted = request.undistorted;
+
+  Json document;
+  document["output"] = request.out;
+  std::size_t total = 0;
+  for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
+    const capture::Camera& camera = capture.cameras[c];
+    const std::vector<double>& times = capture.times[c];
+    const std::vector<render::Frame> frames =
+        render::frames(engine, twin.gaussians, twin.chain, states, base, camera, static_cast<int>(c), times, options);
+    if (video) {
+      std::vector<capture::Image8> images;
+      for (const render::Frame& frame : frames) images.push_back(render::color_image(frame, camera));
+      const double rate = times.size() > 1 ? double(times.size() - 1) / (times.back() - times.front()) : 30.0;
+      capture::write_video(out, rate, images);
+    } else {
+      core::make_folder(out / camera.name);
+      for (std::size_t f = 0; f < frames.size(); ++f) {
+        const render::Frame& frame = frames[f];
+        const Path stem = out / camera.name;
+        capture::write_png(stem / frame_name(frame.frame, ".png"), render::color_image(frame, camera));
+        if (request.mask) capture::write_png(stem / frame_name(frame.frame, ".mask.png"), render::mask_image(frame, camera));
+        if (request.depth)
+          capture::write_depth_exr(stem / frame_name(frame.frame, ".depth.exr"), camera.width, camera.height,
+                                   render::depth_image(frame, camera));
+        core::report({"write " + camera.name, static_cast<std::int64_t>(f + 1),
+                      static_cast<std::int64_t>(frames.size()), NAN, NAN, ""});
+      }
+    }
+    total += frames.size();
+    document["cameras"][camera.name] = frames.size();
+  }
+  if (globals.json)
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+  else
+    say(std::to_string(total) + " frames: " + request.out);
+}
+
+}  // namespace
+
+void add_motion_commands(CLI::App& app, const Globals& globals, Job& job) {
+  CLI::App* roller = app.add_subcommand("rollout", "Set the twin in motion under a base trajectory");
+  auto request = std::make_shared<RolloutRequest>();
+  roller->add_option("RUN", request->run, "Run folder of an identified twin")->required();
+  roller
+      ->add_option("--base", request->base,
+                   "Base motion, 'timestamp tx ty tz qx qy qz qw' a line (default: the capture's own)")
+      ->type_name("FILE.tum");
+  roller->add_option("-o,--output", request->out, "States to write; - is standard output")
+      ->required()
+      ->type_name("STATES.csv");
+  roller->add_option("--rate", request->rate, "Rows a second (default 30)")->type_name("HZ");
+  roller
+      ->add_option("--centerline", request->centerline, "Also write the world points of the grasp, joints and free end")
+      ->type_name("FILE.csv");
+  roller
+      ->add_option("--initial", request->initial,
+                   "Start from its first row (default: the identified state; with --base at rest)")
+      ->type_name("STATES.csv");
+  roller->callback([&globals, &job, request] { job = [&globals, request] { rollout(globals, *request); }; });
+
+  CLI::App* renderer = app.add_subcommand("render", "Draw the twin through the cameras of a capture");
+  auto drawing = std::make_shared<RenderRequest>();
+  renderer->add_option("RUN", drawing->run, "Run folder of a twin")->required();
+  renderer->add_option("--states", drawing->states, "Motion to draw (default: the recognized states)")
+      ->type_name("STATES.csv");
+  renderer->add_option("--camera", drawing->camera, "Whose cameras; with :NAME only that one")
+      ->required()
+      ->type_name("CAPTURE[:NAME]");
+  renderer->add_option("-o,--output", drawing->out, "Folder for CAMERA/000000.png ..., or a video that ends in .mp4")
+      ->required()
+      ->type_name("OUT");
+  renderer->add_option("--base", drawing->base, "Base motion (default: that of --camera's capture)")
+      ->type_name("FILE.tum");
+  renderer->add_flag("--mask", drawing->mask, "Also 000000.mask.png: 255 where the rope covers half or more");
+  renderer->add_flag("--depth", drawing->depth, "Also 000000.depth.exr: meters along the optical axis, 0 = none");
+  renderer->add_flag("--undistorted", drawing->undistorted, "Leave the lens distortion out");
+  renderer->add_flag("--force", drawing->force, "Write into a folder that is not empty");
+  renderer->callback([&globals, &job, drawing] { job = [&globals, drawing] { render(globals, *drawing); }; });
+}
+
+}  // namespace chainsplat::tools

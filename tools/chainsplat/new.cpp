@@ -1,0 +1,140 @@
+// new.cpp - a twin without videos: empty, to identify from measured markers, or a rod of known stiffness and mass.
+#include <CLI/CLI.hpp>
+#include <iostream>
+#include <memory>
+#include <nlohmann/json.hpp>
+
+#include "chainsplat/pipeline.h"
+#include "chainsplat/run_folder.h"
+#include "cli.h"
+
+namespace chainsplat::tools {
+
+namespace {
+
+constexpr double kPerpendicular = 1e-6;  // largest cosine between direction and bending axis that is taken as 0
+
+struct Request {
+  std::string out, bending = "spatial";
+  double length = 0.0, diameter = 0.02, mass = 0.0;    // m, m, kg; mass 0: unknown
+  double bending_stiffness = -1.0, retardation = 0.0;  // EI, N m^2, negative: not given; s
+  int joints = 8;
+  std::vector<double> direction{0, 0, -1}, bending_axis, gravity{0, 0, -9.81};
+  bool force = false;
+};
+
+math::Vector3 vector_of(const std::vector<double>& values) { return {values[0], values[1], values[2]}; }
+
+math::Vector3 unit_of(const std::vector<double>& values, const char* option) {
+  const math::Vector3 v = vector_of(values);
+  if (!v.allFinite() || !(v.norm() > 0.0))
+    throw InputError(option, "has no direction", "give three numbers, not all 0");
+  return v.normalized();
+}
+
+// A uniform straight rod that hangs free, in still air without drag.
+dynamics::Parameters rod(const chain::Chain& chain, const Request& request, const math::Vector3& gravity) {
+  dynamics::Parameters rod;
+  const int links = chain.links() - 1;
+  rod.gravity = gravity;
+  rod.radius = 0.5 * chain.diameter;
+  for (std::vector<double>* zeros : {&rod.viscous_friction, &rod.coulomb_friction, &rod.air_linear, &rod.air_quadratic})
+    zeros->assign(links, 0.0);
+  for (int j = 1; j <= links; ++j)
+    rod.link_mass.push_back(request.mass * (chain.link_end(j) - chain.link_start(j)) / chain.length);
+  for (const int link : chain.child_link) {
+    rod.stiffness.push_back(request.bending_stiffness / chain::bent_length(chain, link));
+    rod.damping.push_back(request.retardation * rod.stiffness.back());
+    rod.rest_angle.push_back(0.0);
+  }
+  return rod;
+}
+
+void make_new(const Globals& globals, const Request& request) {
+  if (request.bending_stiffness >= 0.0 && !(request.mass > 0.0))
+    throw InputError("--bending-stiffness", "moves nothing without a mass", "give --mass too");
+  if (request.retardation > 0.0 && request.bending_stiffness < 0.0)
+    throw InputError("--retardation", "is damping over stiffness, and there is none", "give --bending-stiffness too");
+  pipeline::check_output_folder(request.out, request.force, "name another folder, or give --force");
+  const math::Vector3 direction = unit_of(request.direction, "--direction");
+  math::Vector3 bending_axis;
+  if (request.bending_axis.empty()) {
+    // any axis across the rope; y where it is one, as in the examples of captures
+    const math::Vector3 y = math::Vector3::UnitY(), z = math::Vector3::UnitZ();
+    const math::Vector3 across = std::abs(direction.dot(y)) < 0.9 ? y : z;
+    bending_axis = (across - direction * direction.dot(across)).normalized();
+  } else {
+    bending_axis = unit_of(request.bending_axis, "--bending-axis");
+    if (std::abs(bending_axis.dot(direction)) > kPerpendicular)
+      throw InputError("--bending-axis", "is not perpendicular to --direction", "give an axis across the rope");
+  }
+  twin::Twin twin;
+  twin.gravity = vector_of(request.gravity);
+  if (!twin.gravity.allFinite()) throw InputError("--gravity", "is not finite", "give three finite numbers in m/s^2");
+  twin.chain = chain::make_chain(request.length, request.diameter, direction, bending_axis, request.joints,
+                                 request.bending == "planar" ? chain::Bending::planar : chain::Bending::spatial, false);
+  twin.known_mass = request.mass > 0.0;
+  if (twin.known_mass) twin.provenance.mass = request.mass;
+  if (request.bending_stiffness >= 0.0) twin.parameters = rod(twin.chain, request, twin.gravity);
+  twin.provenance.version = CHAINSPLAT_VERSION;
+  twin.provenance.seed = globals.seed;
+  twin.provenance.options["bending"] = request.bending;
+  twin.provenance.options["joints"] = std::to_string(request.joints);
+  twin::save(twin, request.out);
+  if (globals.json) {
+    nlohmann::ordered_json document;
+    document["run"] = request.out;
+    document["joints"] = twin.chain.links() - 1;
+    document["angles"] = twin.chain.angles();
+    std::cout << document.dump(1, ' ', false, nlohmann::ordered_json::error_handler_t::replace) << "\n";
+  } else {
+    std::cout << "twin: " << request.out << "\n";
+  }
+}
+
+}  // namespace
+
+void add_new_command(CLI::App& app, const Globals& globals, Job& job) {
+  CLI::App* command =
+      app.add_subcommand("new", "Make a twin without videos: empty, to identify from markers, or of a known rod");
+  auto request = std::make_shared<Request>();
+  command->add_option("-o,--output", request->out, "Run folder to make: the twin")->required()->type_name("RUN");
+  command->add_option("--length", request->length, "From the grasp to the free end, m")
+      ->required()
+      ->check(CLI::PositiveNumber)
+      ->type_name("M");
+  command->add_option("--diameter", request->diameter, "m (default 0.02)")->check(CLI::PositiveNumber)->type_name("M");
+  command->add_option("--joints", request->joints, "Joints along the rope (default 8)")
+      ->check(CLI::Range(1, pipeline::kMostJoints))
+      ->type_name("N");
+  command->add_option("--bending", request->bending, "Axes a joint: planar (one) or spatial (two, default)")
+      ->check(CLI::IsMember({"planar", "spatial"}))
+      ->type_name("KIND");
+  command->add_option("--direction", request->direction, "Where the rope leaves the grasp, base frame (default 0,0,-1)")
+      ->delimiter(',')
+      ->expected(3)
+      ->type_name("X,Y,Z");
+  command->add_option("--bending-axis", request->bending_axis, "Axis of bending, base frame (default: across, near y)")
+      ->delimiter(',')
+      ->expected(3)
+      ->type_name("X,Y,Z");
+  command->add_option("--gravity", request->gravity, "World frame, m/s^2 (default 0,0,-9.81)")
+      ->delimiter(',')
+      ->expected(3)
+      ->type_name("X,Y,Z");
+  command->add_option("--mass", request->mass, "kg (default: unknown, forces are per kilogram)")
+      ->check(CLI::PositiveNumber)
+      ->type_name("KG");
+  command
+      ->add_option("--bending-stiffness", request->bending_stiffness,
+                   "EI of a uniform straight rod, N m^2; with --mass the twin is then ready for rollout")
+      ->check(CLI::NonNegativeNumber)
+      ->type_name("EI");
+  command->add_option("--retardation", request->retardation, "Its damping over its stiffness, s (default 0)")
+      ->check(CLI::NonNegativeNumber)
+      ->type_name("S");
+  command->add_flag("--force", request->force, "Also into a folder that is not empty");
+  command->callback([&globals, &job, request] { job = [&globals, request] { make_new(globals, *request); }; });
+}
+
+}  // namespace chainsplat::tools

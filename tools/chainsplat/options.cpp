@@ -1,0 +1,48 @@
+// options.cpp - what a field of the library's options structs is called on the command line.
+#include <algorithm>
+#include <map>
+
+#include "cli.h"
+
+namespace chainsplat::tools {
+
+namespace {
+
+// Fields that are not named as their options are: target_velocity is --target-velocity without a line here.
+const std::map<std::string, std::string> kOtherNames = {
+    {"boxes", "--keep-out-box"},
+    {"loop.rate", "--mpc-rate"},
+    {"loop.target_velocity", "--target-velocity"},
+    {"spheres", "--keep-out-sphere"},
+    {"targets", "--target"},
+    {"truth", "--simulate"},
+};
+
+std::string option_of(const std::string& field) {
+  if (const auto other = kOtherNames.find(field); other != kOtherNames.end()) return other->second;
+  std::string name = "--" + field;
+  std::replace(name.begin(), name.end(), '_', '-');
+  return name;
+}
+
+}  // namespace
+
+std::string with_options(const std::string& text) {
+  std::string out;
+  for (std::size_t at = 0; at < text.size();) {
+    const std::size_t open = text.find('`', at), close = text.find('`', std::min(open, text.size() - 1) + 1);
+    const std::string field = close == std::string::npos ? "" : text.substr(open + 1, close - open - 1);
+    const bool plain = !field.empty() && field.find_first_not_of("abcdefghijklmnopqrstuvwxyz_") == std::string::npos;
+    if (!plain && !kOtherNames.count(field)) {
+      const std::size_t end = open == std::string::npos ? text.size() : open + 1;
+      out.append(text, at, end - at);
+      at = end;
+      continue;
+    }
+    out.append(text, at, open - at).append(option_of(field));
+    at = close + 1;
+  }
+  return out;
+}
+
+}  // namespace chainsplat::tools

@@ -1,0 +1,350 @@
+// plan.cpp - a base motion that makes the rope hit a target.
+#include <unistd.h>
+
+#include <CLI/CLI.hpp>
+#include <algorithm>
+#include <cmath>
+#include <cstdlib>
+#include <iostream>
+#include <memory>
+#include <nlohmann/json.hpp>
+
+#include "chainsplat/capture.h"
+#include "chainsplat/estimation.h"
+#include "chainsplat/identification.h"
+#include "chainsplat/motion_files.h"
+#include "chainsplat/planning.h"
+#include "chainsplat/run_folder.h"
+#include "chainsplat/twin.h"
+#include "cli.h"
+
+namespace chainsplat::tools {
+
+namespace {
+
+using Json = nlohmann::ordered_json;
+using planning::Axis;
+
+struct PlanRequest {
+  std::string run, out, axes, initial, state_from, terminal, horizon = "3", window = "smooth";
+  std::vector<std::string> targets, spheres, boxes;
+  double rate = 100.0;
+  bool force = false, mpc = false;
+  std::string simulate, target_velocity;
+  planning::LoopOptions loop;
+  planning::Options options;
+};
+
+constexpr const char* kAssumed =
+    "mass, stiffness, damping and friction are assumed, and the rope may miss by centimeters";
+
+// Planning needs numbers for everything: a mass of 60 g per 30 cm and the centers of identification's priors, alike at
+// all joints.
+dynamics::Parameters assumed_parameters(const twin::Twin& twin) {
+  constexpr double kMass = 0.2;  // kg/m
+  const chain::Chain& chain = twin.chain;
+  dynamics::Parameters p;
+  const double torque = identification::kStiffnessPart * kMass * chain.length * twin.gravity.norm() * chain.length;
+  for (int link = 1; link < chain.links(); ++link) {
+    const double length = chain.link_end(link) - chain.link_start(link);
+    p.link_mass.push_back(kMass * length);
+    p.viscous_friction.push_back(0.0);
+    p.coulomb_friction.push_back(twin.tabletop ? identification::kCoulombMean : 0.0);
+    p.air_linear.push_back(0.0);
+    p.air_quadratic.push_back(twin.tabletop ? 0.0 : identification::kDragPerDiameter * chain.diameter * length);
+  }
+  p.stiffness.assign(chain.angles(), torque);
+  p.rest_angle.assign(chain.angles(), 0.0);
+  p.damping.assign(chain.angles(), identification::kRetardation * torque);
+  p.radius = 0.5 * chain.diameter;
+  p.gravity = twin.gravity;
+  if (twin.tabletop) p.table_normal = twin.table_normal.value_or(math::Vector3::UnitZ());
+  p.substeps = twin.tabletop ? 8 : 4;
+  return p;
+}
+
+// The rope as one camera sees it in its first frame, and the base where it is then; taken to be at rest, since one
+// image shows no speed.
+void start_from_image(const std::string& source, const twin::Twin& twin, planning::Problem& problem) {
+  const auto [folder, name] = split_camera(source);
+  capture::LoadOptions load;
+  load.camera = name;
+  load.last = 1;
+  const capture::Capture seen = capture::load(folder, load);
+  if (seen.cameras.size() != 1)
+    throw InputError("--state-from", "'" + source + "' names no single camera",
+                     "give CAPTURE:NAME, for example CAPTURE:cam0");
+  if (seen.views.empty() || seen.views[0].width == 0)
+    throw InputError("--state-from", "the first frame of '" + source + "' does not show the rope",
+                     "name another camera");
+  const capture::View& view = seen.views[0];
+  problem.base = seen.base.pose(view.time);
+  estimation::Filter filter = estimation::start(
+      twin, seen.cameras, [&](double) { return dynamics::at_rest(problem.base); }, view.time);
+  const capture::View* const views[] = {&view};
+  const estimation::Estimate found = estimation::update(filter, views);
+  if (!found.seen || found.lost) {
+    std::string what = "the rope was not recognized in the first frame of '";
+    what += source + "'";
+    throw InputError("--state-from", what, "name another camera, or give the state with --initial");
+  }
+  problem.initial.theta = found.theta;
+  char text[160];
+  std::snprintf(text, sizeof text, "the rope starts as %s sees it: overlap %.3f, outline within %.2f px",
+                seen.cameras[0].name.c_str(), found.iou, found.residual);
+  say(text);
+}
+
+planning::Problem make_problem(const PlanRequest& request, const twin::Twin& twin) {
+  planning::Problem problem;
+  dynamics::Parameters parameters;
+  if (twin.parameters) {
+    parameters = *twin.parameters;
+  } else {
+    core::warn(request.run + ": its dynamics are not identified; " + kAssumed);
+    parameters = assumed_parameters(twin);
+  }
+  problem.model = dynamics::make_model(twin.chain, parameters);
+  problem.tabletop = twin.tabletop;
+  problem.table_point = twin.table_point;
+  const trajectory::Trajectory base = pipeline::own_base(request.run);
+  problem.base = base.pose(base.start());
+  problem.estimates = twin.estimates;
+  const int angles = twin.chain.angles();
+  problem.initial.thetadot = math::VectorX::Zero(angles);
+  if (!request.initial.empty()) {
+    const chain::States given = twin::read_states(input_path(request.initial), angles);
+    if (given.time.empty()) throw InputError(request.initial, "has no rows", "give at least one");
+    problem.initial.theta = given.theta[0];
+    if (!given.thetadot.empty()) problem.initial.thetadot = given.thetadot[0];
+  } else if (!request.state_from.empty()) {
+    start_from_image(request.state_from, twin, problem);
+  } else if (twin.tabletop) {
+    problem.initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
+  } else {
+    problem.initial.theta = dynamics::static_equilibrium(problem.model, problem.base).theta;
+  }
+  return problem;
+}
+
+// CHAIN.json is the chain object of a twin.json (formats.md 2.10), held as `twin`'s rope is: read as a twin of its own.
+dynamics::Model read_truth(const std::string& file, const Path& run) {
+  Json chain;
+  try {
+    chain = core::parse_json(core::read_file(input_path(file)));
+  } catch (const Json::exception&) {
+    throw InputError(file, "is not JSON", "give the 'chain' object of a twin.json");
+  }
+  if (chain.is_object() && chain.contains("chain")) chain = chain["chain"];  // a whole twin.json does too
+  Json document = core::parse_json(core::read_file(run / "twin.json"));
+  document["chain"] = std::move(chain);
+  for (const char* key : {"gaussians", "states", "rollout"}) document.erase(key);
+  const Path folder = std::filesystem::temp_directory_path() / ("chainsplat_simulate_" + std::to_string(::getpid()));
+  core::make_folder(folder);
+  struct Remove {
+    Path path;
+    ~Remove() {
+      std::error_code error;
+      std::filesystem::remove_all(path, error);
+    }
+  } remove{folder};
+  core::write_file(folder / "twin.json", document.dump());
+  try {
+    const twin::Twin truth = twin::load(folder);
+    if (!truth.parameters) throw InputError(file, "has no masses, stiffness and damping", "give an identified chain");
+    return dynamics::make_model(truth.chain, *truth.parameters);
+  } catch (const InputError& error) {
+    // name the file that the user knows, not the copy
+    const std::string copy = (folder / "twin.json").string();
+    if (!error.where.starts_with(copy)) throw;
+    throw InputError(file + error.where.substr(copy.size()), error.problem, error.mend);
+  }
+}
+
+void plan(const Globals& globals, PlanRequest& request) {
+  planning::Options& options = request.options;
+  options.seed = globals.seed;
+  if (!request.axes.empty()) options.axes = planning::parse_axes(request.axes);
+  options.window = request.window == "paper" ? planning::Window::paper : planning::Window::smooth;
+  constexpr double kLongestFree = 4.0;  // s, of a free horizon
+  if (request.horizon == "free") {
+    options.free_horizon = true;
+    options.horizon = kLongestFree;
+  } else {
+    options.horizon = numbers(request.horizon, "--horizon", 1)[0];
+  }
+  constexpr double kLongest = 120.0, kMostReplans = 1000.0;  // s; a second
+  if (options.horizon > kLongest)
+    throw InputError("--horizon",
+                     core::exact(options.horizon) + " s are more than " + core::exact(kLongest) +
+                         " s, and the motion is computed in steps of milliseconds, many times",
+                     "give seconds, for example 3");
+  if (request.loop.rate > kMostReplans)
+    throw InputError("--mpc-rate",
+                     core::exact(request.loop.rate) + " replans a second are more than " + core::exact(kMostReplans) +
+                         ", and each is an optimization",
+                     "give for example 10");
+  planning::check_rate(request.rate, options.horizon * static_cast<double>(request.targets.size()),
+             "give rows a second, for example 100");
+  if (!request.terminal.empty()) {
+    const std::vector<double> values = numbers(request.terminal, "--terminal", 0);
+    options.terminal = Eigen::Map<const math::VectorX>(values.data(), static_cast<Eigen::Index>(values.size()));
+  }
+  for (const std::string& text : request.spheres) {
+    const auto v = numbers(text, "--keep-out-sphere", 4);
+    options.spheres.push_back({{v[0], v[1], v[2]}, v[3]});
+  }
+  for (const std::string& text : request.boxes) {
+    const auto v = numbers(text, "--keep-out-box", 6);
+    options.boxes.push_back({{v[0], v[1], v[2]}, {v[3], v[4], v[5]}});
+  }
+  const std::string mend = "name another folder or give --force to write into it";
+  pipeline::check_output_folder(request.out, request.force, mend);
+  const twin::Twin twin = pipeline::load_twin(request.run);
+  planning::Problem problem = make_problem(request, twin);
+  for (const std::string& text : request.targets) {
+    const std::string random = "random:";
+    if (text.rfind(random, 0) == 0) {
+      char* end = nullptr;
+      const std::uint64_t seed = std::strtoull(text.c_str() + random.size(), &end, 10);
+      if (*end != '\0' || end == text.c_str() + random.size())
+        throw InputError("--target", "'" + text + "' has no seed", "give for example random:1");
+      problem.targets.push_back(planning::random_target(problem, options, seed));
+    } else {
+      const auto v = numbers(text, "--target", 3);
+      problem.targets.push_back({v[0], v[1], v[2]});
+    }
+  }
+  for (const math::Vector3& target : problem.targets) {
+    const double bound = planning::unreachable_distance(problem, options, target);
+    if (!(bound > options.tolerance)) continue;
+    char text[160];
+    std::snprintf(
+        text, sizeof text,
+        "--target: at least %.1f mm beyond what rope length, stroke and axes allow; the nearest motion is planned",
+        1e3 * bound);
+    core::warn(text);
+  }
+  if (request.simulate.empty() && (request.mpc || !request.target_velocity.empty()))
+    throw InputError("--mpc", "feedback needs a rope to see", "give --simulate CHAIN.json as the true one");
+  std::optional<dynamics::Model> truth;
+  if (!request.simulate.empty()) truth = read_truth(request.simulate, request.run);
+  if (!request.target_velocity.empty()) {
+    const auto v = numbers(request.target_velocity, "--target-velocity", 3);
+    request.loop.target_velocity = {v[0], v[1], v[2]};
+  }
+  const planning::Plan plan = planning::plan(problem, options);
+  planning::Motion played = plan.motion;
+  std::vector<planning::Simulated> simulated;
+  const auto play = [&](const char* name, bool feedback) {
+    request.loop.feedback = feedback;
+    simulated.push_back({name, planning::closed_loop(problem, options, plan, *truth, request.loop)});
+  };
+  if (truth) play("without_feedback", false);
+  if (truth && request.mpc) {
+    play("with_feedback", true);
+    played = simulated.back().loop.motion;
+  }
+  const Path out = request.out;
+  core::make_folder(out);
+  const std::vector<double> times = planning::row_times(plan.motion.end(), request.rate);
+  core::write_file(out / "base.tum", planning::motion_tum(played, times));
+  core::write_file(out / "base.csv", planning::motion_csv(played, times));
+  core::write_file(out / "states.csv", twin::states_csv(planning::predict(problem, played, times)));
+  core::write_file(out / "picture.svg", planning::picture_svg(problem, options, plan));
+  const std::string document = planning::plan_json(problem, options, plan, request.horizon, simulated);
+  core::write_file(out / "plan.json", document);
+  if (globals.json) {
+    std::cout << document;
+    return;
+  }
+  char text[256];
+  const planning::Hit& worst = planning::worst_hit(plan);
+  std::snprintf(text, sizeof text, "%s: miss %.2f mm at %.2f s, peak %.2f m/s and %.1f m/s^2, %.2f s: %s",
+                plan.reached ? "reached" : "cannot reach", 1e3 * worst.miss, worst.time, plan.peaks.velocity,
+                plan.peaks.acceleration, plan.seconds, request.out.c_str());
+  say(text);
+  if (!plan.reached) say(plan.reason);
+  if (!plan.reached && !solve::converged(plan.summary)) say("its last fit: " + solve::describe(plan.summary));
+  for (const auto& [name, loop] : simulated) {
+    std::snprintf(text, sizeof text, "%s: miss %.2f mm", name.c_str(), 1e3 * loop.hit.miss);
+    say(text);
+    if (!(loop.out_of_reach > options.tolerance)) continue;
+    std::snprintf(text, sizeof text, "%s: the target moves at least %.1f mm out of reach", name.c_str(),
+                  1e3 * loop.out_of_reach);
+    say(text);
+  }
+}
+
+}  // namespace
+
+void add_planning_commands(CLI::App& app, const Globals& globals, Job& job) {
+  CLI::App* planner = app.add_subcommand("plan", "Find a base motion that makes the rope hit a target");
+  auto request = std::make_shared<PlanRequest>();
+  planning::Limits& limits = request->options.limits;
+  planner->add_option("RUN", request->run, "Run folder of an identified twin")->required();
+  planner
+      ->add_option(
+          "--target", request->targets,
+          "Point to hit, m, world: with the tip at any time, on a table with any point of the rope at the end.\n"
+          "Several are hit one after the other. random:SEED: a point that a random motion passes")
+      ->required()
+      ->type_name("X,Y,Z");
+  planner->add_option("-o,--output", request->out, "Folder for base.tum, base.csv, states.csv, plan.json, picture.svg")
+      ->required()
+      ->type_name("PLAN");
+  planner->add_option("--axes", request->axes, "What moves (default: x, for a chain with two bending axes x,y)")
+      ->type_name("x,y,z,yaw");
+  planner
+      ->add_option("--horizon", request->horizon,
+                   "Seconds for each target (default 3), or free: the shortest that does")
+      ->type_name("S|free");
+  planner->add_option("--initial", request->initial, "Start from its first row (default: at rest)")
+      ->type_name("STATES.csv");
+  planner
+      ->add_option("--state-from", request->state_from,
+                   "Start from what one camera shows in its first frame, with the base where it is then, at rest")
+      ->type_name("CAPTURE:NAME")
+      ->excludes("--initial");
+  planner
+      ->add_option("--terminal", request->terminal,
+                   "Where the base ends, from its start, one number an axis (default: free)")
+      ->type_name("OFFSETS");
+  planner->add_option("--window", request->window, "smooth: no acceleration at the ends; paper: s^2(1-s)^2")
+      ->check(CLI::IsMember({"smooth", "paper"}));
+  planner->add_option("--velocity", limits.velocity, "Limit of the base, m/s (default 1.5)");
+  planner->add_option("--acceleration", limits.acceleration, "Limit of the base, m/s^2 (default 10)");
+  planner->add_option("--jerk", limits.jerk, "Limit of the base, m/s^3 (default 200)");
+  planner->add_option("--stroke", limits.stroke, "Farthest from the start along an axis, m (default 0.6)");
+  planner->add_option("--yaw-velocity", limits.yaw_velocity, "Limit, rad/s (default 3.1)");
+  planner->add_option("--yaw-acceleration", limits.yaw_acceleration, "Limit, rad/s^2 (default 20)");
+  planner->add_option("--yaw-jerk", limits.yaw_jerk, "Limit, rad/s^3 (default 400)");
+  planner->add_option("--turn", limits.turn, "Farthest yaw from the start, rad (default 1.6)");
+  planner->add_option("--keep-out-sphere", request->spheres, "Rope and gripper stay out of it")->type_name("X,Y,Z,R");
+  planner->add_option("--keep-out-box", request->boxes, "Rope and gripper stay out of it")->type_name("X,Y,Z,X,Y,Z");
+  planner->add_option("--gripper-radius", request->options.gripper_radius,
+                      "Of a sphere about the base, m (default 0.04)");
+  planner->add_option("--tolerance", request->options.tolerance, "A smaller miss counts as reached, m (default 0.001)");
+  planner->add_option("--starts", request->options.starts, "Random motions to begin from (default 24)")
+      ->check(CLI::Range(0, 100000));
+  planner
+      ->add_option("--samples", request->options.samples,
+                   "Also plan for N parameter sets drawn from the identification's covariance")
+      ->check(CLI::Range(0, 1000))
+      ->type_name("N");
+  planner->add_flag("--worst-case", request->options.worst_case, "Minimize the samples' worst miss, not the mean");
+  planner->add_option("--simulate", request->simulate, "Also play the plan on this true chain (a twin.json's 'chain')")
+      ->type_name("CHAIN.json");
+  planner->add_flag("--mpc", request->mpc,
+                    "With --simulate: plan the rest anew from the state that is seen; base.* is\n"
+                    "then the motion as corrected");
+  planner->add_option("--mpc-rate", request->loop.rate, "Replans a second (default 10)")->type_name("HZ");
+  planner
+      ->add_option("--target-velocity", request->target_velocity, "With --mpc: the target moves from the start on, m/s")
+      ->type_name("VX,VY,VZ");
+  planner->add_option("--rate", request->rate, "Rows a second of the files (default 100)")->type_name("HZ");
+  planner->add_flag("--force", request->force, "Write into a folder that is not empty");
+  planner->callback([&globals, &job, request] { job = [&globals, request] { plan(globals, *request); }; });
+}
+
+}  // namespace chainsplat::tools

@@ -1,0 +1,166 @@
+// result.cpp - eval, export, synth: how good a twin is, and what others can do with it.
+#include <CLI/CLI.hpp>
+#include <algorithm>
+#include <iostream>
+#include <memory>
+#include <nlohmann/json.hpp>
+
+#include "chainsplat/capture.h"
+#include "chainsplat/eval.h"
+#include "chainsplat/export.h"
+#include "chainsplat/pipeline.h"
+#include "chainsplat/run_folder.h"
+#include "chainsplat/synth.h"
+#include "cli.h"
+
+namespace chainsplat::tools {
+
+namespace {
+
+namespace fs = std::filesystem;
+
+struct EvalRequest {
+  std::string run, capture, out, picture, frames;
+};
+
+void evaluate(const Globals& globals, const EvalRequest& request) {
+  if (!request.out.empty()) pipeline::check_output_file(request.out);
+  if (!request.picture.empty()) pipeline::check_output_file(request.picture);
+  if (globals.json && request.out == "-")
+    throw InputError("--json", "standard output is wanted by '-o -' too", "leave one of them out");
+  const pipeline::Evaluation found =
+      pipeline::evaluate(request.run, request.capture,
+                         {capture::read_frame_range(request.frames, "--frames"), request.picture, globals.device}, terminal());
+  const eval::Metrics *recognized = found.recognized ? &*found.recognized : nullptr,
+                      *rollout = found.rollout ? &*found.rollout : nullptr;
+  const std::string json = pipeline::metrics_json(recognized, rollout);
+  if (!request.out.empty()) write_result(request.out, json);
+  end_progress();
+  if (globals.json) {
+    std::cout << json;
+    return;
+  }
+  if (request.out == "-") return;
+  std::vector<MetricsRow> rows;
+  for (const auto& [name, metrics] : {std::pair("recognized", recognized), std::pair("rollout", rollout)}) {
+    if (!metrics) continue;
+    for (std::size_t c = 0; c < metrics->cameras.size(); ++c)
+      rows.push_back({std::string(name) + " " + metrics->camera_names[c], &metrics->cameras[c]});
+    rows.push_back({std::string(name) + " mean", &metrics->mean});
+  }
+  std::cout << metrics_table(rows);
+  if (!request.picture.empty()) std::cout << "picture: " << request.picture << "\n";
+}
+
+struct ExportRequest {
+  std::string run, states, base, out;
+};
+
+void export_twin(const Globals& globals, const ExportRequest& request) {
+  const std::vector<std::string>& known = exports::endings();
+  if (std::find(known.begin(), known.end(), Path(request.out).extension().string()) == known.end()) {
+    std::string list;
+    for (const std::string& ending : known) list += (list.empty() ? "" : ", ") + ending;
+    throw InputError(request.out, "its ending is not known", "use one of " + list);
+  }
+  pipeline::check_output_file(request.out);
+  const twin::Twin twin = pipeline::load_twin(request.run);
+  const chain::States motion =
+      request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
+  exports::write(twin, motion, request.base.empty() ? pipeline::own_base(request.run) : pipeline::read_base(input_path(request.base)), request.out);
+  if (globals.json)
+    std::cout << nlohmann::ordered_json{{"output", request.out}}.dump(-1, ' ', false,
+                                                                      nlohmann::ordered_json::error_handler_t::replace)
+              << "\n";
+  else
+    say("written: " + request.out);
+}
+
+struct SynthRequest {
+  std::string run, states, base, camera, out;
+  bool images = false, force = false;
+};
+
+void synthesize(const Globals& globals, const SynthRequest& request) {
+  const Path out = request.out;
+  pipeline::check_output_folder(out, request.force, "name another folder or give --force to write into it");
+  const twin::Twin twin = pipeline::load_twin(request.run);
+  pipeline::check_drawable(twin, request.run);
+  auto [folder, camera] = split_camera(request.camera);
+  if (folder.empty()) {
+    if (!twin.provenance.path)
+      throw InputError(request.run, "does not say which capture it was made from", "give --camera with a capture");
+    folder = (Path(request.run) / *twin.provenance.path).lexically_normal().string();
+  }
+  capture::LoadOptions load;
+  load.images = false;
+  load.camera = camera;
+  capture::Capture scene = capture::load(folder, load);
+  pipeline::check_not_capture(out, scene.folder);
+  if (!request.base.empty()) scene.base = pipeline::read_base(input_path(request.base));
+  const chain::States states = !request.states.empty()
+                                   ? twin::read_states(input_path(request.states), twin.chain.angles())
+                               : twin.rollout.time.empty() ? twin.states
+                                                           : twin.rollout;
+  const gpu::DevicePtr device = gpu::open_device({.selector = globals.device});
+  splat::Engine engine(*device);
+  synth::Options options;
+  options.name = fs::absolute(out).lexically_normal().filename().string();
+  if (options.name.empty()) options.name = "synth";
+  options.video = !request.images;
+  synth::write(engine, twin, states, scene, out, options);
+  if (globals.json)
+    std::cout << nlohmann::ordered_json{{"capture", request.out}}.dump(-1, ' ', false,
+                                                                       nlohmann::ordered_json::error_handler_t::replace)
+              << "\n";
+  else
+    say("capture: " + request.out);
+}
+
+}  // namespace
+
+void add_result_commands(CLI::App& app, const Globals& globals, Job& job) {
+  CLI::App* evaluator = app.add_subcommand("eval", "Measure how well a twin explains a capture");
+  auto request = std::make_shared<EvalRequest>();
+  evaluator->add_option("RUN", request->run, "Run folder of a twin")->required();
+  evaluator->add_option("CAPTURE", request->capture, "Its own capture, or another one of the same rope (rollout only)")
+      ->required();
+  evaluator->add_option("-o,--output", request->out, "Also write the metrics as JSON")->type_name("FILE.json");
+  evaluator->add_option("--frames", request->frames, "Only these frames: from A up to, not including, B")
+      ->type_name("A:B");
+  evaluator->add_option("--picture", request->picture, "Also make a picture: observed beside rendered frames")
+      ->type_name("FILE.png");
+  evaluator->callback([&globals, &job, request] { job = [&globals, request] { evaluate(globals, *request); }; });
+
+  CLI::App* exporter = app.add_subcommand("export", "Write the twin for other programs, by the file's ending");
+  auto exporting = std::make_shared<ExportRequest>();
+  exporter->add_option("RUN", exporting->run, "Run folder of a twin")->required();
+  std::string endings;
+  for (const std::string& ending : exports::endings()) endings += (endings.empty() ? "" : " ") + ending;
+  exporter->add_option("-o,--output", exporting->out, "File to write; its ending says what: " + endings)
+      ->required()
+      ->type_name("FILE");
+  exporter->add_option("--states", exporting->states, "Motion to write (default: the recognized states)")
+      ->type_name("STATES.csv");
+  exporter->add_option("--base", exporting->base, "Its base motion (default: the capture's own)")
+      ->type_name("FILE.tum");
+  exporter->callback(
+      [&globals, &job, exporting] { job = [&globals, exporting] { export_twin(globals, *exporting); }; });
+
+  CLI::App* synthesizer = app.add_subcommand("synth", "Draw a capture from a twin: videos, masks, depth, truth");
+  auto scene = std::make_shared<SynthRequest>();
+  synthesizer->add_option("RUN", scene->run, "Run folder of a twin")->required();
+  synthesizer->add_option("-o,--output", scene->out, "Capture folder to make")->required()->type_name("CAPTURE");
+  synthesizer
+      ->add_option("--states", scene->states, "Motion to draw (default: the rollout, else the recognized states)")
+      ->type_name("STATES.csv");
+  synthesizer
+      ->add_option("--camera", scene->camera, "Whose cameras, base motion and table (default: the twin's own capture)")
+      ->type_name("CAPTURE[:NAME]");
+  synthesizer->add_option("--base", scene->base, "Base motion (default: that of the capture)")->type_name("FILE.tum");
+  synthesizer->add_flag("--images", scene->images, "Images without loss instead of videos");
+  synthesizer->add_flag("--force", scene->force, "Write into a folder that is not empty");
+  synthesizer->callback([&globals, &job, scene] { job = [&globals, scene] { synthesize(globals, *scene); }; });
+}
+
+}  // namespace chainsplat::tools

@@ -1,0 +1,85 @@
+// results.cpp - texts of the command line, and results on their way out.
+#include <unistd.h>
+
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <fstream>
+#include <iostream>
+
+#include "chainsplat/eval.h"
+#include "cli.h"
+
+namespace chainsplat::tools {
+
+namespace fs = std::filesystem;
+
+Path input_path(const std::string& name) { return name == "-" ? Path("/dev/stdin") : Path(name); }
+
+void write_result(const std::string& name, const std::string& bytes) {
+  std::error_code error;
+  if (name == "-") {
+    std::cout << bytes;
+  } else if (fs::exists(name, error) && !fs::is_regular_file(name, error)) {
+    // a device or a pipe must be written into, not replaced
+    std::ofstream file(name, std::ios::binary);
+    file << bytes;
+    file.flush();
+    if (!file) throw WorkError(name, "writing failed", "make room or name another file");
+  } else {
+    core::write_file(name, bytes);
+  }
+}
+
+std::string metrics_table(const std::vector<MetricsRow>& rows) {
+  constexpr double kMillimeters = 1e3;
+  std::string text = "                    PSNR dB  object dB    SSIM     IoU  Chamfer mm  centerline mm\n";
+  const auto cell = [&](int width, int digits, double value) {
+    char out[64];
+    if (std::isfinite(value))
+      std::snprintf(out, sizeof out, "%*.*f", width, digits, value);
+    else
+      std::snprintf(out, sizeof out, "%*s", width, "-");
+    text += out;
+  };
+  for (const MetricsRow& row : rows) {
+    char name[64];
+    std::snprintf(name, sizeof name, "%-18.40s", row.name.c_str());
+    text += name;
+    cell(9, 2, row.metrics->psnr);
+    cell(11, 2, row.metrics->psnr_object);
+    cell(8, 4, row.metrics->ssim);
+    cell(8, 3, row.metrics->iou);
+    cell(12, 2, kMillimeters * row.metrics->chamfer);
+    cell(15, 2, kMillimeters * row.metrics->centerline_rms);
+    text += "\n";
+  }
+  return text;
+}
+
+std::pair<std::string, std::string> split_camera(const std::string& text) {
+  std::error_code error;
+  const std::size_t colon = text.rfind(':');
+  if (colon == std::string::npos || fs::exists(text, error)) return {text, ""};
+  return {text.substr(0, colon), text.substr(colon + 1)};
+}
+
+std::vector<double> numbers(const std::string& text, const std::string& where, std::size_t count) {
+  std::vector<double> out;
+  const char* at = text.c_str();
+  for (;;) {
+    char* end = nullptr;
+    const double value = std::strtod(at, &end);
+    if (end == at) break;
+    out.push_back(value);
+    at = end;
+    if (*at != ',' || at[1] == '\0') break;
+    ++at;
+  }
+  if (*at != '\0' || (count && out.size() != count) || out.empty())
+    throw InputError(where, "'" + text + "' is not " + (count ? std::to_string(count) + " numbers" : "numbers"),
+                     "give them with commas between, for example 0.1,0,0.3");
+  return out;
+}
+
+}  // namespace chainsplat::tools
