@@ -68,8 +68,14 @@ TEST_CASE("check() names the wrong field") {
 
 TEST_CASE("settings are read from texts, and refused by the name of where they stand") {
   pipeline::TrainOptions options;
-  for (const auto& [name, text] : {std::pair("joints", "6"), {"bending", "spatial"}, {"twist", "true"}, {"every", "2"},
-                                   {"frames", "3:"}, {"mode", "paper"}, {"stages", "identify,rollout"}, {"joint", "true"}})
+  for (const auto& [name, text] : {std::pair("joints", "6"),
+                                   {"bending", "spatial"},
+                                   {"twist", "true"},
+                                   {"every", "2"},
+                                   {"frames", "3:"},
+                                   {"mode", "paper"},
+                                   {"stages", "identify,rollout"},
+                                   {"joint", "true"}})
     pipeline::set(options, name, text, "a");
   CHECK(options.joints == 6);
   CHECK(options.bending == chain::Bending::spatial);
@@ -80,8 +86,8 @@ TEST_CASE("settings are read from texts, and refused by the name of where they s
   CHECK(options.stages == std::vector{pipeline::Stage::identify, pipeline::Stage::rollout});
   CHECK(options.joint);
   for (const pipeline::Setting& setting : pipeline::settings())
-    CHECK_THROWS_WITH_AS(pipeline::set(options, setting.name, "never", "jobs.toml: x"), doctest::Contains("jobs.toml: x: "),
-                         InputError);
+    CHECK_THROWS_WITH_AS(pipeline::set(options, setting.name, "never", "jobs.toml: x"),
+                         doctest::Contains("jobs.toml: x: "), InputError);
 }
 
 TEST_CASE("a wrong request writes nothing, and an error keeps its three fields") {
@@ -209,6 +215,6 @@ TEST_CASE("a job file becomes the jobs of a batch") {
   CHECK(pipeline::load_plan(folder.path).jobs[3].arguments == plan.jobs[3].arguments);
   CHECK(pipeline::unfinished(plan, folder.path).size() == 4);
   core::write_file(folder.path / "jobs.toml", "captures = [\"captures/*\"]\nsettings = { joints = 0 }\n");
-  CHECK_THROWS_WITH_AS(pipeline::read_job_file(folder.path / "jobs.toml"), doctest::Contains("`joints` 0 is not from 1"),
-                       InputError);
+  CHECK_THROWS_WITH_AS(pipeline::read_job_file(folder.path / "jobs.toml"),
+                       doctest::Contains("`joints` 0 is not from 1"), InputError);
 }

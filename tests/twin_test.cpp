@@ -55,7 +55,8 @@ twin::Twin full_twin() {
   twin.estimates.solver = {solve::Reason::no_decrease, 7, std::numeric_limits<double>::quiet_NaN(), 2.0 / 3.0, 1e-300};
   twin::Provenance& p = twin.provenance;
   p.version = "1.2.3", p.capture = "free \xc3\xa4", p.capture_hash = "00ff", p.device = "llvmpipe", p.driver = "Mesa";
-  p.mass = 1.0 / 3.0, p.frames = {12, -1}, p.every = 5, p.mode = twin::Mode::paper, p.path = "../captures/a", p.joint = true;
+  p.mass = 1.0 / 3.0, p.frames = {12, -1}, p.every = 5, p.mode = twin::Mode::paper, p.path = "../captures/a",
+  p.joint = true;
   p.options = {{"joints", "5"}};
   p.seed = std::numeric_limits<std::uint64_t>::max();
   p.seconds = {{"recognize", 61.25}, {"identify", 1.0 / 3.0}};

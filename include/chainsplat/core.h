@@ -77,7 +77,8 @@ struct Listener {
   std::function<void(const std::string&)> warning;  // one line, what was assumed
   std::function<void(const Progress&)> progress;
   std::function<void(const std::string&)> message;  // one line, what was found or done
-  std::function<void(const std::string&)> detail;   // the same for who wants to know more: seconds of a stage, the device
+  std::function<void(const std::string&)>
+      detail;  // the same for who wants to know more: seconds of a stage, the device
   std::function<void(const nlohmann::ordered_json&)> record;  // for a log, beside progress: how a stage's fit ended
   std::function<bool()> stop;  // asked after every progress: true ends the work as SIGINT does, with a checkpoint
 };

@@ -1,5 +1,5 @@
-// chainsplat/follow.h - a rope followed frame by frame: frames from a capture, a video, a V4L2 device or standard input,
-// and an estimate for each.
+// chainsplat/follow.h - a rope followed frame by frame: frames from a capture, a video, a V4L2 device or standard
+// input, and an estimate for each.
 #pragma once
 #include <functional>
 #include <memory>
@@ -29,10 +29,10 @@ struct LiveFrame {
 };
 
 struct SourceOptions {
-  Path source;         // a capture; with `calibration` a video file, a device under /dev or "-": raw RGB24, standard input
-  std::string camera;  // of a capture, by its name; empty: all of them together
-  Path calibration;    // camera object as in capture.json
-  double rate = 0.0;   // frames per second; 0: the calibration's, else the video's
+  Path source;  // a capture; with `calibration` a video file, a device under /dev or "-": raw RGB24, standard input
+  std::string camera;           // of a capture, by its name; empty: all of them together
+  Path calibration;             // camera object as in capture.json
+  double rate = 0.0;            // frames per second; 0: the calibration's, else the video's
   std::optional<double> start;  // s, of the first frame; none: the calibration's
   bool unix_time = false;       // a device's own stamps in Unix time, in place of `start`
   capture::FrameRange frames;
@@ -51,8 +51,8 @@ struct FrameSource {
 // Throws InputError.
 FrameSource open_frames(const SourceOptions& options);
 
-// newton: outlines, then the colors inside them, drawn on the device; silhouette: outlines alone, without a device; adam:
-// the paper's, ten Adam steps on the rendering loss from the last frame's angles, without deviations.
+// newton: outlines, then the colors inside them, drawn on the device; silhouette: outlines alone, without a device;
+// adam: the paper's, ten Adam steps on the rendering loss from the last frame's angles, without deviations.
 enum class Solver { newton, silhouette, adam };
 
 struct FollowOptions {
@@ -78,7 +78,8 @@ class Follower {
   // The twin in `run`, the source and the device, all of them opened and checked.
   Follower(const Path& run, const FollowOptions& options);
   ~Follower();
-  // Frame by frame until the source ends; `each` is called after every one. Throws Interrupted where a stop is requested.
+  // Frame by frame until the source ends; `each` is called after every one. Throws Interrupted where a stop is
+  // requested.
   void follow(const std::function<void(const Followed&)>& each);
 
   const twin::Twin& twin() const;

@@ -1,5 +1,5 @@
-// chainsplat/motion_files.h - a planned base motion as files: TUM for robots and for rollouts, CSV with derivatives, and
-// the plan as JSON.
+// chainsplat/motion_files.h - a planned base motion as files: TUM for robots and for rollouts, CSV with derivatives,
+// and the plan as JSON.
 #pragma once
 #include <span>
 #include <string>

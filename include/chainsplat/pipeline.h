@@ -1,8 +1,8 @@
 // chainsplat/pipeline.h - what the commands of the program do, each as one call.
 //
 // A call takes folders and an options struct, whose check() throws an InputError that names the wrong field; it reports
-// to `listener` (core.h), which may stop it, and returns its results as values. One call at a time in a process: there is
-// one listener. Every call throws InputError where the request or its input is wrong, and then nothing was written;
+// to `listener` (core.h), which may stop it, and returns its results as values. One call at a time in a process: there
+// is one listener. Every call throws InputError where the request or its input is wrong, and then nothing was written;
 // WorkError where the work failed, and then what exists is kept; Interrupted where it was stopped. Files: run_folder.h.
 #pragma once
 #include <cstdint>
@@ -27,9 +27,10 @@ enum class Stage { recognize, identify, rollout, evaluate };
 
 struct TrainOptions {
   int joints = 8;
-  std::optional<chain::Bending> bending;  // none: planar on a table; in free space spatial unless the rope stays in a plane
-  bool twist = false;                     // also a twist axis per joint
-  int every = 5;                          // the Gaussians are trained on every n-th frame
+  std::optional<chain::Bending>
+      bending;         // none: planar on a table; in free space spatial unless the rope stays in a plane
+  bool twist = false;  // also a twist axis per joint
+  int every = 5;       // the Gaussians are trained on every n-th frame
   capture::FrameRange frames;
   twin::Mode mode = twin::Mode::fast;
   std::vector<Stage> stages;  // empty: all that are not done. A stage that is named is done again, but recognition
@@ -51,9 +52,10 @@ struct TrainResult {
 };
 
 // Makes the twin of the capture (its folder or capture.json) in the folder `run`. Reports in stages "recognize",
-// "identify", "joint", "rollout", "evaluate", and writes them to log.jsonl. A call that was stopped goes on with `resume`,
-// with the same bits as if nothing had happened.
-TrainResult train(const Path& capture, const Path& run, const TrainOptions& options, const core::Listener& listener = {});
+// "identify", "joint", "rollout", "evaluate", and writes them to log.jsonl. A call that was stopped goes on with
+// `resume`, with the same bits as if nothing had happened.
+TrainResult train(const Path& capture, const Path& run, const TrainOptions& options,
+                  const core::Listener& listener = {});
 
 // The fields of TrainOptions that a batch may set, by name, and a value of one from its text ("true" or "false" for a
 // flag, commas between stages). Throws InputError, which says by `where` whose text it is.
@@ -102,8 +104,8 @@ struct OnlineResult {
 };
 // Parameters that follow the rope through the lines of estimates (estimate_lines.h) until they end or a stop is
 // requested. `name`: of the lines, for messages.
-OnlineResult identify_online(const Path& run, std::istream& lines, const std::string& name, const OnlineOptions& options,
-                             const core::Listener& listener = {});
+OnlineResult identify_online(const Path& run, std::istream& lines, const std::string& name,
+                             const OnlineOptions& options, const core::Listener& listener = {});
 
 // The stage alone, without files: fills in parameters, initial state, estimates and rollout of a recognized twin.
 // The states count by their covariances where they have them. `paper`: the paper's procedure.

@@ -40,7 +40,8 @@ void check_run_files(const Path& run);
 void remove_run_files(const Path& run);
 // Removes the checkpoint folder and what is ours in it; it stays where somebody else's files are.
 void remove_checkpoint_folder(const Path& run);
-// Removes what a killed process left half-written of a run's files and checkpoints (core::write_file's temporary files).
+// Removes what a killed process left half-written of a run's files and checkpoints (core::write_file's temporary
+// files).
 void remove_half_written(const Path& run);
 
 // The log of a run: a JSON record per interval with stage, iteration, total, loss, psnr and the seconds since it was
@@ -62,7 +63,7 @@ twin::Twin twin_in_scene(const capture::Capture& capture);
 // The twin in `run` with something recognized in it. Throws InputError.
 twin::Twin load_twin(const Path& run);
 void check_drawable(const twin::Twin& twin, const Path& run);  // throws InputError where it has no Gaussians
-trajectory::Trajectory read_base(const Path& file);  // a TUM file as a fitted motion; throws InputError
+trajectory::Trajectory read_base(const Path& file);            // a TUM file as a fitted motion; throws InputError
 // The base motion of the capture that the twin was made from, as kept in its folder. Throws InputError.
 trajectory::Trajectory own_base(const Path& run);
 // The same, for work on the states: throws InputError too where the base does not cover their times.

@@ -214,7 +214,8 @@ std::string read_file(const Path& path) {
   while (file) {
     const std::size_t had = bytes.size();
     if (had > kLargestFile)
-      throw InputError(path.string(), "is larger than 1 GiB", "name the file that is meant; none that is read is so large");
+      throw InputError(path.string(), "is larger than 1 GiB",
+                       "name the file that is meant; none that is read is so large");
     bytes.resize(had + std::max(kBlock, had));  // doubling keeps the total time linear in the size
     file.read(bytes.data() + had, static_cast<std::streamsize>(bytes.size() - had));
     bytes.resize(had + static_cast<std::size_t>(file.gcount()));

@@ -83,7 +83,8 @@ std::optional<EstimateLine> read_estimate_line(const std::string& line, const st
 }
 
 bool next_line(std::istream& in, std::string& line, const std::string& where) {
-  constexpr std::size_t kLongest = 64 << 20;  // bytes; an estimate of a thousand angles, with covariance, has half of it
+  constexpr std::size_t kLongest =
+      64 << 20;  // bytes; an estimate of a thousand angles, with covariance, has half of it
   line.clear();
   for (char letter = 0; in.get(letter);) {
     if (letter == '\n') return true;

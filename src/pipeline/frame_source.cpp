@@ -122,7 +122,7 @@ FrameSource open_stream(const SourceOptions& options) {
   if (options.start) start = *options.start;
   const std::string where = standard_input ? "standard input" : options.source.string();
   // a device has a clock of its own, so that frames which were passed over leave a gap in time
-  std::optional<double> offset;  // from that clock to ours
+  std::optional<double> offset;                             // from that clock to ours
   double stamp = -std::numeric_limits<double>::infinity();  // s, the last frame's by that clock
   source.next = [camera = source.cameras[0], frames = options.frames, reader, rate, start, where, device, unix, offset,
                  stamp, count = 0](LiveFrame& frame) mutable {
@@ -165,7 +165,8 @@ FrameSource open_frames(const SourceOptions& options) {
     if (none)
       throw InputError("`calibration`", "is needed with " + file.string() + ", which is no capture",
                        "give a camera object as in capture.json");
-    if (options.start || options.unix_time) throw InputError("`start`", "a capture has times of its own", "leave it out");
+    if (options.start || options.unix_time)
+      throw InputError("`start`", "a capture has times of its own", "leave it out");
   }
   return options.calibration.empty() ? open_capture(options) : open_stream(options);
 }

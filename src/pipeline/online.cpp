@@ -37,8 +37,8 @@ void follow_lines(adaptation::ParameterFilter& filter, const chain::Chain& chain
 
 }  // namespace
 
-OnlineResult identify_online(const Path& run, std::istream& lines, const std::string& name, const OnlineOptions& options,
-                             const core::Listener& listener) {
+OnlineResult identify_online(const Path& run, std::istream& lines, const std::string& name,
+                             const OnlineOptions& options, const core::Listener& listener) {
   const core::ListenerScope scope(listener);
   twin::Twin twin = twin::load(run);
   if (!twin.parameters) throw InputError(run.string(), "has no parameters yet", "identify it first");

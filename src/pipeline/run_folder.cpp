@@ -108,7 +108,9 @@ void check_drawable(const twin::Twin& twin, const Path& run) {
     throw InputError(run.string(), "has no Gaussians to draw", "recognize it from images first");
 }
 
-trajectory::Trajectory read_base(const Path& file) { return trajectory::fit(trajectory::read_tum(file), file.string()); }
+trajectory::Trajectory read_base(const Path& file) {
+  return trajectory::fit(trajectory::read_tum(file), file.string());
+}
 
 trajectory::Trajectory own_base(const Path& run) {
   const Path file = run / kBaseFile;

@@ -55,9 +55,9 @@ twin::Provenance recognition_provenance(const TrainOptions& options) {
   p.frames = options.frames;
   p.mode = options.mode;
   p.options = {{"joints", std::to_string(options.joints)},
-               {"bending", !options.bending                                   ? "auto"
+               {"bending", !options.bending                             ? "auto"
                            : *options.bending == chain::Bending::planar ? "planar"
-                                                                              : "spatial"},
+                                                                        : "spatial"},
                {"twist", options.twist ? "yes" : "no"}};
   return p;
 }
@@ -90,7 +90,8 @@ void check_outputs(const Training& t) {
 void check_views(const Training& t) {
   const capture::Capture& capture = t.capture;
   if (capture.views.empty())
-    throw InputError("`frames`", "'" + capture::frame_range_text(t.options.frames) + "' holds none of the capture's frames",
+    throw InputError("`frames`",
+                     "'" + capture::frame_range_text(t.options.frames) + "' holds none of the capture's frames",
                      capture.cameras.front().name + " has " + std::to_string(capture.times.front().size()));
   for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
     const auto sees = [&](const capture::View& view) {
@@ -195,7 +196,8 @@ void open_device(Training& t) {
   const gpu::DeviceInfo& info = gpu::info(*t.device);
   t.twin.provenance.device = info.name;
   t.twin.provenance.driver = info.driver;
-  core::say_more("device " + std::to_string(info.index) + ": " + info.name + " (" + info.type + ", " + info.driver + ")");
+  core::say_more("device " + std::to_string(info.index) + ": " + info.name + " (" + info.type + ", " + info.driver +
+                 ")");
 }
 
 void prepare(Training& t) {

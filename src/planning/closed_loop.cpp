@@ -71,9 +71,8 @@ MatrixX centerline_velocity(const chain::Chain& chain, const VectorX& theta, con
 
 }  // namespace
 
-StateFit fit_state(const chain::Chain& chain, const trajectory::BaseMotion& base,
-                   const std::vector<double>& arclengths, const MatrixX& points, const MatrixX& velocities,
-                   const VectorX& start) {
+StateFit fit_state(const chain::Chain& chain, const trajectory::BaseMotion& base, const std::vector<double>& arclengths,
+                   const MatrixX& points, const MatrixX& velocities, const VectorX& start) {
   const int n = chain.angles();
   const Eigen::Index rows = 3 * static_cast<Eigen::Index>(arclengths.size());
   MatrixX jacobian(rows, n);
@@ -202,7 +201,8 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
   if (plan.hits.size() != 1) throw InputError("`targets`", "feedback is for one of them", "give one target");
   if (!(loop.rate > 0.0) || !std::isfinite(loop.rate))
     throw InputError("`loop.rate`", "must be above 0", "give replans a second, for example 10");
-  if (!loop.target_velocity.allFinite()) throw InputError("`loop.target_velocity`", "is not finite", "give VX,VY,VZ in m/s");
+  if (!loop.target_velocity.allFinite())
+    throw InputError("`loop.target_velocity`", "is not finite", "give VX,VY,VZ in m/s");
   if (truth.chain.direction != problem.model.chain.direction)
     throw InputError("`truth`", "the chain leaves the gripper in another direction", "give one of the same grasp");
   const chain::Chain& chain = problem.model.chain;

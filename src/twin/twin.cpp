@@ -447,7 +447,8 @@ void read_option(const std::string& name, const Node& node, Provenance& p) {
   const auto number = [&](auto& value, const std::string& what) {
     const char* const end = text.data() + text.size();
     const auto [after, error] = std::from_chars(text.data(), end, value);
-    if (error != std::errc() || after != end || !std::isfinite(static_cast<double>(value)) || !(value > 0)) refuse(what);
+    if (error != std::errc() || after != end || !std::isfinite(static_cast<double>(value)) || !(value > 0))
+      refuse(what);
   };
   if (name == "mass") {
     number(p.mass.emplace(), "not a positive number, the mass in kg");

@@ -75,7 +75,8 @@ Path small_capture(const char* name) {
   const Path capture = folder() / name;
   for (const char* images : {"cam0", "masks", "depth"}) {
     std::filesystem::create_directories(capture / images);
-    for (const char* frame : {"000000.png", "000001.png", "000002.png", "000003.png"}) put(capture / images / frame, "");
+    for (const char* frame : {"000000.png", "000001.png", "000002.png", "000003.png"})
+      put(capture / images / frame, "");
   }
   put(capture / "base.tum", kBase);
   put(capture / "cam0.txt", "0\n0.02\n0.04\n0.06\n");
@@ -316,11 +317,26 @@ void video(std::string_view bytes) {
 }
 
 const std::map<std::string, Read> kReaders = {
-    {"batch", batch},       {"camera", camera},         {"checkpoint", checkpoint}, {"contacts", contacts},
-    {"covariance", covariance}, {"estimates", estimates},   {"image", image},           {"jobs", jobs},
-    {"manifest", manifest}, {"markers", markers},       {"metrics", metrics},       {"online", online},
-    {"ply", ply},           {"points", points},         {"states", states},         {"timestamps", timestamps},
-    {"truth", truth},       {"tum", tum},               {"twin", twin},             {"values", values},
+    {"batch", batch},
+    {"camera", camera},
+    {"checkpoint", checkpoint},
+    {"contacts", contacts},
+    {"covariance", covariance},
+    {"estimates", estimates},
+    {"image", image},
+    {"jobs", jobs},
+    {"manifest", manifest},
+    {"markers", markers},
+    {"metrics", metrics},
+    {"online", online},
+    {"ply", ply},
+    {"points", points},
+    {"states", states},
+    {"timestamps", timestamps},
+    {"truth", truth},
+    {"tum", tum},
+    {"twin", twin},
+    {"values", values},
     {"video", video},
 };
 

@@ -1,6 +1,6 @@
 // address_space.cpp - what happens before the shared libraries are set up: some of them do not survive a limit on the
-// address space (ulimit -v, memory limits of batch systems). They bring threads of their own, from the image reader down
-// to a BLAS that the program never calls; where there is no room for these, OpenBLAS tries for ever, others abort.
+// address space (ulimit -v, memory limits of batch systems). They bring threads of their own, from the image reader
+// down to a BLAS that the program never calls; where there is no room for these, OpenBLAS tries for ever, others abort.
 #include <sys/resource.h>
 #include <unistd.h>
 
@@ -22,10 +22,11 @@ void before_libraries(int, char** arguments, char** environment) {
   const unsigned long long least = kLibraries + kOfCore * static_cast<unsigned long long>(cores > 0 ? cores : 1);
   if (limit.rlim_cur < least) {
     char line[200];
-    const int length = std::snprintf(line, sizeof line,
-                                     "chainsplat: error: address space: its limit of %llu MiB is less than the %llu MiB "
-                                     "that the program's libraries take; raise it (ulimit -v)\n",
-                                     static_cast<unsigned long long>(limit.rlim_cur) / kMiB, least / kMiB);
+    const int length =
+        std::snprintf(line, sizeof line,
+                      "chainsplat: error: address space: its limit of %llu MiB is less than the %llu MiB "
+                      "that the program's libraries take; raise it (ulimit -v)\n",
+                      static_cast<unsigned long long>(limit.rlim_cur) / kMiB, least / kMiB);
     (void)!::write(STDERR_FILENO, line, static_cast<std::size_t>(length));
     ::_exit(1);
   }

@@ -217,10 +217,9 @@ void batch(const Globals& globals, const Request& request) {
   if (!todo.empty()) {
     pipeline::BatchOptions options;
     options.device = globals.device;
-    options.parallel =
-        request.parallel > 0
-            ? request.parallel
-            : std::min<int>(best_parallel(gpu::choose_device(globals.device).software), static_cast<int>(todo.size()));
+    options.parallel = request.parallel > 0 ? request.parallel
+                                            : std::min<int>(best_parallel(gpu::choose_device(globals.device).software),
+                                                            static_cast<int>(todo.size()));
     options.threads = globals.threads > 0 ? globals.threads : std::max(1, core::threads() / options.parallel);
     outcome = run_jobs(folder, todo, already, options, globals);
   }
@@ -267,7 +266,8 @@ void task(const Globals& globals, const std::string& dir, int index) {
     }
   if (outcome.signal) throw Interrupted(outcome.signal);
   if (outcome.failed > 0)
-    throw WorkError(job.name, pipeline::state_of(folder, job).detail, "see " + pipeline::log_file(folder, job).string());
+    throw WorkError(job.name, pipeline::state_of(folder, job).detail,
+                    "see " + pipeline::log_file(folder, job).string());
 }
 
 }  // namespace
@@ -315,7 +315,8 @@ void add_batch_command(CLI::App& app, const Globals& globals, Job& job) {
   };
   with_folder("status", "How far each job is")->callback([&globals, &job, folder] {
     job = [&globals, folder] {
-      std::cout << (globals.json ? status_json(pipeline::load_plan(*folder), *folder) : status_text(pipeline::load_plan(*folder), *folder));
+      std::cout << (globals.json ? status_json(pipeline::load_plan(*folder), *folder)
+                                 : status_text(pipeline::load_plan(*folder), *folder));
     };
   });
   with_folder("collect", "Metrics of all runs as DIR/results.csv, .json and .html")->callback([&globals, &job, folder] {

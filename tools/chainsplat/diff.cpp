@@ -129,7 +129,8 @@ Json mean_metrics(const Path& run) {
   require(document.is_object(), "is not JSON or is cut off");
   Json means = Json::object();
   for (const auto& [part, metrics] : document.items()) {
-    require(metrics.is_object() && metrics.contains("mean") && metrics["mean"].is_object(), part + ".mean is no object");
+    require(metrics.is_object() && metrics.contains("mean") && metrics["mean"].is_object(),
+            part + ".mean is no object");
     for (const auto& [key, value] : metrics["mean"].items()) {
       require(value.is_number(), part + ".mean." + key + " is no number");
       means[part + " " + key] = value;

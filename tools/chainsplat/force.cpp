@@ -38,7 +38,8 @@ struct State {
 // A line of `estimate`; none where it is lost. `before`: time of the state before.
 std::optional<State> read_estimate(const std::string& text, const std::string& where, const chain::Chain& chain,
                                    double before) {
-  const std::optional<estimation::EstimateLine> line = estimation::read_estimate_line(text, where, chain.angles(), before);
+  const std::optional<estimation::EstimateLine> line =
+      estimation::read_estimate_line(text, where, chain.angles(), before);
   if (!line) return {};
   State out{line->time, line->theta, {}};
   if (line->sigma.size() == 0) return out;  // as estimate's solver adam writes it
@@ -66,9 +67,10 @@ void each_state(const ForceRequest& request, const chain::Chain& chain, const st
     before = state->time;
     if (!known) known = state->standing.size() > 0;
     if (*known != (state->standing.size() > 0))
-      throw InputError(request.estimate + ": line " + std::to_string(number),
-                       *known ? "has no deviations, unlike the lines before" : "has deviations, unlike the lines before",
-                       "give the output of one run of estimate");
+      throw InputError(
+          request.estimate + ": line " + std::to_string(number),
+          *known ? "has no deviations, unlike the lines before" : "has deviations, unlike the lines before",
+          "give the output of one run of estimate");
     take(*state);
   }
 }
@@ -135,7 +137,8 @@ void force(const Globals& globals, const ForceRequest& request) {
     throw InputError("--states, --estimate", "one of the two is needed", "give the angles over time");
   const twin::Twin twin = pipeline::load_twin(request.run);
   const dynamics::Model model = pipeline::model_of(twin, request.run);
-  const trajectory::Trajectory base = request.base.empty() ? pipeline::own_base(request.run) : pipeline::read_base(input_path(request.base));
+  const trajectory::Trajectory base =
+      request.base.empty() ? pipeline::own_base(request.run) : pipeline::read_base(input_path(request.base));
   if (request.base.empty()) core::warn("--base: is missing; the base motion of the twin's own capture is assumed");
   const std::string source = request.estimate.empty() ? request.states : request.estimate;
   const std::string where = !request.hand.empty()                            ? request.hand

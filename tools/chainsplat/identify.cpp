@@ -1,4 +1,5 @@
-// identify.cpp - identify: a twin's dynamics from its recognized states, from marker trajectories or from live estimates.
+// identify.cpp - identify: a twin's dynamics from its recognized states, from marker trajectories or from live
+// estimates.
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cstdio>

@@ -83,7 +83,8 @@ void render(const Globals& globals, const RenderRequest& request) {
   load.images = false;
   load.camera = camera_name;
   const capture::Capture capture = capture::load(folder, load);
-  const trajectory::Trajectory base = request.base.empty() ? capture.base : pipeline::read_base(input_path(request.base));
+  const trajectory::Trajectory base =
+      request.base.empty() ? capture.base : pipeline::read_base(input_path(request.base));
   if (video && capture.cameras.size() != 1)
     throw InputError(request.camera, "has " + std::to_string(capture.cameras.size()) + " cameras and a video shows one",
                      "name it, for example " + folder + ":" + capture.cameras.front().name);
@@ -125,7 +126,8 @@ void render(const Globals& globals, const RenderRequest& request) {
         const render::Frame& frame = frames[f];
         const Path stem = out / camera.name;
         capture::write_png(stem / frame_name(frame.frame, ".png"), render::color_image(frame, camera));
-        if (request.mask) capture::write_png(stem / frame_name(frame.frame, ".mask.png"), render::mask_image(frame, camera));
+        if (request.mask)
+          capture::write_png(stem / frame_name(frame.frame, ".mask.png"), render::mask_image(frame, camera));
         if (request.depth)
           capture::write_depth_exr(stem / frame_name(frame.frame, ".depth.exr"), camera.width, camera.height,
                                    render::depth_image(frame, camera));

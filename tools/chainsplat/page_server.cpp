@@ -20,7 +20,7 @@ namespace {
 // A browser opens up to six. Far more than that fit, so that clients that only hold their places cannot take them all,
 // and far fewer than the files that a program may open.
 constexpr unsigned kMostConnections = 300;
-constexpr unsigned kSilence = 5;     // s without a byte either way, until a connection is closed
+constexpr unsigned kSilence = 5;                            // s without a byte either way, until a connection is closed
 constexpr auto kFarewell = std::chrono::milliseconds(250);  // for the last answers when the server ends
 
 // A page from elsewhere that has its own name lead to this machine must not see the camera.
@@ -47,8 +47,7 @@ MHD_Result look_at_header(void* context, MHD_ValueKind, const char* key, const c
 MHD_Result send(MHD_Connection* connection, PageAnswer&& given) {
   auto* const answer = new PageAnswer(std::move(given));
   const std::string_view rest = answer->rest ? std::string_view(*answer->rest) : std::string_view();
-  const std::array<MHD_IoVec, 2> parts{
-      {{answer->body.data(), answer->body.size()}, {rest.data(), rest.size()}}};
+  const std::array<MHD_IoVec, 2> parts{{{answer->body.data(), answer->body.size()}, {rest.data(), rest.size()}}};
   MHD_Response* const response = MHD_create_response_from_iovec(
       parts.data(), parts.size(), [](void* sent) { delete static_cast<PageAnswer*>(sent); }, answer);
   if (!response) {
@@ -122,8 +121,7 @@ struct PageServer::Implementation {
   }
 };
 
-PageServer::PageServer(int port, PageResponder respond)
-    : implementation_(std::make_unique<Implementation>()) {
+PageServer::PageServer(int port, PageResponder respond) : implementation_(std::make_unique<Implementation>()) {
   Implementation& self = *implementation_;
   self.port = port;
   self.respond = std::move(respond);
@@ -149,7 +147,8 @@ PageServer::PageServer(int port, PageResponder respond)
       kMostConnections, MHD_OPTION_CONNECTION_TIMEOUT, kSilence, MHD_OPTION_STRICT_FOR_CLIENT, 1,
       MHD_OPTION_NOTIFY_COMPLETED, forget, nullptr, MHD_OPTION_END);
   if (!self.daemon)
-    throw InputError("--serve " + std::to_string(port), std::string("the port cannot be had (") + std::strerror(errno) + ")",
+    throw InputError("--serve " + std::to_string(port),
+                     std::string("the port cannot be had (") + std::strerror(errno) + ")",
                      "name another port, for example 8765");
   self.waker = std::thread([&self] { self.wake_those_who_wait(); });
 }

@@ -1,6 +1,6 @@
-// page_server.h - a page for a browser on this machine: HTTP on the loopback address, by libmicrohttpd. One thread serves
-// all connections and waits for none of them: a client that sends or reads slowly, or not at all, keeps nobody else from
-// the page.
+// page_server.h - a page for a browser on this machine: HTTP on the loopback address, by libmicrohttpd. One thread
+// serves all connections and waits for none of them: a client that sends or reads slowly, or not at all, keeps nobody
+// else from the page.
 #pragma once
 #include <functional>
 #include <memory>

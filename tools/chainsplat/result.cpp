@@ -28,9 +28,9 @@ void evaluate(const Globals& globals, const EvalRequest& request) {
   if (!request.picture.empty()) pipeline::check_output_file(request.picture);
   if (globals.json && request.out == "-")
     throw InputError("--json", "standard output is wanted by '-o -' too", "leave one of them out");
-  const pipeline::Evaluation found =
-      pipeline::evaluate(request.run, request.capture,
-                         {capture::read_frame_range(request.frames, "--frames"), request.picture, globals.device}, terminal());
+  const pipeline::Evaluation found = pipeline::evaluate(
+      request.run, request.capture,
+      {capture::read_frame_range(request.frames, "--frames"), request.picture, globals.device}, terminal());
   const eval::Metrics *recognized = found.recognized ? &*found.recognized : nullptr,
                       *rollout = found.rollout ? &*found.rollout : nullptr;
   const std::string json = pipeline::metrics_json(recognized, rollout);
@@ -67,7 +67,9 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
   const twin::Twin twin = pipeline::load_twin(request.run);
   const chain::States motion =
       request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
-  exports::write(twin, motion, request.base.empty() ? pipeline::own_base(request.run) : pipeline::read_base(input_path(request.base)), request.out);
+  exports::write(twin, motion,
+                 request.base.empty() ? pipeline::own_base(request.run) : pipeline::read_base(input_path(request.base)),
+                 request.out);
   if (globals.json)
     std::cout << nlohmann::ordered_json{{"output", request.out}}.dump(-1, ' ', false,
                                                                       nlohmann::ordered_json::error_handler_t::replace)

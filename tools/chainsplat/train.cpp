@@ -42,7 +42,8 @@ Json summary_json(const pipeline::TrainResult& result, const std::string& run) {
   document["joints"] = twin.chain.links() - 1;
   document["angles"] = twin.chain.angles();
   document["gaussians"] = twin.gaussians.count;
-  for (const auto& [name, metrics] : {std::pair("recognized", &result.recognized), std::pair("rollout", &result.rollout)})
+  for (const auto& [name, metrics] :
+       {std::pair("recognized", &result.recognized), std::pair("rollout", &result.rollout)})
     if (*metrics) document[name] = Json::parse(eval::to_json(**metrics))["mean"];
   for (const auto& [stage, summary] : result.fits) document["solver"][stage] = summary;
   document["seconds"] = twin.provenance.seconds;
