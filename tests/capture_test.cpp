@@ -42,11 +42,12 @@ struct Warnings {  // collects the library's warnings
   std::vector<std::string> lines;
   std::mutex mutex;
   Warnings() {
-    core::set_listener({[this](const std::string& line) {
-                          std::lock_guard lock(mutex);
-                          lines.push_back(line);
-                        },
-                        {}});
+    core::Listener listener;
+    listener.warning = [this](const std::string& line) {
+      std::lock_guard lock(mutex);
+      lines.push_back(line);
+    };
+    core::set_listener(listener);
   }
   ~Warnings() { core::set_listener({}); }
   bool mention(const std::string& part) const {

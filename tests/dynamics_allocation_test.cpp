@@ -4,8 +4,15 @@
 
 #include "chainsplat/dynamics.h"
 
-// where another tool has taken malloc, its own is left alone
-#if defined(__GLIBC__) && !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
+// where a sanitizer has taken malloc, its own is left alone
+#if defined(__has_feature)  // Clang's way to say so
+#if __has_feature(address_sanitizer) || __has_feature(thread_sanitizer)
+#define CHAINSPLAT_SANITIZED
+#endif
+#elif defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
+#define CHAINSPLAT_SANITIZED
+#endif
+#if defined(__GLIBC__) && !defined(CHAINSPLAT_SANITIZED)
 
 namespace {
 thread_local long allocations = 0;

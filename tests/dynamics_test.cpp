@@ -703,7 +703,9 @@ TEST_CASE("a diverging step is halved, then RODAS3 takes over, and both are said
   Parameters p = rope(8, chain::Bending::planar).parameters;
   const Model soft = rope(8, chain::Bending::planar);
   std::vector<std::string> warnings;
-  core::set_listener({[&](const std::string& line) { warnings.push_back(line); }, {}});
+  core::Listener listener;
+  listener.warning = [&](const std::string& line) { warnings.push_back(line); };
+  core::set_listener(listener);
   p.integrator = Integrator::implicit_velocity_euler;
   p.substeps = 1;
   p.table_normal.reset();

@@ -302,7 +302,9 @@ TEST_CASE("a twin explains pictures of itself, and the metrics know by how much 
   core::write_file(folder.path / "truth" / "centreline.csv", text);
 
   std::vector<std::string> warnings;
-  core::set_listener({[&](const std::string& line) { warnings.push_back(line); }, {}});
+  core::Listener listener;
+  listener.warning = [&](const std::string& line) { warnings.push_back(line); };
+  core::set_listener(listener);
   const eval::Metrics metrics = eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, recorded);
   core::set_listener({});
   REQUIRE(warnings.size() == 1);

@@ -472,7 +472,9 @@ TEST_CASE("a covariance that is none gives an error, never a force") {
 TEST_CASE("what is not known of the parameters' covariance is named, and the rest is kept") {
   const Balanced rope = balance(chain::Bending::planar, bent(8), 0.2, Vector3::Zero());
   std::vector<std::string> warnings;
-  core::set_listener({[&](const std::string& line) { warnings.push_back(line); }, {}});
+  core::Listener listener;
+  listener.warning = [&](const std::string& line) { warnings.push_back(line); };
+  core::set_listener(listener);
   dynamics::Estimates estimates;
   estimates.names = {"log_stiffness", "theta_1", "log_damping"};
   estimates.covariance = 0.01 * MatrixX::Identity(3, 3);

@@ -42,7 +42,9 @@ gpu::DevicePtr limited_device(std::uint64_t most_bytes, std::uint64_t most_submi
 struct Warnings {
   std::vector<std::string> lines;
   Warnings() {
-    core::set_listener({[this](const std::string& line) { lines.push_back(line); }, {}});
+    core::Listener listener;
+    listener.warning = [this](const std::string& line) { lines.push_back(line); };
+    core::set_listener(listener);
   }
   ~Warnings() { core::set_listener({}); }
   bool tell(const std::string& part) const {

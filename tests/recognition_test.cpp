@@ -202,7 +202,9 @@ TEST_CASE("a damaged checkpoint gives way to the one before; one of another job 
   std::filesystem::remove_all(folder);
   static std::vector<std::string> warnings;
   warnings.clear();
-  core::set_listener({[](const std::string& line) { warnings.push_back(line); }, {}});
+  core::Listener listener;
+  listener.warning = [](const std::string& line) { warnings.push_back(line); };
+  core::set_listener(listener);
   CHECK_FALSE(load_checkpoint(folder, "job"));
   Checkpoint c;
   c.job = "job";

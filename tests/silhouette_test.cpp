@@ -324,7 +324,9 @@ TEST_CASE("a sequence: velocity, frames without masks, bending") {
   for (capture::View& view : flat.views)
     if (view.frame == 6) std::fill(view.rgba.begin(), view.rgba.end(), std::uint8_t{0});
   int warnings = 0;
-  core::set_listener({[&](const std::string&) { ++warnings; }, {}});
+  core::Listener listener;
+  listener.warning = [&](const std::string&) { ++warnings; };
+  core::set_listener(listener);
   const silhouette::SequenceFit fit = silhouette::fit_sequence(planar, flat);
   core::set_listener({});
   CHECK(warnings == 1);

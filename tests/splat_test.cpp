@@ -894,12 +894,12 @@ TEST_CASE("step is Adam on the mean loss of the batch") {
       }
     }
   }
-  const auto got = reference::parameters(engine(false).gaussians());
+  const auto got = reference::parameters(engine(false).gaussians()), before = reference::parameters(scene.gaussians);
   for (int kind = 0; kind < 6; ++kind) {
     INFO(reference::kKindNames[kind]);
     double worst = 0.0;
     int compared = 0;
-    const auto& start = *reference::parameters(scene.gaussians).kinds()[kind];
+    const std::vector<double>& start = *before.kinds()[kind];
     for (std::size_t k = 0; k < g.kinds()[kind]->size(); ++k) {
       if (weak[kind][k]) continue;
       ++compared;
