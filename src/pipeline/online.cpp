@@ -46,6 +46,7 @@ OnlineResult identify_online(const Path& run, std::istream& lines, const std::st
   adaptation::Options settings;
   settings.memory = options.memory;
   adaptation::ParameterFilter filter(twin.chain, *twin.parameters, twin.estimates, settings);
+  if (!lines) throw InputError(name, "cannot be read", "give what 'estimate' printed, or - for standard input");
   OnlineResult result;
   follow_lines(filter, twin.chain, base, lines, name, result);
   const adaptation::Result learned = filter.result();

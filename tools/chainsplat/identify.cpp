@@ -110,7 +110,6 @@ pipeline::OnlineResult identified_online(const OnlineRequest& request) {
   const pipeline::OnlineOptions options{request.base.empty() ? Path() : input_path(request.base), request.memory};
   if (request.file == "-") return pipeline::identify_online(request.run, std::cin, "-", options, terminal());
   std::ifstream file(request.file);
-  if (!file) throw InputError(request.file, "cannot be read", "give what 'estimate' printed, or - for standard input");
   return pipeline::identify_online(request.run, file, request.file, options, terminal());
 }
 
