@@ -320,6 +320,20 @@ TEST_CASE("many fits evaluated at once, each by its own loop, are those one by o
   }
 }
 
+TEST_CASE("a step that raises the cost within its rounding is taken and is no end") {
+  const double start = 1.0 + 1e-8;
+  const auto evaluate = [&](const VectorX& x, NormalEquations* equations) {
+    if (equations) *equations = {MatrixX::Identity(1, 1), VectorX::Constant(1, x[0] - 1.0)};
+    return x[0] == start ? 1.0 : 1.0 + 1e-13;  // the decrease, 5e-17, drowns
+  };
+  VectorX x = VectorX::Constant(1, start);
+  const Summary summary = least_squares(
+      x, evaluate,
+      {.rounding = 1e-12, .gradient_tolerance = 1e-15, .damping = {.rule = Damping::Rule::shift, .first = 0.0}});
+  CHECK(summary.reason == Reason::gradient);
+  CHECK(x[0] == 1.0);
+}
+
 TEST_CASE("a trusted step is taken unevaluated, and only near a minimum") {
   const Linear problem{MatrixX::Identity(2, 2), Eigen::Vector2d(1e-3, 0.0)};
   int evaluations = 0;

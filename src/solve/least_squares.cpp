@@ -109,7 +109,9 @@ bool judge(Descent& descent, double cost, const Options& options) {
     accept(descent);
     descent.attempt = 0;
     lower(descent, options.damping);
-    if (descent.decrease < options.cost_tolerance * std::abs(cost)) end(descent, Reason::cost);
+    // without a tolerance a step within `rounding`, which may raise the cost, is no end
+    if (options.cost_tolerance > 0.0 && descent.decrease < options.cost_tolerance * std::abs(cost))
+      end(descent, Reason::cost);
   } else {
     raise(descent, options.damping);
     if (++descent.attempt >= options.attempts || !adapts(options.damping)) end(descent, Reason::no_decrease);
