@@ -13,7 +13,8 @@ namespace chainsplat::eval {
 
 struct FrameMetrics {  // a metric that does not apply is NaN (no depth, no truth, nothing in the mask)
   int camera = 0, frame = 0;
-  double time = 0, psnr = 0, psnr_object = 0, ssim = 0, iou = 0, chamfer = 0, centerline_rms = 0, tip_rms = 0;
+  double time = 0, psnr = 0, psnr_object = 0, ssim = 0, iou = 0, chamfer = 0, centerline_rms = 0, tip_rms = 0,
+         shape_rms = 0;
 };
 
 // dB; the PSNR of two equal images, and the most that any image gets, because a mean needs a finite number.

@@ -7,6 +7,7 @@
 #include <string>
 #include <vector>
 
+#include "chainsplat/corrections.h"
 #include "chainsplat/capture.h"
 #include "chainsplat/dynamics.h"
 
@@ -37,6 +38,7 @@ struct SourceOptions {
   bool unix_time = false;       // a device's own stamps in Unix time, in place of `start`
   capture::FrameRange frames;
   bool pictures = false;  // whole frames of a capture too (its first camera)
+  capture::Corrections corrections;  // of the cameras and of a capture's base: the twin's, set by the follower
 };
 
 struct FrameSource {

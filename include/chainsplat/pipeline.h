@@ -38,6 +38,8 @@ struct TrainOptions {
   bool resume = false;        // go on in a run folder that was left unfinished
   bool force = false;         // begin again in a run folder that is not empty
   Path picture;               // PNG of observed beside rendered frames; empty: none
+  // What is taken as given instead of estimated with the angles: groups of capture::corrected_quantities(), or "all".
+  std::vector<std::string> fixed;
   std::uint64_t seed = 0;
   std::string device;  // Vulkan device, its number or a part of its name; empty: chosen
 
@@ -56,6 +58,13 @@ struct TrainResult {
 // `resume`, with the same bits as if nothing had happened.
 TrainResult train(const Path& capture, const Path& run, const TrainOptions& options,
                   const core::Listener& listener = {});
+
+// What of a capture was given wrongly by a little, without training: what train corrects, and what it says of it.
+struct Examination {
+  capture::Corrections corrections;
+  std::vector<capture::Finding> verdict;
+};
+Examination examine(const Path& capture, const core::Listener& listener = {});
 
 // The fields of TrainOptions that a batch may set, by name, and a value of one from its text ("true" or "false" for a
 // flag, commas between stages). Throws InputError, which says by `where` whose text it is.

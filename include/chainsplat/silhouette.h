@@ -12,6 +12,7 @@
 #include <vector>
 #include "chainsplat/capture.h"
 #include "chainsplat/chain.h"
+#include "chainsplat/corrections.h"
 #include "chainsplat/solve.h"
 
 namespace chainsplat::silhouette {
@@ -73,5 +74,39 @@ struct BendingChoice {
 };
 BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::Capture& capture,
                              const SequenceFit& fit);
+
+// --- what the recording was given wrongly ------------------------------------------------------------------------------
+
+struct CorrectionOptions {
+  std::vector<std::string> held;  // groups of corrected_quantities() that are not varied
+  int frames = 75;                // at most, spread over the recording
+};
+
+// How far the masks' outlines are from the rope's in one camera, px; a positive sign where the mask is wider.
+struct OutlineMisfit {
+  double mean = 0.0, rms = 0.0;  // over the outline that counts
+  double cut = 0.0;              // share of the outline that is left out as not the rope's
+  int worst_frame = -1;          // of the camera
+  double worst_rms = 0.0;
+};
+
+struct CorrectionFit {
+  capture::Corrections corrections;
+  // By how much what was given fits worse, in squares of standard deviations, whatever of it is wrong.
+  double evidence = 0.0;
+  solve::Summary summary;              // the unknowns relative to their prior deviations, and rad
+  std::vector<OutlineMisfit> misfits;  // by camera, after the corrections
+  chain::Chain chain;                  // with the corrected length and diameter
+  std::vector<double> time;            // s, corrected, of the frames that were fitted
+  std::vector<math::VectorX> theta;    // rad, of these frames
+};
+
+// Poses, focal lengths and clocks of the cameras, the base's clock, the grasp's place and the rope's size, together with
+// the angles of up to `frames` frames, from the masks' outlines. Gauss-Newton on the arrow system from `fit`, which may be
+// a few pixels off: what is cut as foreign starts wide and narrows. Of one camera only clocks and mask offset are varied:
+// nothing tells its distance from the rope's size. Deviations are the larger of what the equations say and of what the
+// scatter between stretches of time says.
+CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& fit,
+                              const CorrectionOptions& options = {});
 
 }  // namespace chainsplat::silhouette

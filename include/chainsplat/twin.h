@@ -21,15 +21,21 @@
 //                   weak* [ { singular_value, direction { name: component } } ]: combinations of parameters that the
 //                   data hardly determine;
 //                   solver* { reason, iterations, initial_cost, final_cost, worst_step }: how the fit ended (solve.h)
+//   corrections     cameras { name { rotation, translation, focal, time, mask_offset; calibration } }, base { time },
+//                   grasp { translation }, object { length, diameter }: each { value, sigma, state } (corrections.h);
+//                   absent where nothing was estimated
+//   verdict, trusted   [ { code, subject, value, sigma, unit, corrected, trusted, frame, text } ]; false: do not trust it
 //   gaussians, states, rollout   file names, each absent until the file exists
 //   provenance      version, capture, capture_hash, options, seed, device, driver, durations { stage: s }
 #pragma once
 #include <map>
+#include <nlohmann/json_fwd.hpp>
 #include <optional>
 #include <string>
 #include <vector>
 #include "chainsplat/capture.h"
 #include "chainsplat/chain.h"
+#include "chainsplat/corrections.h"
 #include "chainsplat/core.h"
 #include "chainsplat/dynamics.h"
 #include "chainsplat/splat.h"
@@ -66,10 +72,16 @@ struct Twin {
   dynamics::Estimates estimates;
   Provenance provenance;
   bool known_mass = false;
+  capture::Corrections corrections;        // of the recording, which everything later on the same cameras goes by
+  std::vector<capture::Finding> verdict;   // what was found wrong or doubtful; empty: nothing
+  bool trusted() const;                    // no finding says otherwise
   splat::Gaussians gaussians;  // count 0 before recognition
   chain::States states;        // recognized, at every frame
   chain::States rollout;
 };
+
+// The findings as twin.json has them.
+nlohmann::ordered_json to_json(const std::vector<capture::Finding>& verdict);
 
 // Writes twin.json, gaussians.ply, states.csv, rollout.csv (those that exist) and creates the folder. Each file is
 // replaced atomically, twin.json last. Throws WorkError. Doubles read back exactly. twin.json does not represent all

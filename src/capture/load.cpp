@@ -34,7 +34,17 @@ Capture load_recorded(Capture loaded, const Path& path, LoadOptions options) {
   options.undistort = false;
   options.depth = true;
   if (std::any_of(loaded.cameras.begin(), loaded.cameras.end(), [](const Camera& c) { return c.distorted(); }))
-    return load(path, options);
+  {
+    // as recorded, but poses, clocks and base are those of `loaded`, which may have been corrected
+    Capture recorded = load(path, options);
+    recorded.cameras = loaded.cameras;
+    recorded.times = loaded.times;
+    recorded.base = loaded.base;
+    recorded.length = loaded.length;
+    recorded.diameter = loaded.diameter;
+    for (View& view : recorded.views) view.time = recorded.times[view.camera][view.frame];
+    return recorded;
+  }
   Findings findings;
   const Manifest manifest = read_manifest(path, options.camera, options.images && options.masked, findings);
   throw_first(findings);

@@ -79,6 +79,7 @@ void compare_centerlines(FrameMetrics& metrics, const chain::Chain& chain, const
   const MatrixX offset = ours - resampled(*points, kCenterlinePoints);
   metrics.centerline_rms = std::sqrt(offset.colwise().squaredNorm().mean());
   metrics.tip_rms = offset.col(kCenterlinePoints - 1).norm();
+  metrics.shape_rms = std::sqrt((offset.colwise() - offset.col(0)).colwise().squaredNorm().mean());
 }
 
 struct Metric {
@@ -90,7 +91,7 @@ constexpr std::array kMetrics{
     Metric{"psnr", &FrameMetrics::psnr, false},       Metric{"psnr_object", &FrameMetrics::psnr_object, false},
     Metric{"ssim", &FrameMetrics::ssim, false},       Metric{"iou", &FrameMetrics::iou, false},
     Metric{"chamfer", &FrameMetrics::chamfer, false}, Metric{"centerline_rms", &FrameMetrics::centerline_rms, true},
-    Metric{"tip_rms", &FrameMetrics::tip_rms, true},
+    Metric{"tip_rms", &FrameMetrics::tip_rms, true},  Metric{"shape_rms", &FrameMetrics::shape_rms, true},
 };
 
 // Mean over the frames of one camera; camera < 0: of all.
@@ -118,7 +119,7 @@ FrameMetrics compare(const render::Frame& drawn, const capture::View& view, cons
   metrics.camera = view.camera;
   metrics.frame = view.frame;
   metrics.time = view.time;
-  metrics.chamfer = metrics.centerline_rms = metrics.tip_rms = kNone;
+  metrics.chamfer = metrics.centerline_rms = metrics.tip_rms = metrics.shape_rms = kNone;
 
   // the area outside of which both pictures are black
   const splat::Picture& picture = drawn.picture;

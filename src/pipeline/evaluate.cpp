@@ -96,7 +96,8 @@ Evaluation evaluate(const Path& run, const Path& capture, const EvaluateOptions&
   load.first = options.frames.first, load.last = options.frames.last;
   load.undistort = false;
   load.depth = true;
-  const capture::Capture recorded = capture::load(capture, load);
+  capture::Capture recorded = capture::load(capture, load);
+  capture::apply(twin.corrections, recorded);
   const bool own = twin.provenance.capture_hash == hash_text(recorded.hash);
   if (!own) {
     core::say("another capture than the twin's own: only the rollout is evaluated, from rest");

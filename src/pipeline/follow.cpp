@@ -135,6 +135,7 @@ Follower::Implementation::Implementation(const Path& folder, const FollowOptions
   twin = load_twin(run);
   if (!twin.parameters)
     core::warn(run.string() + ": its dynamics are not identified; angles are assumed to go on at constant rate");
+  options.source.corrections = twin.corrections;
   source = open_frames(options.source);
   open_base();
   filter = estimation::start(

@@ -58,12 +58,17 @@ FrameSource open_capture(const SourceOptions& options) {
   capture::LoadOptions load;
   load.camera = options.camera;
   load.first = options.frames.first, load.last = options.frames.last;
-  const auto recorded = std::make_shared<const capture::Capture>(capture::load(options.source, load));
+  const auto loaded = [&] {
+    capture::Capture capture = capture::load(options.source, load);
+    capture::apply(options.corrections, capture);
+    return std::make_shared<const capture::Capture>(std::move(capture));
+  };
+  const auto recorded = loaded();
   std::shared_ptr<const capture::Capture> whole;
   if (options.pictures) {
     load.camera = recorded->cameras.front().name;
     load.masked = load.undistort = false;
-    whole = std::make_shared<const capture::Capture>(capture::load(options.source, load));
+    whole = loaded();
   }
   FrameSource source;
   source.cameras = recorded->cameras;
@@ -106,7 +111,8 @@ FrameSource open_stream(const SourceOptions& options) {
   const bool standard_input = options.source == "-";
   double rate = options.rate > 0.0 ? options.rate : calibration.rate, start = calibration.start;
   FrameSource source;
-  source.cameras = {calibration.camera};
+  source.cameras = {capture::corrected(options.corrections, calibration.camera)};
+  const double late = capture::value_of(options.corrections, calibration.camera.name, "time");
   std::shared_ptr<capture::VideoReader> reader;
   if (!standard_input) {
     const capture::Camera& camera = source.cameras[0];
@@ -125,7 +131,7 @@ FrameSource open_stream(const SourceOptions& options) {
   std::optional<double> offset;                             // from that clock to ours
   double stamp = -std::numeric_limits<double>::infinity();  // s, the last frame's by that clock
   source.next = [camera = source.cameras[0], frames = options.frames, reader, rate, start, where, device, unix, offset,
-                 stamp, count = 0](LiveFrame& frame) mutable {
+                 stamp, late, count = 0](LiveFrame& frame) mutable {
     int stale = 0;  // in a row: some drivers' stamps jitter, others' are none
     do {
       if (frames.last >= 0 && count >= frames.last) return false;
@@ -146,7 +152,7 @@ FrameSource open_stream(const SourceOptions& options) {
     } while (frame.frame < frames.first || stale > 0);
     if (device) stamp = reader->time();
     if (device && !offset) offset = unix ? until_unix(reader->time()) : start - reader->first_time();
-    frame.time = device ? reader->time() + *offset : start + frame.frame / rate;
+    frame.time = (device ? reader->time() + *offset : start + frame.frame / rate) - late;
     frame.views.clear();
     frame.arrived = core::seconds_now();
     return true;

@@ -53,6 +53,7 @@ capture::Capture load_own_capture(const twin::Twin& twin, const Path& run) {
   capture::Capture capture = capture::load((run / *twin.provenance.path).lexically_normal(), load);
   if (twin.provenance.capture_hash != hash_text(capture.hash))
     throw InputError(capture.folder.string(), "has changed since " + run.string() + " was made", "train it again");
+  capture::apply(twin.corrections, capture);
   return capture;
 }
 

@@ -59,6 +59,10 @@ twin::Provenance recognition_provenance(const TrainOptions& options) {
                            : *options.bending == chain::Bending::planar ? "planar"
                                                                         : "spatial"},
                {"twist", options.twist ? "yes" : "no"}};
+  if (!options.fixed.empty()) {
+    std::string& held = p.options["fixed"];
+    for (const std::string& group : options.fixed) held += (held.empty() ? "" : ",") + group;
+  }
   return p;
 }
 
@@ -190,6 +194,20 @@ void check_work(Training& t) {
   if (t.continued && t.joint) check_joint(t.twin, t.run);
 }
 
+// What the capture was given wrongly: estimated for a new twin, known of one that goes on.
+void correct_capture(Training& t) {
+  if (!t.recognize) {
+    capture::apply(t.twin.corrections, t.capture);
+    return;
+  }
+  const std::vector<std::string>& fixed = t.options.fixed;
+  if (t.options.mode == twin::Mode::paper || std::find(fixed.begin(), fixed.end(), "all") != fixed.end()) return;
+  core::report({"recognize", 0, 0, NAN, NAN, "cameras, clocks, grasp and size"});
+  t.twin.corrections = correct(t.capture, t.options.bending, fixed, t.twin.verdict);
+  t.twin.chain.length = t.capture.length;
+  t.twin.chain.diameter = t.capture.diameter;
+}
+
 void open_device(Training& t) {
   if (!t.recognize && !t.joint && !t.evaluate) return;
   t.device = gpu::open_device({.selector = t.options.device});
@@ -206,6 +224,9 @@ void prepare(Training& t) {
   begin_or_continue(t);
   t.twin.provenance.seconds["load"] += core::seconds_now() - start;
   choose_work(t);
+  const double begun = core::seconds_now();
+  correct_capture(t);
+  t.twin.provenance.seconds["correct"] += core::seconds_now() - begun;
   check_work(t);
   open_device(t);
   core::stop_if_requested();

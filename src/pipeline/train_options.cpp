@@ -1,4 +1,5 @@
 // train_options.cpp - what train can be asked for, as values and as texts.
+#include <algorithm>
 #include <array>
 #include <charconv>
 #include <sstream>
@@ -33,6 +34,13 @@ std::string choice(const std::string& text, std::initializer_list<const char*> c
   throw InputError(where, "'" + text + "' is not there to choose", "give one of " + all);
 }
 
+std::vector<std::string> read_groups(const std::string& text) {
+  std::vector<std::string> groups;
+  std::istringstream words(text);
+  for (std::string word; std::getline(words, word, ',');) groups.push_back(word);
+  return groups;
+}
+
 }  // namespace
 
 void TrainOptions::check() const {
@@ -43,6 +51,12 @@ void TrainOptions::check() const {
   if (frames.first < 0 || (frames.last >= 0 && frames.last <= frames.first))
     throw InputError("`frames`", "'" + capture::frame_range_text(frames) + "' is no range of frames",
                      "give A:B, for example 0:60 for the first 60");
+  for (const std::string& group : fixed) {
+    const auto& all = capture::corrected_quantities();
+    if (group != "all" && std::none_of(all.begin(), all.end(), [&](const auto& q) { return group == q.group; }))
+      throw InputError("`fixed`", "'" + group + "' is nothing that is estimated",
+                       "name some of cameras,focal,time,length,diameter,grasp,masks, or all");
+  }
   if (force && resume) throw InputError("`force`, `resume`", "contradict each other", "give one of them");
 }
 
@@ -63,7 +77,8 @@ std::vector<Stage> read_stages(const std::string& text, const std::string& where
 
 const std::vector<Setting>& settings() {
   static const std::vector<Setting> all = {{"joints", false}, {"bending", false}, {"twist", true},   {"every", false},
-                                           {"frames", false}, {"mode", false},    {"stages", false}, {"joint", true}};
+                                           {"frames", false}, {"mode", false},    {"stages", false}, {"joint", true},
+                                           {"fixed", false}};
   return all;
 }
 
@@ -86,6 +101,8 @@ void set(TrainOptions& options, const std::string& name, const std::string& text
     options.stages = read_stages(text, where);
   } else if (name == "joint") {
     options.joint = truth(text, where);
+  } else if (name == "fixed") {
+    options.fixed = read_groups(text);
   } else {
     throw InputError(where, "there is no setting '" + name + "'", "give one of those of train");
   }

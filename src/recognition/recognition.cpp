@@ -39,13 +39,20 @@ std::string job_text(const capture::Capture& capture, const Options& options) {
   for (const std::string& range : ranges) frames += (frames.empty() ? "" : ",") + range;
   const char* const bending =
       !options.bending ? "auto" : *options.bending == chain::Bending::planar ? "planar" : "spatial";
+  std::vector<double> geometry{capture.length, capture.diameter};  // which may have been corrected
+  for (const capture::Camera& camera : capture.cameras) {
+    const math::Pose& pose = camera.world_from_camera;
+    geometry.insert(geometry.end(), pose.rotation.data(), pose.rotation.data() + pose.rotation.size());
+    geometry.insert(geometry.end(), {pose.translation.x(), pose.translation.y(), pose.translation.z(), camera.fx});
+  }
   std::ostringstream text;
   text << "capture " << capture.hash << "\nframes " << frames << "\n--joints " << options.joints << "\n--bending "
        << bending << "\n--twist " << (options.twist ? "yes" : "no") << "\n--every " << options.every << "\n--mode "
        << (options.mode == Mode::paper ? "paper" : "fast") << "\n--seed " << options.seed << "\nbudget "
        << options.budget << "\nstep " << core::exact(options.step) << "\npaper's Gaussians "
        << options.paper_gaussians << "\npaper's iterations " << options.paper_iterations << "\ntimes of frames "
-       << hashed(times, core::fnv1a("")) << "\nimages and masks " << hashed(pictures, core::fnv1a("")) << "\n";
+       << hashed(times, core::fnv1a("")) << "\ncameras and size " << hashed(geometry, core::fnv1a(""))
+       << "\nimages and masks " << hashed(pictures, core::fnv1a("")) << "\n";
   return text.str();
 }
 

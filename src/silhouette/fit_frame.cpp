@@ -53,22 +53,6 @@ int neighbor(const chain::Chain& chain, int k) {
   return -1;
 }
 
-MatrixX joint_prior(const chain::Chain& chain, const Options& options) {
-  const int n = chain.angles();
-  const double difference =
-      options.joint_smoothness > 0.0 ? options.joint_smoothness : 1.0 / (kJointDifference * kJointDifference);
-  MatrixX information = MatrixX::Identity(n, n) / (kJointSize * kJointSize);
-  for (int k = 0; k < n; ++k) {
-    const int l = neighbor(chain, k);
-    if (l < 0) continue;
-    information(k, k) += difference;
-    information(l, l) += difference;
-    information(k, l) -= difference;
-    information(l, k) -= difference;
-  }
-  return information;
-}
-
 // What is believed before looking, as information.
 struct Belief {
   MatrixX joints;         // between neighbors, and that angles are small
@@ -176,6 +160,22 @@ std::vector<VectorX> cold_starts(const chain::Chain& chain, const VectorX& start
 }
 
 }  // namespace
+
+MatrixX joint_prior(const chain::Chain& chain, const Options& options) {
+  const int n = chain.angles();
+  const double difference =
+      options.joint_smoothness > 0.0 ? options.joint_smoothness : 1.0 / (kJointDifference * kJointDifference);
+  MatrixX information = MatrixX::Identity(n, n) / (kJointSize * kJointSize);
+  for (int k = 0; k < n; ++k) {
+    const int l = neighbor(chain, k);
+    if (l < 0) continue;
+    information(k, k) += difference;
+    information(l, l) += difference;
+    information(k, l) -= difference;
+    information(l, k) -= difference;
+  }
+  return information;
+}
 
 FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView>& views, const VectorX& start,
                           bool warm, const Options& options) {

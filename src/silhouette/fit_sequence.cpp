@@ -37,51 +37,6 @@ constexpr double kTailDeviations = 2.0;  // beyond this many of them the penalty
 constexpr int kSmoothingRounds = 4;      // of reweighting
 constexpr int kDerivativeReach = 3;      // frames on each side of a local cubic fit
 
-// Times of the frames and, for each, the views (by index) that belong to it.
-struct Frames {
-  std::vector<double> times;
-  std::vector<std::vector<int>> views;
-};
-
-Frames frames_of(const capture::Capture& capture) {
-  Frames frames;
-  const auto& views = capture.views;
-  if (views.empty()) return frames;
-  // all frames of the first camera between its first and last loaded one, views or not
-  const int camera = views.front().camera;
-  int low = views.front().frame, high = low;
-  for (const capture::View& view : views) {
-    if (view.camera != camera) continue;
-    low = std::min(low, view.frame);
-    high = std::max(high, view.frame);
-  }
-  const bool listed =
-      camera < static_cast<int>(capture.times.size()) && high < static_cast<int>(capture.times[camera].size());
-  if (listed) {
-    frames.times.assign(capture.times[camera].begin() + low, capture.times[camera].begin() + high + 1);
-  } else {
-    for (const capture::View& view : views)
-      if (view.camera == camera) frames.times.push_back(view.time);
-  }
-  const int count = static_cast<int>(frames.times.size());
-  frames.views.resize(count);
-  const double interval = count > 1 ? (frames.times.back() - frames.times.front()) / (count - 1) : 1.0;
-  std::vector<std::vector<int>> chosen(count, std::vector<int>(capture.cameras.size(), -1));
-  for (int v = 0; v < static_cast<int>(views.size()); ++v) {
-    const auto above = std::lower_bound(frames.times.begin(), frames.times.end(), views[v].time);
-    int at = static_cast<int>(above - frames.times.begin());
-    if (at == count || (at > 0 && views[v].time - frames.times[at - 1] < frames.times[at] - views[v].time)) --at;
-    const double distance = std::abs(views[v].time - frames.times[at]);
-    if (distance > 0.5 * interval) continue;
-    int& best = chosen[at][views[v].camera];
-    if (best < 0 || distance < std::abs(views[best].time - frames.times[at])) best = v;
-  }
-  for (int f = 0; f < count; ++f)
-    for (const int v : chosen[f])
-      if (v >= 0) frames.views[f].push_back(v);
-  return frames;
-}
-
 double median(std::vector<double> values) {
   if (values.empty()) return 0.0;
   const auto middle = values.begin() + values.size() / 2;
@@ -160,6 +115,45 @@ std::vector<VectorX> derivative(const std::vector<double>& times, const std::vec
 }
 
 }  // namespace
+
+Frames frames_of(const capture::Capture& capture) {
+  Frames frames;
+  const auto& views = capture.views;
+  if (views.empty()) return frames;
+  // all frames of the first camera between its first and last loaded one, views or not
+  const int camera = views.front().camera;
+  int low = views.front().frame, high = low;
+  for (const capture::View& view : views) {
+    if (view.camera != camera) continue;
+    low = std::min(low, view.frame);
+    high = std::max(high, view.frame);
+  }
+  const bool listed =
+      camera < static_cast<int>(capture.times.size()) && high < static_cast<int>(capture.times[camera].size());
+  if (listed) {
+    frames.times.assign(capture.times[camera].begin() + low, capture.times[camera].begin() + high + 1);
+  } else {
+    for (const capture::View& view : views)
+      if (view.camera == camera) frames.times.push_back(view.time);
+  }
+  const int count = static_cast<int>(frames.times.size());
+  frames.views.resize(count);
+  const double interval = count > 1 ? (frames.times.back() - frames.times.front()) / (count - 1) : 1.0;
+  std::vector<std::vector<int>> chosen(count, std::vector<int>(capture.cameras.size(), -1));
+  for (int v = 0; v < static_cast<int>(views.size()); ++v) {
+    const auto above = std::lower_bound(frames.times.begin(), frames.times.end(), views[v].time);
+    int at = static_cast<int>(above - frames.times.begin());
+    if (at == count || (at > 0 && views[v].time - frames.times[at - 1] < frames.times[at] - views[v].time)) --at;
+    const double distance = std::abs(views[v].time - frames.times[at]);
+    if (distance > 0.5 * interval) continue;
+    int& best = chosen[at][views[v].camera];
+    if (best < 0 || distance < std::abs(views[best].time - frames.times[at])) best = v;
+  }
+  for (int f = 0; f < count; ++f)
+    for (const int v : chosen[f])
+      if (v >= 0) frames.views[f].push_back(v);
+  return frames;
+}
 
 SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capture, const Options& options) {
   SequenceFit out;

@@ -23,7 +23,17 @@ struct FrameSolution {
   int mask_pixels = 0;  // in all views
 };
 
+// Information (n x n, 1/rad^2) that angles are small and those of neighboring joints alike, about zero.
+math::MatrixX joint_prior(const chain::Chain& chain, const Options& options);
+
 FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView>& views, const math::VectorX& start,
                           bool warm, const Options& options);
+
+// Times of the frames of the first camera and, for each, the views (by index) that belong to it.
+struct Frames {
+  std::vector<double> times;
+  std::vector<std::vector<int>> views;
+};
+Frames frames_of(const capture::Capture& capture);
 
 }  // namespace chainsplat::silhouette

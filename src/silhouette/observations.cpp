@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "src/silhouette/outline.h"
+
 namespace chainsplat::silhouette {
 
 using math::MatrixX;
@@ -15,48 +17,11 @@ namespace {
 // the two stages
 constexpr int kReverseSamples = 4;            // centerline samples a link that must lie in the mask
 constexpr double kReverseWeight = 0.5;        // of all of them together, against all mask pixels of the view
-constexpr double kAligned = 0.7;              // least cosine between outline and tube normals
-constexpr double kLeastArm = 1.0;             // px, from a joint, to tell a direction from it
 constexpr double kLinkOffsetDeviation = 0.2;  // px, of a link's outline in one view about the common offset
-constexpr double kEndReach = 2.0;             // half widths from the free end within which an outline may be the end's
 
 // blobs
 constexpr double kGap = 3.0;  // diameters, that an occluder may hide between two blobs of the rope
 constexpr double kLeastArea = 0.05, kLargestArea = 2.0;  // of the straight rope's area: what can be the rope alone
-
-struct Nearest {  // place on the projected centerline nearest to a pixel
-  int segment = -1;
-  double t = 0.0;  // along the segment in the image, 0 to 1
-  double distance2 = 1e300;
-};
-
-Vector2 image_of(const capture::Camera& camera, const Vector3& x) {
-  return {camera.fx * x.x() / x.z() + camera.cx, camera.fy * x.y() / x.z() + camera.cy};
-}
-
-// d(m . u)/dx of a camera-frame point.
-Vector3 projected_gradient(const capture::Camera& camera, const Vector3& x, const Vector2& m) {
-  const double gx = camera.fx * m.x() / x.z(), gy = camera.fy * m.y() / x.z();
-  return {gx, gy, -(gx * x.x() + gy * x.y()) / x.z()};
-}
-
-Nearest nearest(const std::vector<Segment>& segments, const Vector2& pixel) {
-  Nearest best;
-  for (int i = 0; i < static_cast<int>(segments.size()); ++i) {
-    const Segment& s = segments[i];
-    const Vector2 offset = pixel - s.from;
-    const double t = std::clamp(offset.dot(s.step) * s.per_length2, 0.0, 1.0);
-    const double distance2 = (offset - t * s.step).squaredNorm();
-    if (distance2 < best.distance2) best = {i, t, distance2};
-  }
-  return best;
-}
-
-// Camera-frame point of image position t along a segment.
-Vector3 point_at(const Segment& s, double t) {
-  const double from = t * s.a.z(), to = (1.0 - t) * s.b.z();
-  return s.a + from / (from + to) * (s.b - s.a);
-}
 
 // `outward`: of an outline, whose place depends on the edge offset and the mask's shift; zero: of something else.
 void add(LinkSums& sums, int link, const Vector3& x, const Vector3& g, const Vector2& outward, double residual,
@@ -68,15 +33,6 @@ void add(LinkSums& sums, int link, const Vector3& x, const Vector3& g, const Vec
 }
 
 double huber_weight(double residual, double cut) { return residual <= cut ? 1.0 : cut / residual; }
-
-double tukey_weight(double residual, double cut) {
-  const double u = residual / cut;
-  return std::abs(u) >= 1.0 ? 0.0 : (1.0 - u * u) * (1.0 - u * u);
-}
-
-bool past_end(const ViewWork& work, const Nearest& at) {
-  return at.segment + 1 == static_cast<int>(work.segments.size()) && at.t >= 1.0;
-}
 
 bool near(const MaskPoints& mask, const Blob& a, const Blob& b, double gap) {
   for (int i = a.first_pixel; i < a.last_pixel; ++i)
@@ -194,59 +150,21 @@ void add_coarse(ViewWork& work, double cut) {
 }
 
 void add_fine(Problem& problem, ViewWork& work, double offset, double cut, FineSums& total) {
-  const capture::Camera& camera = *work.view->camera;
-  const MaskPoints& mask = *work.view->mask;
-  const double radius = 0.5 * problem.chain->diameter;
-  if (work.segments.empty()) return;
-  const Segment& last = work.segments.back();
-  const bool has_end = last.link + 1 == problem.chain->links();
-  const Vector2 end = last.from + last.step;
-  const double end_radius = radius * projected_gradient(camera, last.b, last.normal).norm();
-  // the end is a flat disk, seen as an ellipse: this is its half axis along the rope
-  const double end_depth = end_radius * std::abs((last.b - last.a).normalized().dot(last.b.normalized()));
   constexpr double kWorst = kLargestCut * kLargestCut;
-  const auto observe = [&](const Segment& s, const Vector3& x, const Vector3& g, const Vector2& outward,
-                           double distance, double length) {
-    const double residual = distance - offset - outward.dot(work.shift);
-    const double weight = length * tukey_weight(residual, cut);
+  const auto each = [&](const Edge& edge) {
+    total.length += edge.weight;
+    total.capped_square += edge.weight * kWorst;
+  };
+  for_each_outline_point(*problem.chain, work, each, [&](const OutlinePoint& p) {
+    const double residual = p.distance - offset - p.outward.dot(work.shift);
+    const double weight = p.length * tukey_weight(residual, cut);
     problem.sizes.push_back(std::abs(residual));
-    total.capped_square += length * (std::min(residual * residual, kWorst) - kWorst);
+    total.capped_square += p.length * (std::min(residual * residual, kWorst) - kWorst);
     if (weight == 0.0) return;
-    add(work.sums, s.link, x, g, outward, residual, weight);
+    add(work.sums, p.segment->link, p.x, p.gradient, p.outward, residual, weight);
     total.weighted_square += weight * residual * residual;
     total.weight += weight;
-  };
-  for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
-    if (!work.active[b]) continue;
-    for (int i = mask.blobs[b].first_edge; i < mask.blobs[b].last_edge; ++i) {
-      const Edge& edge = mask.edges[i];
-      total.length += edge.weight;
-      total.capped_square += edge.weight * kWorst;
-      const Vector2 from_end = edge.point - end;
-      if (has_end && from_end.norm() < kEndReach * end_radius && edge.outward.dot(last.tangent) > kAligned) {
-        const double side = last.normal.dot(from_end) / end_radius;
-        const double bulge = end_depth * std::sqrt(std::max(0.0, 1.0 - side * side));
-        observe(last, last.b, projected_gradient(camera, last.b, last.tangent), last.tangent,
-                last.tangent.dot(from_end) - bulge, edge.weight);
-        continue;
-      }
-      const Nearest at = nearest(work.segments, edge.point);
-      if (past_end(work, at)) continue;
-      const Segment& s = work.segments[at.segment];
-      const Vector2 from_center = edge.point - (s.from + at.t * s.step);
-      // the side of the tube is the one the outline faces; about a bend's outer corner the tube is round
-      Vector2 m = s.normal.dot(edge.outward) < 0 ? Vector2(-s.normal) : s.normal;
-      const double distance = std::sqrt(at.distance2);
-      if ((at.t <= 0.0 || at.t >= 1.0) && distance > kLeastArm && from_center.dot(edge.outward) > 0.0)
-        m = from_center / distance;
-      if (m.dot(edge.outward) < kAligned) continue;  // an occluder's outline, or a corner
-      const Vector3 x = point_at(s, at.t);
-      Vector3 g = projected_gradient(camera, x, m);
-      const double half_width = radius * g.norm();
-      g.z() -= half_width / x.z();  // farther is thinner
-      observe(s, x, g, m, m.dot(from_center) - half_width, edge.weight);
-    }
-  }
+  });
 }
 
 // Masks are not equally much wider than the rope everywhere: each link has an unknown offset of its own in each view,

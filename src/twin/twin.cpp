@@ -99,6 +99,23 @@ double drag_per_meter(const chain::Chain& chain, const std::vector<double>& by_l
   });
 }
 
+}  // namespace
+
+nlohmann::ordered_json to_json(const std::vector<capture::Finding>& verdict) {
+  Json out = Json::array();
+  for (const capture::Finding& f : verdict)
+    out.push_back({{"code", f.code},           {"subject", f.subject}, {"value", f.value},
+                   {"sigma", f.deviation},     {"unit", f.unit},       {"corrected", f.corrected},
+                   {"trusted", f.trusted},     {"frame", f.frame},     {"text", f.text}});
+  return out;
+}
+
+bool Twin::trusted() const {
+  return std::all_of(verdict.begin(), verdict.end(), [](const capture::Finding& f) { return f.trusted; });
+}
+
+namespace {
+
 Json chain_json(const Twin& twin) {
   const chain::Chain& chain = twin.chain;
   const dynamics::Parameters* const p = twin.parameters ? &*twin.parameters : nullptr;
@@ -173,6 +190,19 @@ Json identification_json(const Twin& twin) {
     out["weak"].push_back({{"singular_value", weak.singular_value}, {"direction", parts}});
   }
   if (e.solver) out["solver"] = *e.solver;
+  return out;
+}
+
+Json corrections_json(const capture::Corrections& corrections) {
+  Json out{{"cameras", Json::object()}};
+  for (const capture::Correction& c : corrections) {
+    const bool camera = std::string(c.quantity->subject) == "camera";
+    Json& subject = camera ? out["cameras"][c.subject] : out[c.subject];
+    const auto numbers = [](const math::VectorX& v) { return v.size() == 1 ? Json(v[0]) : list(v); };
+    subject[c.quantity->name] = {
+        {"value", numbers(c.value)}, {"sigma", numbers(c.deviation)}, {"state", capture::name(c.state)}};
+    if (camera) subject["calibration"] = c.calibration;
+  }
   return out;
 }
 
@@ -437,6 +467,56 @@ dynamics::Estimates read_estimates(const Node& node) {
   return e;
 }
 
+capture::Corrections read_corrections(const Node& node) {
+  capture::Corrections out;
+  const auto read = [&](const Node& subject, const std::string& name, bool camera) {
+    for (const capture::CorrectedQuantity& quantity : capture::corrected_quantities()) {
+      if (camera != (std::string(quantity.subject) == "camera") || (!camera && quantity.subject != name)) continue;
+      if (!subject.has(quantity.name)) continue;
+      const Node leaf = subject[quantity.name];
+      const auto numbers = [&](const char* key) {
+        return quantity.size == 1 ? math::VectorX::Constant(1, leaf[key].number())
+                                  : math::VectorX(leaf[key].vector(quantity.size));
+      };
+      capture::Correction c;
+      c.quantity = &quantity;
+      c.subject = name;
+      c.value = numbers("value");
+      c.deviation = numbers("sigma");
+      const std::string state = leaf["state"].text();
+      bool known = false;
+      for (const auto one : {capture::CorrectionState::free, capture::CorrectionState::prior,
+                             capture::CorrectionState::held})
+        if (state == capture::name(one)) c.state = one, known = true;
+      if (!known) leaf["state"].fail("is not known", "write free, prior or held");
+      if (camera && subject.has("calibration")) c.calibration = subject["calibration"].text();
+      out.push_back(std::move(c));
+    }
+  };
+  for (const auto& [name, subject] : node["cameras"].members()) read(subject, name, true);
+  for (const char* const name : {"base", "grasp", "object"})
+    if (node.has(name)) read(node[name], name, false);
+  return out;
+}
+
+std::vector<capture::Finding> read_verdict(const Node& node) {
+  std::vector<capture::Finding> out;
+  for (const Node& entry : node.entries()) {
+    capture::Finding f;
+    f.code = entry["code"].text();
+    f.subject = entry["subject"].text();
+    f.value = entry["value"].number();
+    f.deviation = entry["sigma"].number();
+    f.unit = entry["unit"].text();
+    f.corrected = entry["corrected"].boolean();
+    f.trusted = entry["trusted"].boolean();
+    f.frame = entry["frame"].whole(-1, capture::kMostFrames);
+    f.text = entry["text"].text();
+    out.push_back(std::move(f));
+  }
+  return out;
+}
+
 // Reads an option, stored as text, into its field. Throws InputError where the text cannot be parsed as what it is.
 void read_option(const std::string& name, const Node& node, Provenance& p) {
   const std::string text = node.text();
@@ -514,6 +594,11 @@ void save(const Twin& twin, const Path& run) {
            {"grasp", {{"direction", list(twin.chain.direction)}, {"bending_axis", list(twin.chain.bending_axis)}}},
            {"chain", chain_json(twin)},
            {"identification", identification_json(twin)}};
+  if (!twin.corrections.empty()) {
+    out["corrections"] = corrections_json(twin.corrections);
+    out["verdict"] = to_json(twin.verdict);
+    out["trusted"] = twin.trusted();
+  }
   const auto part = [&](bool present, const char* key, const char* name, auto&& bytes) {
     if (!present) return;
     core::write_file(run / name, bytes());
@@ -575,6 +660,9 @@ Twin load(const Path& run) {
                                           initial["thetadot"].vector(angles)};
   }
   twin.provenance = read_provenance(top["provenance"]);
+  // files of older versions have neither
+  if (top.has("corrections")) twin.corrections = read_corrections(top["corrections"]);
+  if (top.has("verdict")) twin.verdict = read_verdict(top["verdict"]);
 
   // the other files of the run folder
   if (const Path ply = named_file(top, "gaussians", run); !ply.empty()) {

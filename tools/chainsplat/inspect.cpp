@@ -1,11 +1,14 @@
 // inspect.cpp - check and doctor: what is in a capture, what this machine can do.
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <iostream>
 #include <memory>
 #include <nlohmann/json.hpp>
+#include <optional>
 
 #include "chainsplat/capture.h"
 #include "chainsplat/gpu.h"
+#include "chainsplat/pipeline.h"
 #include "cli.h"
 
 namespace chainsplat::tools {
@@ -16,12 +19,28 @@ using Json = nlohmann::ordered_json;
 
 void check(const Globals& globals, const std::string& path) {
   const capture::CheckReport report = capture::check(path);
+  // what is wrong by too little to see in one camera alone
+  std::optional<pipeline::Examination> found;
+  std::string unexamined;
+  if (report.problems.empty()) {
+    try {
+      found = pipeline::examine(path);
+    } catch (const InputError& error) {
+      unexamined = error.what();
+    }
+  }
+  const bool clean = report.doubts.empty() && unexamined.empty() && (!found || found->verdict.empty());
   if (globals.json) {
     Json document;
     document["capture"] = path;
     document["facts"] = report.facts;
     document["doubts"] = report.doubts;
     document["problems"] = report.problems;
+    if (found) {
+      document["verdict"] = twin::to_json(found->verdict);
+      document["trusted"] = std::all_of(found->verdict.begin(), found->verdict.end(),
+                                        [](const capture::Finding& finding) { return finding.trusted; });
+    }
     document["usable"] = report.problems.empty();
     std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
   } else {
@@ -29,8 +48,12 @@ void check(const Globals& globals, const std::string& path) {
     for (const std::string& line : report.facts) std::cout << core::printable(line) << "\n";
     for (const std::string& line : report.doubts) std::cout << "doubt: " << core::printable(line) << "\n";
     for (const std::string& line : report.problems) std::cout << "problem: " << core::printable(line) << "\n";
+    if (!unexamined.empty()) std::cout << "doubt: " << core::printable(unexamined) << "\n";
+    if (found)
+      for (const capture::Finding& finding : found->verdict)
+        std::cout << (finding.trusted ? "found: " : "doubt: ") << core::printable(finding.text) << "\n";
     if (report.problems.empty())
-      std::cout << (report.doubts.empty() ? "Nothing is wrong with it.\n" : "It can be used; see the doubts.\n");
+      std::cout << (clean ? "Nothing is wrong with it.\n" : "It can be used; see the doubts.\n");
   }
   if (report.problems.empty()) return;
   std::cout.flush();

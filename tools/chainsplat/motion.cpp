@@ -82,7 +82,8 @@ void render(const Globals& globals, const RenderRequest& request) {
   capture::LoadOptions load;
   load.images = false;
   load.camera = camera_name;
-  const capture::Capture capture = capture::load(folder, load);
+  capture::Capture capture = capture::load(folder, load);
+  capture::apply(twin.corrections, capture);
   const trajectory::Trajectory base =
       request.base.empty() ? capture.base : pipeline::read_base(input_path(request.base));
   if (video && capture.cameras.size() != 1)

@@ -70,7 +70,8 @@ void start_from_image(const std::string& source, const twin::Twin& twin, plannin
   capture::LoadOptions load;
   load.camera = name;
   load.last = 1;
-  const capture::Capture seen = capture::load(folder, load);
+  capture::Capture seen = capture::load(folder, load);
+  capture::apply(twin.corrections, seen);
   if (seen.cameras.size() != 1)
     throw InputError("--state-from", "'" + source + "' names no single camera",
                      "give CAPTURE:NAME, for example CAPTURE:cam0");

@@ -98,6 +98,7 @@ void synthesize(const Globals& globals, const SynthRequest& request) {
   load.images = false;
   load.camera = camera;
   capture::Capture scene = capture::load(folder, load);
+  capture::apply(twin.corrections, scene);
   pipeline::check_not_capture(out, scene.folder);
   if (!request.base.empty()) scene.base = pipeline::read_base(input_path(request.base));
   const chain::States states = !request.states.empty()

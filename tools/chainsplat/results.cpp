@@ -33,7 +33,7 @@ void write_result(const std::string& name, const std::string& bytes) {
 
 std::string metrics_table(const std::vector<MetricsRow>& rows) {
   constexpr double kMillimeters = 1e3;
-  std::string text = "                    PSNR dB  object dB    SSIM     IoU  Chamfer mm  centerline mm\n";
+  std::string text = "                    PSNR dB  object dB    SSIM     IoU  Chamfer mm  centerline mm  from grasp\n";
   const auto cell = [&](int width, int digits, double value) {
     char out[64];
     if (std::isfinite(value))
@@ -52,6 +52,7 @@ std::string metrics_table(const std::vector<MetricsRow>& rows) {
     cell(8, 3, row.metrics->iou);
     cell(12, 2, kMillimeters * row.metrics->chamfer);
     cell(15, 2, kMillimeters * row.metrics->centerline_rms);
+    cell(12, 2, kMillimeters * row.metrics->shape_rms);
     text += "\n";
   }
   return text;

@@ -47,6 +47,10 @@ Json summary_json(const pipeline::TrainResult& result, const std::string& run) {
     if (*metrics) document[name] = Json::parse(eval::to_json(**metrics))["mean"];
   for (const auto& [stage, summary] : result.fits) document["solver"][stage] = summary;
   document["seconds"] = twin.provenance.seconds;
+  if (!twin.corrections.empty()) {
+    document["verdict"] = twin::to_json(twin.verdict);
+    document["trusted"] = twin.trusted();
+  }
   return document;
 }
 
@@ -64,6 +68,7 @@ void train(const Globals& globals, const Request& request) {
   if (result.rollout) rows.push_back({"rollout", &result.rollout->mean});
   if (!rows.empty()) std::cout << metrics_table(rows);
   std::cout << "twin: " << request.out << "\n";
+  for (const capture::Finding& finding : result.twin.verdict) std::cout << core::printable(finding.text) << "\n";
   if (!request.picture.empty() && result.recognized) std::cout << "picture: " << request.picture << "\n";
 }
 
@@ -91,6 +96,11 @@ void add_recognition_options(CLI::App& command, Request& request) {
   command.add_option("--mode", request.mode, "fast (default) or paper: the paper's own procedure, slow")
       ->check(CLI::IsMember({"fast", "paper"}))
       ->type_name("MODE");
+  command
+      .add_option("--fixed", options.fixed,
+                  "Take as given what is else corrected: cameras,focal,time,length,diameter,grasp,masks, or all")
+      ->delimiter(',')
+      ->type_name("LIST");
 }
 
 }  // namespace

@@ -1,0 +1,121 @@
+// The mask's outline as observations of the posed chain: which point of the rope each piece of outline shows, and how far
+// it is from where the tube's outline should be (mathematics.md 6).
+#pragma once
+#include <algorithm>
+#include <cmath>
+
+#include "src/silhouette/observations.h"
+
+namespace chainsplat::silhouette {
+
+using math::Vector3;
+
+constexpr double kAligned = 0.7;   // least cosine between outline and tube normals
+constexpr double kLeastArm = 1.0;  // px, from a joint, to tell a direction from it
+constexpr double kEndReach = 2.0;  // half widths from the free end within which an outline may be the end's
+
+struct Nearest {  // place on the projected centerline nearest to a pixel
+  int segment = -1;
+  double t = 0.0;  // along the segment in the image, 0 to 1
+  double distance2 = 1e300;
+};
+
+inline Vector2 image_of(const capture::Camera& camera, const Vector3& x) {
+  return {camera.fx * x.x() / x.z() + camera.cx, camera.fy * x.y() / x.z() + camera.cy};
+}
+
+// d(m . u)/dx of a camera-frame point.
+inline Vector3 projected_gradient(const capture::Camera& camera, const Vector3& x, const Vector2& m) {
+  const double gx = camera.fx * m.x() / x.z(), gy = camera.fy * m.y() / x.z();
+  return {gx, gy, -(gx * x.x() + gy * x.y()) / x.z()};
+}
+
+inline Nearest nearest(const std::vector<Segment>& segments, const Vector2& pixel) {
+  Nearest best;
+  for (int i = 0; i < static_cast<int>(segments.size()); ++i) {
+    const Segment& s = segments[i];
+    const Vector2 offset = pixel - s.from;
+    const double t = std::clamp(offset.dot(s.step) * s.per_length2, 0.0, 1.0);
+    const double distance2 = (offset - t * s.step).squaredNorm();
+    if (distance2 < best.distance2) best = {i, t, distance2};
+  }
+  return best;
+}
+
+// Camera-frame point of image position t along a segment.
+inline Vector3 point_at(const Segment& s, double t) {
+  const double from = t * s.a.z(), to = (1.0 - t) * s.b.z();
+  return s.a + from / (from + to) * (s.b - s.a);
+}
+
+inline bool past_end(const ViewWork& work, const Nearest& at) {
+  return at.segment + 1 == static_cast<int>(work.segments.size()) && at.t >= 1.0;
+}
+
+inline double tukey_weight(double residual, double cut) {
+  const double u = residual / cut;
+  return std::abs(u) >= 1.0 ? 0.0 : (1.0 - u * u) * (1.0 - u * u);
+}
+
+// One piece of outline and the point of the rope that it shows.
+struct OutlinePoint {
+  const Segment* segment = nullptr;
+  Vector3 x;           // the point on the centerline, camera frame, m
+  Vector3 gradient;    // of the tube's outline along `outward` by x, px/m
+  Vector2 outward;     // unit, image: the direction in which the distance is measured
+  double distance;     // px, from the tube's outline to the mask's, positive where the mask is wider
+  double length;       // px of outline that it stands for
+  double half_width;   // px, of the tube there
+  bool end;            // it shows the free end's disk, not the side
+  bool before_grasp;   // it is nearest to the grasp, and beyond it
+};
+
+// Calls each(edge) for every piece of outline of the active blobs, and then visit(point) where it shows the rope. The
+// free end may be `end_reach` half widths from where the chain ends.
+template <typename Each, typename Visit>
+void for_each_outline_point(const chain::Chain& chain, const ViewWork& work, const Each& each, const Visit& visit,
+                            double end_reach = kEndReach) {
+  const capture::Camera& camera = *work.view->camera;
+  const MaskPoints& mask = *work.view->mask;
+  const double radius = 0.5 * chain.diameter;
+  if (work.segments.empty()) return;
+  const Segment& last = work.segments.back();
+  const bool has_end = last.link + 1 == chain.links();
+  const Vector2 end = last.from + last.step;
+  const double end_radius = radius * projected_gradient(camera, last.b, last.normal).norm();
+  // the end is a flat disk, seen as an ellipse: this is its half axis along the rope
+  const double end_depth = end_radius * std::abs((last.b - last.a).normalized().dot(last.b.normalized()));
+  for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
+    if (!work.active[b]) continue;
+    for (int i = mask.blobs[b].first_edge; i < mask.blobs[b].last_edge; ++i) {
+      const Edge& edge = mask.edges[i];
+      each(edge);
+      const Vector2 from_end = edge.point - end;
+      if (has_end && from_end.norm() < end_reach * end_radius && edge.outward.dot(last.tangent) > kAligned) {
+        const double side = last.normal.dot(from_end) / end_radius;
+        const double bulge = end_depth * std::sqrt(std::max(0.0, 1.0 - side * side));
+        visit(OutlinePoint{&last, last.b, projected_gradient(camera, last.b, last.tangent), last.tangent,
+                           last.tangent.dot(from_end) - bulge, edge.weight, bulge, true, false});
+        continue;
+      }
+      const Nearest at = nearest(work.segments, edge.point);
+      if (past_end(work, at)) continue;
+      const Segment& s = work.segments[at.segment];
+      const Vector2 from_center = edge.point - (s.from + at.t * s.step);
+      // the side of the tube is the one the outline faces; about a bend's outer corner the tube is round
+      Vector2 m = s.normal.dot(edge.outward) < 0 ? Vector2(-s.normal) : s.normal;
+      const double distance = std::sqrt(at.distance2);
+      if ((at.t <= 0.0 || at.t >= 1.0) && distance > kLeastArm && from_center.dot(edge.outward) > 0.0)
+        m = from_center / distance;
+      if (m.dot(edge.outward) < kAligned) continue;  // an occluder's outline, or a corner
+      const Vector3 x = point_at(s, at.t);
+      Vector3 g = projected_gradient(camera, x, m);
+      const double half_width = radius * g.norm();
+      g.z() -= half_width / x.z();  // farther is thinner
+      visit(OutlinePoint{&s, x, g, m, m.dot(from_center) - half_width, edge.weight, half_width, false,
+                         at.segment == 0 && at.t <= 0.0});
+    }
+  }
+}
+
+}  // namespace chainsplat::silhouette
