@@ -17,16 +17,16 @@ layout(constant_id = 3) const uint kSubgroup = 8u;  // lanes per work group, at 
 layout(constant_id = 4) const uint kColumns = 1u;   // columns of a tile that a lane covers
 layout(constant_id = 5) const uint kRows = 8u;      // pixels of each of these columns that it covers
 layout(push_constant) uniform Push { ColorPush p; };
-layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
-layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 2) readonly buffer ColorViews { ColorView color_views[]; };
-layout(std430, binding = 3) readonly buffer Segments { vec4 segments[]; };
-layout(std430, binding = 4) readonly buffer Image { vec4 image[]; };
-layout(std430, binding = 5) readonly buffer DepthImage { float depth_image[]; };
-layout(std430, binding = 6) readonly buffer Target { uint target[]; };
-layout(std430, binding = 7) writeonly buffer TilePixels { uint tile_pixels[]; };
-layout(std430, binding = 8) writeonly buffer TileSummary { uvec2 tile_summary[]; };
-layout(std430, binding = 9) writeonly buffer PixelSums { vec4 pixel_sums[]; };
+layout(std430) readonly buffer Tiles { SplatTile tiles[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer ColorViews { ColorView color_views[]; };
+layout(std430) readonly buffer Segments { vec4 segments[]; };
+layout(std430) readonly buffer Image { vec4 image[]; };
+layout(std430) readonly buffer DepthImage { float depth_image[]; };
+layout(std430) readonly buffer Target { uint target[]; };
+layout(std430) writeonly buffer TilePixels { uint tile_pixels[]; };
+layout(std430) writeonly buffer TileSummary { uvec2 tile_summary[]; };
+layout(std430) writeonly buffer PixelSums { vec4 pixel_sums[]; };
 
 const uint kInsideMask = 128u;
 const uint kReach = 2u * kColorEdge;

@@ -8,11 +8,11 @@ layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
-layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 2) readonly buffer Image { vec4 image[]; };
-layout(std430, binding = 3) readonly buffer Target { uint target[]; };
-layout(std430, binding = 4) writeonly buffer TileLoss { vec4 tile_loss[]; };
+layout(std430) readonly buffer Tiles { SplatTile tiles[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer Image { vec4 image[]; };
+layout(std430) readonly buffer Target { uint target[]; };
+layout(std430) writeonly buffer TileLoss { vec4 tile_loss[]; };
 
 shared vec4 lane_sum[gl_WorkGroupSize.x];
 

@@ -6,11 +6,11 @@
 #include "shared/adam.h"
 layout(local_size_x = 64) in;
 layout(push_constant) uniform Push { AdamPush p; };
-layout(std430, binding = 0) buffer Parameters { vec4 parameters[]; };
-layout(std430, binding = 1) readonly buffer Gradient { vec4 gradient[]; };
-layout(std430, binding = 2) buffer First { vec4 first_moment[]; };
-layout(std430, binding = 3) buffer Second { vec4 second_moment[]; };
-layout(std430, binding = 4) buffer Counters { uint counters[]; };
+layout(std430) buffer Parameters { vec4 parameters[]; };
+layout(std430) readonly buffer Gradient { vec4 gradient[]; };
+layout(std430) buffer FirstMoment { vec4 first_moment[]; };
+layout(std430) buffer SecondMoment { vec4 second_moment[]; };
+layout(std430) buffer Counters { uint counters[]; };
 
 float rate_of(uint i) {
   uint n = p.gaussians, row = 3u * p.coefficients;

@@ -12,18 +12,18 @@ layout(constant_id = 0) const uint kCutoffs = 1u;
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Parameters { float parameters[]; };
-layout(std430, binding = 1) readonly buffer ReplicaOpacity { float replica_opacity[]; };
-layout(std430, binding = 2) readonly buffer Live { uint live[]; };
-layout(std430, binding = 3) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 4) readonly buffer Motions { vec4 motions[]; };
-layout(std430, binding = 5) readonly buffer TileMap { uint tile_map[]; };
-layout(std430, binding = 6) readonly buffer Counters { uint counters[]; };
-layout(std430, binding = 7) writeonly buffer Splats { vec4 splats[]; };
-layout(std430, binding = 8) writeonly buffer InstanceCount { uint instance_count[]; };
-layout(std430, binding = 9) buffer TileCount { uint tile_count[]; };
-layout(std430, binding = 10) writeonly buffer TileHits { uint tile_hits[]; };
-layout(std430, binding = 11) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica number, splat, -
+layout(std430) readonly buffer Parameters { float parameters[]; };
+layout(std430) readonly buffer ReplicaOpacity { float replica_opacity[]; };
+layout(std430) readonly buffer Live { uint live[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer Motions { vec4 motions[]; };
+layout(std430) readonly buffer TileMap { uint tile_map[]; };
+layout(std430) readonly buffer Counters { uint counters[]; };
+layout(std430) writeonly buffer Splats { vec4 splats[]; };
+layout(std430) writeonly buffer InstanceCount { uint instance_count[]; };
+layout(std430) buffer TileCount { uint tile_count[]; };
+layout(std430) writeonly buffer TileHits { uint tile_hits[]; };
+layout(std430) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica number, splat, -
 
 // -exponent at which a Gaussian is about 0 in float: the extent when there is no 1/255 cut
 const float kFullReach = 80.0;

@@ -9,17 +9,17 @@
 #include "inc/project.glsl"
 layout(local_size_x = 64) in;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Parameters { float parameters[]; };
-layout(std430, binding = 1) readonly buffer Live { uint live[]; };
-layout(std430, binding = 2) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 3) readonly buffer Motions { vec4 motions[]; };
-layout(std430, binding = 4) readonly buffer Counters { uint counters[]; };
-layout(std430, binding = 5) readonly buffer Splats { vec4 splats[]; };
-layout(std430, binding = 6) readonly buffer InstanceCount { uint instance_count[]; };
-layout(std430, binding = 7) readonly buffer InstancePrefix { uint instance_prefix[]; };
-layout(std430, binding = 8) readonly buffer InstanceBlock { uint instance_block[]; };
-layout(std430, binding = 9) readonly buffer Partials { vec4 partials[]; };
-layout(std430, binding = 10) writeonly buffer Records { vec4 records[]; };
+layout(std430) readonly buffer Parameters { float parameters[]; };
+layout(std430) readonly buffer Live { uint live[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer Motions { vec4 motions[]; };
+layout(std430) readonly buffer Counters { uint counters[]; };
+layout(std430) readonly buffer Splats { vec4 splats[]; };
+layout(std430) readonly buffer InstanceCount { uint instance_count[]; };
+layout(std430) readonly buffer InstancePrefix { uint instance_prefix[]; };
+layout(std430) readonly buffer InstanceBlock { uint instance_block[]; };
+layout(std430) readonly buffer Partials { vec4 partials[]; };
+layout(std430) writeonly buffer Records { vec4 records[]; };
 
 void main() {
   uint r = gl_GlobalInvocationID.x, v = gl_GlobalInvocationID.y;

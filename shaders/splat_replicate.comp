@@ -9,9 +9,9 @@
 layout(local_size_x = 64) in;
 layout(constant_id = 0) const uint kCutoffs = 1u;  // 0: every replica is live (finite-difference tests)
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Parameters { float parameters[]; };
-layout(std430, binding = 1) writeonly buffer ReplicaOpacity { float replica_opacity[]; };
-layout(std430, binding = 2) writeonly buffer LiveFlag { uint live_flag[]; };
+layout(std430) readonly buffer Parameters { float parameters[]; };
+layout(std430) writeonly buffer ReplicaOpacity { float replica_opacity[]; };
+layout(std430) writeonly buffer LiveFlag { uint live_flag[]; };
 
 void main() {
   uint i = gl_GlobalInvocationID.x;

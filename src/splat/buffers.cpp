@@ -17,12 +17,9 @@ void Engine::State::need(Buffer& buffer, std::size_t bytes, const char* name) {
 
 void Engine::State::release_view_buffers() {
   commands.wait();
-  for (Buffer* buffer :
-       {&views,           &motions,        &tile_map,      &tiles,        &splats,     &instance_count, &tile_hits,
-        &instance_prefix, &instance_block, &records,       &link_twists,  &tile_count, &tile_prefix,    &tile_block,
-        &tile_cursor,     &tile_used,      &tile_loss,     &entries,      &sorted,     &partials,       &image,
-        &depth_image,     &pixel_gradient, &ssim_row_sums, &ssim_factors, &long_tiles, &sort_scratch,   &color_views,
-        &segments,        &tile_pixels,    &tile_summary,  &pixel_sums,   &link_sums})
+#define ADDRESS(buffer) &buffer,
+  for (Buffer* buffer : {VIEW_BUFFERS(ADDRESS)})
+#undef ADDRESS
     *buffer = Buffer();
   instance_capacity = 0;
 }

@@ -49,39 +49,48 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   clamp_margin = settings.projection_clamp ? kClampMargin : kNoClamp;
   range_limit = static_cast<std::size_t>(std::min<std::uint64_t>(device_info.max_storage_range, 1ull << 30));
 
+#define NAMED(buffer) {#buffer, &buffer},
+  // clang-format off
+  bindings = {REPLICA_BUFFERS(NAMED) VIEW_BUFFERS(NAMED)  // and those that bind() and scan() set
+              {"parameters", nullptr}, {"gradient", nullptr},
+              {"first_moment", nullptr}, {"second_moment", nullptr}, {"target", nullptr},
+              {"values", nullptr}, {"prefix", nullptr}, {"block_sum", nullptr}};
+  // clang-format on
+#undef NAMED
+
   // pipelines: splats, then losses, then colors
+  const auto pass = [&](const char* shader, const std::vector<std::uint32_t>& constants) {
+    return gpu::Pipeline(d, shader, bindings, sizeof(SplatPush), constants);
+  };
   const std::uint32_t cut = cutoffs ? 1 : 0;
-  const std::size_t push = sizeof(SplatPush);
-  replicate = gpu::Pipeline(d, "splat_replicate", 3, push, {cut});
-  compact = gpu::Pipeline(d, "splat_compact", 4, push, {});
-  scan_block = gpu::Pipeline(d, "scan_block", 4, push, {});
-  scan_sums = gpu::Pipeline(d, "scan_sums", 2, push, {});
-  project = gpu::Pipeline(d, "splat_project", 12, push, {cut, tile_width, tile_height});
-  bin = gpu::Pipeline(d, "splat_bin", 12, push, {});
-  sort = gpu::Pipeline(d, "splat_sort", 7, push, {laid_out.sort_lanes, laid_out.rank_limit, laid_out.sort_share});
-  sort_long = gpu::Pipeline(d, "splat_sort_long", 7, push, {laid_out.sort_lanes});
-  blend = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 0, share});
-  blend_depth =
-      gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 1, share});
-  blend_backward = gpu::Pipeline(d, "splat_blend_backward", 13, push,
-                                 {lanes, tile_width, tile_height, pixels_per_lane, cut, laid_out.subgroup, share});
-  project_backward = gpu::Pipeline(d, "splat_project_backward", 11, push, {});
-  gather = gpu::Pipeline(d, "splat_gather", 11, push, {});
-  link_twist = gpu::Pipeline(d, "splat_link_twist", 5, push, {});
-  adam = gpu::Pipeline(d, "splat_adam", 5, sizeof(AdamPush), {});
-  const std::vector<std::uint32_t> tile_constants{laid_out.sort_lanes, tile_width, tile_height};
-  loss_pixel = gpu::Pipeline(d, "loss_pixel", 5, push, tile_constants);
-  const std::vector<std::uint32_t> strip_constants{lanes, tile_width, tile_height, pixels_per_lane};
-  ssim_rows = gpu::Pipeline(d, "ssim_rows", 6, push, strip_constants);
-  ssim_columns = gpu::Pipeline(d, "ssim_columns", 6, push, strip_constants);
-  ssim_rows_backward = gpu::Pipeline(d, "ssim_rows_backward", 5, push, strip_constants);
-  ssim_columns_backward = gpu::Pipeline(d, "ssim_columns_backward", 7, push, strip_constants);
+  replicate = pass("splat_replicate", {cut});
+  compact = pass("splat_compact", {});
+  scan_block = pass("scan_block", {});
+  scan_sums = pass("scan_sums", {});
+  project = pass("splat_project", {cut, tile_width, tile_height});
+  bin = pass("splat_bin", {});
+  sort = pass("splat_sort", {laid_out.sort_lanes, laid_out.rank_limit, laid_out.sort_share});
+  sort_long = pass("splat_sort_long", {laid_out.sort_lanes});
+  blend = pass("splat_blend", {lanes, tile_width, tile_height, pixels_per_lane, cut, 0, share});
+  blend_depth = pass("splat_blend", {lanes, tile_width, tile_height, pixels_per_lane, cut, 1, share});
+  blend_backward =
+      pass("splat_blend_backward", {lanes, tile_width, tile_height, pixels_per_lane, cut, laid_out.subgroup, share});
+  project_backward = pass("splat_project_backward", {});
+  gather = pass("splat_gather", {});
+  link_twist = pass("splat_link_twist", {});
+  adam = gpu::Pipeline(d, "splat_adam", bindings, sizeof(AdamPush), {});
+  loss_pixel = pass("loss_pixel", {laid_out.sort_lanes, tile_width, tile_height});
+  const std::vector<std::uint32_t> strips{lanes, tile_width, tile_height, pixels_per_lane};
+  ssim_rows = pass("ssim_rows", strips);
+  ssim_columns = pass("ssim_columns", strips);
+  ssim_rows_backward = pass("ssim_rows_backward", strips);
+  ssim_columns_backward = pass("ssim_columns_backward", strips);
   const std::uint32_t color_lanes = laid_out.color_lanes;
-  color_pixels = gpu::Pipeline(
-      d, "color_pixels", 10, sizeof(ColorPush),
-      {color_lanes, tile_width, tile_height, color_lanes, laid_out.color_columns, laid_out.color_rows});
-  color_equations =
-      gpu::Pipeline(d, "color_equations", 11, sizeof(ColorPush), {color_lanes, tile_width, tile_height, color_lanes});
+  color_pixels =
+      gpu::Pipeline(d, "color_pixels", bindings, sizeof(ColorPush),
+                    {color_lanes, tile_width, tile_height, color_lanes, laid_out.color_columns, laid_out.color_rows});
+  color_equations = gpu::Pipeline(d, "color_equations", bindings, sizeof(ColorPush),
+                                  {color_lanes, tile_width, tile_height, color_lanes});
   need(counters, shared::kCounters * sizeof(std::uint32_t), "counters");
 }
 

@@ -6,7 +6,6 @@
 #include <algorithm>
 #include <cstddef>
 #include <functional>
-#include <initializer_list>
 #include <utility>
 
 #include "chainsplat/splat.h"
@@ -136,6 +135,7 @@ struct Engine::State {
       blend_backward, project_backward, gather, link_twist, adam, loss_pixel, ssim_rows, ssim_columns,
       ssim_rows_backward, ssim_columns_backward, color_pixels, color_equations;
   gpu::Commands commands;
+  gpu::Bindings bindings;  // of the pipelines to the buffers below; bind() and scan() change what some names stand for
 
   // Small transfers are recorded into the submission that they belong to. Where device memory is not mapped, they go
   // through these two buffers.
@@ -147,14 +147,22 @@ struct Engine::State {
   std::vector<Upload> uploads;  // for the next submission
   std::size_t to_host_bytes = 0;
 
-  // work buffers, grown as needed
-  Buffer replica_opacity, live_flag, live_prefix, live_block, live, replica_gradient, counters;
-  Buffer views, motions, tile_map, tiles;
-  Buffer splats, instance_count, tile_hits, instance_prefix, instance_block, records, link_twists;
-  Buffer tile_count, tile_prefix, tile_block, tile_cursor, tile_used, tile_loss;
-  Buffer entries, long_tiles, sort_scratch, sorted, partials;
-  Buffer image, depth_image, pixel_gradient, ssim_row_sums, ssim_factors;
-  Buffer color_views, segments, tile_pixels, tile_summary, pixel_sums, link_sums;
+  // Work buffers, grown as needed. The shaders declare them by the names of these members; those of the second list
+  // have a size that depends on the number of views in a submission.
+  // clang-format off
+#define REPLICA_BUFFERS(X) \
+  X(counters) X(replica_opacity) X(live_flag) X(live_prefix) X(live_block) X(live) X(replica_gradient)
+#define VIEW_BUFFERS(X)                                                                             \
+  X(views) X(motions) X(tile_map) X(tiles)                                                          \
+  X(splats) X(instance_count) X(tile_hits) X(instance_prefix) X(instance_block) X(records)          \
+  X(link_twists) X(tile_count) X(tile_prefix) X(tile_block) X(tile_cursor) X(tile_used)             \
+  X(tile_loss) X(entries) X(long_tiles) X(sort_scratch) X(sorted) X(partials) X(image)              \
+  X(depth_image) X(pixel_gradient) X(ssim_row_sums) X(ssim_factors) X(color_views) X(segments)      \
+  X(tile_pixels) X(tile_summary) X(pixel_sums) X(link_sums)
+#define MEMBER(buffer) Buffer buffer;
+  REPLICA_BUFFERS(MEMBER) VIEW_BUFFERS(MEMBER)
+#undef MEMBER
+  // clang-format on
   ColorPush color_push{};
   std::size_t pixel_sum_bytes = 0, link_sum_bytes = 0;
   const std::byte *read_pixel_sums = nullptr, *read_link_sums = nullptr;  // of the last run
@@ -194,6 +202,7 @@ struct Engine::State {
   // passes.cpp: the steps of one submission, in this order
   Submission lay_out(Scene& scene, std::span<const int> chunk, const RunOptions& options);
   bool make_room(Submission& submission);             // false: too many views for one submission
+  void bind(const Submission& submission);            // the buffers of its scene and of its lists
   void record_lists(const Submission& submission);    // the splats of every tile, front to back
   void record_picture(const Submission& submission);  // the pictures and their loss
   void record_gradients(const Submission& submission);
@@ -203,11 +212,9 @@ struct Engine::State {
   // Runs all these steps. False: a capacity was too small and has been raised; the caller plans and runs again.
   bool run(Scene& scene, std::span<const int> chunk, const RunOptions& options, const AdamPush* adam_push);
   void scan(const Buffer& values, const Buffer& prefix, const Buffer& block, SplatPush push, std::size_t most);
-  void dispatch(const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers, const SplatPush& push,
-                std::uint32_t x, std::uint32_t y = 1);
+  void dispatch(const gpu::Pipeline& pipeline, const SplatPush& push, std::uint32_t x, std::uint32_t y = 1);
   // One invocation per (live replica, view): the group counts are counters of the device.
-  void dispatch_live(const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers,
-                     const SplatPush& push);
+  void dispatch_live(const gpu::Pipeline& pipeline, const SplatPush& push);
 
   // Runs a batch in chunks; `after` gets each chunk that was run and the number of views of the batch before it.
   void run_all(Scene& scene, std::span<const int> batch, const RunOptions& options, const AdamPush* adam_push,

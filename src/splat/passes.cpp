@@ -36,21 +36,29 @@ std::uint32_t groups(std::size_t n) { return static_cast<std::uint32_t>((n + sha
 void Engine::State::scan(const Buffer& values, const Buffer& prefix, const Buffer& block, SplatPush push,
                          std::size_t most) {
   const auto groups = static_cast<std::uint32_t>((most + shared::kScanBlock - 1) / shared::kScanBlock);
-  const std::array block_buffers{&values, &prefix, &block, static_cast<const Buffer*>(&counters)};
-  commands.dispatch(scan_block, block_buffers, &push, sizeof push, groups);
-  const std::array sum_buffers{&block, static_cast<const Buffer*>(&counters)};
-  commands.dispatch(scan_sums, sum_buffers, &push, sizeof push, 1);
+  bindings.set("values", values);
+  bindings.set("prefix", prefix);
+  bindings.set("block_sum", block);
+  dispatch(scan_block, push, groups);
+  dispatch(scan_sums, push, 1);
 }
 
-void Engine::State::dispatch(const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers,
-                             const SplatPush& push, std::uint32_t x, std::uint32_t y) {
-  commands.dispatch(pipeline, {buffers.begin(), buffers.size()}, &push, sizeof push, x, y);
+void Engine::State::dispatch(const gpu::Pipeline& pipeline, const SplatPush& push, std::uint32_t x, std::uint32_t y) {
+  commands.dispatch(pipeline, &push, sizeof push, x, y);
 }
 
-void Engine::State::dispatch_live(const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers,
-                                  const SplatPush& push) {
-  commands.dispatch_indirect(pipeline, {buffers.begin(), buffers.size()}, &push, sizeof push, counters,
-                             words(shared::kCounterDispatch));
+void Engine::State::dispatch_live(const gpu::Pipeline& pipeline, const SplatPush& push) {
+  commands.dispatch_indirect(pipeline, &push, sizeof push, counters, words(shared::kCounterDispatch));
+}
+
+void Engine::State::bind(const Submission& s) {
+  bindings.set("parameters", s.scene.parameters);
+  bindings.set("gradient", s.scene.gradient);
+  bindings.set("first_moment", s.scene.first_moment);
+  bindings.set("second_moment", s.scene.second_moment);
+  bindings.set("target", s.scene.target);
+  bindings.set("tile_prefix", s.own_places ? list_starts : tile_prefix);
+  bindings.set("tile_block", s.own_places ? list_blocks : tile_block);
 }
 
 Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, const RunOptions& options) {
@@ -263,21 +271,17 @@ void Engine::State::record_lists(const Submission& s) {
   // Gaussians to live replicas
   if (!replicas_kept) {
     SplatPush push = s.push;
-    dispatch(replicate, {&scene.parameters, &replica_opacity, &live_flag}, push, groups(scene.count));
+    dispatch(replicate, push, groups(scene.count));
     push.scan_length = static_cast<std::uint32_t>(s.replicas);
     push.scan_counter = shared::kCounterLive;
     scan(live_flag, live_prefix, live_block, push, s.replicas);
     const std::uint32_t replica_groups = groups(s.replicas);
-    dispatch(compact, {&live_flag, &live_prefix, &live_block, &live}, push, std::min(replica_groups, kRow),
-             (replica_groups + kRow - 1) / kRow);
+    dispatch(compact, push, std::min(replica_groups, kRow), (replica_groups + kRow - 1) / kRow);
     commands.stamp("replicate");
   }
 
   // live replicas to splats, and splats to the lists of the tiles that they touch
-  dispatch_live(project,
-                {&scene.parameters, &replica_opacity, &live, &views, &motions, &tile_map, &counters, &splats,
-                 &instance_count, &tile_count, &tile_hits, &entries},
-                s.push);
+  dispatch_live(project, s.push);
   commands.stamp("project");
   if (!s.own_places) {
     SplatPush scan_push = s.push;
@@ -289,96 +293,54 @@ void Engine::State::record_lists(const Submission& s) {
     scan_push.scan_counter = shared::kCounterTiles;
     scan(tile_count, tile_prefix, tile_block, scan_push, s.tiles);
     commands.stamp("scan");
-    dispatch_live(bin,
-                  {&live, &views, &tile_map, &counters, &splats, &instance_prefix, &instance_block, &tile_prefix,
-                   &tile_block, &tile_cursor, &tile_hits, &entries},
-                  s.push);
+    dispatch_live(bin, s.push);
     commands.stamp("bin");
   }
 
   // every list by depth
-  const Buffer &starts = s.own_places ? list_starts : tile_prefix, &blocks = s.own_places ? list_blocks : tile_block;
-  dispatch(sort, {&starts, &blocks, &tile_count, &entries, &long_tiles, &sorted, &counters}, s.push, s.tiles);
-  const std::array long_buffers = {static_cast<const Buffer*>(&starts),     static_cast<const Buffer*>(&blocks),
-                                   static_cast<const Buffer*>(&tile_count), static_cast<const Buffer*>(&entries),
-                                   static_cast<const Buffer*>(&long_tiles), static_cast<const Buffer*>(&sort_scratch),
-                                   static_cast<const Buffer*>(&sorted)};
-  commands.dispatch_indirect(sort_long, long_buffers, &s.push, sizeof s.push, counters,
-                             words(shared::kCounterLongTiles));
+  dispatch(sort, s.push, s.tiles);
+  commands.dispatch_indirect(sort_long, &s.push, sizeof s.push, counters, words(shared::kCounterLongTiles));
   commands.stamp("sort");
 }
 
 void Engine::State::record_picture(const Submission& s) {
-  const Buffer &starts = s.own_places ? list_starts : tile_prefix, &blocks = s.own_places ? list_blocks : tile_block;
-  dispatch(
-      s.options.depth ? blend_depth : blend,
-      {&tiles, &views, &starts, &blocks, &tile_count, &sorted, &splats, &counters, &image, &tile_used, &depth_image},
-      s.push, s.tiles);
+  dispatch(s.options.depth ? blend_depth : blend, s.push, s.tiles);
   commands.stamp("blend");
   if (s.options.sums) {
-    dispatch(loss_pixel, {&tiles, &views, &image, &s.scene.target, &tile_loss}, s.push, s.tiles);
+    dispatch(loss_pixel, s.push, s.tiles);
     commands.stamp("loss");
   }
   if (s.dssim) {
-    dispatch(ssim_rows, {&tiles, &views, &tile_map, &image, &s.scene.target, &ssim_row_sums}, s.push, s.near_tiles);
-    dispatch(ssim_columns, {&tiles, &views, &tile_map, &ssim_row_sums, &ssim_factors, &tile_loss}, s.push,
-             s.near_tiles);
-    dispatch(ssim_rows_backward, {&tiles, &views, &tile_map, &ssim_factors, &ssim_row_sums}, s.push, s.near_tiles);
-    dispatch(ssim_columns_backward,
-             {&tiles, &views, &tile_map, &ssim_row_sums, &image, &s.scene.target, &pixel_gradient}, s.push,
-             s.near_tiles);
+    for (const gpu::Pipeline* pass : {&ssim_rows, &ssim_columns, &ssim_rows_backward, &ssim_columns_backward})
+      dispatch(*pass, s.push, s.near_tiles);
     commands.stamp("ssim");
   }
 }
 
 void Engine::State::record_gradients(const Submission& s) {
   const Scene& scene = s.scene;
-  dispatch(blend_backward,
-           {&tiles, &views, &tile_prefix, &tile_block, &tile_count, &sorted, &splats, &counters, &image, &tile_used,
-            &scene.target, &pixel_gradient, &partials},
-           s.push, s.tiles);
+  dispatch(blend_backward, s.push, s.tiles);
   commands.stamp("blend backward");
-  dispatch_live(project_backward,
-                {&scene.parameters, &live, &views, &motions, &counters, &splats, &instance_count, &instance_prefix,
-                 &instance_block, &partials, &records},
-                s.push);
+  dispatch_live(project_backward, s.push);
   commands.stamp("project backward");
-  dispatch(gather,
-           {&scene.parameters, &replica_opacity, &live_flag, &live_prefix, &live_block, &views, &motions, &counters,
-            &records, &scene.gradient, &replica_gradient},
-           s.push, groups(scene.count));
+  dispatch(gather, s.push, groups(scene.count));
   if (s.options.twists && scene.count > 0)
-    dispatch(link_twist, {&live_prefix, &live_block, &counters, &records, &link_twists}, s.push,
-             static_cast<std::uint32_t>(scene.links), s.views);
+    dispatch(link_twist, s.push, static_cast<std::uint32_t>(scene.links), s.views);
   commands.stamp("gather");
 }
 
 void Engine::State::record_adam(const Submission& s, const AdamPush& push) {
-  Scene& scene = s.scene;
-  const std::array buffers{static_cast<const Buffer*>(&scene.parameters), static_cast<const Buffer*>(&scene.gradient),
-                           static_cast<const Buffer*>(&scene.first_moment),
-                           static_cast<const Buffer*>(&scene.second_moment), static_cast<const Buffer*>(&counters)};
   const std::uint32_t parameter_groups = groups((push.total + 3) / 4);
-  commands.dispatch(adam, buffers, &push, sizeof push, std::min(parameter_groups, kRow),
-                    (parameter_groups + kRow - 1) / kRow);
+  commands.dispatch(adam, &push, sizeof push, std::min(parameter_groups, kRow), (parameter_groups + kRow - 1) / kRow);
   commands.stamp("adam");
-  scene.version = ++versions;
+  s.scene.version = ++versions;
 }
 
 void Engine::State::record_colors(const Submission& s) {
-  const auto dispatch_colors = [&](const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers,
-                                   std::uint32_t x, std::uint32_t y, std::uint32_t z) {
-    commands.dispatch(pipeline, {buffers.begin(), buffers.size()}, &color_push, sizeof color_push, x, y, z);
-  };
-  dispatch_colors(color_pixels,
-                  {&tiles, &views, &color_views, &segments, &image, &depth_image, &s.scene.target, &tile_pixels,
-                   &tile_summary, &pixel_sums},
-                  color_push.pixel_slices, s.views, 1);
+  commands.dispatch(color_pixels, &color_push, sizeof color_push, color_push.pixel_slices, s.views);
   commands.stamp("color pixels");
-  dispatch_colors(color_equations,
-                  {&tiles, &views, &color_views, &segments, &image, &depth_image, &s.scene.target, &tile_pixels,
-                   &tile_summary, &pixel_sums, &link_sums},
-                  color_push.links, color_push.equation_slices, s.views);
+  commands.dispatch(color_equations, &color_push, sizeof color_push, color_push.links, color_push.equation_slices,
+                    s.views);
   commands.stamp("color equations");
   read_pixel_sums = record_download(pixel_sums, pixel_sum_bytes);
   read_link_sums = record_download(link_sums, link_sum_bytes);
@@ -418,6 +380,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
                         const AdamPush* adam_push) {
   Submission s = lay_out(scene, chunk, options);
   if (!make_room(s)) return false;
+  bind(s);
   commands.begin();
   to_host_bytes = 0;
   record_uploads();
