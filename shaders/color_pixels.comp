@@ -10,6 +10,7 @@
 #extension GL_KHR_shader_subgroup_shuffle : require
 #include "shared/splat.h"
 #include "shared/color.h"
+#include "chainsplat/image_model.h"
 layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
@@ -28,7 +29,6 @@ layout(std430) writeonly buffer TilePixels { uint tile_pixels[]; };
 layout(std430) writeonly buffer TileSummary { uvec2 tile_summary[]; };
 layout(std430) writeonly buffer PixelSums { vec4 pixel_sums[]; };
 
-const uint kInsideMask = 128u;
 const uint kReach = 2u * kColorEdge;
 const uint kNone = 0xffffffu;
 const float kFar = 1e30;
@@ -59,7 +59,7 @@ uint inside_below(SplatView view, int x, int y) {
   [[unroll]] for (int r = 0; r < int(kTileHeight + kReach); ++r) {
     bool there = column && y + r >= 0 && y + r < int(view.height);
     uint alpha = there ? target[view.target + uint(y + r) * view.width + uint(x)] >> 24u : 0u;
-    bits |= alpha >= kInsideMask ? 1u << r : 0u;
+    bits |= alpha >= uint(kObjectMask) ? 1u << r : 0u;
   }
   uint all = bits;
   [[unroll]] for (uint r = 1u; r <= kReach; ++r) all &= bits >> r;

@@ -4,6 +4,7 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
+#include "chainsplat/image_model.h"
 layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
@@ -28,7 +29,7 @@ void main() {
       vec4 wanted = unpackUnorm4x8(target[view.target + y * view.width + x]);
       vec4 error = image[pixel] - wanted;
       vec3 shown = clamp(image[pixel].xyz, 0.0, 1.0) - wanted.xyz;
-      float object = wanted.w >= 128.0 / 255.0 ? 1.0 : 0.0;
+      float object = wanted.w >= float(kObjectMask) / 255.0 ? 1.0 : 0.0;
       sum += vec4(dot(abs(error.xyz), vec3(1.0)), abs(error.w), object * dot(shown, shown), object);
     }
   }

@@ -10,7 +10,7 @@ foreach(source ${shader_sources})
   get_filename_component(name ${source} NAME_WE)
   set(header ${shader_dir}/${name}.spv.h)
   add_custom_command(OUTPUT ${header}
-    COMMAND Vulkan::glslangValidator --quiet --target-env vulkan1.3 --auto-map-bindings -I${CMAKE_SOURCE_DIR}/shaders --vn ${name}_spv
+    COMMAND Vulkan::glslangValidator --quiet --target-env vulkan1.3 --auto-map-bindings -I${CMAKE_SOURCE_DIR}/shaders -I${CMAKE_SOURCE_DIR}/include --vn ${name}_spv
             --depfile ${header}.d -o ${header} ${source}
     DEPENDS ${source} DEPFILE ${header}.d COMMENT "Shader ${name}" VERBATIM)
   list(APPEND shader_headers ${header})

@@ -22,7 +22,7 @@ void main() {
   for (uint j = 1u; j < p.links; ++j) largest = max(largest, parameters[logits + j]);
   float sum = 0.0;
   for (uint j = 0u; j < p.links; ++j) sum += exp(parameters[logits + j] - largest);
-  float least = kCutoffs != 0u ? 1.0 / 255.0 : 0.0;
+  float least = kCutoffs != 0u ? kLeastAlpha : 0.0;
   for (uint j = 0u; j < p.links; ++j) {
     float value = opacity * exp(parameters[logits + j] - largest) / sum;
     replica_opacity[j * p.gaussians + i] = value;

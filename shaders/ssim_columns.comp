@@ -28,7 +28,7 @@ void main() {
   uint above = ssim_tile(view, int(t.x), int(t.y) - 1), below = ssim_tile(view, int(t.x), int(t.y) + 1);
   vec4 s0[kPixels], s1[kPixels], s2[kPixels];
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) s0[k] = s1[k] = s2[k] = vec4(0.0);
-  [[unroll]] for (int m = -kReach; m < int(kPixels) + kReach; ++m) {
+  [[unroll]] for (int m = -kSsimReach; m < int(kPixels) + kSsimReach; ++m) {
     int row = int(first) + m;  // in the tile
     uint from = row < 0 ? above : row < int(kTileHeight) ? tile : below;
     bool there = from != kNoTile;
@@ -36,7 +36,7 @@ void main() {
     vec4 v0 = there ? ssim_row_sums[at] : vec4(0.0), v1 = there ? ssim_row_sums[at + 1u] : vec4(0.0);
     vec4 v2 = there ? ssim_row_sums[at + 2u] : vec4(0.0);
     [[unroll]] for (int k = 0; k < int(kPixels); ++k) {
-      if (abs(m - k) > kReach) continue;
+      if (abs(m - k) > kSsimReach) continue;
       float w = window(m - k);
       s0[k] += w * v0;
       s1[k] += w * v1;
@@ -49,8 +49,8 @@ void main() {
   bool inside = t.x * kTileWidth + column < view.width;
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
     vec3 mx = s0[k].xyz, my = vec3(s0[k].w, s1[k].xy);
-    vec3 a1 = 2.0 * mx * my + kC1, a2 = 2.0 * (s2[k].yzw - mx * my) + kC2;
-    vec3 b1 = mx * mx + my * my + kC1, b2 = vec3(s1[k].zw, s2[k].x) - mx * mx - my * my + kC2;
+    vec3 a1 = 2.0 * mx * my + kSsimC1, a2 = 2.0 * (s2[k].yzw - mx * my) + kSsimC2;
+    vec3 b1 = mx * mx + my * my + kSsimC1, b2 = vec3(s1[k].zw, s2[k].x) - mx * mx - my * my + kSsimC2;
     vec3 similarity = a1 * a2 / (b1 * b2);
     // the loss is weight * (1 - S), so the gradient by S is -weight for every pixel of the image
     bool counts = inside && t.y * kTileHeight + first + k < view.height;

@@ -31,7 +31,7 @@ void main() {
     s0[k] = s1[k] = vec4(0.0);
     s2[k] = 0.0;
   }
-  [[unroll]] for (int m = -kReach; m < int(kPixels) + kReach; ++m) {
+  [[unroll]] for (int m = -kSsimReach; m < int(kPixels) + kSsimReach; ++m) {
     int row = int(first) + m;  // in the tile
     uint from = row < 0 ? above : row < int(kTileHeight) ? tile : below;
     bool there = from != kNoTile;
@@ -39,7 +39,7 @@ void main() {
     vec4 v0 = there ? ssim_row_sums[at] : vec4(0.0), v1 = there ? ssim_row_sums[at + 1u] : vec4(0.0);
     float v2 = there ? ssim_row_sums[at + 2u].x : 0.0;
     [[unroll]] for (int k = 0; k < int(kPixels); ++k) {
-      if (abs(m - k) > kReach) continue;
+      if (abs(m - k) > kSsimReach) continue;
       float w = window(m - k);
       s0[k] += w * v0;
       s1[k] += w * v1;

@@ -28,7 +28,7 @@ void main() {
   bool right = active_tile(view, int(t.x) + 1, int(t.y)) != kNoTile;
   vec3 a[kPixels], b[kPixels], squares[kPixels], ab[kPixels];
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) a[k] = b[k] = squares[k] = ab[k] = vec3(0.0);
-  [[unroll]] for (int m = -kReach; m < int(kPixels) + kReach; ++m) {
+  [[unroll]] for (int m = -kSsimReach; m < int(kPixels) + kSsimReach; ++m) {
     int column = int(first) + m;  // in the tile
     int x = int(t.x * kTileWidth) + column;
     bool there = inside && x >= 0 && x < int(view.width);
@@ -38,7 +38,7 @@ void main() {
     vec3 wanted = there ? unpackUnorm4x8(target[view.target + offset]).xyz : vec3(0.0);
     vec3 square = shown * shown + wanted * wanted, product = shown * wanted;
     [[unroll]] for (int k = 0; k < int(kPixels); ++k) {
-      if (abs(m - k) > kReach) continue;
+      if (abs(m - k) > kSsimReach) continue;
       float w = window(m - k);
       a[k] += w * shown;
       b[k] += w * wanted;

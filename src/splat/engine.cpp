@@ -4,18 +4,18 @@
 #include <cmath>
 #include <numeric>
 
+#include "chainsplat/image_model.h"
 #include "src/splat/engine.h"
 
 namespace chainsplat::splat {
 
 namespace {
 
-constexpr double kClampMargin = 1.3;  // multiple of the half image at which the projection's Jacobian is clamped (3DGS)
 constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;  // Adam, as in 3DGS
 
 std::vector<int> everything(std::size_t count) {
   std::vector<int> all(count);
-  for (std::size_t k = 0; k < count; ++k) all[k] = static_cast<int>(k);
+  std::iota(all.begin(), all.end(), 0);
   return all;
 }
 
@@ -44,9 +44,8 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   const TileLanes laid_out = tile_lanes(tile_width, pixels_per_lane, device_info.subgroup_size, device_info.software);
   const std::uint32_t lanes = laid_out.lanes, share = laid_out.share;
   slots = laid_out.slots;
-  cutoffs = settings.exact_cutoffs;
   constexpr double kNoClamp = 1e6;
-  clamp_margin = settings.projection_clamp ? kClampMargin : kNoClamp;
+  clamp_margin = settings.projection_clamp ? image_model::kClampMargin : kNoClamp;
   range_limit = static_cast<std::size_t>(std::min<std::uint64_t>(device_info.max_storage_range, 1ull << 30));
 
 #define NAMED(buffer) {#buffer, &buffer},
@@ -56,13 +55,12 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
               {"first_moment", nullptr}, {"second_moment", nullptr}, {"target", nullptr},
               {"values", nullptr}, {"prefix", nullptr}, {"block_sum", nullptr}};
   // clang-format on
-#undef NAMED
 
   // pipelines: splats, then losses, then colors
   const auto pass = [&](const char* shader, const std::vector<std::uint32_t>& constants) {
     return gpu::Pipeline(d, shader, bindings, sizeof(SplatPush), constants);
   };
-  const std::uint32_t cut = cutoffs ? 1 : 0;
+  const std::uint32_t cut = settings.exact_cutoffs ? 1 : 0;
   replicate = pass("splat_replicate", {cut});
   compact = pass("splat_compact", {});
   scan_block = pass("scan_block", {});
@@ -122,6 +120,16 @@ void Engine::State::run_all(Scene& scene, std::span<const int> batch, const RunO
   }
 }
 
+std::vector<Picture> Engine::State::draw(Scene& scene, std::span<const int> batch, bool depth) {
+  RunOptions options;
+  options.depth = depth;
+  std::vector<Picture> out;
+  run_all(scene, batch, options, nullptr, [&](std::span<const int> chunk, std::size_t) {
+    for (Picture& picture : pictures(scene, chunk, depth)) out.push_back(std::move(picture));
+  });
+  return out;
+}
+
 Engine::Engine(gpu::Device& device, const Settings& settings) : state_(std::make_unique<State>(device, settings)) {}
 Engine::~Engine() = default;
 Engine::Engine(Engine&&) noexcept = default;
@@ -130,13 +138,7 @@ std::vector<Picture> Engine::draw(const Gaussians& gaussians, std::span<const Vi
   State& s = *state_;
   s.load_gaussians(s.scratch, gaussians);
   s.load_views(s.scratch, views, {}, Active::everywhere);
-  RunOptions options;
-  options.depth = depth;
-  std::vector<Picture> out;
-  s.run_all(s.scratch, everything(views.size()), options, nullptr, [&](std::span<const int> chunk, std::size_t) {
-    for (Picture& picture : s.pictures(s.scratch, chunk, depth)) out.push_back(std::move(picture));
-  });
-  return out;
+  return s.draw(s.scratch, everything(views.size()), depth);
 }
 
 LossValues Engine::loss(const Gaussians& gaussians, std::span<const ViewSpec> views,
@@ -146,12 +148,7 @@ LossValues Engine::loss(const Gaussians& gaussians, std::span<const ViewSpec> vi
   s.load_gaussians(s.scratch, gaussians);
   s.load_views(s.scratch, views, targets, Active::everywhere);
   LossValues values;
-  if (gradients) {
-    gradients->gaussians = unpacked(std::vector<float>(s.scratch.parameter_count, 0.0f), gaussians.count,
-                                    gaussians.links, gaussians.degree);
-    std::fill(gradients->gaussians.rotation.begin(), gradients->gaussians.rotation.end(), 0.0f);
-    gradients->link_twists.clear();
-  }
+  if (gradients) gradients->link_twists.clear();
   // the means of crops of different sizes have different normalizers: one run per normalizer, summed here
   std::vector<float> total(s.scratch.parameter_count, 0.0f), part(s.scratch.parameter_count);
   const auto run_batch = [&](std::span<const int> batch, double pixels) {
@@ -197,11 +194,8 @@ void Engine::set_motions(int view, const std::vector<math::Pose>& motions) {
 }
 
 void Engine::set_gaussians(const Gaussians& gaussians) {
-  State& s = *state_;
-  s.load_gaussians(s.training, gaussians);
-  const std::vector<float> zero(s.training.parameter_count, 0.0f);
-  s.write(s.training.first_moment, zero.data(), zero.size() * sizeof(float), "first moment");
-  s.write(s.training.second_moment, zero.data(), zero.size() * sizeof(float), "second moment");
+  const std::vector<float> zeros(packed(gaussians).size(), 0.0f);
+  restore({gaussians, zeros, zeros, 0});
 }
 
 Gaussians Engine::gaussians() const {
@@ -231,8 +225,7 @@ LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, 
   push.gaussians = static_cast<std::uint32_t>(scene.count);
   push.links = static_cast<std::uint32_t>(scene.links);
   push.coefficients = static_cast<std::uint32_t>(scene.coefficients());
-  push.total = static_cast<std::uint32_t>(
-      scene.parameter_count - (options.held_links ? scene.count * static_cast<std::size_t>(scene.links) : 0));
+  push.total = shared::at_link(push.gaussians, push.coefficients, push.links, options.held_links ? 0 : push.gaussians);
   push.mean = rates.mean;
   push.rotation = rates.rotation;
   push.log_scale = rates.log_scale;
@@ -257,14 +250,7 @@ LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, 
 }
 
 std::vector<Picture> Engine::draw_views(std::span<const int> batch, bool depth) {
-  State& s = *state_;
-  RunOptions options;
-  options.depth = depth;
-  std::vector<Picture> out;
-  s.run_all(s.training, batch, options, nullptr, [&](std::span<const int> chunk, std::size_t) {
-    for (Picture& picture : s.pictures(s.training, chunk, depth)) out.push_back(std::move(picture));
-  });
-  return out;
+  return state_->draw(state_->training, batch, depth);
 }
 
 std::vector<ColorSums> Engine::color_sums(const chain::Chain& chain, std::span<const ViewSpec> views,
@@ -312,9 +298,9 @@ void Engine::reset_opacity(float largest) {
   Snapshot now = snapshot();
   const float logit = std::log(largest / (1.0f - largest));
   for (float& value : now.gaussians.opacity_logit) value = std::min(value, logit);
-  const std::size_t first = 10u * now.gaussians.count;
+  const auto count = static_cast<std::uint32_t>(now.gaussians.count);
   for (auto* moment : {&now.first_moment, &now.second_moment})
-    std::fill_n(moment->begin() + first, now.gaussians.count, 0.0f);
+    std::fill_n(moment->begin() + shared::at_opacity(count, 0), count, 0.0f);
   restore(now);
 }
 

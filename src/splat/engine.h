@@ -11,6 +11,7 @@
 #include "chainsplat/splat.h"
 #include "shaders/shared/adam.h"
 #include "shaders/shared/color.h"
+#include "shaders/shared/gaussian.h"
 #include "shaders/shared/splat.h"
 
 namespace chainsplat::splat {
@@ -81,7 +82,6 @@ struct Scene {
   Buffer parameters, gradient, first_moment, second_moment, target;
   std::vector<SceneView> views;
   std::size_t parameter_count = 0;
-  std::size_t target_pixels = 0;
   double normalizer = 1.0;
   int step = 0;
   std::uint64_t version = 0;  // of the parameters, unique among all scenes of an engine
@@ -120,14 +120,25 @@ struct Submission {
   SplatPush push{};
 };
 
-// Parameters as one array, in the order of the device's buffer (inc/gaussian.glsl), and back.
+// Calls visit(values, first) for each kind of parameter: its floats, and where they begin in the device's buffer.
+template <class G, class Visit>
+void each_section(G& g, const Visit& visit) {
+  const auto n = static_cast<std::uint32_t>(g.count), coefficients = static_cast<std::uint32_t>(g.sh_coefficients());
+  visit(g.mean, shared::at_mean(n, 0));
+  visit(g.rotation, shared::at_rotation(n, 0));
+  visit(g.log_scale, shared::at_log_scale(n, 0));
+  visit(g.opacity_logit, shared::at_opacity(n, 0));
+  visit(g.sh, shared::at_sh(n, coefficients, 0));
+  visit(g.link_logits, shared::at_link(n, coefficients, static_cast<std::uint32_t>(g.links), 0));
+}
+
+// Parameters as one array, as in the device's buffer (shared/gaussian.h), and back.
 std::vector<float> packed(const Gaussians& gaussians);
 Gaussians unpacked(const std::vector<float>& all, int count, int links, int degree);
 
 struct Engine::State {
   gpu::Device& device;
   std::uint32_t tile_width, tile_height, pixels_per_lane, slots;  // slots: as in TileLanes
-  bool cutoffs;
   double clamp_margin;      // of the projection's Jacobian, as a multiple of the half image
   std::size_t range_limit;  // bytes of one storage buffer
 
@@ -219,6 +230,7 @@ struct Engine::State {
   // Runs a batch in chunks; `after` gets each chunk that was run and the number of views of the batch before it.
   void run_all(Scene& scene, std::span<const int> batch, const RunOptions& options, const AdamPush* adam_push,
                const std::function<void(std::span<const int> chunk, std::size_t done)>& after);
+  std::vector<Picture> draw(Scene& scene, std::span<const int> batch, bool depth);
 
   // read_back.cpp: results of the last submission
   std::vector<ViewSums> sums(std::size_t chunk_views);

@@ -5,7 +5,7 @@
 
 # preprocessor; shared headers are C++ already
 s/^#(version|extension) .*//
-s/^#include "shared\/.*//
+s/^#include "(shared|chainsplat)\/.*//
 
 # interface
 s/^layout\(local_size_x = ([0-9]+)\) in;/static constexpr WorkGroupSize gl_WorkGroupSize{\1u};/
