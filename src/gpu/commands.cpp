@@ -103,13 +103,9 @@ struct Commands::State {
     for (std::size_t i = 0; i < labels.size(); ++i) {
       const std::uint64_t passed = (ticks[i + 1] - ticks[i]) & device.timestamp_mask;  // right also when it wraps
       const double milliseconds = static_cast<double>(passed) * device.timestamp_period * kMillisecondsANanosecond;
-      const auto same =
-          std::find_if(timings.begin(), timings.end(), [&](const Timing& t) { return t.label == labels[i]; });
-      if (same == timings.end()) {
-        timings.push_back({labels[i], milliseconds});
-      } else {
-        same->milliseconds += milliseconds;
-      }
+      auto same = std::find_if(timings.begin(), timings.end(), [&](const Timing& t) { return t.label == labels[i]; });
+      if (same == timings.end()) same = timings.insert(same, {labels[i], 0.0});
+      same->milliseconds += milliseconds;
     }
   }
 

@@ -106,27 +106,13 @@ struct Interface {
     std::map<std::uint32_t, const char*> array_of_block;  // name of the only member
     std::map<std::uint32_t, std::uint32_t> block_of_pointer, number_of_variable;
     for (std::size_t k = kHeaderWords; k < code.size(); k += code[k] >> 16) {
-      const std::uint32_t* const words = &code[k];
-      switch (words[0] & 0xffff) {
-        case kOpCapability:
-          subgroups = subgroups || words[1] == kGroupNonUniform;
-          break;
-        case kOpMemberName:
-          array_of_block[words[1]] = reinterpret_cast<const char*>(words + 3);
-          break;
-        case kOpTypePointer:
-          block_of_pointer[words[1]] = words[3];
-          break;
-        case kOpDecorate:
-          if (words[2] == kBinding) number_of_variable[words[1]] = words[3];
-          break;
-        case kOpVariable:
-          if (words[3] == kStorageBuffer)
-            bindings.push_back({number_of_variable.at(words[2]), array_of_block.at(block_of_pointer.at(words[1]))});
-          break;
-        default:
-          break;
-      }
+      const std::uint32_t *const words = &code[k], operation = words[0] & 0xffff;
+      if (operation == kOpCapability && words[1] == kGroupNonUniform) subgroups = true;
+      if (operation == kOpMemberName) array_of_block[words[1]] = reinterpret_cast<const char*>(words + 3);
+      if (operation == kOpTypePointer) block_of_pointer[words[1]] = words[3];
+      if (operation == kOpDecorate && words[2] == kBinding) number_of_variable[words[1]] = words[3];
+      if (operation == kOpVariable && words[3] == kStorageBuffer)
+        bindings.push_back({number_of_variable.at(words[2]), array_of_block.at(block_of_pointer.at(words[1]))});
     }
     std::sort(bindings.begin(), bindings.end(), [](const auto& a, const auto& b) { return a.number < b.number; });
   }

@@ -18,20 +18,13 @@ void Engine::State::need(Buffer& buffer, std::size_t bytes, const char* name) {
 void Engine::State::release_view_buffers() {
   commands.wait();
 #define ADDRESS(buffer) &buffer,
-  for (Buffer* buffer : {VIEW_BUFFERS(ADDRESS)})
-#undef ADDRESS
-    *buffer = Buffer();
+  for (Buffer* buffer : {VIEW_BUFFERS(ADDRESS)}) *buffer = Buffer();
   instance_capacity = 0;
 }
 
 void Engine::State::write(Buffer& buffer, const void* data, std::size_t bytes, const char* name) {
   need(buffer, bytes, name);
-  if (bytes == 0) return;
-  if (buffer.mapped()) {
-    std::memcpy(buffer.mapped(), data, bytes);
-  } else {
-    gpu::upload(device, buffer, data, bytes);
-  }
+  gpu::upload(device, buffer, data, bytes);
 }
 
 void Engine::State::stage(Buffer& buffer, const void* data, std::size_t bytes, const char* name) {

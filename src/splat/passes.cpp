@@ -27,15 +27,16 @@ std::uint32_t spreading_stride(std::uint32_t count) {
   return std::max(1u, stride);
 }
 
+std::uint32_t narrow(std::size_t n) { return static_cast<std::uint32_t>(n); }
 std::size_t words(std::size_t n) { return n * sizeof(std::uint32_t); }
 std::size_t vectors(std::size_t n) { return n * sizeof(glm::vec4); }
-std::uint32_t groups(std::size_t n) { return static_cast<std::uint32_t>((n + shared::kGroup - 1) / shared::kGroup); }
+std::uint32_t groups(std::size_t n) { return narrow((n + shared::kGroup - 1) / shared::kGroup); }
 
 }  // namespace
 
 void Engine::State::scan(const Buffer& values, const Buffer& prefix, const Buffer& block, SplatPush push,
                          std::size_t most) {
-  const auto groups = static_cast<std::uint32_t>((most + shared::kScanBlock - 1) / shared::kScanBlock);
+  const auto groups = narrow((most + shared::kScanBlock - 1) / shared::kScanBlock);
   bindings.set("values", values);
   bindings.set("prefix", prefix);
   bindings.set("block_sum", block);
@@ -62,9 +63,9 @@ void Engine::State::bind(const Submission& s) {
 }
 
 Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, const RunOptions& options) {
-  const auto links = static_cast<std::uint32_t>(scene.links);
+  const auto links = narrow(scene.links);
   Submission out{scene, options};
-  out.views = static_cast<std::uint32_t>(chunk.size());
+  out.views = narrow(chunk.size());
   out.replicas = static_cast<std::size_t>(scene.count) * links;
   out.dssim = options.loss && options.weights.dssim > 0.0f;
 
@@ -86,13 +87,13 @@ Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, cons
     const math::Vector3 base =
         view.motions.empty() ? math::Vector3::Zero() : view.camera_from_world * view.motions[0].translation;
     placed.moment_point = {base.x(), base.y(), base.z(), 0};
-    placed.width = static_cast<std::uint32_t>(view.width);
-    placed.height = static_cast<std::uint32_t>(view.height);
-    placed.tiles_x = static_cast<std::uint32_t>(view.tiles_x);
-    placed.tiles_y = static_cast<std::uint32_t>(view.tiles_y);
-    placed.tile_map = static_cast<std::uint32_t>(map.size());
-    placed.pixel = static_cast<std::uint32_t>(out.pixels);
-    placed.target = static_cast<std::uint32_t>(view.target);
+    placed.width = narrow(view.width);
+    placed.height = narrow(view.height);
+    placed.tiles_x = narrow(view.tiles_x);
+    placed.tiles_y = narrow(view.tiles_y);
+    placed.tile_map = narrow(map.size());
+    placed.pixel = narrow(out.pixels);
+    placed.target = narrow(view.target);
     placed.motion = v * links;
     chunk_pixel[v] = out.pixels;
     out.pixels += static_cast<std::size_t>(view.width) * view.height;
@@ -103,13 +104,13 @@ Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, cons
         rows[3 * (placed.motion + j) + r] = {pose.rotation(r, 0), pose.rotation(r, 1), pose.rotation(r, 2),
                                              pose.translation[r]};
     }
-    out.most_tiles = std::max(out.most_tiles, static_cast<std::uint32_t>(view.active.size()));
+    out.most_tiles = std::max(out.most_tiles, narrow(view.active.size()));
 
     // axes of the links, for the normal equations of the colors
     if (!options.chain) continue;
     const chain::Chain& chain = *options.chain;
     const std::uint32_t first_tile = colored.empty() ? 0 : colored.back().first_tile + colored.back().tiles;
-    colored.push_back({first_tile, static_cast<std::uint32_t>(view.active.size()), v * links, 0});
+    colored.push_back({first_tile, narrow(view.active.size()), v * links, 0});
     for (std::uint32_t j = 0; j < links; ++j) {
       const math::Pose pose = view.camera_from_world * view.motions[j];
       const math::Vector3 start = pose * math::Vector3(chain.link_start(j) * chain.direction);
@@ -125,14 +126,14 @@ Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, cons
       const SceneView& view = scene.views[chunk[v]];
       for (std::size_t k = near ? 0 : view.near; k < (near ? view.near : view.active.size()); ++k) {
         const std::uint32_t cell = view.active[k];
-        map[gpu_views[v].tile_map + cell] = static_cast<std::uint32_t>(active.size());
+        map[gpu_views[v].tile_map + cell] = narrow(active.size());
         active.push_back({v, cell % gpu_views[v].tiles_x, cell / gpu_views[v].tiles_x, 0});
         chunk_tile_view.push_back(v);
       }
     }
-    if (near) out.near_tiles = static_cast<std::uint32_t>(active.size());
+    if (near) out.near_tiles = narrow(active.size());
   }
-  out.tiles = static_cast<std::uint32_t>(active.size());
+  out.tiles = narrow(active.size());
   stage(views, gpu_views.data(), gpu_views.size() * sizeof(SplatView), "views");
   stage(motions, rows.data(), rows.size() * sizeof(glm::vec4), "motions");
   stage(tile_map, map.data(), map.size() * sizeof(std::uint32_t), "tile map");
@@ -149,7 +150,7 @@ bool Engine::State::make_room(Submission& s) {
 
   // capacities: first guesses, kept within what one buffer may hold
   if (live_capacity == 0 || live_capacity > s.replicas)
-    live_capacity = static_cast<std::uint32_t>(
+    live_capacity = narrow(
         std::max<std::size_t>(1, std::min<std::size_t>(s.replicas, 2 * static_cast<std::size_t>(s.scene.count) + 256)));
   s.pairs = static_cast<std::size_t>(live_capacity) * s.views;
   const std::size_t pair_bytes = (options.backward ? shared::kGradientRows : shared::kSplatRows) * sizeof(glm::vec4);
@@ -157,11 +158,10 @@ bool Engine::State::make_room(Submission& s) {
     most_views = static_cast<int>(std::max<std::size_t>(1, range_limit / (pair_bytes * live_capacity)));
     return false;
   }
-  if (instance_capacity == 0)
-    instance_capacity = static_cast<std::uint32_t>(std::max<std::size_t>(1024, kFirstInstances * s.pairs / 2));
+  if (instance_capacity == 0) instance_capacity = narrow(std::max<std::size_t>(1024, kFirstInstances * s.pairs / 2));
   // the capacity that drawing has reached may be too large for gradients; an overflow then lowers the number of views
   if (options.backward)
-    instance_capacity = static_cast<std::uint32_t>(
+    instance_capacity = narrow(
         std::min<std::size_t>(instance_capacity, range_limit / (sizeof(glm::vec4) * shared::kPartialRows * slots)));
 
   // buffers of the lists, the picture and the gradients
@@ -227,9 +227,9 @@ bool Engine::State::make_room(Submission& s) {
   }
 
   SplatPush& push = s.push;
-  push.gaussians = static_cast<std::uint32_t>(s.scene.count);
-  push.links = static_cast<std::uint32_t>(s.scene.links);
-  push.coefficients = static_cast<std::uint32_t>(s.scene.coefficients());
+  push.gaussians = narrow(s.scene.count);
+  push.links = narrow(s.scene.links);
+  push.coefficients = narrow(s.scene.coefficients());
   push.views = s.views;
   push.live_capacity = live_capacity;
   push.instance_capacity = instance_capacity;
@@ -272,7 +272,7 @@ void Engine::State::record_lists(const Submission& s) {
   if (!replicas_kept) {
     SplatPush push = s.push;
     dispatch(replicate, push, groups(scene.count));
-    push.scan_length = static_cast<std::uint32_t>(s.replicas);
+    push.scan_length = narrow(s.replicas);
     push.scan_counter = shared::kCounterLive;
     scan(live_flag, live_prefix, live_block, push, s.replicas);
     const std::uint32_t replica_groups = groups(s.replicas);
@@ -324,8 +324,7 @@ void Engine::State::record_gradients(const Submission& s) {
   dispatch_live(project_backward, s.push);
   commands.stamp("project backward");
   dispatch(gather, s.push, groups(scene.count));
-  if (s.options.twists && scene.count > 0)
-    dispatch(link_twist, s.push, static_cast<std::uint32_t>(scene.links), s.views);
+  if (s.options.twists && scene.count > 0) dispatch(link_twist, s.push, narrow(scene.links), s.views);
   commands.stamp("gather");
 }
 
@@ -358,11 +357,10 @@ bool Engine::State::has_fitted(const Submission& s, const std::byte* read_counte
   const std::size_t want_live = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantLive]) + 64;
   const std::size_t want_instances = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantInstances]) + 1024;
   if (read[shared::kCounterWantLive] > live_capacity)
-    live_capacity = static_cast<std::uint32_t>(std::min<std::size_t>(want_live, s.replicas));
+    live_capacity = narrow(std::min<std::size_t>(want_live, s.replicas));
   if (read[shared::kCounterWantTile] > tile_capacity)
     set_tile_capacity(static_cast<std::uint32_t>(kGrowth * read[shared::kCounterWantTile]));
-  if (read[shared::kCounterWantInstances] > instance_capacity)
-    instance_capacity = static_cast<std::uint32_t>(want_instances);
+  if (read[shared::kCounterWantInstances] > instance_capacity) instance_capacity = narrow(want_instances);
   const std::size_t partial_bytes = vectors(static_cast<std::size_t>(shared::kPartialRows) * slots * instance_capacity);
   if (partial_bytes > range_limit) {
     if (s.views == 1)
@@ -393,13 +391,9 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   commands.submit();
   commands.wait();
   for (const gpu::Timing& timing : commands.timings()) {
-    const auto same =
-        std::find_if(timings.begin(), timings.end(), [&](const auto& t) { return t.label == timing.label; });
-    if (same == timings.end()) {
-      timings.push_back(timing);
-    } else {
-      same->milliseconds += timing.milliseconds;
-    }
+    auto same = std::find_if(timings.begin(), timings.end(), [&](const auto& t) { return t.label == timing.label; });
+    if (same == timings.end()) same = timings.insert(same, {timing.label, 0.0});
+    same->milliseconds += timing.milliseconds;
   }
   return has_fitted(s, read_counters);
 }
