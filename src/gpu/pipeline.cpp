@@ -100,9 +100,8 @@ struct Interface {
   std::vector<Pipeline::Handles::Binding> bindings;
 
   explicit Interface(std::span<const std::uint32_t> code) {
-    constexpr std::size_t kHeaderWords = 5;
-    constexpr std::uint32_t kOpMemberName = 6, kOpCapability = 17, kOpTypePointer = 32, kOpVariable = 59,
-                            kOpDecorate = 71, kGroupNonUniform = 61, kStorageBuffer = 12, kBinding = 33;
+    constexpr unsigned kHeaderWords = 5, kBinding = 33, kStorageBuffer = 12, kGroupNonUniform = 61;
+    constexpr unsigned kOpMemberName = 6, kOpCapability = 17, kOpTypePointer = 32, kOpVariable = 59, kOpDecorate = 71;
     std::map<std::uint32_t, const char*> array_of_block;  // name of the only member
     std::map<std::uint32_t, std::uint32_t> block_of_pointer, number_of_variable;
     for (std::size_t k = kHeaderWords; k < code.size(); k += code[k] >> 16) {
@@ -136,9 +135,8 @@ std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std:
 
   // layout: storage buffers of set 0 and push constants
   std::vector<VkDescriptorSetLayoutBinding> bindings;
-  for (const Pipeline::Handles::Binding& binding : h.bindings) {
+  for (const Pipeline::Handles::Binding& binding : h.bindings)
     bindings.push_back({binding.number, VK_DESCRIPTOR_TYPE_STORAGE_BUFFER, 1, VK_SHADER_STAGE_COMPUTE_BIT, nullptr});
-  }
   auto set = of_type<VkDescriptorSetLayoutCreateInfo>(VK_STRUCTURE_TYPE_DESCRIPTOR_SET_LAYOUT_CREATE_INFO);
   set.flags = h.pushes_descriptors ? VK_DESCRIPTOR_SET_LAYOUT_CREATE_PUSH_DESCRIPTOR_BIT_KHR : 0;
   set.bindingCount = static_cast<std::uint32_t>(bindings.size());
@@ -155,9 +153,8 @@ std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std:
 
   // specialization constants and SPIR-V
   std::vector<VkSpecializationMapEntry> entries;
-  for (std::uint32_t i = 0; i < constants.size(); ++i) {
+  for (std::uint32_t i = 0; i < constants.size(); ++i)
     entries.push_back({i, i * static_cast<std::uint32_t>(sizeof(std::uint32_t)), sizeof(std::uint32_t)});
-  }
   VkSpecializationInfo specialization{};
   specialization.mapEntryCount = static_cast<std::uint32_t>(entries.size());
   specialization.pMapEntries = entries.data();

@@ -42,7 +42,7 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   tile_width = tile_height = static_cast<std::uint32_t>(tile);
   pixels_per_lane = static_cast<std::uint32_t>(pixels);
   const TileLanes laid_out = tile_lanes(tile_width, pixels_per_lane, device_info.subgroup_size, device_info.software);
-  const std::uint32_t lanes = laid_out.lanes, share = laid_out.share;
+  const std::uint32_t lanes = laid_out.lanes, share = laid_out.share, color_lanes = laid_out.color_lanes;
   slots = laid_out.slots;
   constexpr double kNoClamp = 1e6;
   clamp_margin = settings.projection_clamp ? image_model::kClampMargin : kNoClamp;
@@ -57,8 +57,9 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   // clang-format on
 
   // pipelines: splats, then losses, then colors
-  const auto pass = [&](const char* shader, const std::vector<std::uint32_t>& constants) {
-    return gpu::Pipeline(d, shader, bindings, sizeof(SplatPush), constants);
+  const auto pass = [&](const char* shader, const std::vector<std::uint32_t>& constants,
+                        std::size_t push_bytes = sizeof(SplatPush)) {
+    return gpu::Pipeline(d, shader, bindings, push_bytes, constants);
   };
   const std::uint32_t cut = settings.exact_cutoffs ? 1 : 0;
   replicate = pass("splat_replicate", {cut});
@@ -76,19 +77,17 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   project_backward = pass("splat_project_backward", {});
   gather = pass("splat_gather", {});
   link_twist = pass("splat_link_twist", {});
-  adam = gpu::Pipeline(d, "splat_adam", bindings, sizeof(AdamPush), {});
+  adam = pass("splat_adam", {}, sizeof(AdamPush));
   loss_pixel = pass("loss_pixel", {laid_out.sort_lanes, tile_width, tile_height});
   const std::vector<std::uint32_t> strips{lanes, tile_width, tile_height, pixels_per_lane};
   ssim_rows = pass("ssim_rows", strips);
   ssim_columns = pass("ssim_columns", strips);
   ssim_rows_backward = pass("ssim_rows_backward", strips);
   ssim_columns_backward = pass("ssim_columns_backward", strips);
-  const std::uint32_t color_lanes = laid_out.color_lanes;
-  color_pixels =
-      gpu::Pipeline(d, "color_pixels", bindings, sizeof(ColorPush),
-                    {color_lanes, tile_width, tile_height, color_lanes, laid_out.color_columns, laid_out.color_rows});
-  color_equations = gpu::Pipeline(d, "color_equations", bindings, sizeof(ColorPush),
-                                  {color_lanes, tile_width, tile_height, color_lanes});
+  color_pixels = pass("color_pixels",
+                      {color_lanes, tile_width, tile_height, color_lanes, laid_out.color_columns, laid_out.color_rows},
+                      sizeof(ColorPush));
+  color_equations = pass("color_equations", {color_lanes, tile_width, tile_height, color_lanes}, sizeof(ColorPush));
   need(counters, shared::kCounters * sizeof(std::uint32_t), "counters");
 }
 
@@ -200,9 +199,7 @@ void Engine::set_gaussians(const Gaussians& gaussians) {
 
 Gaussians Engine::gaussians() const {
   const Scene& scene = state_->training;
-  std::vector<float> all(scene.parameter_count);
-  if (!all.empty()) gpu::download(state_->device, scene.parameters, all.data(), all.size() * sizeof(float));
-  return unpacked(all, scene.count, scene.links, scene.degree);
+  return unpacked(state_->trained(scene.parameters), scene.count, scene.links, scene.degree);
 }
 
 LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, const AdamRates& rates,
@@ -271,15 +268,7 @@ std::vector<ColorSums> Engine::color_sums(const chain::Chain& chain, std::span<c
 
 Engine::Snapshot Engine::snapshot() const {
   const Scene& scene = state_->training;
-  Snapshot out;
-  out.gaussians = gaussians();
-  out.step = scene.step;
-  for (const auto& [buffer, values] :
-       {std::pair{&scene.first_moment, &out.first_moment}, std::pair{&scene.second_moment, &out.second_moment}}) {
-    values->resize(scene.parameter_count);
-    if (!values->empty()) gpu::download(state_->device, *buffer, values->data(), values->size() * sizeof(float));
-  }
-  return out;
+  return {gaussians(), state_->trained(scene.first_moment), state_->trained(scene.second_moment), scene.step};
 }
 
 void Engine::restore(const Snapshot& snapshot) {
@@ -287,10 +276,8 @@ void Engine::restore(const Snapshot& snapshot) {
   s.load_gaussians(s.training, snapshot.gaussians);
   CHAINSPLAT_CHECK(snapshot.first_moment.size() == s.training.parameter_count,
                    std::to_string(snapshot.first_moment.size()));
-  s.write(s.training.first_moment, snapshot.first_moment.data(), snapshot.first_moment.size() * sizeof(float),
-          "first moment");
-  s.write(s.training.second_moment, snapshot.second_moment.data(), snapshot.second_moment.size() * sizeof(float),
-          "second moment");
+  s.write(s.training.first_moment, bytes_of(snapshot.first_moment), "first moment");
+  s.write(s.training.second_moment, bytes_of(snapshot.second_moment), "second moment");
   s.training.step = snapshot.step;
 }
 

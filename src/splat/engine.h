@@ -136,6 +136,11 @@ void each_section(G& g, const Visit& visit) {
 std::vector<float> packed(const Gaussians& gaussians);
 Gaussians unpacked(const std::vector<float>& all, int count, int links, int degree);
 
+template <class T>
+std::span<const std::byte> bytes_of(const std::vector<T>& values) {
+  return std::as_bytes(std::span(values));
+}
+
 struct Engine::State {
   gpu::Device& device;
   std::uint32_t tile_width, tile_height, pixels_per_lane, slots;  // slots: as in TileLanes
@@ -172,7 +177,6 @@ struct Engine::State {
   X(tile_pixels) X(tile_summary) X(pixel_sums) X(link_sums)
 #define MEMBER(buffer) Buffer buffer;
   REPLICA_BUFFERS(MEMBER) VIEW_BUFFERS(MEMBER)
-#undef MEMBER
   // clang-format on
   ColorPush color_push{};
   std::size_t pixel_sum_bytes = 0, link_sum_bytes = 0;
@@ -196,8 +200,8 @@ struct Engine::State {
   // buffers.cpp
   void need(Buffer& buffer, std::size_t bytes, const char* name);  // grows it if too small, which loses its content
   void release_view_buffers();  // frees all buffers whose size depends on the number of views in a submission
-  void write(Buffer& buffer, const void* data, std::size_t bytes, const char* name);
-  void stage(Buffer& buffer, const void* data, std::size_t bytes, const char* name);  // as part of the next submission
+  void write(Buffer& buffer, std::span<const std::byte> data, const char* name);
+  void stage(Buffer& buffer, std::span<const std::byte> data, const char* name);  // as part of the next submission
   void record_uploads();
   // Returns where the first `bytes` of a buffer can be read after the submission; `to_host` must be large enough.
   const std::byte* record_download(const Buffer& buffer, std::size_t bytes);
@@ -212,6 +216,10 @@ struct Engine::State {
 
   // passes.cpp: the steps of one submission, in this order
   Submission lay_out(Scene& scene, std::span<const int> chunk, const RunOptions& options);
+  // Parts of lay_out(): cameras, link motions and places in the buffers; active tiles; axes of the links, for colors.
+  std::vector<SplatView> stage_views(Submission& submission, std::span<const int> chunk);
+  void stage_tiles(Submission& submission, std::span<const int> chunk, const std::vector<SplatView>& placed);
+  void stage_axes(const Scene& scene, std::span<const int> chunk, const chain::Chain& chain);
   bool make_room(Submission& submission);             // false: too many views for one submission
   void bind(const Submission& submission);            // the buffers of its scene and of its lists
   void record_lists(const Submission& submission);    // the splats of every tile, front to back
@@ -233,6 +241,7 @@ struct Engine::State {
   std::vector<Picture> draw(Scene& scene, std::span<const int> batch, bool depth);
 
   // read_back.cpp: results of the last submission
+  std::vector<float> trained(const Buffer& buffer) const;  // the training's parameters, or a moment of all of them
   std::vector<ViewSums> sums(std::size_t chunk_views);
   std::vector<Picture> pictures(const Scene& scene, std::span<const int> chunk, bool depth);
   std::vector<math::MatrixX> twists(const Scene& scene, std::span<const int> chunk);

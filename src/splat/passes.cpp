@@ -63,55 +63,85 @@ void Engine::State::bind(const Submission& s) {
 }
 
 Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, const RunOptions& options) {
-  const auto links = narrow(scene.links);
   Submission out{scene, options};
   out.views = narrow(chunk.size());
-  out.replicas = static_cast<std::size_t>(scene.count) * links;
+  out.replicas = static_cast<std::size_t>(scene.count) * scene.links;
   out.dssim = options.loss && options.weights.dssim > 0.0f;
+  stage_tiles(out, chunk, stage_views(out, chunk));
+  if (options.chain) stage_axes(scene, chunk, *options.chain);
+  return out;
+}
 
-  // views: cameras, link motions and places in the buffers
-  std::vector<SplatView> gpu_views(out.views);
-  std::vector<glm::vec4> rows(static_cast<std::size_t>(out.views) * links * 3);
-  std::vector<std::uint32_t> map;
-  std::vector<SplatTile> active;
-  std::vector<ColorView> colored;
-  std::vector<glm::vec4> axes;
-  chunk_tile_view.clear();
-  chunk_pixel.assign(out.views, 0);
-  for (std::uint32_t v = 0; v < out.views; ++v) {
-    const SceneView& view = scene.views[chunk[v]];
-    CHAINSPLAT_CHECK(view.motions.size() == links || scene.count == 0, std::to_string(view.motions.size()));
-    SplatView& placed = gpu_views[v];
-    placed.intrinsics = {view.fx, view.fy, view.cx, view.cy};
-    placed.limits = {view.limit_x, view.limit_y, 0, 0};
+std::vector<SplatView> Engine::State::stage_views(Submission& s, std::span<const int> chunk) {
+  std::vector<SplatView> placed;
+  std::vector<glm::vec4> rows;  // three of camera_from_home for every link
+  std::size_t cells = 0;        // in the tile map
+  chunk_pixel.clear();
+  for (const int v : chunk) {
+    const SceneView& view = s.scene.views[v];
+    const int links = s.scene.count == 0 ? 0 : s.scene.links;  // without Gaussians there may be no motions
+    CHAINSPLAT_CHECK(view.motions.size() == static_cast<std::size_t>(links) || links == 0,
+                     std::to_string(view.motions.size()));
     const math::Vector3 base =
         view.motions.empty() ? math::Vector3::Zero() : view.camera_from_world * view.motions[0].translation;
-    placed.moment_point = {base.x(), base.y(), base.z(), 0};
-    placed.width = narrow(view.width);
-    placed.height = narrow(view.height);
-    placed.tiles_x = narrow(view.tiles_x);
-    placed.tiles_y = narrow(view.tiles_y);
-    placed.tile_map = narrow(map.size());
-    placed.pixel = narrow(out.pixels);
-    placed.target = narrow(view.target);
-    placed.motion = v * links;
-    chunk_pixel[v] = out.pixels;
-    out.pixels += static_cast<std::size_t>(view.width) * view.height;
-    map.resize(map.size() + static_cast<std::size_t>(view.tiles_x) * view.tiles_y, shared::kNoTile);
-    for (std::uint32_t j = 0; j < std::min<std::size_t>(links, view.motions.size()); ++j) {
+    placed.push_back({.intrinsics = {view.fx, view.fy, view.cx, view.cy},
+                      .limits = {view.limit_x, view.limit_y, 0, 0},
+                      .moment_point = {base.x(), base.y(), base.z(), 0},
+                      .width = narrow(view.width),
+                      .height = narrow(view.height),
+                      .tiles_x = narrow(view.tiles_x),
+                      .tiles_y = narrow(view.tiles_y),
+                      .tile_map = narrow(cells),
+                      .pixel = narrow(s.pixels),
+                      .target = narrow(view.target),
+                      .motion = narrow(rows.size() / 3)});
+    chunk_pixel.push_back(s.pixels);
+    cells += static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
+    s.pixels += static_cast<std::size_t>(view.width) * view.height;
+    s.most_tiles = std::max(s.most_tiles, narrow(view.active.size()));
+    for (int j = 0; j < links; ++j) {
       const math::Pose pose = view.camera_from_world * view.motions[j];
       for (int r = 0; r < 3; ++r)
-        rows[3 * (placed.motion + j) + r] = {pose.rotation(r, 0), pose.rotation(r, 1), pose.rotation(r, 2),
-                                             pose.translation[r]};
+        rows.emplace_back(pose.rotation(r, 0), pose.rotation(r, 1), pose.rotation(r, 2), pose.translation[r]);
     }
-    out.most_tiles = std::max(out.most_tiles, narrow(view.active.size()));
+  }
+  stage(views, bytes_of(placed), "views");
+  stage(motions, bytes_of(rows), "motions");
+  return placed;
+}
 
-    // axes of the links, for the normal equations of the colors
-    if (!options.chain) continue;
-    const chain::Chain& chain = *options.chain;
-    const std::uint32_t first_tile = colored.empty() ? 0 : colored.back().first_tile + colored.back().tiles;
-    colored.push_back({first_tile, narrow(view.active.size()), v * links, 0});
-    for (std::uint32_t j = 0; j < links; ++j) {
+void Engine::State::stage_tiles(Submission& s, std::span<const int> chunk, const std::vector<SplatView>& placed) {
+  std::vector<std::uint32_t> map;
+  for (const SplatView& view : placed) map.resize(map.size() + view.tiles_x * view.tiles_y, shared::kNoTile);
+  std::vector<SplatTile> active;
+  chunk_tile_view.clear();
+  // those with a D-SSIM term come first, so that its passes run over a prefix of the list
+  for (const bool near : {true, false}) {
+    for (std::uint32_t v = 0; v < s.views; ++v) {
+      const SceneView& view = s.scene.views[chunk[v]];
+      for (std::size_t k = near ? 0 : view.near; k < (near ? view.near : view.active.size()); ++k) {
+        const std::uint32_t cell = view.active[k];
+        map[placed[v].tile_map + cell] = narrow(active.size());
+        active.push_back({v, cell % placed[v].tiles_x, cell / placed[v].tiles_x, 0});
+        chunk_tile_view.push_back(v);
+      }
+    }
+    if (near) s.near_tiles = narrow(active.size());
+  }
+  s.tiles = narrow(active.size());
+  stage(tile_map, bytes_of(map), "tile map");
+  stage(tiles, bytes_of(active), "tiles");
+}
+
+void Engine::State::stage_axes(const Scene& scene, std::span<const int> chunk, const chain::Chain& chain) {
+  std::vector<ColorView> colored;
+  std::vector<glm::vec4> axes;
+  std::uint32_t first_tile = 0;
+  for (const int v : chunk) {
+    const SceneView& view = scene.views[v];
+    colored.push_back({first_tile, narrow(view.active.size()), narrow(axes.size() / 2), 0});
+    first_tile += colored.back().tiles;
+    for (int j = 0; j < scene.links; ++j) {
       const math::Pose pose = view.camera_from_world * view.motions[j];
       const math::Vector3 start = pose * math::Vector3(chain.link_start(j) * chain.direction);
       const math::Vector3 along = pose.rotation * chain.direction;
@@ -119,30 +149,8 @@ Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, cons
       axes.emplace_back(along.x(), along.y(), along.z(), 0.0);
     }
   }
-
-  // active tiles: those with a D-SSIM term first, so that its passes run over a prefix of the list
-  for (const bool near : {true, false}) {
-    for (std::uint32_t v = 0; v < out.views; ++v) {
-      const SceneView& view = scene.views[chunk[v]];
-      for (std::size_t k = near ? 0 : view.near; k < (near ? view.near : view.active.size()); ++k) {
-        const std::uint32_t cell = view.active[k];
-        map[gpu_views[v].tile_map + cell] = narrow(active.size());
-        active.push_back({v, cell % gpu_views[v].tiles_x, cell / gpu_views[v].tiles_x, 0});
-        chunk_tile_view.push_back(v);
-      }
-    }
-    if (near) out.near_tiles = narrow(active.size());
-  }
-  out.tiles = narrow(active.size());
-  stage(views, gpu_views.data(), gpu_views.size() * sizeof(SplatView), "views");
-  stage(motions, rows.data(), rows.size() * sizeof(glm::vec4), "motions");
-  stage(tile_map, map.data(), map.size() * sizeof(std::uint32_t), "tile map");
-  stage(tiles, active.data(), active.size() * sizeof(SplatTile), "tiles");
-  if (options.chain) {
-    stage(color_views, colored.data(), colored.size() * sizeof(ColorView), "color views");
-    stage(segments, axes.data(), axes.size() * sizeof(glm::vec4), "segments");
-  }
-  return out;
+  stage(color_views, bytes_of(colored), "color views");
+  stage(segments, bytes_of(axes), "segments");
 }
 
 bool Engine::State::make_room(Submission& s) {

@@ -93,7 +93,7 @@ void Engine::State::load_gaussians(Scene& scene, const Gaussians& gaussians) {
   scene.parameter_count = all.size();
   scene.step = 0;
   scene.version = ++versions;
-  write(scene.parameters, all.data(), all.size() * sizeof(float), "parameters");
+  write(scene.parameters, bytes_of(all), "parameters");
   need(scene.gradient, all.size() * sizeof(float), "gradient");
 }
 
@@ -148,9 +148,9 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
   }
   scene.normalizer = std::max(1.0, object_pixels / std::max<std::size_t>(1, specs.size()));
   if (active == Active::in_mask)
-    stage(scene.target, all_targets.data(), all_targets.size(), "target");
+    stage(scene.target, bytes_of(all_targets), "target");
   else
-    write(scene.target, all_targets.data(), all_targets.size(), "target");
+    write(scene.target, bytes_of(all_targets), "target");
 }
 
 std::vector<std::vector<int>> Engine::State::chunks(const Scene& scene, std::span<const int> batch, bool dssim) const {
