@@ -15,17 +15,17 @@ layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(constant_id = 3) const uint kSubgroup = 8u;  // lanes per work group
 layout(push_constant) uniform Push { ColorPush p; };
-layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
-layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 2) readonly buffer ColorViews { ColorView color_views[]; };
-layout(std430, binding = 3) readonly buffer Segments { vec4 segments[]; };
-layout(std430, binding = 4) readonly buffer Image { vec4 image[]; };
-layout(std430, binding = 5) readonly buffer DepthImage { float depth_image[]; };
-layout(std430, binding = 6) readonly buffer Target { uint target[]; };
-layout(std430, binding = 7) readonly buffer TilePixels { uint tile_pixels[]; };
-layout(std430, binding = 8) readonly buffer TileSummary { uvec2 tile_summary[]; };
-layout(std430, binding = 9) readonly buffer PixelSums { vec4 pixel_sums[]; };
-layout(std430, binding = 10) writeonly buffer Sums { float link_sums[]; };  // 4 kColorRows per (view, link, slice)
+layout(std430) readonly buffer Tiles { SplatTile tiles[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer ColorViews { ColorView color_views[]; };
+layout(std430) readonly buffer Segments { vec4 segments[]; };
+layout(std430) readonly buffer Image { vec4 image[]; };
+layout(std430) readonly buffer DepthImage { float depth_image[]; };
+layout(std430) readonly buffer Target { uint target[]; };
+layout(std430) readonly buffer TilePixels { uint tile_pixels[]; };
+layout(std430) readonly buffer TileSummary { uvec2 tile_summary[]; };
+layout(std430) readonly buffer PixelSums { vec4 pixel_sums[]; };
+layout(std430) writeonly buffer LinkSums { float link_sums[]; };  // 4 kColorRows per (view, link, slice)
 
 #include "inc/subgroup_sum.glsl"
 

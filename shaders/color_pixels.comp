@@ -10,6 +10,7 @@
 #extension GL_KHR_shader_subgroup_shuffle : require
 #include "shared/splat.h"
 #include "shared/color.h"
+#include "chainsplat/image_model.h"
 layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
@@ -17,18 +18,17 @@ layout(constant_id = 3) const uint kSubgroup = 8u;  // lanes per work group, at 
 layout(constant_id = 4) const uint kColumns = 1u;   // columns of a tile that a lane covers
 layout(constant_id = 5) const uint kRows = 8u;      // pixels of each of these columns that it covers
 layout(push_constant) uniform Push { ColorPush p; };
-layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
-layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 2) readonly buffer ColorViews { ColorView color_views[]; };
-layout(std430, binding = 3) readonly buffer Segments { vec4 segments[]; };
-layout(std430, binding = 4) readonly buffer Image { vec4 image[]; };
-layout(std430, binding = 5) readonly buffer DepthImage { float depth_image[]; };
-layout(std430, binding = 6) readonly buffer Target { uint target[]; };
-layout(std430, binding = 7) writeonly buffer TilePixels { uint tile_pixels[]; };
-layout(std430, binding = 8) writeonly buffer TileSummary { uvec2 tile_summary[]; };
-layout(std430, binding = 9) writeonly buffer PixelSums { vec4 pixel_sums[]; };
+layout(std430) readonly buffer Tiles { SplatTile tiles[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer ColorViews { ColorView color_views[]; };
+layout(std430) readonly buffer Segments { vec4 segments[]; };
+layout(std430) readonly buffer Image { vec4 image[]; };
+layout(std430) readonly buffer DepthImage { float depth_image[]; };
+layout(std430) readonly buffer Target { uint target[]; };
+layout(std430) writeonly buffer TilePixels { uint tile_pixels[]; };
+layout(std430) writeonly buffer TileSummary { uvec2 tile_summary[]; };
+layout(std430) writeonly buffer PixelSums { vec4 pixel_sums[]; };
 
-const uint kInsideMask = 128u;
 const uint kReach = 2u * kColorEdge;
 const uint kNone = 0xffffffu;
 const float kFar = 1e30;
@@ -59,7 +59,7 @@ uint inside_below(SplatView view, int x, int y) {
   [[unroll]] for (int r = 0; r < int(kTileHeight + kReach); ++r) {
     bool there = column && y + r >= 0 && y + r < int(view.height);
     uint alpha = there ? target[view.target + uint(y + r) * view.width + uint(x)] >> 24u : 0u;
-    bits |= alpha >= kInsideMask ? 1u << r : 0u;
+    bits |= alpha >= uint(kObjectMask) ? 1u << r : 0u;
   }
   uint all = bits;
   [[unroll]] for (uint r = 1u; r <= kReach; ++r) all &= bits >> r;

@@ -4,15 +4,16 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
+#include "chainsplat/image_model.h"
 layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
-layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 2) readonly buffer Image { vec4 image[]; };
-layout(std430, binding = 3) readonly buffer Target { uint target[]; };
-layout(std430, binding = 4) writeonly buffer TileLoss { vec4 tile_loss[]; };
+layout(std430) readonly buffer Tiles { SplatTile tiles[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer Image { vec4 image[]; };
+layout(std430) readonly buffer Target { uint target[]; };
+layout(std430) writeonly buffer TileLoss { vec4 tile_loss[]; };
 
 shared vec4 lane_sum[gl_WorkGroupSize.x];
 
@@ -28,7 +29,7 @@ void main() {
       vec4 wanted = unpackUnorm4x8(target[view.target + y * view.width + x]);
       vec4 error = image[pixel] - wanted;
       vec3 shown = clamp(image[pixel].xyz, 0.0, 1.0) - wanted.xyz;
-      float object = wanted.w >= 128.0 / 255.0 ? 1.0 : 0.0;
+      float object = wanted.w >= float(kObjectMask) / 255.0 ? 1.0 : 0.0;
       sum += vec4(dot(abs(error.xyz), vec3(1.0)), abs(error.w), object * dot(shown, shown), object);
     }
   }

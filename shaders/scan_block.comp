@@ -5,10 +5,10 @@
 #include "shared/splat.h"
 layout(local_size_x = 64) in;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Values { uint values[]; };
-layout(std430, binding = 1) writeonly buffer Prefix { uint prefix[]; };
-layout(std430, binding = 2) writeonly buffer BlockSum { uint block_sum[]; };
-layout(std430, binding = 3) readonly buffer Counters { uint counters[]; };
+layout(std430) readonly buffer Values { uint values[]; };
+layout(std430) writeonly buffer Prefix { uint prefix[]; };
+layout(std430) writeonly buffer BlockSum { uint block_sum[]; };
+layout(std430) readonly buffer Counters { uint counters[]; };
 
 shared uint lane_sum[64];
 

@@ -5,8 +5,8 @@
 #include "shared/splat.h"
 layout(local_size_x = 64) in;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) buffer BlockSum { uint block_sum[]; };
-layout(std430, binding = 1) buffer Counters { uint counters[]; };
+layout(std430) buffer BlockSum { uint block_sum[]; };
+layout(std430) buffer Counters { uint counters[]; };
 
 shared uint lane_sum[64];
 

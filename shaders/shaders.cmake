@@ -1,4 +1,5 @@
-# Compiles every shaders/*.comp to SPIR-V at build time and embeds it; gpu::shader_code(name) returns it.
+# Compiles every shaders/*.comp to SPIR-V at build time and embeds it; gpu::shader_code(name) returns it. glslang numbers
+# the bindings (--auto-map-bindings) and keeps the names of the buffers, by which gpu::Pipeline binds them.
 file(GLOB shader_sources CONFIGURE_DEPENDS ${CMAKE_SOURCE_DIR}/shaders/*.comp)
 set(shader_dir ${CMAKE_BINARY_DIR}/shaders)
 file(MAKE_DIRECTORY ${shader_dir})
@@ -9,7 +10,7 @@ foreach(source ${shader_sources})
   get_filename_component(name ${source} NAME_WE)
   set(header ${shader_dir}/${name}.spv.h)
   add_custom_command(OUTPUT ${header}
-    COMMAND Vulkan::glslangValidator --quiet --target-env vulkan1.3 -I${CMAKE_SOURCE_DIR}/shaders --vn ${name}_spv
+    COMMAND Vulkan::glslangValidator --quiet --target-env vulkan1.3 --auto-map-bindings -I${CMAKE_SOURCE_DIR}/shaders -I${CMAKE_SOURCE_DIR}/include --vn ${name}_spv
             --depfile ${header}.d -o ${header} ${source}
     DEPENDS ${source} DEPFILE ${header}.d COMMENT "Shader ${name}" VERBATIM)
   list(APPEND shader_headers ${header})

@@ -4,18 +4,20 @@
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
 #include "shared/adam.h"
+#include "shared/gaussian.h"
 layout(local_size_x = 64) in;
 layout(push_constant) uniform Push { AdamPush p; };
-layout(std430, binding = 0) buffer Parameters { vec4 parameters[]; };
-layout(std430, binding = 1) readonly buffer Gradient { vec4 gradient[]; };
-layout(std430, binding = 2) buffer First { vec4 first_moment[]; };
-layout(std430, binding = 3) buffer Second { vec4 second_moment[]; };
-layout(std430, binding = 4) buffer Counters { uint counters[]; };
+layout(std430) buffer Parameters { vec4 parameters[]; };
+layout(std430) readonly buffer Gradient { vec4 gradient[]; };
+layout(std430) buffer FirstMoment { vec4 first_moment[]; };
+layout(std430) buffer SecondMoment { vec4 second_moment[]; };
+layout(std430) buffer Counters { uint counters[]; };
 
 float rate_of(uint i) {
-  uint n = p.gaussians, row = 3u * p.coefficients;
-  return i < 3u * n ? p.mean : i < 7u * n ? p.rotation : i < 10u * n ? p.log_scale : i < 11u * n ? p.opacity
-         : i < (11u + row) * n ? ((i - 11u * n) % row < 3u ? p.sh0 : p.sh_rest) : p.link_logits;
+  uint n = p.gaussians, c = p.coefficients, sh = at_sh(n, c, 0u);
+  return i < at_rotation(n, 0u) ? p.mean : i < at_log_scale(n, 0u) ? p.rotation : i < at_opacity(n, 0u) ? p.log_scale
+         : i < sh ? p.opacity : i < at_link(n, c, p.links, 0u) ? ((i - sh) % (3u * c) < 3u ? p.sh0 : p.sh_rest)
+         : p.link_logits;
 }
 
 void main() {

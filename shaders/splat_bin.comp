@@ -6,18 +6,18 @@
 #include "shared/splat.h"
 layout(local_size_x = 64) in;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Live { uint live[]; };
-layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 2) readonly buffer TileMap { uint tile_map[]; };
-layout(std430, binding = 3) readonly buffer Counters { uint counters[]; };
-layout(std430, binding = 4) readonly buffer Splats { vec4 splats[]; };
-layout(std430, binding = 5) readonly buffer InstancePrefix { uint instance_prefix[]; };
-layout(std430, binding = 6) readonly buffer InstanceBlock { uint instance_block[]; };
-layout(std430, binding = 7) readonly buffer TilePrefix { uint tile_prefix[]; };
-layout(std430, binding = 8) readonly buffer TileBlock { uint tile_block[]; };
-layout(std430, binding = 9) buffer TileCursor { uint tile_cursor[]; };
-layout(std430, binding = 10) readonly buffer TileHits { uint tile_hits[]; };
-layout(std430, binding = 11) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica, splat, instance
+layout(std430) readonly buffer Live { uint live[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer TileMap { uint tile_map[]; };
+layout(std430) readonly buffer Counters { uint counters[]; };
+layout(std430) readonly buffer Splats { vec4 splats[]; };
+layout(std430) readonly buffer InstancePrefix { uint instance_prefix[]; };
+layout(std430) readonly buffer InstanceBlock { uint instance_block[]; };
+layout(std430) readonly buffer TilePrefix { uint tile_prefix[]; };
+layout(std430) readonly buffer TileBlock { uint tile_block[]; };
+layout(std430) buffer TileCursor { uint tile_cursor[]; };
+layout(std430) readonly buffer TileHits { uint tile_hits[]; };
+layout(std430) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica, splat, instance
 
 void main() {
   uint r = gl_GlobalInvocationID.x, v = gl_GlobalInvocationID.y;

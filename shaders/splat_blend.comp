@@ -17,17 +17,17 @@ layout(constant_id = 4) const uint kCutoffs = 1u;
 layout(constant_id = 5) const uint kDepth = 0u;
 layout(constant_id = 6) const uint kShare = 1u;  // lanes that load one splat each and exchange; 1: every lane loads all
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
-layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 2) readonly buffer TilePrefix { uint tile_prefix[]; };
-layout(std430, binding = 3) readonly buffer TileBlock { uint tile_block[]; };
-layout(std430, binding = 4) readonly buffer TileCount { uint tile_count[]; };
-layout(std430, binding = 5) readonly buffer Sorted { uvec2 sorted[]; };
-layout(std430, binding = 6) readonly buffer Splats { vec4 splats[]; };
-layout(std430, binding = 7) readonly buffer Counters { uint counters[]; };
-layout(std430, binding = 8) writeonly buffer Image { vec4 image[]; };
-layout(std430, binding = 9) buffer TileUsed { uint tile_used[]; };
-layout(std430, binding = 10) writeonly buffer DepthImage { float depth_image[]; };
+layout(std430) readonly buffer Tiles { SplatTile tiles[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer TilePrefix { uint tile_prefix[]; };
+layout(std430) readonly buffer TileBlock { uint tile_block[]; };
+layout(std430) readonly buffer TileCount { uint tile_count[]; };
+layout(std430) readonly buffer Sorted { uvec2 sorted[]; };
+layout(std430) readonly buffer Splats { vec4 splats[]; };
+layout(std430) readonly buffer Counters { uint counters[]; };
+layout(std430) writeonly buffer Image { vec4 image[]; };
+layout(std430) buffer TileUsed { uint tile_used[]; };
+layout(std430) writeonly buffer DepthImage { float depth_image[]; };
 
 // entries per iteration: the values that a loop carries from one iteration to the next cost a fifth of an entry's time
 const uint kTurns = kShare > 1u ? 2u : 1u;

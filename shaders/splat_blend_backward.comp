@@ -17,19 +17,19 @@ layout(constant_id = 4) const uint kCutoffs = 1u;
 layout(constant_id = 5) const uint kSubgroup = 8u;  // lanes per cluster; no subgroup has fewer
 layout(constant_id = 6) const uint kShare = 1u;     // as in splat_blend.comp
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
-layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 2) readonly buffer TilePrefix { uint tile_prefix[]; };
-layout(std430, binding = 3) readonly buffer TileBlock { uint tile_block[]; };
-layout(std430, binding = 4) readonly buffer TileCount { uint tile_count[]; };
-layout(std430, binding = 5) readonly buffer Sorted { uvec2 sorted[]; };
-layout(std430, binding = 6) readonly buffer Splats { vec4 splats[]; };
-layout(std430, binding = 7) readonly buffer Counters { uint counters[]; };
-layout(std430, binding = 8) readonly buffer Image { vec4 image[]; };
-layout(std430, binding = 9) readonly buffer TileUsed { uint tile_used[]; };
-layout(std430, binding = 10) readonly buffer Target { uint target[]; };
-layout(std430, binding = 11) readonly buffer PixelGradient { vec4 pixel_gradient[]; };  // of D-SSIM, by color
-layout(std430, binding = 12) writeonly buffer Partials { float partials[]; };  // kPartialRows vec4 per slot
+layout(std430) readonly buffer Tiles { SplatTile tiles[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer TilePrefix { uint tile_prefix[]; };
+layout(std430) readonly buffer TileBlock { uint tile_block[]; };
+layout(std430) readonly buffer TileCount { uint tile_count[]; };
+layout(std430) readonly buffer Sorted { uvec2 sorted[]; };
+layout(std430) readonly buffer Splats { vec4 splats[]; };
+layout(std430) readonly buffer Counters { uint counters[]; };
+layout(std430) readonly buffer Image { vec4 image[]; };
+layout(std430) readonly buffer TileUsed { uint tile_used[]; };
+layout(std430) readonly buffer Target { uint target[]; };
+layout(std430) readonly buffer PixelGradient { vec4 pixel_gradient[]; };  // of D-SSIM, by color
+layout(std430) writeonly buffer Partials { float partials[]; };  // kPartialRows vec4 per slot
 
 #include "inc/alpha.glsl"
 #include "inc/share.glsl"

@@ -7,17 +7,17 @@
 #include "inc/gaussian.glsl"
 layout(local_size_x = 64) in;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Parameters { float parameters[]; };
-layout(std430, binding = 1) readonly buffer ReplicaOpacity { float replica_opacity[]; };
-layout(std430, binding = 2) readonly buffer LiveFlag { uint live_flag[]; };
-layout(std430, binding = 3) readonly buffer LivePrefix { uint live_prefix[]; };
-layout(std430, binding = 4) readonly buffer LiveBlock { uint live_block[]; };
-layout(std430, binding = 5) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 6) readonly buffer Motions { vec4 motions[]; };
-layout(std430, binding = 7) readonly buffer Counters { uint counters[]; };
-layout(std430, binding = 8) readonly buffer Records { vec4 records[]; };
-layout(std430, binding = 9) buffer Gradient { float gradient[]; };
-layout(std430, binding = 10) buffer ReplicaGradient { float replica_gradient[]; };  // d/d(opacity of the replica)
+layout(std430) readonly buffer Parameters { float parameters[]; };
+layout(std430) readonly buffer ReplicaOpacity { float replica_opacity[]; };
+layout(std430) readonly buffer LiveFlag { uint live_flag[]; };
+layout(std430) readonly buffer LivePrefix { uint live_prefix[]; };
+layout(std430) readonly buffer LiveBlock { uint live_block[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer Motions { vec4 motions[]; };
+layout(std430) readonly buffer Counters { uint counters[]; };
+layout(std430) readonly buffer Records { vec4 records[]; };
+layout(std430) buffer Gradient { float gradient[]; };
+layout(std430) buffer ReplicaGradient { float replica_gradient[]; };  // d/d(opacity of the replica)
 
 void put(uint at, float value) {
   gradient[at] = (p.flags & kFlagAccumulate) != 0u ? gradient[at] + value : value;

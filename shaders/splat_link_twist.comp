@@ -5,11 +5,11 @@
 #include "shared/splat.h"
 layout(local_size_x = 64) in;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer LivePrefix { uint live_prefix[]; };
-layout(std430, binding = 1) readonly buffer LiveBlock { uint live_block[]; };
-layout(std430, binding = 2) readonly buffer Counters { uint counters[]; };
-layout(std430, binding = 3) readonly buffer Records { vec4 records[]; };
-layout(std430, binding = 4) writeonly buffer LinkTwist { vec4 link_twist[]; };  // per (view, link): moment, force
+layout(std430) readonly buffer LivePrefix { uint live_prefix[]; };
+layout(std430) readonly buffer LiveBlock { uint live_block[]; };
+layout(std430) readonly buffer Counters { uint counters[]; };
+layout(std430) readonly buffer Records { vec4 records[]; };
+layout(std430) writeonly buffer LinkTwists { vec4 link_twists[]; };  // per (view, link): moment, force
 
 shared vec4 moments[64];
 shared vec4 forces[64];
@@ -37,7 +37,7 @@ void main() {
       moment += moments[k];
       force += forces[k];
     }
-    link_twist[2u * (v * p.links + link)] = moment;
-    link_twist[2u * (v * p.links + link) + 1u] = force;
+    link_twists[2u * (v * p.links + link)] = moment;
+    link_twists[2u * (v * p.links + link) + 1u] = force;
   }
 }

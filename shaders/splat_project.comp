@@ -6,24 +6,25 @@
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
 #include "inc/gaussian.glsl"
-#include "inc/project.glsl"
 layout(local_size_x = 64) in;
 layout(constant_id = 0) const uint kCutoffs = 1u;
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Parameters { float parameters[]; };
-layout(std430, binding = 1) readonly buffer ReplicaOpacity { float replica_opacity[]; };
-layout(std430, binding = 2) readonly buffer Live { uint live[]; };
-layout(std430, binding = 3) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 4) readonly buffer Motions { vec4 motions[]; };
-layout(std430, binding = 5) readonly buffer TileMap { uint tile_map[]; };
-layout(std430, binding = 6) readonly buffer Counters { uint counters[]; };
-layout(std430, binding = 7) writeonly buffer Splats { vec4 splats[]; };
-layout(std430, binding = 8) writeonly buffer InstanceCount { uint instance_count[]; };
-layout(std430, binding = 9) buffer TileCount { uint tile_count[]; };
-layout(std430, binding = 10) writeonly buffer TileHits { uint tile_hits[]; };
-layout(std430, binding = 11) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica number, splat, -
+layout(std430) readonly buffer Parameters { float parameters[]; };
+layout(std430) readonly buffer ReplicaOpacity { float replica_opacity[]; };
+layout(std430) readonly buffer Live { uint live[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer Motions { vec4 motions[]; };
+layout(std430) readonly buffer TileMap { uint tile_map[]; };
+layout(std430) readonly buffer Counters { uint counters[]; };
+layout(std430) writeonly buffer Splats { vec4 splats[]; };
+layout(std430) writeonly buffer InstanceCount { uint instance_count[]; };
+layout(std430) buffer TileCount { uint tile_count[]; };
+layout(std430) writeonly buffer TileHits { uint tile_hits[]; };
+layout(std430) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica number, splat, -
+
+#include "inc/project.glsl"
 
 // -exponent at which a Gaussian is about 0 in float: the extent when there is no 1/255 cut
 const float kFullReach = 80.0;
@@ -48,18 +49,13 @@ void main() {
   SplatView view = views[v];
 
   // project the replica
-  uint motion = 3u * (view.motion + link);
-  uint at = at_mean(n, i), aq = at_rotation(n, i), as = at_log_scale(n, i);
-  vec3 mean = vec3(parameters[at], parameters[at + 1u], parameters[at + 2u]);
-  vec4 rotation = vec4(parameters[aq], parameters[aq + 1u], parameters[aq + 2u], parameters[aq + 3u]);
-  vec3 log_scale = vec3(parameters[as], parameters[as + 1u], parameters[as + 2u]);
-  Projection a = project(view, motions[motion], motions[motion + 1u], motions[motion + 2u], mean, rotation, log_scale);
+  Projection a = project(view, n, i, link);
   float opacity = replica_opacity[e];
   float determinant = a.cov.x * a.cov.z - a.cov.y * a.cov.y;
   vec2 u = view.intrinsics.xy * a.x.xy / a.x.z + view.intrinsics.zw;
 
   // half widths of the box where alpha can reach the cut
-  float reach = kCutoffs != 0u ? 2.0 * log(255.0 * opacity) : 2.0 * kFullReach;
+  float reach = kCutoffs != 0u ? 2.0 * log(1.0 / kLeastAlpha * opacity) : 2.0 * kFullReach;
   bool visible = a.x.z >= kNear && reach > 0.0 && determinant > 0.0;
   vec2 half_width = sqrt(max(reach, 0.0) * a.cov.xz);
   // pixel centers are at + 0.5: pixel k is inside the box when u - h <= k + 0.5 <= u + h

@@ -6,20 +6,21 @@
 #extension GL_GOOGLE_include_directive : require
 #include "shared/splat.h"
 #include "inc/gaussian.glsl"
-#include "inc/project.glsl"
 layout(local_size_x = 64) in;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Parameters { float parameters[]; };
-layout(std430, binding = 1) readonly buffer Live { uint live[]; };
-layout(std430, binding = 2) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 3) readonly buffer Motions { vec4 motions[]; };
-layout(std430, binding = 4) readonly buffer Counters { uint counters[]; };
-layout(std430, binding = 5) readonly buffer Splats { vec4 splats[]; };
-layout(std430, binding = 6) readonly buffer InstanceCount { uint instance_count[]; };
-layout(std430, binding = 7) readonly buffer InstancePrefix { uint instance_prefix[]; };
-layout(std430, binding = 8) readonly buffer InstanceBlock { uint instance_block[]; };
-layout(std430, binding = 9) readonly buffer Partials { vec4 partials[]; };
-layout(std430, binding = 10) writeonly buffer Records { vec4 records[]; };
+layout(std430) readonly buffer Parameters { float parameters[]; };
+layout(std430) readonly buffer Live { uint live[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer Motions { vec4 motions[]; };
+layout(std430) readonly buffer Counters { uint counters[]; };
+layout(std430) readonly buffer Splats { vec4 splats[]; };
+layout(std430) readonly buffer InstanceCount { uint instance_count[]; };
+layout(std430) readonly buffer InstancePrefix { uint instance_prefix[]; };
+layout(std430) readonly buffer InstanceBlock { uint instance_block[]; };
+layout(std430) readonly buffer Partials { vec4 partials[]; };
+layout(std430) writeonly buffer Records { vec4 records[]; };
+
+#include "inc/project.glsl"
 
 void main() {
   uint r = gl_GlobalInvocationID.x, v = gl_GlobalInvocationID.y;
@@ -42,13 +43,7 @@ void main() {
   }
   uint e = live[r], n = p.gaussians, i = e % n, link = e / n;
   SplatView view = views[v];
-  uint motion = 3u * (view.motion + link);
-  uint at = at_mean(n, i), aq = at_rotation(n, i), as = at_log_scale(n, i);
-  vec3 mean = vec3(parameters[at], parameters[at + 1u], parameters[at + 2u]);
-  vec4 rotation = vec4(parameters[aq], parameters[aq + 1u], parameters[aq + 2u], parameters[aq + 3u]);
-  vec3 log_scale = vec3(parameters[as], parameters[as + 1u], parameters[as + 2u]);
-  Projection a = project(view, motions[motion], motions[motion + 1u], motions[motion + 2u], mean, rotation, log_scale);
-
+  Projection a = project(view, n, i, link);
 
   // color: no gradient where max(0, .) is active
   vec3 splat_color = splats[kSplatRows * s + 2u].xyz;

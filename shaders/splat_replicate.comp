@@ -9,9 +9,9 @@
 layout(local_size_x = 64) in;
 layout(constant_id = 0) const uint kCutoffs = 1u;  // 0: every replica is live (finite-difference tests)
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Parameters { float parameters[]; };
-layout(std430, binding = 1) writeonly buffer ReplicaOpacity { float replica_opacity[]; };
-layout(std430, binding = 2) writeonly buffer LiveFlag { uint live_flag[]; };
+layout(std430) readonly buffer Parameters { float parameters[]; };
+layout(std430) writeonly buffer ReplicaOpacity { float replica_opacity[]; };
+layout(std430) writeonly buffer LiveFlag { uint live_flag[]; };
 
 void main() {
   uint i = gl_GlobalInvocationID.x;
@@ -22,7 +22,7 @@ void main() {
   for (uint j = 1u; j < p.links; ++j) largest = max(largest, parameters[logits + j]);
   float sum = 0.0;
   for (uint j = 0u; j < p.links; ++j) sum += exp(parameters[logits + j] - largest);
-  float least = kCutoffs != 0u ? 1.0 / 255.0 : 0.0;
+  float least = kCutoffs != 0u ? kLeastAlpha : 0.0;
   for (uint j = 0u; j < p.links; ++j) {
     float value = opacity * exp(parameters[logits + j] - largest) / sum;
     replica_opacity[j * p.gaussians + i] = value;

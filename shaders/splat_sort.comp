@@ -11,13 +11,13 @@ layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kRankLimit = 256u;  // longest list that is sorted by rank
 layout(constant_id = 2) const uint kShare = 8u;        // lanes that load one key each and exchange them
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer TilePrefix { uint tile_prefix[]; };
-layout(std430, binding = 1) readonly buffer TileBlock { uint tile_block[]; };
-layout(std430, binding = 2) readonly buffer TileCount { uint tile_count[]; };
-layout(std430, binding = 3) readonly buffer Entries { uvec4 entries[]; };  // depth bits, replica, splat, instance
-layout(std430, binding = 4) writeonly buffer LongTiles { uint long_tiles[]; };
-layout(std430, binding = 5) writeonly buffer Sorted { uvec2 sorted[]; };   // splat, instance
-layout(std430, binding = 6) buffer Counters { uint counters[]; };
+layout(std430) readonly buffer TilePrefix { uint tile_prefix[]; };
+layout(std430) readonly buffer TileBlock { uint tile_block[]; };
+layout(std430) readonly buffer TileCount { uint tile_count[]; };
+layout(std430) readonly buffer Entries { uvec4 entries[]; };  // depth bits, replica, splat, instance
+layout(std430) writeonly buffer LongTiles { uint long_tiles[]; };
+layout(std430) writeonly buffer Sorted { uvec2 sorted[]; };   // splat, instance
+layout(std430) buffer Counters { uint counters[]; };
 
 void main() {
   uint tile = gl_WorkGroupID.x * p.tile_stride % p.tiles, lane = gl_LocalInvocationID.x, lanes = gl_WorkGroupSize.x;

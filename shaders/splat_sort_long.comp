@@ -6,13 +6,13 @@
 #include "shared/splat.h"
 layout(local_size_x_id = 0) in;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer TilePrefix { uint tile_prefix[]; };
-layout(std430, binding = 1) readonly buffer TileBlock { uint tile_block[]; };
-layout(std430, binding = 2) readonly buffer TileCount { uint tile_count[]; };
-layout(std430, binding = 3) readonly buffer Entries { uvec4 entries[]; };  // depth bits, replica, splat, instance
-layout(std430, binding = 4) readonly buffer LongTiles { uint long_tiles[]; };
-layout(std430, binding = 5) coherent buffer Scratch { uvec2 scratch[]; };  // two per entry: key, number in the list
-layout(std430, binding = 6) writeonly buffer Sorted { uvec2 sorted[]; };   // splat, instance
+layout(std430) readonly buffer TilePrefix { uint tile_prefix[]; };
+layout(std430) readonly buffer TileBlock { uint tile_block[]; };
+layout(std430) readonly buffer TileCount { uint tile_count[]; };
+layout(std430) readonly buffer Entries { uvec4 entries[]; };  // depth bits, replica, splat, instance
+layout(std430) readonly buffer LongTiles { uint long_tiles[]; };
+layout(std430) coherent buffer SortScratch { uvec2 sort_scratch[]; };  // two per entry: key, number in the list
+layout(std430) writeonly buffer Sorted { uvec2 sorted[]; };   // splat, instance
 
 const uint kDigitBits = 5u, kDigits = 1u << kDigitBits;
 const uint kLongRun = 8u;  // more equal depths in a row than this are sorted by radix, not one against the other
@@ -39,7 +39,7 @@ uint sort_by_key(uint ping, uint pong, Stretch s, uint lane, uint lanes) {
   uint low = 0xffffffffu, high = 0u;
   for (uint first = s.from; first < s.to; first += kUnroll) {
     [[unroll]] for (uint m = 0u; m < kUnroll; ++m) {
-      uint key = scratch[ping + min(first + m, s.to - 1u)].x;
+      uint key = sort_scratch[ping + min(first + m, s.to - 1u)].x;
       low = min(low, key);
       high = max(high, key);
     }
@@ -60,7 +60,7 @@ uint sort_by_key(uint ping, uint pong, Stretch s, uint lane, uint lanes) {
     for (uint first = s.from; first < s.to; first += kUnroll) {
       [[unroll]] for (uint m = 0u; m < kUnroll; ++m) {
         uint k = first + m;
-        if (k < s.to) place[((scratch[ping + k].x - low) >> shift) % kDigits * lanes + lane] += 1u;
+        if (k < s.to) place[((sort_scratch[ping + k].x - low) >> shift) % kDigits * lanes + lane] += 1u;
       }
     }
     barrier();
@@ -82,11 +82,11 @@ uint sort_by_key(uint ping, uint pong, Stretch s, uint lane, uint lanes) {
       [[unroll]] for (uint m = 0u; m < kUnroll; ++m) {
         uint k = first + m;
         if (k < s.to) {
-          uvec2 item = scratch[ping + k];
+          uvec2 item = sort_scratch[ping + k];
           uint counter = ((item.x - low) >> shift) % kDigits * lanes + lane;
           uint at = place[counter];
           place[counter] = at + 1u;
-          scratch[pong + at] = item;
+          sort_scratch[pong + at] = item;
         }
       }
     }
@@ -106,39 +106,39 @@ void main() {
   uint begin = 2u * start, middle = begin + n;  // the tile's two halves of the scratch buffer
 
   // sort by depth
-  for (uint k = s.from; k < s.to; ++k) scratch[begin + k] = uvec2(entries[start + k].x, k);
+  for (uint k = s.from; k < s.to; ++k) sort_scratch[begin + k] = uvec2(entries[start + k].x, k);
   if (lane == 0u) long_run = 0u;
   everyone_sees();
   uint at = sort_by_key(begin, middle, s, lane, lanes);
 
   // with a long run of equal depths, sort by replica first and then, keeping that order, by depth
   for (uint k = s.from; k < s.to; ++k) {
-    if (k + kLongRun < n && scratch[at + k].x == scratch[at + k + kLongRun].x) long_run = 1u;
+    if (k + kLongRun < n && sort_scratch[at + k].x == sort_scratch[at + k + kLongRun].x) long_run = 1u;
   }
   barrier();
   bool many_equal = long_run != 0u;
   if (many_equal) {
-    for (uint k = s.from; k < s.to; ++k) scratch[begin + k] = uvec2(entries[start + k].y, k);
+    for (uint k = s.from; k < s.to; ++k) sort_scratch[begin + k] = uvec2(entries[start + k].y, k);
     everyone_sees();
     at = sort_by_key(begin, middle, s, lane, lanes);
-    for (uint k = s.from; k < s.to; ++k) scratch[at + k].x = entries[start + scratch[at + k].y].x;
+    for (uint k = s.from; k < s.to; ++k) sort_scratch[at + k].x = entries[start + sort_scratch[at + k].y].x;
     everyone_sees();
     at = sort_by_key(at, at == begin ? middle : begin, s, lane, lanes);
   }
 
   // write the result, short runs of equal depths by the rank of their replicas
   for (uint k = s.from; k < s.to; ++k) {
-    uvec2 item = scratch[at + k];
-    bool equal_before = k > 0u && scratch[at + k - 1u].x == item.x;
-    bool equal_after = k + 1u < n && scratch[at + k + 1u].x == item.x;
+    uvec2 item = sort_scratch[at + k];
+    bool equal_before = k > 0u && sort_scratch[at + k - 1u].x == item.x;
+    bool equal_after = k + 1u < n && sort_scratch[at + k + 1u].x == item.x;
     if (many_equal || (!equal_before && !equal_after)) {
       sorted[start + k] = entries[start + item.y].zw;
     } else if (!equal_before) {  // this lane has the first of the run and writes all of it
       uint end = k + 1u;
-      while (end < n && scratch[at + end].x == item.x) ++end;
+      while (end < n && sort_scratch[at + end].x == item.x) ++end;
       for (uint m = k; m < end; ++m) {
-        uint index = scratch[at + m].y, replica = entries[start + index].y, rank = k;
-        for (uint o = k; o < end; ++o) rank += entries[start + scratch[at + o].y].y < replica ? 1u : 0u;
+        uint index = sort_scratch[at + m].y, replica = entries[start + index].y, rank = k;
+        for (uint o = k; o < end; ++o) rank += entries[start + sort_scratch[at + o].y].y < replica ? 1u : 0u;
         sorted[start + rank] = entries[start + index].zw;
       }
     }

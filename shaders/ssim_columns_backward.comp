@@ -10,13 +10,13 @@ layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(constant_id = 3) const uint kPixels = 8u;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
-layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 2) readonly buffer TileMap { uint tile_map[]; };
-layout(std430, binding = 3) readonly buffer Rows { vec4 rows[]; };
-layout(std430, binding = 4) readonly buffer Image { vec4 image[]; };
-layout(std430, binding = 5) readonly buffer Target { uint target[]; };
-layout(std430, binding = 6) writeonly buffer PixelGradient { vec4 pixel_gradient[]; };
+layout(std430) readonly buffer Tiles { SplatTile tiles[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer TileMap { uint tile_map[]; };
+layout(std430) readonly buffer SsimRowSums { vec4 ssim_row_sums[]; };
+layout(std430) readonly buffer Image { vec4 image[]; };
+layout(std430) readonly buffer Target { uint target[]; };
+layout(std430) writeonly buffer PixelGradient { vec4 pixel_gradient[]; };
 #include "inc/ssim.glsl"
 
 void main() {
@@ -31,15 +31,15 @@ void main() {
     s0[k] = s1[k] = vec4(0.0);
     s2[k] = 0.0;
   }
-  [[unroll]] for (int m = -kReach; m < int(kPixels) + kReach; ++m) {
+  [[unroll]] for (int m = -kSsimReach; m < int(kPixels) + kSsimReach; ++m) {
     int row = int(first) + m;  // in the tile
     uint from = row < 0 ? above : row < int(kTileHeight) ? tile : below;
     bool there = from != kNoTile;
     uint at = 3u * ssim_place(there ? from : tile, column, uint(row + int(kTileHeight)) % kTileHeight);
-    vec4 v0 = there ? rows[at] : vec4(0.0), v1 = there ? rows[at + 1u] : vec4(0.0);
-    float v2 = there ? rows[at + 2u].x : 0.0;
+    vec4 v0 = there ? ssim_row_sums[at] : vec4(0.0), v1 = there ? ssim_row_sums[at + 1u] : vec4(0.0);
+    float v2 = there ? ssim_row_sums[at + 2u].x : 0.0;
     [[unroll]] for (int k = 0; k < int(kPixels); ++k) {
-      if (abs(m - k) > kReach) continue;
+      if (abs(m - k) > kSsimReach) continue;
       float w = window(m - k);
       s0[k] += w * v0;
       s1[k] += w * v1;

@@ -9,12 +9,12 @@ layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(constant_id = 3) const uint kPixels = 8u;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
-layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 2) readonly buffer TileMap { uint tile_map[]; };
-layout(std430, binding = 3) readonly buffer Image { vec4 image[]; };
-layout(std430, binding = 4) readonly buffer Target { uint target[]; };
-layout(std430, binding = 5) writeonly buffer Rows { vec4 rows[]; };
+layout(std430) readonly buffer Tiles { SplatTile tiles[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer TileMap { uint tile_map[]; };
+layout(std430) readonly buffer Image { vec4 image[]; };
+layout(std430) readonly buffer Target { uint target[]; };
+layout(std430) writeonly buffer SsimRowSums { vec4 ssim_row_sums[]; };
 #include "inc/ssim.glsl"
 
 void main() {
@@ -28,7 +28,7 @@ void main() {
   bool right = active_tile(view, int(t.x) + 1, int(t.y)) != kNoTile;
   vec3 a[kPixels], b[kPixels], squares[kPixels], ab[kPixels];
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) a[k] = b[k] = squares[k] = ab[k] = vec3(0.0);
-  [[unroll]] for (int m = -kReach; m < int(kPixels) + kReach; ++m) {
+  [[unroll]] for (int m = -kSsimReach; m < int(kPixels) + kSsimReach; ++m) {
     int column = int(first) + m;  // in the tile
     int x = int(t.x * kTileWidth) + column;
     bool there = inside && x >= 0 && x < int(view.width);
@@ -38,7 +38,7 @@ void main() {
     vec3 wanted = there ? unpackUnorm4x8(target[view.target + offset]).xyz : vec3(0.0);
     vec3 square = shown * shown + wanted * wanted, product = shown * wanted;
     [[unroll]] for (int k = 0; k < int(kPixels); ++k) {
-      if (abs(m - k) > kReach) continue;
+      if (abs(m - k) > kSsimReach) continue;
       float w = window(m - k);
       a[k] += w * shown;
       b[k] += w * wanted;
@@ -48,8 +48,8 @@ void main() {
   }
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
     uint at = 3u * ssim_place(tile, first + k, row);
-    rows[at] = vec4(a[k], b[k].x);
-    rows[at + 1u] = vec4(b[k].yz, squares[k].xy);
-    rows[at + 2u] = vec4(squares[k].z, ab[k]);
+    ssim_row_sums[at] = vec4(a[k], b[k].x);
+    ssim_row_sums[at + 1u] = vec4(b[k].yz, squares[k].xy);
+    ssim_row_sums[at + 2u] = vec4(squares[k].z, ab[k]);
   }
 }

@@ -9,11 +9,11 @@ layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(constant_id = 3) const uint kPixels = 8u;
 layout(push_constant) uniform Push { SplatPush p; };
-layout(std430, binding = 0) readonly buffer Tiles { SplatTile tiles[]; };
-layout(std430, binding = 1) readonly buffer Views { SplatView views[]; };
-layout(std430, binding = 2) readonly buffer TileMap { uint tile_map[]; };
-layout(std430, binding = 3) readonly buffer Factors { vec4 factors[]; };
-layout(std430, binding = 4) writeonly buffer Rows { vec4 rows[]; };
+layout(std430) readonly buffer Tiles { SplatTile tiles[]; };
+layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer TileMap { uint tile_map[]; };
+layout(std430) readonly buffer SsimFactors { vec4 ssim_factors[]; };
+layout(std430) writeonly buffer SsimRowSums { vec4 ssim_row_sums[]; };
 #include "inc/ssim.glsl"
 
 void main() {
@@ -28,15 +28,15 @@ void main() {
     s0[k] = s1[k] = vec4(0.0);
     s2[k] = 0.0;
   }
-  [[unroll]] for (int m = -kReach; m < int(kPixels) + kReach; ++m) {
+  [[unroll]] for (int m = -kSsimReach; m < int(kPixels) + kSsimReach; ++m) {
     int column = int(first) + m;  // in the tile
     uint from = column < 0 ? left : column < int(kTileWidth) ? tile : right;
     bool there = from != kNoTile;
     uint at = 3u * ssim_place(there ? from : tile, uint(column + int(kTileWidth)) % kTileWidth, row);
-    vec4 v0 = there ? factors[at] : vec4(0.0), v1 = there ? factors[at + 1u] : vec4(0.0);
-    float v2 = there ? factors[at + 2u].x : 0.0;
+    vec4 v0 = there ? ssim_factors[at] : vec4(0.0), v1 = there ? ssim_factors[at + 1u] : vec4(0.0);
+    float v2 = there ? ssim_factors[at + 2u].x : 0.0;
     [[unroll]] for (int k = 0; k < int(kPixels); ++k) {
-      if (abs(m - k) > kReach) continue;
+      if (abs(m - k) > kSsimReach) continue;
       float w = window(m - k);
       s0[k] += w * v0;
       s1[k] += w * v1;
@@ -45,8 +45,8 @@ void main() {
   }
   [[unroll]] for (uint k = 0u; k < kPixels; ++k) {
     uint at = 3u * ssim_place(tile, first + k, row);
-    rows[at] = s0[k];
-    rows[at + 1u] = s1[k];
-    rows[at + 2u].x = s2[k];
+    ssim_row_sums[at] = s0[k];
+    ssim_row_sums[at + 1u] = s1[k];
+    ssim_row_sums[at + 2u].x = s2[k];
   }
 }

@@ -3,8 +3,8 @@
 #version 460
 layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint kAdd = 0u;
-layout(std430, binding = 0) readonly buffer From { uint from[]; };
-layout(std430, binding = 1) writeonly buffer To { uint to[]; };
+layout(std430) readonly buffer From { uint from[]; };
+layout(std430) writeonly buffer To { uint to[]; };
 
 void main() {
   uint i = gl_GlobalInvocationID.x;

@@ -4,7 +4,7 @@
 layout(local_size_x = 1) in;
 layout(constant_id = 0) const uint kLanes = 64u;
 layout(push_constant) uniform Push { uint count; };
-layout(std430, binding = 0) writeonly buffer Arguments { uint arguments[]; };
+layout(std430) writeonly buffer Arguments { uint arguments[]; };
 
 void main() {
   arguments[3] = (count + kLanes - 1u) / kLanes;

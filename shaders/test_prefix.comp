@@ -5,9 +5,9 @@
 #extension GL_KHR_shader_subgroup_shuffle : require
 layout(local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint count; };
-layout(std430, binding = 0) readonly buffer Values { uint values[]; };
-layout(std430, binding = 1) writeonly buffer Prefix { uint prefix[]; };
-layout(std430, binding = 2) writeonly buffer Size { uint size[]; };
+layout(std430) readonly buffer Values { uint values[]; };
+layout(std430) writeonly buffer Prefix { uint prefix[]; };
+layout(std430) writeonly buffer Size { uint size[]; };
 
 shared uint subgroup_total[gl_WorkGroupSize.x];  // enough even for subgroups of one lane
 shared uint block_total;

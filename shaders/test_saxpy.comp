@@ -2,8 +2,8 @@
 #version 460
 layout(local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint count; float scale; };
-layout(std430, binding = 0) readonly buffer X { float x[]; };
-layout(std430, binding = 1) buffer Y { float y[]; };
+layout(std430) readonly buffer X { float x[]; };
+layout(std430) buffer Y { float y[]; };
 
 void main() {
   uint i = gl_GlobalInvocationID.x + gl_GlobalInvocationID.y * gl_NumWorkGroups.x * gl_WorkGroupSize.x;

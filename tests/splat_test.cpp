@@ -13,9 +13,11 @@
 #include <cstring>
 #include <fstream>
 #include <nlohmann/json.hpp>
+#include <numbers>
 #include <numeric>
 #include <string>
 
+#include "chainsplat/image_model.h"
 #include "reference_renderer.h"
 #include "shaders/shared/splat.h"
 
@@ -911,6 +913,38 @@ TEST_CASE("step is Adam on the mean loss of the batch") {
     CHECK(worst <= 0.02);  // an error of 1e-3 of the largest gradient is 5 % of a gradient of kWeak, but rarely occurs
   }
   check_silent();
+}
+
+TEST_CASE("host and device agree on where each kind of parameter stands: a rate moves those of its kind only") {
+  const Scene scene = random_scene(63, 21, 3, 2, Logits::soft);
+  engine().set_views(scene.views, scene.target_pointers());
+  const auto before = reference::parameters(scene.gaussians);
+  const std::array batch{0, 1, 2};
+  for (int rated = 0; rated < 7; ++rated) {
+    CAPTURE(rated);
+    std::array<float, 7> rate{};
+    rate[rated] = 1e-3f;
+    engine().set_gaussians(scene.gaussians);
+    engine().step(batch, kAllTerms, {rate[0], rate[1], rate[2], rate[3], rate[4], rate[5], rate[6]}, false);
+    const auto after = reference::parameters(engine().gaussians());
+    std::array<std::size_t, 7> moved{};
+    for (int kind = 0; kind < 6; ++kind) {
+      for (std::size_t k = 0; k < before.kinds()[kind]->size(); ++k) {
+        const int section = kind < 4 ? kind : kind == 5 ? 6 : k % (3u * before.coefficients()) < 3 ? 4 : 5;
+        moved[section] += (*after.kinds()[kind])[k] != (*before.kinds()[kind])[k];
+      }
+    }
+    for (int section = 0; section < 7; ++section) CHECK((moved[section] > 0) == (section == rated));
+  }
+  check_silent();
+}
+
+TEST_CASE("the numbers of the image model are what defines them") {
+  CHECK(image_model::kSh0 == doctest::Approx(0.5 / std::sqrt(std::numbers::pi)).epsilon(1e-15));
+  double sum = 0.0;
+  for (int t = -image_model::kSsimReach; t <= image_model::kSsimReach; ++t) sum += std::exp(-0.5 * t * t / (1.5 * 1.5));
+  for (int t = 0; t <= image_model::kSsimReach; ++t)
+    CHECK(image_model::kSsimWindow[t] == doctest::Approx(std::exp(-0.5 * t * t / (1.5 * 1.5)) / sum).epsilon(1e-14));
 }
 
 TEST_CASE("resets cap the opacity, even the links out, and forget their moments only") {

@@ -7,10 +7,13 @@
 #pragma once
 #include <cstddef>
 #include <cstdint>
+#include <initializer_list>
+#include <map>
 #include <memory>
 #include <span>
 #include <string>
 #include <string_view>
+#include <utility>
 #include <vector>
 #include "chainsplat/core.h"
 
@@ -117,22 +120,43 @@ void download(Device& device, const Buffer& buffer, void* data, std::size_t byte
 // std::logic_error for an unknown name.
 std::span<const std::uint32_t> shader_code(std::string_view name);
 
+// Which buffer each name stands for. Copies are the same table. A pipeline finds its names when it is made; a dispatch
+// takes the buffers that they stand for when it is recorded. Buffers must stay where they are, but may be made anew.
+class Bindings {
+ public:
+  Bindings() = default;
+  Bindings(std::initializer_list<std::pair<const std::string, const Buffer*>> buffers);
+  // Lets `name` stand for another buffer. Throws std::logic_error that names it unless the constructor got that name.
+  void set(std::string_view name, const Buffer& buffer);
+  // Place in the table, at which the buffer stands as long as the table exists; null for a name that it has not.
+  const Buffer* const* find(std::string_view name) const;
+
+ private:
+  using Table = std::map<std::string, const Buffer*, std::less<>>;  // its entries never move
+  std::shared_ptr<Table> buffers_ = std::make_shared<Table>();
+};
+
 class Pipeline {
  public:
   Pipeline();
-  // Makes the compute pipeline of shaders/<name>.comp with `buffers` storage buffers (set 0, bindings 0, 1, ...),
-  // `push_bytes` of push constants (at most 128) and the specialization constants 0, 1, 2, ... = `constants` (uint).
-  // Pipelines with equal arguments are compiled once per device and shared.
-  Pipeline(Device& device, const std::string& name, int buffers, std::size_t push_bytes,
+  // Makes the compute pipeline of shaders/<name>.comp with `push_bytes` of push constants (at most 128) and the
+  // specialization constants 0, 1, 2, ... = `constants` (uint). Every storage buffer of the shader is bound to what
+  // `bindings` has under the name of its array, as `splats` in "buffer Splats { vec4 splats[]; }"; more names than the
+  // shader's are no error. Throws std::logic_error for an unknown shader, and for a name without a buffer, which it
+  // gives with the shader's. Pipelines of equal shader and constants are compiled once per device and shared.
+  Pipeline(Device& device, const std::string& name, const Bindings& bindings, std::size_t push_bytes,
            const std::vector<std::uint32_t>& constants);
   Pipeline(Pipeline&&) noexcept;
   Pipeline& operator=(Pipeline&&) noexcept;
   ~Pipeline();
   struct Handles;
   const Handles& handles() const { return *handles_; }
+  const Buffer* buffer(std::size_t i) const { return *places_[i]; }  // for the i-th of handles().bindings
 
  private:
   std::shared_ptr<const Handles> handles_;
+  Bindings bindings_;
+  std::vector<const Buffer* const*> places_;  // in bindings_, so that no dispatch searches for a name
 };
 
 struct Timing {
@@ -152,11 +176,11 @@ class Commands {
   Commands& operator=(Commands&&) noexcept;
   ~Commands();
   void begin();  // starts a new recording and drops the old one; waits for the last submission
-  void dispatch(const Pipeline& pipeline, std::span<const Buffer* const> buffers, const void* push,
-                std::size_t push_bytes, std::uint32_t x, std::uint32_t y = 1, std::uint32_t z = 1);
+  void dispatch(const Pipeline& pipeline, const void* push, std::size_t push_bytes, std::uint32_t x,
+                std::uint32_t y = 1, std::uint32_t z = 1);
   // The device reads the three group counts (uints) from `arguments` at byte `offset` (a multiple of 4).
-  void dispatch_indirect(const Pipeline& pipeline, std::span<const Buffer* const> buffers, const void* push,
-                         std::size_t push_bytes, const Buffer& arguments, std::size_t offset);
+  void dispatch_indirect(const Pipeline& pipeline, const void* push, std::size_t push_bytes, const Buffer& arguments,
+                         std::size_t offset);
   void fill(const Buffer& buffer, std::uint32_t value, std::size_t offset, std::size_t bytes);
   void copy(const Buffer& from, std::size_t from_offset, const Buffer& to, std::size_t to_offset, std::size_t bytes);
   void no_barrier();                    // lets the next command overlap with the one before

@@ -1,9 +1,10 @@
 // alpha.glsl - the alpha of one splat in a column of pixels, shared by the forward and the backward pass so that both
 // agree (mathematics.md 2.6). Needs kCutoffs, kPixels.
+#include "chainsplat/image_model.h"
 
-const float kAlphaCap = kCutoffs != 0u ? 0.99 : 2.0;
-const float kAlphaLeast = kCutoffs != 0u ? 1.0 / 255.0 : -1.0;
-const float kTransmittanceLeast = kCutoffs != 0u ? 1e-4 : -1.0;
+const float kAlphaCap = kCutoffs != 0u ? kMostAlpha : 2.0;
+const float kAlphaLeast = kCutoffs != 0u ? kLeastAlpha : -1.0;
+const float kTransmittanceLeast = kCutoffs != 0u ? kLeastTransmittance : -1.0;
 
 // The exponent log2(e) (-1/2 delta^T Q delta), Q = [x y; y z], with the square completed in y: in a column of pixels at
 // dx to the right of the splat's center it is along dx^2 + fall dy^2, where dy counts from the column's peak, which

@@ -1,13 +1,5 @@
-// gaussian.glsl - the layout of the parameter buffer, and small functions of a Gaussian's parameters.
-// For n Gaussians the sections follow one another, each [Gaussian][component]: mean 3, rotation 4, log scale 3, opacity
-// logit 1, SH 3 x coefficients, link logits.
-
-uint at_mean(uint n, uint i) { return 3u * i; }
-uint at_rotation(uint n, uint i) { return 3u * n + 4u * i; }
-uint at_log_scale(uint n, uint i) { return 7u * n + 3u * i; }
-uint at_opacity(uint n, uint i) { return 10u * n + i; }
-uint at_sh(uint n, uint coefficients, uint i) { return 11u * n + 3u * coefficients * i; }
-uint at_link(uint n, uint coefficients, uint links, uint i) { return (11u + 3u * coefficients) * n + links * i; }
+// gaussian.glsl - small functions of a Gaussian's parameters.
+#include "shared/gaussian.h"
 
 // Rotation matrix of a unit quaternion q = (w, x, y, z).
 mat3 rotation_matrix(vec4 q) {
@@ -31,29 +23,7 @@ vec4 rotation_matrix_backward(vec4 q, float size, mat3 columns) {
   return (d - q * dot(q, d)) / size;
 }
 
-// Real spherical harmonics in the order and signs of 3DGS (mathematics.md 2.4), one basis function, and its gradient.
-float sh_basis(uint l, vec3 r) {
-  float x = r.x, y = r.y, z = r.z;
-  switch (l) {
-    case 0u: return 0.28209479177387814;
-    case 1u: return -0.4886025119029199 * y;
-    case 2u: return 0.4886025119029199 * z;
-    case 3u: return -0.4886025119029199 * x;
-    case 4u: return 1.0925484305920792 * x * y;
-    case 5u: return -1.0925484305920792 * y * z;
-    case 6u: return 0.31539156525252005 * (2.0 * z * z - x * x - y * y);
-    case 7u: return -1.0925484305920792 * x * z;
-    case 8u: return 0.5462742152960396 * (x * x - y * y);
-    case 9u: return -0.5900435899266435 * y * (3.0 * x * x - y * y);
-    case 10u: return 2.890611442640554 * x * y * z;
-    case 11u: return -0.4570457994644658 * y * (4.0 * z * z - x * x - y * y);
-    case 12u: return 0.3731763325901154 * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y);
-    case 13u: return -0.4570457994644658 * x * (4.0 * z * z - x * x - y * y);
-    case 14u: return 1.445305721320277 * z * (x * x - y * y);
-    default: return -0.5900435899266435 * x * (x * x - 3.0 * y * y);
-  }
-}
-
+// Gradient of sh_basis() by the direction.
 vec3 sh_basis_gradient(uint l, vec3 r) {
   float x = r.x, y = r.y, z = r.z;
   switch (l) {

@@ -1,8 +1,7 @@
 // project.glsl - the projection of one replica into one view (mathematics.md 2.5), shared by the forward and the
-// backward pass so that both agree. Needs SplatView, rotation_matrix.
+// backward pass so that both agree. Needs SplatView, inc/gaussian.glsl, parameters[], motions[].
 
-const float kNear = 0.01;     // m; replicas nearer than this are not drawn (mathematics.md 2.5)
-const float kLowPass = 0.3;   // px^2; added to the projected covariance (mathematics.md 2.5)
+#include "chainsplat/image_model.h"
 
 struct Projection {
   vec3 x;            // camera frame, m
@@ -18,7 +17,13 @@ struct Projection {
   vec3 cov;          // xx, xy, yy of Sigma', px^2
 };
 
-Projection project(SplatView view, vec4 row0, vec4 row1, vec4 row2, vec3 mean, vec4 rotation, vec3 log_scale) {
+// Gaussian i of n on a link.
+Projection project(SplatView view, uint n, uint i, uint of_link) {
+  uint motion = 3u * (view.motion + of_link), at = at_mean(n, i), aq = at_rotation(n, i), as = at_log_scale(n, i);
+  vec4 row0 = motions[motion], row1 = motions[motion + 1u], row2 = motions[motion + 2u];
+  vec3 mean = vec3(parameters[at], parameters[at + 1u], parameters[at + 2u]);
+  vec4 rotation = vec4(parameters[aq], parameters[aq + 1u], parameters[aq + 2u], parameters[aq + 3u]);
+  vec3 log_scale = vec3(parameters[as], parameters[as + 1u], parameters[as + 2u]);
   Projection a;
   a.link = transpose(mat3(row0.xyz, row1.xyz, row2.xyz));
   a.x = vec3(dot(row0.xyz, mean) + row0.w, dot(row1.xyz, mean) + row1.w, dot(row2.xyz, mean) + row2.w);

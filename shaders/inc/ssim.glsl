@@ -1,20 +1,19 @@
-// ssim.glsl - the separable 11-tap window of SSIM (mathematics.md 2.7): Gaussian, sigma 1.5, weights normalized to sum
-// 1; and the addressing that its four passes share. A lane filters a strip of kPixels pixels, so that one load serves
-// all of them. Between the passes values are stored tile by tile; tiles without a D-SSIM term count as zero.
-// Needs splat.h, Push p, tile_map[], kTileWidth, kTileHeight.
-const int kReach = 5;
-float window(int offset) {
+// ssim.glsl - the separable window of SSIM (mathematics.md 2.7) and the addressing that its four passes share. A lane
+// filters a strip of kPixels pixels, so that one load serves all of them. Between the passes values are stored tile by
+// tile; tiles without a D-SSIM term count as zero. Needs splat.h, Push p, tile_map[], kTileWidth, kTileHeight.
+#include "chainsplat/image_model.h"
+
+float window(int offset) {  // a switch, because a table indexed by a variable becomes loads from memory
   switch (abs(offset)) {
-    case 0: return 0.266011725;
-    case 1: return 0.213005538;
-    case 2: return 0.10936069;
-    case 3: return 0.0360007721;
-    case 4: return 0.00759875814;
-    case 5: return 0.00102838008;
+    case 0: return kSsimWindow[0];
+    case 1: return kSsimWindow[1];
+    case 2: return kSsimWindow[2];
+    case 3: return kSsimWindow[3];
+    case 4: return kSsimWindow[4];
+    case 5: return kSsimWindow[5];
     default: return 0.0;
   }
 }
-const float kC1 = 0.01 * 0.01, kC2 = 0.03 * 0.03;
 
 // The active tile at a cell of the view's grid, or kNoTile.
 uint active_tile(SplatView view, int x, int y) {

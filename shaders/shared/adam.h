@@ -1,4 +1,4 @@
-// shaders/shared/adam.h - Adam's step sizes for each section of the parameter buffer (inc/gaussian.glsl).
+// shaders/shared/adam.h - Adam's step sizes for each section of the parameter buffer (shared/gaussian.h).
 #ifdef __cplusplus
 #pragma once
 namespace chainsplat::shared {

@@ -4,6 +4,7 @@
 #include <exception>
 #include <functional>
 
+#include "chainsplat/image_model.h"
 #include "image_files.h"
 #include "manifest.h"
 
@@ -13,7 +14,6 @@ using math::Vector2;
 
 namespace {
 
-constexpr std::uint8_t kInside = 128;  // mask values from here on mean the object (formats.md 1.5)
 // Without masks, pixels brighter than this in any channel are the object. Lossy coding does not keep black at 0.
 constexpr std::uint8_t kBlackLossless = 0, kBlackLossy = 16;
 constexpr double kMostCovered = 0.5;  // share of an image; more means that nothing was masked
@@ -33,7 +33,7 @@ Bounds grown(const Bounds& bounds, int margin, int width, int height) {
 // Returns the bounds of the mask's inside pixels; empty where there are none.
 Bounds bounds_of(const std::uint8_t* mask, int width, int height) {
   Bounds bounds{width, height, 0, 0};
-  const auto inside = [](std::uint8_t value) { return value >= kInside; };
+  const auto inside = [](std::uint8_t value) { return value >= image_model::kObjectMask; };
   for (int y = 0; y < height; ++y) {
     const std::uint8_t* const row = mask + static_cast<std::size_t>(y) * width;
     const std::uint8_t* const first = std::find_if(row, row + width, inside);
@@ -105,7 +105,8 @@ void cut_mask(View& view, const Camera& camera, const Pixels& mask, bool undisto
     for (int y = 0; y < height; ++y)
       for (int x = 0; x < width; ++x) {
         const Vector2 position = distort(camera, center(region.x0 + x, region.y0 + y));
-        if (recorded(camera, position) && sample(mask.data(), camera.width, camera.height, 1, 0, position) >= kInside)
+        if (recorded(camera, position) &&
+            sample(mask.data(), camera.width, camera.height, 1, 0, position) >= image_model::kObjectMask)
           straight[static_cast<std::size_t>(y) * width + x] = 255;
       }
     bounds = bounds_of(straight.data(), width, height);
@@ -124,7 +125,7 @@ void cut_mask(View& view, const Camera& camera, const Pixels& mask, bool undisto
       const bool inside =
           undistorting
               ? straight[static_cast<std::size_t>(y - region.y0) * (region.x1 - region.x0) + x - region.x0] != 0
-              : mask[static_cast<std::size_t>(y) * camera.width + x] >= kInside;
+              : mask[static_cast<std::size_t>(y) * camera.width + x] >= image_model::kObjectMask;
       if (inside) view.rgba[4 * (static_cast<std::size_t>(y - crop.y0) * view.width + x - crop.x0) + 3] = 255;
     }
 }

@@ -9,6 +9,7 @@
 #include <numeric>
 
 #include "chainsplat/dynamics/parametrization.h"
+#include "chainsplat/image_model.h"
 #include "src/estimation/color.h"
 #include "src/estimation/start.h"
 
@@ -604,7 +605,6 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
 double tube_iou(const chain::Chain& chain, const Pose& base, const VectorX& theta, const capture::View& view,
                 const capture::Camera& camera) {
   // project the nodes, and bound the tube and the mask
-  constexpr double kNear = 0.01;  // m, mathematics.md 2.5
   const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, base));
   const Pose camera_from_world = camera.world_from_camera.inverse();
   const double focal = 0.5 * (camera.fx + camera.fy);
@@ -616,7 +616,7 @@ double tube_iou(const chain::Chain& chain, const Pose& base, const VectorX& thet
   double x0 = view.x0, y0 = view.y0, x1 = view.x0 + view.width, y1 = view.y0 + view.height;
   for (int i = 0; i < nodes.cols(); ++i) {
     const Vector3 x = camera_from_world * Vector3(nodes.col(i));
-    if (x.z() < kNear) return 0.0;
+    if (x.z() < image_model::kNear) return 0.0;
     points.push_back({capture::project(camera, x), 0.5 * chain.diameter * focal / x.z()});
     x0 = std::min(x0, points.back().pixel.x() - points.back().radius);
     y0 = std::min(y0, points.back().pixel.y() - points.back().radius);

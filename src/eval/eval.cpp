@@ -6,17 +6,17 @@
 #include <limits>
 #include <nlohmann/json.hpp>
 
+#include "chainsplat/image_model.h"
 #include "src/eval/depth_image.h"
 
 namespace chainsplat::eval {
 
+using image_model::kSsimReach;
 using math::MatrixX;
 
 namespace {
 
 constexpr double kNone = std::numeric_limits<double>::quiet_NaN();
-constexpr int kWindow = 5;             // px; reach of SSIM's window
-constexpr std::uint8_t kInMask = 128;  // least mask value of the object
 constexpr float kSolid = 0.5f;         // least 1 - T_end of the object
 constexpr int kCenterlinePoints = 97;  // mathematics.md 9
 constexpr double kSameTime = 1e-6;     // s; times closer than this are equal
@@ -32,8 +32,8 @@ Rectangle compared(const Rectangle& a, const Rectangle& b, const capture::Camera
   Rectangle all = a.empty() ? b : a;
   if (!a.empty() && !b.empty())
     all = {std::min(a.x0, b.x0), std::min(a.y0, b.y0), std::max(a.x1, b.x1), std::max(a.y1, b.y1)};
-  return {std::max(0, all.x0 - kWindow), std::max(0, all.y0 - kWindow), std::min(camera.width, all.x1 + kWindow),
-          std::min(camera.height, all.y1 + kWindow)};
+  return {std::max(0, all.x0 - kSsimReach), std::max(0, all.y0 - kSsimReach),
+          std::min(camera.width, all.x1 + kSsimReach), std::min(camera.height, all.y1 + kSsimReach)};
 }
 
 double psnr(double squared_sum, double count) {
@@ -142,7 +142,7 @@ FrameMetrics compare(const render::Frame& drawn, const capture::View& view, cons
       const std::size_t out = 3 * (static_cast<std::size_t>(width) * (y - area.y0) + x - area.x0);
       const std::size_t v = static_cast<std::size_t>(view.width) * vy + vx,
                         p = static_cast<std::size_t>(picture.width) * py + px;
-      const bool in_mask = in_view && view.rgba[4 * v + 3] >= kInMask;
+      const bool in_mask = in_view && view.rgba[4 * v + 3] >= image_model::kObjectMask;
       const bool solid = in_picture && picture.rgba[4 * p + 3] >= kSolid;
       double difference = 0.0;
       for (int c = 0; c < 3; ++c) {

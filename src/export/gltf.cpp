@@ -8,6 +8,7 @@
 #include <sstream>
 
 #include "chainsplat/export.h"
+#include "chainsplat/image_model.h"
 
 namespace chainsplat::exports {
 
@@ -16,7 +17,6 @@ using math::Vector3;
 namespace {
 
 constexpr const char* kExtension = "KHR_gaussian_splatting";
-constexpr double kSh0 = 0.28209479177387814;  // degree-0 basis function: color = 0.5 + kSh0 * coefficient
 const double kHalfRoot = std::sqrt(0.5);
 
 double sigmoid(double x) { return 1.0 / (1.0 + std::exp(-x)); }
@@ -101,7 +101,7 @@ tinygltf::Primitive primitive(Builder& builder, const splat::Gaussians& g, const
     for (int l = 0; l < coefficients; ++l)
       for (int c = 0; c < 3; ++c) sh[l].push_back(g.sh[3 * (static_cast<std::size_t>(coefficients) * i + l) + c]);
     for (int c = 0; c < 3; ++c) {
-      const double srgb = 0.5 + kSh0 * g.sh[3 * static_cast<std::size_t>(coefficients) * i + c];
+      const double srgb = 0.5 + image_model::kSh0 * g.sh[3 * static_cast<std::size_t>(coefficients) * i + c];
       color.push_back(static_cast<float>(linear_from_srgb(std::clamp(srgb, 0.0, 1.0))));
     }
     color.push_back(opacity.back());

@@ -103,13 +103,9 @@ struct Commands::State {
     for (std::size_t i = 0; i < labels.size(); ++i) {
       const std::uint64_t passed = (ticks[i + 1] - ticks[i]) & device.timestamp_mask;  // right also when it wraps
       const double milliseconds = static_cast<double>(passed) * device.timestamp_period * kMillisecondsANanosecond;
-      const auto same =
-          std::find_if(timings.begin(), timings.end(), [&](const Timing& t) { return t.label == labels[i]; });
-      if (same == timings.end()) {
-        timings.push_back({labels[i], milliseconds});
-      } else {
-        same->milliseconds += milliseconds;
-      }
+      auto same = std::find_if(timings.begin(), timings.end(), [&](const Timing& t) { return t.label == labels[i]; });
+      if (same == timings.end()) same = timings.insert(same, {labels[i], 0.0});
+      same->milliseconds += milliseconds;
     }
   }
 
@@ -134,32 +130,31 @@ struct Commands::State {
     return set;
   }
 
-  void bind(const Pipeline& pipeline, std::span<const Buffer* const> buffers, const void* push,
-            std::size_t push_bytes) {
+  void bind(const Pipeline& pipeline, const void* push, std::size_t push_bytes) {
     const Pipeline::Handles& h = pipeline.handles();
-    CHAINSPLAT_CHECK(buffers.size() == h.buffers, h.name + " takes " + std::to_string(h.buffers) + " buffers, got " +
-                                                      std::to_string(buffers.size()));
     CHAINSPLAT_CHECK(push_bytes == h.push_bytes, h.name + " takes " + std::to_string(h.push_bytes) +
                                                      " bytes of push constants, got " + std::to_string(push_bytes));
     vkCmdBindPipeline(commands, VK_PIPELINE_BIND_POINT_COMPUTE, h.pipeline);
-    if (!buffers.empty()) {
+    if (!h.bindings.empty()) {
       std::array<VkDescriptorBufferInfo, kLeastStorageBuffers> infos{};
       std::array<VkWriteDescriptorSet, kLeastStorageBuffers> writes{};
       const VkDescriptorSet set = h.pushes_descriptors ? VK_NULL_HANDLE : make_set(h.set_layout);
-      for (std::uint32_t i = 0; i < h.buffers; ++i) {
-        CHAINSPLAT_CHECK(buffers[i] && buffers[i]->made(), h.name + ", binding " + std::to_string(i));
-        infos[i] = {buffers[i]->handles().buffer, 0, VK_WHOLE_SIZE};
+      const auto count = static_cast<std::uint32_t>(h.bindings.size());
+      for (std::uint32_t i = 0; i < count; ++i) {
+        const Buffer* const buffer = pipeline.buffer(i);
+        CHAINSPLAT_CHECK(buffer && buffer->made(), "buffer '" + h.bindings[i].buffer + "' of shader '" + h.name + "'");
+        infos[i] = {buffer->handles().buffer, 0, VK_WHOLE_SIZE};
         writes[i] = of_type<VkWriteDescriptorSet>(VK_STRUCTURE_TYPE_WRITE_DESCRIPTOR_SET);
         writes[i].dstSet = set;
-        writes[i].dstBinding = i;
+        writes[i].dstBinding = h.bindings[i].number;
         writes[i].descriptorCount = 1;
         writes[i].descriptorType = VK_DESCRIPTOR_TYPE_STORAGE_BUFFER;
         writes[i].pBufferInfo = &infos[i];
       }
       if (h.pushes_descriptors) {
-        device.push_descriptor_set(commands, VK_PIPELINE_BIND_POINT_COMPUTE, h.layout, 0, h.buffers, writes.data());
+        device.push_descriptor_set(commands, VK_PIPELINE_BIND_POINT_COMPUTE, h.layout, 0, count, writes.data());
       } else {
-        vkUpdateDescriptorSets(device.handle, h.buffers, writes.data(), 0, nullptr);
+        vkUpdateDescriptorSets(device.handle, count, writes.data(), 0, nullptr);
         vkCmdBindDescriptorSets(commands, VK_PIPELINE_BIND_POINT_COMPUTE, h.layout, 0, 1, &set, 0, nullptr);
       }
     }
@@ -197,24 +192,24 @@ void Commands::begin() {
   s.write_timestamp();
 }
 
-void Commands::dispatch(const Pipeline& pipeline, std::span<const Buffer* const> buffers, const void* push,
-                        std::size_t push_bytes, std::uint32_t x, std::uint32_t y, std::uint32_t z) {
+void Commands::dispatch(const Pipeline& pipeline, const void* push, std::size_t push_bytes, std::uint32_t x,
+                        std::uint32_t y, std::uint32_t z) {
   CHAINSPLAT_CHECK(x <= kMostGroups && y <= kMostGroups && z <= kMostGroups,
                    pipeline.handles().name + ": " + std::to_string(x) + " x " + std::to_string(y) + " x " +
                        std::to_string(z) + " groups; at most 65535 an axis, spread them over y");
   state_->before_command();  // also without groups: the next command may skip its own barrier and rely on this one
   if (x == 0 || y == 0 || z == 0) return;
-  state_->bind(pipeline, buffers, push, push_bytes);
+  state_->bind(pipeline, push, push_bytes);
   vkCmdDispatch(state_->commands, x, y, z);
 }
 
-void Commands::dispatch_indirect(const Pipeline& pipeline, std::span<const Buffer* const> buffers, const void* push,
-                                 std::size_t push_bytes, const Buffer& arguments, std::size_t offset) {
+void Commands::dispatch_indirect(const Pipeline& pipeline, const void* push, std::size_t push_bytes,
+                                 const Buffer& arguments, std::size_t offset) {
   CHAINSPLAT_CHECK(offset % 4 == 0 && offset + sizeof(VkDispatchIndirectCommand) <= arguments.bytes(),
                    pipeline.handles().name + ": " + std::to_string(offset) + " of " +
                        std::to_string(arguments.bytes()));
   state_->before_command();
-  state_->bind(pipeline, buffers, push, push_bytes);
+  state_->bind(pipeline, push, push_bytes);
   vkCmdDispatchIndirect(state_->commands, arguments.handles().buffer, offset);
 }
 

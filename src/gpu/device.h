@@ -143,7 +143,12 @@ struct Pipeline::Handles {
   VkPipelineLayout layout = VK_NULL_HANDLE;
   VkPipeline pipeline = VK_NULL_HANDLE;
   std::string name;
-  std::uint32_t buffers = 0, push_bytes = 0;
+  struct Binding {
+    std::uint32_t number = 0;  // in descriptor set 0
+    std::string buffer;        // name of its array
+  };
+  std::vector<Binding> bindings;
+  std::uint32_t push_bytes = 0;
   bool pushes_descriptors = false;
   ~Handles();
 };

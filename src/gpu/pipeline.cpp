@@ -1,4 +1,4 @@
-#include <array>
+#include <algorithm>
 #include <cstdlib>
 #include <cstring>
 #include <system_error>
@@ -93,40 +93,53 @@ Pipeline::Handles::~Handles() {
 
 namespace {
 
-// Whether the kernel declares subgroup operations. Capabilities are the first instructions of a SPIR-V module.
-bool uses_subgroups(std::span<const std::uint32_t> code) {
-  constexpr std::size_t kHeaderWords = 5;
-  constexpr std::uint32_t kOpCapability = 17, kGroupNonUniform = 61, kOperation = 0xffff, kLength = 16;
-  for (std::size_t k = kHeaderWords; k + 1 < code.size() && (code[k] & kOperation) == kOpCapability;
-       k += code[k] >> kLength) {
-    if (code[k + 1] == kGroupNonUniform) return true;
+// What a SPIR-V module declares: whether it has subgroup operations, and its storage buffers by ascending number. The
+// numbers of instructions are those of the SPIR-V specification, section 3.
+struct Interface {
+  bool subgroups = false;
+  std::vector<Pipeline::Handles::Binding> bindings;
+
+  explicit Interface(std::span<const std::uint32_t> code) {
+    constexpr unsigned kHeaderWords = 5, kBinding = 33, kStorageBuffer = 12, kGroupNonUniform = 61;
+    constexpr unsigned kOpMemberName = 6, kOpCapability = 17, kOpTypePointer = 32, kOpVariable = 59, kOpDecorate = 71;
+    std::map<std::uint32_t, const char*> array_of_block;  // name of the only member
+    std::map<std::uint32_t, std::uint32_t> block_of_pointer, number_of_variable;
+    for (std::size_t k = kHeaderWords; k < code.size(); k += code[k] >> 16) {
+      const std::uint32_t *const words = &code[k], operation = words[0] & 0xffff;
+      if (operation == kOpCapability && words[1] == kGroupNonUniform) subgroups = true;
+      if (operation == kOpMemberName) array_of_block[words[1]] = reinterpret_cast<const char*>(words + 3);
+      if (operation == kOpTypePointer) block_of_pointer[words[1]] = words[3];
+      if (operation == kOpDecorate && words[2] == kBinding) number_of_variable[words[1]] = words[3];
+      if (operation == kOpVariable && words[3] == kStorageBuffer)
+        bindings.push_back({number_of_variable.at(words[2]), array_of_block.at(block_of_pointer.at(words[1]))});
+    }
+    std::sort(bindings.begin(), bindings.end(), [](const auto& a, const auto& b) { return a.number < b.number; });
   }
-  return false;
-}
+};
 
 // Throws like the constructor of Pipeline.
-std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std::string& name, int buffers,
-                                                      std::size_t push_bytes,
+std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std::string& name, std::size_t push_bytes,
                                                       const std::vector<std::uint32_t>& constants) {
+  const std::span<const std::uint32_t> code = shader_code(name);
+  const Interface interface(code);
   auto handles = std::make_shared<Pipeline::Handles>();
   Pipeline::Handles& h = *handles;
   h.device = &device;
   CHAINSPLAT_CHECK(push_bytes <= kMostPushBytes && push_bytes % 4 == 0, name + ": " + std::to_string(push_bytes));
-  CHAINSPLAT_CHECK(buffers >= 0 && buffers <= static_cast<int>(kLeastStorageBuffers),
-                   name + ": " + std::to_string(buffers));
+  CHAINSPLAT_CHECK(interface.bindings.size() <= kLeastStorageBuffers,
+                   name + ": " + std::to_string(interface.bindings.size()));
   h.name = name;
-  h.buffers = static_cast<std::uint32_t>(buffers);
+  h.bindings = interface.bindings;
   h.push_bytes = static_cast<std::uint32_t>(push_bytes);
-  h.pushes_descriptors = device.push_descriptors >= h.buffers && device.push_descriptor_set;
+  h.pushes_descriptors = device.push_descriptors >= h.bindings.size() && device.push_descriptor_set;
 
   // layout: storage buffers of set 0 and push constants
-  std::array<VkDescriptorSetLayoutBinding, kLeastStorageBuffers> bindings{};
-  for (std::uint32_t i = 0; i < h.buffers; ++i) {
-    bindings[i] = {i, VK_DESCRIPTOR_TYPE_STORAGE_BUFFER, 1, VK_SHADER_STAGE_COMPUTE_BIT, nullptr};
-  }
+  std::vector<VkDescriptorSetLayoutBinding> bindings;
+  for (const Pipeline::Handles::Binding& binding : h.bindings)
+    bindings.push_back({binding.number, VK_DESCRIPTOR_TYPE_STORAGE_BUFFER, 1, VK_SHADER_STAGE_COMPUTE_BIT, nullptr});
   auto set = of_type<VkDescriptorSetLayoutCreateInfo>(VK_STRUCTURE_TYPE_DESCRIPTOR_SET_LAYOUT_CREATE_INFO);
   set.flags = h.pushes_descriptors ? VK_DESCRIPTOR_SET_LAYOUT_CREATE_PUSH_DESCRIPTOR_BIT_KHR : 0;
-  set.bindingCount = h.buffers;
+  set.bindingCount = static_cast<std::uint32_t>(bindings.size());
   set.pBindings = bindings.data();
   device.check(vkCreateDescriptorSetLayout(device.handle, &set, nullptr, &h.set_layout), "make a descriptor layout");
 
@@ -140,16 +153,14 @@ std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std:
 
   // specialization constants and SPIR-V
   std::vector<VkSpecializationMapEntry> entries;
-  for (std::uint32_t i = 0; i < constants.size(); ++i) {
+  for (std::uint32_t i = 0; i < constants.size(); ++i)
     entries.push_back({i, i * static_cast<std::uint32_t>(sizeof(std::uint32_t)), sizeof(std::uint32_t)});
-  }
   VkSpecializationInfo specialization{};
   specialization.mapEntryCount = static_cast<std::uint32_t>(entries.size());
   specialization.pMapEntries = entries.data();
   specialization.dataSize = constants.size() * sizeof(std::uint32_t);
   specialization.pData = constants.data();
 
-  const std::span<const std::uint32_t> code = shader_code(name);
   auto module_create = of_type<VkShaderModuleCreateInfo>(VK_STRUCTURE_TYPE_SHADER_MODULE_CREATE_INFO);
   module_create.codeSize = code.size_bytes();
   module_create.pCode = code.data();
@@ -165,7 +176,7 @@ std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std:
   // Kernels address other lanes of their subgroup by number, and constant 0 is the size of their work group. Vulkan
   // guarantees a numbering without gaps only for full subgroups, which can be required only of a work group that is
   // made of whole ones. Smaller work groups rely on the driver: all known ones number their lanes from 0.
-  if (device.full_subgroups && uses_subgroups(code) && !constants.empty() && constants[0] % device.subgroups.whole == 0)
+  if (device.full_subgroups && interface.subgroups && !constants.empty() && constants[0] % device.subgroups.whole == 0)
     create.stage.flags = VK_PIPELINE_SHADER_STAGE_CREATE_REQUIRE_FULL_SUBGROUPS_BIT;
   create.stage.stage = VK_SHADER_STAGE_COMPUTE_BIT;
   create.stage.module = module;
@@ -183,14 +194,33 @@ std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std:
 
 }  // namespace
 
-Pipeline::Pipeline(Device& device, const std::string& name, int buffers, std::size_t push_bytes,
-                   const std::vector<std::uint32_t>& constants) {
-  std::string key = name + ' ' + std::to_string(buffers) + ' ' + std::to_string(push_bytes);
+Bindings::Bindings(std::initializer_list<std::pair<const std::string, const Buffer*>> buffers)
+    : buffers_(std::make_shared<Table>(buffers)) {}
+
+const Buffer* const* Bindings::find(std::string_view name) const {
+  const auto found = buffers_->find(name);
+  return found == buffers_->end() ? nullptr : &found->second;
+}
+
+void Bindings::set(std::string_view name, const Buffer& buffer) {
+  const auto found = buffers_->find(name);
+  CHAINSPLAT_CHECK(found != buffers_->end(), "there is no buffer '" + std::string(name) + "'");
+  found->second = &buffer;
+}
+
+Pipeline::Pipeline(Device& device, const std::string& name, const Bindings& bindings, std::size_t push_bytes,
+                   const std::vector<std::uint32_t>& constants)
+    : bindings_(bindings) {
+  std::string key = name + ' ' + std::to_string(push_bytes);
   for (const std::uint32_t constant : constants) key += ' ' + std::to_string(constant);
   const std::lock_guard lock(device.pipelines_mutex);
   std::shared_ptr<const Handles>& shared = device.pipelines[key];
-  if (!shared) shared = make_handles(device, name, buffers, push_bytes, constants);
+  if (!shared) shared = make_handles(device, name, push_bytes, constants);
   handles_ = shared;
+  for (const Handles::Binding& binding : handles_->bindings) {
+    places_.push_back(bindings_.find(binding.buffer));
+    CHAINSPLAT_CHECK(places_.back(), "shader '" + name + "' declares '" + binding.buffer + "', which is not bound");
+  }
 }
 
 Pipeline::Pipeline() = default;

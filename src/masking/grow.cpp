@@ -4,6 +4,7 @@
 #include <array>
 #include <cmath>
 
+#include "chainsplat/image_model.h"
 #include "src/masking/look.h"
 
 namespace chainsplat::masking {
@@ -25,7 +26,6 @@ constexpr double kSpacing = 0.5;                                   // radii betw
 constexpr int kMostStations = 256;        // but no more stations than this, so that a thin rope is sampled sparsely
 constexpr double kHiddenByGripper = 1.0;  // diameters of rope at the grasp that are not sampled
 constexpr double kSeenFromSide = 0.3;     // share of a link's length; one that appears shorter shows no sides
-constexpr double kNearest = 0.01;         // m, the nearest depth in front of a camera (mathematics.md 2.5)
 // the beam search over the joints' angles, and its refinement
 constexpr int kBeam = 48;          // number of ropes that are kept per link
 constexpr double kSameTip = 0.25;  // diameters; of ropes whose tips are nearer than this only the best is kept
@@ -89,7 +89,7 @@ struct Search {
     const Vector3 step = shot.camera_from_base.rotation * along;
     const double length = end - begin;
     const Vector3 b = a + length * step;
-    if (a.z() < kNearest || b.z() < kNearest) return;
+    if (a.z() < image_model::kNear || b.z() < image_model::kNear) return;
     const Vector2 in_picture = capture::project(*shot.camera, b) - capture::project(*shot.camera, a);
     const double long_enough = kSeenFromSide * length * shot.camera->fx / a.z();
     if (in_picture.norm() < long_enough) return;

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "chainsplat/image_model.h"
+
 namespace chainsplat::masking {
 
 using math::Vector2;
@@ -13,7 +15,6 @@ namespace {
 constexpr double kSpacing = 0.003;  // m along the rope between the tube's samples, well below usual ropes' radius,
 constexpr int kMostSamples = 4096;  // but no more samples than this in all, which bounds ropes longer than 12 m,
 constexpr double kNotBelow = 0.05;  // and at least this many diameters apart, because each visits all pixels around it
-constexpr double kNearest = 0.01;   // m, the nearest depth in front of a camera (mathematics.md 2.5)
 
 struct Sample {
   Vector2 at;        // px
@@ -42,7 +43,7 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
   double x0 = 1e9, y0 = 1e9, x1 = -1e9, y1 = -1e9;
   for (int i = 0; i < count; ++i) {
     const Vector3 p = camera_from_world * Vector3(line.col(i));
-    if (p.z() < kNearest) continue;
+    if (p.z() < image_model::kNear) continue;
     const Sample s{capture::project(camera, p), 0.25 * chain.diameter * (camera.fx + camera.fy) / p.z(), arclengths[i]};
     const double around = s.radius + reach + 1.0;
     x0 = std::min(x0, s.at.x() - around), x1 = std::max(x1, s.at.x() + around);

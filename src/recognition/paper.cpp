@@ -5,6 +5,7 @@
 #include <cmath>
 #include <numeric>
 
+#include "chainsplat/image_model.h"
 #include "src/recognition/checkpoint.h"
 #include "src/recognition/modes.h"
 #include "src/recognition/step_watch.h"
@@ -13,7 +14,6 @@ namespace chainsplat::recognition {
 
 namespace {
 
-constexpr double kSh0 = 0.28209479177387814;
 constexpr int kOpacityReset = 3000, kLastOpacityReset = 12000;  // iterations
 constexpr float kResetOpacity = 0.01f;
 constexpr int kLinkResets[] = {1500, 4500, 7500, 10500};
@@ -64,7 +64,7 @@ void hull_bounds(const capture::Capture& capture, const std::vector<FrameViews>&
           for (int dx = -reach; dx <= reach && !any; dx += reach) {
             const int px = cx + dx, py = cy + dy;
             any = px >= 0 && py >= 0 && px < view.width && py < view.height &&
-                  view.rgba[4 * (static_cast<std::size_t>(py) * view.width + px) + 3] >= 128;
+                  view.rgba[4 * (static_cast<std::size_t>(py) * view.width + px) + 3] >= image_model::kObjectMask;
           }
         }
         if (!any) {
@@ -175,7 +175,7 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
       for (int c = 0; c < 3; ++c) {
         g.mean[3 * i + c] = static_cast<float>(random.uniform(low[c], high[c]));
         g.log_scale[3 * i + c] = static_cast<float>(std::log(spacing));
-        g.sh[3 * i + c] = static_cast<float>(random.normal() / 255.0 / kSh0);
+        g.sh[3 * i + c] = static_cast<float>(random.normal() / 255.0 / image_model::kSh0);
       }
       g.opacity_logit[i] = kStartOpacityLogit;
     }

@@ -4,11 +4,12 @@
 #include <cmath>
 #include <numbers>
 
+#include "chainsplat/image_model.h"
+
 namespace chainsplat::recognition {
 
 namespace {
 
-constexpr double kSh0 = 0.28209479177387814;  // degree-0 basis: color = 0.5 + kSh0 * coefficient
 constexpr float kOwnLinkLogit = 12.0f;        // softmax of 12 against zeros: other links below 1/255 by far
 constexpr double kShell = 0.75;         // of the radius, where Gaussians start: most of what is seen is the surface
 constexpr double kCoverage = 0.55;      // sigma in units of the spacing on the shell: neighbors overlap
@@ -22,7 +23,7 @@ void set_gaussian(splat::Gaussians& g, int i, const math::Vector3& mean, double 
   for (int c = 0; c < 3; ++c) {
     g.mean[3 * i + c] = static_cast<float>(mean[c]);
     g.log_scale[3 * i + c] = static_cast<float>(std::log(sigma));
-    g.sh[3 * g.sh_coefficients() * i + c] = static_cast<float>((color[c] - 0.5) / kSh0);
+    g.sh[3 * g.sh_coefficients() * i + c] = static_cast<float>((color[c] - 0.5) / image_model::kSh0);
   }
   g.opacity_logit[i] = opacity;
   for (int j = 0; j < g.links; ++j) g.link_logits[g.links * i + j] = j == link ? kOwnLinkLogit : 0.0f;
@@ -34,7 +35,7 @@ bool sample(const capture::View& view, const math::Vector2& image_pixel, math::V
   const int y = static_cast<int>(std::floor(image_pixel.y())) - view.y0;
   if (x < 0 || y < 0 || x >= view.width || y >= view.height) return false;
   const std::uint8_t* p = &view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x)];
-  if (p[3] < 128) return false;
+  if (p[3] < image_model::kObjectMask) return false;
   color = math::Vector3(p[0], p[1], p[2]) / 255.0;
   return true;
 }
@@ -131,7 +132,7 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
     const capture::View& view = *drawn[d].view;
     const splat::Picture& picture = *drawn[d].picture;
     for (int k = 0; k < view.width * view.height; ++k) {
-      if (view.rgba[4 * k + 3] < 128) continue;
+      if (view.rgba[4 * k + 3] < image_model::kObjectMask) continue;
       double error = std::pow(1.0 - picture.rgba[4 * k + 3], 2);
       for (int c = 0; c < 3; ++c) error += std::pow(picture.rgba[4 * k + c] - view.rgba[4 * k + c] / 255.0, 2);
       constexpr double kNoise =

@@ -3,22 +3,19 @@
 #include <cmath>
 #include <limits>
 
+#include "chainsplat/image_model.h"
 #include "chainsplat/render.h"
 
 namespace chainsplat::render {
 
+using namespace image_model;
 using math::Matrix3;
 using math::Vector2;
 using math::Vector3;
 
 namespace {
 
-// as in shaders/inc/project.glsl and inc/alpha.glsl
-constexpr double kNear = 0.01;             // m; replicas nearer than this are not drawn
-constexpr double kLowPass = 0.3;           // px^2; added to the projected covariance
-constexpr double kClamp = 1.3;             // multiple of the half image at which the projection's Jacobian is clamped
-constexpr double kLeastAlpha = 1.0 / 255;  // splats of a lower alpha are not drawn
-constexpr double kFar = 1e6;               // px; keeps very large bounds in the range of int
+constexpr double kFar = 1e6;  // px; keeps very large bounds in the range of int
 
 }  // namespace
 
@@ -27,7 +24,8 @@ Bounds reach(const splat::Gaussians& g, const std::vector<math::Pose>& motions, 
   const math::Pose camera_from_world = camera.world_from_camera.inverse();
   std::vector<math::Pose> camera_from_home;
   for (const math::Pose& motion : motions) camera_from_home.push_back(camera_from_world * motion);
-  const double limit_x = kClamp * 0.5 * camera.width / camera.fx, limit_y = kClamp * 0.5 * camera.height / camera.fy;
+  const double limit_x = kClampMargin * 0.5 * camera.width / camera.fx;
+  const double limit_y = kClampMargin * 0.5 * camera.height / camera.fy;
   constexpr double kInfinity = std::numeric_limits<double>::infinity();
   Vector2 low(kInfinity, kInfinity), high(-kInfinity, -kInfinity);
   std::vector<double> rho(g.links);

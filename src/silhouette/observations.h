@@ -2,11 +2,13 @@
 #pragma once
 #include <vector>
 
+#include "chainsplat/image_model.h"
 #include "src/silhouette/frame.h"
 
 namespace chainsplat::silhouette {
 
-constexpr double kNear = 0.01;        // m, nothing nearer than this is in front of a camera (mathematics.md 2.5)
+using image_model::kNear;
+
 constexpr double kLargestCut = 12.0;  // px, no outline point farther from the tube counts
 
 using Vector9 = Eigen::Matrix<double, 9, 1>;

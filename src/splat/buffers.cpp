@@ -17,37 +17,23 @@ void Engine::State::need(Buffer& buffer, std::size_t bytes, const char* name) {
 
 void Engine::State::release_view_buffers() {
   commands.wait();
-  for (Buffer* buffer :
-       {&views,           &motions,        &tile_map,      &tiles,        &splats,     &instance_count, &tile_hits,
-        &instance_prefix, &instance_block, &records,       &link_twists,  &tile_count, &tile_prefix,    &tile_block,
-        &tile_cursor,     &tile_used,      &tile_loss,     &entries,      &sorted,     &partials,       &image,
-        &depth_image,     &pixel_gradient, &ssim_row_sums, &ssim_factors, &long_tiles, &sort_scratch,   &color_views,
-        &segments,        &tile_pixels,    &tile_summary,  &pixel_sums,   &link_sums})
-    *buffer = Buffer();
+#define ADDRESS(buffer) &buffer,
+  for (Buffer* buffer : {VIEW_BUFFERS(ADDRESS)}) *buffer = Buffer();
   instance_capacity = 0;
 }
 
-void Engine::State::write(Buffer& buffer, const void* data, std::size_t bytes, const char* name) {
-  need(buffer, bytes, name);
-  if (bytes == 0) return;
-  if (buffer.mapped()) {
-    std::memcpy(buffer.mapped(), data, bytes);
-  } else {
-    gpu::upload(device, buffer, data, bytes);
-  }
+void Engine::State::write(Buffer& buffer, std::span<const std::byte> data, const char* name) {
+  need(buffer, data.size(), name);
+  gpu::upload(device, buffer, data.data(), data.size());
 }
 
-void Engine::State::stage(Buffer& buffer, const void* data, std::size_t bytes, const char* name) {
-  need(buffer, bytes, name);
-  if (buffer.mapped()) {
-    if (bytes > 0) std::memcpy(buffer.mapped(), data, bytes);
-    return;
-  }
+void Engine::State::stage(Buffer& buffer, std::span<const std::byte> data, const char* name) {
+  need(buffer, data.size(), name);
+  if (buffer.mapped()) return gpu::upload(device, buffer, data.data(), data.size());
   const auto same = std::find_if(uploads.begin(), uploads.end(), [&](const Upload& u) { return u.to == &buffer; });
   Upload& upload = same != uploads.end() ? *same : uploads.emplace_back();
-  const auto* const first = static_cast<const std::byte*>(data);
   upload.to = &buffer;
-  upload.data.assign(first, first + bytes);
+  upload.data.assign(data.begin(), data.end());
 }
 
 void Engine::State::record_uploads() {
@@ -81,8 +67,8 @@ void Engine::State::set_tile_capacity(std::uint32_t capacity) {
   std::vector<std::uint32_t> starts(kListEntries / capacity + 1);
   for (std::size_t tile = 0; tile < starts.size(); ++tile) starts[tile] = static_cast<std::uint32_t>(tile * capacity);
   const std::vector<std::uint32_t> blocks(starts.size() / shared::kScanBlock + 1, 0);
-  write(list_starts, starts.data(), starts.size() * sizeof(std::uint32_t), "list starts");
-  write(list_blocks, blocks.data(), blocks.size() * sizeof(std::uint32_t), "list blocks");
+  write(list_starts, bytes_of(starts), "list starts");
+  write(list_blocks, bytes_of(blocks), "list blocks");
 }
 
 }  // namespace chainsplat::splat

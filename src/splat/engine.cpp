@@ -4,18 +4,18 @@
 #include <cmath>
 #include <numeric>
 
+#include "chainsplat/image_model.h"
 #include "src/splat/engine.h"
 
 namespace chainsplat::splat {
 
 namespace {
 
-constexpr double kClampMargin = 1.3;  // multiple of the half image at which the projection's Jacobian is clamped (3DGS)
 constexpr float kBeta1 = 0.9f, kBeta2 = 0.999f, kEpsilon = 1e-15f;  // Adam, as in 3DGS
 
 std::vector<int> everything(std::size_t count) {
   std::vector<int> all(count);
-  for (std::size_t k = 0; k < count; ++k) all[k] = static_cast<int>(k);
+  std::iota(all.begin(), all.end(), 0);
   return all;
 }
 
@@ -42,46 +42,52 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   tile_width = tile_height = static_cast<std::uint32_t>(tile);
   pixels_per_lane = static_cast<std::uint32_t>(pixels);
   const TileLanes laid_out = tile_lanes(tile_width, pixels_per_lane, device_info.subgroup_size, device_info.software);
-  const std::uint32_t lanes = laid_out.lanes, share = laid_out.share;
+  const std::uint32_t lanes = laid_out.lanes, share = laid_out.share, color_lanes = laid_out.color_lanes;
   slots = laid_out.slots;
-  cutoffs = settings.exact_cutoffs;
   constexpr double kNoClamp = 1e6;
-  clamp_margin = settings.projection_clamp ? kClampMargin : kNoClamp;
+  clamp_margin = settings.projection_clamp ? image_model::kClampMargin : kNoClamp;
   range_limit = static_cast<std::size_t>(std::min<std::uint64_t>(device_info.max_storage_range, 1ull << 30));
 
+#define NAMED(buffer) {#buffer, &buffer},
+  // clang-format off
+  bindings = {REPLICA_BUFFERS(NAMED) VIEW_BUFFERS(NAMED)  // and those that bind() and scan() set
+              {"parameters", nullptr}, {"gradient", nullptr},
+              {"first_moment", nullptr}, {"second_moment", nullptr}, {"target", nullptr},
+              {"values", nullptr}, {"prefix", nullptr}, {"block_sum", nullptr}};
+  // clang-format on
+
   // pipelines: splats, then losses, then colors
-  const std::uint32_t cut = cutoffs ? 1 : 0;
-  const std::size_t push = sizeof(SplatPush);
-  replicate = gpu::Pipeline(d, "splat_replicate", 3, push, {cut});
-  compact = gpu::Pipeline(d, "splat_compact", 4, push, {});
-  scan_block = gpu::Pipeline(d, "scan_block", 4, push, {});
-  scan_sums = gpu::Pipeline(d, "scan_sums", 2, push, {});
-  project = gpu::Pipeline(d, "splat_project", 12, push, {cut, tile_width, tile_height});
-  bin = gpu::Pipeline(d, "splat_bin", 12, push, {});
-  sort = gpu::Pipeline(d, "splat_sort", 7, push, {laid_out.sort_lanes, laid_out.rank_limit, laid_out.sort_share});
-  sort_long = gpu::Pipeline(d, "splat_sort_long", 7, push, {laid_out.sort_lanes});
-  blend = gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 0, share});
-  blend_depth =
-      gpu::Pipeline(d, "splat_blend", 11, push, {lanes, tile_width, tile_height, pixels_per_lane, cut, 1, share});
-  blend_backward = gpu::Pipeline(d, "splat_blend_backward", 13, push,
-                                 {lanes, tile_width, tile_height, pixels_per_lane, cut, laid_out.subgroup, share});
-  project_backward = gpu::Pipeline(d, "splat_project_backward", 11, push, {});
-  gather = gpu::Pipeline(d, "splat_gather", 11, push, {});
-  link_twist = gpu::Pipeline(d, "splat_link_twist", 5, push, {});
-  adam = gpu::Pipeline(d, "splat_adam", 5, sizeof(AdamPush), {});
-  const std::vector<std::uint32_t> tile_constants{laid_out.sort_lanes, tile_width, tile_height};
-  loss_pixel = gpu::Pipeline(d, "loss_pixel", 5, push, tile_constants);
-  const std::vector<std::uint32_t> strip_constants{lanes, tile_width, tile_height, pixels_per_lane};
-  ssim_rows = gpu::Pipeline(d, "ssim_rows", 6, push, strip_constants);
-  ssim_columns = gpu::Pipeline(d, "ssim_columns", 6, push, strip_constants);
-  ssim_rows_backward = gpu::Pipeline(d, "ssim_rows_backward", 5, push, strip_constants);
-  ssim_columns_backward = gpu::Pipeline(d, "ssim_columns_backward", 7, push, strip_constants);
-  const std::uint32_t color_lanes = laid_out.color_lanes;
-  color_pixels = gpu::Pipeline(
-      d, "color_pixels", 10, sizeof(ColorPush),
-      {color_lanes, tile_width, tile_height, color_lanes, laid_out.color_columns, laid_out.color_rows});
-  color_equations =
-      gpu::Pipeline(d, "color_equations", 11, sizeof(ColorPush), {color_lanes, tile_width, tile_height, color_lanes});
+  const auto pass = [&](const char* shader, const std::vector<std::uint32_t>& constants,
+                        std::size_t push_bytes = sizeof(SplatPush)) {
+    return gpu::Pipeline(d, shader, bindings, push_bytes, constants);
+  };
+  const std::uint32_t cut = settings.exact_cutoffs ? 1 : 0;
+  replicate = pass("splat_replicate", {cut});
+  compact = pass("splat_compact", {});
+  scan_block = pass("scan_block", {});
+  scan_sums = pass("scan_sums", {});
+  project = pass("splat_project", {cut, tile_width, tile_height});
+  bin = pass("splat_bin", {});
+  sort = pass("splat_sort", {laid_out.sort_lanes, laid_out.rank_limit, laid_out.sort_share});
+  sort_long = pass("splat_sort_long", {laid_out.sort_lanes});
+  blend = pass("splat_blend", {lanes, tile_width, tile_height, pixels_per_lane, cut, 0, share});
+  blend_depth = pass("splat_blend", {lanes, tile_width, tile_height, pixels_per_lane, cut, 1, share});
+  blend_backward =
+      pass("splat_blend_backward", {lanes, tile_width, tile_height, pixels_per_lane, cut, laid_out.subgroup, share});
+  project_backward = pass("splat_project_backward", {});
+  gather = pass("splat_gather", {});
+  link_twist = pass("splat_link_twist", {});
+  adam = pass("splat_adam", {}, sizeof(AdamPush));
+  loss_pixel = pass("loss_pixel", {laid_out.sort_lanes, tile_width, tile_height});
+  const std::vector<std::uint32_t> strips{lanes, tile_width, tile_height, pixels_per_lane};
+  ssim_rows = pass("ssim_rows", strips);
+  ssim_columns = pass("ssim_columns", strips);
+  ssim_rows_backward = pass("ssim_rows_backward", strips);
+  ssim_columns_backward = pass("ssim_columns_backward", strips);
+  color_pixels = pass("color_pixels",
+                      {color_lanes, tile_width, tile_height, color_lanes, laid_out.color_columns, laid_out.color_rows},
+                      sizeof(ColorPush));
+  color_equations = pass("color_equations", {color_lanes, tile_width, tile_height, color_lanes}, sizeof(ColorPush));
   need(counters, shared::kCounters * sizeof(std::uint32_t), "counters");
 }
 
@@ -113,6 +119,16 @@ void Engine::State::run_all(Scene& scene, std::span<const int> batch, const RunO
   }
 }
 
+std::vector<Picture> Engine::State::draw(Scene& scene, std::span<const int> batch, bool depth) {
+  RunOptions options;
+  options.depth = depth;
+  std::vector<Picture> out;
+  run_all(scene, batch, options, nullptr, [&](std::span<const int> chunk, std::size_t) {
+    for (Picture& picture : pictures(scene, chunk, depth)) out.push_back(std::move(picture));
+  });
+  return out;
+}
+
 Engine::Engine(gpu::Device& device, const Settings& settings) : state_(std::make_unique<State>(device, settings)) {}
 Engine::~Engine() = default;
 Engine::Engine(Engine&&) noexcept = default;
@@ -121,13 +137,7 @@ std::vector<Picture> Engine::draw(const Gaussians& gaussians, std::span<const Vi
   State& s = *state_;
   s.load_gaussians(s.scratch, gaussians);
   s.load_views(s.scratch, views, {}, Active::everywhere);
-  RunOptions options;
-  options.depth = depth;
-  std::vector<Picture> out;
-  s.run_all(s.scratch, everything(views.size()), options, nullptr, [&](std::span<const int> chunk, std::size_t) {
-    for (Picture& picture : s.pictures(s.scratch, chunk, depth)) out.push_back(std::move(picture));
-  });
-  return out;
+  return s.draw(s.scratch, everything(views.size()), depth);
 }
 
 LossValues Engine::loss(const Gaussians& gaussians, std::span<const ViewSpec> views,
@@ -137,12 +147,7 @@ LossValues Engine::loss(const Gaussians& gaussians, std::span<const ViewSpec> vi
   s.load_gaussians(s.scratch, gaussians);
   s.load_views(s.scratch, views, targets, Active::everywhere);
   LossValues values;
-  if (gradients) {
-    gradients->gaussians = unpacked(std::vector<float>(s.scratch.parameter_count, 0.0f), gaussians.count,
-                                    gaussians.links, gaussians.degree);
-    std::fill(gradients->gaussians.rotation.begin(), gradients->gaussians.rotation.end(), 0.0f);
-    gradients->link_twists.clear();
-  }
+  if (gradients) gradients->link_twists.clear();
   // the means of crops of different sizes have different normalizers: one run per normalizer, summed here
   std::vector<float> total(s.scratch.parameter_count, 0.0f), part(s.scratch.parameter_count);
   const auto run_batch = [&](std::span<const int> batch, double pixels) {
@@ -188,18 +193,13 @@ void Engine::set_motions(int view, const std::vector<math::Pose>& motions) {
 }
 
 void Engine::set_gaussians(const Gaussians& gaussians) {
-  State& s = *state_;
-  s.load_gaussians(s.training, gaussians);
-  const std::vector<float> zero(s.training.parameter_count, 0.0f);
-  s.write(s.training.first_moment, zero.data(), zero.size() * sizeof(float), "first moment");
-  s.write(s.training.second_moment, zero.data(), zero.size() * sizeof(float), "second moment");
+  const std::vector<float> zeros(packed(gaussians).size(), 0.0f);
+  restore({gaussians, zeros, zeros, 0});
 }
 
 Gaussians Engine::gaussians() const {
   const Scene& scene = state_->training;
-  std::vector<float> all(scene.parameter_count);
-  if (!all.empty()) gpu::download(state_->device, scene.parameters, all.data(), all.size() * sizeof(float));
-  return unpacked(all, scene.count, scene.links, scene.degree);
+  return unpacked(state_->trained(scene.parameters), scene.count, scene.links, scene.degree);
 }
 
 LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, const AdamRates& rates,
@@ -222,8 +222,7 @@ LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, 
   push.gaussians = static_cast<std::uint32_t>(scene.count);
   push.links = static_cast<std::uint32_t>(scene.links);
   push.coefficients = static_cast<std::uint32_t>(scene.coefficients());
-  push.total = static_cast<std::uint32_t>(
-      scene.parameter_count - (options.held_links ? scene.count * static_cast<std::size_t>(scene.links) : 0));
+  push.total = shared::at_link(push.gaussians, push.coefficients, push.links, options.held_links ? 0 : push.gaussians);
   push.mean = rates.mean;
   push.rotation = rates.rotation;
   push.log_scale = rates.log_scale;
@@ -248,14 +247,7 @@ LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, 
 }
 
 std::vector<Picture> Engine::draw_views(std::span<const int> batch, bool depth) {
-  State& s = *state_;
-  RunOptions options;
-  options.depth = depth;
-  std::vector<Picture> out;
-  s.run_all(s.training, batch, options, nullptr, [&](std::span<const int> chunk, std::size_t) {
-    for (Picture& picture : s.pictures(s.training, chunk, depth)) out.push_back(std::move(picture));
-  });
-  return out;
+  return state_->draw(state_->training, batch, depth);
 }
 
 std::vector<ColorSums> Engine::color_sums(const chain::Chain& chain, std::span<const ViewSpec> views,
@@ -276,15 +268,7 @@ std::vector<ColorSums> Engine::color_sums(const chain::Chain& chain, std::span<c
 
 Engine::Snapshot Engine::snapshot() const {
   const Scene& scene = state_->training;
-  Snapshot out;
-  out.gaussians = gaussians();
-  out.step = scene.step;
-  for (const auto& [buffer, values] :
-       {std::pair{&scene.first_moment, &out.first_moment}, std::pair{&scene.second_moment, &out.second_moment}}) {
-    values->resize(scene.parameter_count);
-    if (!values->empty()) gpu::download(state_->device, *buffer, values->data(), values->size() * sizeof(float));
-  }
-  return out;
+  return {gaussians(), state_->trained(scene.first_moment), state_->trained(scene.second_moment), scene.step};
 }
 
 void Engine::restore(const Snapshot& snapshot) {
@@ -292,10 +276,8 @@ void Engine::restore(const Snapshot& snapshot) {
   s.load_gaussians(s.training, snapshot.gaussians);
   CHAINSPLAT_CHECK(snapshot.first_moment.size() == s.training.parameter_count,
                    std::to_string(snapshot.first_moment.size()));
-  s.write(s.training.first_moment, snapshot.first_moment.data(), snapshot.first_moment.size() * sizeof(float),
-          "first moment");
-  s.write(s.training.second_moment, snapshot.second_moment.data(), snapshot.second_moment.size() * sizeof(float),
-          "second moment");
+  s.write(s.training.first_moment, bytes_of(snapshot.first_moment), "first moment");
+  s.write(s.training.second_moment, bytes_of(snapshot.second_moment), "second moment");
   s.training.step = snapshot.step;
 }
 
@@ -303,9 +285,9 @@ void Engine::reset_opacity(float largest) {
   Snapshot now = snapshot();
   const float logit = std::log(largest / (1.0f - largest));
   for (float& value : now.gaussians.opacity_logit) value = std::min(value, logit);
-  const std::size_t first = 10u * now.gaussians.count;
+  const auto count = static_cast<std::uint32_t>(now.gaussians.count);
   for (auto* moment : {&now.first_moment, &now.second_moment})
-    std::fill_n(moment->begin() + first, now.gaussians.count, 0.0f);
+    std::fill_n(moment->begin() + shared::at_opacity(count, 0), count, 0.0f);
   restore(now);
 }
 

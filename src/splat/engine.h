@@ -6,12 +6,12 @@
 #include <algorithm>
 #include <cstddef>
 #include <functional>
-#include <initializer_list>
 #include <utility>
 
 #include "chainsplat/splat.h"
 #include "shaders/shared/adam.h"
 #include "shaders/shared/color.h"
+#include "shaders/shared/gaussian.h"
 #include "shaders/shared/splat.h"
 
 namespace chainsplat::splat {
@@ -82,7 +82,6 @@ struct Scene {
   Buffer parameters, gradient, first_moment, second_moment, target;
   std::vector<SceneView> views;
   std::size_t parameter_count = 0;
-  std::size_t target_pixels = 0;
   double normalizer = 1.0;
   int step = 0;
   std::uint64_t version = 0;  // of the parameters, unique among all scenes of an engine
@@ -121,14 +120,30 @@ struct Submission {
   SplatPush push{};
 };
 
-// Parameters as one array, in the order of the device's buffer (inc/gaussian.glsl), and back.
+// Calls visit(values, first) for each kind of parameter: its floats, and where they begin in the device's buffer.
+template <class G, class Visit>
+void each_section(G& g, const Visit& visit) {
+  const auto n = static_cast<std::uint32_t>(g.count), coefficients = static_cast<std::uint32_t>(g.sh_coefficients());
+  visit(g.mean, shared::at_mean(n, 0));
+  visit(g.rotation, shared::at_rotation(n, 0));
+  visit(g.log_scale, shared::at_log_scale(n, 0));
+  visit(g.opacity_logit, shared::at_opacity(n, 0));
+  visit(g.sh, shared::at_sh(n, coefficients, 0));
+  visit(g.link_logits, shared::at_link(n, coefficients, static_cast<std::uint32_t>(g.links), 0));
+}
+
+// Parameters as one array, as in the device's buffer (shared/gaussian.h), and back.
 std::vector<float> packed(const Gaussians& gaussians);
 Gaussians unpacked(const std::vector<float>& all, int count, int links, int degree);
+
+template <class T>
+std::span<const std::byte> bytes_of(const std::vector<T>& values) {
+  return std::as_bytes(std::span(values));
+}
 
 struct Engine::State {
   gpu::Device& device;
   std::uint32_t tile_width, tile_height, pixels_per_lane, slots;  // slots: as in TileLanes
-  bool cutoffs;
   double clamp_margin;      // of the projection's Jacobian, as a multiple of the half image
   std::size_t range_limit;  // bytes of one storage buffer
 
@@ -136,6 +151,7 @@ struct Engine::State {
       blend_backward, project_backward, gather, link_twist, adam, loss_pixel, ssim_rows, ssim_columns,
       ssim_rows_backward, ssim_columns_backward, color_pixels, color_equations;
   gpu::Commands commands;
+  gpu::Bindings bindings;  // of the pipelines to the buffers below; bind() and scan() change what some names stand for
 
   // Small transfers are recorded into the submission that they belong to. Where device memory is not mapped, they go
   // through these two buffers.
@@ -147,14 +163,21 @@ struct Engine::State {
   std::vector<Upload> uploads;  // for the next submission
   std::size_t to_host_bytes = 0;
 
-  // work buffers, grown as needed
-  Buffer replica_opacity, live_flag, live_prefix, live_block, live, replica_gradient, counters;
-  Buffer views, motions, tile_map, tiles;
-  Buffer splats, instance_count, tile_hits, instance_prefix, instance_block, records, link_twists;
-  Buffer tile_count, tile_prefix, tile_block, tile_cursor, tile_used, tile_loss;
-  Buffer entries, long_tiles, sort_scratch, sorted, partials;
-  Buffer image, depth_image, pixel_gradient, ssim_row_sums, ssim_factors;
-  Buffer color_views, segments, tile_pixels, tile_summary, pixel_sums, link_sums;
+  // Work buffers, grown as needed. The shaders declare them by the names of these members; those of the second list
+  // have a size that depends on the number of views in a submission.
+  // clang-format off
+#define REPLICA_BUFFERS(X) \
+  X(counters) X(replica_opacity) X(live_flag) X(live_prefix) X(live_block) X(live) X(replica_gradient)
+#define VIEW_BUFFERS(X)                                                                             \
+  X(views) X(motions) X(tile_map) X(tiles)                                                          \
+  X(splats) X(instance_count) X(tile_hits) X(instance_prefix) X(instance_block) X(records)          \
+  X(link_twists) X(tile_count) X(tile_prefix) X(tile_block) X(tile_cursor) X(tile_used)             \
+  X(tile_loss) X(entries) X(long_tiles) X(sort_scratch) X(sorted) X(partials) X(image)              \
+  X(depth_image) X(pixel_gradient) X(ssim_row_sums) X(ssim_factors) X(color_views) X(segments)      \
+  X(tile_pixels) X(tile_summary) X(pixel_sums) X(link_sums)
+#define MEMBER(buffer) Buffer buffer;
+  REPLICA_BUFFERS(MEMBER) VIEW_BUFFERS(MEMBER)
+  // clang-format on
   ColorPush color_push{};
   std::size_t pixel_sum_bytes = 0, link_sum_bytes = 0;
   const std::byte *read_pixel_sums = nullptr, *read_link_sums = nullptr;  // of the last run
@@ -177,8 +200,8 @@ struct Engine::State {
   // buffers.cpp
   void need(Buffer& buffer, std::size_t bytes, const char* name);  // grows it if too small, which loses its content
   void release_view_buffers();  // frees all buffers whose size depends on the number of views in a submission
-  void write(Buffer& buffer, const void* data, std::size_t bytes, const char* name);
-  void stage(Buffer& buffer, const void* data, std::size_t bytes, const char* name);  // as part of the next submission
+  void write(Buffer& buffer, std::span<const std::byte> data, const char* name);
+  void stage(Buffer& buffer, std::span<const std::byte> data, const char* name);  // as part of the next submission
   void record_uploads();
   // Returns where the first `bytes` of a buffer can be read after the submission; `to_host` must be large enough.
   const std::byte* record_download(const Buffer& buffer, std::size_t bytes);
@@ -193,7 +216,12 @@ struct Engine::State {
 
   // passes.cpp: the steps of one submission, in this order
   Submission lay_out(Scene& scene, std::span<const int> chunk, const RunOptions& options);
+  // Parts of lay_out(): cameras, link motions and places in the buffers; active tiles; axes of the links, for colors.
+  std::vector<SplatView> stage_views(Submission& submission, std::span<const int> chunk);
+  void stage_tiles(Submission& submission, std::span<const int> chunk, const std::vector<SplatView>& placed);
+  void stage_axes(const Scene& scene, std::span<const int> chunk, const chain::Chain& chain);
   bool make_room(Submission& submission);             // false: too many views for one submission
+  void bind(const Submission& submission);            // the buffers of its scene and of its lists
   void record_lists(const Submission& submission);    // the splats of every tile, front to back
   void record_picture(const Submission& submission);  // the pictures and their loss
   void record_gradients(const Submission& submission);
@@ -203,17 +231,17 @@ struct Engine::State {
   // Runs all these steps. False: a capacity was too small and has been raised; the caller plans and runs again.
   bool run(Scene& scene, std::span<const int> chunk, const RunOptions& options, const AdamPush* adam_push);
   void scan(const Buffer& values, const Buffer& prefix, const Buffer& block, SplatPush push, std::size_t most);
-  void dispatch(const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers, const SplatPush& push,
-                std::uint32_t x, std::uint32_t y = 1);
+  void dispatch(const gpu::Pipeline& pipeline, const SplatPush& push, std::uint32_t x, std::uint32_t y = 1);
   // One invocation per (live replica, view): the group counts are counters of the device.
-  void dispatch_live(const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers,
-                     const SplatPush& push);
+  void dispatch_live(const gpu::Pipeline& pipeline, const SplatPush& push);
 
   // Runs a batch in chunks; `after` gets each chunk that was run and the number of views of the batch before it.
   void run_all(Scene& scene, std::span<const int> batch, const RunOptions& options, const AdamPush* adam_push,
                const std::function<void(std::span<const int> chunk, std::size_t done)>& after);
+  std::vector<Picture> draw(Scene& scene, std::span<const int> batch, bool depth);
 
   // read_back.cpp: results of the last submission
+  std::vector<float> trained(const Buffer& buffer) const;  // the training's parameters, or a moment of all of them
   std::vector<ViewSums> sums(std::size_t chunk_views);
   std::vector<Picture> pictures(const Scene& scene, std::span<const int> chunk, bool depth);
   std::vector<math::MatrixX> twists(const Scene& scene, std::span<const int> chunk);

@@ -2,6 +2,7 @@
 #include <cmath>
 
 #include "chainsplat/splat.h"
+#include "shaders/shared/gaussian.h"
 
 namespace chainsplat::splat {
 
@@ -27,27 +28,11 @@ void Gaussians::resize(int new_count, int new_links, int new_degree) {
 }
 
 math::Vector3 sh_color(const Gaussians& gaussians, int index, const math::Vector3& r) {
-  const double x = r.x(), y = r.y(), z = r.z();
-  const double basis[16] = {0.28209479177387814,
-                            -0.4886025119029199 * y,
-                            0.4886025119029199 * z,
-                            -0.4886025119029199 * x,
-                            1.0925484305920792 * x * y,
-                            -1.0925484305920792 * y * z,
-                            0.31539156525252005 * (2 * z * z - x * x - y * y),
-                            -1.0925484305920792 * x * z,
-                            0.5462742152960396 * (x * x - y * y),
-                            -0.5900435899266435 * y * (3 * x * x - y * y),
-                            2.890611442640554 * x * y * z,
-                            -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
-                            0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
-                            -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
-                            1.445305721320277 * z * (x * x - y * y),
-                            -0.5900435899266435 * x * (x * x - 3 * y * y)};
   math::Vector3 color = math::Vector3::Constant(0.5);
   const int coefficients = gaussians.sh_coefficients();
   for (int l = 0; l < coefficients; ++l) {
-    for (int c = 0; c < 3; ++c) color[c] += basis[l] * gaussians.sh[3 * (coefficients * index + l) + c];
+    const double basis = shared::sh_basis(static_cast<unsigned>(l), {r.x(), r.y(), r.z()});
+    for (int c = 0; c < 3; ++c) color[c] += basis * gaussians.sh[3 * (coefficients * index + l) + c];
   }
   return color.cwiseMax(0.0);
 }

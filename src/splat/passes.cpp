@@ -27,82 +27,121 @@ std::uint32_t spreading_stride(std::uint32_t count) {
   return std::max(1u, stride);
 }
 
+std::uint32_t narrow(std::size_t n) { return static_cast<std::uint32_t>(n); }
 std::size_t words(std::size_t n) { return n * sizeof(std::uint32_t); }
 std::size_t vectors(std::size_t n) { return n * sizeof(glm::vec4); }
-std::uint32_t groups(std::size_t n) { return static_cast<std::uint32_t>((n + shared::kGroup - 1) / shared::kGroup); }
+std::uint32_t groups(std::size_t n) { return narrow((n + shared::kGroup - 1) / shared::kGroup); }
 
 }  // namespace
 
 void Engine::State::scan(const Buffer& values, const Buffer& prefix, const Buffer& block, SplatPush push,
                          std::size_t most) {
-  const auto groups = static_cast<std::uint32_t>((most + shared::kScanBlock - 1) / shared::kScanBlock);
-  const std::array block_buffers{&values, &prefix, &block, static_cast<const Buffer*>(&counters)};
-  commands.dispatch(scan_block, block_buffers, &push, sizeof push, groups);
-  const std::array sum_buffers{&block, static_cast<const Buffer*>(&counters)};
-  commands.dispatch(scan_sums, sum_buffers, &push, sizeof push, 1);
+  const auto groups = narrow((most + shared::kScanBlock - 1) / shared::kScanBlock);
+  bindings.set("values", values);
+  bindings.set("prefix", prefix);
+  bindings.set("block_sum", block);
+  dispatch(scan_block, push, groups);
+  dispatch(scan_sums, push, 1);
 }
 
-void Engine::State::dispatch(const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers,
-                             const SplatPush& push, std::uint32_t x, std::uint32_t y) {
-  commands.dispatch(pipeline, {buffers.begin(), buffers.size()}, &push, sizeof push, x, y);
+void Engine::State::dispatch(const gpu::Pipeline& pipeline, const SplatPush& push, std::uint32_t x, std::uint32_t y) {
+  commands.dispatch(pipeline, &push, sizeof push, x, y);
 }
 
-void Engine::State::dispatch_live(const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers,
-                                  const SplatPush& push) {
-  commands.dispatch_indirect(pipeline, {buffers.begin(), buffers.size()}, &push, sizeof push, counters,
-                             words(shared::kCounterDispatch));
+void Engine::State::dispatch_live(const gpu::Pipeline& pipeline, const SplatPush& push) {
+  commands.dispatch_indirect(pipeline, &push, sizeof push, counters, words(shared::kCounterDispatch));
+}
+
+void Engine::State::bind(const Submission& s) {
+  bindings.set("parameters", s.scene.parameters);
+  bindings.set("gradient", s.scene.gradient);
+  bindings.set("first_moment", s.scene.first_moment);
+  bindings.set("second_moment", s.scene.second_moment);
+  bindings.set("target", s.scene.target);
+  bindings.set("tile_prefix", s.own_places ? list_starts : tile_prefix);
+  bindings.set("tile_block", s.own_places ? list_blocks : tile_block);
 }
 
 Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, const RunOptions& options) {
-  const auto links = static_cast<std::uint32_t>(scene.links);
   Submission out{scene, options};
-  out.views = static_cast<std::uint32_t>(chunk.size());
-  out.replicas = static_cast<std::size_t>(scene.count) * links;
+  out.views = narrow(chunk.size());
+  out.replicas = static_cast<std::size_t>(scene.count) * scene.links;
   out.dssim = options.loss && options.weights.dssim > 0.0f;
+  stage_tiles(out, chunk, stage_views(out, chunk));
+  if (options.chain) stage_axes(scene, chunk, *options.chain);
+  return out;
+}
 
-  // views: cameras, link motions and places in the buffers
-  std::vector<SplatView> gpu_views(out.views);
-  std::vector<glm::vec4> rows(static_cast<std::size_t>(out.views) * links * 3);
-  std::vector<std::uint32_t> map;
-  std::vector<SplatTile> active;
-  std::vector<ColorView> colored;
-  std::vector<glm::vec4> axes;
-  chunk_tile_view.clear();
-  chunk_pixel.assign(out.views, 0);
-  for (std::uint32_t v = 0; v < out.views; ++v) {
-    const SceneView& view = scene.views[chunk[v]];
-    CHAINSPLAT_CHECK(view.motions.size() == links || scene.count == 0, std::to_string(view.motions.size()));
-    SplatView& placed = gpu_views[v];
-    placed.intrinsics = {view.fx, view.fy, view.cx, view.cy};
-    placed.limits = {view.limit_x, view.limit_y, 0, 0};
+std::vector<SplatView> Engine::State::stage_views(Submission& s, std::span<const int> chunk) {
+  std::vector<SplatView> placed;
+  std::vector<glm::vec4> rows;  // three of camera_from_home for every link
+  std::size_t cells = 0;        // in the tile map
+  chunk_pixel.clear();
+  for (const int v : chunk) {
+    const SceneView& view = s.scene.views[v];
+    const int links = s.scene.count == 0 ? 0 : s.scene.links;  // without Gaussians there may be no motions
+    CHAINSPLAT_CHECK(view.motions.size() == static_cast<std::size_t>(links) || links == 0,
+                     std::to_string(view.motions.size()));
     const math::Vector3 base =
         view.motions.empty() ? math::Vector3::Zero() : view.camera_from_world * view.motions[0].translation;
-    placed.moment_point = {base.x(), base.y(), base.z(), 0};
-    placed.width = static_cast<std::uint32_t>(view.width);
-    placed.height = static_cast<std::uint32_t>(view.height);
-    placed.tiles_x = static_cast<std::uint32_t>(view.tiles_x);
-    placed.tiles_y = static_cast<std::uint32_t>(view.tiles_y);
-    placed.tile_map = static_cast<std::uint32_t>(map.size());
-    placed.pixel = static_cast<std::uint32_t>(out.pixels);
-    placed.target = static_cast<std::uint32_t>(view.target);
-    placed.motion = v * links;
-    chunk_pixel[v] = out.pixels;
-    out.pixels += static_cast<std::size_t>(view.width) * view.height;
-    map.resize(map.size() + static_cast<std::size_t>(view.tiles_x) * view.tiles_y, shared::kNoTile);
-    for (std::uint32_t j = 0; j < std::min<std::size_t>(links, view.motions.size()); ++j) {
+    placed.push_back({.intrinsics = {view.fx, view.fy, view.cx, view.cy},
+                      .limits = {view.limit_x, view.limit_y, 0, 0},
+                      .moment_point = {base.x(), base.y(), base.z(), 0},
+                      .width = narrow(view.width),
+                      .height = narrow(view.height),
+                      .tiles_x = narrow(view.tiles_x),
+                      .tiles_y = narrow(view.tiles_y),
+                      .tile_map = narrow(cells),
+                      .pixel = narrow(s.pixels),
+                      .target = narrow(view.target),
+                      .motion = narrow(rows.size() / 3)});
+    chunk_pixel.push_back(s.pixels);
+    cells += static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
+    s.pixels += static_cast<std::size_t>(view.width) * view.height;
+    s.most_tiles = std::max(s.most_tiles, narrow(view.active.size()));
+    for (int j = 0; j < links; ++j) {
       const math::Pose pose = view.camera_from_world * view.motions[j];
       for (int r = 0; r < 3; ++r)
-        rows[3 * (placed.motion + j) + r] = {pose.rotation(r, 0), pose.rotation(r, 1), pose.rotation(r, 2),
-                                             pose.translation[r]};
+        rows.emplace_back(pose.rotation(r, 0), pose.rotation(r, 1), pose.rotation(r, 2), pose.translation[r]);
     }
-    out.most_tiles = std::max(out.most_tiles, static_cast<std::uint32_t>(view.active.size()));
+  }
+  stage(views, bytes_of(placed), "views");
+  stage(motions, bytes_of(rows), "motions");
+  return placed;
+}
 
-    // axes of the links, for the normal equations of the colors
-    if (!options.chain) continue;
-    const chain::Chain& chain = *options.chain;
-    const std::uint32_t first_tile = colored.empty() ? 0 : colored.back().first_tile + colored.back().tiles;
-    colored.push_back({first_tile, static_cast<std::uint32_t>(view.active.size()), v * links, 0});
-    for (std::uint32_t j = 0; j < links; ++j) {
+void Engine::State::stage_tiles(Submission& s, std::span<const int> chunk, const std::vector<SplatView>& placed) {
+  std::vector<std::uint32_t> map;
+  for (const SplatView& view : placed) map.resize(map.size() + view.tiles_x * view.tiles_y, shared::kNoTile);
+  std::vector<SplatTile> active;
+  chunk_tile_view.clear();
+  // those with a D-SSIM term come first, so that its passes run over a prefix of the list
+  for (const bool near : {true, false}) {
+    for (std::uint32_t v = 0; v < s.views; ++v) {
+      const SceneView& view = s.scene.views[chunk[v]];
+      for (std::size_t k = near ? 0 : view.near; k < (near ? view.near : view.active.size()); ++k) {
+        const std::uint32_t cell = view.active[k];
+        map[placed[v].tile_map + cell] = narrow(active.size());
+        active.push_back({v, cell % placed[v].tiles_x, cell / placed[v].tiles_x, 0});
+        chunk_tile_view.push_back(v);
+      }
+    }
+    if (near) s.near_tiles = narrow(active.size());
+  }
+  s.tiles = narrow(active.size());
+  stage(tile_map, bytes_of(map), "tile map");
+  stage(tiles, bytes_of(active), "tiles");
+}
+
+void Engine::State::stage_axes(const Scene& scene, std::span<const int> chunk, const chain::Chain& chain) {
+  std::vector<ColorView> colored;
+  std::vector<glm::vec4> axes;
+  std::uint32_t first_tile = 0;
+  for (const int v : chunk) {
+    const SceneView& view = scene.views[v];
+    colored.push_back({first_tile, narrow(view.active.size()), narrow(axes.size() / 2), 0});
+    first_tile += colored.back().tiles;
+    for (int j = 0; j < scene.links; ++j) {
       const math::Pose pose = view.camera_from_world * view.motions[j];
       const math::Vector3 start = pose * math::Vector3(chain.link_start(j) * chain.direction);
       const math::Vector3 along = pose.rotation * chain.direction;
@@ -110,30 +149,8 @@ Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, cons
       axes.emplace_back(along.x(), along.y(), along.z(), 0.0);
     }
   }
-
-  // active tiles: those with a D-SSIM term first, so that its passes run over a prefix of the list
-  for (const bool near : {true, false}) {
-    for (std::uint32_t v = 0; v < out.views; ++v) {
-      const SceneView& view = scene.views[chunk[v]];
-      for (std::size_t k = near ? 0 : view.near; k < (near ? view.near : view.active.size()); ++k) {
-        const std::uint32_t cell = view.active[k];
-        map[gpu_views[v].tile_map + cell] = static_cast<std::uint32_t>(active.size());
-        active.push_back({v, cell % gpu_views[v].tiles_x, cell / gpu_views[v].tiles_x, 0});
-        chunk_tile_view.push_back(v);
-      }
-    }
-    if (near) out.near_tiles = static_cast<std::uint32_t>(active.size());
-  }
-  out.tiles = static_cast<std::uint32_t>(active.size());
-  stage(views, gpu_views.data(), gpu_views.size() * sizeof(SplatView), "views");
-  stage(motions, rows.data(), rows.size() * sizeof(glm::vec4), "motions");
-  stage(tile_map, map.data(), map.size() * sizeof(std::uint32_t), "tile map");
-  stage(tiles, active.data(), active.size() * sizeof(SplatTile), "tiles");
-  if (options.chain) {
-    stage(color_views, colored.data(), colored.size() * sizeof(ColorView), "color views");
-    stage(segments, axes.data(), axes.size() * sizeof(glm::vec4), "segments");
-  }
-  return out;
+  stage(color_views, bytes_of(colored), "color views");
+  stage(segments, bytes_of(axes), "segments");
 }
 
 bool Engine::State::make_room(Submission& s) {
@@ -141,7 +158,7 @@ bool Engine::State::make_room(Submission& s) {
 
   // capacities: first guesses, kept within what one buffer may hold
   if (live_capacity == 0 || live_capacity > s.replicas)
-    live_capacity = static_cast<std::uint32_t>(
+    live_capacity = narrow(
         std::max<std::size_t>(1, std::min<std::size_t>(s.replicas, 2 * static_cast<std::size_t>(s.scene.count) + 256)));
   s.pairs = static_cast<std::size_t>(live_capacity) * s.views;
   const std::size_t pair_bytes = (options.backward ? shared::kGradientRows : shared::kSplatRows) * sizeof(glm::vec4);
@@ -149,11 +166,10 @@ bool Engine::State::make_room(Submission& s) {
     most_views = static_cast<int>(std::max<std::size_t>(1, range_limit / (pair_bytes * live_capacity)));
     return false;
   }
-  if (instance_capacity == 0)
-    instance_capacity = static_cast<std::uint32_t>(std::max<std::size_t>(1024, kFirstInstances * s.pairs / 2));
+  if (instance_capacity == 0) instance_capacity = narrow(std::max<std::size_t>(1024, kFirstInstances * s.pairs / 2));
   // the capacity that drawing has reached may be too large for gradients; an overflow then lowers the number of views
   if (options.backward)
-    instance_capacity = static_cast<std::uint32_t>(
+    instance_capacity = narrow(
         std::min<std::size_t>(instance_capacity, range_limit / (sizeof(glm::vec4) * shared::kPartialRows * slots)));
 
   // buffers of the lists, the picture and the gradients
@@ -219,9 +235,9 @@ bool Engine::State::make_room(Submission& s) {
   }
 
   SplatPush& push = s.push;
-  push.gaussians = static_cast<std::uint32_t>(s.scene.count);
-  push.links = static_cast<std::uint32_t>(s.scene.links);
-  push.coefficients = static_cast<std::uint32_t>(s.scene.coefficients());
+  push.gaussians = narrow(s.scene.count);
+  push.links = narrow(s.scene.links);
+  push.coefficients = narrow(s.scene.coefficients());
   push.views = s.views;
   push.live_capacity = live_capacity;
   push.instance_capacity = instance_capacity;
@@ -263,21 +279,17 @@ void Engine::State::record_lists(const Submission& s) {
   // Gaussians to live replicas
   if (!replicas_kept) {
     SplatPush push = s.push;
-    dispatch(replicate, {&scene.parameters, &replica_opacity, &live_flag}, push, groups(scene.count));
-    push.scan_length = static_cast<std::uint32_t>(s.replicas);
+    dispatch(replicate, push, groups(scene.count));
+    push.scan_length = narrow(s.replicas);
     push.scan_counter = shared::kCounterLive;
     scan(live_flag, live_prefix, live_block, push, s.replicas);
     const std::uint32_t replica_groups = groups(s.replicas);
-    dispatch(compact, {&live_flag, &live_prefix, &live_block, &live}, push, std::min(replica_groups, kRow),
-             (replica_groups + kRow - 1) / kRow);
+    dispatch(compact, push, std::min(replica_groups, kRow), (replica_groups + kRow - 1) / kRow);
     commands.stamp("replicate");
   }
 
   // live replicas to splats, and splats to the lists of the tiles that they touch
-  dispatch_live(project,
-                {&scene.parameters, &replica_opacity, &live, &views, &motions, &tile_map, &counters, &splats,
-                 &instance_count, &tile_count, &tile_hits, &entries},
-                s.push);
+  dispatch_live(project, s.push);
   commands.stamp("project");
   if (!s.own_places) {
     SplatPush scan_push = s.push;
@@ -289,96 +301,53 @@ void Engine::State::record_lists(const Submission& s) {
     scan_push.scan_counter = shared::kCounterTiles;
     scan(tile_count, tile_prefix, tile_block, scan_push, s.tiles);
     commands.stamp("scan");
-    dispatch_live(bin,
-                  {&live, &views, &tile_map, &counters, &splats, &instance_prefix, &instance_block, &tile_prefix,
-                   &tile_block, &tile_cursor, &tile_hits, &entries},
-                  s.push);
+    dispatch_live(bin, s.push);
     commands.stamp("bin");
   }
 
   // every list by depth
-  const Buffer &starts = s.own_places ? list_starts : tile_prefix, &blocks = s.own_places ? list_blocks : tile_block;
-  dispatch(sort, {&starts, &blocks, &tile_count, &entries, &long_tiles, &sorted, &counters}, s.push, s.tiles);
-  const std::array long_buffers = {static_cast<const Buffer*>(&starts),     static_cast<const Buffer*>(&blocks),
-                                   static_cast<const Buffer*>(&tile_count), static_cast<const Buffer*>(&entries),
-                                   static_cast<const Buffer*>(&long_tiles), static_cast<const Buffer*>(&sort_scratch),
-                                   static_cast<const Buffer*>(&sorted)};
-  commands.dispatch_indirect(sort_long, long_buffers, &s.push, sizeof s.push, counters,
-                             words(shared::kCounterLongTiles));
+  dispatch(sort, s.push, s.tiles);
+  commands.dispatch_indirect(sort_long, &s.push, sizeof s.push, counters, words(shared::kCounterLongTiles));
   commands.stamp("sort");
 }
 
 void Engine::State::record_picture(const Submission& s) {
-  const Buffer &starts = s.own_places ? list_starts : tile_prefix, &blocks = s.own_places ? list_blocks : tile_block;
-  dispatch(
-      s.options.depth ? blend_depth : blend,
-      {&tiles, &views, &starts, &blocks, &tile_count, &sorted, &splats, &counters, &image, &tile_used, &depth_image},
-      s.push, s.tiles);
+  dispatch(s.options.depth ? blend_depth : blend, s.push, s.tiles);
   commands.stamp("blend");
   if (s.options.sums) {
-    dispatch(loss_pixel, {&tiles, &views, &image, &s.scene.target, &tile_loss}, s.push, s.tiles);
+    dispatch(loss_pixel, s.push, s.tiles);
     commands.stamp("loss");
   }
   if (s.dssim) {
-    dispatch(ssim_rows, {&tiles, &views, &tile_map, &image, &s.scene.target, &ssim_row_sums}, s.push, s.near_tiles);
-    dispatch(ssim_columns, {&tiles, &views, &tile_map, &ssim_row_sums, &ssim_factors, &tile_loss}, s.push,
-             s.near_tiles);
-    dispatch(ssim_rows_backward, {&tiles, &views, &tile_map, &ssim_factors, &ssim_row_sums}, s.push, s.near_tiles);
-    dispatch(ssim_columns_backward,
-             {&tiles, &views, &tile_map, &ssim_row_sums, &image, &s.scene.target, &pixel_gradient}, s.push,
-             s.near_tiles);
+    for (const gpu::Pipeline* pass : {&ssim_rows, &ssim_columns, &ssim_rows_backward, &ssim_columns_backward})
+      dispatch(*pass, s.push, s.near_tiles);
     commands.stamp("ssim");
   }
 }
 
 void Engine::State::record_gradients(const Submission& s) {
   const Scene& scene = s.scene;
-  dispatch(blend_backward,
-           {&tiles, &views, &tile_prefix, &tile_block, &tile_count, &sorted, &splats, &counters, &image, &tile_used,
-            &scene.target, &pixel_gradient, &partials},
-           s.push, s.tiles);
+  dispatch(blend_backward, s.push, s.tiles);
   commands.stamp("blend backward");
-  dispatch_live(project_backward,
-                {&scene.parameters, &live, &views, &motions, &counters, &splats, &instance_count, &instance_prefix,
-                 &instance_block, &partials, &records},
-                s.push);
+  dispatch_live(project_backward, s.push);
   commands.stamp("project backward");
-  dispatch(gather,
-           {&scene.parameters, &replica_opacity, &live_flag, &live_prefix, &live_block, &views, &motions, &counters,
-            &records, &scene.gradient, &replica_gradient},
-           s.push, groups(scene.count));
-  if (s.options.twists && scene.count > 0)
-    dispatch(link_twist, {&live_prefix, &live_block, &counters, &records, &link_twists}, s.push,
-             static_cast<std::uint32_t>(scene.links), s.views);
+  dispatch(gather, s.push, groups(scene.count));
+  if (s.options.twists && scene.count > 0) dispatch(link_twist, s.push, narrow(scene.links), s.views);
   commands.stamp("gather");
 }
 
 void Engine::State::record_adam(const Submission& s, const AdamPush& push) {
-  Scene& scene = s.scene;
-  const std::array buffers{static_cast<const Buffer*>(&scene.parameters), static_cast<const Buffer*>(&scene.gradient),
-                           static_cast<const Buffer*>(&scene.first_moment),
-                           static_cast<const Buffer*>(&scene.second_moment), static_cast<const Buffer*>(&counters)};
   const std::uint32_t parameter_groups = groups((push.total + 3) / 4);
-  commands.dispatch(adam, buffers, &push, sizeof push, std::min(parameter_groups, kRow),
-                    (parameter_groups + kRow - 1) / kRow);
+  commands.dispatch(adam, &push, sizeof push, std::min(parameter_groups, kRow), (parameter_groups + kRow - 1) / kRow);
   commands.stamp("adam");
-  scene.version = ++versions;
+  s.scene.version = ++versions;
 }
 
 void Engine::State::record_colors(const Submission& s) {
-  const auto dispatch_colors = [&](const gpu::Pipeline& pipeline, std::initializer_list<const Buffer*> buffers,
-                                   std::uint32_t x, std::uint32_t y, std::uint32_t z) {
-    commands.dispatch(pipeline, {buffers.begin(), buffers.size()}, &color_push, sizeof color_push, x, y, z);
-  };
-  dispatch_colors(color_pixels,
-                  {&tiles, &views, &color_views, &segments, &image, &depth_image, &s.scene.target, &tile_pixels,
-                   &tile_summary, &pixel_sums},
-                  color_push.pixel_slices, s.views, 1);
+  commands.dispatch(color_pixels, &color_push, sizeof color_push, color_push.pixel_slices, s.views);
   commands.stamp("color pixels");
-  dispatch_colors(color_equations,
-                  {&tiles, &views, &color_views, &segments, &image, &depth_image, &s.scene.target, &tile_pixels,
-                   &tile_summary, &pixel_sums, &link_sums},
-                  color_push.links, color_push.equation_slices, s.views);
+  commands.dispatch(color_equations, &color_push, sizeof color_push, color_push.links, color_push.equation_slices,
+                    s.views);
   commands.stamp("color equations");
   read_pixel_sums = record_download(pixel_sums, pixel_sum_bytes);
   read_link_sums = record_download(link_sums, link_sum_bytes);
@@ -396,11 +365,10 @@ bool Engine::State::has_fitted(const Submission& s, const std::byte* read_counte
   const std::size_t want_live = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantLive]) + 64;
   const std::size_t want_instances = static_cast<std::size_t>(kGrowth * read[shared::kCounterWantInstances]) + 1024;
   if (read[shared::kCounterWantLive] > live_capacity)
-    live_capacity = static_cast<std::uint32_t>(std::min<std::size_t>(want_live, s.replicas));
+    live_capacity = narrow(std::min<std::size_t>(want_live, s.replicas));
   if (read[shared::kCounterWantTile] > tile_capacity)
     set_tile_capacity(static_cast<std::uint32_t>(kGrowth * read[shared::kCounterWantTile]));
-  if (read[shared::kCounterWantInstances] > instance_capacity)
-    instance_capacity = static_cast<std::uint32_t>(want_instances);
+  if (read[shared::kCounterWantInstances] > instance_capacity) instance_capacity = narrow(want_instances);
   const std::size_t partial_bytes = vectors(static_cast<std::size_t>(shared::kPartialRows) * slots * instance_capacity);
   if (partial_bytes > range_limit) {
     if (s.views == 1)
@@ -418,6 +386,7 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
                         const AdamPush* adam_push) {
   Submission s = lay_out(scene, chunk, options);
   if (!make_room(s)) return false;
+  bind(s);
   commands.begin();
   to_host_bytes = 0;
   record_uploads();
@@ -430,13 +399,9 @@ bool Engine::State::run(Scene& scene, std::span<const int> chunk, const RunOptio
   commands.submit();
   commands.wait();
   for (const gpu::Timing& timing : commands.timings()) {
-    const auto same =
-        std::find_if(timings.begin(), timings.end(), [&](const auto& t) { return t.label == timing.label; });
-    if (same == timings.end()) {
-      timings.push_back(timing);
-    } else {
-      same->milliseconds += timing.milliseconds;
-    }
+    auto same = std::find_if(timings.begin(), timings.end(), [&](const auto& t) { return t.label == timing.label; });
+    if (same == timings.end()) same = timings.insert(same, {timing.label, 0.0});
+    same->milliseconds += timing.milliseconds;
   }
   return has_fitted(s, read_counters);
 }

@@ -6,6 +6,12 @@
 
 namespace chainsplat::splat {
 
+std::vector<float> Engine::State::trained(const Buffer& buffer) const {
+  std::vector<float> values(training.parameter_count);
+  gpu::download(device, buffer, values.data(), values.size() * sizeof(float));
+  return values;
+}
+
 std::vector<ViewSums> Engine::State::sums(std::size_t chunk_views) {
   std::vector<ViewSums> out(chunk_views);
   std::vector<glm::vec4> rows(2 * chunk_tile_view.size());

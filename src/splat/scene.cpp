@@ -1,6 +1,7 @@
 // scene.cpp - loads Gaussians and views: decides which tiles are active and which views go into one submission.
 #include <algorithm>
 
+#include "chainsplat/image_model.h"
 #include "src/splat/engine.h"
 
 namespace chainsplat::splat {
@@ -8,7 +9,7 @@ namespace chainsplat::splat {
 namespace {
 
 constexpr int kActiveMargin = 16;            // px around the mask within which training has active tiles
-constexpr int kDssimMargin = 10;             // px around the mask with a D-SSIM term: twice the window's reach of 5 px
+constexpr int kDssimMargin = 2 * image_model::kSsimReach;  // px around the mask with a D-SSIM term
 constexpr std::uint32_t kMostTiles = 60000;  // per submission; below every device's limit of work groups (65535)
 
 // Per grid cell, whether it has a mask pixel within each of two margins (px); `inner` <= `outer`.
@@ -68,21 +69,19 @@ std::vector<bool> in_mask(const SceneView& view, const std::vector<std::uint8_t>
 
 std::vector<float> packed(const Gaussians& g) {
   std::vector<float> all;
-  all.reserve(g.mean.size() + g.rotation.size() + g.log_scale.size() + g.opacity_logit.size() + g.sh.size() +
-              g.link_logits.size());
-  for (const auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
-    all.insert(all.end(), part->begin(), part->end());
+  each_section(g, [&](const std::vector<float>& values, std::size_t first) {
+    all.resize(first);
+    all.insert(all.end(), values.begin(), values.end());
+  });
   return all;
 }
 
 Gaussians unpacked(const std::vector<float>& all, int count, int links, int degree) {
   Gaussians g;
   g.resize(count, links, degree);
-  auto from = all.begin();
-  for (auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits}) {
-    std::copy_n(from, part->size(), part->begin());
-    from += static_cast<std::ptrdiff_t>(part->size());
-  }
+  each_section(g, [&](std::vector<float>& values, std::size_t first) {
+    std::copy_n(all.begin() + static_cast<std::ptrdiff_t>(first), values.size(), values.begin());
+  });
   return g;
 }
 
@@ -94,14 +93,13 @@ void Engine::State::load_gaussians(Scene& scene, const Gaussians& gaussians) {
   scene.parameter_count = all.size();
   scene.step = 0;
   scene.version = ++versions;
-  write(scene.parameters, all.data(), all.size() * sizeof(float), "parameters");
+  write(scene.parameters, bytes_of(all), "parameters");
   need(scene.gradient, all.size() * sizeof(float), "gradient");
 }
 
 void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
                                std::span<const std::vector<std::uint8_t>* const> targets, Active active) {
   scene.views.clear();
-  scene.target_pixels = 0;
   double object_pixels = 0.0;
   std::vector<std::uint8_t> all_targets;
   for (std::size_t v = 0; v < specs.size(); ++v) {
@@ -127,7 +125,8 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
       view.target = all_targets.size() / 4;
       all_targets.insert(all_targets.end(), target.begin(), target.end());
       if (active != Active::in_mask)
-        for (std::size_t k = 3; k < target.size(); k += 4) object_pixels += target[k] >= 128 ? 1.0 : 0.0;
+        for (std::size_t k = 3; k < target.size(); k += 4)
+          object_pixels += target[k] >= image_model::kObjectMask ? 1.0 : 0.0;
     }
 
     // active tiles, those with a D-SSIM term first
@@ -147,12 +146,11 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
       if (near.outer[cell] && !near.inner[cell]) view.active.push_back(static_cast<std::uint32_t>(cell));
     scene.views.push_back(std::move(view));
   }
-  scene.target_pixels = all_targets.size() / 4;
   scene.normalizer = std::max(1.0, object_pixels / std::max<std::size_t>(1, specs.size()));
   if (active == Active::in_mask)
-    stage(scene.target, all_targets.data(), all_targets.size(), "target");
+    stage(scene.target, bytes_of(all_targets), "target");
   else
-    write(scene.target, all_targets.data(), all_targets.size(), "target");
+    write(scene.target, bytes_of(all_targets), "target");
 }
 
 std::vector<std::vector<int>> Engine::State::chunks(const Scene& scene, std::span<const int> batch, bool dssim) const {

@@ -77,17 +77,16 @@ void sort(const Layout& layout, Lists& lists, uint32_t stride) {
   std::vector<uvec2> scratch(2 * lists.entries.size());
   lists.sorted.assign(lists.entries.size(), uvec2(~0u));
   Bindings bound = with(push);
-  bound.bind(0, lists.prefix);
-  bound.bind(1, lists.block);
-  bound.bind(2, lists.count);
-  bound.bind(3, lists.entries);
-  bound.bind(4, long_tiles);
-  bound.bind(5, lists.sorted);
-  bound.bind(6, counters);
+  bound.bind("tile_prefix", lists.prefix);
+  bound.bind("tile_block", lists.block);
+  bound.bind("tile_count", lists.count);
+  bound.bind("entries", lists.entries);
+  bound.bind("long_tiles", long_tiles);
+  bound.bind("sorted", lists.sorted);
+  bound.bind("counters", counters);
   emulation::dispatch<kernels::SplatSort<kLaidOut.sort_lanes, kLaidOut.rank_limit, kLaidOut.sort_share>>(layout, bound,
                                                                                                        tiles);
-  bound.bind(5, scratch);
-  bound.bind(6, lists.sorted);
+  bound.bind("sort_scratch", scratch);
   if (counters[shared::kCounterLongTiles] > 0)
     emulation::dispatch<kernels::SplatSortLong<kLaidOut.sort_lanes>>(layout, bound, counters[shared::kCounterLongTiles]);
 }
@@ -361,22 +360,22 @@ Drawn draw(const Layout& layout, Scene& scene) {
   out.partials.assign(4 * shared::kPartialRows * kLaidOut.slots * scene.splat_of_instance.size(), NAN);
   std::vector<uint32_t> counters(shared::kCounters, 0), used(tiles, 0);
   Bindings bound = with(push);
-  bound.bind(0, scene.tiles);
-  bound.bind(1, scene.views);
-  bound.bind(2, scene.lists.prefix);
-  bound.bind(3, scene.lists.block);
-  bound.bind(4, scene.lists.count);
-  bound.bind(5, scene.lists.sorted);
-  bound.bind(6, scene.splats);
-  bound.bind(7, counters);
-  bound.bind(8, out.image);
-  bound.bind(9, used);
-  bound.bind(10, out.depth);
+  bound.bind("tiles", scene.tiles);
+  bound.bind("views", scene.views);
+  bound.bind("tile_prefix", scene.lists.prefix);
+  bound.bind("tile_block", scene.lists.block);
+  bound.bind("tile_count", scene.lists.count);
+  bound.bind("sorted", scene.lists.sorted);
+  bound.bind("splats", scene.splats);
+  bound.bind("counters", counters);
+  bound.bind("image", out.image);
+  bound.bind("tile_used", used);
+  bound.bind("depth_image", out.depth);
   emulation::dispatch<
       kernels::SplatBlend<kLaidOut.lanes, kTile, kTile, kPixels, 1u, kDepth, kLaidOut.share>>(layout, bound, tiles);
-  bound.bind(10, scene.targets);
-  bound.bind(11, scene.dssim);
-  bound.bind(12, out.partials);
+  bound.bind("target", scene.targets);
+  bound.bind("pixel_gradient", scene.dssim);
+  bound.bind("partials", out.partials);
   emulation::dispatch<kernels::SplatBlendBackward<kLaidOut.lanes, kTile, kTile, kPixels, 1u, kLaidOut.subgroup,
                                                   kLaidOut.share>>(layout, bound, tiles);
   return out;
@@ -495,17 +494,17 @@ ColorResult color_sums(const Layout& layout, Colors& scene) {
   std::vector<vec4> pixel_sums(shared::kColorPixelRows * push.pixel_slices);
   std::vector<float> link_sums(4 * shared::kColorRows * push.equation_slices * push.links, NAN);
   Bindings bound = with(push);
-  bound.bind(0, scene.tiles);
-  bound.bind(1, scene.views);
-  bound.bind(2, scene.color_views);
-  bound.bind(3, scene.segments);
-  bound.bind(4, scene.image);
-  bound.bind(5, scene.depth);
-  bound.bind(6, scene.target);
-  bound.bind(7, tile_pixels);
-  bound.bind(8, summary);
-  bound.bind(9, pixel_sums);
-  bound.bind(10, link_sums);
+  bound.bind("tiles", scene.tiles);
+  bound.bind("views", scene.views);
+  bound.bind("color_views", scene.color_views);
+  bound.bind("segments", scene.segments);
+  bound.bind("image", scene.image);
+  bound.bind("depth_image", scene.depth);
+  bound.bind("target", scene.target);
+  bound.bind("tile_pixels", tile_pixels);
+  bound.bind("tile_summary", summary);
+  bound.bind("pixel_sums", pixel_sums);
+  bound.bind("link_sums", link_sums);
   emulation::dispatch<
       kernels::ColorPixels<kLanes, kTile, kTile, kLanes, kLaidOut.color_columns, kLaidOut.color_rows>>(
       layout, bound, push.pixel_slices);
@@ -562,9 +561,9 @@ TEST_CASE("prefix sums over subgroups of any width") {
     for (const bool backward : {false, true}) {
       std::vector<uint32_t> prefix(kCount, 0), size(1, 0);
       Bindings bound = with(kCount);
-      bound.bind(0, values);
-      bound.bind(1, prefix);
-      bound.bind(2, size);
+      bound.bind("values", values);
+      bound.bind("prefix", prefix);
+      bound.bind("size", size);
       emulation::dispatch<kernels::TestPrefix<128u>>({width, false, backward}, bound, 1);
       CHECK(prefix == wanted);
       CHECK(size[0] == width);

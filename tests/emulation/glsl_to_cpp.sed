@@ -5,7 +5,7 @@
 
 # preprocessor; shared headers are C++ already
 s/^#(version|extension) .*//
-s/^#include "shared\/.*//
+s/^#include "(shared|chainsplat)\/.*//
 
 # interface
 s/^layout\(local_size_x = ([0-9]+)\) in;/static constexpr WorkGroupSize gl_WorkGroupSize{\1u};/
@@ -13,7 +13,7 @@ s/^layout\(local_size_x_id = ([0-9]+)\) in;/static constexpr WorkGroupSize gl_Wo
 s/^layout\(constant_id = ([0-9]+)\) const uint (\w+) = (\w+);/static constexpr uint \2 = specialized<\1, kConstants...>(\3);/
 s/^layout\(push_constant\) uniform Push \{ (\w+) (\w+); \};/Push<\1> push_constants; const \1\& \2 = push_constants.value;/
 s/^layout\(push_constant\) uniform Push \{ uint (\w+); \};/Push<uint> push_constants; const uint\& \1 = push_constants.value;/
-s/^layout\(std430, binding = ([0-9]+)\) [a-z ]*buffer \w+ \{ (\w+) (\w+)\[\]; \};/Storage<\2> \3{\1u};/
+s/^layout\(std430\) [a-z ]*buffer \w+ \{ (\w+) (\w+)\[\]; \};/Storage<\1> \2{"\2"};/
 s/^const /static constexpr /
 s/^shared //
 

@@ -3,6 +3,7 @@
 #pragma once
 #include "lanes.h"
 // after lanes.h, which configures GLM
+#include "chainsplat/image_model.h"
 #include "shaders/shared/color.h"
 #include "shaders/shared/splat.h"
 
@@ -14,6 +15,7 @@ namespace chainsplat::emulation::kernels {
 #pragma GCC diagnostic ignored "-Wparentheses"
 
 using namespace glm;
+using namespace chainsplat::image_model;
 using namespace chainsplat::shared;
 using uint = std::uint32_t;
 

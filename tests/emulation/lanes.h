@@ -35,14 +35,14 @@ struct Layout {
   bool backward = false;   // the last lane runs first
 };
 
-// Buffers and push constants of a dispatch.
+// Buffers, by the names that the kernel has for them, and push constants of a dispatch.
 struct Bindings {
-  std::map<uint, std::span<std::byte>> buffers;
+  std::map<std::string, std::span<std::byte>> buffers;
   std::span<const std::byte> push;
 
   template <class T>
-  void bind(uint binding, std::vector<T>& values) {
-    buffers[binding] = std::as_writable_bytes(std::span(values));
+  void bind(const std::string& name, std::vector<T>& values) {
+    buffers[name] = std::as_writable_bytes(std::span(values));
   }
 };
 
@@ -53,17 +53,16 @@ inline const Bindings* bindings = nullptr;  // of the current dispatch
 template <class T>
 struct Storage {  // a buffer
   std::span<T> values;
-  uint binding;
+  const char* name;
 
-  explicit Storage(uint at) : binding(at) {
-    const auto found = bindings->buffers.find(at);
-    if (found == bindings->buffers.end()) fail("nothing is bound to " + std::to_string(at));
+  explicit Storage(const char* n) : name(n) {
+    const auto found = bindings->buffers.find(name);
+    if (found == bindings->buffers.end()) fail(std::string("nothing is bound to ") + name);
     values = {reinterpret_cast<T*>(found->second.data()), found->second.size() / sizeof(T)};
   }
   T& operator[](std::size_t k) const {
     if (k >= values.size())
-      fail("element " + std::to_string(k) + " of the " + std::to_string(values.size()) + " of binding " +
-           std::to_string(binding));
+      fail("element " + std::to_string(k) + " of the " + std::to_string(values.size()) + " of " + name);
     return values[k];
   }
 };

@@ -9,6 +9,7 @@
 #include <optional>
 
 #include "chainsplat/core.h"
+#include "chainsplat/image_model.h"
 #include "page_server.h"
 #include "window_page.h"
 
@@ -132,12 +133,11 @@ void Window::show(const Shown& shown) {
 }
 
 std::vector<math::Vector2> recorded_line(const capture::Camera& camera, const math::MatrixX& world_points) {
-  constexpr double kNearest = 0.01;  // m
   std::vector<math::Vector2> line;
   const math::Pose camera_from_world = camera.world_from_camera.inverse();
   for (Eigen::Index i = 0; i < world_points.cols(); ++i) {
     const math::Vector3 p = camera_from_world * math::Vector3(world_points.col(i));
-    if (p.z() > kNearest) line.push_back(capture::distort(camera, capture::project(camera, p)));
+    if (p.z() > image_model::kNear) line.push_back(capture::distort(camera, capture::project(camera, p)));
   }
   return line;
 }
