@@ -1,5 +1,5 @@
 // chainsplat/corrections.h - what a recording was given wrongly by a little: poses, focal lengths and clocks of its
-// cameras, the clock of its base, the place of the grasp, the size of the rope (mathematics.md 6.4).
+// cameras, the clock of its base, the place of the grasp, the size of the rope (mathematics.md 6.10).
 //
 // silhouette::fit_corrections() estimates them together with the angles of all frames; apply() mends the capture, and
 // everything downstream works on the mended one. A twin carries them, so that later work on the same cameras mends
@@ -47,7 +47,7 @@ using Corrections = std::vector<Correction>;
 // What is wrong with a recording or doubtful about a twin, in plain words and as numbers. formats.md 2 lists the codes.
 struct Finding {
   std::string code;         // "base-time", "camera-pose", "length", "outline-misfit", "fold", ...
-  std::string subject;      // a camera's name, "base", "grasp", "object", "joint 8"
+  std::string subject;      // a camera's name, "base", "base", "grasp" or "object"
   double value = 0.0;       // in `unit`
   double deviation = 0.0;   // one standard deviation, 0: none
   std::string unit;         // "ms", "deg", "mm", "%", "px", "rad"

@@ -92,7 +92,7 @@ struct OutlineMisfit {
 
 struct CorrectionFit {
   capture::Corrections corrections;
-  // By how much what was given fits worse, in squares of standard deviations, whatever of it is wrong.
+  // By which share the outlines' square residuals would be larger with what was given, whatever of it is wrong.
   double evidence = 0.0;
   solve::Summary summary;              // the unknowns relative to their prior deviations, and rad
   std::vector<OutlineMisfit> misfits;  // by camera, after the corrections
@@ -103,7 +103,7 @@ struct CorrectionFit {
 
 // Poses, focal lengths and clocks of the cameras, the base's clock, the grasp's place and the rope's size, together with
 // the angles of up to `frames` frames, from the masks' outlines. Gauss-Newton on the arrow system from `fit`, which may be
-// a few pixels off: what is cut as foreign starts wide and narrows. Of one camera only clocks and mask offset are varied:
+// a few pixels off: what is cut as foreign starts wide and narrows. Of one camera only its masks and the base's clock are varied:
 // nothing tells its distance from the rope's size. Deviations are the larger of what the equations say and of what the
 // scatter between stretches of time says.
 CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& fit,

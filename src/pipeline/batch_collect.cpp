@@ -37,6 +37,7 @@ constexpr std::array kColumns{
     Column{"psnr_object", "PSNR in the object", "dB", 2, 1.0, false, false},
     Column{"centerline_rms", "centerline", "mm", 2, 1e3, false, true},
     Column{"tip_rms", "tip", "mm", 2, 1e3, false, true},
+    Column{"shape_rms", "from grasp", "mm", 2, 1e3, false, true},
 };
 constexpr std::size_t kPaperColumns = 5;
 constexpr std::array kParts{"recognized", "rollout"};

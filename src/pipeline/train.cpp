@@ -59,10 +59,9 @@ twin::Provenance recognition_provenance(const TrainOptions& options) {
                            : *options.bending == chain::Bending::planar ? "planar"
                                                                         : "spatial"},
                {"twist", options.twist ? "yes" : "no"}};
-  if (!options.fixed.empty()) {
-    std::string& held = p.options["fixed"];
-    for (const std::string& group : options.fixed) held += (held.empty() ? "" : ",") + group;
-  }
+  std::string& held = p.options["fixed"];
+  for (const std::string& group : options.fixed) held += (held.empty() ? "" : ",") + group;
+  if (held.empty()) held = "nothing";
   return p;
 }
 

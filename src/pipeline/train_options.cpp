@@ -34,10 +34,19 @@ std::string choice(const std::string& text, std::initializer_list<const char*> c
   throw InputError(where, "'" + text + "' is not there to choose", "give one of " + all);
 }
 
-std::vector<std::string> read_groups(const std::string& text) {
+void check_groups(const std::vector<std::string>& groups, const std::string& where) {
+  const auto& all = capture::corrected_quantities();
+  for (const std::string& group : groups)
+    if (group != "all" && std::none_of(all.begin(), all.end(), [&](const auto& q) { return group == q.group; }))
+      throw InputError(where, "'" + group + "' is nothing that is estimated",
+                       "name some of cameras,focal,time,length,diameter,grasp,masks, or all");
+}
+
+std::vector<std::string> read_groups(const std::string& text, const std::string& where) {
   std::vector<std::string> groups;
   std::istringstream words(text);
   for (std::string word; std::getline(words, word, ',');) groups.push_back(word);
+  check_groups(groups, where);
   return groups;
 }
 
@@ -51,12 +60,7 @@ void TrainOptions::check() const {
   if (frames.first < 0 || (frames.last >= 0 && frames.last <= frames.first))
     throw InputError("`frames`", "'" + capture::frame_range_text(frames) + "' is no range of frames",
                      "give A:B, for example 0:60 for the first 60");
-  for (const std::string& group : fixed) {
-    const auto& all = capture::corrected_quantities();
-    if (group != "all" && std::none_of(all.begin(), all.end(), [&](const auto& q) { return group == q.group; }))
-      throw InputError("`fixed`", "'" + group + "' is nothing that is estimated",
-                       "name some of cameras,focal,time,length,diameter,grasp,masks, or all");
-  }
+  check_groups(fixed, "`fixed`");
   if (force && resume) throw InputError("`force`, `resume`", "contradict each other", "give one of them");
 }
 
@@ -102,7 +106,7 @@ void set(TrainOptions& options, const std::string& name, const std::string& text
   } else if (name == "joint") {
     options.joint = truth(text, where);
   } else if (name == "fixed") {
-    options.fixed = read_groups(text);
+    options.fixed = read_groups(text, where);
   } else {
     throw InputError(where, "there is no setting '" + name + "'", "give one of those of train");
   }

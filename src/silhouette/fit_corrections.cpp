@@ -17,7 +17,7 @@ using math::VectorX;
 namespace {
 
 // Gauss-Newton. Outlines farther from the rope than a cut do not count (Tukey); it starts wide, since what is given may
-// be wrong by many pixels, and halves until the residuals' own spread sets it.
+// be wrong by many pixels, and narrows until the residuals' own spread sets it.
 constexpr int kSteps = 16;
 constexpr double kStep = 1e-3;          // of the prior deviations, and rad: smaller steps end it
 constexpr double kLongestStep = 50.0;    // the same, in one step
@@ -33,8 +33,10 @@ constexpr double kLinkOffset = 0.2;     // px, deviation of one link's outline i
 // outline and neighboring frames share the error of straight links, which pulls the grasp along the rope: on recordings
 // with truth the place of the grasp and the length were off by 10 mm with 1, by their priors with less than 0.05.
 constexpr double kEvidence = 0.02;
-constexpr double kTails = 2.0;  // degrees of freedom of the priors (Student's t)
-constexpr double kUnknownShare = 0.7;   // of the prior deviation above which a value is the prior's
+// The priors' penalty is kTails / 2 ln(1 + |y|^2 / kTails) in units of their deviation: nearly a Gaussian's for what a careful
+// laboratory gets wrong, and for a fault ten times that nearly flat.
+constexpr double kTails = 2.0;
+constexpr double kUnknownShare = 0.7;   // of the prior's deviation there above which a value is the prior's
 constexpr int kStretches = 12;          // of time, whose scatter tells what the equations do not know
 constexpr double kSameClock = 1e-9;     // s
 constexpr int kLeastCameras = 2;        // from which poses and sizes can be told apart
@@ -351,7 +353,10 @@ MatrixX shared_covariance(const std::vector<FrameEquations>& frames, const Vecto
     }
     scatter += gradient * gradient.transpose();
   }
-  evidence = x.dot(information * x) - x.dot(prior.cwiseProduct(x));
+  double squares = 0.0;
+  for (const FrameEquations& frame : frames)
+    for (const FrameEquations::Sums& sums : frame.sums) squares += sums.second;
+  evidence = squares > 0.0 ? (x.dot(information * x) - x.dot(prior.cwiseProduct(x))) / squares : 0.0;
   const MatrixX covariance = information.ldlt().solve(MatrixX::Identity(m, m));
   MatrixX robust = covariance * scatter * covariance;
   const VectorX grown = (covariance.diagonal().array() / robust.diagonal().array()).max(1.0).sqrt();
@@ -364,6 +369,8 @@ void choose_clock(const Layout& layout, const MatrixX& covariance, capture::Corr
   std::vector<int> clocks;
   for (int i = 0; i < static_cast<int>(layout.columns.size()); ++i)
     if (std::string(layout.columns[i].quantity->group) == "time") clocks.push_back(i);
+  // a held clock other than the first camera's takes no part
+  std::erase_if(clocks, [&](int i) { return layout.columns[i].first < 0 && layout.columns[i].camera != 0; });
   const auto time = [&](int i) { return corrections[i].value[0]; };
   int best = -1;
   double least = 1e300;
@@ -378,14 +385,15 @@ void choose_clock(const Layout& layout, const MatrixX& covariance, capture::Corr
   if (best < 0 || layout.columns[best].first < 0) return;
   const double shift = time(best);
   const int reference = layout.columns[best].first;
+  const double unit = layout.columns[best].deviation;
   for (const int i : clocks) {
     Correction& c = corrections[i];
     const int own = layout.columns[i].first;
-    double variance = covariance(reference, reference);
-    if (own >= 0) variance += covariance(own, own) - 2.0 * covariance(own, reference);
-    const double unit = layout.columns[best].deviation;
+    const double own_unit = layout.columns[i].deviation;
+    double variance = unit * unit * covariance(reference, reference);
+    if (own >= 0) variance += own_unit * (own_unit * covariance(own, own) - 2.0 * unit * covariance(own, reference));
     c.value[0] -= shift;
-    c.deviation[0] = i == best ? 0.0 : unit * std::sqrt(std::max(0.0, variance));
+    c.deviation[0] = i == best ? 0.0 : std::sqrt(std::max(0.0, variance));
     c.state = i == best ? CorrectionState::held : CorrectionState::free;
   }
 }
@@ -446,8 +454,8 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
   out.summary = solve::least_squares(x, evaluate, solving);
   frames = all_equations(fit, x);
 
-  MatrixX covariance = shared_covariance(frames, prior_weights(fit.layout, x.head(m)), x.head(m),
-                                         out.evidence);
+  const VectorX prior = prior_weights(fit.layout, x.head(m));
+  const MatrixX covariance = shared_covariance(frames, prior, x.head(m), out.evidence);
   out.corrections = corrections_at(fit.layout, capture, x.head(m));
   for (std::size_t i = 0; i < out.corrections.size(); ++i) {
     const Column& column = fit.layout.columns[i];
@@ -455,7 +463,7 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
     if (column.first < 0) continue;
     const VectorX relative = covariance.diagonal().segment(column.first, c.value.size()).cwiseSqrt();
     c.deviation = column.deviation * relative;
-    c.state = relative.minCoeff() < kUnknownShare ? CorrectionState::free : CorrectionState::prior;
+    c.state = relative.minCoeff() * std::sqrt(prior[column.first]) < kUnknownShare ? CorrectionState::free : CorrectionState::prior;
   }
   choose_clock(fit.layout, covariance, out.corrections);
   out.chain = resized(chain, chain.length + capture::value_of(out.corrections, "object", "length"),

@@ -18,18 +18,17 @@ namespace {
 using Json = nlohmann::ordered_json;
 
 void check(const Globals& globals, const std::string& path) {
-  const capture::CheckReport report = capture::check(path);
+  capture::CheckReport report = capture::check(path);
   // what is wrong by too little to see in one camera alone
   std::optional<pipeline::Examination> found;
-  std::string unexamined;
   if (report.problems.empty()) {
     try {
       found = pipeline::examine(path);
     } catch (const InputError& error) {
-      unexamined = error.what();
+      report.doubts.push_back(error.what());
     }
   }
-  const bool clean = report.doubts.empty() && unexamined.empty() && (!found || found->verdict.empty());
+  const bool clean = report.doubts.empty() && (!found || found->verdict.empty());
   if (globals.json) {
     Json document;
     document["capture"] = path;
@@ -48,7 +47,6 @@ void check(const Globals& globals, const std::string& path) {
     for (const std::string& line : report.facts) std::cout << core::printable(line) << "\n";
     for (const std::string& line : report.doubts) std::cout << "doubt: " << core::printable(line) << "\n";
     for (const std::string& line : report.problems) std::cout << "problem: " << core::printable(line) << "\n";
-    if (!unexamined.empty()) std::cout << "doubt: " << core::printable(unexamined) << "\n";
     if (found)
       for (const capture::Finding& finding : found->verdict)
         std::cout << (finding.trusted ? "found: " : "doubt: ") << core::printable(finding.text) << "\n";

@@ -1,0 +1,91 @@
+// What a recording was given wrongly, put into the demo capture by hand and looked for.
+#include "chainsplat/silhouette.h"
+
+#include <doctest/doctest.h>
+
+#include <cmath>
+
+namespace {
+
+using namespace chainsplat;
+using math::Vector3;
+
+constexpr double kDegree = 3.14159265358979323846 / 180.0;
+
+const capture::Capture& demo() {
+  static const capture::Capture capture = capture::load(Path(CHAINSPLAT_SOURCE_DIR) / "assets/demo_free_30");
+  return capture;
+}
+
+silhouette::CorrectionFit fit(const capture::Capture& capture, const silhouette::CorrectionOptions& options = {}) {
+  constexpr int kJoints = 16;
+  const chain::Chain chain = chain::make_chain(capture.length, capture.diameter, capture.direction,
+                                               capture.bending_axis, kJoints, chain::Bending::spatial, false);
+  return silhouette::fit_corrections(chain, capture, silhouette::fit_sequence(chain, capture), options);
+}
+
+capture::Capture with_late_base(double late) {
+  capture::Capture capture = demo();
+  const trajectory::Trajectory& base = capture.base;
+  std::vector<trajectory::Sample> samples = base.samples();
+  for (trajectory::Sample& sample : samples) sample.pose = base.pose(sample.time - late);
+  capture.base = trajectory::fit(samples, "test");
+  return capture;
+}
+
+TEST_CASE("nothing is found wrong with a recording that is right") {
+  const silhouette::CorrectionFit found = fit(demo());
+  CHECK(found.evidence < 0.2);
+  CHECK(std::abs(capture::value_of(found.corrections, "base", "time")) < 2e-3);
+  CHECK(std::abs(capture::value_of(found.corrections, "object", "length")) < 0.005 * demo().length);
+  for (const silhouette::OutlineMisfit& misfit : found.misfits) {
+    CHECK(misfit.rms < 0.6);
+    CHECK(std::abs(misfit.mean) < 0.05);
+  }
+}
+
+TEST_CASE("a late base, a wrong length and a turned camera are each found to be what they are") {
+  constexpr double kLate = 1.0 / 30.0, kRatio = 0.97, kTurn = 0.5 * kDegree;
+  const silhouette::CorrectionFit late = fit(with_late_base(kLate));
+  CHECK(late.evidence > 2.0);
+  const capture::Correction& clock = *capture::find(late.corrections, "base", "time");
+  CHECK(clock.value[0] == doctest::Approx(kLate).epsilon(0.1));
+  CHECK(std::abs(clock.value[0] - kLate) < 3.0 * clock.deviation[0]);
+  CHECK(clock.state == capture::CorrectionState::free);
+
+  capture::Capture shorter = demo();
+  shorter.length *= kRatio;
+  const silhouette::CorrectionFit length = fit(shorter);
+  const capture::Correction& object = *capture::find(length.corrections, "object", "length");
+  CHECK(object.value[0] == doctest::Approx(demo().length - shorter.length).epsilon(0.2));
+  CHECK(length.chain.length == doctest::Approx(demo().length).epsilon(0.006));
+  CHECK(std::abs(capture::value_of(length.corrections, "base", "time")) < 2e-3);
+
+  capture::Capture turned = demo();
+  turned.cameras[1].world_from_camera.rotation =
+      turned.cameras[1].world_from_camera.rotation * math::exp_so3(kTurn * Vector3(0.0, 1.0, 0.0));
+  const silhouette::CorrectionFit pose = fit(turned);
+  const math::VectorX found = capture::find(pose.corrections, "cam1", "rotation")->value;
+  CHECK((found / kTurn + Vector3(0.0, 1.0, 0.0)).norm() < 0.35);
+  CHECK(capture::find(pose.corrections, "cam0", "rotation")->value.norm() < 0.35 * kTurn);
+}
+
+TEST_CASE("a group that is held stays as given, and one camera alone tells clocks only") {
+  const capture::Capture late = with_late_base(0.02);
+  const silhouette::CorrectionFit held = fit(late, {.held = {"time", "length"}});
+  for (const auto& [subject, quantity] : {std::pair("base", "time"), std::pair("object", "length")}) {
+    const capture::Correction& c = *capture::find(held.corrections, subject, quantity);
+    CHECK(c.value[0] == 0.0);
+    CHECK(c.state == capture::CorrectionState::held);
+  }
+  capture::Capture alone = late;
+  alone.cameras.resize(1);
+  alone.times.resize(1);
+  std::erase_if(alone.views, [](const capture::View& view) { return view.camera != 0; });
+  const silhouette::CorrectionFit one = fit(alone);
+  CHECK(capture::value_of(one.corrections, "base", "time") == doctest::Approx(0.02).epsilon(0.25));
+  CHECK(capture::find(one.corrections, "cam0", "rotation")->state == capture::CorrectionState::held);
+  CHECK(capture::find(one.corrections, "object", "length")->state == capture::CorrectionState::held);
+}
+
+}  // namespace
