@@ -59,9 +59,9 @@ twin::Provenance recognition_provenance(const TrainOptions& options) {
                            : *options.bending == chain::Bending::planar ? "planar"
                                                                         : "spatial"},
                {"twist", options.twist ? "yes" : "no"}};
-  std::string& held = p.options["fixed"];
+  std::string held;
   for (const std::string& group : options.fixed) held += (held.empty() ? "" : ",") + group;
-  if (held.empty()) held = "nothing";
+  if (!held.empty()) p.options["fixed"] = held;
   return p;
 }
 
@@ -134,6 +134,11 @@ void check_same_work(const Training& t) {
   const std::map<std::string, std::string> before = option_texts(had);
   for (const auto& [name, text] : option_texts(wanted))
     if (const auto at = before.find(name); at != before.end()) compare(name, at->second, text);
+  const auto held = [](const twin::Provenance& p) {
+    const auto at = p.options.find("fixed");
+    return at == p.options.end() ? std::string("nothing") : at->second;
+  };
+  compare("fixed", held(had), held(wanted));
   compare("seed", std::to_string(had.seed), std::to_string(wanted.seed));
 }
 
