@@ -170,11 +170,10 @@ void judge_folds(const silhouette::CorrectionFit& fit, std::vector<Finding>& ver
 
 }  // namespace
 
-capture::Corrections correct(capture::Capture& capture, std::optional<chain::Bending> bending,
-                             const std::vector<std::string>& fixed, std::vector<Finding>& verdict) {
+capture::Corrections correct(capture::Capture& capture, const std::vector<std::string>& fixed,
+                             std::vector<Finding>& verdict) {
   verdict.clear();
-  const chain::Bending kind =
-      bending.value_or(capture.tabletop ? chain::Bending::planar : chain::Bending::spatial);
+  const chain::Bending kind = capture.tabletop ? chain::Bending::planar : chain::Bending::spatial;
   const chain::Chain chain = chain::make_chain(capture.length, capture.diameter, capture.direction,
                                                capture.bending_axis, kJoints, kind, false);
   const silhouette::SequenceFit sequence = silhouette::fit_sequence(chain, capture);
@@ -199,7 +198,7 @@ Examination examine(const Path& path, const core::Listener& listener) {
   const core::ListenerScope scope(listener);
   capture::Capture capture = capture::load(path);
   Examination out;
-  out.corrections = correct(capture, {}, {}, out.verdict);
+  out.corrections = correct(capture, {}, out.verdict);
   return out;
 }
 

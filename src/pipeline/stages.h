@@ -24,10 +24,10 @@ class Stopwatch {
   double start_;
 };
 
-// Estimates what `capture` was given wrongly, mends it, and says so in `verdict`. `fixed`: groups taken as given. The
-// joints are its own, so that what the twin's straight links cannot follow is not taken for a fault of the capture.
-capture::Corrections correct(capture::Capture& capture, std::optional<chain::Bending> bending,
-                             const std::vector<std::string>& fixed, std::vector<capture::Finding>& verdict);
+// Estimates what `capture` was given wrongly, mends it, and says so in `verdict`. `fixed`: groups taken as given. Joints
+// and bending are its own, so that what the twin's chain cannot follow is not taken for a fault of the capture.
+capture::Corrections correct(capture::Capture& capture, const std::vector<std::string>& fixed,
+                             std::vector<capture::Finding>& verdict);
 
 // What the twin and its capture say of how to identify it.
 identification::Options identification_options(const twin::Twin& twin, bool paper, std::uint64_t seed);

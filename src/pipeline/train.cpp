@@ -207,7 +207,7 @@ void correct_capture(Training& t) {
   const std::vector<std::string>& fixed = t.options.fixed;
   if (t.options.mode == twin::Mode::paper || std::find(fixed.begin(), fixed.end(), "all") != fixed.end()) return;
   core::report({"recognize", 0, 0, NAN, NAN, "cameras, clocks, grasp and size"});
-  t.twin.corrections = correct(t.capture, t.options.bending, fixed, t.twin.verdict);
+  t.twin.corrections = correct(t.capture, fixed, t.twin.verdict);
   t.twin.chain.length = t.capture.length;
   t.twin.chain.diameter = t.capture.diameter;
 }
