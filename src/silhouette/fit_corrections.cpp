@@ -18,8 +18,8 @@ namespace {
 
 // Gauss-Newton. Outlines farther from the rope than a cut do not count (Tukey); it starts wide, since what is given may
 // be wrong by many pixels, and narrows until the residuals' own spread sets it.
-constexpr int kSteps = 16;
-constexpr double kStep = 1e-3;          // of the prior deviations, and rad: smaller steps end it
+constexpr int kSteps = 40;
+constexpr double kStep = 0.02;          // of the prior deviations, and rad: smaller steps end it
 constexpr double kLongestStep = 50.0;    // the same, in one step
 constexpr double kWidestCut = 30.0;     // px
 constexpr double kNarrowing = 0.6;      // of that cut from step to step
