@@ -64,12 +64,12 @@ TEST_CASE("a mended capture is given + value, and stamps that are late are moved
   capture::Capture mended = given;
   const Vector3 turn(0.01, -0.02, 0.005), shift(0.001, 0.002, -0.003), grasp(0.0, 0.002, 0.001);
   const double late = 0.02;
-  capture::apply({correction("left", "camera", "rotation", turn), correction("left", "camera", "translation", shift),
-                  correction("left", "camera", "focal", one(6.0)), correction("right", "camera", "time", one(0.01)),
-                  correction("base", "base", "time", one(late)), correction("grasp", "grasp", "translation", grasp),
-                  correction("object", "object", "length", one(0.009)),
-                  correction("object", "object", "diameter", one(-0.001))},
-                 mended);
+  capture::apply(
+      {correction("left", "camera", "rotation", turn), correction("left", "camera", "translation", shift),
+       correction("left", "camera", "focal", one(6.0)), correction("right", "camera", "time", one(0.01)),
+       correction("base", "base", "time", one(late)), correction("grasp", "grasp", "translation", grasp),
+       correction("object", "object", "length", one(0.009)), correction("object", "object", "diameter", one(-0.001))},
+      mended);
   const Pose &before = given.cameras[0].world_from_camera, &after = mended.cameras[0].world_from_camera;
   CHECK((after.rotation - before.rotation * math::exp_so3(turn)).norm() < 1e-12);
   CHECK((after.translation - before.translation - shift).norm() < 1e-12);

@@ -46,15 +46,15 @@ using Corrections = std::vector<Correction>;
 
 // What is wrong with a recording or doubtful about a twin, in plain words and as numbers. formats.md 2 lists the codes.
 struct Finding {
-  std::string code;         // "base-time", "camera-pose", "length", "outline-misfit", "fold", ...
-  std::string subject;      // a camera's name, "base", "base", "grasp" or "object"
-  double value = 0.0;       // in `unit`
-  double deviation = 0.0;   // one standard deviation, 0: none
-  std::string unit;         // "ms", "deg", "mm", "%", "px", "rad"
-  bool corrected = false;   // the twin is made as if it were right
-  bool trusted = true;      // false: do not trust this twin
-  int frame = -1;           // of the subject, where it shows most; -1: everywhere
-  std::string text;         // one line
+  std::string code;        // "base-time", "camera-pose", "length", "outline-misfit", "fold", ...
+  std::string subject;     // a camera's name, "base", "base", "grasp" or "object"
+  double value = 0.0;      // in `unit`
+  double deviation = 0.0;  // one standard deviation, 0: none
+  std::string unit;        // "ms", "deg", "mm", "%", "px", "rad"
+  bool corrected = false;  // the twin is made as if it were right
+  bool trusted = true;     // false: do not trust this twin
+  int frame = -1;          // of the subject, where it shows most; -1: everywhere
+  std::string text;        // one line
 };
 
 // Text of a camera's pose and focal length as given, by which a calibration is known again.

@@ -21,14 +21,10 @@ constexpr double kLongestExtrapolation = 0.2;  // s by which a base is continued
 const std::vector<CorrectedQuantity>& corrected_quantities() {
   // What a careful laboratory reaches. The priors have heavy tails, so that a fault of ten times that is still found.
   static const std::vector<CorrectedQuantity> quantities = {
-      {"camera", "rotation", "cameras", "rad", 3, 0.002, 0.0},
-      {"camera", "translation", "cameras", "m", 3, 0.001, 0.0},
-      {"camera", "focal", "focal", "px", 1, 0.0, 0.001},
-      {"camera", "time", "time", "s", 1, 0.001, 0.0},
-      {"camera", "mask_offset", "masks", "px", 1, 0.3, 0.0},
-      {"base", "time", "time", "s", 1, 0.002, 0.0},
-      {"grasp", "translation", "grasp", "m", 3, 0.0005, 0.0},
-      {"object", "length", "length", "m", 1, 0.0, 0.01},
+      {"camera", "rotation", "cameras", "rad", 3, 0.002, 0.0}, {"camera", "translation", "cameras", "m", 3, 0.001, 0.0},
+      {"camera", "focal", "focal", "px", 1, 0.0, 0.001},       {"camera", "time", "time", "s", 1, 0.001, 0.0},
+      {"camera", "mask_offset", "masks", "px", 1, 0.3, 0.0},   {"base", "time", "time", "s", 1, 0.002, 0.0},
+      {"grasp", "translation", "grasp", "m", 3, 0.0005, 0.0},  {"object", "length", "length", "m", 1, 0.0, 0.01},
       {"object", "diameter", "diameter", "m", 1, 0.0, 0.01},
   };
   return quantities;
@@ -57,9 +53,9 @@ std::string calibration_text(const Camera& camera) {
   numbers[12] = camera.fx;
   numbers[13] = camera.fy;
   char text[17];
-  std::snprintf(text, sizeof text, "%016llx",
-                static_cast<unsigned long long>(
-                    core::fnv1a({reinterpret_cast<const char*>(numbers.data()), sizeof numbers})));
+  std::snprintf(
+      text, sizeof text, "%016llx",
+      static_cast<unsigned long long>(core::fnv1a({reinterpret_cast<const char*>(numbers.data()), sizeof numbers})));
   return text;
 }
 

@@ -22,18 +22,18 @@ constexpr double kNothingWrong = 1.0;
 constexpr double kSure = 1.5;  // standard deviations from which a correction is told, since something is wrong
 constexpr double kMeters = 1e3, kSeconds = 1e3, kDegrees = 180.0 / std::numbers::pi;  // to mm, ms, degrees
 // What a correction must be, at least, to be worth a line.
-constexpr double kClock = 2.0;      // ms
-constexpr double kTurn = 0.1;       // degrees
-constexpr double kShift = 2.0;      // mm, of a camera
-constexpr double kFocal = 0.3;      // %
-constexpr double kGrasp = 1.0;      // mm
-constexpr double kLength = 0.5;     // %
-constexpr double kDiameter = 3.0;   // %
-constexpr double kFringe = 0.6;     // px
+constexpr double kClock = 2.0;     // ms
+constexpr double kTurn = 0.1;      // degrees
+constexpr double kShift = 2.0;     // mm, of a camera
+constexpr double kFocal = 0.3;     // %
+constexpr double kGrasp = 1.0;     // mm
+constexpr double kLength = 0.5;    // %
+constexpr double kDiameter = 3.0;  // %
+constexpr double kFringe = 0.6;    // px
 // What no correction explains.
-constexpr double kMisfit = 1.5;     // px RMS of a camera's outlines, of which straight links leave 0.3 to 0.4
-constexpr double kForeign = 0.25;   // share of the outline that is not the rope's: blobs, occluders, or a wrong length
-constexpr double kFold = 2.4;       // rad at one of the user's joints: no rope bends so far at one place
+constexpr double kMisfit = 1.5;    // px RMS of a camera's outlines, of which straight links leave 0.3 to 0.4
+constexpr double kForeign = 0.25;  // share of the outline that is not the rope's: blobs, occluders, or a wrong length
+constexpr double kFold = 2.4;      // rad at one of the user's joints: no rope bends so far at one place
 constexpr double kFartherThanAny = 0.15;  // share of the length by which no ruler is wrong
 
 std::string text(const char* format, ...) __attribute__((format(printf, 1, 2)));
@@ -89,25 +89,25 @@ void judge_cameras(const capture::Corrections& found, const capture::Capture& gi
                                             shift.value, shift.deviation)});
     const Size focal = size_of(capture::find(found, camera.name, "focal"), 100.0 / camera.fx);
     if (worth_saying(focal, kFocal))
-      verdict.push_back({"focal", camera.name, focal.value, focal.deviation, "%", true, true, -1,
-                         camera.name + text("'s focal length is %.2f +- %.2f %% %s than given: corrected",
-                                            std::abs(focal.value), focal.deviation,
-                                            focal.value > 0.0 ? "longer" : "shorter")});
+      verdict.push_back(
+          {"focal", camera.name, focal.value, focal.deviation, "%", true, true, -1,
+           camera.name + text("'s focal length is %.2f +- %.2f %% %s than given: corrected", std::abs(focal.value),
+                              focal.deviation, focal.value > 0.0 ? "longer" : "shorter")});
     const Size fringe = size_of(capture::find(found, camera.name, "mask_offset"), 1.0);
     if (worth_saying(fringe, kFringe))
-      verdict.push_back({"mask-offset", camera.name, fringe.value, fringe.deviation, "px", false, true, -1,
-                         camera.name + text("'s masks are %.1f +- %.1f px %s than the rope on each side",
-                                            std::abs(fringe.value), fringe.deviation,
-                                            fringe.value > 0.0 ? "wider" : "narrower")});
+      verdict.push_back(
+          {"mask-offset", camera.name, fringe.value, fringe.deviation, "px", false, true, -1,
+           camera.name + text("'s masks are %.1f +- %.1f px %s than the rope on each side", std::abs(fringe.value),
+                              fringe.deviation, fringe.value > 0.0 ? "wider" : "narrower")});
   }
 }
 
 void judge_rope(const capture::Corrections& found, const capture::Capture& given, std::vector<Finding>& verdict) {
   const Size grasp = size_of(capture::find(found, "grasp", "translation"), kMeters);
   if (worth_saying(grasp, kGrasp))
-    verdict.push_back({"grasp", "grasp", grasp.value, grasp.deviation, "mm", true, true, -1,
-                       text("the rope is held %.1f +- %.1f mm from where it was given: corrected", grasp.value,
-                            grasp.deviation)});
+    verdict.push_back(
+        {"grasp", "grasp", grasp.value, grasp.deviation, "mm", true, true, -1,
+         text("the rope is held %.1f +- %.1f mm from where it was given: corrected", grasp.value, grasp.deviation)});
   const Size length = size_of(capture::find(found, "object", "length"), 100.0 / given.length);
   if (worth_saying(length, kLength)) {
     const bool possible = std::abs(length.value) < 100.0 * kFartherThanAny;
@@ -118,10 +118,10 @@ void judge_rope(const capture::Corrections& found, const capture::Capture& given
   }
   const Size diameter = size_of(capture::find(found, "object", "diameter"), 100.0 / given.diameter);
   if (worth_saying(diameter, kDiameter))
-    verdict.push_back({"diameter", "object", diameter.value, diameter.deviation, "%", true, true, -1,
-                       text("the rope is %.1f +- %.1f %% %s than %.2f mm: corrected", std::abs(diameter.value),
-                            diameter.deviation, diameter.value > 0.0 ? "thicker" : "thinner",
-                            kMeters * given.diameter)});
+    verdict.push_back(
+        {"diameter", "object", diameter.value, diameter.deviation, "%", true, true, -1,
+         text("the rope is %.1f +- %.1f %% %s than %.2f mm: corrected", std::abs(diameter.value), diameter.deviation,
+              diameter.value > 0.0 ? "thicker" : "thinner", kMeters * given.diameter)});
 }
 
 void judge_outlines(const silhouette::CorrectionFit& fit, const capture::Capture& given,
@@ -130,10 +130,11 @@ void judge_outlines(const silhouette::CorrectionFit& fit, const capture::Capture
     const silhouette::OutlineMisfit& misfit = fit.misfits[c];
     const std::string& name = given.cameras[c].name;
     if (misfit.rms > kMisfit)
-      verdict.push_back({"outline-misfit", name, misfit.rms, 0.0, "px", false, false, misfit.worst_frame,
-                         name + text("'s outlines still miss the rope by %.1f px (worst in frame %d): do not trust this "
-                                     "twin",
-                                     misfit.rms, misfit.worst_frame)});
+      verdict.push_back(
+          {"outline-misfit", name, misfit.rms, 0.0, "px", false, false, misfit.worst_frame,
+           name + text("'s outlines still miss the rope by %.1f px (worst in frame %d): do not trust this "
+                       "twin",
+                       misfit.rms, misfit.worst_frame)});
     else if (misfit.cut > kForeign)
       verdict.push_back({"outline-misfit", name, 100.0 * misfit.cut, 0.0, "%", false, true, misfit.worst_frame,
                          name + text(": %.0f %% of the masks' outline is not the rope's", 100.0 * misfit.cut)});
@@ -162,10 +163,11 @@ void judge_folds(const silhouette::CorrectionFit& fit, std::vector<Finding>& ver
   }
   if (worst < kFold) return;
   const double from_grasp = chain.link_start(joint);
-  verdict.push_back({"fold", "object", worst, 0.0, "rad", false, false, -1,
-                     text("the rope folds back by %.1f rad at %.0f mm from the grasp (%.2f s): its length is wrong, do not "
-                          "trust this twin",
-                          worst, kMeters * from_grasp, fit.time[frame])});
+  verdict.push_back(
+      {"fold", "object", worst, 0.0, "rad", false, false, -1,
+       text("the rope folds back by %.1f rad at %.0f mm from the grasp (%.2f s): its length is wrong, do not "
+            "trust this twin",
+            worst, kMeters * from_grasp, fit.time[frame])});
 }
 
 }  // namespace

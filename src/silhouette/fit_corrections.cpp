@@ -19,33 +19,34 @@ namespace {
 // Gauss-Newton. Outlines farther from the rope than a cut do not count (Tukey); it starts wide, since what is given may
 // be wrong by many pixels, and narrows until the residuals' own spread sets it.
 constexpr int kSteps = 40;
-constexpr double kStep = 0.02;          // of the prior deviations, and rad: smaller steps end it
-constexpr double kLongestStep = 50.0;    // the same, in one step
-constexpr double kWidestCut = 30.0;     // px
-constexpr double kNarrowing = 0.6;      // of that cut from step to step
-constexpr double kLeastCut = 2.5;       // px
+constexpr double kStep = 0.02;                     // of the prior deviations, and rad: smaller steps end it
+constexpr double kLongestStep = 50.0;              // the same, in one step
+constexpr double kWidestCut = 30.0;                // px
+constexpr double kNarrowing = 0.6;                 // of that cut from step to step
+constexpr double kLeastCut = 2.5;                  // px
 constexpr double kCutDeviations = 4.685 * 1.4826;  // Tukey's constant times a median's standard deviation
-constexpr double kWideEnd = 8.0;        // half widths from the chain's end within which the free end is sought
+constexpr double kWideEnd = 8.0;          // half widths from the chain's end within which the free end is sought
 constexpr double kJointDifference = 0.3;  // rad, deviation of the difference of neighboring angles with eight joints
-constexpr double kBlobReach = 3.0;      // diameters from the chain within which a blob is the rope
-constexpr double kLinkOffset = 0.2;     // px, deviation of one link's outline in one view (observations.cpp)
-// What one pixel of outline counts against the priors, of one independent observation of a deviation of 1 px. Neighboring
-// outline and neighboring frames share the error of straight links, which pulls the grasp along the rope: on recordings
-// with truth the place of the grasp and the length were off by 10 mm with 1, by their priors with less than 0.05.
+constexpr double kBlobReach = 3.0;        // diameters from the chain within which a blob is the rope
+constexpr double kLinkOffset = 0.2;       // px, deviation of one link's outline in one view (observations.cpp)
+// What one pixel of outline counts against the priors, of one independent observation of a deviation of 1 px.
+// Neighboring outline and neighboring frames share the error of straight links, which pulls the grasp along the rope:
+// on recordings with truth the place of the grasp and the length were off by 10 mm with 1, by their priors with less
+// than 0.05.
 constexpr double kEvidence = 0.02;
-// The priors' penalty is kTails / 2 ln(1 + |y|^2 / kTails) in units of their deviation: nearly a Gaussian's for what a careful
-// laboratory gets wrong, and for a fault ten times that nearly flat.
+// The priors' penalty is kTails / 2 ln(1 + |y|^2 / kTails) in units of their deviation: nearly a Gaussian's for what a
+// careful laboratory gets wrong, and for a fault ten times that nearly flat.
 constexpr double kTails = 2.0;
-constexpr double kUnknownShare = 0.7;   // of the prior's deviation there above which a value is the prior's
-constexpr int kStretches = 12;          // of time, whose scatter tells what the equations do not know
-constexpr double kSameClock = 1e-9;     // s
-constexpr int kLeastCameras = 2;        // from which poses and sizes can be told apart
+constexpr double kUnknownShare = 0.7;  // of the prior's deviation there above which a value is the prior's
+constexpr int kStretches = 12;         // of time, whose scatter tells what the equations do not know
+constexpr double kSameClock = 1e-9;    // s
+constexpr int kLeastCameras = 2;       // from which poses and sizes can be told apart
 
 // Where one kind of correction of one subject stands among the shared unknowns, which are in units of its deviation.
 struct Column {
   const capture::CorrectedQuantity* quantity = nullptr;
-  int camera = -1;  // -1: of base, grasp or object
-  int first = -1;   // -1: held
+  int camera = -1;         // -1: of base, grasp or object
+  int first = -1;          // -1: held
   double deviation = 0.0;  // in the quantity's unit
 };
 
@@ -96,8 +97,7 @@ VectorX prior_weights(const Layout& layout, const VectorX& x) {
   for (const Column& column : layout.columns) {
     if (column.first < 0) continue;
     const int size = column.quantity->size;
-    out.segment(column.first, size).setConstant(1.0 /
-                                                (1.0 + x.segment(column.first, size).squaredNorm() / kTails));
+    out.segment(column.first, size).setConstant(1.0 / (1.0 + x.segment(column.first, size).squaredNorm() / kTails));
   }
   return out;
 }
@@ -152,9 +152,9 @@ struct Fit {
   const chain::Chain& given;
   Layout layout;
   std::vector<Frame> frames;
-  std::vector<MaskPoints> masks;  // by view
-  MatrixX prior;                  // of the angles
-  std::vector<char> held;         // by angle
+  std::vector<MaskPoints> masks;               // by view
+  MatrixX prior;                               // of the angles
+  std::vector<char> held;                      // by angle
   double cut = kWidestCut, wide = kWidestCut;  // px
 };
 
@@ -190,8 +190,8 @@ FrameEquations frame_equations(const Fit& fit, const Frame& frame, const capture
     ViewWork work;
     work.view = &frame_view;
     work.camera_from_base = camera.world_from_camera.inverse() * world_from_base;
-    work.diameter = chain.diameter * 0.5 * (camera.fx + camera.fy) /
-                    std::max(kNear, work.camera_from_base.translation.z());
+    work.diameter =
+        chain.diameter * 0.5 * (camera.fx + camera.fy) / std::max(kNear, work.camera_from_base.translation.z());
     work.active.assign(frame_view.mask->blobs.size(), 0);
     problem.views.push_back(std::move(work));
     pose(problem, theta + after * frame.thetadot);
@@ -219,20 +219,20 @@ FrameEquations frame_equations(const Fit& fit, const Frame& frame, const capture
     const int at_grasp = use("grasp", "translation", -1), at_length = use("object", "length", -1);
     const int at_diameter = use("object", "diameter", -1);
     MatrixX twists(6, n);
-    for (int k = 0; k < n; ++k)
-      twists.col(k) = math::transform_twist(posed.camera_from_base, problem.axes.col(k));
+    for (int k = 0; k < n; ++k) twists.col(k) = math::transform_twist(posed.camera_from_base, problem.axes.col(k));
     const Pose camera_from_recorded = camera.world_from_camera.inverse() * base.pose;
     const Vector6 base_twist = math::transform_twist(camera_from_recorded, base.velocity);
     const math::Matrix3 &world_from_camera = camera.world_from_camera.rotation,
                         &camera_from_base = posed.camera_from_base.rotation;
-    const Vector3 &at_clamp = posed.camera_from_base.translation;
+    const Vector3& at_clamp = posed.camera_from_base.translation;
     const double offset = capture::value_of(corrections, camera.name, "mask_offset");
 
     MatrixX normal = MatrixX::Zero(size, size);
     VectorX right = VectorX::Zero(size);
     const int links = chain.links();
     MatrixX coupling = MatrixX::Zero(size, links);  // of each link's own offset in this view
-    VectorX link_weight = VectorX::Constant(links, kEvidence / (kLinkOffset * kLinkOffset)), link_right = VectorX::Zero(links);
+    VectorX link_weight = VectorX::Constant(links, kEvidence / (kLinkOffset * kLinkOffset)),
+            link_right = VectorX::Zero(links);
     VectorX row(size);
     FrameEquations::Sums& sums = out.sums[c];
     for_each_outline_point(
@@ -259,14 +259,16 @@ FrameEquations frame_equations(const Fit& fit, const Frame& frame, const capture
             speed += row[k] * frame.thetadot[k];
           }
           const double base_speed = moment.dot(base_twist.head<3>()) + g.dot(base_twist.tail<3>());
-          const auto scaled = [&](int at, const char* subject, const char* quantity, int camera_index, const auto& value) {
+          const auto scaled = [&](int at, const char* subject, const char* quantity, int camera_index,
+                                  const auto& value) {
             const double unit = column_of(layout, subject, quantity, camera_index).deviation;
             row.segment(at, value.size()) = unit * value;
           };
           using One = Eigen::Matrix<double, 1, 1>;
           const auto one = [](double value) { return One(value); };
           if (at_rotation >= 0) scaled(at_rotation, "camera", "rotation", c, Vector3(g.cross(p.x)));
-          if (at_translation >= 0) scaled(at_translation, "camera", "translation", c, Vector3(-(world_from_camera * g)));
+          if (at_translation >= 0)
+            scaled(at_translation, "camera", "translation", c, Vector3(-(world_from_camera * g)));
           if (at_focal >= 0) {
             const Vector2 from_center = image_of(camera, p.x) - Vector2(camera.cx, camera.cy);
             scaled(at_focal, "camera", "focal", c, one((p.outward.dot(from_center) + p.half_width) / camera.fx));
@@ -275,8 +277,7 @@ FrameEquations frame_equations(const Fit& fit, const Frame& frame, const capture
           if (at_offset >= 0) scaled(at_offset, "camera", "mask_offset", c, one(1.0));
           if (at_base >= 0) scaled(at_base, "base", "time", -1, one(base_speed));
           if (at_grasp >= 0) scaled(at_grasp, "grasp", "translation", -1, Vector3(camera_from_base.transpose() * g));
-          if (at_length >= 0)
-            scaled(at_length, "object", "length", -1, one(g.dot(p.x - at_clamp) / chain.length));
+          if (at_length >= 0) scaled(at_length, "object", "length", -1, one(g.dot(p.x - at_clamp) / chain.length));
           if (at_diameter >= 0) scaled(at_diameter, "object", "diameter", -1, one(p.half_width / chain.diameter));
           normal.selfadjointView<Eigen::Lower>().rankUpdate(row, weight);
           right += weight * residual * row;
@@ -463,7 +464,8 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
     if (column.first < 0) continue;
     const VectorX relative = covariance.diagonal().segment(column.first, c.value.size()).cwiseSqrt();
     c.deviation = column.deviation * relative;
-    c.state = relative.minCoeff() * std::sqrt(prior[column.first]) < kUnknownShare ? CorrectionState::free : CorrectionState::prior;
+    c.state = relative.minCoeff() * std::sqrt(prior[column.first]) < kUnknownShare ? CorrectionState::free
+                                                                                   : CorrectionState::prior;
   }
   choose_clock(fit.layout, covariance, out.corrections);
   out.chain = resized(chain, chain.length + capture::value_of(out.corrections, "object", "length"),

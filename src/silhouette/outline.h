@@ -1,5 +1,5 @@
-// The mask's outline as observations of the posed chain: which point of the rope each piece of outline shows, and how far
-// it is from where the tube's outline should be (mathematics.md 6).
+// The mask's outline as observations of the posed chain: which point of the rope each piece of outline shows, and how
+// far it is from where the tube's outline should be (mathematics.md 6).
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -60,14 +60,14 @@ inline double tukey_weight(double residual, double cut) {
 // One piece of outline and the point of the rope that it shows.
 struct OutlinePoint {
   const Segment* segment = nullptr;
-  Vector3 x;           // the point on the centerline, camera frame, m
-  Vector3 gradient;    // of the tube's outline along `outward` by x, px/m
-  Vector2 outward;     // unit, image: the direction in which the distance is measured
-  double distance;     // px, from the tube's outline to the mask's, positive where the mask is wider
-  double length;       // px of outline that it stands for
-  double half_width;   // px, of the tube there
-  bool end;            // it shows the free end's disk, not the side
-  bool before_grasp;   // it is nearest to the grasp, and beyond it
+  Vector3 x;          // the point on the centerline, camera frame, m
+  Vector3 gradient;   // of the tube's outline along `outward` by x, px/m
+  Vector2 outward;    // unit, image: the direction in which the distance is measured
+  double distance;    // px, from the tube's outline to the mask's, positive where the mask is wider
+  double length;      // px of outline that it stands for
+  double half_width;  // px, of the tube there
+  bool end;           // it shows the free end's disk, not the side
+  bool before_grasp;  // it is nearest to the grasp, and beyond it
 };
 
 // Calls each(edge) for every piece of outline of the active blobs, and then visit(point) where it shows the rope. The
