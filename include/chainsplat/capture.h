@@ -48,6 +48,14 @@ struct Table {
   math::Vector3 normal = math::Vector3::UnitZ();  // upward, unit, world frame
 };
 
+// How sure one thing that a capture gives is: one standard deviation in the unit of capture::corrected_quantities(),
+// of each number; 0: it is exact.
+struct GivenSigma {
+  std::string subject;  // a camera's name, "base", "grasp" or "object"
+  std::string quantity;
+  double deviation = 0.0;
+};
+
 struct Capture {
   Path folder;
   std::string name;
@@ -61,7 +69,8 @@ struct Capture {
   std::vector<std::vector<double>> times;  // s, frame times of each camera (of all frames, loaded or not)
   std::vector<View> views;                 // sorted by camera, then frame; only the frames asked for
   trajectory::Trajectory base;
-  std::uint64_t hash = 0;  // of capture.json, the base file and the sizes of the image and mask files
+  std::vector<GivenSigma> sigma;  // where the capture says so; else what corrected_quantities() says
+  std::uint64_t hash = 0;         // of capture.json, the base file and the sizes of the image and mask files
   bool has_depth = false;
 };
 
@@ -115,6 +124,7 @@ Capture load_recorded(Capture loaded, const Path& path, LoadOptions options = {}
 // The findings of `chainsplat check`: `problems` would make load() throw, `doubts` are warnings.
 struct CheckReport {
   std::vector<std::string> facts, doubts, problems;
+  bool poses_doubted = false;  // one of the doubts is about where cameras and gripper are
 };
 CheckReport check(const Path& path);
 

@@ -78,6 +78,12 @@ MatrixX displacement_metric(const std::vector<MatrixX>& jacobians, const VectorX
 bool is_twist(const Chain& chain, int angle);
 bool has_twist(const Chain& chain);
 
+// What straight links and a tube of constant width cannot follow: the variance, m^2 per coordinate, of the position of
+// every link's end (links 1..), and the covariance of the angles that follows from it, rad^2, n x n (mathematics.md
+// 6.11). It belongs to every covariance that is told, and to none that weights measurements by their noise.
+std::vector<double> shape_variances(const Chain& chain, const VectorX& theta);
+MatrixX shape_covariance(const Chain& chain, const std::vector<double>& variances, const VectorX& theta);
+
 // Link that carries the material point at `arclength` (a joint belongs to the link it starts).
 int link_at(const Chain& chain, double arclength);
 

@@ -22,10 +22,11 @@ struct CorrectedQuantity {
   int size;             // numbers
   double deviation;     // standard deviation before anything was seen, in the unit,
   double relative;      // or as a share of the given value
+  double most;          // in the unit: more in a file is no correction
 };
-// rotation: rotation vector in the camera's frame (world_from_camera's rotation times its exponential); translation:
-// of a camera in the world frame, of the grasp in the base frame; focal: of fx, with fy in proportion; mask_offset: by
-// how much the camera's masks are wider than the rope on each side.
+// rotation: rotation vector of a camera in its own frame (world_from_camera's rotation times its exponential), of the
+// grasp in the base frame; translation: of a camera in the world frame, of the grasp in the base frame; focal: of fx,
+// with fy in proportion; mask_offset: by how much the camera's masks are wider than the rope on each side.
 const std::vector<CorrectedQuantity>& corrected_quantities();
 
 // free: the recording determines it. prior: it may vary, but the recording says little beyond the given value. held:
@@ -46,15 +47,16 @@ using Corrections = std::vector<Correction>;
 
 // What is wrong with a recording or doubtful about a twin, in plain words and as numbers. formats.md 2 lists the codes.
 struct Finding {
-  std::string code;        // "base-time", "camera-pose", "length", "outline-misfit", "fold", ...
-  std::string subject;     // a camera's name, "base", "base", "grasp" or "object"
-  double value = 0.0;      // in `unit`
-  double deviation = 0.0;  // one standard deviation, 0: none
-  std::string unit;        // "ms", "deg", "mm", "%", "px", "rad"
-  bool corrected = false;  // the twin is made as if it were right
-  bool trusted = true;     // false: do not trust this twin
-  int frame = -1;          // of the subject, where it shows most; -1: everywhere
-  std::string text;        // one line
+  std::string code;         // "base-time", "camera-pose", "length", "outline-misfit", "fold", ...
+  std::string subject;      // a camera's name, "base", "grasp" or "object"
+  double value = 0.0;       // in `unit`
+  double deviation = 0.0;   // one standard deviation, 0: none
+  std::string unit;         // "ms", "deg", "mm", "%", "px", "rad"
+  bool corrected = false;   // the twin is made as if it were right
+  bool trusted = true;      // false: do not trust this twin
+  bool impossible = false;  // a mistake in how the capture was written: no twin is made of it unless that is asked for
+  int frame = -1;           // of the subject, where it shows most; -1: everywhere
+  std::string text;         // one line
 };
 
 // Text of a camera's pose and focal length as given, by which a calibration is known again.
@@ -70,6 +72,8 @@ double value_of(const Corrections& corrections, const std::string& subject, cons
 // its last velocity and acceleration. Views keep their pixels. Cameras without corrections stay as they are, and so do
 // those that are calibrated otherwise than the corrected ones were, which is warned of.
 void apply(const Corrections& corrections, Capture& capture);
+// What the base's poses are multiplied by.
+math::Pose grasp_in_base(const Corrections& corrections);
 // The parts of it: one camera (without its clock), and a base whose clock and grasp were off.
 Camera corrected(const Corrections& corrections, Camera camera);
 trajectory::Trajectory corrected(const Corrections& corrections, const trajectory::Trajectory& base, double first,

@@ -47,6 +47,9 @@ Matrix3 orthonormalized(const Matrix3& almost_rotation);
 // moves the eigenvalues of an n x n correlation matrix by up to 5e-9 n; the computation's own rounding is smaller.
 constexpr double kCovarianceTolerance = 1e-6;
 bool is_covariance(const MatrixX& m);
+// The middle value, of an even number the upper of the two in the middle, 0 of none. Reorders the values.
+double median(std::vector<double>& values);
+
 // Returns the indices that remain, in ascending order, after those with unknown (not finite) entries are removed from
 // the covariance one by one, each time the index with the most unknown entries.
 std::vector<Eigen::Index> known_part(const MatrixX& covariance);

@@ -40,6 +40,7 @@ struct TrainOptions {
   Path picture;               // PNG of observed beside rendered frames; empty: none
   // What is taken as given instead of estimated with the angles: groups of capture::corrected_quantities(), or "all".
   std::vector<std::string> fixed;
+  bool anyway = false;  // go on where the capture contradicts itself so that no twin of it is worth having
   std::uint64_t seed = 0;
   std::string device;  // Vulkan device, its number or a part of its name; empty: chosen
 

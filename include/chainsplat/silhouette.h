@@ -93,6 +93,7 @@ struct OutlineMisfit {
 
 struct CorrectionFit {
   capture::Corrections corrections;
+  math::MatrixX covariance;  // of all their numbers, in their order and units; 0 for those that are held
   // By which share the outlines' square residuals would be larger with what was given, whatever of it is wrong.
   double evidence = 0.0;
   solve::Summary summary;              // the unknowns relative to their prior deviations, and rad
@@ -109,5 +110,12 @@ struct CorrectionFit {
 // equations say and of what the scatter between stretches of time says.
 CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& fit,
                               const CorrectionOptions& options = {});
+
+// What the corrections' `covariance` (CorrectionFit) leaves open about the angles of every state, rad^2, n x n: other
+// corrections as likely as these would have made other angles. `capture` is the corrected one that the states are of.
+std::vector<math::MatrixX> covariances_by_corrections(const chain::Chain& chain, const capture::Capture& capture,
+                                                      const chain::States& states,
+                                                      const capture::Corrections& corrections,
+                                                      const math::MatrixX& covariance);
 
 }  // namespace chainsplat::silhouette

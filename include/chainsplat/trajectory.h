@@ -54,6 +54,10 @@ class Trajectory {
 // order, places or durations beyond all bounds, more than half a turn between samples, and more than a whole turn from
 // the first sample about a changing axis (r has no smooth continuation there).
 Trajectory fit(std::vector<Sample> samples, const std::string& where);
+// The trajectory with samples beyond its own, one mean interval apart, so that it covers [first, last], but at most
+// kLongestContinuation s at either end: there it goes on with its last velocity and acceleration. A base at rest stays.
+constexpr double kLongestContinuation = 0.2;  // s
+std::vector<Sample> continued(const Trajectory& trajectory, double first, double last);
 // Reads one pose per line, 'timestamp tx ty tz qx qy qz qw' in s and m, with '#' comments. Throws InputError that names
 // file and line.
 std::vector<Sample> read_tum(const Path& file);

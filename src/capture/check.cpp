@@ -43,10 +43,7 @@ std::string text(const char* format, auto... values) {
 }
 
 double median(std::vector<double> values) {
-  if (values.empty()) return std::numeric_limits<double>::quiet_NaN();
-  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
+  return values.empty() ? std::numeric_limits<double>::quiet_NaN() : math::median(values);
 }
 
 // Returns the distance from an image position to the nearest mask pixel, px.
@@ -246,13 +243,14 @@ void check_camera(const Manifest& manifest, const CameraSource& source, const Vi
     report.doubts.push_back(
         text("%s: the object's brightness jumps between frames (%.0f to %.0f of 255): is the exposure fixed?",
              name.c_str(), *darkest, *brightest));
+  if (std::isfinite(across) && across < kThinRope)
+    report.doubts.push_back(text("%s: the rope is only %.1f px across", name.c_str(), across));
   // where the grasp projects to
+  const std::size_t before = report.doubts.size();
   if (behind > 0)
     report.doubts.push_back(
         text("%s: the grasp is behind the camera in %d frames: does world_from_camera use OpenCV's axes (z forward)?",
              name.c_str(), behind));
-  if (std::isfinite(across) && across < kThinRope)
-    report.doubts.push_back(text("%s: the rope is only %.1f px across", name.c_str(), across));
   const double allowed = kGripperReach * camera.fx / z + kPoseSlack;
   if (miss > allowed)
     report.doubts.push_back(
@@ -264,6 +262,7 @@ void check_camera(const Manifest& manifest, const CameraSource& source, const Vi
         "%s: %.0f %% of the mask lies behind the grasp, against grasp.direction: check the camera's pose, the base "
         "trajectory and the direction",
         name.c_str(), 100.0 * median(wrong_side)));
+  report.poses_doubted = report.poses_doubted || report.doubts.size() > before;
   // a wrong clock shows as a distance that shrinks when the base is moved in time; the RMS over all frames is compared,
   // because frames at rest carry no information and would decide a median
   const auto rms = [](const std::vector<double>& values) {

@@ -14,18 +14,23 @@ using math::VectorX;
 
 namespace {
 
-constexpr double kLongestExtrapolation = 0.2;  // s by which a base is continued at either end
+constexpr double kLeastShare = 0.1;  // of a given size or focal length: less left is no correction
 
 }  // namespace
 
 const std::vector<CorrectedQuantity>& corrected_quantities() {
   // What a careful laboratory reaches. The priors have heavy tails, so that a fault of ten times that is still found.
   static const std::vector<CorrectedQuantity> quantities = {
-      {"camera", "rotation", "cameras", "rad", 3, 0.002, 0.0}, {"camera", "translation", "cameras", "m", 3, 0.001, 0.0},
-      {"camera", "focal", "focal", "px", 1, 0.0, 0.001},       {"camera", "time", "time", "s", 1, 0.001, 0.0},
-      {"camera", "mask_offset", "masks", "px", 1, 0.3, 0.0},   {"base", "time", "time", "s", 1, 0.002, 0.0},
-      {"grasp", "translation", "grasp", "m", 3, 0.0005, 0.0},  {"object", "length", "length", "m", 1, 0.0, 0.01},
-      {"object", "diameter", "diameter", "m", 1, 0.0, 0.01},
+      {"camera", "rotation", "cameras", "rad", 3, 0.002, 0.0, 3.2},
+      {"camera", "translation", "cameras", "m", 3, 0.001, 0.0, 100.0},
+      {"camera", "focal", "focal", "px", 1, 0.0, 0.001, 1e6},
+      {"camera", "time", "time", "s", 1, 0.001, 0.0, 10.0},
+      {"camera", "mask_offset", "masks", "px", 1, 0.3, 0.0, 1e3},
+      {"base", "time", "time", "s", 1, 0.002, 0.0, 10.0},
+      {"grasp", "translation", "grasp", "m", 3, 0.0005, 0.0, 100.0},
+      {"grasp", "rotation", "grasp", "rad", 3, 0.005, 0.0, 3.2},
+      {"object", "length", "length", "m", 1, 0.0, 0.01, 100.0},
+      {"object", "diameter", "diameter", "m", 1, 0.0, 0.01, 100.0},
   };
   return quantities;
 }
@@ -59,12 +64,21 @@ std::string calibration_text(const Camera& camera) {
   return text;
 }
 
+math::Pose grasp_in_base(const Corrections& corrections) {
+  Pose out;
+  if (const Correction* const turn = find(corrections, "grasp", "rotation")) out.rotation = math::exp_so3(turn->value);
+  if (const Correction* const shift = find(corrections, "grasp", "translation")) out.translation = shift->value;
+  return out;
+}
+
 Camera corrected(const Corrections& corrections, Camera camera) {
   Pose& pose = camera.world_from_camera;
   if (const Correction* const turn = find(corrections, camera.name, "rotation"))
     pose.rotation = pose.rotation * math::exp_so3(turn->value);
   if (const Correction* const shift = find(corrections, camera.name, "translation")) pose.translation += shift->value;
   const double scale = 1.0 + value_of(corrections, camera.name, "focal") / camera.fx;
+  if (!(scale > kLeastShare))
+    throw InputError(camera.name, "the twin's correction leaves nothing of its focal length", "train again");
   camera.fx *= scale;
   camera.fy *= scale;
   return camera;
@@ -73,34 +87,14 @@ Camera corrected(const Corrections& corrections, Camera camera) {
 trajectory::Trajectory corrected(const Corrections& corrections, const trajectory::Trajectory& base, double first,
                                  double last) {
   const double late = value_of(corrections, "base", "time");
-  const Correction* const grasp = find(corrections, "grasp", "translation");
-  if (late == 0.0 && (!grasp || grasp->value.isZero(0.0))) return base;
-  const Pose grasp_in_base{math::Matrix3::Identity(), grasp ? Vector3(grasp->value) : Vector3::Zero()};
+  const Pose grasp = grasp_in_base(corrections);
+  if (late == 0.0 && grasp.translation.isZero(0.0) && grasp.rotation.isIdentity(0.0)) return base;
 
-  // samples beyond the recorded ones, one interval apart, where a clock that was wrong leaves frames without a base
-  std::vector<trajectory::Sample> samples = base.samples();
-  if (samples.size() > 1) {
-    const double interval = (base.end() - base.start()) / static_cast<double>(samples.size() - 1);
-    const auto beyond = [&](double needed, double from, double direction) {
-      std::vector<trajectory::Sample> out;
-      const trajectory::BaseMotion motion = base.at(from);
-      const int count = static_cast<int>(std::ceil(std::min(needed, kLongestExtrapolation) / interval));
-      for (int i = 1; i <= count; ++i) {
-        const double t = direction * i * interval;
-        const Vector6 twist = t * motion.velocity + 0.5 * t * t * motion.acceleration;
-        out.push_back({from + t, motion.pose * math::exp_se3(twist)});
-      }
-      return out;
-    };
-    const std::vector<trajectory::Sample> after = beyond(last + late - base.end(), base.end(), 1.0);
-    std::vector<trajectory::Sample> before = beyond(base.start() - first - late, base.start(), -1.0);
-    std::reverse(before.begin(), before.end());
-    samples.insert(samples.end(), after.begin(), after.end());
-    samples.insert(samples.begin(), before.begin(), before.end());
-  }
+  // a clock that was wrong leaves frames without a base
+  std::vector<trajectory::Sample> samples = trajectory::continued(base, first + late, last + late);
   for (trajectory::Sample& sample : samples) {
     sample.time -= late;
-    sample.pose = sample.pose * grasp_in_base;
+    sample.pose = sample.pose * grasp;
   }
   return trajectory::fit(std::move(samples), "the corrected base");
 }
@@ -129,8 +123,14 @@ void apply(const Corrections& corrections, Capture& capture) {
     camera = corrected(corrections, camera);
   }
   capture.base = corrected(corrections, capture.base, first, last);
-  capture.length += value_of(corrections, "object", "length");
-  capture.diameter += value_of(corrections, "object", "diameter");
+  const auto resize = [&](double& size, const char* quantity) {
+    const double corrected = size + value_of(corrections, "object", quantity);
+    if (!(corrected > kLeastShare * size))
+      throw InputError("object." + std::string(quantity), "the twin's correction leaves nothing of it", "train again");
+    size = corrected;
+  };
+  resize(capture.length, "length");
+  resize(capture.diameter, "diameter");
 }
 
 }  // namespace chainsplat::capture

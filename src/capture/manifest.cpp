@@ -1,4 +1,5 @@
 #include "manifest.h"
+#include "chainsplat/corrections.h"
 
 #include <algorithm>
 #include <charconv>
@@ -40,7 +41,9 @@ constexpr double kRotationTolerance = 1e-3;              // of |R R^T - I|; numb
 constexpr double kUnitTolerance = 1e-3;                  // of a direction's length, beyond which it is doubted
 constexpr double kPerpendicular = 1e-3;                  // rad
 constexpr double kInversePixels = 1e-3;                  // px, largest error of undistort(distort(.)) at the border
-constexpr double kTopMeters = 5.0;                       // m; a longer rope is doubted, as it may be in millimeters
+// s by which the base may begin after the frames or end before them: its clock may be late, which training finds
+constexpr double kLateClock = 0.08;
+constexpr double kTopMeters = 5.0;  // m; a longer rope is doubted, as it may be in millimeters
 
 // The text in quotes, cut to a length that fits on a line.
 std::string in_quotes(const std::string& text) {
@@ -135,7 +138,8 @@ class Reader {
     if (value > 0.0)
       problem("rate",
               core::exact(value) + " is not between " + core::exact(kSlowestRate) + " and " +
-                  std::to_string(static_cast<int>(kFastestRate)) + " frames a second, between which cameras record motion",
+                  std::to_string(static_cast<int>(kFastestRate)) +
+                  " frames a second, between which cameras record motion",
               "write frames a second");
     return 0.0;
   }
@@ -143,7 +147,9 @@ class Reader {
   // Returns whether a place in the world is near enough to the origin that enough digits remain for the rope.
   bool near(const std::string& key, const Vector3& place) const {
     if (place.cwiseAbs().maxCoeff() <= kFarthest) return true;
-    problem(key, "lies more than " + std::to_string(static_cast<int>(kFarthest)) + " m from the world's origin, too far for exact numbers",
+    problem(key,
+            "lies more than " + std::to_string(static_cast<int>(kFarthest)) +
+                " m from the world's origin, too far for exact numbers",
             "write meters from an origin near the rope");
     return false;
   }
@@ -285,21 +291,21 @@ void require_file(const Path& file) {
   std::error_code error;
   const auto status = std::filesystem::status(file, error);
   if (!std::filesystem::exists(status)) throw InputError(file.string(), "does not exist", "check the path");
-  if (std::filesystem::is_directory(status))
-    throw InputError(file.string(), "is a folder, not a file", "name a file");
+  if (std::filesystem::is_directory(status)) throw InputError(file.string(), "is a folder, not a file", "name a file");
   throw InputError(file.string(), "is a pipe or device, not a file", "name a file");
 }
 
 // The same for a file that a capture names, which must also lie in its folder.
 void require_own_file(const Path& folder, const Path& file) {
-  if (const std::string link = link_out_of(folder, file); !link.empty()) throw InputError(file.string(), link, kOwnFile);
+  if (const std::string link = link_out_of(folder, file); !link.empty())
+    throw InputError(file.string(), link, kOwnFile);
   require_file(file);
 }
 
 // Sets source.frames, and `*rate` for a video. Returns false and records a problem when there is no frame, a number is
 // missing, or a file is unreadable or leads out of the folder.
-bool count_frames(ImageSource& source, const Path& folder, const std::string& where, double* rate,
-                  const Camera* camera, Findings& findings) {
+bool count_frames(ImageSource& source, const Path& folder, const std::string& where, double* rate, const Camera* camera,
+                  Findings& findings) {
   const auto too_many = [&](const Path& file) {
     findings.problems.push_back({file.string(),
                                  "there are more than " + std::to_string(kMostFrames) +
@@ -414,10 +420,7 @@ void set_times(CameraSource& source, const Path& folder, Findings& findings) {
     source.times.resize(frames);
     std::vector<double> intervals;
     for (int k = 1; k < frames; ++k) intervals.push_back(source.times[k] - source.times[k - 1]);
-    if (!intervals.empty()) {
-      std::nth_element(intervals.begin(), intervals.begin() + intervals.size() / 2, intervals.end());
-      source.interval = intervals[intervals.size() / 2];
-    }
+    source.interval = math::median(intervals);
   } else {
     source.times.resize(frames);
     for (int k = 0; k < frames; ++k) source.times[k] = source.start + k / source.rate;
@@ -482,8 +485,23 @@ bool good_name(const std::string& name) {
                      [](unsigned char c) { return std::isalnum(c) || c == '_' || c == '-' || c == '.'; });
 }
 
+// Other lens models than OpenCV's five numbers are refused where they are named: read as these, they bend the image.
+void refuse_lens_models(const Reader& reader) {
+  for (const char* const key : {"model", "camera_model", "distortion_model", "lens_model", "lens"}) {
+    const Json* const value = reader.find(key, false, "");
+    if (!value || !value->is_string()) continue;
+    std::string name = value->get<std::string>();
+    std::transform(name.begin(), name.end(), name.begin(), [](unsigned char c) { return std::tolower(c); });
+    for (const char* const other : {"fish", "equidist", "kannala", "omni", "rational", "thin_prism", "fov"})
+      if (name.find(other) != std::string::npos)
+        reader.problem(key, "the lens model " + in_quotes(value->get<std::string>()) + " is not known here",
+                       "undistort images and masks first, and write \"distortion\": [0, 0, 0, 0, 0]");
+  }
+}
+
 // Reads a camera except its name and the location of its frames.
 Camera read_optics(const Reader& reader) {
+  refuse_lens_models(reader);
   reader.know({"name", "width", "height", "fx", "fy", "cx", "cy", "distortion", "world_from_camera", "images", "masks",
                "depth", "depth_scale", "rate", "start", "timestamps"});
   Camera camera;
@@ -509,7 +527,8 @@ Camera read_optics(const Reader& reader) {
     reader.doubt("cx", "the principal point lies outside the image");
   if (const auto values = reader.numbers("distortion", 5, false, "OpenCV's [k1, k2, p1, p2, k3]"))
     std::copy(values->begin(), values->end(), camera.distortion.begin());
-  if (camera.width > 0 && camera.height > 0 && camera.fx >= kLeastFocal && camera.fy >= kLeastFocal) check_lens(reader, camera);
+  if (camera.width > 0 && camera.height > 0 && camera.fx >= kLeastFocal && camera.fy >= kLeastFocal)
+    check_lens(reader, camera);
   read_pose(reader, camera);
   return camera;
 }
@@ -578,7 +597,8 @@ struct Keys : nlohmann::json_sax<Json> {
 // Parses a text that must be one JSON object; `file` and `expected` are for the messages.
 Json parse(const std::string& text, const std::string& file, const char* expected) {
   if (text.size() > kMostText)
-    throw InputError(file, "is larger than " + std::to_string(kMostText >> 20) + " MiB, too large for numbers and names",
+    throw InputError(file,
+                     "is larger than " + std::to_string(kMostText >> 20) + " MiB, too large for numbers and names",
                      std::string("write ") + expected);
   Keys keys;
   Json::sax_parse(text, &keys);
@@ -609,7 +629,8 @@ void survey(Manifest& manifest, bool masked, Findings& findings) {
     Findings& mine = found[c];
     if (source.images.file.empty() && source.images.prefix.empty()) return;
     const Path& folder = manifest.capture.folder;
-    if (!count_frames(source.images, folder, source.where + ".images", &source.video_rate, &source.camera, mine)) return;
+    if (!count_frames(source.images, folder, source.where + ".images", &source.video_rate, &source.camera, mine))
+      return;
     const int frames = source.images.frames;
     const auto compare = [&](std::optional<ImageSource>& other, const char* key) {
       if (!other || !count_frames(*other, folder, source.where + "." + key, nullptr, &source.camera, mine)) return;
@@ -641,9 +662,12 @@ void read_base(Manifest& manifest, const Path& file, Findings& findings) {
     findings.problems.push_back({manifest.file.string() + ": base", error.what(), "correct the file"});
     return;
   }
+  double first = capture.base.start(), last = capture.base.end();
   for (const CameraSource& source : manifest.cameras) {
     if (source.times.empty()) continue;
-    const double slack = 0.5 * source.interval;
+    const double slack = std::max(0.5 * source.interval, kLateClock);
+    first = std::min(first, source.times.front());
+    last = std::max(last, source.times.back());
     if (source.times.front() < capture.base.start() - slack || source.times.back() > capture.base.end() + slack)
       findings.problems.push_back({file.string(),
                                    "covers " + core::exact(capture.base.start()) + " to " +
@@ -652,6 +676,45 @@ void read_base(Manifest& manifest, const Path& file, Findings& findings) {
                                        core::exact(source.times.back()) + " s",
                                    "record the base during all frames or correct start, rate or timestamps"});
   }
+  // frames that a clock of the base, late or early, leaves without a base
+  std::vector<trajectory::Sample> samples = trajectory::continued(capture.base, first, last);
+  if (samples.size() == capture.base.samples().size()) return;
+  findings.doubts.push_back(file.string() + ": does not cover all frames; it is continued with its last velocity");
+  capture.base = trajectory::fit(std::move(samples), file.string());
+}
+
+// "sigma": how sure each thing is that may be corrected, with the same keys as "corrections" in twin.json.
+void read_sigma(const Reader& reader, Capture& capture) {
+  if (!reader.present()) return;
+  reader.know({"cameras", "base", "grasp", "object"});
+  const auto read = [&](const Reader& node, const std::string& subject, const char* kind) {
+    if (!node.present()) return;
+    for (const CorrectedQuantity& quantity : corrected_quantities()) {
+      if (std::string(quantity.subject) != kind) continue;
+      const std::string expected = std::string("one standard deviation in ") + quantity.unit;
+      const std::optional<double> value = node.number(quantity.name, false, expected.c_str());
+      if (!value) continue;
+      if (*value < 0.0 || *value > quantity.most)
+        node.problem(quantity.name, core::exact(*value) + " is no standard deviation", "write " + expected);
+      else
+        capture.sigma.push_back({subject, quantity.name, *value});
+    }
+  };
+  const Reader cameras = reader.child("cameras", false, "{ \"cam0\": { \"rotation\": 0.002 } }");
+  for (const Camera& camera : capture.cameras) {
+    const Reader node = cameras.child(camera.name, false, "{ \"rotation\": 0.002 }");
+    if (node.present()) node.know({"rotation", "translation", "focal", "time", "mask_offset"});
+    read(node, camera.name, "camera");
+  }
+  const Reader base = reader.child("base", false, "{ \"time\": 0.002 }");
+  if (base.present()) base.know({"time"});
+  read(base, "base", "base");
+  const Reader grasp = reader.child("grasp", false, "{ \"translation\": 0.001 }");
+  if (grasp.present()) grasp.know({"translation", "rotation"});
+  read(grasp, "grasp", "grasp");
+  const Reader object = reader.child("object", false, "{ \"length\": 0.003 }");
+  if (object.present()) object.know({"length", "diameter"});
+  read(object, "object", "object");
 }
 
 std::uint64_t capture_hash(const std::string& text, const Manifest& manifest, const Path& base) {
@@ -691,7 +754,7 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
   }
 
   // the scene
-  top.know({"format", "name", "scenario", "gravity", "object", "grasp", "table", "base", "cameras"});
+  top.know({"format", "name", "scenario", "gravity", "object", "grasp", "table", "base", "cameras", "sigma"});
   capture.name = top.text("name", false, "a short name").value_or(capture.folder.filename().string());
   const std::string scenario = top.text("scenario", true, "\"free\" or \"tabletop\"").value_or("free");
   if (scenario != "free" && scenario != "tabletop")
@@ -723,8 +786,10 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
     if (capture.length > 0 && capture.diameter >= capture.length)
       object.problem("diameter", "is not less than the length", "write both in meters");
     if (capture.diameter > 0 && capture.diameter < kThinnest * capture.length)
-      object.problem("diameter", "is less than 1/" + std::to_string(std::lround(1.0 / kThinnest)) + " of the length, as no camera sees",
-                     "write both in meters");
+      object.problem(
+          "diameter",
+          "is less than 1/" + std::to_string(std::lround(1.0 / kThinnest)) + " of the length, as no camera sees",
+          "write both in meters");
   }
 
   // how the gripper holds it; the bending axis is made exactly perpendicular to the direction
@@ -795,6 +860,7 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
     capture.times.push_back(source.times);
     capture.has_depth = capture.has_depth || source.depth.has_value();
   }
+  read_sigma(top.child("sigma", false, "{ \"object\": { \"length\": 0.003 } }"), capture);
   if (findings.problems.empty()) capture.hash = capture_hash(text, manifest, base ? capture.folder / *base : Path());
   return manifest;
 }

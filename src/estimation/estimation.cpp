@@ -46,14 +46,6 @@ constexpr double kPlaceFloor = 0.005;
 // Ridge, as a share of the torques' mean variance, for torques that a force at few places cannot cause.
 constexpr double kPlaceRidge = 1e-3;
 
-// Deviation of the model's shape, which straight links and a tube of constant width cannot follow: per coordinate of
-// every joint's position, as a share of the diameter. It is added to the reported covariance, not to the filter's.
-constexpr double kLinkDeviation = 0.02;
-// A straight link stands for an arc. Where the arc turns by an angle, the two are up to length * angle / 8 apart, half
-// of it on either side of a link through the arc's middle.
-constexpr double kArc = 1.0 / 16.0;
-constexpr double kUnseenAngle = 0.5;  // rad, deviation of angles that move no joint (twist)
-
 constexpr double kLongUnseen = 0.5;  // s without a mask, after which the rope counts as lost
 // Standard deviations that are added for the search of a lost rope.
 constexpr double kLostAngle = 0.5;      // rad
@@ -123,32 +115,6 @@ FoundForce found_force(const Filter& filter, const Belief& belief) {
   const double total = out.shares.sum();
   out.shares = total > 0.0 ? VectorX(out.shares / total) : filter.everywhere;
   return out;
-}
-
-// Returns the variance, m^2 per coordinate, that the model's shape leaves in the position of every link's end.
-std::vector<double> shape_variances(const chain::Chain& chain, const VectorX& theta) {
-  std::vector<double> variances(chain.links() - 1, 0.0);
-  for (int link = 1; link < chain.links(); ++link) {
-    double bend2 = 0.0;  // rad^2, mean of the squared bends at the link's two ends
-    for (int k = 0; k < chain.angles(); ++k)
-      if (chain.child_link[k] == link || chain.child_link[k] == link + 1) bend2 += 0.5 * theta[k] * theta[k];
-    const double arc = kArc * (chain.link_end(link) - chain.link_start(link));
-    const double straight = kLinkDeviation * chain.diameter;
-    variances[link - 1] = straight * straight + arc * arc * bend2;
-  }
-  return variances;
-}
-
-// Returns the covariance of the angles that follows from these variances of the links' ends.
-MatrixX shape_covariance(const chain::Chain& chain, const std::vector<double>& variances, const VectorX& theta) {
-  const int n = chain.angles();
-  VectorX weights(variances.size());
-  for (std::size_t i = 0; i < variances.size(); ++i) weights[i] = 1.0 / variances[i];
-  MatrixX information = chain::displacement_metric(chain::link_end_jacobians(chain, theta, Pose{}), weights);
-  information.diagonal().array() += 1.0 / (kUnseenAngle * kUnseenAngle);
-  const Eigen::LLT<MatrixX> factor(information);
-  CHAINSPLAT_CHECK(math::is_positive(factor), "angles that are not finite");
-  return factor.solve(MatrixX::Identity(n, n));
 }
 
 // Returns the standard deviation of the centerline in m, RMS over the rope: by the angles' `covariance` and by the
@@ -593,9 +559,9 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
   out.theta = filter.belief->mean.head(n);
   out.thetadot = filter.belief->mean.segment(n, n);
   out.covariance = filter.belief->covariance.topLeftCorner(2 * n, 2 * n);
-  const std::vector<double> shape = shape_variances(filter.model.chain, out.theta);
+  const std::vector<double> shape = chain::shape_variances(filter.model.chain, out.theta);
   out.centerline_sigma = centerline_deviation(filter.model.chain, out.theta, out.covariance.topLeftCorner(n, n), shape);
-  out.covariance.topLeftCorner(n, n) += shape_covariance(filter.model.chain, shape, out.theta);
+  out.covariance.topLeftCorner(n, n) += chain::shape_covariance(filter.model.chain, shape, out.theta);
   for (const capture::View* const v : views)
     out.iou += tube_iou(filter.model.chain, filter.base(view.time).pose, out.theta, *v, filter.cameras.at(v->camera)) /
                views.size();

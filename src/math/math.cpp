@@ -1,5 +1,6 @@
 #include "chainsplat/math.h"
 
+#include <algorithm>
 #include <cmath>
 #include <numeric>
 
@@ -132,6 +133,13 @@ bool is_covariance(const MatrixX& m) {
   if (!((correlation - correlation.transpose()).array().abs() <= kCovarianceTolerance).all()) return false;
   correlation.diagonal().array() += kCovarianceTolerance;
   return is_positive(Eigen::LLT<MatrixX>(correlation));
+}
+
+double median(std::vector<double>& values) {
+  if (values.empty()) return 0.0;
+  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
 }
 
 std::vector<Eigen::Index> known_part(const MatrixX& covariance) {

@@ -1,7 +1,7 @@
 // batch_plan.cpp - a job file becomes a list of jobs, or one line that says what is wrong with it.
 #include <glob.h>
 
-#define TOML_MAX_NESTED_VALUES 16  // lists in lists; a document is freed by recursion
+#define TOML_MAX_NESTED_VALUES 16                     // lists in lists; a document is freed by recursion
 #define TOML_ASSERT(expression) static_cast<void>(0)  // they fail for text from outside, which it then refuses
 #include <toml++/toml.h>
 
@@ -106,8 +106,8 @@ std::vector<std::string> arguments_of(const Combination& combination, const std:
   TrainOptions options;
   for (const Value& value : combination) {
     set(options, value.key, value.text, file + ": settings." + value.key);
-    const auto setting = std::find_if(settings().begin(), settings().end(),
-                                      [&](const Setting& s) { return s.name == value.key; });
+    const auto setting =
+        std::find_if(settings().begin(), settings().end(), [&](const Setting& s) { return s.name == value.key; });
     if (!setting->flag)
       arguments.push_back("--" + value.key + "=" + value.text);  // by '=': the value can begin with a dash
     else if (value.text == "true")

@@ -126,9 +126,8 @@ JobEnd end_of(const Path& folder, const BatchJob& job, int status, double second
   end.arguments = job.arguments;
   end.seconds += seconds;
   end.code = WIFSIGNALED(status) ? 128 + WTERMSIG(status) : WEXITSTATUS(status);
-  end.stopped = !WIFSIGNALED(status) &&
-                (end.code == 128 + SIGINT || end.code == 128 + SIGTERM ||
-                 (end.code == 0 && fs::exists(folder / job.name / kCheckpointFolder)));
+  end.stopped = !WIFSIGNALED(status) && (end.code == 128 + SIGINT || end.code == 128 + SIGTERM ||
+                                         (end.code == 0 && fs::exists(folder / job.name / kCheckpointFolder)));
   if (end.code == 0 || end.stopped) return end;
   end.error = error_line(log_file(folder, job));
   if (end.error.empty())

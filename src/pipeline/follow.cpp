@@ -230,16 +230,16 @@ capture::View Follower::Implementation::mask(const capture::Image8& picture, con
 
 // Whether the base's motion is known then.
 void Follower::Implementation::check_time(const LiveFrame& frame, bool first) const {
-  constexpr double kSlack = 1.0 / 30.0;        // s, a frame beyond the first or last sample
+  constexpr double kSlack = 1.0 / 30.0;    // s, a frame beyond the first or last sample
   if (base.samples().size() <= 1) return;  // it rests
   if (first && frame.time < base.start() - kSlack)
     core::warn(base_name + ": the base motion begins " + core::exact(base.start() - frame.time) +
                " s after the first frame; until then the base is assumed to rest where it begins");
   if (frame.time > base.end() + kSlack)
-    throw WorkError(base_name,
-                    "the base motion ends at " + core::exact(base.end()) + " s, before frame " +
-                        std::to_string(frame.frame),
-                    "give a base motion as long as the frames; the states so far are kept");
+    throw WorkError(
+        base_name,
+        "the base motion ends at " + core::exact(base.end()) + " s, before frame " + std::to_string(frame.frame),
+        "give a base motion as long as the frames; the states so far are kept");
 }
 
 Follower::Follower(const Path& run, const FollowOptions& options)
@@ -254,11 +254,11 @@ void Follower::follow(const std::function<void(const Followed&)>& each) {
   for (int read = 0; f.source.next(frame); ++read) {
     core::stop_if_requested();
     if (!(frame.time > last))
-      throw WorkError(f.source_name,
-                      "frame " + std::to_string(frame.frame) + " is at " + core::exact(frame.time) +
-                          " s, not after the one before",
-                      "give times that increase, and near enough to 0 that a frame's interval is told; the states so "
-                      "far are kept");
+      throw WorkError(
+          f.source_name,
+          "frame " + std::to_string(frame.frame) + " is at " + core::exact(frame.time) + " s, not after the one before",
+          "give times that increase, and near enough to 0 that a frame's interval is told; the states so "
+          "far are kept");
     last = frame.time;
     if (read % f.options.drop != 0) continue;
     f.check_time(frame, read == 0);

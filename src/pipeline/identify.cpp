@@ -56,8 +56,7 @@ void identify_states(twin::Twin& twin, const trajectory::Trajectory& base, bool 
 
 void roll_out(twin::Twin& twin, const trajectory::Trajectory& base, const Path& run) {
   const Stopwatch watch(twin, "rollout");
-  if (!twin.initial)
-    throw InputError((run / "twin.json").string(), "has no initial state", "add identify to `stages`");
+  if (!twin.initial) throw InputError((run / "twin.json").string(), "has no initial state", "add identify to `stages`");
   twin.rollout = dynamics::rollout(model_of(twin, run), base, *twin.initial, twin.states.time);
 }
 

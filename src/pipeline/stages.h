@@ -24,10 +24,15 @@ class Stopwatch {
   double start_;
 };
 
-// Estimates what `capture` was given wrongly, mends it, and says so in `verdict`. `fixed`: groups taken as given. Joints
-// and bending are its own, so that what the twin's chain cannot follow is not taken for a fault of the capture.
-capture::Corrections correct(capture::Capture& capture, const std::vector<std::string>& fixed,
-                             std::vector<capture::Finding>& verdict);
+// Estimates what `capture` was given wrongly, mends it, and says so in the verdict. `fixed`: groups taken as given.
+// Joints and bending are its own, so that what the twin's chain cannot follow is not taken for a fault of the capture.
+// Where a finding is `impossible` nothing is estimated, unless `anyway`.
+struct Corrected {
+  capture::Corrections corrections;
+  math::MatrixX covariance;  // silhouette::CorrectionFit's; empty where nothing was surely wrong
+  std::vector<capture::Finding> verdict;
+};
+Corrected correct(capture::Capture& capture, const std::vector<std::string>& fixed, bool anyway);
 
 // What the twin and its capture say of how to identify it.
 identification::Options identification_options(const twin::Twin& twin, bool paper, std::uint64_t seed);

@@ -7,6 +7,7 @@
 #include "chainsplat/comparison.h"
 #include "chainsplat/recognition.h"
 #include "chainsplat/run_folder.h"
+#include "chainsplat/silhouette.h"
 #include "pipeline/stages.h"
 
 namespace chainsplat::pipeline {
@@ -23,7 +24,8 @@ struct Training {
   capture::Capture capture;
   twin::Twin twin;
   gpu::DevicePtr device;
-  bool continued = false;  // the twin was in the run folder
+  math::MatrixX correction_covariance;  // of what was corrected in this call; empty: nothing
+  bool continued = false;               // the twin was in the run folder
   bool recognize = false, identify = false, joint = false, roll_out = false, evaluate = false;  // what is to be done
   bool saved = false;  // from then on nothing is removed, whatever happens
   TrainResult result;
@@ -207,7 +209,13 @@ void correct_capture(Training& t) {
   const std::vector<std::string>& fixed = t.options.fixed;
   if (t.options.mode == twin::Mode::paper || std::find(fixed.begin(), fixed.end(), "all") != fixed.end()) return;
   core::report({"recognize", 0, 0, NAN, NAN, "cameras, clocks, grasp and size"});
-  t.twin.corrections = correct(t.capture, fixed, t.twin.verdict);
+  Corrected found = correct(t.capture, fixed, t.options.anyway);
+  t.twin.corrections = std::move(found.corrections);
+  t.twin.verdict = std::move(found.verdict);
+  t.correction_covariance = std::move(found.covariance);
+  for (const capture::Finding& finding : t.twin.verdict)
+    if (finding.impossible && !t.options.anyway)
+      throw InputError(t.capture_path.string(), finding.text, "or give `anyway`, and do not trust the twin");
   t.twin.chain.length = t.capture.length;
   t.twin.chain.diameter = t.capture.diameter;
 }
@@ -253,12 +261,26 @@ void write_covariances(const Training& t) {
   if (!t.twin.states.covariance.empty()) core::write_file(t.run / kCovarianceFile, covariance_csv(t.twin.states));
 }
 
+// What the pictures' noise does not say: straight links stand for arcs, and what was corrected is not sure.
+void add_model_errors(Training& t) {
+  chain::States& states = t.twin.states;
+  const chain::Chain& chain = t.twin.chain;
+  for (std::size_t k = 0; k < states.covariance.size(); ++k)
+    states.covariance[k] +=
+        chain::shape_covariance(chain, chain::shape_variances(chain, states.theta[k]), states.theta[k]);
+  if (t.correction_covariance.size() == 0 || states.covariance.empty()) return;
+  const std::vector<math::MatrixX> more =
+      silhouette::covariances_by_corrections(chain, t.capture, states, t.twin.corrections, t.correction_covariance);
+  for (std::size_t k = 0; k < states.covariance.size(); ++k) states.covariance[k] += more[k];
+}
+
 void recognize(Training& t) {
   const Stopwatch watch(t.twin, "recognize");
   recognition::Result found = recognition::recognize(*t.device, t.capture, recognition_options(t));
   t.twin.chain = std::move(found.chain);
   t.twin.gaussians = std::move(found.gaussians);
   t.twin.states = std::move(found.states);
+  add_model_errors(t);
   // exactly symmetric, as they are read back
   for (math::MatrixX& covariance : t.twin.states.covariance)
     covariance = math::MatrixX(covariance.selfadjointView<Eigen::Lower>());

@@ -82,7 +82,7 @@ std::vector<Stage> read_stages(const std::string& text, const std::string& where
 const std::vector<Setting>& settings() {
   static const std::vector<Setting> all = {{"joints", false}, {"bending", false}, {"twist", true},   {"every", false},
                                            {"frames", false}, {"mode", false},    {"stages", false}, {"joint", true},
-                                           {"fixed", false}};
+                                           {"fixed", false},  {"anyway", true}};
   return all;
 }
 
@@ -105,6 +105,8 @@ void set(TrainOptions& options, const std::string& name, const std::string& text
     options.stages = read_stages(text, where);
   } else if (name == "joint") {
     options.joint = truth(text, where);
+  } else if (name == "anyway") {
+    options.anyway = truth(text, where);
   } else if (name == "fixed") {
     options.fixed = read_groups(text, where);
   } else {

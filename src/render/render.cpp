@@ -110,12 +110,9 @@ void paste(const Frame& frame, const capture::Camera& camera, Copy copy) {
 }  // namespace
 
 double median_interval(const std::vector<double>& times) {
-  if (times.size() < 2) return 0.0;
   std::vector<double> intervals;
   for (std::size_t k = 1; k < times.size(); ++k) intervals.push_back(times[k] - times[k - 1]);
-  const auto middle = intervals.begin() + static_cast<std::ptrdiff_t>(intervals.size() / 2);
-  std::nth_element(intervals.begin(), middle, intervals.end());
-  return *middle;
+  return math::median(intervals);
 }
 
 bool covered(const chain::States& states, double time, double interval) {

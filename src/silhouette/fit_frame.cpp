@@ -26,11 +26,8 @@ constexpr double kReach = 5.0;           // diameters: farther from the predicti
 constexpr double kLastReach = 1.0;       // the same after the coarse stage
 
 // fine stage
-constexpr double kFirstCut = 8.0;              // px, Tukey's cut-off before residuals are known
-constexpr double kLeastCut = 2.5;              // px, smallest cut-off
-constexpr double kCutDeviations = 4.685;       // Tukey's constant
-constexpr double kDeviationOfMedian = 1.4826;  // standard deviation from a median of absolute values
-constexpr double kFineStep = 1e-5;             // rad
+constexpr double kFirstCut = 8.0;   // px, Tukey's cut-off before residuals are known
+constexpr double kFineStep = 1e-5;  // rad
 
 // priors, rad
 constexpr double kJointDifference = 0.3;  // between neighboring joints, along one axis
@@ -127,17 +124,10 @@ void coarse_stage(Problem& problem, const Belief& belief, int iterations, bool c
   gauss_newton(problem, iterations - far, kCoarseStep, equations, unknowns);
 }
 
-double median(std::vector<double>& values) {
-  if (values.empty()) return 0.0;
-  const auto middle = values.begin() + values.size() / 2;
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
-}
-
 // Tukey's cut-off that the last residuals call for.
 double next_cut(Problem& problem, double cut) {
   if (problem.sizes.empty()) return cut;
-  return std::clamp(kCutDeviations * kDeviationOfMedian * median(problem.sizes), kLeastCut, kLargestCut);
+  return std::clamp(robust_cut(problem.sizes), kLeastCut, kLargestCut);
 }
 
 // `start`, and bends to every side, of one size.
@@ -214,8 +204,7 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
     belief.weighted_mean.head(n) += weight * start;
   }
 
-  const OffsetBelief offset{options.edge_offset,
-                            1.0 / (options.edge_offset_deviation * options.edge_offset_deviation)};
+  const OffsetBelief offset{options.edge_offset, 1.0 / (options.edge_offset_deviation * options.edge_offset_deviation)};
   const double variance = kEdgeDeviation * kEdgeDeviation;
   FineSums total;
   // tells apart fits that cover the masks alike
@@ -237,8 +226,8 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
       add_priors(problem, belief, variance, offset, at);
       return edge_cost();
     };
-    out.fit.summary = gauss_newton(problem, std::max(1, options.iterations - options.iterations / 2), kFineStep,
-                                   equations, unknowns);
+    out.fit.summary =
+        gauss_newton(problem, std::max(1, options.iterations - options.iterations / 2), kFineStep, equations, unknowns);
     place(problem, unknowns);
     total = fine_equations(problem, unknowns[last], cut);
     out.fit.summary.final_cost = edge_cost();

@@ -37,13 +37,6 @@ constexpr double kTailDeviations = 2.0;  // beyond this many of them the penalty
 constexpr int kSmoothingRounds = 4;      // of reweighting
 constexpr int kDerivativeReach = 3;      // frames on each side of a local cubic fit
 
-double median(std::vector<double> values) {
-  if (values.empty()) return 0.0;
-  const auto middle = values.begin() + values.size() / 2;
-  std::nth_element(values.begin(), middle, values.end());
-  return *middle;
-}
-
 // Second difference of three unevenly spaced values as an acceleration: weights of the three.
 std::array<double, 3> acceleration_weights(double t0, double t1, double t2) {
   const double a = t1 - t0, b = t2 - t1;
@@ -206,7 +199,8 @@ SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capt
     inside.push_back(solutions[f].fit.inside);
     residual.push_back(solutions[f].fit.residual_pixels);
   }
-  const double usual_covered = median(covered), usual_inside = median(inside), usual_residual = median(residual);
+  const double usual_covered = math::median(covered), usual_inside = math::median(inside),
+               usual_residual = math::median(residual);
   const auto bad = [&](int f) {
     const FrameFit& fit = solutions[f].fit;
     return seen[f] && (fit.covered < usual_covered - kLessCovered || fit.inside < usual_inside - kLessInside ||
@@ -229,7 +223,7 @@ SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capt
     views_a_frame += views[f].size();
   }
   if (offsets.size() > 1 && views_a_frame < kFewViews * offsets.size()) {
-    each.edge_offset = median(offsets);
+    each.edge_offset = math::median(offsets);
     each.edge_offset_deviation = kCommonOffsetDeviation;
     const std::vector<VectorX> near = smoothed(frames.times, solutions, seen);
     for (int f = 0; f < count; ++f)

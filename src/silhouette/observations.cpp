@@ -15,9 +15,8 @@ using math::VectorX;
 namespace {
 
 // the two stages
-constexpr int kReverseSamples = 4;            // centerline samples a link that must lie in the mask
-constexpr double kReverseWeight = 0.5;        // of all of them together, against all mask pixels of the view
-constexpr double kLinkOffsetDeviation = 0.2;  // px, of a link's outline in one view about the common offset
+constexpr int kReverseSamples = 4;      // centerline samples a link that must lie in the mask
+constexpr double kReverseWeight = 0.5;  // of all of them together, against all mask pixels of the view
 
 // blobs
 constexpr double kGap = 3.0;  // diameters, that an occluder may hide between two blobs of the rope
@@ -253,10 +252,8 @@ void choose_blobs(Problem& problem, double reach) {
       for (int i = blob.first_pixel; i < blob.last_pixel; ++i)
         problem.sizes.push_back(nearest(work.segments, mask.pixels[i]).distance2);
       if (problem.sizes.empty()) continue;
-      const auto middle = problem.sizes.begin() + problem.sizes.size() / 2;
-      std::nth_element(problem.sizes.begin(), middle, problem.sizes.end());
       const double limit = reach * work.diameter;
-      work.active[b] = *middle <= limit * limit;
+      work.active[b] = math::median(problem.sizes) <= limit * limit;
       any = any || work.active[b];
     }
     if (any || mask.blobs.empty()) continue;

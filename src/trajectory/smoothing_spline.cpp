@@ -133,8 +133,7 @@ SplineFit fit_spline(const std::vector<double>& times, const Points& values) {
   // take the median interval as the unit of time, so that lambda has no dimension
   std::vector<double> intervals(samples - 1);
   for (int k = 0; k + 1 < samples; ++k) intervals[k] = times[k + 1] - times[k];
-  std::nth_element(intervals.begin(), intervals.begin() + intervals.size() / 2, intervals.end());
-  const double unit = intervals[intervals.size() / 2], origin = times.front();
+  const double unit = math::median(intervals), origin = times.front();
   const auto scaled = [&](int k) { return (times[k] - origin) / unit; };
 
   // place knots at the samples, except where they would be too close

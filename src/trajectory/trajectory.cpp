@@ -77,7 +77,8 @@ Trajectory fit(std::vector<Sample> samples, const std::string& where) {
       throw InputError(which, "a number is not finite", "remove the pose or fill it from its neighbors");
     if (sample.pose.translation.cwiseAbs().maxCoeff() > kFarthest)
       throw InputError(which,
-                       "lies more than " + std::to_string(static_cast<int>(kFarthest)) + " m from the origin, too far for exact numbers",
+                       "lies more than " + std::to_string(static_cast<int>(kFarthest)) +
+                           " m from the origin, too far for exact numbers",
                        "write meters from an origin near the rope");
     if (k > 0 && !(sample.time > samples[k - 1].time))
       throw InputError(
@@ -87,8 +88,7 @@ Trajectory fit(std::vector<Sample> samples, const std::string& where) {
     if (sample.time - samples.front().time > kLongest)
       throw InputError(which,
                        "comes " + core::exact(sample.time - samples.front().time) +
-                           " s after the first and a motion lasts at most " + core::exact(kLongest) +
-                           " s",
+                           " s after the first and a motion lasts at most " + core::exact(kLongest) + " s",
                        "write times in seconds, or split the recording");
   }
 
@@ -128,8 +128,7 @@ Trajectory fit(std::vector<Sample> samples, const std::string& where) {
     data->noise = position.noise;
     std::vector<double> intervals;
     for (int k = 1; k < count; ++k) intervals.push_back(poses[k].time - poses[k - 1].time);
-    std::nth_element(intervals.begin(), intervals.begin() + intervals.size() / 2, intervals.end());
-    data->slack = 0.5 * intervals[intervals.size() / 2];
+    data->slack = 0.5 * math::median(intervals);
   }
   return Trajectory(std::move(data));
 }
@@ -153,6 +152,29 @@ BaseMotion Trajectory::at(double time) const {
   motion.velocity << w, v;
   motion.acceleration << w_rate, to_base * position.acceleration - w.cross(v);
   return motion;
+}
+
+std::vector<Sample> continued(const Trajectory& trajectory, double first, double last) {
+  std::vector<Sample> samples = trajectory.samples();
+  if (samples.size() < 2) return samples;
+  const double interval = (trajectory.end() - trajectory.start()) / static_cast<double>(samples.size() - 1);
+  const auto beyond = [&](double needed, double from, double direction) {
+    std::vector<Sample> out;
+    const BaseMotion motion = trajectory.at(from);
+    const int count = static_cast<int>(std::ceil(std::min(needed, kLongestContinuation) / interval));
+    for (int i = 1; i <= count; ++i) {
+      const double t = direction * i * interval;
+      const math::Vector6 twist = t * motion.velocity + 0.5 * t * t * motion.acceleration;
+      out.push_back({from + t, motion.pose * math::exp_se3(twist)});
+    }
+    return out;
+  };
+  const std::vector<Sample> after = beyond(last - trajectory.end(), trajectory.end(), 1.0);
+  std::vector<Sample> before = beyond(trajectory.start() - first, trajectory.start(), -1.0);
+  std::reverse(before.begin(), before.end());
+  samples.insert(samples.end(), after.begin(), after.end());
+  samples.insert(samples.begin(), before.begin(), before.end());
+  return samples;
 }
 
 math::Pose Trajectory::pose(double time) const { return at(time).pose; }

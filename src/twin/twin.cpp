@@ -104,9 +104,15 @@ double drag_per_meter(const chain::Chain& chain, const std::vector<double>& by_l
 nlohmann::ordered_json to_json(const std::vector<capture::Finding>& verdict) {
   Json out = Json::array();
   for (const capture::Finding& f : verdict)
-    out.push_back({{"code", f.code},           {"subject", f.subject}, {"value", f.value},
-                   {"sigma", f.deviation},     {"unit", f.unit},       {"corrected", f.corrected},
-                   {"trusted", f.trusted},     {"frame", f.frame},     {"text", f.text}});
+    out.push_back({{"code", f.code},
+                   {"subject", f.subject},
+                   {"value", f.value},
+                   {"sigma", f.deviation},
+                   {"unit", f.unit},
+                   {"corrected", f.corrected},
+                   {"trusted", f.trusted},
+                   {"frame", f.frame},
+                   {"text", f.text}});
   return out;
 }
 
@@ -483,10 +489,12 @@ capture::Corrections read_corrections(const Node& node) {
       c.subject = name;
       c.value = numbers("value");
       c.deviation = numbers("sigma");
+      if (c.value.cwiseAbs().maxCoeff() > quantity.most)
+        leaf["value"].fail("is more than " + core::exact(quantity.most) + " " + quantity.unit, "train again");
       const std::string state = leaf["state"].text();
       bool known = false;
-      for (const auto one : {capture::CorrectionState::free, capture::CorrectionState::prior,
-                             capture::CorrectionState::held})
+      for (const auto one :
+           {capture::CorrectionState::free, capture::CorrectionState::prior, capture::CorrectionState::held})
         if (state == capture::name(one)) c.state = one, known = true;
       if (!known) leaf["state"].fail("is not known", "write free, prior or held");
       if (camera && subject.has("calibration")) c.calibration = subject["calibration"].text();

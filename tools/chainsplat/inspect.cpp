@@ -24,10 +24,14 @@ void check(const Globals& globals, const std::string& path) {
   if (report.problems.empty()) {
     try {
       found = pipeline::examine(path);
+      for (const capture::Finding& finding : found->verdict)
+        if (finding.impossible) report.problems.push_back(finding.text);
     } catch (const InputError& error) {
-      report.doubts.push_back(error.what());
+      report.problems.push_back(error.what());
     }
   }
+  const bool trusted = found && std::all_of(found->verdict.begin(), found->verdict.end(),
+                                            [](const capture::Finding& finding) { return finding.trusted; });
   const bool clean = report.doubts.empty() && (!found || found->verdict.empty());
   if (globals.json) {
     Json document;
@@ -37,8 +41,7 @@ void check(const Globals& globals, const std::string& path) {
     document["problems"] = report.problems;
     if (found) {
       document["verdict"] = twin::to_json(found->verdict);
-      document["trusted"] = std::all_of(found->verdict.begin(), found->verdict.end(),
-                                        [](const capture::Finding& finding) { return finding.trusted; });
+      document["trusted"] = trusted;
     }
     document["usable"] = report.problems.empty();
     std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
@@ -49,9 +52,12 @@ void check(const Globals& globals, const std::string& path) {
     for (const std::string& line : report.problems) std::cout << "problem: " << core::printable(line) << "\n";
     if (found)
       for (const capture::Finding& finding : found->verdict)
-        std::cout << (finding.trusted ? "found: " : "doubt: ") << core::printable(finding.text) << "\n";
+        if (!finding.impossible)
+          std::cout << (finding.trusted ? "found: " : "doubt: ") << core::printable(finding.text) << "\n";
     if (report.problems.empty())
-      std::cout << (clean ? "Nothing is wrong with it.\n" : "It can be used; see the doubts.\n");
+      std::cout << (clean                              ? "Nothing is wrong with it.\n"
+                    : trusted && !report.poses_doubted ? "It can be used; see the doubts.\n"
+                                                       : "A twin made from it is not to be trusted; see the doubts.\n");
   }
   if (report.problems.empty()) return;
   std::cout.flush();

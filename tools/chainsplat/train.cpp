@@ -101,6 +101,8 @@ void add_recognition_options(CLI::App& command, Request& request) {
                   "Take as given what is else corrected: cameras,focal,time,length,diameter,grasp,masks, or all")
       ->delimiter(',')
       ->type_name("LIST");
+  command.add_flag("--anyway", options.anyway,
+                   "Go on where check names a mistake in the capture; do not trust the twin");
 }
 
 }  // namespace

@@ -1,0 +1,193 @@
+#include "src/silhouette/correction_equations.h"
+
+namespace chainsplat::silhouette {
+
+using capture::Correction;
+using math::MatrixX;
+using math::Pose;
+using math::Vector6;
+using math::VectorX;
+
+namespace {
+
+constexpr double kBlobReach = 3.0;  // diameters from the chain within which a blob is the rope
+// What one pixel of outline counts against the priors, of one independent observation of a deviation of 1 px.
+// Neighboring outline and neighboring frames share the error of straight links, which pulls the grasp along the rope:
+// on recordings with truth the place of the grasp and the length were off by 10 mm with 1, by their priors with less
+// than 0.05.
+constexpr double kEvidence = 0.02;
+
+// The rope in one view, posed with the corrections, and how what the view depends on moves it. Its parts point at each
+// other.
+struct PosedView {
+  PosedView() = default;
+  PosedView(const PosedView&) = delete;
+  PosedView& operator=(const PosedView&) = delete;
+
+  capture::Camera camera;
+  FrameView frame;
+  Problem problem;           // of this view alone
+  MatrixX twists;            // 6 x angles, camera frame
+  Vector6 base_twist;        // camera frame, of the base's own motion
+  double mask_offset = 0.0;  // px
+};
+
+void pose_view(const CorrectionProblem& fit, const CorrectedFrame& frame, int v,
+               const capture::Corrections& corrections, const chain::Chain& chain, const VectorX& theta,
+               PosedView& out) {
+  const capture::View& view = fit.capture.views[v];
+  const capture::Camera& given = fit.capture.cameras[view.camera];
+  const double base_late = capture::value_of(corrections, "base", "time");
+  const double first_late = capture::value_of(corrections, fit.capture.cameras[0].name, "time");
+  const double late = capture::value_of(corrections, given.name, "time");
+  const double after = (view.time - late) - (frame.time - first_late);  // s, of the view after the frame
+  const trajectory::BaseMotion base = fit.capture.base.at(view.time - late + base_late);
+
+  out.camera = capture::corrected(corrections, given);
+  out.mask_offset = capture::value_of(corrections, given.name, "mask_offset");
+  out.frame = {&fit.masks[v], &out.camera, base.pose * capture::grasp_in_base(corrections)};
+  out.problem.chain = &chain;
+  ViewWork work;
+  work.view = &out.frame;
+  work.camera_from_base = out.camera.world_from_camera.inverse() * out.frame.base;
+  work.diameter =
+      chain.diameter * 0.5 * (out.camera.fx + out.camera.fy) / std::max(kNear, work.camera_from_base.translation.z());
+  work.active.assign(out.frame.mask->blobs.size(), 0);
+  out.problem.views.push_back(std::move(work));
+  out.twists.resize(6, chain.angles());
+  const Pose camera_from_recorded = out.camera.world_from_camera.inverse() * base.pose;
+  out.base_twist = math::transform_twist(camera_from_recorded, base.velocity);
+  pose(out.problem, theta + after * frame.thetadot);
+  choose_blobs(out.problem, kBlobReach);
+  for (int k = 0; k < chain.angles(); ++k)
+    out.twists.col(k) = math::transform_twist(out.problem.views[0].camera_from_base, out.problem.axes.col(k));
+}
+
+// How fast a point of the outline moves, px/s, px/m, ..., with the quantities that its view depends on.
+SharedRow shared_row(const PosedView& view, const OutlinePoint& p, double angle_speed) {
+  const ViewWork& work = view.problem.views[0];
+  const capture::Camera& camera = view.camera;
+  const chain::Chain& chain = *view.problem.chain;
+  const Vector3 &g = p.gradient, moment = p.x.cross(g), from_grasp = p.x - work.camera_from_base.translation;
+  const math::Matrix3& camera_from_base = work.camera_from_base.rotation;
+  const double base_speed = moment.dot(view.base_twist.head<3>()) + g.dot(view.base_twist.tail<3>());
+  const Vector2 from_center = image_of(camera, p.x) - Vector2(camera.cx, camera.cy);
+  SharedRow row;
+  row.segment<3>(kRotation) = -moment;
+  row.segment<3>(kTranslation) = -(camera.world_from_camera.rotation * g);
+  row[kFocal] = (p.outward.dot(from_center) + p.half_width) / camera.fx;
+  row[kCameraTime] = -angle_speed - base_speed;
+  row[kMaskOffset] = 1.0;
+  row[kBaseTime] = base_speed;
+  row.segment<3>(kGrasp) = camera_from_base.transpose() * g;
+  row.segment<3>(kGraspRotation) = camera_from_base.transpose() * from_grasp.cross(g);
+  row[kLength] = g.dot(from_grasp) / chain.length;
+  row[kDiameter] = p.half_width / chain.diameter;
+  return row;
+}
+
+// Normal equations of one view: its angles, then what it shares.
+struct ViewEquations {
+  MatrixX normal;
+  VectorX right;
+};
+
+// Its sums go into those of its camera in `frame`.
+ViewEquations view_equations(const PosedView& view, int camera, const CorrectionProblem& fit, const VectorX& thetadot,
+                             FrameEquations& frame) {
+  const SharedPlaces& places = fit.places[camera];
+  FrameEquations::Sums& sums = frame.sums[camera];
+  const chain::Chain& chain = *view.problem.chain;
+  const int n = chain.angles(), size = n + kSharedOfView, links = chain.links();
+  ViewEquations out{MatrixX::Zero(size, size), VectorX::Zero(size)};
+  // of each link's own offset in this view (observations.cpp), eliminated at the end
+  MatrixX coupling = MatrixX::Zero(size, links);
+  VectorX link_weight = VectorX::Constant(links, kEvidence / (kLinkOffsetDeviation * kLinkOffsetDeviation));
+  VectorX link_right = VectorX::Zero(links), row(size);
+  const auto add = [&](const OutlinePoint& p) {
+    if (p.before_grasp) return;  // the gripper's, or a cut face that is not round
+    const double residual = p.distance - view.mask_offset;
+    const double weight = kEvidence * p.length * tukey_weight(residual, fit.cut);
+    frame.sizes.push_back(std::abs(residual));
+    sums.length += p.length;
+    if (weight == 0.0) {
+      sums.cut += p.length;
+      return;
+    }
+    sums.weight += weight;
+    sums.first += weight * residual;
+    sums.second += weight * residual * residual;
+    frame.cost += 0.5 * weight * residual * residual;
+    const Vector3 moment = p.x.cross(p.gradient);
+    const int link = p.segment->link;
+    for (int k = 0; k < n; ++k)
+      row[k] = link < chain.child_link[k]
+                   ? 0.0
+                   : moment.dot(view.twists.col(k).head<3>()) + p.gradient.dot(view.twists.col(k).tail<3>());
+    row.tail<kSharedOfView>() = places.unit.cwiseProduct(shared_row(view, p, row.head(n).dot(thetadot)));
+    out.normal.selfadjointView<Eigen::Lower>().rankUpdate(row, weight);
+    out.right += weight * residual * row;
+    coupling.col(link) += weight * row;
+    link_weight[link] += weight;
+    link_right[link] += weight * residual;
+  };
+  for_each_outline_point(
+      chain, view.problem.views[0], [](const Edge&) {}, add, fit.end_reach);
+  for (int link = 0; link < links; ++link) {
+    out.normal.selfadjointView<Eigen::Lower>().rankUpdate(coupling.col(link), -1.0 / link_weight[link]);
+    out.right -= coupling.col(link) * (link_right[link] / link_weight[link]);
+  }
+  out.normal.triangularView<Eigen::StrictlyUpper>() = out.normal.transpose();
+  return out;
+}
+
+// Adds a view's equations where they belong; the gradient is that of the cost, the residual's negative.
+void scatter(const ViewEquations& view, const SharedPlaces& places, FrameEquations& out) {
+  const Eigen::Index n = out.local.gradient.size();
+  out.local.matrix += view.normal.topLeftCorner(n, n);
+  out.local.gradient -= view.right.head(n);
+  for (int i = 0; i < kSharedOfView; ++i) {
+    if (places.at[i] < 0) continue;
+    out.local.coupling.col(places.at[i]) += view.normal.block(0, n + i, n, 1);
+    out.shared_gradient[places.at[i]] -= view.right[n + i];
+    for (int j = 0; j < kSharedOfView; ++j)
+      if (places.at[j] >= 0) out.shared(places.at[i], places.at[j]) += view.normal(n + i, n + j);
+  }
+}
+
+void hold(const std::vector<char>& held, solve::ArrowEquations::Local& local) {
+  for (Eigen::Index k = 0; k < local.gradient.size(); ++k) {
+    if (!held[k]) continue;
+    local.matrix.row(k).setZero();
+    local.matrix.col(k).setZero();
+    local.matrix(k, k) = 1.0;
+    local.coupling.row(k).setZero();
+    local.gradient[k] = 0.0;
+  }
+}
+
+}  // namespace
+
+FrameEquations frame_equations(const CorrectionProblem& problem, const CorrectedFrame& frame,
+                               const capture::Corrections& corrections, const chain::Chain& chain,
+                               const VectorX& theta) {
+  const int n = chain.angles(), m = problem.shared;
+  FrameEquations out;
+  out.shared = MatrixX::Zero(m, m);
+  out.shared_gradient = VectorX::Zero(m);
+  out.local.matrix = problem.prior;
+  out.local.coupling = MatrixX::Zero(n, m);
+  out.local.gradient = problem.prior * theta;
+  out.cost = 0.5 * theta.dot(problem.prior * theta);
+  out.sums.resize(problem.capture.cameras.size());
+  for (const int v : frame.views) {
+    const int camera = problem.capture.views[v].camera;
+    PosedView view;
+    pose_view(problem, frame, v, corrections, chain, theta, view);
+    scatter(view_equations(view, camera, problem, frame.thetadot, out), problem.places[camera], out);
+  }
+  hold(problem.held, out.local);
+  return out;
+}
+
+}  // namespace chainsplat::silhouette

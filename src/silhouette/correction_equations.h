@@ -1,0 +1,69 @@
+// Outlines of one frame as equations of its angles and of what the recording was given wrongly (mathematics.md 6.10).
+#pragma once
+#include <array>
+#include <vector>
+
+#include "src/silhouette/outline.h"
+
+namespace chainsplat::silhouette {
+
+// What one view depends on beside the angles, in the order of capture::corrected_quantities().
+enum SharedOfView {
+  kRotation = 0,
+  kTranslation = 3,
+  kFocal = 6,
+  kCameraTime = 7,
+  kMaskOffset = 8,
+  kBaseTime = 9,
+  kGrasp = 10,
+  kGraspRotation = 13,
+  kLength = 16,
+  kDiameter = 17,
+  kSharedOfView = 18
+};
+using SharedRow = Eigen::Matrix<double, kSharedOfView, 1>;
+
+// Where the quantities of one camera's views stand among the shared unknowns, which are in units of their deviations.
+struct SharedPlaces {
+  std::array<int, kSharedOfView> at;   // -1: held
+  SharedRow unit = SharedRow::Zero();  // deviation of the unknown in the quantity's unit; 0: held
+};
+
+struct CorrectedFrame {
+  double time = 0.0;       // s, as given
+  math::VectorX thetadot;  // rad/s
+  std::vector<int> views;
+};
+
+// Equations of one frame: shared x shared, own x shared, own x own.
+struct FrameEquations {
+  math::MatrixX shared;
+  math::VectorX shared_gradient;
+  solve::ArrowEquations::Local local;
+  double cost = 0.0;
+  std::vector<double> sizes;  // px, residuals' absolute values
+  struct Sums {
+    double weight = 0.0, first = 0.0, second = 0.0;  // of the weights, times the residual, times its square
+    double length = 0.0, cut = 0.0;                  // px of outline, and of it what does not count
+  };
+  std::vector<Sums> sums;  // by camera
+};
+
+struct CorrectionProblem {
+  const capture::Capture& capture;
+  std::vector<SharedPlaces> places;  // by camera
+  int shared = 0;                    // number of shared unknowns
+  std::vector<CorrectedFrame> frames;
+  std::vector<MaskPoints> masks;  // by view
+  math::MatrixX prior;            // of the angles
+  std::vector<char> held;         // by angle
+  double cut = 0.0;               // px, of Tukey's loss
+  double end_reach = kEndReach;   // half widths from the chain's end within which the free end is sought
+};
+
+// `corrections`: where the shared unknowns are now; `chain`: with the rope's size there.
+FrameEquations frame_equations(const CorrectionProblem& problem, const CorrectedFrame& frame,
+                               const capture::Corrections& corrections, const chain::Chain& chain,
+                               const math::VectorX& theta);
+
+}  // namespace chainsplat::silhouette
