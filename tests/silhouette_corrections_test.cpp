@@ -68,6 +68,27 @@ TEST_CASE("a late base, a wrong length and a turned camera are each found to be 
   const math::VectorX found = capture::find(pose.corrections, "cam1", "rotation")->value;
   CHECK((found / kTurn + Vector3(0.0, 1.0, 0.0)).norm() < 0.35);
   CHECK(capture::find(pose.corrections, "cam0", "rotation")->value.norm() < 0.35 * kTurn);
+  CHECK(capture::find(pose.corrections, "grasp", "rotation")->value.isZero(0.0));  // the first joint takes it
+}
+
+TEST_CASE("a rope that bends in a plane tells how the gripper turned it, and a table tells it better") {
+  const Vector3 turn = 1.5 * kDegree * Vector3(1.0, 0.0, 0.0);  // out of the plane in which the demo nearly swings
+  capture::Capture turned = demo();
+  std::vector<trajectory::Sample> samples = turned.base.samples();
+  for (trajectory::Sample& sample : samples) sample.pose.rotation = sample.pose.rotation * math::exp_so3(turn);
+  turned.base = trajectory::fit(samples, "test");
+  const chain::Chain chain = chain::make_chain(turned.length, turned.diameter, turned.direction, turned.bending_axis,
+                                               16, chain::Bending::planar, false);
+  const auto found = [&](const capture::Capture& capture) {
+    const silhouette::CorrectionFit fit =
+        silhouette::fit_corrections(chain, capture, silhouette::fit_sequence(chain, capture));
+    return *capture::find(fit.corrections, "grasp", "rotation");
+  };
+  const capture::Correction before = found(demo()), after = found(turned);
+  CHECK((after.value - before.value + turn).norm() < 0.25 * turn.norm());
+  turned.table = capture::Table{Vector3::Zero(), Vector3(0.0, 1.0, 0.0)};
+  const capture::Correction table = found(turned);
+  CHECK(std::abs(table.value[0] + turn[0]) < std::abs(after.value[0] + turn[0]));
 }
 
 TEST_CASE("a group that is held stays as given, and one camera alone tells clocks only") {

@@ -24,6 +24,7 @@ constexpr double kWidestCut = 30.0;       // px
 constexpr double kNarrowing = 0.6;        // of that cut from step to step
 constexpr double kWideEnd = 8.0;          // half widths: the reach of the free end as long as the cut is wide
 constexpr double kJointDifference = 0.3;  // rad, deviation of the difference of neighboring angles with eight joints
+constexpr double kTableTilt = 0.003;      // rad, deviation of the bending plane from the table's
 constexpr double kLeastSize = 0.5;        // share of the given length and diameter below which no correction goes
 // The priors' penalty is kTails / 2 ln(1 + |y|^2 / kTails) in units of their deviation: nearly a Gaussian's for what a
 // careful laboratory gets wrong, and for a fault ten times that nearly flat.
@@ -173,12 +174,56 @@ double cut_of(const std::vector<FrameEquations>& frames) {
   return robust_cut(sizes);
 }
 
+// What is known of the shared unknowns beside the outlines, at x.
+struct Known {
+  MatrixX information;
+  VectorX gradient;
+};
+
+// A rope that lies on a table bends in its plane, however the gripper holds it.
+void add_table(const capture::Capture& capture, const Layout& layout, const VectorX& x, Known& known) {
+  if (!capture.table) return;
+  for (const Column& column : layout.columns) {
+    if (column.first < 0 || column.quantity->subject != std::string("grasp") ||
+        column.quantity->name != std::string("rotation"))
+      continue;
+    const Vector3 normal = capture.base.pose(capture.base.start()).rotation.transpose() * capture.table->normal;
+    Vector3 axis = math::exp_so3(column.deviation * x.segment<3>(column.first)) * capture.bending_axis;
+    if (axis.dot(normal) < 0.0) axis = -axis;  // bending axes may also point down
+    const Vector3 residual = axis.cross(normal);
+    // (w x axis) x normal = [normal] [axis] w
+    const math::Matrix3 slope = column.deviation * math::hat(normal) * math::hat(axis);
+    constexpr double kWeight = 1.0 / (kTableTilt * kTableTilt);
+    known.information.block<3, 3>(column.first, column.first) += kWeight * slope.transpose() * slope;
+    known.gradient.segment<3>(column.first) += kWeight * slope.transpose() * residual;
+  }
+}
+
+Known known_at(const capture::Capture& capture, const Layout& layout, const VectorX& x) {
+  const VectorX weights = prior_weights(layout, x);
+  Known known{weights.asDiagonal(), weights.cwiseProduct(x)};
+  add_table(capture, layout, x, known);
+  return known;
+}
+
+solve::ArrowEquations arrow_of(const std::vector<FrameEquations>& frames, const Known& known) {
+  solve::ArrowEquations arrow;
+  arrow.shared = known.information;
+  arrow.gradient = known.gradient;
+  for (const FrameEquations& frame : frames) {
+    arrow.shared += frame.shared;
+    arrow.gradient += frame.shared_gradient;
+    arrow.local.push_back(frame.local);
+  }
+  return arrow;
+}
+
 // Deviations of the shared unknowns: the larger of what the equations say and of what the scatter of the gradients
 // between stretches of time says (a sandwich estimate), since neighboring frames share the model's error.
-MatrixX shared_covariance(const std::vector<FrameEquations>& frames, const VectorX& prior, const VectorX& x,
+MatrixX shared_covariance(const std::vector<FrameEquations>& frames, const MatrixX& known, const VectorX& x,
                           double& evidence) {
-  const Eigen::Index m = prior.size();
-  MatrixX information = prior.asDiagonal(), scatter = information;
+  const Eigen::Index m = known.rows();
+  MatrixX information = known, scatter = known;
   const int count = static_cast<int>(frames.size()), stretches = std::min(kStretches, count);
   for (int s = 0; s < stretches; ++s) {
     VectorX gradient = VectorX::Zero(m);
@@ -193,7 +238,7 @@ MatrixX shared_covariance(const std::vector<FrameEquations>& frames, const Vecto
   double squares = 0.0;
   for (const FrameEquations& frame : frames)
     for (const FrameEquations::Sums& sums : frame.sums) squares += sums.second;
-  evidence = squares > 0.0 ? (x.dot(information * x) - x.dot(prior.cwiseProduct(x))) / squares : 0.0;
+  evidence = squares > 0.0 ? (x.dot(information * x) - x.dot(known * x)) / squares : 0.0;
   const MatrixX covariance = information.ldlt().solve(MatrixX::Identity(m, m));
   MatrixX robust = covariance * scatter * covariance;
   const VectorX grown = (covariance.diagonal().array() / robust.diagonal().array()).max(1.0).sqrt();
@@ -250,20 +295,6 @@ std::vector<VectorX> choose_frames(const SequenceFit& sequence, int most, Correc
     problem.masks[needed[i]] = mask_points(view, capture.cameras[view.camera], Options{}.max_pixels);
   });
   return theta;
-}
-
-// Adds the priors of the shared unknowns to what the frames say.
-solve::ArrowEquations arrow_of(const std::vector<FrameEquations>& frames, const Layout& layout, const VectorX& shared) {
-  const VectorX weights = prior_weights(layout, shared);
-  solve::ArrowEquations arrow;
-  arrow.shared = weights.asDiagonal();
-  arrow.gradient = weights.cwiseProduct(shared);
-  for (const FrameEquations& frame : frames) {
-    arrow.shared += frame.shared;
-    arrow.gradient += frame.shared_gradient;
-    arrow.local.push_back(frame.local);
-  }
-  return arrow;
 }
 
 // The covariance of all numbers of the corrections, in their units: 0 for those that are held.
@@ -339,7 +370,7 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
     wide *= kNarrowing;
     problem.cut = std::max({cut_of(frames), kLeastCut, wide});
     if (wide <= kLeastCut) problem.end_reach = kEndReach;
-    if (equations) *equations = arrow_of(frames, layout, at.head(m));
+    if (equations) *equations = arrow_of(frames, known_at(capture, layout, at.head(m)));
     double cost = 0.5 * at.head(m).squaredNorm();
     for (const FrameEquations& frame : frames) cost += frame.cost;
     return cost;
@@ -355,7 +386,8 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
 
   const std::vector<FrameEquations> frames = all_equations(problem, layout, chain, x);
   const VectorX prior = prior_weights(layout, x.head(m));
-  const MatrixX covariance = shared_covariance(frames, prior, x.head(m), out.evidence);
+  const MatrixX covariance =
+      shared_covariance(frames, known_at(capture, layout, x.head(m)).information, x.head(m), out.evidence);
   out.corrections = corrections_at(layout, capture, x.head(m));
   set_states(layout, prior, covariance, out.corrections);
   out.covariance = covariance_of_numbers(layout, covariance);
