@@ -74,7 +74,10 @@ struct Estimate {
   bool seen = false;               // whether a mask shows anything
   bool lost = false;               // whether the estimate does not explain the mask, the masks were empty for long,
                                    // or the colors in them have been unlike the twin's for long
+  bool doubtful = false;           // not lost, but what is seen may not be the rope, or not all of it: the deviations
+                                   // are those of a rope that nobody looks at, and no force should be told from it
 };
+const char* status(const Estimate& estimate);  // "following", "doubtful" or "lost"
 
 constexpr double kNever = -std::numeric_limits<double>::infinity();  // s; before all times, which may be negative
 
@@ -96,6 +99,8 @@ struct Filter {
   double last_seen = kNever;        // s, last frame in which the masks showed the rope
   double last_like = kNever;        // s, last frame in which the colors in the masks were like the twin's
   bool lost = false;                // in the last frame
+  bool whole = false;               // the masks have shown the whole rope since it was found
+  double hidden_since = kNever;     // s, first frame since it was found
   double edge_offset = 0.0, edge_offset_variance = 0.0;  // px, px^2, of the masks' outline outside the tube's
 };
 

@@ -63,8 +63,16 @@ constexpr double kMaskShift = 0.2;        // px, standard deviation from the shi
 constexpr double kLowerSide = 0.8;        // which is this share of the offset, downward; the rest is even on all sides
 constexpr double kMaskShiftMemory = 5.0;  // s
 
-constexpr double kUnlike = 0.5;      // likeness of drawn and recorded colors, below which the object is not the rope
-constexpr double kLongUnlike = 0.2;  // s of such frames, after which the rope counts as lost
+constexpr double kUnlike = 0.5;  // likeness of drawn and recorded colors, below which the object is not the rope
+// Share of the rope that the masks must show of what they should show: less, and they end too early. The rope would be
+// laid double into them, or be turned toward the camera.
+constexpr double kShown = 0.7;
+constexpr double kLongHidden = 2.0;  // s after which a rope that was never seen whole is followed as it is seen
+constexpr double kSearched = 0.9;  // share of the masks that the rope covers, below which it is sought elsewhere, too,
+constexpr double kBetter = 0.05;   // and by which it must be higher there
+constexpr double kUnexplained = 0.8;  // the same share, below which something else is in the masks
+constexpr double kDoubtAngle = 0.15;  // rad, added to the deviations of a doubtful rope's angles
+constexpr double kLongUnlike = 0.2;   // s of such frames, after which the rope counts as lost
 
 constexpr double kLeastColorWeight = 100;  // pixels times channels; fewer carry too little information
 
@@ -341,6 +349,37 @@ double rounded(double value) {
   return value;
 }
 
+// Image area of the tube, px, every link by itself: where the chain lies on itself it counts twice. `wider`: px on each
+// side.
+double tube_area(const chain::Chain& chain, const Pose& base, const VectorX& theta, const capture::Camera& camera,
+                 double wider) {
+  const MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, theta, base));
+  const Pose camera_from_world = camera.world_from_camera.inverse();
+  double area = 0.0;
+  for (Eigen::Index i = 0; i + 1 < nodes.cols(); ++i) {
+    const Vector3 a = camera_from_world * Vector3(nodes.col(i)), b = camera_from_world * Vector3(nodes.col(i + 1));
+    if (std::min(a.z(), b.z()) < image_model::kNear) continue;
+    const double width = chain.diameter * (camera.fx + camera.fy) / (a.z() + b.z()) + 2.0 * wider;
+    area += width * (capture::project(camera, b) - capture::project(camera, a)).norm();
+  }
+  return area;
+}
+
+// The masks' area over that of the tube at theta, in the view where it is most: a rope may point at one camera or cross
+// itself there, but not in all views.
+double shown_share(const Filter& filter, std::span<const capture::View* const> views, const VectorX& theta,
+                   double edge_offset) {
+  double most = 0.0;
+  for (const capture::View* const view : views) {
+    int pixels = 0;
+    for (std::size_t i = 3; i < view->rgba.size(); i += 4) pixels += view->rgba[i] >= 128;
+    const double tube = tube_area(filter.model.chain, filter.base(view->time).pose, theta,
+                                  filter.cameras.at(view->camera), edge_offset);
+    if (tube > 0.0) most = std::max(most, pixels / tube);
+  }
+  return most;
+}
+
 bool explains(const silhouette::FrameFit& fit) { return fit.covered >= kLostShare && fit.theta.allFinite(); }
 
 }  // namespace
@@ -497,45 +536,57 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
   const capture::View& view = *views.front();
   const int n = filter.model.chain.angles();
   const bool first = !filter.belief;
-  const auto believed = [&](Contact contact) {
+  const auto believed_after = [&](Contact contact) {
     return first ? first_belief(filter, view.time) : predict(filter, *filter.belief, view.time, contact);
   };
   // predict
   const bool in_contact = view.time <= filter.contact_until;
-  Belief predicted = believed(in_contact ? Contact::touched : Contact::none);
+  Belief predicted = believed_after(in_contact ? Contact::touched : Contact::none);
   if (first) filter.last_seen = view.time;
 
   Estimate out;
   out.frame = view.frame;
   out.time = view.time;
   out.seen = std::any_of(views.begin(), views.end(), [](const capture::View* v) { return has_mask(*v); });
+  bool believed = false;  // the belief is taken from this frame
   if (out.seen) {
     // measure; where the model does not explain the frame, again with a force that may change, and then with a blow
     Measured measured = measure(filter, predicted, views, !first);
     if (!first && (measured.surprise > kSurprise || !explains(measured.fit))) {
       filter.contact_until = view.time + kContactMemory;
       if (!in_contact) {
-        predicted = believed(Contact::touched);
+        predicted = believed_after(Contact::touched);
         measured = measure(filter, predicted, views, true);
       }
       if (filter.shifts && (measured.surprise > kSurprise || !explains(measured.fit))) {
-        predicted = believed(Contact::struck);
+        predicted = believed_after(Contact::struck);
         measured = measure(filter, predicted, views, true);
       }
     }
-    // where nothing explains the masks, search from a wide belief
-    if (!explains(measured.fit)) {
+    // where the masks are not explained, or not all of them, search from a wide belief
+    if (!explains(measured.fit) || measured.fit.covered < kSearched) {
       Belief wide = first_belief(filter, view.time);
       wide.covariance.diagonal().head(n).array() += kLostAngle * kLostAngle;
       wide.covariance.diagonal().segment(n, n).array() += kLostRate * kLostRate;
       const Measured again = measure(filter, wide, views, false);
-      if (explains(again.fit)) measured = again;
+      if (explains(again.fit) && again.fit.covered > measured.fit.covered + kBetter) measured = again;
     }
-    // take the colors, the force and the masks' edge offset from a frame that is explained
     out.lost = !explains(measured.fit);
     out.residual = measured.fit.residual_pixels;
     out.surprise = measured.surprise;
-    if (!out.lost) {
+    const silhouette::FrameFit& fit = measured.fit;
+    const bool folded = shown_share(filter, views, fit.theta, fit.edge_offset) * fit.covered <
+                        kShown * std::max(fit.inside, kLostShare);
+    // a first mask that shows less rope than there is must not be believed: any shape that fits it is wrong
+    if (!filter.whole && !out.lost && !folded)
+      filter.whole = shown_share(filter, views, predicted.mean.head(n), filter.edge_offset) > kShown;
+    if (!filter.whole && filter.hidden_since == kNever) filter.hidden_since = view.time;
+    const bool hidden = !filter.whole && view.time - filter.hidden_since < kLongHidden;
+    out.doubtful = !filter.whole || folded || fit.covered < kUnexplained;
+    believed = !out.lost && !folded && !hidden;
+    if (!out.lost && !believed) filter.last_like = filter.last_seen = view.time;  // something of the rope is there
+    // take the colors, the force and the masks' edge offset from a frame that is explained
+    if (believed) {
       filter.last_seen = view.time;
       filter.belief = measured.belief;
       if (filter.compare_colors) look_at_colors(filter, views, *filter.belief, out);
@@ -547,18 +598,21 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
           std::max(kLeastOffsetDeviation * kLeastOffsetDeviation, filter.edge_offset_variance * (1.0 - gain));
     }
   }
-  if (!out.seen || out.lost) {
+  if (!believed) {
     filter.belief = predicted;
     out.lost = out.lost || view.time - filter.last_seen > kLongUnseen;
   } else if (view.time - filter.last_like > kLongUnlike) {  // search again where the twin alone would be
     filter.belief = first_belief(filter, view.time);
     out.lost = true;
   }
+  out.doubtful = !out.lost && (out.doubtful || out.likeness.value_or(1.0) < kUnlike);
+  if (out.lost) filter.whole = false, filter.hidden_since = kNever;
   // report, with the uncertainty of the model's shape
   filter.lost = out.lost;
   out.theta = filter.belief->mean.head(n);
   out.thetadot = filter.belief->mean.segment(n, n);
   out.covariance = filter.belief->covariance.topLeftCorner(2 * n, 2 * n);
+  if (out.doubtful) out.covariance.diagonal().head(n).array() += kDoubtAngle * kDoubtAngle;
   const std::vector<double> shape = chain::shape_variances(filter.model.chain, out.theta);
   out.centerline_sigma = centerline_deviation(filter.model.chain, out.theta, out.covariance.topLeftCorner(n, n), shape);
   out.covariance.topLeftCorner(n, n) += chain::shape_covariance(filter.model.chain, shape, out.theta);
@@ -632,6 +686,10 @@ double tube_iou(const chain::Chain& chain, const Pose& base, const VectorX& thet
   return either > 0 ? static_cast<double>(both) / either : 0.0;
 }
 
+const char* status(const Estimate& estimate) {
+  return estimate.lost ? "lost" : estimate.doubtful ? "doubtful" : "following";
+}
+
 std::string to_json(const Estimate& estimate, double latency, bool rates) {
   using Json = nlohmann::ordered_json;
   const auto list = [](const VectorX& values) { return Json(std::vector<double>(values.begin(), values.end())); };
@@ -653,6 +711,7 @@ std::string to_json(const Estimate& estimate, double latency, bool rates) {
                   {"color_residual", estimate.color_residual},
                   {"covariance", std::move(covariance)},
                   {"lost", estimate.lost},
+                  {"status", status(estimate)},
                   {"latency_ms", std::round(1e6 * latency) / 1e3}};
   return line.dump();
 }

@@ -50,6 +50,10 @@ std::optional<EstimateLine> read_estimate_line(const std::string& line, const st
     if (!lost->is_boolean()) refuse(where, "lost", "is not true or false");
     if (lost->get<bool>()) return {};
   }
+  if (const auto status = object.find("status"); status != object.end()) {
+    if (!status->is_string()) refuse(where, "status", "is no text");
+    if (status->get<std::string>() != "following") return {};
+  }
   for (const char* field : {"time", "theta"})
     if (!object.contains(field)) refuse(where, field, "is missing");
   EstimateLine out;

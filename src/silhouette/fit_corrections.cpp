@@ -24,7 +24,7 @@ constexpr double kWidestCut = 30.0;       // px
 constexpr double kNarrowing = 0.6;        // of that cut from step to step
 constexpr double kWideEnd = 8.0;          // half widths: the reach of the free end as long as the cut is wide
 constexpr double kJointDifference = 0.3;  // rad, deviation of the difference of neighboring angles with eight joints
-constexpr double kTableTilt = 0.003;      // rad, deviation of the bending plane from the table's
+constexpr double kTableTilt = 0.002;      // rad, deviation of the bending plane from the table's
 constexpr double kLeastSize = 0.5;        // share of the given length and diameter below which no correction goes
 // The priors' penalty is kTails / 2 ln(1 + |y|^2 / kTails) in units of their deviation: nearly a Gaussian's for what a
 // careful laboratory gets wrong, and for a fault ten times that nearly flat.

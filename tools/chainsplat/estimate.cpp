@@ -37,12 +37,13 @@ struct Tally {
   static constexpr double kShortest = 1e-6;  // s, latency of the first bin
   static constexpr double kGrowth = 1.01;    // from bin to bin: latencies are told to 1 %
   std::array<std::int64_t, 2100> bins{};     // up to 1,000 s
-  std::int64_t frames = 0, lost = 0;
+  std::int64_t frames = 0, lost = 0, doubtful = 0;
 };
 
 void count(Tally& tally, const estimation::Estimate& estimate, double latency) {
   ++tally.frames;
   tally.lost += estimate.lost;
+  tally.doubtful += estimate.doubtful;
   const double bin = std::log(std::max(latency, Tally::kShortest) / Tally::kShortest) / std::log(Tally::kGrowth);
   ++tally.bins[static_cast<std::size_t>(std::min(bin, static_cast<double>(tally.bins.size() - 1)))];
 }
@@ -138,10 +139,10 @@ class Page {
     if (!first_time_) first_time_ = e.time;
     Shown shown;
     shown.frame = e.frame, shown.time = e.time, shown.latency = followed.latency;
-    shown.iou = e.iou, shown.residual = e.residual, shown.seen = e.seen, shown.lost = e.lost;
+    shown.iou = e.iou, shown.residual = e.residual, shown.seen = e.seen, shown.status = estimation::status(e);
     shown.line = recorded_line(
         camera, chain::nodes(twin.chain, chain::link_motions(twin.chain, e.theta, follower_.base().pose(e.time))));
-    if (pushed_ && !e.lost) {
+    if (pushed_ && !e.lost && !e.doubtful) {
       const Eigen::Index n = std::min(e.theta.size(), e.covariance.rows());  // 0: no covariance
       if (const auto f = force::update(*pushed_, e.time, e.theta, e.covariance.topLeftCorner(n, n)))
         show_force(*f, twin, follower_.model(), camera, shown);
@@ -183,7 +184,7 @@ struct Ending {
   void summarize() const {
     if (tally.frames > 0)
       say(std::to_string(tally.frames) + " frames" + (tally.lost ? ", lost in " + std::to_string(tally.lost) : "") +
-          "; " + latency_text(tally) + ".");
+          (tally.doubtful ? ", doubtful in " + std::to_string(tally.doubtful) : "") + "; " + latency_text(tally) + ".");
   }
 };
 

@@ -23,7 +23,7 @@ using Json = nlohmann::ordered_json;
 
 constexpr std::uint8_t kInside = 128;  // mask values from here on are object (formats.md 1.5)
 constexpr std::string_view kImageName = "{image}", kMaskName = "{mask}";  // in the line of a command
-constexpr double kDoubtful = 0.85;     // share of the chain's centerline in the masks under which they may be wrong
+constexpr double kDoubtful = 0.85;  // share of the chain's centerline in the masks under which they may be wrong
 
 struct Request {
   std::string capture, out, command, frames;
@@ -94,8 +94,7 @@ capture::Image8 mask_by_command(const std::string& command, const capture::View&
   std::error_code error;
   fs::remove(mask, error);
   // its standard output must not mix with ours
-  const std::string line =
-      "{ " + filled_in(command, image, mask) + "\n} 1>&2 </dev/null";
+  const std::string line = "{ " + filled_in(command, image, mask) + "\n} 1>&2 </dev/null";
   const int status = std::system(line.c_str());
   const std::string mend = "try the command by hand on one image; the masks so far are kept";
   if (WIFSIGNALED(status)) {
@@ -183,8 +182,7 @@ void make_masks(const Globals& globals, const Request& request) {
     wanted.push_back({files ? own : "masks/" + name + "/%06d.png", scene.folder});
     const Path into = wanted.back().file(0).parent_path();
     if (!request.force && (!own.empty() || (fs::is_directory(into, error) && !fs::is_empty(into, error))))
-      throw InputError(into.string(), name + " has masks already",
-                       "use --force to replace them, or -o FOLDER");
+      throw InputError(into.string(), name + " has masks already", "use --force to replace them, or -o FOLDER");
   }
   if (in_place && ::access(scene.folder.c_str(), W_OK) != 0)
     throw InputError(scene.folder.string(), "cannot be written", "give -o FOLDER");

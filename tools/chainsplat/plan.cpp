@@ -84,8 +84,8 @@ void start_from_image(const std::string& source, const twin::Twin& twin, plannin
       twin, seen.cameras, [&](double) { return dynamics::at_rest(problem.base); }, view.time);
   const capture::View* const views[] = {&view};
   const estimation::Estimate found = estimation::update(filter, views);
-  if (!found.seen || found.lost) {
-    std::string what = "the rope was not recognized in the first frame of '";
+  if (!found.seen || found.lost || found.doubtful) {
+    std::string what = "the rope was not surely recognized in the first frame of '";
     what += source + "'";
     throw InputError("--state-from", what, "name another camera, or give the state with --initial");
   }
@@ -186,7 +186,7 @@ void plan(const Globals& globals, PlanRequest& request) {
                          ", and each is an optimization",
                      "give for example 10");
   planning::check_rate(request.rate, options.horizon * static_cast<double>(request.targets.size()),
-             "give rows a second, for example 100");
+                       "give rows a second, for example 100");
   if (!request.terminal.empty()) {
     const std::vector<double> values = numbers(request.terminal, "--terminal", 0);
     options.terminal = Eigen::Map<const math::VectorX>(values.data(), static_cast<Eigen::Index>(values.size()));

@@ -19,9 +19,9 @@ namespace {
 
 using Json = nlohmann::ordered_json;
 
-constexpr std::size_t kHistory = 300;                       // frames of the latency plot: ten seconds at 30 Hz
-constexpr double kPatience = 0.5;  // s, until a browser without news is told so
-constexpr double kAsking = 2.0;    // s after the last request in which pictures are still copied
+constexpr std::size_t kHistory = 300;  // frames of the latency plot: ten seconds at 30 Hz
+constexpr double kPatience = 0.5;      // s, until a browser without news is told so
+constexpr double kAsking = 2.0;        // s after the last request in which pictures are still copied
 
 // The masked object on black, as far as there is no picture.
 void draw(const capture::View& view, int width, int height, std::string& rgb) {
@@ -110,7 +110,7 @@ void Window::show(const Shown& shown) {
     return out;
   };
   Json state = {{"frame", shown.frame},       {"time", shown.time},           {"iou", shown.iou},
-                {"residual", shown.residual}, {"seen", shown.seen},           {"lost", shown.lost},
+                {"residual", shown.residual}, {"seen", shown.seen},           {"status", shown.status},
                 {"line", points(shown.line)}, {"force", points(shown.force)}, {"force_text", shown.force_text}};
   std::shared_ptr<std::string> rgb;
   if (core::seconds_now() - self.asked < kAsking) {

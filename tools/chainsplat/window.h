@@ -16,7 +16,8 @@ struct Shown {
   double time = 0.0;     // s
   double latency = 0.0;  // s
   double iou = 0.0, residual = 0.0;
-  bool seen = false, lost = false;
+  bool seen = false;
+  std::string status = "following";  // or doubtful, lost
   std::vector<math::Vector2> line;           // the chain's joints and ends
   std::vector<math::Vector2> force;          // from the contact to the arrow's head; empty: none known
   std::string force_text = "unknown";        // its size and standard error, or "none"
