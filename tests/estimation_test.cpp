@@ -536,6 +536,28 @@ TEST_CASE("a rope out of sight is predicted, counts as lost in time, and is foun
   CHECK(rms(shared_twin().chain, found[40].theta, shared_truth().theta[40]) < 4e-3);
 }
 
+TEST_CASE("first masks that end half-way down the rope are not believed, and said to be doubtful") {
+  std::vector<capture::View> views(shared_views().begin(), shared_views().begin() + 30);
+  for (int f = 0; f < 10; ++f) {
+    capture::View& view = views[f];
+    int top = view.height, bottom = 0;
+    const auto row = [&](int y) { return view.rgba.begin() + 4L * y * view.width; };
+    for (int y = 0; y < view.height; ++y)
+      for (int x = 0; x < view.width; ++x)
+        if (row(y)[4 * x + 3] != 0) top = std::min(top, y), bottom = y;
+    std::fill(row((top + bottom) / 2), view.rgba.end(), std::uint8_t{0});
+  }
+  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  const auto found = follow(filter, views);
+  const chain::Chain& chain = shared_twin().chain;
+  for (int f = 0; f < 10; ++f) {
+    CHECK(std::string(estimation::status(found[f])) == "doubtful");
+    CHECK(rms(chain, found[f].theta, shared_truth().theta[f]) < 3.0 * deviation(chain, found[f]));
+  }
+  for (int f = 12; f < 30; ++f) CHECK(std::string(estimation::status(found[f])) == "following");
+  CHECK(rms(chain, found[25].theta, shared_truth().theta[25]) < 5e-3);
+}
+
 TEST_CASE("a mask elsewhere is not the rope: lost, and the prediction stays") {
   std::vector<capture::View> views(shared_views().begin(), shared_views().begin() + 14);
   for (int f = 8; f < 11; ++f) {
