@@ -709,6 +709,7 @@ std::string to_json(const Estimate& estimate, double latency, bool rates) {
                   {"iou", estimate.iou},
                   {"residual", estimate.residual},
                   {"color_residual", estimate.color_residual},
+                  {"surprise", estimate.surprise},
                   {"covariance", std::move(covariance)},
                   {"lost", estimate.lost},
                   {"status", status(estimate)},
