@@ -88,6 +88,7 @@ struct Filter {
   bool shifts = false;                        // the unknown force is a part of the state
   std::optional<math::Vector3> table_normal;  // unit, world; on a table the masks' shift is a part of the state too
   std::vector<capture::Camera> cameras;
+  std::vector<char> unverified;  // by camera: its pose was never compared with the rope; empty: none
   dynamics::BaseFunction base;
   Options options;
   CompareColors compare_colors;     // empty: silhouettes alone

@@ -7,8 +7,8 @@
 #include <string>
 #include <vector>
 
-#include "chainsplat/corrections.h"
 #include "chainsplat/capture.h"
+#include "chainsplat/corrections.h"
 #include "chainsplat/dynamics.h"
 
 namespace chainsplat::estimation {
@@ -37,12 +37,13 @@ struct SourceOptions {
   std::optional<double> start;  // s, of the first frame; none: the calibration's
   bool unix_time = false;       // a device's own stamps in Unix time, in place of `start`
   capture::FrameRange frames;
-  bool pictures = false;  // whole frames of a capture too (its first camera)
+  bool pictures = false;             // whole frames of a capture too (its first camera)
   capture::Corrections corrections;  // of the cameras and of a capture's base: the twin's, set by the follower
 };
 
 struct FrameSource {
   std::vector<capture::Camera> cameras;
+  std::vector<char> unverified;                // by camera: the twin was made with another calibration
   std::optional<trajectory::Trajectory> base;  // a capture's own
   bool masked = false;                         // the frames have views
   // The next frame; false at the end. Throws InputError or WorkError where the frames end in another way, Interrupted

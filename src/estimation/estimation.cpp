@@ -46,6 +46,10 @@ constexpr double kPlaceFloor = 0.005;
 // Ridge, as a share of the torques' mean variance, for torques that a force at few places cannot cause.
 constexpr double kPlaceRidge = 1e-3;
 
+// Deviation of the pose of a camera that no training has compared with the rope: what calibrations by hand reach.
+constexpr double kCameraTurn = 0.0044;  // rad, a quarter of a degree
+constexpr double kCameraShift = 0.003;  // m
+
 constexpr double kLongUnseen = 0.5;  // s without a mask, after which the rope counts as lost
 // Standard deviations that are added for the search of a lost rope.
 constexpr double kLostAngle = 0.5;      // rad
@@ -380,6 +384,18 @@ double shown_share(const Filter& filter, std::span<const capture::View* const> v
   return most;
 }
 
+// Variance, m^2 per coordinate, by which the poses of cameras that were never compared with the rope displace it.
+double pose_variance(const Filter& filter, std::span<const capture::View* const> views) {
+  double sum = 0.0;
+  for (const capture::View* const view : views) {
+    if (filter.unverified.empty() || !filter.unverified.at(view->camera)) continue;
+    const Vector3 from_camera =
+        filter.base(view->time).pose.translation - filter.cameras.at(view->camera).world_from_camera.translation;
+    sum += kCameraTurn * kCameraTurn * from_camera.squaredNorm() + kCameraShift * kCameraShift;
+  }
+  return sum / static_cast<double>(views.size() * views.size());
+}
+
 bool explains(const silhouette::FrameFit& fit) { return fit.covered >= kLostShare && fit.theta.allFinite(); }
 
 }  // namespace
@@ -613,7 +629,8 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
   out.thetadot = filter.belief->mean.segment(n, n);
   out.covariance = filter.belief->covariance.topLeftCorner(2 * n, 2 * n);
   if (out.doubtful) out.covariance.diagonal().head(n).array() += kDoubtAngle * kDoubtAngle;
-  const std::vector<double> shape = chain::shape_variances(filter.model.chain, out.theta);
+  std::vector<double> shape = chain::shape_variances(filter.model.chain, out.theta);
+  for (double& variance : shape) variance += pose_variance(filter, views);
   out.centerline_sigma = centerline_deviation(filter.model.chain, out.theta, out.covariance.topLeftCorner(n, n), shape);
   out.covariance.topLeftCorner(n, n) += chain::shape_covariance(filter.model.chain, shape, out.theta);
   for (const capture::View* const v : views)

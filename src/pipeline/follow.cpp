@@ -140,6 +140,11 @@ Follower::Implementation::Implementation(const Path& folder, const FollowOptions
   open_base();
   filter = estimation::start(
       twin, source.cameras, [this](double time) { return base.at(time); }, base.start());
+  filter.unverified = source.unverified;
+  for (std::size_t c = 0; c < source.cameras.size(); ++c)
+    if (source.unverified[c])
+      core::warn(source.cameras[c].name +
+                 ": the twin was not made with this calibration; deviations allow for its errors");
   open_engine();
   if (options.solver == Solver::adam)
     start_adam();

@@ -53,13 +53,24 @@ double until_unix(double stamp) {
   return std::abs(stamp - monotonic) < std::abs(stamp - unix) ? unix - monotonic : 0.0;
 }
 
+// Whether the twin was made with this camera as it is given. A twin without corrections does not say.
+bool is_unverified(const capture::Corrections& corrections, const capture::Camera& camera) {
+  if (corrections.empty()) return false;
+  const capture::Correction* const known = capture::find(corrections, camera.name, "rotation");
+  return !known || known->calibration != capture::calibration_text(camera);
+}
+
 // A capture, loaded and checked as a whole.
 FrameSource open_capture(const SourceOptions& options) {
   capture::LoadOptions load;
   load.camera = options.camera;
   load.first = options.frames.first, load.last = options.frames.last;
+  FrameSource source;
   const auto loaded = [&] {
     capture::Capture capture = capture::load(options.source, load);
+    source.unverified.clear();
+    for (const capture::Camera& camera : capture.cameras)
+      source.unverified.push_back(is_unverified(options.corrections, camera));
     capture::apply(options.corrections, capture);
     return std::make_shared<const capture::Capture>(std::move(capture));
   };
@@ -70,7 +81,6 @@ FrameSource open_capture(const SourceOptions& options) {
     load.masked = load.undistort = false;
     whole = loaded();
   }
-  FrameSource source;
   source.cameras = recorded->cameras;
   source.base = recorded->base;
   source.masked = true;
@@ -111,7 +121,9 @@ FrameSource open_stream(const SourceOptions& options) {
   const bool standard_input = options.source == "-";
   double rate = options.rate > 0.0 ? options.rate : calibration.rate, start = calibration.start;
   FrameSource source;
-  source.cameras = {capture::corrected(options.corrections, calibration.camera)};
+  source.unverified = {is_unverified(options.corrections, calibration.camera)};
+  source.cameras = {calibration.camera};
+  if (!source.unverified[0]) source.cameras[0] = capture::corrected(options.corrections, calibration.camera);
   const double late = capture::value_of(options.corrections, calibration.camera.name, "time");
   std::shared_ptr<capture::VideoReader> reader;
   if (!standard_input) {
