@@ -1,4 +1,5 @@
 #include "chainsplat/core.h"
+#include "chainsplat/text.h"
 
 #include <doctest/doctest.h>
 
@@ -113,4 +114,13 @@ TEST_CASE("a listener hears what is said in its scope, and may stop the work") {
   CHECK(inner == std::vector<std::string>{"one", "two"});
   CHECK(outer == std::vector<std::string>{"three"});
   core::set_listener({});
+}
+
+TEST_CASE("numbers for people have few digits, and none too few") {
+  CHECK(core::brief(1.9666666666666666) == "1.967");
+  CHECK(core::brief(-5.0) == "-5");
+  CHECK(core::brief(100.0) == "100");
+  CHECK(core::brief(0.012345678) == "0.01235");
+  CHECK(core::brief(0.0) == "0");
+  CHECK(core::brief(1763800000.25) == "1763800000.25");
 }

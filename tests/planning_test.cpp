@@ -243,9 +243,35 @@ TEST_CASE("targets that a random motion passes are reached within the limits, th
       least = std::min(least, std::sqrt(nearest(problem.model.chain,
                                                 chain::link_motions(problem.model.chain, states.theta[k],
                                                                     base_at(one.motion, times[k]).pose),
-                                                tabletop, problem.targets[0])
+                                                tabletop ? Part::rope : Part::tip, problem.targets[0])
                                             .squared));
     CHECK(std::abs(least - one.hits[0].miss) < 3e-4);
+  }
+}
+
+TEST_CASE("what of the rope hits is what was asked for, and it is said where along the rope that is") {
+  Problem problem = problem_of(chain::Bending::planar, false);
+  Options options;
+  options.horizon = 1.0;
+  options.starts = 2;
+  // a place beside the middle of the rope at rest: the whole rope is there at once, the tip must come up
+  problem.targets = {problem.base.translation + Vector3(0.0, 0.0, -0.15)};
+  options.part = Part::rope;
+  const Plan rope_plan = plan(problem, options);
+  CHECK(rope_plan.reached);
+  CHECK(rope_plan.hits[0].arclength < 0.25);
+  for (const Part part : {Part::tip, Part::last_link}) {
+    options.part = part;
+    problem.targets = {problem.base.translation + Vector3(0.1, 0.0, -0.28)};
+    const Plan found = plan(problem, options);
+    CHECK(found.reached);
+    const double first = part == Part::tip ? 0.3 : 0.3 - 0.3 / 8 - 1e-9;
+    CHECK(found.hits[0].arclength >= first);
+    // the point at that arclength is where the hit says
+    const chain::States there = predict(problem, found.motion, {found.hits[0].time});
+    const auto motions = chain::link_motions(problem.model.chain, there.theta[0], base_at(found.motion, found.hits[0].time).pose);
+    const Vector3 point = motions.back() * (found.hits[0].arclength * problem.model.chain.direction);
+    CHECK((point - found.hits[0].point).norm() < 1e-3);
   }
 }
 

@@ -24,6 +24,9 @@ enum class Axis { x, y, z, yaw };
 // - s)^2 with a cubic, as in the paper.
 enum class Window { smooth, paper };
 
+// What of the rope is to hit: the free end, the nearest point of the last link's centerline, or of the whole rope's.
+enum class Part { tip, last_link, rope };
+
 // What the arm can do. Speeds are of the translation (norm of the vector); those of yaw are separate. Stroke: farthest
 // offset from the start along each axis. Yaw's are of a wrist like the UR5e's (180 deg/s).
 struct Limits {
@@ -74,6 +77,7 @@ struct Box {
 struct Options {
   std::vector<Axis> axes;  // empty: x for a planar chain, else x and y
   Window window = Window::smooth;
+  std::optional<Part> part;         // none: the tip in free space, the whole rope on a table
   double horizon = 3.0;             // s, for each target
   bool free_horizon = false;        // the shortest of a set of horizons that reaches it; `horizon` is the longest
   std::optional<VectorX> terminal;  // offset from the start at the end, one an axis; none: free
@@ -88,8 +92,8 @@ struct Options {
   std::uint64_t seed = 0;
 };
 
-// Where the rope is to be brought. On a table: any point of the rope at the end of the stretch, at rest; the target is
-// taken at the rope's height. In free space: the centerline of the last link, at any time.
+// Where the rope (what of it, Options say) is to be brought. On a table: at the end of the stretch, at rest; the target
+// is taken at the rope's height. In free space: at any time.
 struct Problem {
   dynamics::Model model;
   bool tabletop = false;
@@ -104,6 +108,7 @@ struct Hit {
   double miss = 0.0;                         // m, hard minimum, between the steps too
   double time = 0.0;                         // s
   Vector3 point = Vector3::Zero();           // of the rope, m, world
+  double arclength = 0.0;                    // m, of that point from the grasp
   double mean_miss = 0.0, worst_miss = 0.0;  // over the samples; the miss itself without them
 };
 
@@ -142,9 +147,8 @@ struct StateFit {
   dynamics::InitialState state;
   solve::Summary summary;  // m^2, rad (norm)
 };
-StateFit fit_state(const chain::Chain& chain, const trajectory::BaseMotion& base,
-                   const std::vector<double>& arclengths, const MatrixX& points, const MatrixX& velocities,
-                   const VectorX& start);
+StateFit fit_state(const chain::Chain& chain, const trajectory::BaseMotion& base, const std::vector<double>& arclengths,
+                   const MatrixX& points, const MatrixX& velocities, const VectorX& start);
 
 // Replanning while another chain plays the rope's part. What is seen of it are points of its centerline and their
 // speeds, without noise; from them come the twin's state and, by what the model did not foretell since the last look,

@@ -9,6 +9,8 @@
 #include <nlohmann/json.hpp>
 #include <set>
 
+#include "chainsplat/text.h"
+
 namespace chainsplat::capture {
 
 using Json = nlohmann::ordered_json;
@@ -204,7 +206,7 @@ class Reader {
       return std::nullopt;
     }
     if (std::abs(length - 1.0) > kUnitTolerance)
-      doubt(key, "has length " + core::exact(length) + ", taken as a direction");
+      doubt(key, "has length " + core::brief(length) + ", taken as a direction");
     return *value / length;
   }
 
@@ -428,7 +430,7 @@ void set_times(CameraSource& source, const Path& folder, Findings& findings) {
   }
   if (const double seconds = source.times.back() - source.times.front(); seconds > kLongestRecording) {
     findings.problems.push_back({source.where + (source.timestamps ? ".timestamps" : ".rate"),
-                                 "the frames span " + core::exact(seconds) + " s and a recording at most " +
+                                 "the frames span " + core::brief(seconds) + " s and a recording at most " +
                                      core::exact(kLongestRecording) + " s, for the motion between all is computed",
                                  "correct it or split the recording"});
     source.times.clear();
@@ -471,7 +473,7 @@ void check_lens(const Reader& reader, const Camera& camera) {
     const math::Vector2 back = distort(camera, undistort(camera, recorded));
     if (!((back - recorded).norm() < kInversePixels)) {
       reader.problem("distortion",
-                     "cannot be undone at pixel (" + core::exact(recorded.x()) + ", " + core::exact(recorded.y()) +
+                     "cannot be undone at pixel (" + core::brief(recorded.x()) + ", " + core::brief(recorded.y()) +
                          "): the model folds the image",
                      "write OpenCV's k1, k2, p1, p2, k3 of this image size");
       return;
@@ -670,10 +672,10 @@ void read_base(Manifest& manifest, const Path& file, Findings& findings) {
     last = std::max(last, source.times.back());
     if (source.times.front() < capture.base.start() - slack || source.times.back() > capture.base.end() + slack)
       findings.problems.push_back({file.string(),
-                                   "covers " + core::exact(capture.base.start()) + " to " +
-                                       core::exact(capture.base.end()) + " s, but the frames of " + source.camera.name +
-                                       " are at " + core::exact(source.times.front()) + " to " +
-                                       core::exact(source.times.back()) + " s",
+                                   "covers " + core::brief(capture.base.start()) + " to " +
+                                       core::brief(capture.base.end()) + " s, but the frames of " + source.camera.name +
+                                       " are at " + core::brief(source.times.front()) + " to " +
+                                       core::brief(source.times.back()) + " s",
                                    "record the base during all frames or correct start, rate or timestamps"});
   }
   // frames that a clock of the base, late or early, leaves without a base
@@ -767,7 +769,7 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
       top.problem("gravity", "is more than " + core::exact(kMostGravity) + " m/s^2, beyond every experiment",
                   "write it in m/s^2, world frame");
     else if (gravity->norm() < kLeast || gravity->norm() > kMost)
-      top.doubt("gravity", "has length " + core::exact(gravity->norm()) + " m/s^2, not Earth's");
+      top.doubt("gravity", "has length " + core::brief(gravity->norm()) + " m/s^2, not Earth's");
   } else if (!top.has("gravity")) {
     top.doubt("gravity", "is missing; (0, 0, -9.81) is assumed");
   }

@@ -14,6 +14,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/recognition.h"
+#include "chainsplat/text.h"
 
 namespace chainsplat::pipeline {
 
@@ -128,8 +129,8 @@ trajectory::Trajectory own_base(const Path& run, const chain::States& states) {
   const double slack = 0.5 * (last - first) / static_cast<double>(std::max<std::size_t>(states.time.size() - 1, 1));
   if (first < base.start() - slack || last > base.end() + slack)
     throw InputError((run / kBaseFile).string(),
-                     "covers " + core::exact(base.start()) + " to " + core::exact(base.end()) +
-                         " s, but the states are at " + core::exact(first) + " to " + core::exact(last) + " s",
+                     "covers " + core::brief(base.start()) + " to " + core::brief(base.end()) +
+                         " s, but the states are at " + core::brief(first) + " to " + core::brief(last) + " s",
                      "copy the whole base file of the capture there");
   return base;
 }

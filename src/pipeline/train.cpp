@@ -181,6 +181,14 @@ void choose_work(Training& t) {
   if (t.roll_out && !t.identify && !(t.twin.parameters && t.twin.initial))
     throw InputError("`stages`", "nothing is identified that could be rolled out", "add identify");
   t.evaluate = asked_for(t, Stage::evaluate);
+  // a few stills: a twin that looks like the rope, and of whose motion nothing is known
+  const std::size_t frames = (t.recognize ? times_of(t.capture) : t.twin.states.time).size();
+  if (t.identify && !named && !t.joint && frames < kLeastFrames) {
+    t.identify = t.roll_out = false;
+    core::warn(std::to_string(frames) + (frames == 1 ? " frame: " : " frames: ") +
+               "the rope is recognized, and its dynamics are not identified, for which " + std::to_string(kLeastFrames) +
+               " frames or more of a motion are needed");
+  }
 }
 
 void check_work(Training& t) {

@@ -44,9 +44,10 @@ constexpr int kSeenPoints = 33;         // of the rope's centerline
 // Distance of `target` to a polyline.
 double distance_to(const MatrixX& points, const Vector3& target, Vector3& nearest) {
   double least = std::numeric_limits<double>::infinity();
-  for (Eigen::Index i = 0; i + 1 < points.cols(); ++i) {
-    const Vector3 a = points.col(i), d = points.col(i + 1) - points.col(i);
-    const Vector3 p = a + std::clamp((target - a).dot(d) / d.squaredNorm(), 0.0, 1.0) * d;
+  for (Eigen::Index i = 0; i < points.cols(); ++i) {
+    const Vector3 a = points.col(i), d = points.col(std::min(i + 1, points.cols() - 1)) - a;
+    const double length = d.squaredNorm();
+    const Vector3 p = a + (length > 0.0 ? std::clamp((target - a).dot(d) / length, 0.0, 1.0) : 0.0) * d;
     if (const double distance = (p - target).norm(); distance < least) least = distance, nearest = p;
   }
   return least;
@@ -297,7 +298,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
           correction(VectorX::Zero(static_cast<Eigen::Index>(motion.axes.size()) * kPerAxis), kReplanEffort);
       if (elsewhere) {
         Task other = task;
-        if (problem.tabletop && k % 2 == 0) other.first_link = chain.links() - 1;
+        if (other.part == Part::rope && problem.tabletop && k % 2 == 0) other.first_link = chain.links() - 1;
         std::vector<VectorX> starts = carried(other);
         while (starts.size() < kOthers)
           starts.push_back(random_unknowns(other, random, random.uniform(kLeastLoad, kMostLoad)));
@@ -341,9 +342,12 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
 
   // the same part of the true rope that counts for the twin
   std::vector<double> counts;
-  const double first = problem.tabletop ? 0.0 : chain.link_start(chain.links() - 1) / chain.length;
+  const Part part = part_of(options, problem.tabletop);
+  const double first = part == Part::rope        ? 0.0
+                       : part == Part::last_link ? chain.link_start(chain.links() - 1) / chain.length
+                                                 : 1.0;
   constexpr int kCounted = 65;
-  for (int i = 0; i < kCounted; ++i)
+  for (int i = part == Part::tip ? kCounted - 1 : 0; i < kCounted; ++i)
     counts.push_back(truth.chain.length * std::min(1.0, first + (1.0 - first) * i / (kCounted - 1)));
   out.hit.miss = std::numeric_limits<double>::infinity();
   constexpr int kBetween = 4;  // parts of a step
@@ -363,8 +367,8 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
   out.hit.mean_miss = out.hit.worst_miss = out.hit.miss;
   out.foretold = out.replans > 0 ? foretold : plan.hits.front().miss;
   out.out_of_reach = std::numeric_limits<double>::infinity();
-  for (double part = problem.tabletop ? 1.0 : 0.0; part <= 1.0; part += 0.01)
-    out.out_of_reach = std::min(out.out_of_reach, unreachable_distance(problem, options, target_at(part * end)));
+  for (double share = problem.tabletop ? 1.0 : 0.0; share <= 1.0; share += 0.01)
+    out.out_of_reach = std::min(out.out_of_reach, unreachable_distance(problem, options, target_at(share * end)));
   out.peaks = peaks(out.motion, 0.0, end, options.limits);
   out.summary = solve::together(summaries);
   return out;

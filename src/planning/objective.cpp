@@ -83,6 +83,14 @@ void watch(const Task& task, const chain::Chain& chain, const std::vector<math::
     }
 }
 
+Nearest nearest_on(const chain::Chain& chain, const std::vector<math::Pose>& motions, int link, const Vector3& target) {
+  const double start = chain.link_start(link), end = chain.link_end(link);
+  const Vector3 a = motions[link] * (start * chain.direction), b = motions[link] * (end * chain.direction);
+  const double part = std::clamp((target - a).dot(b - a) / (b - a).squaredNorm(), 0.0, 1.0);
+  const Vector3 point = a + part * (b - a);
+  return {link, point, (point - target).squaredNorm(), start + part * (end - start)};
+}
+
 struct Candidate {
   int node;
   Nearest nearest;
@@ -102,17 +110,12 @@ Soft soft_minimum(const Task& task, const dynamics::Model& model, const Rollout&
   for (int node = task.tabletop ? nodes - 1 : 0; node < nodes; ++node) {
     const auto motions = chain::link_motions(chain, rollout.theta[node], pose_at(task, rollout, node));
     const Vector3 target = task.target_at(task.grid.time(node));
-    if (!task.tabletop) {
-      soft.candidates.push_back({node, nearest(chain, motions, false, target)});
+    if (!task.tabletop || task.part != Part::rope) {
+      soft.candidates.push_back({node, nearest(chain, motions, task.part, target)});
       continue;
     }
-    for (int link = task.first_link; link < chain.links(); ++link) {
-      const Vector3 a = motions[link] * (chain.link_start(link) * chain.direction);
-      const Vector3 b = motions[link] * (chain.link_end(link) * chain.direction);
-      const double part = std::clamp((target - a).dot(b - a) / (b - a).squaredNorm(), 0.0, 1.0);
-      const Vector3 point = a + part * (b - a);
-      soft.candidates.push_back({node, {link, point, (point - target).squaredNorm()}});
-    }
+    for (int link = task.first_link; link < chain.links(); ++link)
+      soft.candidates.push_back({node, nearest_on(chain, motions, link, target)});
   }
   double least = std::numeric_limits<double>::infinity(), total = 0.0;
   for (const Candidate& c : soft.candidates) least = std::min(least, c.nearest.squared);
@@ -128,17 +131,19 @@ Soft soft_minimum(const Task& task, const dynamics::Model& model, const Rollout&
 
 }  // namespace
 
-Nearest nearest(const chain::Chain& chain, const std::vector<math::Pose>& motions, bool tabletop,
-                const Vector3& target) {
-  Nearest best;
-  best.squared = std::numeric_limits<double>::infinity();
-  for (int link = tabletop ? 1 : chain.links() - 1; link < chain.links(); ++link) {
-    const Vector3 a = motions[link] * (chain.link_start(link) * chain.direction);
-    const Vector3 b = motions[link] * (chain.link_end(link) * chain.direction);
-    const double part = std::clamp((target - a).dot(b - a) / (b - a).squaredNorm(), 0.0, 1.0);
-    const Vector3 point = a + part * (b - a);
-    if (const double squared = (point - target).squaredNorm(); squared < best.squared) best = {link, point, squared};
+Part part_of(const Options& options, bool tabletop) {
+  return options.part.value_or(tabletop ? Part::rope : Part::tip);
+}
+
+Nearest nearest(const chain::Chain& chain, const std::vector<math::Pose>& motions, Part part, const Vector3& target) {
+  const int last = chain.links() - 1;
+  if (part == Part::tip) {
+    const Vector3 tip = motions[last] * (chain.length * chain.direction);
+    return {last, tip, (tip - target).squaredNorm(), chain.length};
   }
+  Nearest best = nearest_on(chain, motions, last, target);
+  for (int link = 1; part == Part::rope && link < last; ++link)
+    if (const Nearest here = nearest_on(chain, motions, link, target); here.squared < best.squared) best = here;
   return best;
 }
 
@@ -300,8 +305,9 @@ Hit measure(const Task& task, const dynamics::Model& model, const Rollout& rollo
   Hit hit;
   double least = std::numeric_limits<double>::infinity();
   const auto consider = [&](double time, const VectorX& theta, const math::Pose& base) {
-    const Nearest best = nearest(chain, chain::link_motions(chain, theta, base), task.tabletop, task.target_at(time));
-    if (best.squared < least) least = best.squared, hit.time = time, hit.point = best.point;
+    const Nearest best = nearest(chain, chain::link_motions(chain, theta, base), task.part, task.target_at(time));
+    if (best.squared < least)
+      least = best.squared, hit.time = time, hit.point = best.point, hit.arclength = best.arclength;
     return best.squared;
   };
   const int last = task.grid.nodes() - 1;

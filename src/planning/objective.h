@@ -8,6 +8,7 @@ namespace chainsplat::planning {
 struct Task {
   std::vector<const dynamics::Model*> models;  // one, or the samples
   bool tabletop = false;
+  Part part = Part::tip;
   Motion motion;  // the last piece's numbers do not count
   Grid grid;
   dynamics::InitialState initial;
@@ -18,7 +19,7 @@ struct Task {
   std::vector<bool> held;     // unknowns that keep their value
   bool exact = true;          // derivatives of the discrete map
   double limit_weight = 1.0;  // of limits and obstacles, against the usual
-  int first_link = 1;         // on a table: only points from this link on are drawn to the target
+  int first_link = 1;         // on a table, of the whole rope: only points from this link on are drawn to the target
 
   Vector3 target_at(double time) const { return target + (time - target_time) * target_velocity; }
 };
@@ -38,14 +39,17 @@ struct Evaluation {
 };
 Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& sharpness, bool derivatives);
 
+// What of the rope counts where nothing is asked for.
+Part part_of(const Options& options, bool tabletop);
+
 // Point of the rope nearest to `target` among the candidates of mathematics.md 8.
 struct Nearest {
   int link = 0;
   Vector3 point = Vector3::Zero();
   double squared = 0.0;
+  double arclength = 0.0;  // m
 };
-Nearest nearest(const chain::Chain& chain, const std::vector<math::Pose>& motions, bool tabletop,
-                const Vector3& target);
+Nearest nearest(const chain::Chain& chain, const std::vector<math::Pose>& motions, Part part, const Vector3& target);
 
 // Hard minimum over a rollout, between its nodes too.
 Hit measure(const Task& task, const dynamics::Model& model, const Rollout& rollout);

@@ -280,7 +280,7 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
     if (spent > most_spent || (out_of_reach && groups == kOutOfReach)) break;
     ++groups;
     std::vector<std::pair<const Task*, int>> chosen;  // with the start
-    if (group > 1 && problem.tabletop && tip_order.empty()) tip_order = ranked(tip);
+    if (group > 1 && problem.tabletop && coarse.part == Part::rope && tip_order.empty()) tip_order = ranked(tip);
     for (int i = 0; i < group; ++i)
       if (i % 2 == 1 && next_tip < tip_order.size())
         chosen.emplace_back(&tip, tip_order[next_tip++]);

@@ -25,13 +25,19 @@ Json document_of(const Problem& problem, const Options& options, const Plan& pla
   out["miss"] = worst.miss;
   out["miss_time"] = worst.time;
   out["miss_point"] = json_of(worst.point);
+  out["miss_arclength"] = worst.arclength;
+  constexpr const char* kParts[] = {"tip", "last-link", "rope"};
+  out["hit"] = kParts[static_cast<int>(options.part.value_or(problem.tabletop ? Part::rope : Part::tip))];
   out["reached"] = plan.reached;
   if (!plan.reached) out["reason"] = plan.reason;
   out["tolerance"] = options.tolerance;
   if (plan.hits.size() > 1) {
     out["hits"] = Json::array();
     for (const Hit& hit : plan.hits)
-      out["hits"].push_back({{"miss", hit.miss}, {"miss_time", hit.time}, {"miss_point", json_of(hit.point)}});
+      out["hits"].push_back({{"miss", hit.miss},
+                             {"miss_time", hit.time},
+                             {"miss_point", json_of(hit.point)},
+                             {"miss_arclength", hit.arclength}});
   }
   if (options.samples > 0) {
     out["samples"] = options.samples;

@@ -68,6 +68,7 @@ Task make_task(const Problem& problem, const Options& options, const std::vector
   Task task;
   task.models = models;
   task.tabletop = problem.tabletop;
+  task.part = part_of(options, problem.tabletop);
   task.motion = motion;
   task.grid = make_grid(motion, substeps);
   task.initial = initial;
@@ -154,7 +155,7 @@ std::vector<VectorX> carried(const Task& task) {
   const chain::Chain& chain = task.models.front()->chain;
   math::Pose base{task.motion.origin.rotation, task.grid.fixed[0].col(0).head<3>()};
   const auto motions = chain::link_motions(chain, task.initial.theta, base);
-  for (const double part : task.tabletop ? std::vector<double>{0.35, 0.65, 1.0} : std::vector<double>{1.0}) {
+  for (const double part : task.part == Part::rope ? std::vector<double>{0.35, 0.65, 1.0} : std::vector<double>{1.0}) {
     const double s = part * chain.length;
     const Vector3 point = motions[chain::link_at(chain, std::min(s, 0.999 * chain.length))] * (s * chain.direction);
     VectorX q = VectorX::Zero(static_cast<Eigen::Index>(task.motion.axes.size()) * kPerAxis);

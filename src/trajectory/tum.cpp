@@ -3,6 +3,7 @@
 #include <cmath>
 #include <string>
 
+#include "chainsplat/text.h"
 #include "chainsplat/trajectory.h"
 
 namespace chainsplat::trajectory {
@@ -56,7 +57,7 @@ std::vector<Sample> read_tum(const Path& file) {
                        "write 'timestamp tx ty tz qx qy qz qw' on every line");
     const Eigen::Quaterniond q(numbers[7], numbers[4], numbers[5], numbers[6]);
     if (std::abs(q.norm() - 1.0) > kQuaternionTolerance)
-      throw InputError(where, "the quaternion has length " + core::exact(q.norm()) + ", not 1",
+      throw InputError(where, "the quaternion has length " + core::brief(q.norm()) + ", not 1",
                        "check the columns: qx qy qz qw are the last four");
     if (samples.size() == kMostPoses)
       throw InputError(where, "is beyond the " + std::to_string(kMostPoses) + " poses that a motion has at most",

@@ -99,7 +99,7 @@ black_8x8 >"$capture/depth/cam1/000007.png"
 refused 'depth/cam1/000007\.png: is 8x8 pixels'
 
 # too few frames for identification, not for recognition
-expect_error 2 '--frames: identification needs 3 frames of cam0 or more, and there are 2' train "$demo" -o "$out" --frames 0:2
+expect_error 2 '--frames: identification needs 3 frames of cam0 or more, and there are 2' train "$demo" -o "$out" --frames 0:2 --stages recognize,identify
 [ -e "$out" ] && fail 'too few frames: something was written'
 expect_error 2 'Vulkan' recognize "$demo" -o "$out" --frames 0:2
 

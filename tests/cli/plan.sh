@@ -35,6 +35,7 @@ refused 'target.*3 numbers' "$free" --target 0.1,x,0.3
 refused 'target.*3 numbers' "$free" --target 0.1,0,0.3,
 refused 'target.*under the table' "$table" --target 0.1,0.1,-0.02
 refused 'target.*seed' "$free" --target random:x
+refused 'hit' "$free" --target random:1 --hit middle
 # limits
 for limit in velocity acceleration jerk stroke yaw-velocity yaw-acceleration yaw-jerk turn; do
   refused "${limit//-/ } limit.*above 0" "$free" --target random:1 "--$limit" -1
@@ -76,12 +77,20 @@ head -1 "$out/base.csv" | grep -q '^time,x,y,z,vx,vy,vz,ax,ay,az,yaw' || fail 'b
 [ "$(grep -vc '^#' "$out/base.tum")" -eq 101 ] || fail 'base.tum has not 100 rows a second'
 planned "$table" --target random:2 --rate 10
 expect_plan '"reached": true'
+expect_plan '"hit": "rope"'
+planned "$free" --target 0,0,0.4 --hit rope
+expect_plan '"miss_arclength": 0\.1'
 # two targets in sequence past a sphere and a box, ending where it began
 planned "$free" --target 0.1,0,0.27 --target -0.1,0,0.3 --axes x,z --terminal 0,0 --keep-out-sphere 0.3,0,0.3,0.03 \
   --keep-out-box -0.4,-0.1,0.2,-0.3,0.1,0.3
 expect_plan '"hits"'
-# out of reach: a warning first, a plan all the same
-planned "$free" --target 1.5,0,0.3
+# out of reach: a warning first, the nearest motion all the same, and exit code 1
+rm -rf "$out"
+run plan "$free" --target 1.5,0,0.3 -o "$out" --horizon 1 --starts 8
+expect_code 1 'out of reach'
+head -1 "$work/stderr" | grep -q 'warning: .*beyond what rope length' || fail 'out of reach: not said first'
+tail -1 "$work/stderr" | grep -Eq '^chainsplat: error: --target: cannot be reached: .*; .*nearest motion is in' ||
+  fail 'out of reach: another last line'
 expect_warning 'beyond what rope length'
 expect_plan '"reached": false'
 expect_plan '"reason"'

@@ -83,6 +83,23 @@ run rollout "$work/whole" --base "$demo/base.tum" -o "$work/states.csv" --center
 expect_code 0 'rollout --base'
 expect_output '"rows": 61' 'rollout --base'
 expect_error 1 '/dev/full' rollout "$work/whole" -o /dev/full
+expect_error 2 'would be overwritten' rollout "$work/whole" -o "$work/whole/states.csv"
+# a motion that is longer than the recording, and elsewhere, is drawn to its end under its own base
+{ awk '!/^#/ { $2 += 0.05; print }' "$demo/base.tum"
+  seq 1 60 | awk -v last="$(tail -1 "$demo/base.tum")" '{ $0 = $1 " " last; t = 2 + $1 / 60; n = split(last, p, " "); printf "%.6f %.7f", t, p[2] + 0.05; for (i = 3; i <= n; ++i) printf " %s", p[i]; print "" }'
+} >"$work/longer.tum"
+run rollout "$work/whole" --base "$work/longer.tum" -o "$work/longer.csv"
+expect_code 0 'rollout --base, longer'
+[ -s "$work/longer.base.tum" ] || fail 'rollout: its base is not beside it'
+run render "$work/whole" --states "$work/longer.csv" --camera "$demo:cam1" -o "$work/longer"
+expect_code 0 'render of a longer motion'
+[ "$(ls "$work/longer/cam1" | wc -l)" -eq 91 ] || fail "render of a longer motion: $(ls "$work/longer/cam1" | wc -l) frames instead of 91"
+run render "$work/whole" --states "$work/longer.csv" --base "$work/longer.tum" --camera "$demo:cam1" -o "$work/same"
+cmp -s "$work/longer/cam1/000080.png" "$work/same/cam1/000080.png" || fail 'render: another base than the one beside the states'
+cp "$work/longer.csv" "$work/alone.csv"
+run render "$work/whole" --states "$work/alone.csv" --camera "$demo:cam1" -o "$work/alone"
+grep -q 'no base motion lies beside it' "$work/stderr" || fail 'render of states without a base: does not say so'
+cmp -s "$work/longer/cam1/000030.png" "$work/alone/cam1/000030.png" && fail 'render: the base does not matter'
 run render "$work/whole" --states "$work/whole/rollout.csv" --camera "$demo:cam1" -o "$work/frames" --mask --depth
 expect_code 0 render
 for ending in png mask.png depth.exr; do
@@ -101,6 +118,9 @@ expect_code 0 eval
 run export "$work/whole" -o "$work/twin.glb"
 expect_code 0 export
 [ "$(head -c 4 "$work/twin.glb")" = glTF ] || fail 'export: no glTF'
+gaussians=$(cksum <"$work/whole/gaussians.ply")
+expect_error 2 'would be overwritten' export "$work/whole" -o "$work/whole/gaussians.ply"
+[ "$gaussians" = "$(cksum <"$work/whole/gaussians.ply")" ] || fail 'export: its input is gone'
 run synth "$work/whole" -o "$work/drawn"
 expect_code 0 synth
 run check "$work/drawn"
@@ -116,6 +136,17 @@ expect_code 0 'train --resume --stages'
 run identify "$work/whole"
 expect_code 0 identify
 cmp -s "$work/whole/rollout.csv" "$work/stopped/rollout.csv" || fail 'identify alone: not the rollout of train'
+
+# a still or two: a twin that looks like the rope, and it is said that its dynamics are not known
+for frames in 0:1 0:2; do
+  run train "$demo" -o "$work/still" --frames $frames --joints 4 --force
+  expect_code 0 "train --frames $frames"
+  grep -q 'dynamics are not identified' "$work/stderr" || fail "train --frames $frames: does not say what is missing"
+  grep -q '"recognized"' "$work/still/metrics.json" || fail "train --frames $frames: not evaluated"
+  expect_error 2 'not identified' rollout "$work/still" -o "$work/states.csv"
+  run render "$work/still" --camera "$demo:cam0" -o "$work/still.mp4"
+  expect_code 0 "render of train --frames $frames"
+done
 
 # images and dynamics together, once; the capture's place is kept relative to the run folder
 cp -r "$work/whole" "$work/joint"

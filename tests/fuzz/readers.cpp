@@ -318,8 +318,10 @@ void video(std::string_view bytes) {
 
 const std::map<std::string, Read> kReaders = {
     {"batch", batch},
+    {"calibration", calibration},
     {"camera", camera},
     {"checkpoint", checkpoint},
+    {"colmap", colmap},
     {"contacts", contacts},
     {"covariance", covariance},
     {"estimates", estimates},
@@ -331,11 +333,14 @@ const std::map<std::string, Read> kReaders = {
     {"online", online},
     {"ply", ply},
     {"points", points},
+    {"pose", pose},
+    {"robot_log", robot_log},
     {"states", states},
     {"timestamps", timestamps},
     {"truth", truth},
     {"tum", tum},
     {"twin", twin},
+    {"urdf", urdf},
     {"values", values},
     {"video", video},
 };

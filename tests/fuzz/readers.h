@@ -25,10 +25,15 @@ dynamics::Parameters parameters_of_two_joints();
 
 using Read = void (*)(std::string_view);
 void batch(std::string_view bytes);
+void calibration(std::string_view bytes);
 void checkpoint(std::string_view bytes);
+void colmap(std::string_view bytes);
 void contacts(std::string_view bytes);
 void estimates(std::string_view bytes);
 void metrics(std::string_view bytes);
 void online(std::string_view bytes);
+void pose(std::string_view bytes);
+void robot_log(std::string_view bytes);
+void urdf(std::string_view bytes);
 
 }  // namespace chainsplat::fuzz

@@ -93,6 +93,7 @@ int run(int argc, char** argv) {
   tools::add_batch_command(app, globals, job);
   tools::add_diff_command(app, globals, job);
   tools::add_new_command(app, globals, job);
+  tools::add_import_command(app, globals, job);
   tools::add_mask_command(app, globals, job);
   tools::add_bench_command(app, globals, job);
   for (CLI::App* command : app.get_subcommands({})) {

@@ -2,6 +2,7 @@
 #pragma once
 #include <cstdint>
 #include <functional>
+#include <nlohmann/json.hpp>
 #include <string>
 #include <vector>
 
@@ -41,6 +42,7 @@ void add_new_command(CLI::App& app, const Globals& globals, Job& job);
 void add_batch_command(CLI::App& app, const Globals& globals, Job& job);    // batch
 void add_diff_command(CLI::App& app, const Globals& globals, Job& job);     // diff
 void add_mask_command(CLI::App& app, const Globals& globals, Job& job);
+void add_import_command(CLI::App& app, const Globals& globals, Job& job);
 void add_bench_command(CLI::App& app, const Globals& globals, Job& job);
 
 // --- progress.cpp --------------------------------------------------------------------------------
@@ -68,6 +70,16 @@ void flush_output();
 // in their place: `frames` becomes --frames.
 std::string with_options(const std::string& text);
 
+// --- inspect.cpp --------------------------------------------------------------------------------
+// What `check` finds: as lines, and as the document of --json. `with_masks` false: of a capture whose masks are still to
+// be made, which cannot be judged by its images.
+struct CheckReport {
+  std::string text;
+  nlohmann::ordered_json document;
+  int problems = 0;
+};
+CheckReport check_report(const std::string& path, bool with_masks);
+
 // --- results.cpp --------------------------------------------------------------------------------
 // "-" is standard input.
 Path input_path(const std::string& name);
@@ -75,6 +87,11 @@ Path input_path(const std::string& name);
 std::vector<double> numbers(const std::string& text, const std::string& where, std::size_t count);
 // Writes `bytes` to standard output ("-"), into a device or pipe that exists, else as a file in one step.
 void write_result(const std::string& name, const std::string& bytes);
+// The base motion that is kept beside a file of states: NAME.base.tum beside NAME.csv, as rollout writes it, or base.tum
+// beside the states.csv or rollout.csv of a run or plan. Empty: there is none.
+Path base_beside(const std::string& states);
+// Throws InputError where `output` is a file of the run folder, or one of `inputs`.
+void check_not_input(const std::string& output, const Path& run, const std::vector<std::string>& inputs);
 // CAPTURE[:camera] as the two; the second is empty for all cameras. A folder whose own name has a colon is taken as it
 // is.
 std::pair<std::string, std::string> split_camera(const std::string& text);

@@ -5,6 +5,7 @@
 #include <memory>
 #include <nlohmann/json.hpp>
 #include <optional>
+#include <sstream>
 
 #include "chainsplat/capture.h"
 #include "chainsplat/gpu.h"
@@ -18,51 +19,14 @@ namespace {
 using Json = nlohmann::ordered_json;
 
 void check(const Globals& globals, const std::string& path) {
-  capture::CheckReport report = capture::check(path);
-  // what is wrong by too little to see in one camera alone
-  std::optional<pipeline::Examination> found;
-  if (report.problems.empty()) {
-    try {
-      found = pipeline::examine(path);
-      for (const capture::Finding& finding : found->verdict)
-        if (finding.impossible) report.problems.push_back(finding.text);
-    } catch (const InputError& error) {
-      report.problems.push_back(error.what());
-    }
-  }
-  const bool trusted = found && std::all_of(found->verdict.begin(), found->verdict.end(),
-                                            [](const capture::Finding& finding) { return finding.trusted; });
-  const bool clean = report.doubts.empty() && (!found || found->verdict.empty());
-  if (globals.json) {
-    Json document;
-    document["capture"] = path;
-    document["facts"] = report.facts;
-    document["doubts"] = report.doubts;
-    document["problems"] = report.problems;
-    if (found) {
-      document["verdict"] = twin::to_json(found->verdict);
-      document["trusted"] = trusted;
-    }
-    document["usable"] = report.problems.empty();
-    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
-  } else {
-    // names come from the files
-    for (const std::string& line : report.facts) std::cout << core::printable(line) << "\n";
-    for (const std::string& line : report.doubts) std::cout << "doubt: " << core::printable(line) << "\n";
-    for (const std::string& line : report.problems) std::cout << "problem: " << core::printable(line) << "\n";
-    if (found)
-      for (const capture::Finding& finding : found->verdict)
-        if (!finding.impossible)
-          std::cout << (finding.trusted ? "found: " : "doubt: ") << core::printable(finding.text) << "\n";
-    if (report.problems.empty())
-      std::cout << (clean                              ? "Nothing is wrong with it.\n"
-                    : trusted && !report.poses_doubted ? "It can be used; see the doubts.\n"
-                                                       : "A twin made from it is not to be trusted; see the doubts.\n");
-  }
-  if (report.problems.empty()) return;
+  const CheckReport report = check_report(path, true);
+  if (globals.json)
+    std::cout << report.document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+  else
+    std::cout << report.text;
+  if (report.problems == 0) return;
   std::cout.flush();
-  throw InputError(path,
-                   std::to_string(report.problems.size()) + (report.problems.size() == 1 ? " problem" : " problems"),
+  throw InputError(path, std::to_string(report.problems) + (report.problems == 1 ? " problem" : " problems"),
                    "mend what is listed as a problem");
 }
 
@@ -102,6 +66,52 @@ void doctor(const Globals& globals) {
 }
 
 }  // namespace
+
+CheckReport check_report(const std::string& path, bool with_masks) {
+  capture::CheckReport report;
+  if (with_masks) report = capture::check(path);
+  // what is wrong by too little to see in one camera alone
+  std::optional<pipeline::Examination> found;
+  if (report.problems.empty() && with_masks) {
+    try {
+      found = pipeline::examine(path);
+      for (const capture::Finding& finding : found->verdict)
+        if (finding.impossible) report.problems.push_back(finding.text);
+    } catch (const InputError& error) {
+      report.problems.push_back(error.what());
+    }
+  }
+  const bool trusted = found && std::all_of(found->verdict.begin(), found->verdict.end(),
+                                            [](const capture::Finding& finding) { return finding.trusted; });
+  const bool clean = report.doubts.empty() && (!found || found->verdict.empty());
+  CheckReport out;
+  out.problems = static_cast<int>(report.problems.size());
+  Json& document = out.document;
+  document["capture"] = path;
+  document["facts"] = report.facts;
+  document["doubts"] = report.doubts;
+  document["problems"] = report.problems;
+  if (found) {
+    document["verdict"] = twin::to_json(found->verdict);
+    document["trusted"] = trusted;
+  }
+  document["usable"] = report.problems.empty();
+  // names come from the files
+  std::ostringstream text;
+  for (const std::string& line : report.facts) text << core::printable(line) << "\n";
+  for (const std::string& line : report.doubts) text << "doubt: " << core::printable(line) << "\n";
+  for (const std::string& line : report.problems) text << "problem: " << core::printable(line) << "\n";
+  if (found)
+    for (const capture::Finding& finding : found->verdict)
+      if (!finding.impossible)
+        text << (finding.trusted ? "found: " : "doubt: ") << core::printable(finding.text) << "\n";
+  if (report.problems.empty() && with_masks)
+    text << (clean                              ? "Nothing is wrong with it.\n"
+             : trusted && !report.poses_doubted ? "It can be used; see the doubts.\n"
+                                                : "A twin made from it is not to be trusted; see the doubts.\n");
+  out.text = text.str();
+  return out;
+}
 
 void add_inspection_commands(CLI::App& app, const Globals& globals, Job& job) {
   CLI::App* checker = app.add_subcommand("check", "Say what is in a capture, and what is wrong with it");

@@ -26,6 +26,13 @@ struct RolloutRequest {
   double rate = 30.0;
 };
 
+// Where the base motion of states goes, so that nobody draws them under another one; empty for a stream.
+Path base_file_of(const std::string& states) {
+  std::error_code error;
+  if (states == "-" || (fs::exists(states, error) && !fs::is_regular_file(states, error))) return {};
+  return Path(states).replace_extension(".base.tum");
+}
+
 void rollout(const Globals& globals, const RolloutRequest& request) {
   pipeline::RolloutOptions options;
   if (!request.base.empty()) options.base = input_path(request.base);
@@ -36,8 +43,12 @@ void rollout(const Globals& globals, const RolloutRequest& request) {
     throw InputError("--json", "standard output is wanted by '-' too", "name a file");
   pipeline::check_output_file(request.out);
   if (!request.centerline.empty()) pipeline::check_output_file(request.centerline);
+  for (const std::string& out : {request.out, request.centerline})
+    if (!out.empty()) check_not_input(out, request.run, {request.base, request.initial});
   const auto [twin, base, states] = pipeline::rollout(request.run, options, terminal());
   write_result(request.out, twin::states_csv(states));
+  const Path kept_base = base_file_of(request.out);
+  if (!kept_base.empty()) core::write_file(kept_base, trajectory::write_tum(base.samples()));
   if (!request.centerline.empty()) write_result(request.centerline, twin::centerline_csv(twin.chain, states, base));
   if (!globals.json) {
     say(std::to_string(states.time.size()) + " rows" + (request.out == "-" ? "" : ": " + request.out));
@@ -45,6 +56,7 @@ void rollout(const Globals& globals, const RolloutRequest& request) {
   }
   Json document;
   document["states"] = request.out;
+  if (!kept_base.empty()) document["base"] = kept_base.string();
   if (!request.centerline.empty()) document["centerline"] = request.centerline;
   document["rows"] = states.time.size();
   document["start"] = states.time.front();
@@ -61,6 +73,23 @@ std::string frame_name(int frame, const char* ending) {
   char text[64];
   std::snprintf(text, sizeof text, "%06d%s", frame, ending);
   return text;
+}
+
+// The camera's times and, as a motion of its own may be longer than the recording, as many more at its rate. A motion at
+// quite other times is drawn from its beginning on.
+std::vector<double> frame_times(const std::vector<double>& recorded, const chain::States& states) {
+  constexpr double kRate = 30.0;  // frames per second, for a camera of one frame
+  const double known = render::median_interval(recorded), interval = known > 0.0 ? known : 1.0 / kRate;
+  const bool any = std::any_of(recorded.begin(), recorded.end(),
+                               [&](double time) { return render::covered(states, time, interval); });
+  std::vector<double> times = any ? recorded : std::vector<double>{states.time.front()};
+  const double last = times.back();
+  for (int k = 1; static_cast<int>(times.size()) < capture::kMostFrames; ++k) {
+    const double time = last + k * interval;
+    if (time > states.time.back() + 1e-9) break;
+    times.push_back(time);
+  }
+  return times;
 }
 
 void render(const Globals& globals, const RenderRequest& request) {
@@ -84,8 +113,16 @@ void render(const Globals& globals, const RenderRequest& request) {
   load.camera = camera_name;
   capture::Capture capture = capture::load(folder, load);
   capture::apply(twin.corrections, capture);
-  const trajectory::Trajectory base =
-      request.base.empty() ? capture.base : pipeline::read_base(input_path(request.base));
+  // states of a motion of their own bring its base with them
+  const Path beside = base_beside(request.states);
+  const bool own_base = !request.base.empty() || !beside.empty();
+  const trajectory::Trajectory base = !request.base.empty() ? pipeline::read_base(input_path(request.base))
+                                      : !beside.empty()     ? pipeline::read_base(beside)
+                                                            : capture.base;
+  if (!request.states.empty() && !own_base)
+    core::warn(request.states + ": no base motion lies beside it; that of " + folder + " is taken");
+  if (own_base)
+    for (std::vector<double>& times : capture.times) times = frame_times(times, states);
   if (video && capture.cameras.size() != 1)
     throw InputError(request.camera, "has " + std::to_string(capture.cameras.size()) + " cameras and a video shows one",
                      "name it, for example " + folder + ":" + capture.cameras.front().name);
@@ -179,7 +216,7 @@ void add_motion_commands(CLI::App& app, const Globals& globals, Job& job) {
   renderer->add_option("-o,--output", drawing->out, "Folder for CAMERA/000000.png ..., or a video that ends in .mp4")
       ->required()
       ->type_name("OUT");
-  renderer->add_option("--base", drawing->base, "Base motion (default: that of --camera's capture)")
+  renderer->add_option("--base", drawing->base, "Base motion (default: the one kept beside the states, else that of --camera's capture)")
       ->type_name("FILE.tum");
   renderer->add_flag("--mask", drawing->mask, "Also 000000.mask.png: 255 where the rope covers half or more");
   renderer->add_flag("--depth", drawing->depth, "Also 000000.depth.exr: meters along the optical axis, 0 = none");

@@ -26,7 +26,7 @@ using Json = nlohmann::ordered_json;
 using planning::Axis;
 
 struct PlanRequest {
-  std::string run, out, axes, initial, state_from, terminal, horizon = "3", window = "smooth";
+  std::string run, out, axes, initial, state_from, terminal, hit, horizon = "3", window = "smooth";
   std::vector<std::string> targets, spheres, boxes;
   double rate = 100.0;
   bool force = false, mpc = false;
@@ -167,6 +167,9 @@ void plan(const Globals& globals, PlanRequest& request) {
   options.seed = globals.seed;
   if (!request.axes.empty()) options.axes = planning::parse_axes(request.axes);
   options.window = request.window == "paper" ? planning::Window::paper : planning::Window::smooth;
+  if (request.hit == "tip") options.part = planning::Part::tip;
+  if (request.hit == "last-link") options.part = planning::Part::last_link;
+  if (request.hit == "rope") options.part = planning::Part::rope;
   constexpr double kLongestFree = 4.0;  // s, of a free horizon
   if (request.horizon == "free") {
     options.free_horizon = true;
@@ -255,17 +258,23 @@ void plan(const Globals& globals, PlanRequest& request) {
   core::write_file(out / "picture.svg", planning::picture_svg(problem, options, plan));
   const std::string document = planning::plan_json(problem, options, plan, request.horizon, simulated);
   core::write_file(out / "plan.json", document);
+  const auto end = [&] {
+    if (plan.reached) return;
+    std::cout.flush();
+    throw WorkError("--target", "cannot be reached: " + plan.reason,
+                    "give other axes, limits or a longer horizon; the nearest motion is in " + request.out);
+  };
   if (globals.json) {
     std::cout << document;
-    return;
+    return end();
   }
   char text[256];
   const planning::Hit& worst = planning::worst_hit(plan);
-  std::snprintf(text, sizeof text, "%s: miss %.2f mm at %.2f s, peak %.2f m/s and %.1f m/s^2, %.2f s: %s",
-                plan.reached ? "reached" : "cannot reach", 1e3 * worst.miss, worst.time, plan.peaks.velocity,
-                plan.peaks.acceleration, plan.seconds, request.out.c_str());
+  std::snprintf(text, sizeof text,
+                "%s: miss %.2f mm at %.2f s, %.0f mm along the rope, peak %.2f m/s and %.1f m/s^2, planned in %.2f s: %s",
+                plan.reached ? "reached" : "cannot be reached", 1e3 * worst.miss, worst.time, 1e3 * worst.arclength,
+                plan.peaks.velocity, plan.peaks.acceleration, plan.seconds, request.out.c_str());
   say(text);
-  if (!plan.reached) say(plan.reason);
   if (!plan.reached && !solve::converged(plan.summary)) say("its last fit: " + solve::describe(plan.summary));
   for (const auto& [name, loop] : simulated) {
     std::snprintf(text, sizeof text, "%s: miss %.2f mm", name.c_str(), 1e3 * loop.hit.miss);
@@ -275,6 +284,7 @@ void plan(const Globals& globals, PlanRequest& request) {
                   1e3 * loop.out_of_reach);
     say(text);
   }
+  end();
 }
 
 }  // namespace
@@ -287,10 +297,14 @@ void add_planning_commands(CLI::App& app, const Globals& globals, Job& job) {
   planner
       ->add_option(
           "--target", request->targets,
-          "Point to hit, m, world: with the tip at any time, on a table with any point of the rope at the end.\n"
+          "Point to hit, m, world: in free space at any time, on a table at the end, at rest.\n"
           "Several are hit one after the other. random:SEED: a point that a random motion passes")
       ->required()
       ->type_name("X,Y,Z");
+  planner
+      ->add_option("--hit", request->hit,
+                   "With what: tip, the nearest point of the last link or of the whole rope (default: tip, on a table rope)")
+      ->check(CLI::IsMember({"tip", "last-link", "rope"}));
   planner->add_option("-o,--output", request->out, "Folder for base.tum, base.csv, states.csv, plan.json, picture.svg")
       ->required()
       ->type_name("PLAN");

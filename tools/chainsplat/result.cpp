@@ -64,11 +64,15 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
     throw InputError(request.out, "its ending is not known", "use one of " + list);
   }
   pipeline::check_output_file(request.out);
+  check_not_input(request.out, request.run, {request.states, request.base});
   const twin::Twin twin = pipeline::load_twin(request.run);
+  const Path beside = base_beside(request.states);
   const chain::States motion =
       request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
   exports::write(twin, motion,
-                 request.base.empty() ? pipeline::own_base(request.run) : pipeline::read_base(input_path(request.base)),
+                 !request.base.empty() ? pipeline::read_base(input_path(request.base))
+                 : !beside.empty()     ? pipeline::read_base(beside)
+                                       : pipeline::own_base(request.run),
                  request.out);
   if (globals.json)
     std::cout << nlohmann::ordered_json{{"output", request.out}}.dump(-1, ' ', false,
@@ -100,7 +104,8 @@ void synthesize(const Globals& globals, const SynthRequest& request) {
   capture::Capture scene = capture::load(folder, load);
   capture::apply(twin.corrections, scene);
   pipeline::check_not_capture(out, scene.folder);
-  if (!request.base.empty()) scene.base = pipeline::read_base(input_path(request.base));
+  if (const Path beside = base_beside(request.states); !request.base.empty() || !beside.empty())
+    scene.base = pipeline::read_base(request.base.empty() ? beside : input_path(request.base));
   const chain::States states = !request.states.empty()
                                    ? twin::read_states(input_path(request.states), twin.chain.angles())
                                : twin.rollout.time.empty() ? twin.states
@@ -145,7 +150,7 @@ void add_result_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("FILE");
   exporter->add_option("--states", exporting->states, "Motion to write (default: the recognized states)")
       ->type_name("STATES.csv");
-  exporter->add_option("--base", exporting->base, "Its base motion (default: the capture's own)")
+  exporter->add_option("--base", exporting->base, "Its base motion (default: the one kept beside the states, else the capture's own)")
       ->type_name("FILE.tum");
   exporter->callback(
       [&globals, &job, exporting] { job = [&globals, exporting] { export_twin(globals, *exporting); }; });
@@ -160,7 +165,7 @@ void add_result_commands(CLI::App& app, const Globals& globals, Job& job) {
   synthesizer
       ->add_option("--camera", scene->camera, "Whose cameras, base motion and table (default: the twin's own capture)")
       ->type_name("CAPTURE[:NAME]");
-  synthesizer->add_option("--base", scene->base, "Base motion (default: that of the capture)")->type_name("FILE.tum");
+  synthesizer->add_option("--base", scene->base, "Base motion (default: the one kept beside the states, else that of the capture)")->type_name("FILE.tum");
   synthesizer->add_flag("--images", scene->images, "Images without loss instead of videos");
   synthesizer->add_flag("--force", scene->force, "Write into a folder that is not empty");
   synthesizer->callback([&globals, &job, scene] { job = [&globals, scene] { synthesize(globals, *scene); }; });

@@ -8,6 +8,7 @@
 #include <iostream>
 
 #include "chainsplat/eval.h"
+#include "chainsplat/run_folder.h"
 #include "cli.h"
 
 namespace chainsplat::tools {
@@ -29,6 +30,27 @@ void write_result(const std::string& name, const std::string& bytes) {
   } else {
     core::write_file(name, bytes);
   }
+}
+
+Path base_beside(const std::string& states) {
+  if (states.empty() || states == "-") return {};
+  std::error_code error;
+  const Path file = states, own = Path(file).replace_extension(".base.tum");
+  if (fs::is_regular_file(own, error)) return own;
+  const Path folder = file.parent_path() / pipeline::kBaseFile;
+  const bool of_a_folder = file.filename() == "states.csv" || file.filename() == "rollout.csv";
+  return of_a_folder && fs::is_regular_file(folder, error) ? folder : Path();
+}
+
+void check_not_input(const std::string& output, const Path& run, const std::vector<std::string>& inputs) {
+  std::error_code error;
+  const auto refuse = [&](const Path& input) {
+    if (!fs::equivalent(output, input, error)) return;
+    throw InputError(output, "is a file that is read, and would be overwritten", "name another file");
+  };
+  for (const char* name : pipeline::kRunFiles) refuse(run / name);
+  for (const std::string& input : inputs)
+    if (!input.empty() && input != "-") refuse(input);
 }
 
 std::string metrics_table(const std::vector<MetricsRow>& rows) {
