@@ -558,6 +558,20 @@ TEST_CASE("first masks that end half-way down the rope are not believed, and sai
   CHECK(rms(chain, found[25].theta, shared_truth().theta[25]) < 5e-3);
 }
 
+TEST_CASE("a base whose stamps are late is found to be so while it moves") {
+  constexpr double kLate = 0.02;
+  const auto late_base = [](double time) { return moving_base(time - kLate); };
+  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, late_base, 0.0);
+  const auto found = follow(filter, shared_views());
+  CHECK(std::abs(filter.base_late - kLate) < 6e-3);  // in a second of motion
+  CHECK(filter.base_late_information > 1.0 / (3e-3 * 3e-3));
+  const std::size_t last = found.size() - 1;
+  CHECK(rms(shared_twin().chain, found[last].theta, shared_truth().theta[last]) < 5e-3);
+  estimation::Filter right = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  follow(right, shared_views());
+  CHECK(std::abs(right.base_late) < 3e-3);
+}
+
 TEST_CASE("a mask elsewhere is not the rope: lost, and the prediction stays") {
   std::vector<capture::View> views(shared_views().begin(), shared_views().begin() + 14);
   for (int f = 8; f < 11; ++f) {

@@ -88,8 +88,10 @@ struct Filter {
   bool shifts = false;                        // the unknown force is a part of the state
   std::optional<math::Vector3> table_normal;  // unit, world; on a table the masks' shift is a part of the state too
   std::vector<capture::Camera> cameras;
-  std::vector<char> unverified;  // by camera: its pose was never compared with the rope; empty: none
-  dynamics::BaseFunction base;
+  std::vector<char> unverified;        // by camera: its pose was never compared with the rope; empty: none
+  dynamics::BaseFunction base;         // as given; base_at() is what is believed
+  double base_late = 0.0;              // s, by which its stamps are late, as learned while it moves,
+  double base_late_information = 0.0;  // 1/s^2; 0: not learned
   Options options;
   CompareColors compare_colors;     // empty: silhouettes alone
   std::optional<Belief> belief;     // none before the first frame
@@ -109,6 +111,9 @@ struct Filter {
 // parameters are unusable.
 Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
              double base_start, const Options& options = {});
+
+// The base's motion, its clock mended as far as it is known.
+trajectory::BaseMotion base_at(const Filter& filter, double time);
 
 // Processes one frame: undistorted crops with their masks, which may be empty, of one camera or of several at nearly
 // the same time (the first view's; View::camera is an index into Filter::cameras). Times must increase. Throws

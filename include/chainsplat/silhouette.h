@@ -8,6 +8,7 @@
 // where that failed, and smoothed over time with each frame's own normal equations as weights. design.md,
 // 'Recognition'.
 #pragma once
+#include <functional>
 #include <span>
 #include <vector>
 #include "chainsplat/capture.h"
@@ -117,5 +118,15 @@ std::vector<math::MatrixX> covariances_by_corrections(const chain::Chain& chain,
                                                       const chain::States& states,
                                                       const capture::Corrections& corrections,
                                                       const math::MatrixX& covariance);
+
+// What one frame says of by how much its base is late, its angles being unknown too, with a prior of their own (about
+// theta, the frame's fit): information, 1/s^2, and the cost's gradient, 1/s, with the tempered weights of
+// fit_corrections(). The change that the frame asks for is -gradient / information.
+struct ClockEquation {
+  double information = 0.0, gradient = 0.0;
+};
+ClockEquation clock_equation(const chain::Chain& chain, const std::function<trajectory::BaseMotion(double time)>& base,
+                             std::span<const capture::View* const> views, const std::vector<capture::Camera>& cameras,
+                             const math::VectorX& theta, const Prior& prior);
 
 }  // namespace chainsplat::silhouette

@@ -35,7 +35,7 @@ Estimate update(AdamFollower& follower, std::span<const capture::View* const> vi
     VectorX gradient = VectorX::Zero(n);
     for (const capture::View* const view : views) {
       if (view->width <= 0 || view->height <= 0) continue;
-      const math::Pose base = filter.base(view->time).pose;
+      const math::Pose base = base_at(filter, view->time).pose;
       const MatrixX twists = follower.gradient(*view, chain::link_motions(chain, theta, base));
       gradient += chain::theta_gradient(chain, chain::world_axes(chain, theta, base), twists);
     }
@@ -46,7 +46,7 @@ Estimate update(AdamFollower& follower, std::span<const capture::View* const> vi
   out.theta = theta;
   out.thetadot = first ? VectorX(VectorX::Zero(n)) : VectorX((theta - follower.theta) / (time - follower.time));
   for (const capture::View* const view : views)
-    out.iou += tube_iou(chain, filter.base(view->time).pose, theta, *view, filter.cameras.at(view->camera)) /
+    out.iou += tube_iou(chain, base_at(filter, view->time).pose, theta, *view, filter.cameras.at(view->camera)) /
                static_cast<double>(views.size());
   out.lost = out.seen && out.iou < kLostShare;
   follower.theta = theta;

@@ -19,6 +19,7 @@ using math::MatrixX;
 using math::Pose;
 using math::Vector2;
 using math::Vector3;
+using math::Vector6;
 using math::VectorX;
 
 namespace {
@@ -49,6 +50,10 @@ constexpr double kPlaceRidge = 1e-3;
 // Deviation of the pose of a camera that no training has compared with the rope: what calibrations by hand reach.
 constexpr double kCameraTurn = 0.0044;  // rad, a quarter of a degree
 constexpr double kCameraShift = 0.003;  // m
+// The base's clock: how late its stamps may be, and the speed from which it is learned.
+constexpr double kClock = 0.01;        // s, standard deviation before anything was seen
+constexpr double kLatestClock = 0.15;  // s
+constexpr double kMoving = 0.03;       // m/s
 
 constexpr double kLongUnseen = 0.5;  // s without a mask, after which the rope counts as lost
 // Standard deviations that are added for the search of a lost rope.
@@ -111,7 +116,7 @@ struct FoundForce {
 FoundForce found_force(const Filter& filter, const Belief& belief) {
   const int n = filter.model.chain.angles();
   const std::vector<MatrixX> jacobians =
-      chain::link_end_jacobians(filter.model.chain, belief.mean.head(n), filter.base(belief.time).pose);
+      chain::link_end_jacobians(filter.model.chain, belief.mean.head(n), base_at(filter, belief.time).pose);
   VectorX torque = belief.mean.segment(2 * n, n);
   for (int k = 0; k < n; ++k) torque[k] *= filter.model.parameters.stiffness[k];
   MatrixX covariance = chain::displacement_metric(jacobians, filter.place);
@@ -186,7 +191,7 @@ std::vector<VectorX> stopping_shifts(const Filter& filter, const trajectory::Bas
 // with it, and the shadow there, on the rope's lower side, so that a mask that is too wide is too wide on that side.
 VectorX expected_mask_shifts(const Filter& filter, double time) {
   VectorX out(2 * filter.cameras.size());
-  const Pose base = filter.base(time).pose;
+  const Pose base = base_at(filter, time).pose;
   const double step = filter.model.chain.diameter;
   for (std::size_t c = 0; c < filter.cameras.size(); ++c) {
     const capture::Camera& camera = filter.cameras[c];
@@ -221,7 +226,8 @@ Motion move(const Filter& filter, const Belief& belief, double time) {
     std::vector<dynamics::Unknown> unknowns = dynamics::initial_state_unknowns(model.chain);
     for (int k = 0; filter.shifts && k < n; ++k) unknowns.push_back({dynamics::Quantity::rest_angle, k});
     const std::vector<dynamics::Tangent> tangents = dynamics::tangents(model.chain, model.parameters, unknowns);
-    const dynamics::BaseGrid grid = dynamics::sample_base(filter.base, belief.time, {time}, model.parameters.substeps);
+    const dynamics::BaseGrid grid = dynamics::sample_base([&](double t) { return base_at(filter, t); }, belief.time,
+                                                          {time}, model.parameters.substeps);
     chain::States states;
     dynamics::Sensitivities sensitivities;
     if (dynamics::simulate(model, grid, belief.mean.head(n), belief.mean.segment(n, n), states, tangents,
@@ -281,7 +287,7 @@ Measured measure(const Filter& filter, const Belief& predicted, std::span<const 
 
   Measured out;
   // fit, and compare the innovation with its expectation
-  out.fit = silhouette::fit_frame(filter.model.chain, filter.base(time).pose, views, filter.cameras,
+  out.fit = silhouette::fit_frame(filter.model.chain, base_at(filter, time).pose, views, filter.cameras,
                                   predicted.mean.head(n), warm, options);
   MatrixX posterior = out.fit.covariance / share;
   symmetrize(posterior);
@@ -320,10 +326,10 @@ void look_at_colors(const Filter& filter, std::span<const capture::View* const> 
     double weight = 0.0, square = 0.0;
     std::vector<std::vector<Pose>> motions;
     for (const capture::View* const view : shown)
-      motions.push_back(chain::link_motions(chain, theta, filter.base(view->time).pose));
+      motions.push_back(chain::link_motions(chain, theta, base_at(filter, view->time).pose));
     const std::vector<splat::ColorSums> sums = filter.compare_colors(shown, motions);
     for (std::size_t v = 0; v < shown.size(); ++v) {
-      const ColorEquations e = color_equations(chain, filter.base(shown[v]->time).pose, theta, sums[v]);
+      const ColorEquations e = color_equations(chain, base_at(filter, shown[v]->time).pose, theta, sums[v]);
       if (e.weight < kLeastColorWeight || !(e.square > 0.0)) continue;
       const double scale = filter.options.color_share * e.weight / e.square;  // over this view's residual variance
       information += scale * e.normal;
@@ -377,23 +383,46 @@ double shown_share(const Filter& filter, std::span<const capture::View* const> v
   for (const capture::View* const view : views) {
     int pixels = 0;
     for (std::size_t i = 3; i < view->rgba.size(); i += 4) pixels += view->rgba[i] >= 128;
-    const double tube = tube_area(filter.model.chain, filter.base(view->time).pose, theta,
+    const double tube = tube_area(filter.model.chain, base_at(filter, view->time).pose, theta,
                                   filter.cameras.at(view->camera), edge_offset);
     if (tube > 0.0) most = std::max(most, pixels / tube);
   }
   return most;
 }
 
-// Variance, m^2 per coordinate, by which the poses of cameras that were never compared with the rope displace it.
+// Learns by how much the base's stamps are late, from a frame that is explained, while the base moves.
+void learn_clock(Filter& filter, std::span<const capture::View* const> views, const Belief& predicted,
+                 const VectorX& theta) {
+  const Vector6 velocity = base_at(filter, predicted.time).velocity;
+  if (velocity.tail<3>().norm() < kMoving) return;
+  const int n = filter.model.chain.angles();
+  const Eigen::LLT<MatrixX> factor(predicted.covariance.topLeftCorner(n, n));
+  if (!math::is_positive(factor)) return;
+  silhouette::Prior prior;
+  prior.mean = predicted.mean.head(n);
+  prior.information = factor.solve(MatrixX::Identity(n, n));
+  const silhouette::ClockEquation clock = silhouette::clock_equation(
+      filter.model.chain, [&](double t) { return base_at(filter, t); }, views, filter.cameras, theta, prior);
+  if (!std::isfinite(clock.gradient) || !(clock.information > 0.0)) return;
+  if (filter.base_late_information == 0.0) filter.base_late_information = 1.0 / (kClock * kClock);
+  filter.base_late_information += clock.information;
+  const double change = -clock.gradient / filter.base_late_information;
+  filter.base_late = std::clamp(filter.base_late + change, -kLatestClock, kLatestClock);
+}
+
+// Variance, m^2 per coordinate, by which the rope is displaced by the poses of cameras that were never compared with
+// it, and by the base's clock.
 double pose_variance(const Filter& filter, std::span<const capture::View* const> views) {
   double sum = 0.0;
   for (const capture::View* const view : views) {
     if (filter.unverified.empty() || !filter.unverified.at(view->camera)) continue;
     const Vector3 from_camera =
-        filter.base(view->time).pose.translation - filter.cameras.at(view->camera).world_from_camera.translation;
+        base_at(filter, view->time).pose.translation - filter.cameras.at(view->camera).world_from_camera.translation;
     sum += kCameraTurn * kCameraTurn * from_camera.squaredNorm() + kCameraShift * kCameraShift;
   }
-  return sum / static_cast<double>(views.size() * views.size());
+  const double clock = filter.base_late_information > 0.0 ? 1.0 / filter.base_late_information : kClock * kClock;
+  const double speed2 = base_at(filter, views.front()->time).velocity.tail<3>().squaredNorm();
+  return sum / static_cast<double>(views.size() * views.size()) + clock * speed2 / 3.0;
 }
 
 bool explains(const silhouette::FrameFit& fit) { return fit.covered >= kLostShare && fit.theta.allFinite(); }
@@ -434,7 +463,7 @@ Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras
                   : twin.states.theta.empty() ? VectorX::Zero(twin.chain.angles())
                                               : twin.states.theta.front();
   } else {
-    filter.rest = dynamics::static_equilibrium(filter.model, filter.base(base_start).pose).theta;
+    filter.rest = dynamics::static_equilibrium(filter.model, base_at(filter, base_start).pose).theta;
   }
   return filter;
 }
@@ -448,8 +477,8 @@ Belief first_belief(const Filter& filter, double time) {
   belief.mean.head(n) = filter.rest;
   // the mean by simulation from rest, where the dynamics are known
   if (filter.identified && filter.base_start < time) {
-    const dynamics::BaseGrid grid =
-        dynamics::sample_base(filter.base, filter.base_start, {time}, filter.model.parameters.substeps);
+    const dynamics::BaseGrid grid = dynamics::sample_base([&](double t) { return base_at(filter, t); },
+                                                          filter.base_start, {time}, filter.model.parameters.substeps);
     chain::States states;
     if (dynamics::simulate(filter.model, grid, filter.rest, VectorX::Zero(n), states)) {
       belief.mean.head(n) = states.theta.back();
@@ -462,7 +491,7 @@ Belief first_belief(const Filter& filter, double time) {
   belief.covariance.diagonal().segment(n, n).setConstant(kFirstRate * kFirstRate);
   if (filter.shifts)
     belief.covariance.block(2 * n, 2 * n, n, n) =
-        shift_covariance(filter, filter.base(time).pose, belief.mean.head(n),
+        shift_covariance(filter, base_at(filter, time).pose, belief.mean.head(n),
                          kFirstForce * dynamics::total_mass(filter.model.parameters), filter.everywhere);
   belief.covariance.diagonal().tail(size - 3 * n).setConstant(kMaskShift * kMaskShift);
   belief.covariance.diagonal().array() += kLeastVariance;
@@ -505,7 +534,7 @@ Belief predict(const Filter& filter, const Belief& belief, double time, Contact 
   if (filter.shifts) {
     const double force = (touched ? filter.options.contact_force : filter.options.model_force) *
                          dynamics::total_mass(filter.model.parameters) * std::sqrt(h);
-    const MatrixX shift = shift_covariance(filter, filter.base(time).pose, motion.theta, force,
+    const MatrixX shift = shift_covariance(filter, base_at(filter, time).pose, motion.theta, force,
                                            touched ? filter.place : filter.everywhere);
     // the force changes during the step: in the mean square a third of the change acts throughout
     MatrixX noise = transition.middleCols(2 * n, n);
@@ -513,7 +542,7 @@ Belief predict(const Filter& filter, const Belief& belief, double time, Contact 
     noise.middleRows(2 * n, n).setIdentity();
     out.covariance += noise * shift * noise.transpose();
     if (contact == Contact::struck) {
-      const std::vector<VectorX> stops = stopping_shifts(filter, filter.base(time), motion.theta, motion.thetadot,
+      const std::vector<VectorX> stops = stopping_shifts(filter, base_at(filter, time), motion.theta, motion.thetadot,
                                                          motion.thetadot_by_state.rightCols(n));
       for (std::size_t i = 0; i < stops.size(); ++i) {
         VectorX blow = std::sqrt(filter.place[i]) * (transition.block(0, 2 * n, 2 * n, n) * stops[i]);
@@ -546,6 +575,8 @@ std::optional<VectorX> expected(const Filter& filter, double time) {
   if (time <= filter.belief->time) return filter.belief->mean.head(n);
   return move(filter, *filter.belief, time).theta;
 }
+
+trajectory::BaseMotion base_at(const Filter& filter, double time) { return filter.base(time + filter.base_late); }
 
 Estimate update(Filter& filter, std::span<const capture::View* const> views) {
   CHAINSPLAT_CHECK(!views.empty(), "no view");
@@ -608,6 +639,7 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
       if (filter.compare_colors) look_at_colors(filter, views, *filter.belief, out);
       if (first || out.likeness.value_or(1.0) >= kUnlike) filter.last_like = view.time;
       learn_force(filter, view.time);
+      learn_clock(filter, views, predicted, measured.fit.theta);
       const double gain = 1.0 / kOffsetFrames;
       filter.edge_offset += gain * (measured.fit.edge_offset - filter.edge_offset);
       filter.edge_offset_variance =
@@ -634,8 +666,9 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
   out.centerline_sigma = centerline_deviation(filter.model.chain, out.theta, out.covariance.topLeftCorner(n, n), shape);
   out.covariance.topLeftCorner(n, n) += chain::shape_covariance(filter.model.chain, shape, out.theta);
   for (const capture::View* const v : views)
-    out.iou += tube_iou(filter.model.chain, filter.base(view.time).pose, out.theta, *v, filter.cameras.at(v->camera)) /
-               views.size();
+    out.iou +=
+        tube_iou(filter.model.chain, base_at(filter, view.time).pose, out.theta, *v, filter.cameras.at(v->camera)) /
+        views.size();
   return out;
 }
 

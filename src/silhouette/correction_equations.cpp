@@ -35,13 +35,13 @@ struct PosedView {
 void pose_view(const CorrectionProblem& fit, const CorrectedFrame& frame, int v,
                const capture::Corrections& corrections, const chain::Chain& chain, const VectorX& theta,
                PosedView& out) {
-  const capture::View& view = fit.capture.views[v];
-  const capture::Camera& given = fit.capture.cameras[view.camera];
+  const capture::View& view = *fit.views[v];
+  const capture::Camera& given = fit.cameras[view.camera];
   const double base_late = capture::value_of(corrections, "base", "time");
-  const double first_late = capture::value_of(corrections, fit.capture.cameras[0].name, "time");
+  const double first_late = capture::value_of(corrections, fit.cameras[0].name, "time");
   const double late = capture::value_of(corrections, given.name, "time");
   const double after = (view.time - late) - (frame.time - first_late);  // s, of the view after the frame
-  const trajectory::BaseMotion base = fit.capture.base.at(view.time - late + base_late);
+  const trajectory::BaseMotion base = fit.base(view.time - late + base_late);
 
   out.camera = capture::corrected(corrections, given);
   out.mask_offset = capture::value_of(corrections, given.name, "mask_offset");
@@ -179,15 +179,38 @@ FrameEquations frame_equations(const CorrectionProblem& problem, const Corrected
   out.local.coupling = MatrixX::Zero(n, m);
   out.local.gradient = problem.prior * theta;
   out.cost = 0.5 * theta.dot(problem.prior * theta);
-  out.sums.resize(problem.capture.cameras.size());
+  out.sums.resize(problem.cameras.size());
   for (const int v : frame.views) {
-    const int camera = problem.capture.views[v].camera;
+    const int camera = problem.views[v]->camera;
     PosedView view;
     pose_view(problem, frame, v, corrections, chain, theta, view);
     scatter(view_equations(view, camera, problem, frame.thetadot, out), problem.places[camera], out);
   }
   hold(problem.held, out.local);
   return out;
+}
+
+ClockEquation clock_equation(const chain::Chain& chain, const std::function<trajectory::BaseMotion(double time)>& base,
+                             std::span<const capture::View* const> views, const std::vector<capture::Camera>& cameras,
+                             const VectorX& theta, const Prior& prior) {
+  CorrectionProblem problem{{views.begin(), views.end()},  cameras, base,        {},       1, {}, {},
+                            kEvidence * prior.information, {},      kLargestCut, kEndReach};
+  SharedPlaces clock;
+  clock.at.fill(-1);
+  clock.at[kBaseTime] = 0;
+  clock.unit[kBaseTime] = 1.0;
+  problem.places.assign(cameras.size(), clock);
+  for (int k = 0; k < chain.angles(); ++k) problem.held.push_back(chain::is_twist(chain, k));
+  CorrectedFrame frame{views.front()->time, VectorX::Zero(chain.angles()), {}};
+  for (std::size_t v = 0; v < views.size(); ++v) {
+    problem.masks.push_back(mask_points(*views[v], cameras.at(views[v]->camera), Options{}.max_pixels));
+    frame.views.push_back(static_cast<int>(v));
+  }
+  FrameEquations equations = frame_equations(problem, frame, {}, chain, theta);
+  equations.local.gradient -= problem.prior * prior.mean;
+  const VectorX moved = equations.local.matrix.ldlt().solve(equations.local.coupling.col(0));
+  return {equations.shared(0, 0) - moved.dot(equations.local.coupling.col(0)),
+          equations.shared_gradient[0] - moved.dot(equations.local.gradient)};
 }
 
 }  // namespace chainsplat::silhouette

@@ -1,6 +1,7 @@
 // Outlines of one frame as equations of its angles and of what the recording was given wrongly (mathematics.md 6.10).
 #pragma once
 #include <array>
+#include <functional>
 #include <vector>
 
 #include "src/silhouette/outline.h"
@@ -50,7 +51,9 @@ struct FrameEquations {
 };
 
 struct CorrectionProblem {
-  const capture::Capture& capture;
+  std::vector<const capture::View*> views;
+  const std::vector<capture::Camera>& cameras;
+  std::function<trajectory::BaseMotion(double time)> base;
   std::vector<SharedPlaces> places;  // by camera
   int shared = 0;                    // number of shared unknowns
   std::vector<CorrectedFrame> frames;

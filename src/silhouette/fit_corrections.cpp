@@ -122,16 +122,17 @@ VectorX prior_weights(const Layout& layout, const VectorX& x) {
   return out;
 }
 
-capture::Corrections corrections_at(const Layout& layout, const capture::Capture& capture, const VectorX& x) {
+capture::Corrections corrections_at(const Layout& layout, const std::vector<capture::Camera>& cameras,
+                                    const VectorX& x) {
   capture::Corrections out;
   for (const Column& column : layout.columns) {
     const capture::CorrectedQuantity& q = *column.quantity;
     Correction c;
     c.quantity = &q;
-    c.subject = column.camera < 0 ? std::string(q.subject) : capture.cameras[column.camera].name;
+    c.subject = column.camera < 0 ? std::string(q.subject) : cameras[column.camera].name;
     c.value = column.first < 0 ? VectorX::Zero(q.size) : VectorX(column.deviation * x.segment(column.first, q.size));
     c.deviation = VectorX::Zero(q.size);
-    if (column.camera >= 0) c.calibration = capture::calibration_text(capture.cameras[column.camera]);
+    if (column.camera >= 0) c.calibration = capture::calibration_text(cameras[column.camera]);
     out.push_back(std::move(c));
   }
   return out;
@@ -159,7 +160,7 @@ chain::Chain resized(const chain::Chain& given, const capture::Corrections& corr
 std::vector<FrameEquations> all_equations(const CorrectionProblem& problem, const Layout& layout,
                                           const chain::Chain& given, const VectorX& x) {
   const int m = layout.size, n = given.angles();
-  const capture::Corrections corrections = corrections_at(layout, problem.capture, x.head(m));
+  const capture::Corrections corrections = corrections_at(layout, problem.cameras, x.head(m));
   const chain::Chain chain = resized(given, corrections);
   std::vector<FrameEquations> out(problem.frames.size());
   core::parallel_for(static_cast<std::int64_t>(out.size()), [&](std::int64_t f) {
@@ -276,9 +277,15 @@ void choose_clock(const Layout& layout, MatrixX& covariance, capture::Correction
   covariance = MatrixX(change * covariance * change.transpose());
 }
 
+std::vector<const capture::View*> views_of(const capture::Capture& capture) {
+  std::vector<const capture::View*> views;
+  for (const capture::View& view : capture.views) views.push_back(&view);
+  return views;
+}
+
 // Frames that show something, evenly spread, with their masks; returns their angles.
-std::vector<VectorX> choose_frames(const SequenceFit& sequence, int most, CorrectionProblem& problem) {
-  const capture::Capture& capture = problem.capture;
+std::vector<VectorX> choose_frames(const SequenceFit& sequence, int most, const capture::Capture& capture,
+                                   CorrectionProblem& problem) {
   const Frames all = frames_of(capture);
   const int every = std::max(1, (static_cast<int>(all.times.size()) + most - 1) / most);
   std::vector<VectorX> theta;
@@ -317,7 +324,7 @@ void set_states(const Layout& layout, const VectorX& prior, const MatrixX& share
 }
 
 std::vector<OutlineMisfit> misfits_of(const CorrectionProblem& problem, const std::vector<FrameEquations>& frames) {
-  const int cameras = static_cast<int>(problem.capture.cameras.size());
+  const int cameras = static_cast<int>(problem.cameras.size());
   std::vector<FrameEquations::Sums> sums(cameras);
   std::vector<OutlineMisfit> out(cameras);
   for (std::size_t f = 0; f < frames.size(); ++f) {
@@ -332,7 +339,7 @@ std::vector<OutlineMisfit> misfits_of(const CorrectionProblem& problem, const st
       if (rms <= out[c].worst_rms) continue;
       out[c].worst_rms = rms;
       for (const int v : problem.frames[f].views)
-        if (problem.capture.views[v].camera == c) out[c].worst_frame = problem.capture.views[v].frame;
+        if (problem.views[v]->camera == c) out[c].worst_frame = problem.views[v]->frame;
     }
   }
   for (int c = 0; c < cameras; ++c) {
@@ -349,9 +356,17 @@ std::vector<OutlineMisfit> misfits_of(const CorrectionProblem& problem, const st
 CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& sequence,
                               const CorrectionOptions& options) {
   const Layout layout = layout_of(capture, chain, options);
-  CorrectionProblem problem{
-      capture, places_of(layout, static_cast<int>(capture.cameras.size())), layout.size, {}, {}, {}, {}, kWidestCut,
-      kWideEnd};
+  CorrectionProblem problem{views_of(capture),
+                            capture.cameras,
+                            [&](double time) { return capture.base.at(time); },
+                            places_of(layout, static_cast<int>(capture.cameras.size())),
+                            layout.size,
+                            {},
+                            {},
+                            {},
+                            {},
+                            kWidestCut,
+                            kWideEnd};
   // bends between neighbors shrink with the square of the links' length, as curvature changes along the rope
   Options smooth;
   const double difference = kJointDifference * std::pow(8.0 / (chain.links() - 1), 2);
@@ -359,7 +374,7 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
   problem.prior = joint_prior(chain, smooth);
   const int n = chain.angles(), m = layout.size;
   for (int k = 0; k < n; ++k) problem.held.push_back(chain::is_twist(chain, k));
-  const std::vector<VectorX> theta = choose_frames(sequence, options.frames, problem);
+  const std::vector<VectorX> theta = choose_frames(sequence, options.frames, capture, problem);
 
   VectorX x = VectorX::Zero(m + n * static_cast<int>(theta.size()));
   for (std::size_t f = 0; f < theta.size(); ++f) x.segment(m + static_cast<int>(f) * n, n) = theta[f];
@@ -388,7 +403,7 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
   const VectorX prior = prior_weights(layout, x.head(m));
   const MatrixX covariance =
       shared_covariance(frames, known_at(capture, layout, x.head(m)).information, x.head(m), out.evidence);
-  out.corrections = corrections_at(layout, capture, x.head(m));
+  out.corrections = corrections_at(layout, capture.cameras, x.head(m));
   set_states(layout, prior, covariance, out.corrections);
   out.covariance = covariance_of_numbers(layout, covariance);
   choose_clock(layout, out.covariance, out.corrections);
@@ -428,8 +443,17 @@ std::vector<MatrixX> covariances_by_corrections(const chain::Chain& chain, const
   const MatrixX shared = choose * covariance * choose.transpose();
 
   const Frames all = frames_of(capture);
-  CorrectionProblem problem{
-      capture, places_of(layout, cameras), layout.size, {}, {}, joint_prior(chain, {}), {}, kLargestCut, kEndReach};
+  CorrectionProblem problem{views_of(capture),
+                            capture.cameras,
+                            [&](double time) { return capture.base.at(time); },
+                            places_of(layout, cameras),
+                            layout.size,
+                            {},
+                            {},
+                            joint_prior(chain, {}),
+                            {},
+                            kLargestCut,
+                            kEndReach};
   for (int k = 0; k < n; ++k) problem.held.push_back(chain::is_twist(chain, k));
   problem.masks.resize(capture.views.size());
   core::parallel_for(static_cast<std::int64_t>(capture.views.size()), [&](std::int64_t v) {
