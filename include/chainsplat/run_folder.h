@@ -14,11 +14,12 @@ inline constexpr const char* kBaseFile = "base.tum";              // the capture
 inline constexpr const char* kCovarianceFile = "covariance.csv";  // of the recognized angles
 inline constexpr const char* kMetricsFile = "metrics.json";
 inline constexpr const char* kLogFile = "log.jsonl";
+inline constexpr const char* kReportFile = "report.html";
 inline constexpr const char* kCheckpointFolder = "checkpoint";
 inline constexpr const char* kLockFile = "checkpoint/lock";  // held by the process that trains
 // All that a training leaves in its run folder, but the checkpoint folder.
-inline constexpr const char* kRunFiles[] = {"twin.json",  "gaussians.ply", "states.csv", "rollout.csv",
-                                            kMetricsFile, kLogFile,        kBaseFile,    kCovarianceFile};
+inline constexpr const char* kRunFiles[] = {"twin.json", "gaussians.ply", "states.csv",    "rollout.csv", kMetricsFile,
+                                            kLogFile,    kBaseFile,       kCovarianceFile, kReportFile};
 
 // One process at a time in a folder: the lock ends with the process, however that ends.
 class FolderLock {

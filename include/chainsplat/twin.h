@@ -80,8 +80,9 @@ struct Twin {
   chain::States rollout;
 };
 
-// The findings as twin.json has them.
+// The findings and the corrections as twin.json has them.
 nlohmann::ordered_json to_json(const std::vector<capture::Finding>& verdict);
+nlohmann::ordered_json to_json(const capture::Corrections& corrections);
 
 // Writes twin.json, gaussians.ply, states.csv, rollout.csv (those that exist) and creates the folder. Each file is
 // replaced atomically, twin.json last. Throws WorkError. Doubles read back exactly. twin.json does not represent all

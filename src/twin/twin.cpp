@@ -104,9 +104,28 @@ double drag_per_meter(const chain::Chain& chain, const std::vector<double>& by_l
 nlohmann::ordered_json to_json(const std::vector<capture::Finding>& verdict) {
   Json out = Json::array();
   for (const capture::Finding& f : verdict)
-    out.push_back({{"code", f.code},           {"subject", f.subject}, {"value", f.value},
-                   {"sigma", f.deviation},     {"unit", f.unit},       {"corrected", f.corrected},
-                   {"trusted", f.trusted},     {"frame", f.frame},     {"text", f.text}});
+    out.push_back({{"code", f.code},
+                   {"subject", f.subject},
+                   {"value", f.value},
+                   {"sigma", f.deviation},
+                   {"unit", f.unit},
+                   {"corrected", f.corrected},
+                   {"trusted", f.trusted},
+                   {"frame", f.frame},
+                   {"text", f.text}});
+  return out;
+}
+
+nlohmann::ordered_json to_json(const capture::Corrections& corrections) {
+  Json out{{"cameras", Json::object()}};
+  for (const capture::Correction& c : corrections) {
+    const bool camera = std::string(c.quantity->subject) == "camera";
+    Json& subject = camera ? out["cameras"][c.subject] : out[c.subject];
+    const auto numbers = [](const math::VectorX& v) { return v.size() == 1 ? Json(v[0]) : list(v); };
+    subject[c.quantity->name] = {
+        {"value", numbers(c.value)}, {"sigma", numbers(c.deviation)}, {"state", capture::name(c.state)}};
+    if (camera) subject["calibration"] = c.calibration;
+  }
   return out;
 }
 
@@ -190,19 +209,6 @@ Json identification_json(const Twin& twin) {
     out["weak"].push_back({{"singular_value", weak.singular_value}, {"direction", parts}});
   }
   if (e.solver) out["solver"] = *e.solver;
-  return out;
-}
-
-Json corrections_json(const capture::Corrections& corrections) {
-  Json out{{"cameras", Json::object()}};
-  for (const capture::Correction& c : corrections) {
-    const bool camera = std::string(c.quantity->subject) == "camera";
-    Json& subject = camera ? out["cameras"][c.subject] : out[c.subject];
-    const auto numbers = [](const math::VectorX& v) { return v.size() == 1 ? Json(v[0]) : list(v); };
-    subject[c.quantity->name] = {
-        {"value", numbers(c.value)}, {"sigma", numbers(c.deviation)}, {"state", capture::name(c.state)}};
-    if (camera) subject["calibration"] = c.calibration;
-  }
   return out;
 }
 
@@ -485,8 +491,8 @@ capture::Corrections read_corrections(const Node& node) {
       c.deviation = numbers("sigma");
       const std::string state = leaf["state"].text();
       bool known = false;
-      for (const auto one : {capture::CorrectionState::free, capture::CorrectionState::prior,
-                             capture::CorrectionState::held})
+      for (const auto one :
+           {capture::CorrectionState::free, capture::CorrectionState::prior, capture::CorrectionState::held})
         if (state == capture::name(one)) c.state = one, known = true;
       if (!known) leaf["state"].fail("is not known", "write free, prior or held");
       if (camera && subject.has("calibration")) c.calibration = subject["calibration"].text();
@@ -595,7 +601,7 @@ void save(const Twin& twin, const Path& run) {
            {"chain", chain_json(twin)},
            {"identification", identification_json(twin)}};
   if (!twin.corrections.empty()) {
-    out["corrections"] = corrections_json(twin.corrections);
+    out["corrections"] = to_json(twin.corrections);
     out["verdict"] = to_json(twin.verdict);
     out["trusted"] = twin.trusted();
   }

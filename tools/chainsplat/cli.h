@@ -31,7 +31,7 @@ using Job = std::function<void()>;
 void add_training_commands(CLI::App& app, const Globals& globals, Job& job);  // train, recognize
 void add_identify_command(CLI::App& app, const Globals& globals, Job& job);
 void add_motion_commands(CLI::App& app, const Globals& globals, Job& job);      // rollout, render
-void add_result_commands(CLI::App& app, const Globals& globals, Job& job);      // eval, export, synth
+void add_result_commands(CLI::App& app, const Globals& globals, Job& job);      // eval, report, export, synth
 void add_inspection_commands(CLI::App& app, const Globals& globals, Job& job);  // check, doctor
 void add_planning_commands(CLI::App& app, const Globals& globals, Job& job);    // plan
 void add_excite_command(CLI::App& app, const Globals& globals, Job& job);

@@ -1,4 +1,4 @@
-// result.cpp - eval, export, synth: how good a twin is, and what others can do with it.
+// result.cpp - eval, report, export, synth: how good a twin is, and what others can do with it.
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <iostream>
@@ -50,6 +50,28 @@ void evaluate(const Globals& globals, const EvalRequest& request) {
   }
   std::cout << metrics_table(rows);
   if (!request.picture.empty()) std::cout << "picture: " << request.picture << "\n";
+}
+
+struct ReportRequest {
+  std::string run, out;
+  pipeline::ReportOptions options;
+  std::string capture;
+};
+
+void report(const Globals& globals, const ReportRequest& request) {
+  pipeline::check_output_file(request.out);
+  pipeline::ReportOptions options = request.options;
+  options.capture = request.capture;
+  const std::string page = pipeline::report(request.run, options, terminal());
+  end_progress();
+  write_result(request.out, page);
+  if (request.out == "-") return;
+  if (globals.json)
+    std::cout << nlohmann::ordered_json{{"output", request.out}, {"bytes", page.size()}}.dump(
+                     -1, ' ', false, nlohmann::ordered_json::error_handler_t::replace)
+              << "\n";
+  else
+    say("written: " + request.out + ", " + std::to_string(page.size() / 1024) + " KiB; open it in a browser");
 }
 
 struct ExportRequest {
@@ -134,6 +156,21 @@ void add_result_commands(CLI::App& app, const Globals& globals, Job& job) {
   evaluator->add_option("--picture", request->picture, "Also make a picture: observed beside rendered frames")
       ->type_name("FILE.png");
   evaluator->callback([&globals, &job, request] { job = [&globals, request] { evaluate(globals, *request); }; });
+
+  CLI::App* reporter =
+      app.add_subcommand("report", "Show the twin as one page for a browser: replay, verdict, metrics, numbers");
+  auto showing = std::make_shared<ReportRequest>();
+  reporter->add_option("RUN", showing->run, "Run folder of a twin")->required();
+  reporter->add_option("-o,--output", showing->out, "Page to write; - is standard output")
+      ->required()
+      ->type_name("FILE.html");
+  reporter
+      ->add_option("--video", showing->options.videos, "Cameras whose frames go into the page, small: about 2 MB each")
+      ->delimiter(',')
+      ->type_name("CAMERA,...");
+  reporter->add_option("--capture", showing->capture, "The twin's own capture, where it has moved")
+      ->type_name("CAPTURE");
+  reporter->callback([&globals, &job, showing] { job = [&globals, showing] { report(globals, *showing); }; });
 
   CLI::App* exporter = app.add_subcommand("export", "Write the twin for other programs, by the file's ending");
   auto exporting = std::make_shared<ExportRequest>();
