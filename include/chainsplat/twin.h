@@ -1,7 +1,7 @@
 // chainsplat/twin.h - the result of training as one value, and its run folder (formats.md 2).
 //
 // Recognition provides the chain, the Gaussians and the states, identification the parameters. Rollout, rendering,
-// estimation, planning and export start from a twin.
+// estimation, planning and export start from a twin. In the file `about` says in words what its numbers mean.
 //
 // twin.json ("format": "chainsplat-twin/1"); SI units, radians. Keys marked * are absent before identification.
 //   grasp           direction, bending_axis: unit vectors, base frame
