@@ -42,6 +42,11 @@ void add_batch_command(CLI::App& app, const Globals& globals, Job& job);    // b
 void add_diff_command(CLI::App& app, const Globals& globals, Job& job);     // diff
 void add_mask_command(CLI::App& app, const Globals& globals, Job& job);
 void add_bench_command(CLI::App& app, const Globals& globals, Job& job);
+void add_describe_commands(CLI::App& app, Job& job);  // completions, manual
+
+// --- describe.cpp --------------------------------------------------------------------------------
+// The command, or of the command that was named the option, that `word` may be a slip of; empty where none is near.
+std::string meant(const CLI::App& app, const std::string& word);
 
 // --- progress.cpp --------------------------------------------------------------------------------
 // Warnings, messages and progress go to standard error from now on, progress as a redrawn line on a terminal, else as a
