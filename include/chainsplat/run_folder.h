@@ -1,6 +1,7 @@
 // chainsplat/run_folder.h - what is kept in a run folder beside the twin: base motion, covariances, metrics, log, lock.
 #pragma once
 #include <fstream>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -69,6 +70,10 @@ trajectory::Trajectory read_base(const Path& file);            // a TUM file as 
 trajectory::Trajectory own_base(const Path& run);
 // The same, for work on the states: throws InputError too where the base does not cover their times.
 trajectory::Trajectory own_base(const Path& run, const chain::States& states);
+// Cameras, clocks and base of the capture that the twin was made from, as corrected, without its frames. `moved`: where
+// it is now; empty: where the twin says. None where it is not there any more; throws InputError where it is another
+// one.
+std::optional<capture::Capture> own_recording(const twin::Twin& twin, const Path& run, const Path& moved = {});
 dynamics::Model model_of(const twin::Twin& twin, const Path& run);  // throws InputError before identification
 
 // 'time,c_1_1,c_2_1,c_2_2,...': the lower triangle of every frame's covariance of theta, rad^2.

@@ -11,33 +11,10 @@ namespace chainsplat::pipeline {
 
 namespace {
 
-namespace fs = std::filesystem;
-
-// The capture's cameras and clocks, as corrected. No frame is read, but all are counted, since the hash is over them.
-void add_cameras(const Path& capture, report::Contents& contents) {
-  capture::LoadOptions load;
-  load.last = 0;
-  capture::Capture facts = capture::load(capture, load);
-  if (contents.twin.provenance.capture_hash != hash_text(facts.hash))
-    throw InputError(facts.folder.string(), "is not the capture that the twin was made from, or has changed since",
-                     "name the capture of this run");
-  capture::apply(contents.twin.corrections, facts);
-  contents.cameras = std::move(facts.cameras);
-  contents.times = std::move(facts.times);
-}
-
-// Where the run's capture is, empty where it is not there any more.
-Path own_capture(const twin::Twin& twin, const Path& run) {
-  if (!twin.provenance.path) return {};
-  const Path folder = (run / *twin.provenance.path).lexically_normal();
-  std::error_code error;
-  return fs::exists(folder, error) ? folder : Path();
-}
-
 // Of metrics.json the parts that the page shows. Throws InputError where one is missing.
 nlohmann::ordered_json read_metrics(const Path& file) {
   std::error_code error;
-  if (!fs::exists(file, error)) return {};
+  if (!std::filesystem::exists(file, error)) return {};
   const auto refuse = [&] {
     throw InputError(file.string(), "is damaged or of another program", "make it again with 'chainsplat eval'");
   };
@@ -61,20 +38,23 @@ nlohmann::ordered_json read_metrics(const Path& file) {
 std::string report(const Path& run, const ReportOptions& options, const core::Listener& listener) {
   const core::ListenerScope scope(listener);
   report::Contents contents;
+  Path folder;
   contents.twin = load_twin(run);
   contents.base = own_base(run, contents.twin.states);
   contents.twin.states.covariance = read_covariances(run / kCovarianceFile, contents.twin.states);
   contents.metrics = read_metrics(run / kMetricsFile);
-  const Path capture = options.capture.empty() ? own_capture(contents.twin, run) : options.capture;
-  if (!capture.empty())
-    add_cameras(capture, contents);
-  else if (!options.videos.empty())
+  if (std::optional<capture::Capture> facts = own_recording(contents.twin, run, options.capture)) {
+    contents.cameras = std::move(facts->cameras);
+    contents.times = std::move(facts->times);
+    folder = facts->folder;
+  } else if (!options.videos.empty()) {
     throw InputError("`video`", "the capture of " + run.string() + " is not there any more", "name it with `capture`");
-  else
+  } else {
     core::warn(run.string() + ": its capture is not there any more; the report shows no cameras");
+  }
   for (const std::string& camera : options.videos) {
     core::report({"video", 0, 0, NAN, NAN, "frames of " + camera});
-    contents.videos.push_back(report::read_video(capture, camera, contents.twin));
+    contents.videos.push_back(report::read_video(folder, camera, contents.twin));
   }
   return report::page(contents);
 }

@@ -76,28 +76,40 @@ void report(const Globals& globals, const ReportRequest& request) {
 
 struct ExportRequest {
   std::string run, states, base, out;
+  bool force = false, raw = false, mesh = false;
 };
 
 void export_twin(const Globals& globals, const ExportRequest& request) {
-  const std::vector<std::string>& known = exports::endings();
-  if (std::find(known.begin(), known.end(), Path(request.out).extension().string()) == known.end()) {
-    std::string list;
-    for (const std::string& ending : known) list += (list.empty() ? "" : ", ") + ending;
-    throw InputError(request.out, "its ending is not known", "use one of " + list);
+  const std::vector<Path> files = exports::files(request.out);
+  for (const Path& file : files) {
+    pipeline::check_output_file(file.string());
+    std::error_code error;
+    if (!request.force && std::filesystem::is_regular_file(file, error))
+      throw InputError(file.string(), "is there already", "name another file, or give --force to replace it");
   }
-  pipeline::check_output_file(request.out);
-  const twin::Twin twin = pipeline::load_twin(request.run);
+  twin::Twin twin = pipeline::load_twin(request.run);
+  if (files.front().extension() == ".npz")
+    twin.states.covariance = pipeline::read_covariances(Path(request.run) / pipeline::kCovarianceFile, twin.states);
   const chain::States motion =
       request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
-  exports::write(twin, motion,
-                 request.base.empty() ? pipeline::own_base(request.run) : pipeline::read_base(input_path(request.base)),
-                 request.out);
-  if (globals.json)
-    std::cout << nlohmann::ordered_json{{"output", request.out}}.dump(-1, ' ', false,
-                                                                      nlohmann::ordered_json::error_handler_t::replace)
-              << "\n";
-  else
-    say("written: " + request.out);
+  const trajectory::Trajectory base =
+      request.base.empty() ? pipeline::own_base(request.run) : pipeline::read_base(input_path(request.base));
+  if (!request.raw && twin.gaussians.count > 0 && exports::for_viewers(request.out)) {
+    if (const std::optional<capture::Capture> recording = pipeline::own_recording(twin, request.run))
+      twin.gaussians =
+          exports::with_low_pass(twin.gaussians, twin.chain, twin.states, recording->base, recording->cameras);
+    else
+      core::warn(request.run +
+                 ": its capture is not there any more; the Gaussians are as trained, thin in other viewers");
+  }
+  exports::write(twin, motion, base, request.out, request.mesh);
+  if (globals.json) {
+    nlohmann::ordered_json document{{"output", request.out}, {"files", nlohmann::ordered_json::array()}};
+    for (const Path& file : files) document["files"].push_back(file.string());
+    std::cout << document.dump(-1, ' ', false, nlohmann::ordered_json::error_handler_t::replace) << "\n";
+    return;
+  }
+  for (const Path& file : files) say("written: " + file.string());
 }
 
 struct SynthRequest {
@@ -184,6 +196,10 @@ void add_result_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("STATES.csv");
   exporter->add_option("--base", exporting->base, "Its base motion (default: the capture's own)")
       ->type_name("FILE.tum");
+  exporter->add_flag("--mesh", exporting->mesh, "In glTF also a skinned tube, for viewers that draw no splats");
+  exporter->add_flag("--raw", exporting->raw,
+                     "Gaussians as trained, without what our renderer adds on the image and other viewers do not");
+  exporter->add_flag("--force", exporting->force, "Replace files that are there");
   exporter->callback(
       [&globals, &job, exporting] { job = [&globals, exporting] { export_twin(globals, *exporting); }; });
 
