@@ -57,7 +57,7 @@ place = page.rindex('</body>')
 page = page[:place] + '<script>' + driver + f'drive([{sys.argv[4]}]);</script>\n' + page[place:]
 open(sys.argv[2], 'w', encoding='utf-8').write(page)
 PYTHON
-  timeout 120 "$browser" --headless --no-sandbox --user-data-dir="$work/profile" --window-size="$3",900 \
+  timeout 300 "$browser" --headless --no-sandbox --user-data-dir="$work/profile" --window-size="$3",900 \
     --virtual-time-budget=8000 --dump-dom "file://$work/$2.html" >"$work/$2.dom" 2>/dev/null
   grep -q 'data-checks=' "$work/$2.dom" || fail "$2: the page did not come to its end"
 }
@@ -78,7 +78,7 @@ drive "$work/video.html" phone 400 11
 check phone '"images":true'
 
 # one moment alone, as a link asks for it, pixel by pixel on the screen
-timeout 60 "$browser" --headless --no-sandbox --user-data-dir="$work/profile" --hide-scrollbars --window-size=320,240 \
+timeout 300 "$browser" --headless --no-sandbox --user-data-dir="$work/profile" --hide-scrollbars --window-size=320,240 \
   --virtual-time-budget=3000 --screenshot="$work/moment.png" \
   "file://$page#camera=cam2&time=0.36666667&plain" 2>/dev/null
 python3 "$(dirname "$0")/report_pictures.py" "$work/moment.png" "$work/frames/cam2/000011.png" 45 ||

@@ -38,8 +38,8 @@ void add_excite_command(CLI::App& app, const Globals& globals, Job& job);
 void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job);  // estimate
 void add_force_commands(CLI::App& app, const Globals& globals, Job& job);       // force
 void add_new_command(CLI::App& app, const Globals& globals, Job& job);
-void add_batch_command(CLI::App& app, const Globals& globals, Job& job);    // batch
-void add_diff_command(CLI::App& app, const Globals& globals, Job& job);     // diff
+void add_batch_command(CLI::App& app, const Globals& globals, Job& job);  // batch
+void add_diff_command(CLI::App& app, const Globals& globals, Job& job);   // diff
 void add_mask_command(CLI::App& app, const Globals& globals, Job& job);
 void add_bench_command(CLI::App& app, const Globals& globals, Job& job);
 void add_describe_commands(CLI::App& app, Job& job);  // completions, manual
