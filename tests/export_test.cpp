@@ -269,3 +269,55 @@ TEST_CASE("files by ending") {
   CHECK(message("b.glb", bare).find("no Gaussians") != std::string::npos);
   CHECK(!std::filesystem::exists(folder.path / "b.glb"));
 }
+
+TEST_CASE("a tube rides on the links: where a vertex has one link, it is where the chain carries it") {
+  const twin::Twin twin = test::small_twin();
+  const trajectory::Trajectory base = test::moving_base(1.0);
+  const tinygltf::Model model = loaded(exports::gltf(twin.gaussians, twin.chain, twin.states, base, true, true), true);
+  REQUIRE(model.skins.size() == 1);
+  const tinygltf::Node& node = model.nodes.back();
+  REQUIRE(node.name == "tube");
+  const tinygltf::Primitive& tube = model.meshes[node.mesh].primitives[0];
+  const std::vector<float> position = floats(model, tube.attributes.at("POSITION"), 3),
+                           normal = floats(model, tube.attributes.at("NORMAL"), 3),
+                           weight = floats(model, tube.attributes.at("WEIGHTS_0"), 4),
+                           color = floats(model, tube.attributes.at("COLOR_0"), 4);
+  const auto shorts = [&](int accessor) {
+    const tinygltf::Accessor& a = model.accessors[accessor];
+    REQUIRE(a.componentType == TINYGLTF_COMPONENT_TYPE_UNSIGNED_SHORT);
+    const tinygltf::BufferView& view = model.bufferViews[a.bufferView];
+    std::vector<std::uint16_t> out(a.count * tinygltf::GetNumComponentsInType(a.type));
+    std::memcpy(out.data(), model.buffers[0].data.data() + view.byteOffset, 2 * out.size());
+    return out;
+  };
+  const std::vector<std::uint16_t> joint = shorts(tube.attributes.at("JOINTS_0")), corner = shorts(tube.indices);
+  const std::vector<math::Pose> world = world_transforms(model, 7);
+  const std::vector<math::Pose> motions =
+      chain::link_motions(twin.chain, twin.states.theta[7], base.pose(twin.states.time[7]));
+  int of_one = 0, of_two = 0;
+  for (std::size_t i = 0; i < position.size() / 3; ++i) {
+    const math::Vector3 home(position[3 * i], position[3 * i + 1], position[3 * i + 2]);
+    math::Vector3 skinned = math::Vector3::Zero(), carried = math::Vector3::Zero();
+    for (int c = 0; c < 4; ++c) {
+      const int link = joint[4 * i + c];
+      const math::Pose inverse{math::Matrix3::Identity(), -twin.chain.link_start(link) * twin.chain.direction};
+      skinned += weight[4 * i + c] * (world[model.skins[0].joints[link]] * (inverse * home));
+      carried += weight[4 * i + c] * (y_up() * (motions[link] * home));
+    }
+    CHECK((skinned - carried).norm() < 1e-6);
+    (weight[4 * i] > 0.0f && weight[4 * i + 1] > 0.0f ? of_two : of_one) += 1;
+    for (int c = 0; c < 3; ++c) CHECK((color[4 * i + c] >= 0.0f && color[4 * i + c] <= 1.0f));
+  }
+  CHECK(of_one > of_two);
+  CHECK(of_two > 0);
+  // every triangle looks outward
+  for (std::size_t t = 0; t < corner.size(); t += 3) {
+    math::Vector3 p[3], n = math::Vector3::Zero();
+    for (int c = 0; c < 3; ++c) {
+      p[c] =
+          math::Vector3(position[3 * corner[t + c]], position[3 * corner[t + c] + 1], position[3 * corner[t + c] + 2]);
+      n += math::Vector3(normal[3 * corner[t + c]], normal[3 * corner[t + c] + 1], normal[3 * corner[t + c] + 2]);
+    }
+    CHECK((p[1] - p[0]).cross(p[2] - p[0]).dot(n) > 0.0);
+  }
+}

@@ -8,10 +8,15 @@
 //               base, rotation of each link; its time starts at 0. The file contains its buffers.
 //   .ply        gaussians.ply of the run folder: home configuration, base frame. Some PLY viewers show it with y down.
 //   .csv        the states, and beside them NAME.centerline.csv: the nodes in the world frame.
+//   .npz        NumPy arrays of everything (states, covariances, poses, parameters, Gaussians), and beside them
+//   NAME.py, which
+//               poses the twin.
+//   .xml        MJCF for MuJoCo, and beside it NAME_base.csv and NAME_play.py, which plays it as the twin moves.
 // The namespace is not `export`, which is a keyword.
 #pragma once
 #include <string>
 #include <vector>
+#include "chainsplat/capture.h"
 #include "chainsplat/chain.h"
 #include "chainsplat/trajectory.h"
 #include "chainsplat/twin.h"
@@ -21,13 +26,41 @@ namespace chainsplat::exports {
 // The endings that write() knows: ".glb", ".gltf", ...
 const std::vector<std::string>& endings();
 
-// Writes `file`. An empty `motion` means the home configuration without animation; a default-constructed `base` is at
-// rest at the world origin. Throws InputError for an unknown ending (listing the known ones) and for a twin without the
-// data that the format needs, WorkError if the file cannot be written.
-void write(const twin::Twin& twin, const chain::States& motion, const trajectory::Trajectory& base, const Path& file);
+// All files that write() makes for this one, itself first. Throws InputError for an unknown ending.
+std::vector<Path> files(const Path& file);
 
-// Returns the bytes of a .glb (`binary`) or .gltf file.
+bool for_viewers(const Path& file);  // whether it is a format in which others draw the Gaussians: .glb, .gltf, .ply
+
+// Writes them. An empty `motion` means the home configuration without animation; a default-constructed `base` is at
+// rest at the world origin. Throws InputError for an unknown ending (listing the known ones) and for a twin without the
+// data that the format needs, WorkError if the file cannot be written. `mesh`: of glTF.
+void write(const twin::Twin& twin, const chain::States& motion, const trajectory::Trajectory& base, const Path& file,
+           bool mesh = false);
+
+// Returns the bytes of a .glb (`binary`) or .gltf file. `mesh`: with the rope as a skinned tube beside the splats.
 std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, const chain::States& motion,
-                 const trajectory::Trajectory& base, bool binary);
+                 const trajectory::Trajectory& base, bool binary, bool mesh = false);
+
+// The link with the largest probability of Gaussian `i`.
+int surest_link(const splat::Gaussians& gaussians, int i);
+
+// Gaussians that look in other viewers as they do here: their scales hold what the renderer adds on the image,
+// sqrt(0.3) px at the nearest that each comes to a camera in the motion.
+splat::Gaussians with_low_pass(const splat::Gaussians& gaussians, const chain::Chain& chain,
+                               const chain::States& motion, const trajectory::Trajectory& base,
+                               const std::vector<capture::Camera>& cameras);
+
+// A zip archive of .npy arrays (formats.md 5.5), and the text of the module that reads it.
+std::string npz(const twin::Twin& twin, const chain::States& motion, const trajectory::Trajectory& base);
+std::string npz_script();
+
+// The rope as a MuJoCo model: universal joints as hinges in one body, quadratic drag as massless ellipsoids, the base
+// on heavy joints. `base` by rows of 1/240 s, and the player that sets it and adds what MJCF has no law for: friction
+// on a table, and linear drag. Left out: contacts, and the smoothing of drag at speeds below a millimeter per second.
+// `stem`: of the files' names. The twin must be identified.
+struct MujocoFiles {
+  std::string model, base, player;
+};
+MujocoFiles mujoco(const twin::Twin& twin, const trajectory::Trajectory& base, const std::string& stem);
 
 }  // namespace chainsplat::exports

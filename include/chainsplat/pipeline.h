@@ -149,4 +149,13 @@ struct Evaluation {
 Evaluation evaluate(const Path& run, const Path& capture, const EvaluateOptions& options,
                     const core::Listener& listener = {});
 
+// --- report ----------------------------------------------------------------------------------------------------------
+
+struct ReportOptions {
+  Path capture;  // that the twin was made from; empty: where the twin says that it is, if it is there
+  std::vector<std::string> videos;  // cameras whose frames, made small, become a part of the page
+};
+// The page of a run (report.h), as `train` writes it to report.html, but with videos where asked.
+std::string report(const Path& run, const ReportOptions& options, const core::Listener& listener = {});
+
 }  // namespace chainsplat::pipeline

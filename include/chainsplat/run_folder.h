@@ -1,6 +1,7 @@
 // chainsplat/run_folder.h - what is kept in a run folder beside the twin: base motion, covariances, metrics, log, lock.
 #pragma once
 #include <fstream>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -14,11 +15,12 @@ inline constexpr const char* kBaseFile = "base.tum";              // the capture
 inline constexpr const char* kCovarianceFile = "covariance.csv";  // of the recognized angles
 inline constexpr const char* kMetricsFile = "metrics.json";
 inline constexpr const char* kLogFile = "log.jsonl";
+inline constexpr const char* kReportFile = "report.html";
 inline constexpr const char* kCheckpointFolder = "checkpoint";
 inline constexpr const char* kLockFile = "checkpoint/lock";  // held by the process that trains
 // All that a training leaves in its run folder, but the checkpoint folder.
-inline constexpr const char* kRunFiles[] = {"twin.json",  "gaussians.ply", "states.csv", "rollout.csv",
-                                            kMetricsFile, kLogFile,        kBaseFile,    kCovarianceFile};
+inline constexpr const char* kRunFiles[] = {"twin.json", "gaussians.ply", "states.csv",    "rollout.csv", kMetricsFile,
+                                            kLogFile,    kBaseFile,       kCovarianceFile, kReportFile};
 
 // One process at a time in a folder: the lock ends with the process, however that ends.
 class FolderLock {
@@ -68,6 +70,10 @@ trajectory::Trajectory read_base(const Path& file);            // a TUM file as 
 trajectory::Trajectory own_base(const Path& run);
 // The same, for work on the states: throws InputError too where the base does not cover their times.
 trajectory::Trajectory own_base(const Path& run, const chain::States& states);
+// Cameras, clocks and base of the capture that the twin was made from, as corrected, without its frames. `moved`: where
+// it is now; empty: where the twin says. None where it is not there any more; throws InputError where it is another
+// one.
+std::optional<capture::Capture> own_recording(const twin::Twin& twin, const Path& run, const Path& moved = {});
 dynamics::Model model_of(const twin::Twin& twin, const Path& run);  // throws InputError before identification
 
 // 'time,c_1_1,c_2_1,c_2_2,...': the lower triangle of every frame's covariance of theta, rad^2.

@@ -1,7 +1,7 @@
 // chainsplat/twin.h - the result of training as one value, and its run folder (formats.md 2).
 //
 // Recognition provides the chain, the Gaussians and the states, identification the parameters. Rollout, rendering,
-// estimation, planning and export start from a twin.
+// estimation, planning and export start from a twin. In the file `about` says in words what its numbers mean.
 //
 // twin.json ("format": "chainsplat-twin/1"); SI units, radians. Keys marked * are absent before identification.
 //   grasp           direction, bending_axis: unit vectors, base frame
@@ -80,8 +80,9 @@ struct Twin {
   chain::States rollout;
 };
 
-// The findings as twin.json has them.
+// The findings and the corrections as twin.json has them.
 nlohmann::ordered_json to_json(const std::vector<capture::Finding>& verdict);
+nlohmann::ordered_json to_json(const capture::Corrections& corrections);
 
 // Writes twin.json, gaussians.ply, states.csv, rollout.csv (those that exist) and creates the folder. Each file is
 // replaced atomically, twin.json last. Throws WorkError. Doubles read back exactly. twin.json does not represent all

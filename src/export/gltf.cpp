@@ -6,9 +6,11 @@
 #include <cmath>
 #include <cstring>
 #include <sstream>
+#include <type_traits>
 
 #include "chainsplat/export.h"
 #include "chainsplat/image_model.h"
+#include "tube.h"
 
 namespace chainsplat::exports {
 
@@ -41,25 +43,28 @@ class Builder {
  public:
   explicit Builder(tinygltf::Model& model) : model_(model) { model_.buffers.emplace_back(); }
 
-  int accessor(const std::vector<float>& values, int components, int target, bool with_bounds) {
+  template <class Number>
+  int accessor(const std::vector<Number>& values, int components, int target, bool with_bounds) {
     std::vector<unsigned char>& data = model_.buffers[0].data;
     tinygltf::BufferView view;
     view.buffer = 0;
     view.byteOffset = data.size();
-    view.byteLength = values.size() * sizeof(float);
+    view.byteLength = values.size() * sizeof(Number);
     view.target = target;
     const auto* const bytes = reinterpret_cast<const unsigned char*>(values.data());
     data.insert(data.end(), bytes, bytes + view.byteLength);
+    data.resize((data.size() + 3) / 4 * 4);  // floats begin at multiples of four bytes
     model_.bufferViews.push_back(view);
 
     tinygltf::Accessor accessor;
     accessor.bufferView = static_cast<int>(model_.bufferViews.size()) - 1;
-    accessor.componentType = TINYGLTF_COMPONENT_TYPE_FLOAT;
+    accessor.componentType =
+        std::is_same_v<Number, float> ? TINYGLTF_COMPONENT_TYPE_FLOAT : TINYGLTF_COMPONENT_TYPE_UNSIGNED_SHORT;
     accessor.count = values.size() / components;
     constexpr int kTypes[] = {0, TINYGLTF_TYPE_SCALAR, TINYGLTF_TYPE_VEC2, TINYGLTF_TYPE_VEC3, TINYGLTF_TYPE_VEC4};
     accessor.type = kTypes[components];
     for (int c = 0; with_bounds && c < components; ++c) {
-      float low = values[c], high = values[c];
+      Number low = values[c], high = values[c];
       for (std::size_t i = c; i < values.size(); i += components) {
         low = std::min(low, values[i]);
         high = std::max(high, values[i]);
@@ -73,6 +78,19 @@ class Builder {
 
   int vertices(const std::vector<float>& values, int components, bool with_bounds = false) {
     return accessor(values, components, TINYGLTF_TARGET_ARRAY_BUFFER, with_bounds);
+  }
+  // The inverses of the links' poses at home, which are pure translations.
+  int inverse_bind_matrices(const chain::Chain& chain) {
+    std::vector<float> matrices;
+    for (int j = 0; j < chain.links(); ++j) {
+      const Vector3 origin = -chain.link_start(j) * chain.direction;
+      for (int i = 0; i < 16; ++i)  // column by column
+        matrices.push_back(i % 5 == 0 ? 1.0f : i >= 12 ? static_cast<float>(origin[i - 12]) : 0.0f);
+    }
+    const int made = accessor(matrices, 4, 0, false);
+    model_.accessors[made].type = TINYGLTF_TYPE_MAT4;
+    model_.accessors[made].count = chain.links();
+    return made;
   }
   int keys(const std::vector<float>& values, int components, bool with_bounds = false) {
     return accessor(values, components, 0, with_bounds);
@@ -129,10 +147,37 @@ tinygltf::Primitive primitive(Builder& builder, const splat::Gaussians& g, const
   return out;
 }
 
-// The link with the largest probability.
-int surest_link(const splat::Gaussians& g, int i) {
-  const auto first = g.link_logits.begin() + static_cast<std::ptrdiff_t>(g.links) * i;
-  return static_cast<int>(std::max_element(first, first + g.links) - first);
+// The rope as a skinned mesh in a node of its own beside the chain: a skin is where its joints are.
+void add_tube(tinygltf::Model& model, Builder& builder, const splat::Gaussians& gaussians, const chain::Chain& chain) {
+  const Tube tube = make_tube(gaussians, chain);
+  tinygltf::Primitive primitive;
+  primitive.mode = TINYGLTF_MODE_TRIANGLES;
+  primitive.attributes["POSITION"] = builder.vertices(tube.position, 3, true);
+  primitive.attributes["NORMAL"] = builder.vertices(tube.normal, 3);
+  primitive.attributes["COLOR_0"] = builder.vertices(tube.color, 4);
+  primitive.attributes["JOINTS_0"] = builder.accessor(tube.link, 4, TINYGLTF_TARGET_ARRAY_BUFFER, false);
+  primitive.attributes["WEIGHTS_0"] = builder.vertices(tube.weight, 4);
+  primitive.indices = builder.accessor(tube.triangles, 1, TINYGLTF_TARGET_ELEMENT_ARRAY_BUFFER, false);
+  tinygltf::Material material;
+  material.name = "rope";
+  material.pbrMetallicRoughness.metallicFactor = 0.0;
+  material.pbrMetallicRoughness.roughnessFactor = 0.8;
+  primitive.material = static_cast<int>(model.materials.size());
+  model.materials.push_back(material);
+  tinygltf::Skin skin;
+  skin.inverseBindMatrices = builder.inverse_bind_matrices(chain);
+  for (int j = 0; j < chain.links(); ++j) skin.joints.push_back(1 + j);
+  model.skins.push_back(skin);
+  tinygltf::Mesh mesh;
+  mesh.name = "tube";
+  mesh.primitives.push_back(primitive);
+  tinygltf::Node node;
+  node.name = "tube";
+  node.mesh = static_cast<int>(model.meshes.size());
+  node.skin = 0;
+  model.meshes.push_back(mesh);
+  model.scenes[0].nodes.push_back(static_cast<int>(model.nodes.size()));
+  model.nodes.push_back(node);
 }
 
 // Poses of all link frames at one time, each in its parent's frame (link 0: in the world).
@@ -150,7 +195,7 @@ std::vector<math::Pose> local_poses(const chain::Chain& chain, const math::Vecto
 }  // namespace
 
 std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, const chain::States& motion,
-                 const trajectory::Trajectory& base, bool binary) {
+                 const trajectory::Trajectory& base, bool binary, bool with_tube) {
   CHAINSPLAT_CHECK(gaussians.links == chain.links(), std::to_string(gaussians.links));
   const int links = chain.links();
   tinygltf::Model model;
@@ -195,6 +240,7 @@ std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, c
   scene.nodes = {0};
   model.scenes.push_back(scene);
   model.defaultScene = 0;
+  if (with_tube) add_tube(model, builder, gaussians, chain);
 
   // animation: translation of the base, rotation of every link
   if (moving) {

@@ -100,6 +100,7 @@ struct Row {
   double length = NAN;
   std::string version, device;
   std::array<std::array<double, kColumns.size()>, kParts.size()> values;  // NaN: none
+  bool report = false;                                                    // its page is there
 };
 
 struct Spread {
@@ -118,11 +119,12 @@ struct Spread {
 };
 
 Row read_row(const BatchJob& job, const Path& folder) {
-  Row row{&job, state_of(folder, job), "", NAN, "", "", {}};
+  Row row{&job, state_of(folder, job), "", NAN, "", "", {}, false};
   for (auto& part : row.values) part.fill(NAN);
   const Path run = folder / job.name;
   std::error_code error;
   if (row.state.kind != Kind::done) return row;
+  row.report = fs::exists(run / kReportFile, error);
   Path file = run / "twin.json";
   try {
     const Json twin = core::parse_json(core::read_file(file));
@@ -374,9 +376,10 @@ std::string html(const std::vector<Row>& rows, const Groups& groups) {
   text += "</tr></thead><tbody>\n";
   for (const Row& row : rows) {
     const bool failed = row.state.kind == Kind::failed;
+    const std::string page = row.report ? " <a href=\"" + link_to(row.job->name) + "/report.html\">report</a>" : "";
     text += std::string(failed ? "<tr class=failed>" : "<tr>") + "<td class=text><a href=\"" + link_to(row.job->name) +
             "/\">" + escaped(row.job->name) + "</a> <small><a href=\"logs/" + link_to(row.job->name) +
-            ".txt\">log</a></small></td><td class=text>" + kind_name(row.state.kind) + "</td><td>" +
+            ".txt\">log</a>" + page + "</small></td><td class=text>" + kind_name(row.state.kind) + "</td><td>" +
             number(row.state.seconds, 1) + "</td>";
     if (row.state.kind != Kind::done) {
       text += "<td class=text colspan=" + std::to_string(kColumns.size()) + ">" + escaped(row.state.detail) +

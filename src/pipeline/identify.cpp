@@ -182,6 +182,7 @@ IdentifyResult save_all(std::vector<twin::Twin> twins, const std::vector<Path>& 
     twin::save(result.twins[i], runs[i]);
     std::error_code ignored;
     if (fs::remove(runs[i] / kMetricsFile, ignored)) result.lost_metrics.push_back(runs[i]);
+    if (fs::exists(runs[i] / kReportFile, ignored)) write_report(runs[i]);
   }
   return result;
 }

@@ -135,6 +135,24 @@ trajectory::Trajectory own_base(const Path& run, const chain::States& states) {
   return base;
 }
 
+std::optional<capture::Capture> own_recording(const twin::Twin& twin, const Path& run, const Path& moved) {
+  Path folder = moved;
+  std::error_code error;
+  if (folder.empty()) {
+    if (!twin.provenance.path) return {};
+    folder = (run / *twin.provenance.path).lexically_normal();
+    if (!std::filesystem::exists(folder, error)) return {};
+  }
+  capture::LoadOptions load;
+  load.last = 0;
+  capture::Capture facts = capture::load(folder, load);
+  if (twin.provenance.capture_hash != hash_text(facts.hash))
+    throw InputError(folder.string(), "is not the capture that the twin was made from, or has changed since",
+                     "name the capture of this run");
+  capture::apply(twin.corrections, facts);
+  return facts;
+}
+
 dynamics::Model model_of(const twin::Twin& twin, const Path& run) {
   if (!twin.parameters)
     throw InputError((run / "twin.json").string(), "its dynamics are not identified",

@@ -44,6 +44,9 @@ void tell_fit(const std::string& stage, const solve::Summary& summary);
 // Rolls the identified twin out over its recognized times. `run`: its folder, for messages.
 void roll_out(twin::Twin& twin, const trajectory::Trajectory& base, const Path& run);
 
+// Writes the run's report.html from what stands in its folder.
+void write_report(const Path& run);
+
 // Throws InputError unless `twin` can be refined: recognized fast, with covariances, not refined before.
 void check_joint(const twin::Twin& twin, const Path& run);
 // The frames that the twin in `run` was made from. Throws InputError where they are gone or have changed.

@@ -339,6 +339,7 @@ void run_stages(Training& t) {
   }
   if (t.evaluate) evaluate(t);
   save(t);  // with all durations
+  write_report(t.run);
   remove_checkpoint_folder(t.run);
 }
 

@@ -116,6 +116,19 @@ nlohmann::ordered_json to_json(const std::vector<capture::Finding>& verdict) {
   return out;
 }
 
+nlohmann::ordered_json to_json(const capture::Corrections& corrections) {
+  Json out{{"cameras", Json::object()}};
+  for (const capture::Correction& c : corrections) {
+    const bool camera = std::string(c.quantity->subject) == "camera";
+    Json& subject = camera ? out["cameras"][c.subject] : out[c.subject];
+    const auto numbers = [](const math::VectorX& v) { return v.size() == 1 ? Json(v[0]) : list(v); };
+    subject[c.quantity->name] = {
+        {"value", numbers(c.value)}, {"sigma", numbers(c.deviation)}, {"state", capture::name(c.state)}};
+    if (camera) subject["calibration"] = c.calibration;
+  }
+  return out;
+}
+
 bool Twin::trusted() const {
   return std::all_of(verdict.begin(), verdict.end(), [](const capture::Finding& f) { return f.trusted; });
 }
@@ -177,6 +190,37 @@ Json chain_json(const Twin& twin) {
   return out;
 }
 
+// What the numbers mean, in words, so that a reader of the file alone can use them (formats.md 2.1).
+Json about_json(const Twin& twin) {
+  Json out{{"units", "m, s, kg, N, rad"},
+           {"frames",
+            "world as in the capture; base: origin at the grasp; home: all angles 0, the rope straight along "
+            "grasp.direction"},
+           {"joints",
+            "one entry per angle, base to tip; theta_k turns all links from its child_link on about its axis (w, v)"},
+           {"base",
+            "base.tum, smoothed by a quintic spline, its noise found by cross-validation; velocities and accelerations "
+            "are the spline's"}};
+  if (!twin.parameters) return out;
+  if (!twin.known_mass) out["units"] = "m, s, rad; the total mass counts as 1 kg, forces are N per kg of rope";
+  Json laws{{"joint", "torque = -stiffness (theta - rest_angle) - damping thetadot"},
+            {"inertia", "links are uniform cylinders; tip_mass is a point at the free end"}};
+  if (twin.tabletop) {
+    laws["table"] =
+        "force on a link, spread evenly = -(viscous_friction + coulomb_friction mass g_n / sqrt(v_t^2 + "
+        "coulomb_speed^2)) v_t; the table carries the weight";
+    laws["roll_lever"] =
+        "torque = -roll_lever sum over links j of min(arclength of the joint, of the middle of j)/length times the "
+        "friction across j: a rope that friction rolls";
+  } else {
+    laws["air"] =
+        "force on a link, spread evenly = -length (linear + quadratic sqrt(v_n^2 + drag_speed^2)) v_n, v_n across the "
+        "link";
+  }
+  out["laws"] = std::move(laws);
+  return out;
+}
+
 Json identification_json(const Twin& twin) {
   Json out{{"known_mass", twin.known_mass}};
   const dynamics::Estimates& e = twin.estimates;
@@ -196,19 +240,6 @@ Json identification_json(const Twin& twin) {
     out["weak"].push_back({{"singular_value", weak.singular_value}, {"direction", parts}});
   }
   if (e.solver) out["solver"] = *e.solver;
-  return out;
-}
-
-Json corrections_json(const capture::Corrections& corrections) {
-  Json out{{"cameras", Json::object()}};
-  for (const capture::Correction& c : corrections) {
-    const bool camera = std::string(c.quantity->subject) == "camera";
-    Json& subject = camera ? out["cameras"][c.subject] : out[c.subject];
-    const auto numbers = [](const math::VectorX& v) { return v.size() == 1 ? Json(v[0]) : list(v); };
-    subject[c.quantity->name] = {
-        {"value", numbers(c.value)}, {"sigma", numbers(c.deviation)}, {"state", capture::name(c.state)}};
-    if (camera) subject["calibration"] = c.calibration;
-  }
   return out;
 }
 
@@ -599,11 +630,12 @@ void save(const Twin& twin, const Path& run) {
   if (error)
     throw WorkError(run.string(), "cannot be made (" + error.message() + ")", "choose a folder that can be written");
   Json out{{"format", kFormat},
+           {"about", about_json(twin)},
            {"grasp", {{"direction", list(twin.chain.direction)}, {"bending_axis", list(twin.chain.bending_axis)}}},
            {"chain", chain_json(twin)},
            {"identification", identification_json(twin)}};
   if (!twin.corrections.empty()) {
-    out["corrections"] = corrections_json(twin.corrections);
+    out["corrections"] = to_json(twin.corrections);
     out["verdict"] = to_json(twin.verdict);
     out["trusted"] = twin.trusted();
   }

@@ -119,6 +119,7 @@ expect_code 0 'batch collect'
 grep -q '^good-joints_3,.*,free,0.3,joints=3,0,done,,' "$work/batch/results.csv" || fail 'batch collect: no row of the done job'
 grep -q '<td>0.0265</td>\|0.0265' "$work/batch/results.html" || fail "batch collect: the paper's figure is missing"
 grep -q 'href="good-joints_3/"' "$work/batch/results.html" || fail 'batch collect: no link to the run'
+grep -q 'href="good-joints_3/report.html"' "$work/batch/results.html" || fail 'batch collect: no link to the report'
 grep -Eq 'https?://' "$work/batch/results.html" && fail 'batch collect: results.html is not self-contained'
 
 # diff: a run and itself, and another

@@ -148,4 +148,5 @@ cp "$work/one.csv" "$odd.csv"
 run --json identify "$odd" --markers "$odd.csv" --shape-only
 expect_code 0 'identify --json, names that are not UTF-8'
 python3 -m json.tool "$work/stdout" >"$work/null" || fail 'identify --json, names that are not UTF-8: is not JSON'
+"$source_dir/tests/check_twin.py" "$work"/{rod,twin,run_one,run_two}/twin.json >"$work/stderr" || fail 'twin.json is not as docs/twin.schema.json says'
 finish

@@ -195,9 +195,9 @@ reads clock 0 '^cam2: .* 0\.020 to 1\.987 s'
 perturb lossy --recompress 30 --only cam2
 reads lossy 0 '^cam2: .* 60 frames'
 perturb inverse --inverse-poses --only cam1
-reads inverse 0 '^doubt: cam1: the grasp projects'
+reads inverse 2 "^problem: cam1's world_from_camera is the pose of the world"
 perturb axes --opengl-axes
-reads axes 0 '^doubt: cam2: the grasp is behind the camera'
+reads axes 2 "^problem: cam2's world_from_camera has OpenGL"
 perturb units --millimeters object
 reads units 2 '^problem: .*object\.length'
 perturb size --calibration-scale 2

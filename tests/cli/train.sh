@@ -178,6 +178,9 @@ run train "$work/capture" -o "$work/late" "${small[@]}" --resume
 expect_code 0 'train --resume after an evaluation that failed'
 cmp -s "$work/late/metrics.json" "$work/stopped/metrics.json" || fail 'train --resume: other metrics'
 
+# what was written is as the schema says
+"$source_dir/tests/check_twin.py" "$work"/{whole,stopped,joint,late}/twin.json >"$work/stderr" || fail 'twin.json is not as docs/twin.schema.json says'
+
 # something else where a file should go: refused before anything is removed
 for name in log.jsonl base.tum metrics.json; do
   rm -rf "$work/blocked"

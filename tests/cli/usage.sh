@@ -26,6 +26,31 @@ expect_output '^ "chosen": null' 'doctor --json'
 
 expect_error 2 'subcommand'
 expect_error 2 'dance: is not a command' dance
+expect_error 2 "tarin: is not a command; did you mean 'train'?" tarin capture
+expect_error 2 "did you mean '--joints'?" train capture -o run --joins 4
+expect_error 2 "did you mean '--picture'?" train capture -o run --pictrue=x.png
+
+# completions and manual pages, made from the commands themselves
+complete_bash() { bash -c 'source "$1"; COMP_WORDS=("${@:2}"); COMP_CWORD=$(($# - 2)); _chainsplat; echo "${COMPREPLY[@]}"' - "$work/bash" "$@"; }
+for shell in bash zsh fish; do
+  run completions $shell
+  expect_code 0 "completions $shell"
+  cp "$work/stdout" "$work/$shell"
+  command -v $shell >/dev/null && { $shell -n "$work/$shell" || fail "completions $shell: does not parse"; }
+done
+[ "$(complete_bash chainsplat tra)" = train ] || fail 'completions bash: no train'
+[ "$(complete_bash chainsplat --json train capture --pic)" = --picture ] || fail 'completions bash: no --picture of train'
+[ "$(complete_bash chainsplat export run --thr)" = --threads ] || fail 'completions bash: no global option'
+rm "$work"/{bash,zsh,fish}
+for command in '' train export; do
+  run manual $command
+  expect_code 0 "manual $command"
+  grep -q '^\.SH OPTIONS' "$work/stdout" || fail "manual $command: no options"
+  if command -v groff >/dev/null; then
+    [ -z "$(groff -ww -man -Tutf8 "$work/stdout" 2>&1 >/dev/null)" ] || fail "manual $command: groff complains"
+  fi
+done
+expect_error 2 'dance: is not a command' manual dance
 expect_error 2 'CAPTURE' train
 expect_error 2 '--output' train capture
 expect_error 2 'nonsense' train capture -o run --nonsense

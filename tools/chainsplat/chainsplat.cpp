@@ -35,16 +35,28 @@ int fail(int code, const std::string& message) {
   return code;
 }
 
+// "did you mean 'train'? ", empty where nothing is near.
+std::string did_you_mean(const CLI::App& app, const std::string& word) {
+  const std::string best = tools::meant(app, word);
+  return best.empty() ? "" : "did you mean '" + best + "'? ";
+}
+
 std::string command_line_error(const CLI::App& app, const CLI::ParseError& error) {
   const auto chosen = app.get_subcommands();
   std::string what = error.what();
   while (!what.empty() && (what.back() == '.' || what.back() == '\n')) what.pop_back();
   if (chosen.empty()) {
     for (const std::string& word : app.remaining())
-      if (word[0] != '-') return word + ": is not a command; see 'chainsplat --help' for those there are";
+      if (word[0] != '-')
+        return word + ": is not a command; " + did_you_mean(app, word) + "see 'chainsplat --help' for those there are";
     return "command line: " + what + "; see 'chainsplat --help'";
   }
   const std::string command = chosen.front()->get_name();
+  if (const auto* extras = dynamic_cast<const CLI::ExtrasError*>(&error); extras)
+    for (const std::string& word : app.remaining(true))
+      if (word[0] == '-' && !tools::meant(app, word).empty())
+        return "chainsplat " + command + ": " + word + ": is not an option; " + did_you_mean(app, word) +
+               "see 'chainsplat " + command + " --help'";
   return "chainsplat " + command + ": " + what + "; see 'chainsplat " + command + " --help'";
 }
 
@@ -96,6 +108,7 @@ int run(int argc, char** argv) {
   tools::add_import_command(app, globals, job);
   tools::add_mask_command(app, globals, job);
   tools::add_bench_command(app, globals, job);
+  tools::add_describe_commands(app, job);
   for (CLI::App* command : app.get_subcommands({})) {
     command->get_formatter()->column_width(34);
     command->footer(

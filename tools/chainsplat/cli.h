@@ -32,18 +32,23 @@ using Job = std::function<void()>;
 void add_training_commands(CLI::App& app, const Globals& globals, Job& job);  // train, recognize
 void add_identify_command(CLI::App& app, const Globals& globals, Job& job);
 void add_motion_commands(CLI::App& app, const Globals& globals, Job& job);      // rollout, render
-void add_result_commands(CLI::App& app, const Globals& globals, Job& job);      // eval, export, synth
+void add_result_commands(CLI::App& app, const Globals& globals, Job& job);      // eval, report, export, synth
 void add_inspection_commands(CLI::App& app, const Globals& globals, Job& job);  // check, doctor
 void add_planning_commands(CLI::App& app, const Globals& globals, Job& job);    // plan
 void add_excite_command(CLI::App& app, const Globals& globals, Job& job);
 void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job);  // estimate
 void add_force_commands(CLI::App& app, const Globals& globals, Job& job);       // force
 void add_new_command(CLI::App& app, const Globals& globals, Job& job);
-void add_batch_command(CLI::App& app, const Globals& globals, Job& job);    // batch
-void add_diff_command(CLI::App& app, const Globals& globals, Job& job);     // diff
+void add_batch_command(CLI::App& app, const Globals& globals, Job& job);  // batch
+void add_diff_command(CLI::App& app, const Globals& globals, Job& job);   // diff
 void add_mask_command(CLI::App& app, const Globals& globals, Job& job);
 void add_import_command(CLI::App& app, const Globals& globals, Job& job);
 void add_bench_command(CLI::App& app, const Globals& globals, Job& job);
+void add_describe_commands(CLI::App& app, Job& job);  // completions, manual
+
+// --- describe.cpp --------------------------------------------------------------------------------
+// The command, or of the command that was named the option, that `word` may be a slip of; empty where none is near.
+std::string meant(const CLI::App& app, const std::string& word);
 
 // --- progress.cpp --------------------------------------------------------------------------------
 // Warnings, messages and progress go to standard error from now on, progress as a redrawn line on a terminal, else as a

@@ -1,4 +1,4 @@
-// result.cpp - eval, export, synth: how good a twin is, and what others can do with it.
+// result.cpp - eval, report, export, synth: how good a twin is, and what others can do with it.
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <iostream>
@@ -52,34 +52,67 @@ void evaluate(const Globals& globals, const EvalRequest& request) {
   if (!request.picture.empty()) std::cout << "picture: " << request.picture << "\n";
 }
 
+struct ReportRequest {
+  std::string run, out;
+  pipeline::ReportOptions options;
+  std::string capture;
+};
+
+void report(const Globals& globals, const ReportRequest& request) {
+  pipeline::check_output_file(request.out);
+  pipeline::ReportOptions options = request.options;
+  options.capture = request.capture;
+  const std::string page = pipeline::report(request.run, options, terminal());
+  end_progress();
+  write_result(request.out, page);
+  if (request.out == "-") return;
+  if (globals.json)
+    std::cout << nlohmann::ordered_json{{"output", request.out}, {"bytes", page.size()}}.dump(
+                     -1, ' ', false, nlohmann::ordered_json::error_handler_t::replace)
+              << "\n";
+  else
+    say("written: " + request.out + ", " + std::to_string(page.size() / 1024) + " KiB; open it in a browser");
+}
+
 struct ExportRequest {
   std::string run, states, base, out;
+  bool force = false, raw = false, mesh = false;
 };
 
 void export_twin(const Globals& globals, const ExportRequest& request) {
-  const std::vector<std::string>& known = exports::endings();
-  if (std::find(known.begin(), known.end(), Path(request.out).extension().string()) == known.end()) {
-    std::string list;
-    for (const std::string& ending : known) list += (list.empty() ? "" : ", ") + ending;
-    throw InputError(request.out, "its ending is not known", "use one of " + list);
+  const std::vector<Path> files = exports::files(request.out);
+  for (const Path& file : files) {
+    pipeline::check_output_file(file.string());
+    std::error_code error;
+    if (!request.force && std::filesystem::is_regular_file(file, error))
+      throw InputError(file.string(), "is there already", "name another file, or give --force to replace it");
   }
-  pipeline::check_output_file(request.out);
-  check_not_input(request.out, request.run, {request.states, request.base});
-  const twin::Twin twin = pipeline::load_twin(request.run);
-  const Path beside = base_beside(request.states);
+  for (const Path& file : files) check_not_input(file.string(), request.run, {request.states, request.base});
+  twin::Twin twin = pipeline::load_twin(request.run);
+  if (files.front().extension() == ".npz")
+    twin.states.covariance = pipeline::read_covariances(Path(request.run) / pipeline::kCovarianceFile, twin.states);
   const chain::States motion =
       request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
-  exports::write(twin, motion,
-                 !request.base.empty() ? pipeline::read_base(input_path(request.base))
-                 : !beside.empty()     ? pipeline::read_base(beside)
-                                       : pipeline::own_base(request.run),
-                 request.out);
-  if (globals.json)
-    std::cout << nlohmann::ordered_json{{"output", request.out}}.dump(-1, ' ', false,
-                                                                      nlohmann::ordered_json::error_handler_t::replace)
-              << "\n";
-  else
-    say("written: " + request.out);
+  const Path beside = base_beside(request.states);
+  const trajectory::Trajectory base = !request.base.empty() ? pipeline::read_base(input_path(request.base))
+                                      : !beside.empty()     ? pipeline::read_base(beside)
+                                                            : pipeline::own_base(request.run);
+  if (!request.raw && twin.gaussians.count > 0 && exports::for_viewers(request.out)) {
+    if (const std::optional<capture::Capture> recording = pipeline::own_recording(twin, request.run))
+      twin.gaussians =
+          exports::with_low_pass(twin.gaussians, twin.chain, twin.states, recording->base, recording->cameras);
+    else
+      core::warn(request.run +
+                 ": its capture is not there any more; the Gaussians are as trained, thin in other viewers");
+  }
+  exports::write(twin, motion, base, request.out, request.mesh);
+  if (globals.json) {
+    nlohmann::ordered_json document{{"output", request.out}, {"files", nlohmann::ordered_json::array()}};
+    for (const Path& file : files) document["files"].push_back(file.string());
+    std::cout << document.dump(-1, ' ', false, nlohmann::ordered_json::error_handler_t::replace) << "\n";
+    return;
+  }
+  for (const Path& file : files) say("written: " + file.string());
 }
 
 struct SynthRequest {
@@ -140,6 +173,21 @@ void add_result_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("FILE.png");
   evaluator->callback([&globals, &job, request] { job = [&globals, request] { evaluate(globals, *request); }; });
 
+  CLI::App* reporter =
+      app.add_subcommand("report", "Show the twin as one page for a browser: replay, verdict, metrics, numbers");
+  auto showing = std::make_shared<ReportRequest>();
+  reporter->add_option("RUN", showing->run, "Run folder of a twin")->required();
+  reporter->add_option("-o,--output", showing->out, "Page to write; - is standard output")
+      ->required()
+      ->type_name("FILE.html");
+  reporter
+      ->add_option("--video", showing->options.videos, "Cameras whose frames go into the page, small: about 2 MB each")
+      ->delimiter(',')
+      ->type_name("CAMERA,...");
+  reporter->add_option("--capture", showing->capture, "The twin's own capture, where it has moved")
+      ->type_name("CAPTURE");
+  reporter->callback([&globals, &job, showing] { job = [&globals, showing] { report(globals, *showing); }; });
+
   CLI::App* exporter = app.add_subcommand("export", "Write the twin for other programs, by the file's ending");
   auto exporting = std::make_shared<ExportRequest>();
   exporter->add_option("RUN", exporting->run, "Run folder of a twin")->required();
@@ -150,8 +198,14 @@ void add_result_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("FILE");
   exporter->add_option("--states", exporting->states, "Motion to write (default: the recognized states)")
       ->type_name("STATES.csv");
-  exporter->add_option("--base", exporting->base, "Its base motion (default: the one kept beside the states, else the capture's own)")
+  exporter
+      ->add_option("--base", exporting->base,
+                   "Its base motion (default: the one kept beside the states, else the capture's own)")
       ->type_name("FILE.tum");
+  exporter->add_flag("--mesh", exporting->mesh, "In glTF also a skinned tube, for viewers that draw no splats");
+  exporter->add_flag("--raw", exporting->raw,
+                     "Gaussians as trained, without what our renderer adds on the image and other viewers do not");
+  exporter->add_flag("--force", exporting->force, "Replace files that are there");
   exporter->callback(
       [&globals, &job, exporting] { job = [&globals, exporting] { export_twin(globals, *exporting); }; });
 
@@ -165,7 +219,10 @@ void add_result_commands(CLI::App& app, const Globals& globals, Job& job) {
   synthesizer
       ->add_option("--camera", scene->camera, "Whose cameras, base motion and table (default: the twin's own capture)")
       ->type_name("CAPTURE[:NAME]");
-  synthesizer->add_option("--base", scene->base, "Base motion (default: the one kept beside the states, else that of the capture)")->type_name("FILE.tum");
+  synthesizer
+      ->add_option("--base", scene->base,
+                   "Base motion (default: the one kept beside the states, else that of the capture)")
+      ->type_name("FILE.tum");
   synthesizer->add_flag("--images", scene->images, "Images without loss instead of videos");
   synthesizer->add_flag("--force", scene->force, "Write into a folder that is not empty");
   synthesizer->callback([&globals, &job, scene] { job = [&globals, scene] { synthesize(globals, *scene); }; });

@@ -1,0 +1,46 @@
+"""Poses a twin that chainsplat has exported as .npz, in pure NumPy:
+
+    twin = Twin("twin.npz")
+    poses = twin.link_poses(twin.theta[0], twin.base_pose[0])    # links x 4 x 4: link frames in the world
+    line = twin.centerline(twin.theta[0], twin.base_pose[0], 50)  # 50 x 3
+
+Units are m, s, kg, N and rad. docs/formats.md 5.5 of chainsplat lists all arrays; every one is an attribute here.
+"""
+import numpy as np
+
+
+class Twin:
+    def __init__(self, file):
+        self.__dict__.update(np.load(file))
+
+    def link_motions(self, theta, base_pose):
+        """4 x 4 world motions of the links, base link first: they carry what is given in the home configuration."""
+        motions = [np.array(base_pose)] + [None] * int(self.child_link[-1])
+        for axis, child, angle in zip(self.axes, self.child_link, theta):
+            w, v = axis[:3], axis[3:]
+            k = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+            turn = np.eye(4)
+            turn[:3, :3] += np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+            turn[:3, 3] = (np.eye(3) - turn[:3, :3]) @ np.cross(w, v)  # w x v is a point of the axis
+            before = motions[child - 1] if motions[child] is None else motions[child]
+            motions[child] = before @ turn
+        return np.array(motions)
+
+    def link_poses(self, theta, base_pose):
+        """4 x 4 world poses of the link frames: origin at the link's joint, axes parallel to the base's at home."""
+        home = np.tile(np.eye(4), (len(self.link_start), 1, 1))
+        home[:, :3, 3] = self.link_start[:, None] * self.direction
+        return self.link_motions(theta, base_pose) @ home
+
+    def centerline(self, theta, base_pose, count):
+        arclength = np.linspace(0, self.length, count)
+        link = np.searchsorted(self.link_start[1:], arclength, "right")
+        return self.carry(link, arclength[:, None] * self.direction, theta, base_pose)
+
+    def gaussian_centers(self, theta, base_pose):
+        """Of every Gaussian on its most probable link, in the world."""
+        return self.carry(self.gaussian_link_probability.argmax(1), self.gaussian_mean, theta, base_pose)
+
+    def carry(self, link, home, theta, base_pose):
+        motion = self.link_motions(theta, base_pose)[link]
+        return np.einsum("nij,nj->ni", motion[:, :3, :3], home) + motion[:, :3, 3]

@@ -1,0 +1,129 @@
+// The tables of the page. Whatever comes from files goes through textContent, so that names never become markup.
+
+function element(tag, text, options = {}) {
+  const out = document.createElement(tag);
+  if (text !== undefined) out.textContent = text;
+  return Object.assign(out, options);
+}
+
+// Cells are texts or elements. Every row but the head may have its own class.
+function table(head, rows, className = '') {
+  const out = element('table', undefined, {className}), box = element('div', undefined, {className: 'wide'});
+  const line = (cells, tag) => {
+    const row = element('tr');
+    for (const cell of cells) {
+      const made = element(tag);
+      made.append(cell instanceof Node ? cell : String(cell));
+      row.append(made);
+    }
+    return row;
+  };
+  if (head) out.createTHead().append(line(head, 'th'));
+  const body = out.createTBody();
+  for (const cells of rows) body.append(line(cells, 'td'));
+  box.append(out);
+  return box;
+}
+
+const note = text => element('span', text, {className: 'note'});
+// `digits` significant ones, without exponents where the number is of ordinary size.
+function figure(value, digits = 3) {
+  if (value === null || value === undefined || !isFinite(value)) return '\u2013';
+  const size = Math.abs(value);
+  return size !== 0 && (size < 1e-3 || size >= 1e5) ? value.toExponential(digits - 1)
+    : value.toFixed(Math.max(0, Math.min(6, digits - 1 - Math.floor(Math.log10(size || 1)))));
+}
+
+// A button that shows a moment of a camera.
+function lookButton(text, look) {
+  return element('button', text, {className: 'look', onclick: look});
+}
+
+function fillVerdict(box, report, look) {
+  const findings = report.verdict || [], doubts = findings.filter(f => !f.trusted);
+  const [word, kind] = report.trusted === undefined ? ['not examined', 'doubt'] : !report.trusted ? ['do not trust this twin', 'bad']
+    : findings.length ? ['trusted, with remarks', 'doubt'] : ['trusted', 'good'];
+  box.append(element('h2', 'Verdict'), element('p', word, {className: 'word ' + kind}));
+  const list = element('ul');
+  for (const finding of [...doubts, ...findings.filter(f => f.trusted)]) {
+    const line = element('li', finding.text + ' ');
+    if (finding.frame >= 0) line.append(lookButton('frame ' + finding.frame, () => look(finding.subject, finding.frame)));
+    list.append(line);
+  }
+  for (const camera of report.cameras) {
+    const worst = worstFrame(report, camera.name);
+    if (!worst) continue;
+    const line = element('li', `${camera.name}: the ${worst.motion} twin fits worst at ${worst.time.toFixed(2)} s, overlap ${figure(worst.iou)} `);
+    line.append(lookButton('look', () => look(camera.name, worst.frame, worst.motion)));
+    list.append(line);
+  }
+  const common = ['log_stiffness', 'log_damping', 'log_drag'], poor = (report.weak || []).filter(w => common.includes(w[0]));
+  if (poor.length)
+    list.append(element('li', 'The motion was too poor to tell ' + [...new Set(poor.map(w => w[0]))].join(', ') +
+                        ': their errors are those of what was assumed beforehand.'));
+  if (report.trusted === undefined) list.append(element('li', 'Cameras, clocks, grasp and size were taken as given.'));
+  box.append(list);
+}
+
+function worstFrame(report, camera) {
+  let worst = null;
+  for (const motion of report.motions) {
+    const frames = (motion.overlap || {})[camera];
+    if (frames) frames.values.forEach((iou, k) => {
+      if (!worst || iou < worst.iou) worst = {motion: motion.name, iou, time: frames.times[k], frame: frames.numbers[k]};
+    });
+  }
+  return worst;
+}
+
+const metricColumns = [['psnr_object', 'object PSNR, dB', 1, 1], ['psnr', 'PSNR, dB', 1, 1], ['iou', 'overlap (IoU)', 1, 3],
+                       ['ssim', 'SSIM', 1, 4], ['chamfer', 'Chamfer, mm', 1e3, 2], ['centerline_rms', 'centerline, mm', 1e3, 2],
+                       ['tip_rms', 'tip, mm', 1e3, 2]];
+
+function fillMetrics(box, report) {
+  const known = report.motions.filter(motion => motion.metrics);
+  if (!known.length) return;
+  const columns = metricColumns.filter(([key]) => known.some(motion => key in motion.metrics.mean)), rows = [];
+  for (const motion of known)
+    for (const [name, values] of [...Object.entries(motion.metrics.cameras), ['all', motion.metrics.mean]])
+      rows.push([`${motion.name}, ${name}`, ...columns.map(([key, , scale, digits]) => key in values ? (scale * values[key]).toFixed(digits) : '\u2013')]);
+  box.append(element('h2', 'How well it explains the capture'), table(['', ...columns.map(c => c[1])], rows));
+}
+
+function fillIdentified(box, report) {
+  if (!report.identified) return;
+  box.append(element('h2', 'Identified'));
+  if (!report.known_mass) box.append(element('p', 'The mass is not known: the total counts as 1 kg, forces are per kilogram of rope.', {className: 'legend'}));
+  const rows = report.identified.map(q => [q.name, figure(q.value), q.error === null ? '' : '\u00b1 ' + figure(q.error, 2), q.unit, note(q.note)]);
+  box.append(table(['', 'value', 'one \u03c3', 'unit', ''], rows, 'text'));
+  const more = element('details'), raw = report.estimates;
+  more.append(element('summary', `all ${raw.names.length} numbers of the fit`),
+              table(['name', 'value', 'one \u03c3'], raw.names.map((name, i) => [name, figure(raw.values[i], 4), figure(raw.errors[i], 2)])));
+  if (report.weak.length)
+    more.append(table(['combinations of which the data tell less than what was assumed beforehand'], report.weak.map(w => [w.join(', ')]), 'text names'));
+  if (raw.held.length) more.append(table(['held', 'why'], raw.held.map(h => [h.name, h.reason]), 'text'));
+  box.append(more);
+}
+
+function fillCorrections(box, report) {
+  const rows = [];
+  const lines = (subject, quantities) => {
+    for (const [name, q] of Object.entries(quantities))
+      if (q && typeof q === 'object' && 'state' in q && q.state !== 'held')
+        rows.push([`${subject}: ${name}`, [q.value].flat().map(v => figure(v)).join(', '), '\u00b1 ' + [q.sigma].flat().map(v => figure(v, 2)).join(', '), q.state]);
+  };
+  const {cameras = {}, ...rest} = report.corrections || {};
+  for (const [name, quantities] of Object.entries(cameras)) lines(name, quantities);
+  for (const [name, quantities] of Object.entries(rest)) lines(name, quantities);
+  if (!rows.length) return;
+  const more = element('details');
+  more.append(element('summary', 'all of them, in rad, m, s and px; what was found is given + value'), table(['', 'value', 'one \u03c3', ''], rows, 'text'));
+  box.append(element('h2', 'Corrections of the recording'), more);
+}
+
+function fillSeconds(box, report) {
+  const rows = Object.entries(report.seconds).filter(([, s]) => s > 0).map(([stage, s]) => [stage, s.toFixed(2)]);
+  if (!rows.length) return;
+  const total = Object.values(report.seconds).reduce((a, b) => a + b, 0);
+  box.append(element('h2', 'Time by stage, s'), table(null, [...rows, ['together', total.toFixed(2)]]));
+}

@@ -1,0 +1,79 @@
+// video.cpp - what a camera saw, as small JPEG pictures.
+#include <OpenImageIO/filesystem.h>
+#include <OpenImageIO/imageio.h>
+
+#include <algorithm>
+
+#include "chainsplat/render.h"
+#include "chainsplat/report.h"
+
+namespace chainsplat::report {
+
+namespace {
+
+constexpr int kWidth = 480;                       // px, at most: a phone's, and half of a usual camera's
+constexpr int kMostPictures = 300;                // 10 s at 30 Hz; longer recordings lose frames evenly
+constexpr std::size_t kPixelsAtOnce = 32u << 20;  // that are loaded, 128 MiB
+constexpr const char* kCompression = "jpeg:60";   // about 8 kB for 480 x 360
+
+// The RGB picture of a whole view with its sides divided by `shrink`, every pixel the mean of what it covers.
+capture::Image8 shrunk(const capture::View& view, int shrink) {
+  capture::Image8 out{view.width / shrink, view.height / shrink, 3, {}};
+  out.pixels.resize(3u * out.width * out.height);
+  for (int y = 0; y < out.height; ++y)
+    for (int x = 0; x < out.width; ++x)
+      for (int c = 0; c < 3; ++c) {
+        int sum = 0;
+        for (int dy = 0; dy < shrink; ++dy)
+          for (int dx = 0; dx < shrink; ++dx)
+            sum += view.rgba[4 * (static_cast<std::size_t>(y * shrink + dy) * view.width + x * shrink + dx) + c];
+        out.pixels[3 * (static_cast<std::size_t>(y) * out.width + x) + c] =
+            static_cast<std::uint8_t>((sum + shrink * shrink / 2) / (shrink * shrink));
+      }
+  return out;
+}
+
+std::string jpeg(const capture::Image8& image) {
+  std::vector<unsigned char> bytes;
+  OIIO::Filesystem::IOVecOutput sink(bytes);
+  OIIO::ImageSpec spec(image.width, image.height, image.channels, OIIO::TypeDesc::UINT8);
+  spec.attribute("Compression", kCompression);
+  const auto output = OIIO::ImageOutput::create("picture.jpg");
+  const bool written = output && output->set_ioproxy(&sink) && output->open("picture.jpg", spec) &&
+                       output->write_image(OIIO::TypeDesc::UINT8, image.pixels.data()) && output->close();
+  if (!written) throw WorkError("video", "OpenImageIO cannot write JPEG into memory", "leave `video` out");
+  return std::string(bytes.begin(), bytes.end());
+}
+
+}  // namespace
+
+Video read_video(const Path& capture, const std::string& camera, const twin::Twin& twin) {
+  capture::LoadOptions load;
+  load.images = false;
+  load.camera = camera;
+  capture::Capture facts = capture::load(capture, load);
+  capture::apply(twin.corrections, facts);
+  const capture::Camera& seen = facts.cameras.front();
+  const std::vector<double>& times = facts.times.front();
+  const double interval = render::median_interval(times);
+  const int frames = static_cast<int>(times.size());
+  const int every = (frames + kMostPictures - 1) / kMostPictures, shrink = (seen.width + kWidth - 1) / kWidth;
+  const int at_once =
+      static_cast<int>(std::max<std::size_t>(1, kPixelsAtOnce / (static_cast<std::size_t>(seen.width) * seen.height)));
+  Video out;
+  out.camera = seen.name;
+  load.images = true;
+  load.masked = false;
+  for (load.first = 0; load.first < frames; load.first = load.last) {
+    load.last = std::min(frames, load.first + at_once);
+    for (const capture::View& view : capture::load(capture, load).views) {
+      if (view.frame % every != 0 || !render::covered(twin.states, times[view.frame], interval)) continue;
+      out.times.push_back(times[view.frame]);
+      out.jpegs.push_back(jpeg(shrunk(view, shrink)));
+    }
+    core::stop_if_requested();
+  }
+  return out;
+}
+
+}  // namespace chainsplat::report

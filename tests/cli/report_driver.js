@@ -1,0 +1,57 @@
+// What report.sh puts at the end of a copy of the page: uses it as a person would, and leaves in the document what came
+// out: pictures of every camera over black at the frames asked for, and what the controls did.
+const checks = {};
+const wait = seconds => new Promise(done => setTimeout(done, 1e3 * seconds));
+
+function picture(camera, frame, motion) {
+  state.plain = true;
+  setMotion(motion);
+  setCamera(camera);
+  state.time = report.cameras[camera].times[frame];
+  drawNow();
+  const paper = document.createElement('canvas'), pen = paper.getContext('2d');
+  Object.assign(paper, {width: at('splats').width, height: at('splats').height});
+  pen.fillRect(0, 0, paper.width, paper.height);
+  pen.drawImage(at('splats'), 0, 0);
+  const shot = element('i', paper.toDataURL('image/png'), {className: 'shot', hidden: true});
+  shot.dataset.name = `${report.cameras[camera].name}/${String(frame).padStart(6, '0')}`;
+  document.body.append(shot);
+}
+
+async function drive(frames) {
+  if (paint) report.cameras.forEach((_, camera) => frames.forEach(frame => picture(camera, frame, motions.length - 1)));
+  state.plain = false;
+  setCamera(-1);
+  // the slider
+  at('time').value = (first + last) / 2;
+  at('time').dispatchEvent(new Event('input'));
+  await wait(0.2);
+  checks.slider = Math.abs(Number(document.body.dataset.time) - (first + last) / 2) < 0.01;
+  // play, and stop
+  at('play').click();
+  for (let k = 0; k < 6; ++k) tick(1000 + 40 * k);  // without a screen nobody says when frames are due
+  at('play').click();
+  const stopped = state.time;
+  checks.play = Math.abs(stopped - (first + last) / 2 - 0.2) < 1e-6 && at('clock').textContent === stopped.toFixed(2) + ' s';
+  await wait(0.2);
+  checks.stop = state.time === stopped;
+  // every button, every layer and every kind of video
+  for (const button of document.querySelectorAll('.bar button:not(#play), .look, #theme')) button.click(), drawNow();
+  for (const select of ['angle', 'mode', 'speed'])
+    for (const option of at(select).options) at(select).value = option.value, at(select).dispatchEvent(new Event('change')), drawNow();
+  // the free view turns and comes closer
+  setCamera(-1);
+  const {yaw, distance} = state.orbit, stage = at('stage');
+  stage.setPointerCapture = () => {};
+  const pointer = (kind, x) => stage.dispatchEvent(new PointerEvent(kind, {pointerId: 1, clientX: x, clientY: 50, buttons: 1}));
+  pointer('pointerdown', 50), pointer('pointermove', 90), pointer('pointerup', 90);
+  stage.dispatchEvent(new WheelEvent('wheel', {deltaY: 100, cancelable: true}));
+  checks.orbit = state.orbit.yaw !== yaw && state.orbit.distance > distance;
+  drawNow();
+  checks.width = document.documentElement.scrollWidth <= innerWidth;
+  checks.images = document.images.length === 0;
+  checks.title = document.title;
+  checks.sections = [...document.querySelectorAll('main section')].filter(s => s.offsetHeight > 0).map(s => s.id).join();
+  checks.errors = window.errors;
+  document.body.dataset.checks = JSON.stringify(checks);
+}

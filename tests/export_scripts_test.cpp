@@ -1,0 +1,114 @@
+// What exports for NumPy and MuJoCo hold. With CHAINSPLAT_TEST_EXPORTS=FOLDER they are left there, beside what the
+// program says of the same motion, for tests/cli/exports.sh, which runs them.
+#include <doctest/doctest.h>
+
+#include <cstdlib>
+
+#include "chainsplat/export.h"
+#include "small_twin.h"
+
+using namespace chainsplat;
+
+namespace {
+
+constexpr double kSeconds = 5.0;
+
+// A rope that lies on a table, which grips it and rolls it.
+twin::Twin table_twin() {
+  twin::Twin twin = test::small_twin(chain::Bending::planar);
+  twin.chain = chain::make_chain(0.3, 0.02, {0, 1, 0}, {0, 0, 1}, 5, chain::Bending::planar, false, 0.013);
+  twin.gaussians = test::spiral_gaussians(twin.chain, 300);
+  twin.tabletop = true;
+  twin.table_point = math::Vector3(0, 0, 0.54);
+  twin.table_normal = math::Vector3::UnitZ();
+  dynamics::Parameters& p = *twin.parameters;
+  p.table_normal = twin.table_normal;
+  p.tip_mass = 0.0;
+  for (double& c : p.air_quadratic) c = 0.0;
+  for (double& c : p.coulomb_friction) c = 0.2 + 0.2 * c;
+  for (double& c : p.viscous_friction) c = 1e-3;
+  for (int k = 0; k < twin.chain.angles(); ++k) {
+    p.roll_lever.push_back(2e-4 * (k - 2));
+    p.stiffness[k] += 6e-3, p.damping[k] += 3e-4;  // or it folds
+  }
+  p.substeps = 16;
+  return twin;
+}
+
+void write_all(twin::Twin twin, const Path& folder) {
+  const trajectory::Trajectory base = test::moving_base(kSeconds);
+  core::make_folder(folder);
+  twin.initial->time = 0.0;
+  twin.parameters->substeps = 16;  // its own steps must not be seen beside MuJoCo's
+  std::vector<double> times;
+  for (int k = 0; k <= 30 * static_cast<int>(kSeconds); ++k) times.push_back(k / 30.0);
+  twin.rollout = dynamics::rollout(dynamics::make_model(twin.chain, *twin.parameters), base, *twin.initial, times);
+  for (const math::VectorX& theta : twin.states.theta)
+    twin.states.covariance.push_back(1e-4 * math::MatrixX::Identity(theta.size(), theta.size()));
+  twin.estimates.names = {"log_stiffness", "log_damping"};
+  twin.estimates.values = twin.estimates.standard_errors = {0.1, 0.2};
+  twin.estimates.covariance = math::MatrixX::Identity(2, 2);
+  for (const char* const name : {"rope.xml", "twin.npz"}) exports::write(twin, twin.states, base, folder / name);
+  core::write_file(folder / "rollout.csv", twin::states_csv(twin.rollout));
+  core::write_file(folder / "centerline.csv", twin::centerline_csv(twin.chain, twin.rollout, base));
+}
+
+}  // namespace
+
+TEST_CASE("exports for NumPy and MuJoCo: every file that was named, the same bytes again") {
+  const char* const asked = std::getenv("CHAINSPLAT_TEST_EXPORTS");
+  const test::TemporaryFolder own("scripts");
+  const Path folder = asked ? Path(asked) : own.path;
+  twin::Twin free = test::small_twin();
+  for (double& b : free.parameters->air_linear) b = 2e-4;
+  write_all(free, folder / "free");
+  write_all(table_twin(), folder / "table");
+  for (const char* const name : {"rope.xml", "rope_base.csv", "rope_play.py", "twin.npz", "twin.py"})
+    CHECK(std::filesystem::file_size(folder / "free" / name) > 100);
+  CHECK(exports::files("a/rope.xml") == std::vector<Path>{"a/rope.xml", "a/rope_base.csv", "a/rope_play.py"});
+  CHECK(exports::files("a/b.c.npz") == std::vector<Path>{"a/b.c.npz", "a/b.c.py"});
+  write_all(free, folder / "again");
+  for (const char* const name : {"rope.xml", "twin.npz"})
+    CHECK(core::read_file(folder / "free" / name) == core::read_file(folder / "again" / name));
+
+  // a name with markup in it stays a name, and cannot end the comment
+  free.provenance.capture = "\"/>--><x a='";
+  const std::string model = exports::mujoco(free, test::moving_base(1.0), "rope").model;
+  CHECK(model.find("<x") == std::string::npos);
+  CHECK(model.find("-->") == model.rfind("-->"));
+}
+
+TEST_CASE("a twin that is not identified has no dynamics to export") {
+  twin::Twin twin = test::small_twin();
+  twin.parameters.reset();
+  const test::TemporaryFolder folder("unidentified");
+  CHECK_THROWS_AS(exports::write(twin, twin.states, {}, folder.path / "rope.xml"), InputError);
+  CHECK(std::filesystem::is_empty(folder.path));
+  exports::write(twin, twin.states, {}, folder.path / "twin.npz");
+  CHECK(std::filesystem::exists(folder.path / "twin.py"));
+}
+
+TEST_CASE("exported scales hold what the renderer adds at the nearest that a Gaussian comes to a camera") {
+  twin::Twin twin = test::small_twin(chain::Bending::spatial, 40);
+  capture::Camera camera;
+  camera.width = 640, camera.height = 480, camera.fx = 600, camera.fy = 620, camera.cx = 320, camera.cy = 240;
+  camera.world_from_camera.translation = {0, 0, -1};  // looks up along z
+  capture::Camera far = camera;
+  far.world_from_camera.translation.z() = -4;
+  const trajectory::Trajectory rest = trajectory::fit({trajectory::Sample{}}, "rest");
+  chain::States straight;
+  straight.time = {0.0};
+  straight.theta = {math::VectorX::Zero(twin.chain.angles())};
+  const splat::Gaussians& before = twin.gaussians;
+  const splat::Gaussians after = exports::with_low_pass(before, twin.chain, straight, rest, {far, camera});
+  for (int i = 0; i < before.count; ++i)
+    for (int c = 0; c < 3; ++c) {
+      const double pixel = (before.mean[3 * i + 2] + 1.0) / std::sqrt(600.0 * 620.0),
+                   scale = std::exp(before.log_scale[3 * i + c]);
+      CHECK(std::exp(after.log_scale[3 * i + c]) ==
+            doctest::Approx(std::sqrt(scale * scale + 0.3 * pixel * pixel)).epsilon(1e-5));
+    }
+  // a camera that the rope is behind sees nothing of it
+  camera.world_from_camera.translation.z() = 1;
+  CHECK(exports::with_low_pass(before, twin.chain, straight, rest, {camera}).log_scale == before.log_scale);
+}
