@@ -2,6 +2,7 @@
 #pragma once
 #include <cstdint>
 #include <functional>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -12,6 +13,9 @@ class App;
 }
 namespace chainsplat::eval {
 struct FrameMetrics;
+}
+namespace chainsplat::capture {
+struct Payload;
 }
 
 namespace chainsplat::tools {
@@ -67,6 +71,9 @@ void flush_output();
 // A text of the library, in which fields of options structs stand in backquotes, with the options of the command line
 // in their place: `frames` becomes --frames.
 std::string with_options(const std::string& text);
+// --tip-mass KG[,SIGMA] and what it says: nothing where `numbers` is empty. Throws InputError.
+void add_payload_option(CLI::App& command, std::vector<double>& numbers);
+std::optional<capture::Payload> payload_of(const std::vector<double>& numbers);
 
 // --- results.cpp --------------------------------------------------------------------------------
 // "-" is standard input.
