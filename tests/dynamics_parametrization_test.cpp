@@ -32,6 +32,8 @@ Rope make_rope(const char* name, chain::Bending bending, bool twist, bool table)
   p.air_linear = fill(links, table ? 0.0 : 5e-4), p.air_quadratic = fill(links, table ? 0.0 : 1e-3);
   p.stiffness = fill(n, 0.012), p.damping = fill(n, 4e-4), p.rest_angle = fill(n, 0.1);
   if (table) p.roll_lever = fill(n, 0.001);
+  if (!table) p.bending_friction = fill(n, 0.002), p.bending_friction_angle = fill(n, 0.05);
+  if (bending == chain::Bending::spatial) p.torsional_stiffness = fill(links, 0.01);
   return rope;
 }
 
@@ -45,7 +47,7 @@ std::vector<Rope> ropes() {
 // Every unknown that the chain has a number for.
 std::vector<Unknown> all_unknowns(const chain::Chain& chain) {
   std::vector<Unknown> out;
-  for (int q = 1; q <= static_cast<int>(Quantity::thetadot); ++q)
+  for (int q = 1; q <= static_cast<int>(Quantity::friction_state); ++q)
     for (int index = 0; index < 30; ++index) {
       const Unknown unknown{static_cast<Quantity>(q), index};
       Estimates named;
@@ -64,7 +66,10 @@ constexpr std::pair<std::vector<double> Parameters::*, std::vector<double> Tange
     {&Parameters::stiffness, &Tangent::stiffness},
     {&Parameters::rest_angle, &Tangent::rest_angle},
     {&Parameters::damping, &Tangent::damping},
-    {&Parameters::roll_lever, &Tangent::roll_lever}};
+    {&Parameters::roll_lever, &Tangent::roll_lever},
+    {&Parameters::bending_friction, &Tangent::bending_friction},
+    {&Parameters::bending_friction_angle, &Tangent::bending_friction_angle},
+    {&Parameters::torsional_stiffness, &Tangent::torsional_stiffness}};
 
 }  // namespace
 
@@ -73,7 +78,7 @@ TEST_CASE("names are read as they are written, and those of other chains and pro
     CAPTURE(rope.name);
     const std::vector<Unknown> all = all_unknowns(rope.chain);
     const int n = rope.chain.angles(), links = rope.chain.links() - 1;
-    CHECK(all.size() == static_cast<std::size_t>(7 + 5 * links + 4 * n));
+    CHECK(all.size() == static_cast<std::size_t>(10 + 5 * links + 5 * n));
     Estimates e;
     for (const Unknown& unknown : all) {
       e.names.push_back(name_of(unknown));
@@ -81,8 +86,8 @@ TEST_CASE("names are read as they are written, and those of other chains and pro
       CHECK(std::string(unit_of(unknown.quantity)) != "");
     }
     CHECK(unknowns_of(rope.chain, e) == all);
-    CHECK(parameters_among(all).size() == all.size() - 2 * static_cast<std::size_t>(n));
-    CHECK(initial_state_unknowns(rope.chain) == std::vector<Unknown>(all.end() - 2 * n, all.end()));
+    CHECK(parameters_among(all).size() == all.size() - 3 * static_cast<std::size_t>(n));
+    CHECK(initial_state_unknowns(rope.chain) == std::vector<Unknown>(all.end() - 3 * n, all.end() - n));
   }
   CHECK(name_of({Quantity::link_mass, 2}) == "log_mass_link_3");
   CHECK(unknown_named("rest_angle") == Unknown{Quantity::rest_angle, kEvery});
@@ -134,8 +139,9 @@ TEST_CASE("tangents agree with central differences of the moved parameters, for 
       compare((up.tip_mass - down.tip_mass) / (2.0 * kStep), found[i].tip_mass, std::max(p.tip_mass, 1e-3));
       CHECK(std::abs(total_mass(up) - total_mass(rope.parameters)) < 1e-15);
       const InitialState moved_up = moved(zero, all, at + step), moved_down = moved(zero, all, at - step);
-      for (const auto& [value, slope] :
-           {std::pair{&InitialState::theta, &Tangent::theta}, {&InitialState::thetadot, &Tangent::thetadot}}) {
+      for (const auto& [value, slope] : {std::pair{&InitialState::theta, &Tangent::theta},
+                                         {&InitialState::thetadot, &Tangent::thetadot},
+                                         {&InitialState::friction_state, &Tangent::friction_state}}) {
         const VectorX difference = (moved_up.*value - moved_down.*value) / (2.0 * kStep);
         const VectorX& s = found[i].*slope;
         CHECK((difference - (s.size() ? s : VectorX::Zero(difference.size()).eval())).norm() < 1e-9);

@@ -110,8 +110,9 @@ Options options_of(const Case& what) {
 std::vector<double> cramer_rao(const Truth& truth, const Case& what, const std::vector<std::string>& names) {
   dynamics::Model model = dynamics::make_model(truth.chain, truth.parameters);
   const Unknowns unknowns =
-      make_unknowns(truth.chain, options_of(what), truth.states.theta[0], VectorX::Zero(8),
-                    VectorX::Constant(8, std::hypot(kNoise, 0.5 * kThetaSd)), what.table ? kAtRestSd : kRateSd);
+      make_unknowns(truth.chain, options_of(what),
+                    {truth.states.theta[0], VectorX::Zero(8), VectorX::Constant(8, std::hypot(kNoise, 0.5 * kThetaSd)),
+                     what.table ? kAtRestSd : kRateSd});
   REQUIRE(unknowns.names() == names);
   const auto tangents = dynamics::tangents(truth.chain, truth.parameters, unknowns.list);
   const dynamics::BaseGrid grid = dynamics::sample_base(base_at, 0.0, truth.states.time, 16);

@@ -56,13 +56,19 @@ struct GivenSigma {
   double deviation = 0.0;
 };
 
+// A weight at the free end, kg, and its standard deviation.
+struct Payload {
+  double mass = 0.0, sigma = 0.0;
+};
+
 struct Capture {
   Path folder;
   std::string name;
   bool tabletop = false;
   math::Vector3 gravity{0, 0, -9.81};     // world frame, m/s^2
   double length = 0, diameter = 0;        // m
-  std::optional<double> mass;             // kg
+  std::optional<double> mass;             // kg, of the rope without its payload
+  std::optional<Payload> payload;         // none: not known to be there, nor to be absent
   math::Vector3 direction, bending_axis;  // unit, base frame
   std::optional<Table> table;
   std::vector<Camera> cameras;

@@ -41,6 +41,12 @@ struct Parameters {
   // the friction across link j (along bending axis x link), share_kj = min(s_k, middle of j) / L. It is k r L B/C for a
   // natural curvature k out of the plane, radius r, bending stiffness B and torsional stiffness C.
   std::vector<double> roll_lever;
+  // Dry friction in bending (mathematics.md 3.10), an angle; both empty: none. The moment of joints that slip, N m, and
+  // the bend over which it builds up after a change of direction, rad. Angles that twist the rope have none.
+  std::vector<double> bending_friction, bending_friction_angle;
+  // N m/rad, a joint of two bending angles; empty: what the rope is naturally bent keeps its place about the links.
+  // Else the rope twists freely within the links until all its moments about itself balance (mathematics.md 3.11).
+  std::vector<double> torsional_stiffness;
   double tip_mass = 0.0;                // kg, point mass at the free end
   double radius = 0.0;                  // m, of the cylinder that gives the links' inertia; 0 allowed
   Vector3 gravity{0, 0, -9.81};         // m/s^2, world
@@ -52,6 +58,10 @@ struct Parameters {
   int substeps = 4;  // a frame of 1/30 s
 };
 
+// Speed below which friction in bending is a spring, rad/s: slow for every motion that a camera sees. It rounds the
+// corner of |theta'| at 0, and keeps a joint at rest from creeping.
+inline constexpr double kBendingFrictionRate = 1e-3;
+
 // Of all links and the tip, kg.
 double total_mass(const Parameters& parameters);
 
@@ -59,6 +69,9 @@ double total_mass(const Parameters& parameters);
 struct InitialState {
   double time = 0.0;
   VectorX theta, thetadot;  // rad, rad/s
+  // The share of the friction moment that each angle's bending has built up, from -1 to 1, for ropes with friction in
+  // bending; empty: 0, a rope that has come to rest by ever smaller swings.
+  VectorX friction_state = {};
 };
 
 // What identification says of its numbers; one entry per fitted number, in the order of the covariance. Names are those
@@ -101,7 +114,8 @@ trajectory::BaseMotion at_rest(const math::Pose& pose);
 // tau_i = A_i^T F_i of mathematics.md 3.2, external wrenches of mathematics.md 3.3 included, joint law not. n, N m.
 VectorX inverse_dynamics(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                          const VectorX& thetadot, const VectorX& thetaddot);
-// -K (theta - theta_0) - D thetadot. n, N m.
+// -K (theta - theta_0) - D thetadot. n, N m. What follows here about single states leaves friction in bending out,
+// whose moment is of the past (friction_states()).
 VectorX joint_law(const Model& model, const VectorX& theta, const VectorX& thetadot);
 // M(theta), n x n, kg m^2. mathematics.md 3.4.
 MatrixX mass_matrix(const Model& model, const VectorX& theta);
@@ -164,6 +178,12 @@ struct Equilibrium {
 };
 Equilibrium static_equilibrium(const Model& model, const math::Pose& base, const VectorX& start = {});
 
+// The friction states of InitialState along given motion, from `before` (empty: 0) at its first time: exact where the
+// angles of a joint go straight from one time to the next. Empty for a rope without friction in bending.
+std::vector<VectorX> friction_states(const Model& model, const std::vector<VectorX>& theta, const VectorX& before = {});
+// Where only one state is known: those of joints that have moved on at their present rates until here. Empty as above.
+VectorX friction_state_in_motion(const Model& model, const VectorX& theta, const VectorX& thetadot);
+
 // The base motion on the integrator's own time grid, sampled once for many rollouts.
 struct BaseGrid {
   struct Node {
@@ -185,8 +205,10 @@ BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<d
 struct Tangent {
   std::vector<double> link_mass, viscous_friction, coulomb_friction, air_linear, air_quadratic;  // a link
   std::vector<double> stiffness, rest_angle, damping, roll_lever;                                // an angle
+  std::vector<double> bending_friction, bending_friction_angle;                                  // an angle
+  std::vector<double> torsional_stiffness;                                                       // a joint
   double tip_mass = 0.0;
-  VectorX theta, thetadot;
+  VectorX theta, thetadot, friction_state;
 };
 // d(joint law - tau_ID) / d unknowns at fixed thetaddot = a, n x unknowns; M^-1 of it is da / d unknowns. The tangents'
 // initial states have no part in it.
@@ -208,6 +230,10 @@ struct Divergence {
 // all bounds (then `states` is shorter). With `unknowns`, the variational equation is integrated beside (mathematics.md
 // 4; RODAS3 only): trapezoidal rule with the factorization of the step, second order, not the exact derivative of the
 // discrete map.
+bool simulate(const Model& model, const BaseGrid& grid, const InitialState& initial, chain::States& states,
+              std::span<const Tangent> unknowns = {}, Sensitivities* sensitivities = nullptr,
+              Divergence* divergence = nullptr);
+// From angles and rates alone.
 bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta, const VectorX& thetadot,
               chain::States& states, std::span<const Tangent> unknowns = {}, Sensitivities* sensitivities = nullptr,
               Divergence* divergence = nullptr);
@@ -222,6 +248,8 @@ struct BaseUnknowns {
 };
 // The same rollout with its derivatives by those; RODAS3 only. `exact`: those of the discrete map, stage by stage; else
 // by the trapezoidal rule as above, of second order and several times faster, enough for a Gauss-Newton step.
+bool simulate(const Model& model, const BaseGrid& grid, const InitialState& initial, chain::States& states,
+              const BaseUnknowns& unknowns, bool exact, Sensitivities& sensitivities);
 bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta, const VectorX& thetadot,
               chain::States& states, const BaseUnknowns& unknowns, bool exact, Sensitivities& sensitivities);
 
@@ -235,8 +263,10 @@ class Stepper {
   // thetaddot of the free motion as forward_dynamics(); NaN where M is singular. Valid until the next call.
   const VectorX& acceleration(const trajectory::BaseMotion& base, const VectorX& theta, const VectorX& thetadot);
   // From `now` (motion, jerk, step) to the base motion `next`, with the model's integrator; `substeps` are the
-  // caller's. False where the state leaves all bounds or M is singular.
-  bool step(const BaseGrid::Node& now, const trajectory::BaseMotion& next, VectorX& theta, VectorX& thetadot);
+  // caller's. `friction_state`, where given, goes along; without it friction in bending starts at 0. False where the
+  // state leaves all bounds or M is singular.
+  bool step(const BaseGrid::Node& now, const trajectory::BaseMotion& next, VectorX& theta, VectorX& thetadot,
+            VectorX* friction_state = nullptr);
 
  private:
   std::unique_ptr<Step> step_;

@@ -25,6 +25,11 @@ inline constexpr double kTipPart = 0.03;
 inline constexpr double kCoulombMean = 0.3;
 inline constexpr double kViscousRate = 3.0;  // 1/s, friction over mass
 
+// Friction in bending, where the data ask for it: of the moment weight times length; rad, of a joint that stands for
+// the mean length of a link.
+inline constexpr double kBendingFrictionPart = 0.02;
+inline constexpr double kBendingFrictionAngle = 0.05;
+
 // What is known of an unknown beforehand: takes the place of its prior. The index can be dynamics::kEvery.
 struct Prior {
   dynamics::Unknown unknown;
@@ -36,6 +41,13 @@ struct Options {
   math::Vector3 gravity{0, 0, -9.81};   // m/s^2, world
   math::Vector3 table_normal{0, 0, 1};  // unit, world; used on a table
   std::optional<double> mass;           // kg, links and tip; none: 1 kg, forces are then per kilogram
+  // kg, a payload at the free end and its standard deviation; part of `mass`, which must be there. None: a rope's bare
+  // end, or where the data ask for it a payload of unknown mass.
+  std::optional<double> tip_mass;
+  double tip_mass_deviation = 0.0;
+  // Where a fit in free space leaves more than the errors of the data, friction in bending and a payload are tried, and
+  // taken if the evidence is for them (mathematics.md 5.10).
+  bool ask_for_more = true;
   bool fit_stiffness = true;            // else 0
   bool per_joint = true;                // stiffness, damping and mass vary smoothly along the rope
   bool friction_per_link = true;        // else one Coulomb coefficient for the whole rope
@@ -82,6 +94,13 @@ struct MarkerFit {
   solve::Summary summary;  // of all times together; rad
 };
 MarkerFit fit_markers(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers);
+
+// The state at the first time with which `parameters` follow the first `seconds` of the markers best, rates and
+// friction states included. Throws as identify().
+inline constexpr double kInitialWindow = 0.5;  // s
+dynamics::InitialState fit_initial(const chain::Chain& chain, const dynamics::Parameters& parameters,
+                                   const trajectory::Trajectory& base, const Markers& markers,
+                                   double seconds = kInitialWindow);
 
 // Of one recording. Throws InputError for too little data, WorkError where no start gives a rollout that stays finite.
 Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,

@@ -82,6 +82,7 @@ const char* stage_text(Stage stage);
 
 struct IdentifyOptions {
   bool joint = false;  // refine angles, Gaussians and dynamics together afterwards; one run, whose capture is there
+  std::optional<capture::Payload> payload;  // instead of what the twins know of it
   std::uint64_t seed = 0;
   std::string device;
 };
@@ -97,6 +98,7 @@ IdentifyResult identify(const std::vector<Path>& runs, const IdentifyOptions& op
 
 struct MarkerOptions {
   bool shape_only = false;  // fit the states, identify nothing
+  std::optional<capture::Payload> payload;  // instead of what the twin knows of it
   std::uint64_t seed = 0;
 };
 // Dynamics from marker files (marker_files.h). The twin, which may be an empty one, keeps the motion of the first file.

@@ -48,7 +48,8 @@ std::string mode_text(Mode mode);
 // How the twin was made. What later work goes by has a type of its own; absent: not known, or it does not apply.
 struct Provenance {
   std::string version, capture, capture_hash, device, driver;
-  std::optional<double> mass;                 // kg, of the rope
+  std::optional<double> mass;                 // kg, of the rope without its payload
+  std::optional<capture::Payload> payload;    // weighed; none: not known
   std::optional<capture::FrameRange> frames;  // of the capture that were recognized
   std::optional<int> every;                   // frames between those that trained the Gaussians
   std::optional<Mode> mode;

@@ -719,6 +719,29 @@ void read_sigma(const Reader& reader, Capture& capture) {
   read(object, "object", "object");
 }
 
+// object.tip_mass: a number, or { value, sigma }.
+std::optional<Payload> read_payload(const Reader& object, bool known_mass) {
+  constexpr const char* kExpected = "kilograms, as 0.2 or { \"value\": 0.2, \"sigma\": 0.01 }";
+  const Json* const given = object.find("tip_mass", false, kExpected);
+  if (!given) return {};
+  const auto mass = [&](const Json* value) {
+    return value && value->is_number() && value->get<double>() >= 0.0 && value->get<double>() <= kHeaviest;
+  };
+  const auto member = [&](const char* name) {
+    return given->is_object() && given->contains(name) ? &(*given)[name] : nullptr;
+  };
+  const Json* const value = given->is_object() ? member("value") : given;
+  const Json* const sigma = member("sigma");
+  if (!mass(value) || (sigma && !mass(sigma)))
+    object.problem("tip_mass", "is no mass from 0 to " + core::exact(kHeaviest) + " kg",
+                   std::string("write ") + kExpected);
+  else if (!known_mass)
+    object.problem("tip_mass", "says nothing beside a rope of unknown mass", "give object.mass, too");
+  else
+    return Payload{value->get<double>(), sigma ? sigma->get<double>() : 0.0};
+  return {};
+}
+
 std::uint64_t capture_hash(const std::string& text, const Manifest& manifest, const Path& base) {
   std::uint64_t hash = core::fnv1a(text);
   std::error_code error;
@@ -777,13 +800,14 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
   // the rope
   const Reader object = top.child("object", true, "{ \"length\": 0.3, \"diameter\": 0.02, \"mass\": 0.06 }");
   if (object.present()) {
-    object.know({"length", "diameter", "mass"});
+    object.know({"length", "diameter", "mass", "tip_mass"});
     capture.length = object.positive("length", "meters from the grasp to the free end", kLongestRope, " m");
     capture.diameter = object.positive("diameter", "meters");
     if (object.has("mass")) {
       const double mass = object.positive("mass", "kilograms, or leave it out", kHeaviest, " kg");
       if (mass > 0) capture.mass = mass;
     }
+    capture.payload = read_payload(object, capture.mass.has_value());
     if (capture.length > kTopMeters) object.doubt("length", core::exact(capture.length) + " m: are these millimeters?");
     if (capture.length > 0 && capture.diameter >= capture.length)
       object.problem("diameter", "is not less than the length", "write both in meters");

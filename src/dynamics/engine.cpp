@@ -172,6 +172,7 @@ void Engine::set_state(const VectorX& theta, const VectorX& thetadot) {
   const Parameters& p = model.parameters;
   for (int k = 0; k < angles; ++k)
     torque[k] = -p.stiffness[k] * (theta[k] - p.rest_angle[k]) - p.damping[k] * thetadot[k];
+  for (Eigen::Index k = 0; k < friction_state.size(); ++k) torque[k] -= p.bending_friction[k] * friction_state[k];
 }
 
 void Engine::add_roll() {
@@ -196,6 +197,8 @@ void Engine::joint_forces(const Tangent& d, Eigen::Ref<VectorX> column) const {
     for (int k = 0; k < angles; ++k) column[k] += p.stiffness[k] * d.rest_angle[k];
   if (!d.damping.empty())
     for (int k = 0; k < angles; ++k) column[k] -= d.damping[k] * thetadot_[k];
+  if (!d.bending_friction.empty())
+    for (Eigen::Index k = 0; k < friction_state.size(); ++k) column[k] -= d.bending_friction[k] * friction_state[k];
   if (!rolls) return;
   if (!d.roll_lever.empty())
     for (int k = 0; k < angles; ++k) column[k] -= d.roll_lever[k] * roll_share.row(k).dot(roll_friction);

@@ -86,7 +86,8 @@ class Engine {
   int singular_angle = -1;
   std::vector<LinkConstants> links;
 
-  VectorX torque;        // joint law
+  VectorX friction_state;  // of bending, for place(); empty: no friction
+  VectorX torque;          // joint law, and friction in bending
   VectorX bias;          // tau_ID at zero acceleration
   VectorX force;         // torque - bias = M a
   VectorX acceleration;  // a

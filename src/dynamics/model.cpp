@@ -39,6 +39,15 @@ Model make_model(const chain::Chain& chain, const Parameters& p) {
     check_array(p.roll_lever, angles, "roll_lever", true);
     require(is_planar(chain), "roll_lever is given for a chain that bends in more than one plane", "leave it empty");
   }
+  require(p.bending_friction.empty() == p.bending_friction_angle.empty(),
+          "bending_friction is given without bending_friction_angle, or the other way round", "give both or none");
+  if (!p.bending_friction.empty()) {
+    check_array(p.bending_friction, angles, "bending_friction");
+    check_array(p.bending_friction_angle, angles, "bending_friction_angle");
+    for (const double angle : p.bending_friction_angle)
+      require(angle > 0.0, "a bending_friction_angle is 0", "give a number > 0");
+    require(p.integrator == Integrator::rodas3, "friction in bending needs the integrator rodas3", "choose it");
+  }
   check_array({p.tip_mass, p.radius}, 2, "tip_mass or radius");
   check_array({p.coulomb_speed, p.drag_speed}, 2, "coulomb_speed or drag_speed");
   require(p.coulomb_speed > 0.0 && p.drag_speed > 0.0, "a regularization speed is 0", "give a number > 0");

@@ -25,9 +25,11 @@ constexpr Array kLinkMass{&Parameters::link_mass, &Tangent::link_mass},
     kCoulomb{&Parameters::coulomb_friction, &Tangent::coulomb_friction},
     kAirLinear{&Parameters::air_linear, &Tangent::air_linear},
     kAirQuadratic{&Parameters::air_quadratic, &Tangent::air_quadratic},
-    kStiffness{&Parameters::stiffness, &Tangent::stiffness},
-    kRestAngle{&Parameters::rest_angle, &Tangent::rest_angle}, kDamping{&Parameters::damping, &Tangent::damping},
-    kRollLever{&Parameters::roll_lever, &Tangent::roll_lever};
+    kStiffness{&Parameters::stiffness, &Tangent::stiffness}, kRestAngle{&Parameters::rest_angle, &Tangent::rest_angle},
+    kDamping{&Parameters::damping, &Tangent::damping}, kRollLever{&Parameters::roll_lever, &Tangent::roll_lever},
+    kBendingFriction{&Parameters::bending_friction, &Tangent::bending_friction},
+    kTorsionalStiffness{&Parameters::torsional_stiffness, &Tangent::torsional_stiffness},
+    kBendingFrictionAngle{&Parameters::bending_friction_angle, &Tangent::bending_friction_angle};
 
 // Which elements of its arrays unknown `index` of a quantity acts on.
 bool every(const chain::Chain&, int, int) { return true; }
@@ -65,9 +67,16 @@ const Row kRows[] = {
     {Quantity::tip_mass, "logit_tip_mass_fraction", "logit", 1.0, Per::rope, How::tip_logit},
     {Quantity::rest_angle, "rest_angle", "rad", 0.2, Per::angle, How::addition, {kRestAngle}},
     {Quantity::roll_lever, "roll_lever", "m", 0.01, Per::angle, How::addition, {kRollLever}},
+    {Quantity::bending_friction, "log_bending_friction", "log(N m)", 1.0, Per::rope, How::logarithm, {kBendingFriction}, every},
+    {Quantity::bending_friction_angle, "log_bending_friction_angle", "log(rad)", 1.0, Per::rope, How::logarithm,
+     {kBendingFrictionAngle}, every},
+    {Quantity::torsional_stiffness, "log_torsional_stiffness", "log(N m/rad)", 1.0, Per::rope, How::logarithm,
+     {kTorsionalStiffness}, every},
     {Quantity::theta, "theta", "rad", 0.2, Per::angle, How::addition, {}, own, &InitialState::theta, &Tangent::theta},
     {Quantity::thetadot, "thetadot", "rad/s", 1.0, Per::angle, How::addition, {}, own, &InitialState::thetadot,
      &Tangent::thetadot},
+    {Quantity::friction_state, "friction_state", "1", 0.3, Per::angle, How::addition, {}, own,
+     &InitialState::friction_state, &Tangent::friction_state},
 };
 // clang-format on
 
@@ -199,8 +208,10 @@ Parameters moved(const chain::Chain& chain, const Parameters& reference, std::sp
 InitialState moved(const InitialState& reference, std::span<const Unknown> unknowns, const VectorX& change) {
   InitialState out = reference;
   for (std::size_t i = 0; i < unknowns.size(); ++i)
-    if (const auto state = row_of(unknowns[i].quantity).state)
+    if (const auto state = row_of(unknowns[i].quantity).state) {
+      if ((out.*state).size() == 0) out.*state = VectorX::Zero(reference.theta.size());
       (out.*state)[unknowns[i].index] += change[static_cast<Eigen::Index>(i)];
+    }
   return out;
 }
 

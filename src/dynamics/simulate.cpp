@@ -8,7 +8,7 @@ namespace {
 
 constexpr double kFrame = 1.0 / 30.0;  // s, what `substeps` counts in
 constexpr int kMaxRefinement = 32;     // of the steps of a diverging rollout
-constexpr int kMostSteps = 4000000;     // a step is kept with its motion: 1 GiB. At 8 steps a frame more than four hours
+constexpr int kMostSteps = 4000000;    // a step is kept with its motion: 1 GiB. At 8 steps a frame more than four hours
 constexpr double kJerkStep = 0.01;     // of a step, for the one-sided difference of the base acceleration
 
 }  // namespace
@@ -23,10 +23,12 @@ BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<d
   double now = start;
   std::size_t begin = 0;
   if (times.empty()) throw InputError("rollout", "no output times", "ask for at least one");
-  if (const double steps = (times.back() - start) / kFrame * substeps; steps > kMostSteps && std::isfinite(times.back()))
+  if (const double steps = (times.back() - start) / kFrame * substeps;
+      steps > kMostSteps && std::isfinite(times.back()))
     throw InputError("rollout",
                      "from " + core::exact(start) + " to " + core::exact(times.back()) + " s it would take " +
-                         core::exact(std::ceil(steps)) + " steps, and memory is meant for " + std::to_string(kMostSteps),
+                         core::exact(std::ceil(steps)) + " steps, and memory is meant for " +
+                         std::to_string(kMostSteps),
                      "check the times, or split the motion");
   grid.nodes.push_back({start, 0.0, base(start), Vector6::Zero(), false});
   if (times[0] == start) {
@@ -59,15 +61,19 @@ BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<d
 
 namespace {
 
-bool integrate(const Model& model, const BaseGrid& grid, const VectorX& theta0, const VectorX& thetadot0,
-               chain::States& states, Variation* variation, Sensitivities* sensitivities, Divergence* divergence) {
+bool integrate(const Model& model, const BaseGrid& grid, const InitialState& initial, chain::States& states,
+               Variation* variation, Sensitivities* sensitivities, Divergence* divergence) {
   const int n = model.chain.angles();
-  CHAINSPLAT_CHECK(theta0.size() == n && thetadot0.size() == n, std::to_string(theta0.size()));
+  CHAINSPLAT_CHECK(initial.theta.size() == n && initial.thetadot.size() == n, std::to_string(initial.theta.size()));
+  CHAINSPLAT_CHECK(initial.friction_state.size() == 0 || initial.friction_state.size() == n,
+                   std::to_string(initial.friction_state.size()));
   CHAINSPLAT_CHECK(!variation || model.parameters.integrator == Integrator::rodas3,
                    "variational equation with the Euler step");
   Step step(model);
   Factor other_factor(n);
-  VectorX theta = theta0, thetadot = thetadot0;
+  VectorX theta = initial.theta, thetadot = initial.thetadot;
+  const bool friction = step.friction.present;
+  if (friction && initial.friction_state.size()) step.friction_state = initial.friction_state;
 
   std::size_t count = 0;
   const auto write = [&](double time) {
@@ -75,6 +81,8 @@ bool integrate(const Model& model, const BaseGrid& grid, const VectorX& theta0, 
       states.time.emplace_back(), states.theta.emplace_back(), states.thetadot.emplace_back();
     if (states.thetadot.size() <= count) states.thetadot.resize(count + 1);
     states.time[count] = time, states.theta[count] = theta, states.thetadot[count] = thetadot;
+    if (friction && states.friction_state.size() <= count) states.friction_state.resize(count + 1);
+    if (friction) states.friction_state[count] = step.friction_state;
     if (variation) {
       if (sensitivities->theta.size() <= count)
         sensitivities->theta.emplace_back(), sensitivities->thetadot.emplace_back();
@@ -84,6 +92,7 @@ bool integrate(const Model& model, const BaseGrid& grid, const VectorX& theta0, 
   };
   const auto finish = [&](bool good) {
     states.time.resize(count), states.theta.resize(count), states.thetadot.resize(count);
+    states.friction_state.resize(friction ? count : 0);
     if (variation) sensitivities->theta.resize(count), sensitivities->thetadot.resize(count);
     return good;
   };
@@ -99,15 +108,16 @@ bool integrate(const Model& model, const BaseGrid& grid, const VectorX& theta0, 
     if (!step.bounded(theta, thetadot)) return failed();
     if ((!last || variation) && !step.linearize(now, theta, thetadot)) return failed();
     if (variation && (node == 0 || variation->exact)) {
-      if (!variation->start(step.engine, node)) return failed();
+      if (!variation->start(step.engine, step.friction, node)) return failed();
     } else if (variation) {
       const double half = 0.5 * last_step;
       const bool same = !last && std::abs(last_step - now.step) <= 1e-9 * now.step;
       if (!same) {
         other_factor.matrix = step.engine.mass + half * step.engine.damping + (half * half) * step.engine.stiffness;
+        if (friction) step.friction.add_to(half, other_factor.matrix);
         if (!other_factor.factor()) return failed();
       }
-      variation->advance(step.engine, same ? step.factor : other_factor, node, half);
+      variation->advance(step.engine, step.friction, same ? step.factor : other_factor, node, half);
     }
     if (now.output) write(now.time);
     if (last) break;
@@ -119,30 +129,43 @@ bool integrate(const Model& model, const BaseGrid& grid, const VectorX& theta0, 
 
 }  // namespace
 
-bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta, const VectorX& thetadot,
-              chain::States& states, std::span<const Tangent> unknowns, Sensitivities* sensitivities,
-              Divergence* divergence) {
-  if (!sensitivities || unknowns.empty())
-    return integrate(model, grid, theta, thetadot, states, nullptr, nullptr, divergence);
+bool simulate(const Model& model, const BaseGrid& grid, const InitialState& initial, chain::States& states,
+              std::span<const Tangent> unknowns, Sensitivities* sensitivities, Divergence* divergence) {
+  if (!sensitivities || unknowns.empty()) return integrate(model, grid, initial, states, nullptr, nullptr, divergence);
   const auto forces = [&](Engine& engine, std::size_t, double, MatrixX& out) { engine.unknown_forces(unknowns, out); };
-  Variation variation(model.chain.angles(), static_cast<Eigen::Index>(unknowns.size()), forces, {}, false);
+  const bool friction = BendingFriction(model).present;
+  Variation variation(model.chain.angles(), static_cast<Eigen::Index>(unknowns.size()), forces, {}, false, friction);
+  variation.tangents = unknowns;
   for (Eigen::Index p = 0; p < variation.x.cols(); ++p) {
     if (unknowns[p].theta.size()) variation.x.col(p) = unknowns[p].theta;
     if (unknowns[p].thetadot.size()) variation.y.col(p) = unknowns[p].thetadot;
+    if (friction && unknowns[p].friction_state.size()) variation.z.col(p) = unknowns[p].friction_state;
   }
-  return integrate(model, grid, theta, thetadot, states, &variation, sensitivities, divergence);
+  return integrate(model, grid, initial, states, &variation, sensitivities, divergence);
 }
 
 bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta, const VectorX& thetadot,
-              chain::States& states, const BaseUnknowns& unknowns, bool exact, Sensitivities& sensitivities) {
+              chain::States& states, std::span<const Tangent> unknowns, Sensitivities* sensitivities,
+              Divergence* divergence) {
+  return simulate(model, grid, InitialState{0.0, theta, thetadot}, states, unknowns, sensitivities, divergence);
+}
+
+bool simulate(const Model& model, const BaseGrid& grid, const InitialState& initial, chain::States& states,
+              const BaseUnknowns& unknowns, bool exact, Sensitivities& sensitivities) {
   BaseSlopes slopes;
   const auto forces = [&](Engine& engine, std::size_t node, double after, MatrixX& out) {
     engine.base_slopes(slopes);
     unknowns.torques(node, after, slopes, out);
     out = -out;
   };
-  Variation variation(model.chain.angles(), unknowns.count, forces, unknowns.motion, exact);
-  return integrate(model, grid, theta, thetadot, states, &variation, &sensitivities, nullptr);
+  Variation variation(model.chain.angles(), unknowns.count, forces, unknowns.motion, exact,
+                      BendingFriction(model).present);
+  return integrate(model, grid, initial, states, &variation, &sensitivities, nullptr);
+}
+
+bool simulate(const Model& model, const BaseGrid& grid, const VectorX& theta, const VectorX& thetadot,
+              chain::States& states, const BaseUnknowns& unknowns, bool exact, Sensitivities& sensitivities) {
+  return simulate(model, grid, InitialState{0.0, theta, thetadot}, states, unknowns, exact, sensitivities);
 }
 
 chain::States rollout(const Model& model, const BaseFunction& base, const InitialState& initial,
@@ -161,8 +184,7 @@ chain::States rollout(const Model& model, const BaseFunction& base, const Initia
     const std::string name = euler ? "implicit Euler" : "RODAS3";
     for (int refinement = 1; refinement <= kMaxRefinement; refinement *= 2) {
       const int substeps = now.parameters.substeps * refinement;
-      if (simulate(now, sample_base(base, initial.time, times, substeps), initial.theta, initial.thetadot, states, {},
-                   nullptr, &last))
+      if (simulate(now, sample_base(base, initial.time, times, substeps), initial, states, {}, nullptr, &last))
         return states;
       const std::string joint = "joint " + std::to_string(model.chain.child_link[last.angle]);
       if (last.singular)

@@ -5,6 +5,7 @@
 #include <functional>
 #include <vector>
 
+#include "bending_friction.h"
 #include "planar.h"
 
 namespace chainsplat::dynamics {
@@ -69,23 +70,28 @@ struct Variation {
   bool exact = false;
   MatrixX x, y;          // d theta / d unknowns, d thetadot / d unknowns
   MatrixX acceleration;  // y'
+  // The same of the state of friction in bending, where there is one: z and z', by unknowns with tangents of it.
+  MatrixX z, z_rate;
+  std::span<const Tangent> tangents;
 
-  Variation(int n, Eigen::Index unknowns, Forces forces_of, Base base, bool exact);
-  // The acceleration at a node where the engine is linearized. False where the mass matrix is singular.
-  bool start(Engine& engine, std::size_t node);
-  // The engine is linearized at the new node; `factor` holds M + g damping + g^2 stiffness there, g half the step
-  // before.
-  void advance(Engine& engine, const Factor& factor, std::size_t node, double g);
+  Variation(int n, Eigen::Index unknowns, Forces forces_of, Base base, bool exact, bool friction);
+  // The acceleration at a node where engine and friction are linearized. False where the mass matrix is singular.
+  bool start(Engine& engine, const BendingFriction& friction, std::size_t node);
+  // Engine and friction are linearized at the new node; `factor` holds M + g damping + g^2 stiffness there, with the
+  // friction's part, g half the step before.
+  void advance(Engine& engine, const BendingFriction& friction, const Factor& factor, std::size_t node, double g);
 
   // Step's own, for `exact`: what multiplies 1/G - J, and the stages
   MatrixX right, work, stage_x, stage_y, k_x[4], k_y[4];
+  MatrixX right_z, stage_z, k_z[4];
   VectorX probe_theta, probe_rate;
-  // forces = b + J S at (s_x, s_y): forces_of - stiffness s_x - damping s_y
-  void force(Engine& engine, std::size_t node, double after, const MatrixX& s_x, const MatrixX& s_y, MatrixX& forces);
+  // forces = b + J S at (s_x, s_y, s_z): forces_of - stiffness s_x - damping s_y - friction's moment s_z
+  void force(Engine& engine, const BendingFriction& friction, std::size_t node, double after, const MatrixX& s_x,
+             const MatrixX& s_y, const MatrixX& s_z, MatrixX& forces);
 
  private:
   Factor mass_;
-  MatrixX forces_, predicted_x_, predicted_y_;
+  MatrixX forces_, predicted_x_, predicted_y_, predicted_z_;
 };
 
 class Step {
@@ -99,8 +105,10 @@ class Step {
   bool advance(double h, const trajectory::BaseMotion& next, VectorX& theta, VectorX& thetadot,
                Variation* variation = nullptr, std::size_t node = 0);
 
-  Engine& engine;  // at the node
-  Factor factor;   // M + G C + G^2 K (Euler: M + h C)
+  Engine& engine;            // at the node
+  BendingFriction friction;  // there, too
+  VectorX friction_state;    // there; of the model's size where it has friction in bending, else empty
+  Factor factor;             // M + G C + G^2 K (Euler: M + h C), and the friction's part
   // After a failure: the first angle beyond all bounds, or without inertia.
   int bad_angle = 0;
   bool singular = false;
@@ -112,11 +120,14 @@ class Step {
   bool factor_mass(Engine& at);
   bool evaluate(const trajectory::BaseMotion& motion, bool slopes);
   void solve_stage(int i, double g);
+  void right_friction(int i, double h);  // right_z_ of stage i
   bool vary_stage(int i, double h, std::size_t node, const VectorX& theta, const VectorX& thetadot, Variation& v);
 
   bool rodas_;
   VectorX right_theta_, stage_theta_, stage_thetadot_, stage_acceleration_, work_;
   VectorX k_theta_[4], k_rate_[4];
+  BendingFriction stage_friction_;
+  VectorX right_z_, stage_z_, k_z_[4];
 };
 
 }  // namespace chainsplat::dynamics

@@ -230,8 +230,10 @@ Motion move(const Filter& filter, const Belief& belief, double time) {
                                                           {time}, model.parameters.substeps);
     chain::States states;
     dynamics::Sensitivities sensitivities;
-    if (dynamics::simulate(model, grid, belief.mean.head(n), belief.mean.segment(n, n), states, tangents,
-                           &sensitivities)) {
+    const VectorX theta = belief.mean.head(n), thetadot = belief.mean.segment(n, n);
+    const dynamics::InitialState now{belief.time, theta, thetadot,
+                                     dynamics::friction_state_in_motion(model, theta, thetadot)};
+    if (dynamics::simulate(model, grid, now, states, tangents, &sensitivities)) {
       out.theta = states.theta.back();
       out.thetadot = states.thetadot.back();
       out.theta_by_state = MatrixX::Zero(n, 3 * n);

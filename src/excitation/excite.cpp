@@ -111,7 +111,7 @@ Result excite(const Problem& problem, const Options& options) {
   const auto simulate = [&](const planning::Motion& motion, chain::States& states) {
     const auto grid = dynamics::sample_base([&](double t) { return planning::base_at(motion, t); }, 0.0, times,
                                             problem.model.parameters.substeps);
-    if (!dynamics::simulate(problem.model, grid, initial.theta, initial.thetadot, states)) return false;
+    if (!dynamics::simulate(problem.model, grid, initial, states)) return false;
     for (const VectorX& theta : states.theta)
       if (!((theta - initial.theta).cwiseAbs().maxCoeff() <= options.max_bend)) return false;
     return true;

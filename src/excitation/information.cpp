@@ -25,7 +25,7 @@ MatrixX information(const dynamics::Model& model, std::span<const dynamics::Unkn
   chain::States& motion = states ? *states : rolled;
   dynamics::Sensitivities slopes;
   const dynamics::BaseGrid grid = dynamics::sample_base(base, initial.time, times, model.parameters.substeps);
-  if (!dynamics::simulate(model, grid, initial.theta, initial.thetadot, motion, tangents, &slopes)) return {};
+  if (!dynamics::simulate(model, grid, initial, motion, tangents, &slopes)) return {};
 
   const std::vector<chain::MaterialPoint> points = chain::shape_points(chain, true);
   MatrixX sum = MatrixX::Zero(size + 2 * n, size + 2 * n);

@@ -56,6 +56,8 @@ Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> de
   Frame out;
   // the residual and the configuration
   out.residual = residual_torque(model, base, theta, thetadot, thetaddot);
+  const VectorX slip = dynamics::friction_state_in_motion(model, theta, thetadot);
+  for (Eigen::Index k = 0; k < slip.size(); ++k) out.residual[k] += p.bending_friction[k] * slip[k];
   out.axes = chain::world_axes(chain, theta, base.pose);
   out.motions = chain::link_motions(chain, theta, base.pose);
 
@@ -73,6 +75,9 @@ Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> de
     const VectorX off = residual_torque(other, base, theta, thetadot, thetaddot) - out.residual;
     out.covariance.noalias() += off * off.transpose();
   }
+  // from friction in bending, of any share that motion has not decided,
+  for (Eigen::Index k = 0; k < slip.size(); ++k)
+    out.covariance(k, k) += std::pow(p.bending_friction[k], 2) * std::max(0.0, 1.0 - slip[k] * slip[k]) / 3.0;
   // from the joint laws',
   const double moment = dynamics::total_mass(p) * p.gravity.norm() * chain.length;
   for (int k = 0; k < n; ++k) {

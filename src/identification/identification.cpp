@@ -38,6 +38,7 @@ struct Part {
   BaseGrid grids[2];                  // half the substeps, for the way to the minimum, and all of them
   std::vector<std::size_t> nodes[2];  // of the grid, up to and with each output
   bool has_markers = false;           // the points are markers; unseen ones have no weight
+  Start start = {};
 };
 
 // All recordings. The unknowns: those that are shared, then the initial state of each recording.
@@ -85,11 +86,10 @@ bool simulate(const Part& part, const BaseGrid& grid, const VectorX& p, chain::S
               dynamics::Sensitivities* sensitivities = nullptr) {
   const State state = apply(part.chain, part.unknowns, p);
   const dynamics::Model model = dynamics::make_model(part.chain, state.parameters);
-  if (!sensitivities) return dynamics::simulate(model, grid, state.initial.theta, state.initial.thetadot, states);
+  if (!sensitivities) return dynamics::simulate(model, grid, state.initial, states);
   const auto unknowns = tangents(part.chain, part.unknowns, p);
   if (model.parameters.integrator == dynamics::Integrator::rodas3)
-    return dynamics::simulate(model, grid, state.initial.theta, state.initial.thetadot, states, unknowns,
-                              sensitivities);
+    return dynamics::simulate(model, grid, state.initial, states, unknowns, sensitivities);
   // the Euler step has no variational equation: differences of rollouts
   if (!dynamics::simulate(model, grid, state.initial.theta, state.initial.thetadot, states)) return false;
   const std::size_t frames = states.theta.size();
@@ -435,7 +435,8 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
   const bool at_rest = options.tabletop && !options.paper && base.at(part.times[0]).velocity.norm() < kBaseAtRest &&
                        thetadot.cwiseAbs().maxCoeff() < std::max(kRopeAtRest, kSignificant * thetadot_sd);
   if (at_rest) thetadot.setZero();
-  part.unknowns = make_unknowns(chain, options, theta, thetadot, theta_sd, at_rest ? kAtRestSd : kRateSd);
+  part.start = {theta, thetadot, theta_sd, at_rest ? kAtRestSd : kRateSd};
+  part.unknowns = make_unknowns(chain, options, part.start);
   const int substeps = part.unknowns.reference.substeps;
   for (bool fine : {false, true}) {
     BaseGrid& grid = part.grids[fine];
@@ -449,7 +450,8 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
 
 Problem make_problem(const chain::Chain& chain, std::vector<Part> parts) {
   const Unknowns& first = parts.front().unknowns;
-  const int theta = first.first(Quantity::theta), shared = theta < 0 ? first.size() : theta;
+  // an initial state alone is one block, too
+  const int theta = first.first(Quantity::theta), shared = theta <= 0 ? first.size() : theta;
   Problem problem{chain, std::move(parts), shared, {}, {}};
   const int own = problem.own();
   const Eigen::Index size = shared + own * static_cast<Eigen::Index>(problem.parts.size());
@@ -675,9 +677,92 @@ double alone_rms(const Problem& problem, std::size_t index, const VectorX& p) {
                                                                    : kInfinity;
 }
 
+// Residuals of a fit: their root mean square in units of what one alone is expected to be off, and how many there are.
+struct Misfit {
+  double scale = kInfinity;
+  double count = 0.0;
+};
+
+Misfit misfit_of(const Rollouts& rollouts) {
+  double sum = 0.0;
+  std::int64_t count = 0;
+  for (const auto& part : rollouts.values)
+    for (const MatrixX& frame : part) sum += frame.squaredNorm(), count += (frame.array() != 0.0).count();
+  const double seen = static_cast<double>(std::max<std::int64_t>(count, 1));
+  return {std::sqrt(kCorrelated * sum / seen), seen};
+}
+
+// Minus the logarithm of what the data say for a model, by Laplace's method at its fit; less is better. The residuals'
+// own size says how large errors are, since a fit can be far within what was expected, but it is never taken as less
+// than `least` of that (mathematics.md 5.10).
+double lack_of_evidence(const Problem& problem, const Fit& fit, double least) {
+  Rollouts rollouts(problem, kInfinity, true);
+  if (fit.cost == kInfinity || !rollouts.run(problem, fit.p, true)) return kInfinity;
+  const Misfit found = misfit_of(rollouts);
+  const double scale = std::max(found.scale, least);
+  const MatrixX data = solve::dense(normal_equations(problem, rollouts, kInfinity)).matrix / (scale * scale);
+  const Eigen::LDLT<MatrixX> posterior(data + problem.precision), prior(problem.precision);
+  if (!math::is_positive(posterior) || !math::is_positive(prior)) return kInfinity;
+  const double shrunk = posterior.vectorD().array().log().sum() - prior.vectorD().array().log().sum();
+  const VectorX off = fit.p - problem.mean;
+  const double free = found.count / kCorrelated;  // residuals, as many as are independent
+  return free * (std::log(scale) + 0.5 * std::pow(found.scale / scale, 2)) + 0.5 * off.dot(problem.precision * off) +
+         0.5 * shrunk;
+}
+
+struct Candidate {
+  Extras extras;
+  Problem problem;
+  Fit fit;
+  double lack = kInfinity;  // of evidence
+};
+
+// The model of every rope, or one with friction in bending or a payload where the data ask for it.
+Candidate fit_candidates(const chain::Chain& chain, std::vector<Part> parts, const Options& options) {
+  constexpr double kWithin = 0.3;    // misfit that needs no further explanation
+  constexpr double kEvidence = 5.0;  // in favor of what a rope need not have, natural logarithm
+  std::vector<Candidate> tried;
+  const auto attempt = [&](const Extras& extras) {
+    std::vector<Part> own = parts;
+    for (Part& part : own) part.unknowns = make_unknowns(chain, options, part.start, extras);
+    tried.push_back({extras, make_problem(chain, std::move(own)), {}});
+    tried.back().fit = fit_centerline(tried.back().problem, options);
+  };
+  attempt({});
+  const auto within = [&](const Candidate& one) {
+    Rollouts rollouts(one.problem, kInfinity, true);
+    return one.fit.cost < kInfinity && rollouts.run(one.problem, one.fit.p, false) &&
+           misfit_of(rollouts).scale <= kWithin;
+  };
+  if (!options.ask_for_more || options.tabletop || !options.fit_stiffness || within(tried[0]))
+    return std::move(tried[0]);
+  for (const Extras& extras : {Extras{true, false}, Extras{false, true}, Extras{true, true}})
+    if (!extras.payload || !options.tip_mass) attempt(extras);
+  // what every rope has is the scale, and has to be beaten clearly
+  std::size_t best = 0;
+  for (std::size_t i = 0; i < tried.size(); ++i) {
+    Candidate& now = tried[i];
+    now.lack = lack_of_evidence(now.problem, now.fit, kWithin);
+    const double parts_more = static_cast<int>(now.extras.friction) + static_cast<int>(now.extras.payload);
+    core::say_more("identify: " + std::string(now.extras.friction ? "friction in bending, " : "") +
+                   (now.extras.payload ? "a payload, " : "") + "log evidence " + core::exact(-now.lack));
+    now.lack += kEvidence * parts_more;
+    if (now.lack < tried[best].lack) best = i;
+  }
+  return std::move(tried[best]);
+}
+
 std::vector<Result> fit_parts(const chain::Chain& chain, std::vector<Part> parts, const Options& options) {
-  const Problem problem = make_problem(chain, std::move(parts));
-  const Fit fit = options.paper ? fit_angles(problem, options) : fit_centerline(problem, options);
+  const auto paper = [&] {
+    Candidate only{{}, make_problem(chain, std::move(parts)), {}};
+    only.fit = fit_angles(only.problem, options);
+    return only;
+  };
+  const Candidate chosen = options.paper ? paper() : fit_candidates(chain, std::move(parts), options);
+  if (chosen.extras.friction) core::say("identify: the motion asks for friction in bending");
+  if (chosen.extras.payload) core::say("identify: the motion asks for a payload at the free end");
+  const Problem& problem = chosen.problem;
+  const Fit& fit = chosen.fit;
   Rollouts rollouts(problem, kInfinity, true);
   if (fit.cost == kInfinity || !rollouts.run(problem, fit.p, true))
     throw WorkError("identify", "no parameters gave a rollout that stays finite",
@@ -696,7 +781,8 @@ std::vector<Result> fit_parts(const chain::Chain& chain, std::vector<Part> parts
     const VectorX p = problem.of_part(fit.p, i);
     const State state = apply(chain, part.unknowns, p);
     result.parameters = state.parameters;
-    result.initial = {part.times[0], state.initial.theta, state.initial.thetadot};
+    result.initial = state.initial;
+    result.initial.time = part.times[0];
     result.rollout = std::move(rollouts.states[i]);
     result.node_rms = result.alone_rms = rms_of(part, result.rollout);
     if (results.size() > 1 && !options.paper)
@@ -717,6 +803,25 @@ std::vector<Result> fit_parts(const chain::Chain& chain, std::vector<Part> parts
 }
 
 }  // namespace
+
+dynamics::InitialState fit_initial(const chain::Chain& chain, const dynamics::Parameters& parameters,
+                                   const trajectory::Trajectory& base, const Markers& markers, double seconds) {
+  Options options;
+  options.tabletop = parameters.table_normal.has_value();
+  options.substeps = parameters.substeps;
+  std::vector<Part> parts{make_part(chain, base, fit_markers(chain, base, markers).states, options, &markers)};
+  parts[0].unknowns = make_state_unknowns(chain, parameters, parts[0].start);
+  const Problem problem = make_problem(chain, std::move(parts));
+  constexpr int kIterations = 30;
+  Fit fit;
+  fit.p = problem.mean;
+  improve(problem, seconds, true, kIterations, fit);
+  if (fit.cost == kInfinity)
+    throw WorkError("identify", "no initial state gave a rollout that stays finite", "check the markers and the twin");
+  dynamics::InitialState found = apply(chain, problem.parts[0].unknowns, problem.of_part(fit.p, 0)).initial;
+  found.time = problem.parts[0].times[0];
+  return found;
+}
 
 std::vector<Result> identify(const chain::Chain& chain, std::span<const Recording> recordings, const Options& options) {
   std::vector<Part> parts;

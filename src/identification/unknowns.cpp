@@ -24,17 +24,36 @@ constexpr double kTwistSd = 0.7;        // of all twist stiffnesses over the ben
 constexpr double kPaperMassSd = 0.3;    // mass of one link about the mean, [P]
 constexpr double kViscousSd = 1.0;
 constexpr double kRestSd = 0.3;  // rad
+constexpr double kBendingFrictionSd = 1.5;
+constexpr double kBendingFrictionAngleSd = 1.0;
+constexpr double kFrictionStateSd = 0.5;  // of a share between -1 and 1
+// Of an initial state that is all that is sought: the smoothest chain through a few markers, and its local slope.
+constexpr double kInitialThetaSd = 0.1;  // rad
+constexpr double kInitialRateSd = 1.0;   // rad/s
+constexpr double kPayloadPart = 0.3;     // of the total mass: what grippers' ropes carry, 0.05 to 0.8 within two
+constexpr double kPayloadSd = 1.1;       // deviations
+constexpr double kLeastTipSd = 1e-3;     // logit, of a payload that was weighed
+
+// Of the tip's part of the total mass; the deviation is that of its logit.
+struct TipPrior {
+  double part, deviation;
+};
+
+TipPrior tip_prior(const Options& options, const Extras& extras, double total_mass) {
+  if (!options.tip_mass) return extras.payload ? TipPrior{kPayloadPart, kPayloadSd} : TipPrior{kTipPart, kTipSd};
+  const double part = *options.tip_mass / total_mass;
+  return {part, std::max(kLeastTipSd, options.tip_mass_deviation / (*options.tip_mass * (1.0 - part)))};
+}
 
 }  // namespace
 
-Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const VectorX& theta, const VectorX& thetadot,
-                       const VectorX& theta_sd, double rate_sd) {
+Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const Start& start, const Extras& extras) {
   const int n = chain.angles(), links = chain.links() - 1;
   Unknowns u;
   u.total_mass = options.mass.value_or(1.0);
   u.held.emplace_back("total_mass", options.mass ? "given: only ratios to it are observable"
                                                  : "set to 1 kg: only ratios to it are observable, forces are per kg");
-  u.initial = {0.0, theta, thetadot};
+  u.initial = {0.0, start.theta, start.thetadot};
 
   dynamics::Parameters& unit = u.reference;
   const auto all = [](int count, double value) { return std::vector<double>(count, value); };
@@ -106,13 +125,19 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
     if (options.tabletop) {
       unit.coulomb_friction = all(links, 1.0);
       add_many(Quantity::coulomb_friction, links, std::log(kCoulombMean), kCoulombSd, 0.0);
-      u.held.emplace_back("tip_mass", "0: not observable on a table beside the friction");
+      unit.tip_mass = options.tip_mass.value_or(0.0);
+      u.held.emplace_back("tip_mass", options.tip_mass ? "given" : "0: not observable on a table beside the friction");
       u.held.emplace_back("drag", "0 on a table");
     } else {
       unit.air_quadratic = unit.link_mass;  // by length, too
-      unit.tip_mass = 0.5 * u.total_mass;   // where the logit is 0
       add(Quantity::drag, 0, std::log(kDragPerDiameter * std::max(chain.diameter, 1e-3)), kSharedSd);
-      add(Quantity::tip_mass, 0, std::log(kTipPart / (1.0 - kTipPart)), kTipSd);
+      if (options.tip_mass && *options.tip_mass == 0.0) {
+        u.held.emplace_back("tip_mass", "0: given");
+      } else {
+        const TipPrior prior = tip_prior(options, extras, u.total_mass);
+        unit.tip_mass = 0.5 * u.total_mass;  // where the logit is 0
+        add(Quantity::tip_mass, 0, std::log(prior.part / (1.0 - prior.part)), prior.deviation);
+      }
     }
     if (stiff)
       add_many(Quantity::rest_angle, n, 0.0, kRestSd, 0.0);
@@ -124,9 +149,20 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
       for (int k = chain.link_start(1) > 0.0 ? 0 : 1; k < n; ++k)  // at the grasp nothing rolls
         add(Quantity::roll_lever, k, 0.0, kRestSd * 0.5 * chain.diameter * chain.length / reference);
     }
+    if (!extras.friction) {
+      u.held.emplace_back("bending_friction",
+                          options.tabletop ? "0: not told from the table's friction" : "0: the data do not ask for it");
+    } else {
+      unit.bending_friction = all(n, 1.0);
+      for (int k = 0; k < n; ++k)  // a curvature, alike all along
+        unit.bending_friction_angle.push_back(chain::bent_length(chain, chain.child_link[k]) / reference);
+      add(Quantity::bending_friction, 0, std::log(kBendingFrictionPart * torque), kBendingFrictionSd);
+      add(Quantity::bending_friction_angle, 0, std::log(kBendingFrictionAngle), kBendingFrictionAngleSd);
+    }
     u.initial = {0.0, VectorX::Zero(n), VectorX::Zero(n)};
-    for (int k = 0; k < n; ++k) add(Quantity::theta, k, theta[k], theta_sd[k]);
-    for (int k = 0; k < n; ++k) add(Quantity::thetadot, k, thetadot[k], rate_sd);
+    for (int k = 0; k < n; ++k) add(Quantity::theta, k, start.theta[k], start.theta_sd[k]);
+    for (int k = 0; k < n; ++k) add(Quantity::thetadot, k, start.thetadot[k], start.rate_sd);
+    if (extras.friction) add_many(Quantity::friction_state, n, 0.0, kFrictionStateSd, 0.0);
   }
 
   const int size = u.size();
@@ -154,6 +190,26 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
     CHAINSPLAT_CHECK(math::is_positive(factor), std::to_string(links));
     u.precision.block(coulomb, coulomb, links, links) = factor.solve(MatrixX::Identity(links, links));
   }
+  return u;
+}
+
+Unknowns make_state_unknowns(const chain::Chain& chain, const dynamics::Parameters& parameters, const Start& start) {
+  const int n = chain.angles();
+  Unknowns u;
+  u.reference = parameters;
+  u.total_mass = dynamics::total_mass(parameters);
+  u.initial = {0.0, VectorX::Zero(n), VectorX::Zero(n)};
+  std::vector<double> means, sds;
+  const auto add = [&](Quantity quantity, double mean, double sd, int k) {
+    u.list.push_back({quantity, k});
+    means.push_back(mean), sds.push_back(sd);
+  };
+  for (int k = 0; k < n; ++k) add(Quantity::theta, start.theta[k], kInitialThetaSd, k);
+  for (int k = 0; k < n; ++k) add(Quantity::thetadot, start.thetadot[k], kInitialRateSd, k);
+  for (int k = 0; k < n && !parameters.bending_friction.empty(); ++k)
+    add(Quantity::friction_state, 0.0, kFrictionStateSd, k);
+  u.mean = Eigen::Map<const VectorX>(means.data(), u.size());
+  u.precision = Eigen::Map<const VectorX>(sds.data(), u.size()).cwiseAbs2().cwiseInverse().asDiagonal();
   return u;
 }
 

@@ -30,9 +30,24 @@ inline constexpr double kThetaSd = 0.02;   // rad, initial angles about the reco
 inline constexpr double kRateSd = 0.5;     // rad/s, initial velocity about the differences of the recognized angles
 inline constexpr double kAtRestSd = 1e-4;  // rad/s, of a rope on a table under a base at rest: friction holds it
 
-// Priors follow mathematics.md 5. `theta_sd` per angle, rad; `rate_sd` of the initial velocities, rad/s.
-Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const VectorX& theta, const VectorX& thetadot,
-                       const VectorX& theta_sd, double rate_sd = kRateSd);
+// What a rope can have beside what every rope has.
+struct Extras {
+  bool friction = false;  // in bending
+  bool payload = false;   // of unknown mass
+};
+
+// What is known of the initial state beforehand: rad, rad/s, and the deviations of one.
+struct Start {
+  VectorX theta, thetadot, theta_sd;
+  double rate_sd = kRateSd;
+};
+
+// Priors follow mathematics.md 5.
+Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const Start& start,
+                       const Extras& extras = {});
+
+// The initial state alone, of a rope of these parameters.
+Unknowns make_state_unknowns(const chain::Chain& chain, const dynamics::Parameters& parameters, const Start& start);
 
 struct State {
   dynamics::Parameters parameters;

@@ -3,6 +3,8 @@
 
 #include "chainsplat/comparison.h"
 #include "chainsplat/gpu.h"
+#include "chainsplat/identification.h"
+#include "chainsplat/marker_files.h"
 #include "chainsplat/motion_files.h"
 #include "chainsplat/pipeline.h"
 #include "chainsplat/run_folder.h"
@@ -14,6 +16,15 @@ namespace {
 constexpr double kTimeSlack = 1e-6;  // s: times in text files are rounded
 constexpr const char* kExampleRate = "give rows a second, for example 30";
 
+// Marker files begin with what their markers are (formats.md 4.1), states with a head line.
+bool is_marker_file(const Path& file) { return core::read_file(file).starts_with("#"); }
+
+// A rope that was held in this shape and let go: friction in bending has built up on the way there from its rest.
+math::VectorX friction_of_shape(const dynamics::Model& model, const math::Pose& base, const math::VectorX& theta) {
+  if (model.parameters.bending_friction.empty()) return {};
+  return dynamics::friction_states(model, {dynamics::static_equilibrium(model, base).theta, theta}).back();
+}
+
 // Where the rollout starts (formats.md 2.4, rollout).
 dynamics::InitialState start_of(const Path& run, const RolloutOptions& options, const twin::Twin& twin,
                                 const dynamics::Model& model, const trajectory::Trajectory& base) {
@@ -21,7 +32,15 @@ dynamics::InitialState start_of(const Path& run, const RolloutOptions& options, 
   dynamics::InitialState initial;
   initial.time = base.start();
   initial.thetadot = math::VectorX::Zero(angles);
-  if (!options.initial.empty()) {
+  if (!options.initial.empty() && is_marker_file(options.initial)) {
+    const identification::MarkerFile measured = identification::read_markers(options.initial);
+    initial = identification::fit_initial(twin.chain, *twin.parameters,
+                                          trajectory::fit(measured.base, options.initial.string()), measured.markers);
+    if (initial.time < base.start() || initial.time >= base.end())
+      throw InputError(options.initial.string(),
+                       "begins at " + core::exact(initial.time) + " s, outside of the base motion",
+                       "give marks and base motion of one recording");
+  } else if (!options.initial.empty()) {
     const chain::States states = twin::read_states(options.initial, angles);
     if (states.time.empty()) throw InputError(options.initial.string(), "has no rows", "give at least one");
     // the states of the twin's own motion keep their time
@@ -32,6 +51,9 @@ dynamics::InitialState start_of(const Path& run, const RolloutOptions& options, 
       initial.thetadot = states.thetadot[0];
     else
       core::warn(options.initial.string() + ": no thetadot columns; the rope is assumed to start at rest");
+    initial.friction_state = states.thetadot.empty() || states.thetadot[0].isZero(0.0)
+                                 ? friction_of_shape(model, base.pose(initial.time), initial.theta)
+                                 : dynamics::friction_state_in_motion(model, initial.theta, initial.thetadot);
   } else if (options.base.empty()) {
     if (!twin.initial)
       throw InputError(run.string() + "/twin.json", "has no initial state",

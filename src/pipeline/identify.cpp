@@ -25,6 +25,12 @@ identification::Options identification_options(const twin::Twin& twin, bool pape
   options.gravity = twin.gravity;
   if (twin.table_normal) options.table_normal = *twin.table_normal;
   options.mass = twin.provenance.mass;
+  if (const std::optional<capture::Payload>& payload = twin.provenance.payload) {
+    if (!options.mass)
+      throw InputError("tip_mass", "says nothing beside a rope of unknown mass", "give the rope's mass, too");
+    *options.mass += payload->mass;
+    options.tip_mass = payload->mass, options.tip_mass_deviation = payload->sigma;
+  }
   options.paper = paper;
   if (paper) {
     options.fit_stiffness = false;
@@ -138,7 +144,10 @@ void identify_several(std::vector<twin::Twin>& twins, const std::vector<Path>& r
   for (std::size_t i = 0; i < twins.size(); ++i) {
     twin::Twin& twin = twins[i];
     if (i > 0) check_same_chain(twins[0], runs[0], twin, runs[i]);
-    if (!options.mass) options.mass = twin.provenance.mass;  // what one capture knows is that of all
+    if (!options.mass && twin.provenance.mass) {  // what one capture knows is that of all
+      twins[0].provenance.mass = twin.provenance.mass;
+      options = identification_options(twins[0], false, seed);
+    }
     twin.states.covariance = read_covariances(runs[i] / kCovarianceFile, twin.states);
     recordings.push_back({own_base(runs[i], twin.states), twin.states});
   }
@@ -153,7 +162,7 @@ void identify_several(std::vector<twin::Twin>& twins, const std::vector<Path>& r
     adopt(twins[i], std::move(found[i]));
     tell_fit("identify", *twins[i].estimates.solver);
     twins[i].known_mass = options.mass.has_value();
-    if (options.mass) twins[i].provenance.mass = options.mass;
+    twins[i].provenance.mass = twins[0].provenance.mass;
   }
 }
 
@@ -195,6 +204,8 @@ IdentifyResult identify(const std::vector<Path>& runs, const IdentifyOptions& op
   if (options.joint && runs.size() > 1)
     throw InputError("`joint`", "goes with one RUN", "refine them one after the other");
   std::vector<twin::Twin> twins = load_all(runs);
+  if (options.payload)
+    for (twin::Twin& twin : twins) twin.provenance.payload = options.payload;
   if (runs.size() > 1)
     identify_several(twins, runs, options.seed);
   else
@@ -207,6 +218,7 @@ IdentifyResult identify_markers(const Path& run, const std::vector<Path>& files,
   const core::ListenerScope scope(listener);
   if (files.empty()) throw InputError("files", "is empty", "name one or more");
   twin::Twin twin = twin::load(run);
+  if (options.payload) twin.provenance.payload = options.payload;
   {
     const Stopwatch watch(twin, "identify");
     std::vector<identification::MarkerRecording> recordings;

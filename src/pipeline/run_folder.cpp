@@ -28,6 +28,7 @@ twin::Twin twin_in_scene(const capture::Capture& capture) {
   }
   twin.known_mass = capture.mass.has_value();
   twin.provenance.mass = capture.mass;
+  twin.provenance.payload = capture.payload;
   return twin;
 }
 

@@ -70,9 +70,10 @@ twin::Provenance recognition_provenance(const TrainOptions& options) {
 // What the capture and the options say of a new twin.
 twin::Twin new_twin(const Training& t) {
   twin::Twin twin = twin_in_scene(t.capture);
-  const std::optional<double> mass = twin.provenance.mass;
+  const twin::Provenance scene = twin.provenance;
   twin.provenance = recognition_provenance(t.options);
-  twin.provenance.mass = mass;
+  twin.provenance.mass = scene.mass;
+  twin.provenance.payload = scene.payload;
   twin.provenance.version = CHAINSPLAT_VERSION;
   twin.provenance.capture = t.capture.name;
   twin.provenance.capture_hash = hash_text(t.capture.hash);

@@ -35,7 +35,10 @@ void correct(ParameterCorrection& correction, const dynamics::BaseFunction& base
   const std::vector<dynamics::Tangent> tangents = dynamics::tangents(chain, parameters, correction.unknowns);
   chain::States states;
   dynamics::Sensitivities slopes;
-  if (!dynamics::simulate(correction.model, grid, before.theta, before.thetadot, states, tangents, &slopes)) return;
+  dynamics::InitialState start = before;
+  if (start.friction_state.size() == 0)
+    start.friction_state = dynamics::friction_state_in_motion(correction.model, before.theta, before.thetadot);
+  if (!dynamics::simulate(correction.model, grid, start, states, tangents, &slopes)) return;
 
   // angles count by how far they move the rope
   const math::Pose pose = base(after.time).pose;

@@ -108,9 +108,9 @@ bool roll_out(const dynamics::Model& model, const Motion& motion, const Grid& gr
       torques.setZero(model.chain.angles(), columns);
       add_torques(motion, shifted(out.base[node], after), shifted(grid.basis[node], after), at, torques);
     };
-    good = dynamics::simulate(model, base, initial.theta, initial.thetadot, states, by, exact, slopes);
+    good = dynamics::simulate(model, base, initial, states, by, exact, slopes);
   } else {
-    good = dynamics::simulate(model, base, initial.theta, initial.thetadot, states);
+    good = dynamics::simulate(model, base, initial, states);
   }
   out.theta = std::move(states.theta), out.thetadot = std::move(states.thetadot);
   out.theta_slope = std::move(slopes.theta), out.thetadot_slope = std::move(slopes.thetadot);

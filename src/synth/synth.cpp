@@ -75,7 +75,9 @@ Json scene_json(const twin::Twin& twin, const capture::Capture& scene, const Opt
            {"object", {{"length", chain.length}, {"diameter", chain.diameter}}},
            {"grasp", {{"direction", list(chain.direction)}, {"bending_axis", list(chain.bending_axis)}}}};
   if (twin.known_mass && twin.parameters) {
-    out["object"]["mass"] = dynamics::total_mass(*twin.parameters);
+    const std::optional<capture::Payload>& payload = twin.provenance.payload;
+    out["object"]["mass"] = dynamics::total_mass(*twin.parameters) - (payload ? twin.parameters->tip_mass : 0.0);
+    if (payload) out["object"]["tip_mass"] = twin.parameters->tip_mass;
   }
   if (twin.tabletop) {
     const capture::Table table = scene.table.value_or(capture::Table{});

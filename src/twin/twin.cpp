@@ -6,6 +6,7 @@
 #include <limits>
 #include <nlohmann/json.hpp>
 
+#include "chainsplat/properties.h"
 #include "chainsplat/twin.h"
 
 namespace chainsplat::twin {
@@ -17,6 +18,8 @@ using math::Vector6;
 namespace {
 
 constexpr const char* kFormat = "chainsplat-twin/1";
+// Of twins that a program of format 1 would set in motion wrongly: with friction in bending.
+constexpr const char* kNewFormat = "chainsplat-twin/2";
 constexpr const char *kGaussians = "gaussians.ply", *kStates = "states.csv", *kRollout = "rollout.csv";
 constexpr double kLengthTolerance = 1e-6;  // m, and for lengths of unit vectors; accepts files edited by hand
 
@@ -156,6 +159,10 @@ Json chain_json(const Twin& twin) {
       joint["rest_angle"] = p->rest_angle[k];
       joint["damping"] = p->damping[k];
       if (!p->roll_lever.empty()) joint["roll_lever"] = p->roll_lever[k];
+      if (!p->bending_friction.empty()) {
+        joint["bending_friction"] = p->bending_friction[k];
+        joint["bending_friction_angle"] = p->bending_friction_angle[k];
+      }
     }
     out["joints"].push_back(std::move(joint));
   }
@@ -184,9 +191,12 @@ Json chain_json(const Twin& twin) {
     for (const auto& [integrator, name] : kIntegrators)
       if (integrator == p->integrator) out["integrator"] = {{"name", name}, {"substeps", p->substeps}};
   }
-  if (twin.initial)
+  if (twin.initial) {
     out["initial_state"] = {
         {"time", twin.initial->time}, {"theta", list(twin.initial->theta)}, {"thetadot", list(twin.initial->thetadot)}};
+    if (twin.initial->friction_state.size())
+      out["initial_state"]["friction_state"] = list(twin.initial->friction_state);
+  }
   return out;
 }
 
@@ -240,6 +250,14 @@ Json identification_json(const Twin& twin) {
     out["weak"].push_back({{"singular_value", weak.singular_value}, {"direction", parts}});
   }
   if (e.solver) out["solver"] = *e.solver;
+  return out;
+}
+
+Json properties_json(const Twin& twin) {
+  Json out = Json::object();
+  for (const Property& p :
+       properties(dynamics::make_model(twin.chain, *twin.parameters), twin.estimates, twin.known_mass))
+    out[p.name] = {{"value", p.value}, {"sigma", std::isfinite(p.sigma) ? Json(p.sigma) : Json()}, {"unit", p.unit}};
   return out;
 }
 
@@ -429,7 +447,15 @@ dynamics::Parameters read_parameters(const Node& node, const Twin& twin) {
     p.rest_angle.push_back(joint["rest_angle"].number());
     p.damping.push_back(joint["damping"].not_negative());
     if (joint.has("roll_lever")) p.roll_lever.push_back(joint["roll_lever"].number());
+    if (joint.has("bending_friction")) {
+      p.bending_friction.push_back(joint["bending_friction"].not_negative());
+      p.bending_friction_angle.push_back(joint["bending_friction_angle"].positive());
+    }
   }
+  if (!p.bending_friction.empty() && p.bending_friction.size() != p.damping.size())
+    node["joints"].fail("has bending_friction for " + std::to_string(p.bending_friction.size()) + " joints of " +
+                            std::to_string(p.damping.size()),
+                        "give it for all or none");
   if (!p.roll_lever.empty() && p.roll_lever.size() != p.damping.size())
     node["joints"].fail(
         "has roll_lever for " + std::to_string(p.roll_lever.size()) + " joints of " + std::to_string(p.damping.size()),
@@ -571,6 +597,17 @@ void read_option(const std::string& name, const Node& node, Provenance& p) {
   };
   if (name == "mass") {
     number(p.mass.emplace(), "not a positive number, the mass in kg");
+  } else if (name == "tip_mass") {
+    p.payload.emplace();
+    const std::size_t comma = text.find(',');
+    const auto part = [&](const char* begin, const char* end, double& value) {
+      const auto [after, error] = std::from_chars(begin, end, value);
+      if (error != std::errc() || after != end || !(value >= 0.0) || !std::isfinite(value))
+        refuse("no mass in kg, nor one with its deviation after a comma");
+    };
+    const char* const end = text.data() + text.size();
+    part(text.data(), comma == std::string::npos ? end : text.data() + comma, p.payload->mass);
+    if (comma != std::string::npos) part(text.data() + comma + 1, end, p.payload->sigma);
   } else if (name == "every") {
     number(p.every.emplace(), "not a whole number >= 1");
   } else if (name == "mode") {
@@ -616,6 +653,10 @@ std::string mode_text(Mode mode) { return mode == Mode::paper ? "paper" : "fast"
 std::map<std::string, std::string> option_texts(const Provenance& p) {
   std::map<std::string, std::string> texts = p.options;
   if (p.mass) texts["mass"] = core::exact(*p.mass);
+  if (p.payload) {
+    texts["tip_mass"] = core::exact(p.payload->mass);
+    if (p.payload->sigma > 0.0) texts["tip_mass"] += "," + core::exact(p.payload->sigma);
+  }
   if (p.frames) texts["frames"] = capture::frame_range_text(*p.frames);
   if (p.every) texts["every"] = std::to_string(*p.every);
   if (p.mode) texts["mode"] = mode_text(*p.mode);
@@ -629,11 +670,13 @@ void save(const Twin& twin, const Path& run) {
   std::filesystem::create_directories(run, error);
   if (error)
     throw WorkError(run.string(), "cannot be made (" + error.message() + ")", "choose a folder that can be written");
-  Json out{{"format", kFormat},
+  const bool plain = !twin.parameters || twin.parameters->bending_friction.empty();
+  Json out{{"format", plain ? kFormat : kNewFormat},
            {"about", about_json(twin)},
            {"grasp", {{"direction", list(twin.chain.direction)}, {"bending_axis", list(twin.chain.bending_axis)}}},
            {"chain", chain_json(twin)},
            {"identification", identification_json(twin)}};
+  if (twin.parameters) out["properties"] = properties_json(twin);
   if (!twin.corrections.empty()) {
     out["corrections"] = to_json(twin.corrections);
     out["verdict"] = to_json(twin.verdict);
@@ -670,8 +713,9 @@ Twin load(const Path& run) {
   const Json document = core::parse_json_or_discard(core::read_file(path));
   if (document.is_discarded()) throw InputError(file, "is not JSON or is cut off", "restore it or train again");
   const Node top(document, file, "");
-  if (top["format"].text() != kFormat)
-    top["format"].fail("is not '" + std::string(kFormat) + "'", "use the program that wrote it");
+  if (const std::string format = top["format"].text(); format != kFormat && format != kNewFormat)
+    top["format"].fail("is neither '" + std::string(kFormat) + "' nor '" + kNewFormat + "'",
+                       "use the program that wrote it");
 
   // scene and chain
   Twin twin;
@@ -698,6 +742,7 @@ Twin load(const Path& run) {
     const Node initial = node["initial_state"];
     twin.initial = dynamics::InitialState{initial["time"].number(), initial["theta"].vector(angles),
                                           initial["thetadot"].vector(angles)};
+    if (initial.has("friction_state")) twin.initial->friction_state = initial["friction_state"].vector(angles);
   }
   twin.provenance = read_provenance(top["provenance"]);
   // files of older versions have neither

@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <functional>
 #include <nlohmann/json.hpp>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -13,6 +14,9 @@ class App;
 }
 namespace chainsplat::eval {
 struct FrameMetrics;
+}
+namespace chainsplat::capture {
+struct Payload;
 }
 
 namespace chainsplat::tools {
@@ -74,10 +78,13 @@ void flush_output();
 // A text of the library, in which fields of options structs stand in backquotes, with the options of the command line
 // in their place: `frames` becomes --frames.
 std::string with_options(const std::string& text);
+// --tip-mass KG[,SIGMA] and what it says: nothing where `numbers` is empty. Throws InputError.
+void add_payload_option(CLI::App& command, std::vector<double>& numbers);
+std::optional<capture::Payload> payload_of(const std::vector<double>& numbers);
 
 // --- inspect.cpp --------------------------------------------------------------------------------
-// What `check` finds: as lines, and as the document of --json. `with_masks` false: of a capture whose masks are still to
-// be made, which cannot be judged by its images.
+// What `check` finds: as lines, and as the document of --json. `with_masks` false: of a capture whose masks are still
+// to be made, which cannot be judged by its images.
 struct CheckReport {
   std::string text;
   nlohmann::ordered_json document;
@@ -92,8 +99,8 @@ Path input_path(const std::string& name);
 std::vector<double> numbers(const std::string& text, const std::string& where, std::size_t count);
 // Writes `bytes` to standard output ("-"), into a device or pipe that exists, else as a file in one step.
 void write_result(const std::string& name, const std::string& bytes);
-// The base motion that is kept beside a file of states: NAME.base.tum beside NAME.csv, as rollout writes it, or base.tum
-// beside the states.csv or rollout.csv of a run or plan. Empty: there is none.
+// The base motion that is kept beside a file of states: NAME.base.tum beside NAME.csv, as rollout writes it, or
+// base.tum beside the states.csv or rollout.csv of a run or plan. Empty: there is none.
 Path base_beside(const std::string& states);
 // Throws InputError where `output` is a file of the run folder, or one of `inputs`.
 void check_not_input(const std::string& output, const Path& run, const std::vector<std::string>& inputs);

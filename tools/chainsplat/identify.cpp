@@ -10,6 +10,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/pipeline.h"
+#include "chainsplat/properties.h"
 #include "chainsplat/run_folder.h"
 #include "cli.h"
 
@@ -21,6 +22,7 @@ using Json = nlohmann::ordered_json;
 
 struct Request {
   std::vector<std::string> runs, markers;
+  std::vector<double> payload;
   bool shape_only = false, joint = false;
 };
 
@@ -80,13 +82,18 @@ void print_estimates(const dynamics::Estimates& found) {
 pipeline::IdentifyResult identified(const Globals& globals, const Request& request) {
   if (request.markers.empty())
     return pipeline::identify({request.runs.begin(), request.runs.end()},
-                              {.joint = request.joint, .seed = globals.seed, .device = globals.device}, terminal());
+                              {.joint = request.joint,
+                               .payload = payload_of(request.payload),
+                               .seed = globals.seed,
+                               .device = globals.device},
+                              terminal());
   if (request.runs.size() > 1)
     throw InputError("--markers", "goes with one RUN", "name one twin; several files can follow --markers");
   std::vector<Path> files;
   for (const std::string& name : request.markers) files.push_back(input_path(name));
-  return pipeline::identify_markers(request.runs[0], files, {.shape_only = request.shape_only, .seed = globals.seed},
-                                    terminal());
+  return pipeline::identify_markers(
+      request.runs[0], files,
+      {.shape_only = request.shape_only, .payload = payload_of(request.payload), .seed = globals.seed}, terminal());
 }
 
 void identify(const Globals& globals, const Request& request) {
@@ -103,6 +110,9 @@ void identify(const Globals& globals, const Request& request) {
     return;
   }
   print_estimates(result.twins[0].estimates);
+  if (const twin::Twin& twin = result.twins[0]; twin.parameters)
+    std::cout << twin::describe(
+        twin::properties(dynamics::make_model(twin.chain, *twin.parameters), twin.estimates, twin.known_mass));
   for (const std::string& run : request.runs) std::cout << "twin: " << run << "\n";
 }
 
@@ -169,6 +179,7 @@ void add_identify_command(CLI::App& app, const Globals& globals, Job& job) {
           "Then refine angles, Gaussians and dynamics of one RUN together with the capture's images: helps where\n"
           "a single camera hardly sees depth")
       ->excludes(markers);
+  add_payload_option(*identifier, request->payload);
   auto online = std::make_shared<OnlineRequest>();
   CLI::Option* stream =
       identifier

@@ -201,8 +201,9 @@ void add_motion_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("FILE.csv");
   roller
       ->add_option("--initial", request->initial,
-                   "Start from its first row (default: the identified state; with --base at rest)")
-      ->type_name("STATES.csv");
+                   "Start from its first row (default: the identified state; with --base at rest), or from the state\n"
+                   "that fits the first half second of a file of markers")
+      ->type_name("FILE.csv");
   roller->callback([&globals, &job, request] { job = [&globals, request] { rollout(globals, *request); }; });
 
   CLI::App* renderer = app.add_subcommand("render", "Draw the twin through the cameras of a capture");

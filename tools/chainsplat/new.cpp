@@ -18,6 +18,7 @@ struct Request {
   std::string out, bending = "spatial";
   double length = 0.0, diameter = 0.02, mass = 0.0;    // m, m, kg; mass 0: unknown
   double bending_stiffness = -1.0, retardation = 0.0;  // EI, N m^2, negative: not given; s
+  std::vector<double> payload;                         // kg, and its deviation; empty: unknown
   int joints = 8;
   std::vector<double> direction{0, 0, -1}, bending_axis, gravity{0, 0, -9.81};
   bool force = false;
@@ -42,6 +43,7 @@ dynamics::Parameters rod(const chain::Chain& chain, const Request& request, cons
     zeros->assign(links, 0.0);
   for (int j = 1; j <= links; ++j)
     rod.link_mass.push_back(request.mass * (chain.link_end(j) - chain.link_start(j)) / chain.length);
+  if (!request.payload.empty()) rod.tip_mass = request.payload[0];
   for (const int link : chain.child_link) {
     rod.stiffness.push_back(request.bending_stiffness / chain::bent_length(chain, link));
     rod.damping.push_back(request.retardation * rod.stiffness.back());
@@ -75,6 +77,9 @@ void make_new(const Globals& globals, const Request& request) {
                                  request.bending == "planar" ? chain::Bending::planar : chain::Bending::spatial, false);
   twin.known_mass = request.mass > 0.0;
   if (twin.known_mass) twin.provenance.mass = request.mass;
+  twin.provenance.payload = payload_of(request.payload);
+  if (twin.provenance.payload && !twin.known_mass)
+    throw InputError("--tip-mass", "says nothing beside a rope of unknown mass", "give --mass, too");
   if (request.bending_stiffness >= 0.0) twin.parameters = rod(twin.chain, request, twin.gravity);
   twin.provenance.version = CHAINSPLAT_VERSION;
   twin.provenance.seed = globals.seed;
@@ -122,9 +127,10 @@ void add_new_command(CLI::App& app, const Globals& globals, Job& job) {
       ->delimiter(',')
       ->expected(3)
       ->type_name("X,Y,Z");
-  command->add_option("--mass", request->mass, "kg (default: unknown, forces are per kilogram)")
+  command->add_option("--mass", request->mass, "Of the rope, kg (default: unknown, forces are per kilogram)")
       ->check(CLI::PositiveNumber)
       ->type_name("KG");
+  add_payload_option(*command, request->payload);
   command
       ->add_option("--bending-stiffness", request->bending_stiffness,
                    "EI of a uniform straight rod, N m^2; with --mass the twin is then ready for rollout")

@@ -1,7 +1,9 @@
 // options.cpp - what a field of the library's options structs is called on the command line.
+#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <map>
 
+#include "chainsplat/capture.h"
 #include "cli.h"
 
 namespace chainsplat::tools {
@@ -39,6 +41,27 @@ std::string with_options(const std::string& text) {
     at = close + 1;
   }
   return out;
+}
+
+void add_payload_option(CLI::App& command, std::vector<double>& numbers) {
+  command
+      .add_option(
+          "--tip-mass", numbers,
+          "kg, of what hangs at the free end beside the rope, and its standard deviation after a comma; 0: nothing\n"
+          "(default: not known; found where the motion tells it)")
+      ->delimiter(',')
+      ->expected(1, 2)
+      ->type_name("KG");
+}
+
+std::optional<capture::Payload> payload_of(const std::vector<double>& numbers) {
+  if (numbers.empty()) return {};
+  constexpr double kHeaviest = 1e4;  // kg, as in capture.json
+  for (const double number : numbers)
+    if (!(number >= 0.0 && number <= kHeaviest))
+      throw InputError("--tip-mass", core::exact(number) + " kg is no mass of a payload",
+                       "give kilograms from 0 to " + core::exact(kHeaviest));
+  return capture::Payload{numbers[0], numbers.size() > 1 ? numbers[1] : 0.0};
 }
 
 }  // namespace chainsplat::tools

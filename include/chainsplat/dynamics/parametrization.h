@@ -30,8 +30,12 @@ enum class Quantity {
   tip_mass,  // the tip's part of the total mass, which stays
   rest_angle,
   roll_lever,
-  theta,  // of the initial state
-  thetadot
+  bending_friction,  // the moment of all joints; only where the parameters have some
+  bending_friction_angle,
+  torsional_stiffness,  // of all joints over what bending would have it
+  theta,                // of the initial state
+  thetadot,
+  friction_state
 };
 
 inline constexpr int kEvery = -1;
@@ -56,7 +60,7 @@ bool is_parameter(Quantity quantity);    // changes parameters; not of the initi
 bool has_effect(const chain::Chain& chain, const Parameters& parameters, const Unknown& unknown);
 // Where the parameters are among `unknowns`.
 std::vector<Eigen::Index> parameters_among(std::span<const Unknown> unknowns);
-// The unknowns theta_1..n, then thetadot_1..n.
+// The unknowns theta_1..n, then thetadot_1..n. Not friction_state: filters take it as it is.
 std::vector<Unknown> initial_state_unknowns(const chain::Chain& chain);
 
 // `reference` after its unknowns have changed by `change`: the parameters, and the initial state. `total_mass` in kg is

@@ -1,0 +1,118 @@
+#include "chainsplat/properties.h"
+
+#include <Eigen/Eigenvalues>
+#include <cmath>
+#include <cstdio>
+#include <limits>
+
+#include "chainsplat/dynamics/parametrization.h"
+
+namespace chainsplat::twin {
+namespace {
+
+using math::MatrixX;
+using math::VectorX;
+
+// First mode about the shape in which the rope hangs from a base at rest, found from `near` on; left out where there is
+// none.
+void add_first_mode(const dynamics::Model& model, VectorX& near, std::vector<Property>& out) {
+  const math::Pose base;
+  try {
+    near = dynamics::static_equilibrium(model, base, near).theta;
+  } catch (const WorkError&) {
+    return;
+  }
+  const VectorX& theta = near;
+  const dynamics::Linearization at =
+      dynamics::linearize(model, dynamics::at_rest(base), math::Vector6::Zero(), theta, VectorX::Zero(theta.size()));
+  const MatrixX stiffness = 0.5 * (at.stiffness + at.stiffness.transpose());
+  const Eigen::GeneralizedSelfAdjointEigenSolver<MatrixX> modes(stiffness, at.mass);
+  const double square = modes.eigenvalues()[0];
+  if (!(square > 0.0)) return;
+  const VectorX shape = modes.eigenvectors().col(0);  // its modal mass is 1
+  const double turn = std::sqrt(square);
+  out.push_back({"damping_ratio", "1", shape.dot(at.damping * shape) / (2.0 * turn)});
+  out.push_back({"first_frequency", "Hz", turn / (2.0 * M_PI)});
+}
+
+// `near`: the shape at rest, of a rope that is much the same; empty: not known.
+std::vector<Property> values(const dynamics::Model& model, bool known_mass, VectorX& near) {
+  const dynamics::Parameters& p = model.parameters;
+  const chain::Chain& chain = model.chain;
+  const std::string per_mass = known_mass ? "" : "/kg";
+  double bending = 0.0, twisting = 0.0, friction = 0.0, mass = 0.0, length = 0.0, held = 0.0;
+  int bends = 0;
+  for (int k = 0; k < chain.angles(); ++k) {
+    if (chain::is_twist(chain, k)) continue;
+    bending += p.stiffness[k] * chain::bent_length(chain, chain.child_link[k]);
+    if (!p.bending_friction.empty()) friction += p.bending_friction[k];
+    ++bends;
+  }
+  for (std::size_t j = 0; j < p.torsional_stiffness.size(); ++j)
+    twisting += p.torsional_stiffness[j] * chain::bent_length(chain, static_cast<int>(j) + 1);
+  for (std::size_t j = 0; j < p.link_mass.size(); ++j) {
+    const int link = static_cast<int>(j) + 1;
+    mass += p.link_mass[j], length += chain.link_end(link) - chain.link_start(link);
+    held += p.link_mass[j] * p.coulomb_friction[j];
+  }
+  std::vector<Property> out;
+  out.push_back({"bending_stiffness", "N m^2" + per_mass, bending / bends});
+  if (!p.torsional_stiffness.empty())
+    out.push_back(
+        {"torsional_stiffness", "N m^2" + per_mass, twisting / static_cast<double>(p.torsional_stiffness.size())});
+  if (!p.bending_friction.empty()) out.push_back({"bending_friction", "N m" + per_mass, friction / bends});
+  if (!p.table_normal) add_first_mode(model, near, out);
+  out.push_back({"mass_per_length", known_mass ? "kg/m" : "1/m", mass / length});
+  if (p.table_normal) out.push_back({"friction_coefficient", "1", held / mass});
+  out.push_back({"tip_mass", known_mass ? "kg" : "1", p.tip_mass});
+  return out;
+}
+
+}  // namespace
+
+std::vector<Property> properties(const dynamics::Model& model, const dynamics::Estimates& estimates, bool known_mass) {
+  VectorX near;
+  std::vector<Property> out = values(model, known_mass, near);
+  const std::vector<dynamics::Unknown> all = dynamics::unknowns_of(model.chain, estimates);
+  const std::vector<Eigen::Index> known = dynamics::parameters_among(all);
+  const bool told = estimates.covariance.rows() == static_cast<Eigen::Index>(all.size()) && !known.empty() &&
+                    estimates.covariance(known, known).allFinite();
+  if (!told) {
+    for (Property& property : out) property.sigma = std::numeric_limits<double>::quiet_NaN();
+    return out;
+  }
+  // by central differences; the initial state has no part in it
+  constexpr double kStep = 1e-4;  // of a logarithm, in units of the quantity's scale
+  MatrixX slopes(out.size(), known.size());
+  for (std::size_t i = 0; i < known.size(); ++i) {
+    const dynamics::Unknown& unknown = all[known[i]];
+    const double step = kStep * dynamics::scale_of(unknown.quantity);
+    const auto moved = [&](double by) {
+      const dynamics::Parameters p =
+          dynamics::moved(model.chain, model.parameters, {&unknown, 1}, VectorX::Constant(1, by));
+      VectorX start = near;
+      return values(dynamics::make_model(model.chain, p), known_mass, start);
+    };
+    const std::vector<Property> up = moved(step), down = moved(-step);
+    for (std::size_t k = 0; k < out.size(); ++k)
+      slopes(k, i) =
+          up.size() == out.size() && down.size() == out.size() ? (up[k].value - down[k].value) / (2.0 * step) : 0.0;
+  }
+  const MatrixX covariance = slopes * estimates.covariance(known, known) * slopes.transpose();
+  for (std::size_t k = 0; k < out.size(); ++k)
+    out[k].sigma = std::sqrt(std::max(0.0, covariance(static_cast<Eigen::Index>(k), static_cast<Eigen::Index>(k))));
+  return out;
+}
+
+std::string describe(const std::vector<Property>& properties) {
+  std::string out;
+  char line[160];
+  for (const Property& p : properties) {
+    std::snprintf(line, sizeof line, "%-22s %10.4g +- %.2g %s\n", p.name.c_str(), p.value, p.sigma,
+                  p.unit == "1" ? "" : p.unit.c_str());
+    out += line;
+  }
+  return out;
+}
+
+}  // namespace chainsplat::twin

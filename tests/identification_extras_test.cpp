@@ -1,0 +1,153 @@
+// Friction in bending and payloads: asked for by the data, or not.
+#include <doctest/doctest.h>
+#include <cmath>
+
+#include "chainsplat/identification.h"
+
+using namespace chainsplat;
+using namespace chainsplat::identification;
+using math::MatrixX;
+using math::Vector3;
+using math::VectorX;
+
+namespace {
+
+constexpr double kMass = 0.3, kLength = 0.5, kStiffness = 0.6;  // kg, rope alone; m; N m/rad
+constexpr double kMoment = 0.03, kAngle = 0.02;                 // N m, rad
+constexpr double kPayload = 0.2;                                // kg
+constexpr double kNoise = 5e-4;                                 // m, of a marker's coordinate
+
+struct Scene {
+  chain::Chain chain;
+  trajectory::Trajectory base;
+  Markers markers;
+};
+
+// A rope bent aside and let go while its base stands still, then swings a little: six joints, three markers.
+Scene make_scene(double moment, double payload) {
+  Scene s;
+  s.chain = chain::make_chain(kLength, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 6, chain::Bending::planar, false);
+  dynamics::Parameters p;
+  p.link_mass.assign(6, kMass / 6), p.tip_mass = payload;
+  for (auto* zeros : {&p.viscous_friction, &p.coulomb_friction, &p.air_linear, &p.air_quadratic}) zeros->assign(6, 0.0);
+  p.stiffness.assign(6, kStiffness), p.damping.assign(6, 0.01), p.rest_angle.assign(6, 0.03);
+  p.stiffness[0] *= 2.0, p.damping[0] *= 2.0;
+  p.radius = 0.01;
+  p.substeps = 32;
+  if (moment > 0.0) {
+    p.bending_friction.assign(6, moment), p.bending_friction_angle.assign(6, kAngle);
+    p.bending_friction_angle[0] *= 0.5;
+  }
+  std::vector<trajectory::Sample> samples;
+  for (int k = 0; k <= 500; ++k) {
+    const double t = k / 120.0, u = std::clamp((t - 2.0) / 1.0, 0.0, 1.0);
+    const double x = 0.15 * u * u * u * (10.0 - 15.0 * u + 6.0 * u * u);
+    samples.push_back({t, {math::Matrix3::Identity(), Vector3(x, 0, 1)}});
+  }
+  s.base = trajectory::fit(samples, "test");
+  for (int k = 0; k < 120; ++k) s.markers.time.push_back(k / 30.0);
+  const dynamics::Model model = dynamics::make_model(s.chain, p);
+  dynamics::InitialState start{0.0, VectorX::Constant(6, 0.2), VectorX::Zero(6)};
+  start.friction_state = VectorX::Constant(6, 0.9);
+  const chain::States states = dynamics::rollout(model, s.base, start, s.markers.time);
+  s.markers.arclengths = {0.15, 0.3, 0.5};
+  s.markers.deviation = kNoise;
+  core::Random random(5);
+  for (std::size_t k = 0; k < states.time.size(); ++k) {
+    MatrixX seen = chain::centerline(
+        s.chain, chain::link_motions(s.chain, states.theta[k], s.base.pose(states.time[k])), s.markers.arclengths);
+    for (double& x : seen.reshaped()) x += kNoise * random.normal();
+    s.markers.world.push_back(seen);
+  }
+  return s;
+}
+
+Options options_of(double payload) {
+  Options options;
+  options.mass = kMass + payload;
+  return options;
+}
+
+// Estimate and standard error.
+std::pair<double, double> found(const Result& result, const std::string& name) {
+  for (std::size_t i = 0; i < result.estimates.names.size(); ++i)
+    if (result.estimates.names[i] == name) return {result.estimates.values[i], result.estimates.standard_errors[i]};
+  FAIL("no estimate named " << name);
+  return {};
+}
+
+double logit(double part) { return std::log(part / (1.0 - part)); }
+
+}  // namespace
+
+TEST_CASE("a rope with friction in bending gets it, and its numbers; one without gets none") {
+  const Scene braked = make_scene(kMoment, 0.0);
+  Options options = options_of(0.0);
+  options.tip_mass = 0.0;
+  const Result result = identify(braked.chain, braked.base, braked.markers, options);
+  REQUIRE(!result.parameters.bending_friction.empty());
+  const auto [moment, moment_error] = found(result, "log_bending_friction");
+  CHECK(std::abs(moment - std::log(kMoment)) < std::max(3.0 * moment_error, 0.05));
+  CHECK(moment_error < 0.5);
+  CHECK(result.parameters.bending_friction_angle[3] / kAngle == doctest::Approx(1.0).epsilon(0.5));
+  CHECK(result.node_rms < 2e-3);
+  options.ask_for_more = false;
+  const Result smooth = identify(braked.chain, braked.base, braked.markers, options);
+  CHECK(smooth.parameters.bending_friction.empty());
+  CHECK(smooth.node_rms > 3.0 * result.node_rms);
+
+  const Scene free = make_scene(0.0, 0.0);
+  options.ask_for_more = true;
+  const Result none = identify(free.chain, free.base, free.markers, options);
+  CHECK(none.parameters.bending_friction.empty());
+  options.ask_for_more = false;
+  const Result before = identify(free.chain, free.base, free.markers, options);
+  CHECK(none.estimates.values == before.estimates.values);
+}
+
+TEST_CASE("a payload is believed where it was weighed, and found where it was not") {
+  const Scene s = make_scene(0.0, kPayload);
+  const double part = kPayload / (kMass + kPayload);
+  Options options = options_of(kPayload);
+  options.tip_mass = kPayload;
+  const Result weighed = identify(s.chain, s.base, s.markers, options);
+  CHECK(weighed.parameters.tip_mass == doctest::Approx(kPayload).epsilon(2e-3));
+  CHECK(weighed.node_rms < 2e-3);
+  options.tip_mass_deviation = 0.1 * kPayload;
+  const Result about = identify(s.chain, s.base, s.markers, options);
+  CHECK(std::abs(about.parameters.tip_mass - kPayload) < 0.3 * kPayload);
+  options.tip_mass.reset(), options.tip_mass_deviation = 0.0;
+  const Result unknown = identify(s.chain, s.base, s.markers, options);
+  const auto [found_part, error] = found(unknown, "logit_tip_mass_fraction");
+  CHECK(std::abs(found_part - logit(part)) < std::max(3.0 * error, 0.3));
+}
+
+TEST_CASE("the initial state of a known rope is found from the first marks") {
+  const Scene s = make_scene(kMoment, kPayload);
+  Options options = options_of(kPayload);
+  options.tip_mass = kPayload;
+  const Result result = identify(s.chain, s.base, s.markers, options);
+  // begin in the midst of a swing
+  constexpr std::size_t kFirst = 10;
+  Markers later = s.markers;
+  later.time.erase(later.time.begin(), later.time.begin() + kFirst);
+  later.world.erase(later.world.begin(), later.world.begin() + kFirst);
+  const dynamics::InitialState start = fit_initial(s.chain, result.parameters, s.base, later);
+  CHECK(start.time == later.time[0]);
+  CHECK(start.thetadot.norm() > 0.5);
+  const dynamics::Model model = dynamics::make_model(s.chain, result.parameters);
+  const auto off = [&](const dynamics::InitialState& from) {
+    const chain::States states = dynamics::rollout(model, s.base, from, later.time);
+    double sum = 0.0;
+    for (std::size_t k = 0; k < later.time.size(); ++k)
+      sum += (chain::centerline(s.chain, chain::link_motions(s.chain, states.theta[k], s.base.pose(later.time[k])),
+                                {kLength}) -
+              later.world[k].col(2))
+                 .squaredNorm();
+    return std::sqrt(sum / later.time.size());
+  };
+  dynamics::InitialState still = start;
+  still.thetadot.setZero();
+  CHECK(off(start) < 4e-3);
+  CHECK(off(still) > 3.0 * off(start));
+}
