@@ -215,6 +215,10 @@ Json about_json(const Twin& twin) {
   if (!twin.known_mass) out["units"] = "m, s, rad; the total mass counts as 1 kg, forces are N per kg of rope";
   Json laws{{"joint", "torque = -stiffness (theta - rest_angle) - damping thetadot"},
             {"inertia", "links are uniform cylinders; tip_mass is a point at the free end"}};
+  if (!twin.parameters->bending_friction.empty())
+    laws["bending_friction"] =
+        "torque = -bending_friction z, dz/dt = (thetadot - |thetadot| z) / bending_friction_angle (Dahl); "
+        "initial_state.friction_state is z";
   if (twin.tabletop) {
     laws["table"] =
         "force on a link, spread evenly = -(viscous_friction + coulomb_friction mass g_n / sqrt(v_t^2 + "
