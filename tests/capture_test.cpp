@@ -567,7 +567,7 @@ TEST_CASE("numbers that memory and time follow are bounded, each with its reason
   CHECK(contains(with("/object", keys), "an object has more than 1000 keys"));
 
   made.write("times.txt", "0\n0.1\n0.2\n1e7\n");
-  CHECK(contains(with("/cameras/0/timestamps", "times.txt"), "timestamps: the frames span 1e+07 s"));
+  CHECK(contains(with("/cameras/0/timestamps", "times.txt"), "timestamps: the frames span 10000000 s"));
 
   std::string text = made.json.dump(1);
   text.replace(text.find("\"length\""), 8, "\"length\": 0.2, \"length\"");
