@@ -162,6 +162,7 @@ double scale_by(const Table& table, std::initializer_list<std::size_t> indices, 
     const bool large = most > plausible;
     unit = large ? larger : std::string(larger) == "mm" ? "m" : "rad";
     reason = large ? ", since they reach " + core::brief(most) : ", which is assumed";
+    reason += std::string(" (`") + (std::string(larger) == "mm" ? "base" : "angle") + "_unit`)";
   }
   notes.push_back(std::string("base: ") + what + " in " + unit + reason);
   return unit_scale(unit);

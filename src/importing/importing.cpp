@@ -9,6 +9,7 @@
 
 #include "base_log.h"
 #include "calibration.h"
+#include "chainsplat/text.h"
 #include "clock.h"
 #include "document.h"
 #include "media.h"
@@ -29,6 +30,7 @@ constexpr double kFarCamera = 30.0;  // m from its world's origin; farther ones 
 constexpr double kInView = 0.5;      // share of the base's poses that a camera must see to be believed
 constexpr double kMargin = 0.1;      // of the image around it that still counts as view
 constexpr int kViewSamples = 50;
+constexpr double kBesideFrames = 1.0;    // s of the base's motion before and after the frames that are kept
 constexpr double kHour = 3600.0;         // s
 constexpr double kPerpendicular = 1e-3;  // rad
 constexpr double kOffVertical = 60.0;    // degrees from straight down, where a hanging rope is doubted
@@ -76,7 +78,7 @@ void find_clock(Camera& camera, const trajectory::Trajectory& base, double origi
            camera.rate, found->start + origin, found->miss));
 }
 
-void set_times(Camera& camera, const Options& options, const trajectory::Trajectory& base, double origin,
+void set_times(Camera& camera, const Options& options, const std::vector<trajectory::Sample>& base, double origin,
                std::vector<std::string>& notes) {
   const CameraRequest& request = *camera.request;
   const int frames = camera.images.frames;
@@ -110,10 +112,10 @@ void set_times(Camera& camera, const Options& options, const trajectory::Traject
     throw InputError("`rate`", request.name + " has no times: images have no frame rate",
                      "give `rate` or `timestamps`");
   if (request.find_start) {
-    find_clock(camera, base, origin, notes);
+    find_clock(camera, trajectory::fit(base, options.base.file.string()), origin, notes);
     return;
   }
-  const double base_start = base.start() + origin;
+  const double base_start = base.front().time + origin;
   if (!request.start && base_start > kNewOrigin)
     throw InputError(
         "`timestamps`", request.name + text(" has no clock, and the base's begins at %.3f s", base_start),
@@ -123,7 +125,7 @@ void set_times(Camera& camera, const Options& options, const trajectory::Traject
   notes.push_back(request.name + ": " + text("%.6g frames per second", camera.rate) +
                   (request.rate ? "" : " by the video's header") +
                   (request.start ? text(", frame 0 at %.3f s", *request.start)
-                                 : ", frame 0 at the base's time 0, which is assumed"));
+                                 : ", frame 0 at the base's time 0, which is assumed (`start`, `timestamps`)"));
 }
 
 // The frames that the base covers, which lasts from `from` to `to`, s; `origin`: of the clock, for what is said.
@@ -150,6 +152,27 @@ void cut(Camera& camera, double from, double to, double origin, std::vector<std:
   if (left_out > 0)
     notes.push_back(camera.request->name + ": " + std::to_string(left_out) + " of " + std::to_string(times.size()) +
                     " frames are outside of the base's motion and are left out");
+}
+
+// A log that goes on for an hour says nothing more of a recording of seconds, and what the arm did then may be no
+// smooth motion.
+void leave_out_far_poses(std::vector<trajectory::Sample>& base, const std::vector<Camera>& cameras,
+                         std::vector<std::string>& notes) {
+  double from = std::numeric_limits<double>::infinity(), to = -from;
+  for (const Camera& camera : cameras) {
+    from = std::min(from, camera.times[camera.take.first] - kBesideFrames);
+    to = std::max(to, camera.times[camera.take.last - 1] + kBesideFrames);
+  }
+  const std::size_t before = base.size();
+  const auto is_before = [](const trajectory::Sample& sample, double time) { return sample.time < time; };
+  auto first = std::lower_bound(base.begin(), base.end(), from, is_before);
+  auto last = std::lower_bound(base.begin(), base.end(), to, is_before);
+  if (first != base.begin()) --first;  // of a slow log the frames lie between two poses
+  if (last != base.end()) ++last;
+  base = std::vector<trajectory::Sample>(first, last);
+  if (base.size() < before)
+    notes.push_back("base: " + std::to_string(before - base.size()) + " of " + std::to_string(before) +
+                    " poses are more than " + core::brief(kBesideFrames) + " s from all frames and are left out");
 }
 
 // --- cameras ---------------------------------------------------------------------------------------------------------
@@ -348,6 +371,8 @@ Vector3 choose_bending_axis(const Options& options, const std::vector<trajectory
   Eigen::Index largest = 0;
   axis.cwiseAbs().maxCoeff(&largest);
   if (axis[largest] < 0.0) axis = -axis;
+  for (double& number : axis)
+    if (std::abs(number) < 1e-12) number = 0.0;  // and no -0
   notes.push_back("grasp: bending axis " + text("%.3f, %.3f, %.3f", axis.x(), axis.y(), axis.z()) + ": " + reason);
   return axis;
 }
@@ -600,7 +625,6 @@ Imported import_capture(const Path& out, const Options& given) {
   const double origin = std::abs(base.front().time) > kNewOrigin ? std::floor(base.front().time) : 0.0;
   if (origin != 0.0) notes.push_back("clock: all times are from " + text("%.0f", origin) + " s on");
   for (trajectory::Sample& sample : base) sample.time -= origin;
-  const trajectory::Trajectory motion = trajectory::fit(base, options.base.file.string());
   // frames, what is the rope in them, and where the cameras are
   std::vector<Camera> cameras(options.cameras.size());
   for (std::size_t c = 0; c < cameras.size(); ++c) {
@@ -613,10 +637,12 @@ Imported import_capture(const Path& out, const Options& given) {
       std::all_of(cameras.begin(), cameras.end(), [](const Camera& camera) { return camera.masks.has_value(); });
   set_poses(cameras, base, options, notes);
   for (Camera& camera : cameras) {
-    set_times(camera, options, motion, origin, notes);
+    set_times(camera, options, base, origin, notes);
     camera.take = {0, camera.images.frames};
-    if (base.size() > 1) cut(camera, motion.start(), motion.end(), origin, notes);
+    if (base.size() > 1) cut(camera, base.front().time, base.back().time, origin, notes);
   }
+  leave_out_far_poses(base, cameras, notes);
+  const trajectory::Trajectory motion = trajectory::fit(base, options.base.file.string());
   options.bending_axis = bending_axis(options, base, notes);
   try {
     write_capture(out, options, cameras, base, motion, imported);

@@ -45,6 +45,22 @@ expect_output 'cam0: 20 of 60 frames are outside of the base' 'a short base'
 cmp -s "$out/masks/cam0/000000.png" "$demo/masks/cam0/000000.png" && fail 'a short base: its masks begin with frame 0'
 rm -r "$out"
 
+# a log that goes on for minutes: only its part about the frames is kept
+{ cat "$raw/robot.csv"
+  tail -1 "$raw/robot.csv" | awk -F, -v OFS=, -v CONVFMT=%.3f '{ for (i = 1; i <= 60; ++i) { $1 += 5000; print } }'; } >"$work/long.csv"
+run import "$out" "${opencv[@]}" "${stamps[@]}" --base "$work/long.csv"
+expect_code 0 'a long log'
+expect_output 'base: 59 of 301 poses are more than 1 s from all frames' 'a long log'
+rm -r "$out"
+
+# without any clock: found from the masks, to about the frame's interval that rope and gripper leave open
+run import "$out" "${opencv[@]}" --start auto --masks "$demo/masks/cam0" --base "$raw/robot.csv"
+expect_code 0 'import --start auto'
+start=$(python3 -c 'import json, sys; print(json.load(open(sys.argv[1]))["cameras"][0]["start"])' "$out/capture.json")
+awk -v start="$start" 'BEGIN { exit !(start > 0.22 && start < 0.28) }' || fail "import --start auto: $start instead of 0.25"
+rm -r "$out"
+refused 'has none.*--masks' "${opencv[@]}" --start auto --base "$raw/robot.csv"
+
 # what cannot be
 sed 's/image_width: 320/image_width: 640/' "$raw/cam0.yaml" >"$work/large.yaml"
 refused '640x240.*320x240' "${opencv[@]}" "${stamps[@]}" --base "$raw/robot.csv" --calibration cam0="$work/large.yaml"
