@@ -214,7 +214,7 @@ TEST_CASE("twin.json has the keys that other programs read") {
   };
   using Keys = std::vector<std::string>;
   CHECK(keys(json) ==
-        Keys{"chain", "format", "gaussians", "grasp", "identification", "provenance", "rollout", "states"});
+        Keys{"about", "chain", "format", "gaussians", "grasp", "identification", "provenance", "rollout", "states"});
   CHECK(keys(json["chain"]) == Keys{"air_drag", "diameter", "gravity", "initial_state", "integrator", "joints",
                                     "length", "links", "regularization", "scenario", "tip_mass"});
   CHECK(keys(json["chain"]["joints"][0]) ==
