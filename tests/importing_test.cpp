@@ -110,7 +110,27 @@ TEST_CASE("OpenCV's YAML and JSON: half a pixel more, and rvec and tvec take the
   CHECK(holds(refusal([&] {
                 read_calibration({folder.write("d.yaml", "a: [1, 2\nb: }"), ""}, "left");
               }),
-              "neither YAML nor JSON"));
+              "neither YAML, JSON nor"));
+}
+
+TEST_CASE("OpenCV's XML") {
+  const Folder folder;
+  const Calibration c = read_calibration(
+      {folder.write(
+           "a.xml",
+           "<?xml version=\"1.0\"?>\n<opencv_storage>\n<image_width>640</image_width><image_height>480</image_height>\n"
+           "<camera_matrix type_id=\"opencv-matrix\"><rows>3</rows><cols>3</cols><dt>d</dt>\n"
+           "<data> 600. 0. 319.5\n 0. 601. 239.5 0. 0. 1.</data></camera_matrix>\n<distortion_coefficients "
+           "type_id=\"opencv-matrix\"><rows>5</rows><cols>1</cols><dt>d</dt><data>-0.1 0. 0. 0. 2e-3</data>"
+           "</distortion_coefficients><rvec>0 0 0</rvec><tvec>0.1 0.2 0.3</tvec></opencv_storage>\n"),
+       ""},
+      "cam0");
+  CHECK(c.width == 640);
+  CHECK(c.lens.cy == 240.0);
+  CHECK(c.lens.coefficients == std::vector<double>{-0.1, 0.0, 0.0, 0.0, 2e-3});
+  REQUIRE(c.pose);
+  CHECK(c.pose->matrix.translation == Vector3(0.1, 0.2, 0.3));
+  CHECK(refusal([&] { read_calibration({folder.write("b.xml", "<a><b></a>"), ""}, "cam0"); }) != "");
 }
 
 TEST_CASE("a matrix's name says which way it maps") {

@@ -456,7 +456,8 @@ std::optional<FoundPose> read_pose_text(const Source& source) {
 }  // namespace
 
 std::string known_calibrations() {
-  return "OpenCV (YAML or JSON), ROS camera_info, Kalibr camchain, COLMAP (folder with cameras and images, .txt or "
+  return "OpenCV (YAML, JSON or XML), ROS camera_info, Kalibr camchain, COLMAP (folder with cameras and images, .txt "
+         "or "
          ".bin), nerfstudio transforms.json, capture.json";
 }
 

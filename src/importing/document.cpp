@@ -1,5 +1,6 @@
 #include "document.h"
 
+#include <tinyxml2.h>
 #include <yaml-cpp/yaml.h>
 
 #include <algorithm>
@@ -35,6 +36,27 @@ Json tree_of(const YAML::Node& node, int depth, int& left, const std::string& fi
   const bool quoted = node.Tag() == "!";
   if (const auto value = quoted ? std::nullopt : number_of(node.Scalar())) return *value;
   return node.Scalar();
+}
+
+// OpenCV's XML: an element is an object of its children, or numbers between spaces, or a text.
+Json tree_of(const tinyxml2::XMLElement& element, int depth, const std::string& file) {
+  if (depth > core::kDeepestJson) throw InputError(file, "is nested too deep", "give the file of a calibration");
+  Json object = Json::object();
+  for (const auto* child = element.FirstChildElement(); child; child = child->NextSiblingElement())
+    object[child->Name()] = tree_of(*child, depth + 1, file);
+  if (!object.empty()) return object;
+  const char* const inside = element.GetText();
+  const std::string text = inside ? inside : "";
+  Json numbers = Json::array();
+  for (std::size_t at = 0; at < text.size();) {
+    const std::size_t from = text.find_first_not_of(" \t\r\n", at);
+    if (from == std::string::npos) break;
+    at = std::min(text.find_first_of(" \t\r\n", from), text.size());
+    const auto value = number_of(std::string_view(text).substr(from, at - from));
+    if (!value) return text;
+    numbers.push_back(*value);
+  }
+  return numbers.size() == 1 ? numbers[0] : numbers;
 }
 
 }  // namespace
@@ -92,6 +114,11 @@ Json read_document(const Path& file) {
     Json json = core::parse_json_or_discard(text);
     if (!json.is_discarded()) return json;
   }
+  if (first != std::string::npos && text[first] == '<') {
+    tinyxml2::XMLDocument document;
+    if (document.Parse(text.data(), text.size()) == tinyxml2::XML_SUCCESS && document.RootElement())
+      return tree_of(*document.RootElement(), 0, file.string());
+  }
   if (text.size() > kMostYaml)
     throw InputError(file.string(), "is YAML of more than " + std::to_string(kMostYaml >> 20) + " MiB",
                      "give the file of a calibration");
@@ -102,7 +129,7 @@ Json read_document(const Path& file) {
     return tree_of(YAML::Load(text), 0, left, file.string());
   } catch (const YAML::Exception& failure) {
     throw InputError(file.string() + (failure.mark.is_null() ? "" : ":" + std::to_string(failure.mark.line + 1)),
-                     "is neither YAML nor JSON", "give a file in a known format");
+                     "is neither YAML, JSON nor OpenCV's XML", "give a file in a known format");
   }
 }
 

@@ -1,4 +1,4 @@
-// src/importing/document.h - YAML and JSON files of other programs as one kind of tree, and the numbers in it.
+// src/importing/document.h - YAML, JSON and OpenCV's XML files of other programs as one kind of tree, and the numbers in it.
 #pragma once
 #include <initializer_list>
 #include <nlohmann/json.hpp>
@@ -14,7 +14,7 @@ namespace chainsplat::importing {
 
 using Json = nlohmann::ordered_json;
 
-// Reads YAML (OpenCV's dialect too) or JSON. Throws InputError for a file that is neither.
+// Reads YAML (OpenCV's dialect too), JSON or OpenCV's XML. Throws InputError for a file that is none of them.
 Json read_document(const Path& file);
 
 // The whole text as one finite number, spaces about it and a leading '+' allowed.
