@@ -18,8 +18,8 @@ namespace {
 constexpr double kTimeSlack = 1e-6;  // s: times in text files are rounded
 constexpr const char* kExampleRate = "give rows a second, for example 30";
 
-// Marker files begin with what their markers are (formats.md 4.1), states with a head line. A pipe can be read only once:
-// it gives states.
+// Marker files begin with what their markers are (formats.md 4.1), states with a head line. A pipe can be read only
+// once: it gives states.
 bool is_marker_file(const Path& file) {
   std::error_code ignored;
   return std::filesystem::is_regular_file(file, ignored) && core::read_file(file).starts_with("#");
