@@ -153,6 +153,38 @@ TEST_CASE("a twin reads back bit by bit") {
     CHECK(core::read_file(folder.path / "run" / name) == core::read_file(folder.path / "again" / name));
 }
 
+TEST_CASE("torsion, friction in bending and a payload read back, in a file that an older program refuses") {
+  const test::TemporaryFolder folder("twin");
+  twin::Twin twin = full_twin();
+  const auto format = [&] {
+    return nlohmann::json::parse(core::read_file(folder.path / "run/twin.json"))["format"].get<std::string>();
+  };
+  twin::save(twin, folder.path / "run");
+  CHECK(format() == "chainsplat-twin/1");
+  CHECK(twin::load(folder.path / "run").parameters->bending_friction.empty());
+  dynamics::Parameters& p = *twin.parameters;
+  const int n = twin.chain.angles();
+  for (int k = 0; k < n; ++k) p.bending_friction.push_back(0.01 / (k + 3)), p.bending_friction_angle.push_back(0.1 / 3);
+  twin.initial->friction_state = math::VectorX::LinSpaced(n, -1.0, 0.7);
+  twin.provenance.payload = {0.1 / 3, 0.01 / 3};
+  twin::save(twin, folder.path / "run");
+  CHECK(format() == "chainsplat-twin/2");
+  p.torsional_stiffness.assign(twin.chain.links() - 1, 0.01 / 3);
+  twin::save(twin, folder.path / "run");
+  const twin::Twin read = twin::load(folder.path / "run");
+  CHECK(same_all(read.parameters->bending_friction, p.bending_friction));
+  CHECK(same_all(read.parameters->bending_friction_angle, p.bending_friction_angle));
+  CHECK(same_all(read.parameters->torsional_stiffness, p.torsional_stiffness));
+  CHECK(same_all(read.initial->friction_state, twin.initial->friction_state));
+  REQUIRE(read.provenance.payload.has_value());
+  CHECK(same(read.provenance.payload->mass, 0.1 / 3));
+  CHECK(same(read.provenance.payload->sigma, 0.01 / 3));
+  const auto properties = nlohmann::json::parse(core::read_file(folder.path / "run/twin.json"))["properties"];
+  CHECK(properties["bending_stiffness"]["unit"] == "N m^2");
+  CHECK(properties["tip_mass"]["value"] == p.tip_mass);
+  CHECK(properties["first_frequency"]["value"] > 0.5);
+}
+
 TEST_CASE("tabletop twins keep their table, thin links and paper's integrator") {
   const test::TemporaryFolder folder("table");
   twin::Twin twin = full_twin();

@@ -34,7 +34,7 @@ RigidInertia world_inertia(double mass, double center, double transverse, double
   return out;
 }
 
-Engine::Engine(const Model& m) : model(m), angles(m.chain.angles()), link_count(m.chain.links() - 1) {
+Engine::Engine(const Model& m) : model(m), angles(m.chain.angles()), link_count(m.chain.links() - 1), torsion_(m) {
   const Parameters& p = model.parameters;
   table_ = p.table_normal.has_value();
   normal_ = table_ ? *p.table_normal : Vector3::Zero();
@@ -172,6 +172,10 @@ void Engine::set_state(const VectorX& theta, const VectorX& thetadot) {
   const Parameters& p = model.parameters;
   for (int k = 0; k < angles; ++k)
     torque[k] = -p.stiffness[k] * (theta[k] - p.rest_angle[k]) - p.damping[k] * thetadot[k];
+  if (torsion_.present) {
+    torsion_.place(theta);
+    for (int k = 0; k < angles; ++k) torque[k] = torsion_.torque()[k] - p.damping[k] * thetadot[k];
+  }
   for (Eigen::Index k = 0; k < friction_state.size(); ++k) torque[k] -= p.bending_friction[k] * friction_state[k];
 }
 
@@ -191,9 +195,10 @@ void Engine::linearize_roll() {
 void Engine::joint_forces(const Tangent& d, Eigen::Ref<VectorX> column) const {
   const Parameters& p = model.parameters;
   column.setZero();
-  if (!d.stiffness.empty())
+  if (torsion_.present) torsion_.add_unknown(d, column);
+  if (!d.stiffness.empty() && !torsion_.present)
     for (int k = 0; k < angles; ++k) column[k] -= d.stiffness[k] * (theta_[k] - p.rest_angle[k]);
-  if (!d.rest_angle.empty())
+  if (!d.rest_angle.empty() && !torsion_.present)
     for (int k = 0; k < angles; ++k) column[k] += p.stiffness[k] * d.rest_angle[k];
   if (!d.damping.empty())
     for (int k = 0; k < angles; ++k) column[k] -= d.damping[k] * thetadot_[k];
@@ -376,10 +381,11 @@ void Engine::linearize(const Vector6& base_jerk) {
         stiffness(i, k) = dot(axis[i], column);
         damping(i, k) = dot(axis[i], speed_column);
       }
-      stiffness(k, k) += p.stiffness[k];
+      if (!torsion_.present) stiffness(k, k) += p.stiffness[k];
       damping(k, k) += p.damping[k];
     }
   }
+  if (torsion_.present) torsion_.add_stiffness(stiffness);
   for (int j = 0; rolls && j < link_count; ++j) {
     roll_by_time[j] = dot(roll_slope_[j], base_turn);
     for (int i = 0; i < links[j].end_angle; ++i)

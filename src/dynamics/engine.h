@@ -15,6 +15,7 @@
 #include <vector>
 
 #include "chainsplat/dynamics.h"
+#include "torsion.h"
 
 namespace chainsplat::dynamics {
 
@@ -135,6 +136,7 @@ class Engine {
   double normal_gravity_ = 0.0;
   bool table_ = false;
   VectorX theta_, thetadot_;
+  Torsion torsion_;
   Vector3 bending_axis_;             // world
   std::vector<Vector6> roll_slope_;  // df_j / dV_j
   std::vector<Vector3> local_axis_;

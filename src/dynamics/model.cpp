@@ -48,6 +48,18 @@ Model make_model(const chain::Chain& chain, const Parameters& p) {
       require(angle > 0.0, "a bending_friction_angle is 0", "give a number > 0");
     require(p.integrator == Integrator::rodas3, "friction in bending needs the integrator rodas3", "choose it");
   }
+  if (!p.torsional_stiffness.empty()) {
+    check_array(p.torsional_stiffness, links, "torsional_stiffness");
+    require(angles == 2 * links && !chain::has_twist(chain),
+            "torsional_stiffness is given for a chain whose joints do not bend in two directions", "leave it empty");
+    for (const double twist : p.torsional_stiffness)
+      require(twist > 0.0, "a torsional_stiffness is 0", "give a number > 0");
+    for (int k = 0; k < angles; ++k) {
+      const Vector3 axis = k % 2 == 0 ? chain.bending_axis : chain.direction.cross(chain.bending_axis);
+      require((chain.axes[k].head<3>() - axis).norm() < 1e-9,
+              "torsional_stiffness is given for joints that bend about other axes than a and d x a", "leave it empty");
+    }
+  }
   check_array({p.tip_mass, p.radius}, 2, "tip_mass or radius");
   check_array({p.coulomb_speed, p.drag_speed}, 2, "coulomb_speed or drag_speed");
   require(p.coulomb_speed > 0.0 && p.drag_speed > 0.0, "a regularization speed is 0", "give a number > 0");
@@ -126,6 +138,11 @@ trajectory::BaseMotion at_rest(const math::Pose& pose) {
 VectorX joint_law(const Model& model, const VectorX& theta, const VectorX& thetadot) {
   VectorX torque(theta.size());
   const Parameters& p = model.parameters;
+  if (Torsion torsion(model); torsion.present) {
+    torsion.place(theta);
+    for (Eigen::Index k = 0; k < theta.size(); ++k) torque[k] = torsion.torque()[k] - p.damping[k] * thetadot[k];
+    return torque;
+  }
   for (Eigen::Index k = 0; k < theta.size(); ++k)
     torque[k] = -p.stiffness[k] * (theta[k] - p.rest_angle[k]) - p.damping[k] * thetadot[k];
   return torque;
@@ -249,6 +266,10 @@ double potential_energy(const Model& model, const math::Pose& base, const Vector
     const double start = chain.link_start(link), end = chain.link_end(link);
     energy -= p.link_mass[link - 1] * gravity.dot(motions[link] * (0.5 * (start + end) * chain.direction));
     if (link + 1 == chain.links()) energy -= p.tip_mass * gravity.dot(motions[link] * (end * chain.direction));
+  }
+  if (Torsion torsion(model); torsion.present) {
+    torsion.place(theta);
+    return energy + torsion.energy();
   }
   for (int k = 0; k < chain.angles(); ++k) {
     const double bend = theta[k] - p.rest_angle[k];

@@ -53,7 +53,8 @@ struct Row {
 // clang-format off
 const Row kRows[] = {
     {Quantity::none, "", "", 1.0, Per::rope},
-    {Quantity::stiffness, "log_stiffness", "log(N m/rad)", 1.0, Per::rope, How::logarithm, {kStiffness}, every},
+    {Quantity::stiffness, "log_stiffness", "log(N m/rad)", 1.0, Per::rope, How::logarithm,
+     {kStiffness, kTorsionalStiffness}, every},
     {Quantity::grasp_stiffness, "log_grasp_stiffness_ratio", "log", 1.0, Per::rope, How::factor, {kStiffness}, second},
     {Quantity::twist_stiffness, "log_twist_stiffness_ratio", "log", 1.0, Per::rope, How::logarithm, {kStiffness}, twists},
     {Quantity::damping, "log_damping", "log(N m s/rad)", 1.0, Per::rope, How::logarithm, {kDamping}, every},
@@ -70,7 +71,7 @@ const Row kRows[] = {
     {Quantity::bending_friction, "log_bending_friction", "log(N m)", 1.0, Per::rope, How::logarithm, {kBendingFriction}, every},
     {Quantity::bending_friction_angle, "log_bending_friction_angle", "log(rad)", 1.0, Per::rope, How::logarithm,
      {kBendingFrictionAngle}, every},
-    {Quantity::torsional_stiffness, "log_torsional_stiffness", "log(N m/rad)", 1.0, Per::rope, How::logarithm,
+    {Quantity::torsional_stiffness, "log_torsional_stiffness_ratio", "log", 1.0, Per::rope, How::logarithm,
      {kTorsionalStiffness}, every},
     {Quantity::theta, "theta", "rad", 0.2, Per::angle, How::addition, {}, own, &InitialState::theta, &Tangent::theta},
     {Quantity::thetadot, "thetadot", "rad/s", 1.0, Per::angle, How::addition, {}, own, &InitialState::thetadot,

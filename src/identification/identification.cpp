@@ -719,7 +719,9 @@ struct Candidate {
 
 // The model of every rope, or one with friction in bending or a payload where the data ask for it.
 Candidate fit_candidates(const chain::Chain& chain, std::vector<Part> parts, const Options& options) {
-  constexpr double kWithin = 0.3;    // misfit that needs no further explanation
+  // Misfit that needs no further explanation. What is expected of markers is generous; of recognized angles it is a
+  // millimeter, within which errors of calibration look like physics.
+  const double within_errors = parts.front().has_markers ? 0.3 : 1.0;
   constexpr double kEvidence = 5.0;  // in favor of what a rope need not have, natural logarithm
   std::vector<Candidate> tried;
   const auto attempt = [&](const Extras& extras) {
@@ -732,7 +734,7 @@ Candidate fit_candidates(const chain::Chain& chain, std::vector<Part> parts, con
   const auto within = [&](const Candidate& one) {
     Rollouts rollouts(one.problem, kInfinity, true);
     return one.fit.cost < kInfinity && rollouts.run(one.problem, one.fit.p, false) &&
-           misfit_of(rollouts).scale <= kWithin;
+           misfit_of(rollouts).scale <= within_errors;
   };
   if (!options.ask_for_more || options.tabletop || !options.fit_stiffness || within(tried[0]))
     return std::move(tried[0]);
@@ -742,7 +744,7 @@ Candidate fit_candidates(const chain::Chain& chain, std::vector<Part> parts, con
   std::size_t best = 0;
   for (std::size_t i = 0; i < tried.size(); ++i) {
     Candidate& now = tried[i];
-    now.lack = lack_of_evidence(now.problem, now.fit, kWithin);
+    now.lack = lack_of_evidence(now.problem, now.fit, within_errors);
     const double parts_more = static_cast<int>(now.extras.friction) + static_cast<int>(now.extras.payload);
     core::say_more("identify: " + std::string(now.extras.friction ? "friction in bending, " : "") +
                    (now.extras.payload ? "a payload, " : "") + "log evidence " + core::exact(-now.lack));

@@ -1,5 +1,7 @@
 // evaluate.cpp - a twin set in motion, and measured against a capture.
 #include <algorithm>
+#include <filesystem>
+#include <system_error>
 
 #include "chainsplat/comparison.h"
 #include "chainsplat/gpu.h"
@@ -16,8 +18,12 @@ namespace {
 constexpr double kTimeSlack = 1e-6;  // s: times in text files are rounded
 constexpr const char* kExampleRate = "give rows a second, for example 30";
 
-// Marker files begin with what their markers are (formats.md 4.1), states with a head line.
-bool is_marker_file(const Path& file) { return core::read_file(file).starts_with("#"); }
+// Marker files begin with what their markers are (formats.md 4.1), states with a head line. A pipe can be read only
+// once: it gives states.
+bool is_marker_file(const Path& file) {
+  std::error_code ignored;
+  return std::filesystem::is_regular_file(file, ignored) && core::read_file(file).starts_with("#");
+}
 
 // A rope that was held in this shape and let go: friction in bending has built up on the way there from its rest.
 math::VectorX friction_of_shape(const dynamics::Model& model, const math::Pose& base, const math::VectorX& theta) {

@@ -3,6 +3,7 @@
 #include <Eigen/Eigenvalues>
 #include <cmath>
 #include <cstdio>
+#include <exception>
 #include <limits>
 
 #include "chainsplat/dynamics/parametrization.h"
@@ -17,14 +18,13 @@ using math::VectorX;
 // none.
 void add_first_mode(const dynamics::Model& model, VectorX& near, std::vector<Property>& out) {
   const math::Pose base;
+  dynamics::Linearization at;
   try {
     near = dynamics::static_equilibrium(model, base, near).theta;
-  } catch (const WorkError&) {
+    at = dynamics::linearize(model, dynamics::at_rest(base), math::Vector6::Zero(), near, VectorX::Zero(near.size()));
+  } catch (const std::exception&) {  // it hangs nowhere, or a joint has no inertia
     return;
   }
-  const VectorX& theta = near;
-  const dynamics::Linearization at =
-      dynamics::linearize(model, dynamics::at_rest(base), math::Vector6::Zero(), theta, VectorX::Zero(theta.size()));
   const MatrixX stiffness = 0.5 * (at.stiffness + at.stiffness.transpose());
   const Eigen::GeneralizedSelfAdjointEigenSolver<MatrixX> modes(stiffness, at.mass);
   const double square = modes.eigenvalues()[0];

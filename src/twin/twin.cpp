@@ -18,7 +18,7 @@ using math::Vector6;
 namespace {
 
 constexpr const char* kFormat = "chainsplat-twin/1";
-// Of twins that a program of format 1 would set in motion wrongly: with friction in bending.
+// Of twins that a program of format 1 would set in motion wrongly: with friction in bending or torsion.
 constexpr const char* kNewFormat = "chainsplat-twin/2";
 constexpr const char *kGaussians = "gaussians.ply", *kStates = "states.csv", *kRollout = "rollout.csv";
 constexpr double kLengthTolerance = 1e-6;  // m, and for lengths of unit vectors; accepts files edited by hand
@@ -187,6 +187,7 @@ Json chain_json(const Twin& twin) {
     out["air_drag"] = {{"linear", drag_per_meter(chain, p->air_linear)},
                        {"quadratic", drag_per_meter(chain, p->air_quadratic)}};
     out["tip_mass"] = p->tip_mass;
+    if (!p->torsional_stiffness.empty()) out["torsional_stiffness"] = list(p->torsional_stiffness);
     out["regularization"] = {{"coulomb_speed", p->coulomb_speed}, {"drag_speed", p->drag_speed}};
     for (const auto& [integrator, name] : kIntegrators)
       if (integrator == p->integrator) out["integrator"] = {{"name", name}, {"substeps", p->substeps}};
@@ -215,6 +216,9 @@ Json about_json(const Twin& twin) {
   if (!twin.known_mass) out["units"] = "m, s, rad; the total mass counts as 1 kg, forces are N per kg of rope";
   Json laws{{"joint", "torque = -stiffness (theta - rest_angle) - damping thetadot"},
             {"inertia", "links are uniform cylinders; tip_mass is a point at the free end"}};
+  if (!twin.parameters->torsional_stiffness.empty())
+    laws["torsion"] =
+        "the rope twists within its links with torsional_stiffness, in equilibrium (docs/mathematics.md 3.11)";
   if (!twin.parameters->bending_friction.empty())
     laws["bending_friction"] =
         "torque = -bending_friction z, dz/dt = (thetadot - |thetadot| z) / bending_friction_angle (Dahl); "
@@ -257,11 +261,15 @@ Json identification_json(const Twin& twin) {
   return out;
 }
 
+// Of a twin that can be set in motion; numbers that cannot are saved all the same.
 Json properties_json(const Twin& twin) {
   Json out = Json::object();
-  for (const Property& p :
-       properties(dynamics::make_model(twin.chain, *twin.parameters), twin.estimates, twin.known_mass))
-    out[p.name] = {{"value", p.value}, {"sigma", std::isfinite(p.sigma) ? Json(p.sigma) : Json()}, {"unit", p.unit}};
+  try {
+    const dynamics::Model model = dynamics::make_model(twin.chain, *twin.parameters);
+    for (const Property& p : properties(model, twin.estimates, twin.known_mass))
+      out[p.name] = {{"value", p.value}, {"sigma", std::isfinite(p.sigma) ? Json(p.sigma) : Json()}, {"unit", p.unit}};
+  } catch (const InputError&) {
+  }
   return out;
 }
 
@@ -482,6 +490,8 @@ dynamics::Parameters read_parameters(const Node& node, const Twin& twin) {
 
   p.radius = cylinder_radius(twin.chain, p.link_mass, links);
   p.tip_mass = node["tip_mass"].not_negative();
+  if (node.has("torsional_stiffness"))
+    for (const Node& twist : node["torsional_stiffness"].entries()) p.torsional_stiffness.push_back(twist.positive());
   p.coulomb_speed = node["regularization"]["coulomb_speed"].positive();
   p.drag_speed = node["regularization"]["drag_speed"].positive();
   const Node name = node["integrator"]["name"];
@@ -674,7 +684,8 @@ void save(const Twin& twin, const Path& run) {
   std::filesystem::create_directories(run, error);
   if (error)
     throw WorkError(run.string(), "cannot be made (" + error.message() + ")", "choose a folder that can be written");
-  const bool plain = !twin.parameters || twin.parameters->bending_friction.empty();
+  const bool plain =
+      !twin.parameters || (twin.parameters->bending_friction.empty() && twin.parameters->torsional_stiffness.empty());
   Json out{{"format", plain ? kFormat : kNewFormat},
            {"about", about_json(twin)},
            {"grasp", {{"direction", list(twin.chain.direction)}, {"bending_axis", list(twin.chain.bending_axis)}}},
