@@ -245,8 +245,8 @@ TEST_CASE("twin.json has the keys that other programs read") {
     return out;  // sorted by nlohmann::json
   };
   using Keys = std::vector<std::string>;
-  CHECK(keys(json) ==
-        Keys{"about", "chain", "format", "gaussians", "grasp", "identification", "provenance", "rollout", "states"});
+  CHECK(keys(json) == Keys{"about", "chain", "format", "gaussians", "grasp", "identification", "properties",
+                           "provenance", "rollout", "states"});
   CHECK(keys(json["chain"]) == Keys{"air_drag", "diameter", "gravity", "initial_state", "integrator", "joints",
                                     "length", "links", "regularization", "scenario", "tip_mass"});
   CHECK(keys(json["chain"]["joints"][0]) ==

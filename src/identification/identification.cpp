@@ -761,8 +761,8 @@ std::vector<Result> fit_parts(const chain::Chain& chain, std::vector<Part> parts
     return only;
   };
   const Candidate chosen = options.paper ? paper() : fit_candidates(chain, std::move(parts), options);
-  if (chosen.extras.friction) core::say("identify: the motion asks for friction in bending");
-  if (chosen.extras.payload) core::say("identify: the motion asks for a payload at the free end");
+  if (chosen.extras.friction) core::say_more("identify: the motion asks for friction in bending");
+  if (chosen.extras.payload) core::say_more("identify: the motion asks for a payload at the free end");
   const Problem& problem = chosen.problem;
   const Fit& fit = chosen.fit;
   Rollouts rollouts(problem, kInfinity, true);

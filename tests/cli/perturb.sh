@@ -197,7 +197,7 @@ reads lossy 0 '^cam2: .* 60 frames'
 perturb inverse --inverse-poses --only cam1
 reads inverse 2 "^problem: cam1's world_from_camera is the pose of the world"
 perturb axes --opengl-axes
-reads axes 2 "^problem: cam2's world_from_camera has OpenGL"
+reads axes 2 "^problem: the cameras' world_from_camera has OpenGL"
 perturb units --millimeters object
 reads units 2 '^problem: .*object\.length'
 perturb size --calibration-scale 2
