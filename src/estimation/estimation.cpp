@@ -77,9 +77,9 @@ constexpr double kUnlike = 0.5;  // likeness of drawn and recorded colors, below
 // laid double into them, or be turned toward the camera.
 constexpr double kShown = 0.7;
 constexpr double kLongHidden = 2.0;  // s after which a rope that was never seen whole is followed as it is seen
-constexpr double kSearched = 0.9;  // share of the masks that the rope covers, below which it is sought elsewhere, too,
-constexpr double kBetter = 0.05;   // and by which it must be higher there
-constexpr double kUnexplained = 0.8;  // the same share, below which something else is in the masks
+// Share of the masks that the rope covers, below which something else is in them, and the rope is sought elsewhere,
+// too; there it must cover so much more.
+constexpr double kUnexplained = 0.8, kBetter = 0.1;
 constexpr double kDoubtAngle = 0.15;  // rad, added to the deviations of a doubtful rope's angles
 constexpr double kLongUnlike = 0.2;   // s of such frames, after which the rope counts as lost
 
@@ -613,7 +613,7 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
       }
     }
     // where the masks are not explained, or not all of them, search from a wide belief
-    if (!explains(measured.fit) || measured.fit.covered < kSearched) {
+    if (!explains(measured.fit) || measured.fit.covered < kUnexplained) {
       Belief wide = first_belief(filter, view.time);
       wide.covariance.diagonal().head(n).array() += kLostAngle * kLostAngle;
       wide.covariance.diagonal().segment(n, n).array() += kLostRate * kLostRate;

@@ -82,12 +82,12 @@ struct ExportRequest {
 void export_twin(const Globals& globals, const ExportRequest& request) {
   const std::vector<Path> files = exports::files(request.out);
   for (const Path& file : files) {
+    check_not_input(file.string(), request.run, {request.states, request.base});
     pipeline::check_output_file(file.string());
     std::error_code error;
     if (!request.force && std::filesystem::is_regular_file(file, error))
       throw InputError(file.string(), "is there already", "name another file, or give --force to replace it");
   }
-  for (const Path& file : files) check_not_input(file.string(), request.run, {request.states, request.base});
   twin::Twin twin = pipeline::load_twin(request.run);
   if (files.front().extension() == ".npz")
     twin.states.covariance = pipeline::read_covariances(Path(request.run) / pipeline::kCovarianceFile, twin.states);
