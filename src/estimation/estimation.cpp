@@ -396,7 +396,8 @@ double shown_share(const Filter& filter, std::span<const capture::View* const> v
 void learn_clock(Filter& filter, std::span<const capture::View* const> views, const Belief& predicted,
                  const VectorX& theta) {
   const Vector6 velocity = base_at(filter, predicted.time).velocity;
-  if (velocity.tail<3>().norm() < kMoving) return;
+  // without dynamics nothing tells a rope that follows late from a base that is stamped late
+  if (!filter.identified || velocity.tail<3>().norm() < kMoving) return;
   const int n = filter.model.chain.angles();
   const Eigen::LLT<MatrixX> factor(predicted.covariance.topLeftCorner(n, n));
   if (!math::is_positive(factor)) return;
