@@ -581,85 +581,79 @@ std::optional<VectorX> expected(const Filter& filter, double time) {
 
 trajectory::BaseMotion base_at(const Filter& filter, double time) { return filter.base(time + filter.base_late); }
 
-Estimate update(Filter& filter, std::span<const capture::View* const> views) {
-  CHAINSPLAT_CHECK(!views.empty(), "no view");
-  const capture::View& view = *views.front();
-  const int n = filter.model.chain.angles();
-  const bool first = !filter.belief;
-  const auto believed_after = [&](Contact contact) {
-    return first ? first_belief(filter, view.time) : predict(filter, *filter.belief, view.time, contact);
-  };
-  // predict
-  const bool in_contact = view.time <= filter.contact_until;
-  Belief predicted = believed_after(in_contact ? Contact::touched : Contact::none);
-  if (first) filter.last_seen = view.time;
+namespace {
 
-  Estimate out;
-  out.frame = view.frame;
-  out.time = view.time;
-  out.seen = std::any_of(views.begin(), views.end(), [](const capture::View* v) { return has_mask(*v); });
-  bool believed = false;  // the belief is taken from this frame
-  if (out.seen) {
-    // measure; where the model does not explain the frame, again with a force that may change, and then with a blow
-    Measured measured = measure(filter, predicted, views, !first);
-    if (!first && (measured.surprise > kSurprise || !explains(measured.fit))) {
-      filter.contact_until = view.time + kContactMemory;
-      if (!in_contact) {
-        predicted = believed_after(Contact::touched);
-        measured = measure(filter, predicted, views, true);
-      }
-      if (filter.shifts && (measured.surprise > kSurprise || !explains(measured.fit))) {
-        predicted = believed_after(Contact::struck);
-        measured = measure(filter, predicted, views, true);
-      }
-    }
-    // where the masks are not explained, or not all of them, search from a wide belief
-    if (!explains(measured.fit) || measured.fit.covered < kUnexplained) {
-      Belief wide = first_belief(filter, view.time);
-      wide.covariance.diagonal().head(n).array() += kLostAngle * kLostAngle;
-      wide.covariance.diagonal().segment(n, n).array() += kLostRate * kLostRate;
-      const Measured again = measure(filter, wide, views, false);
-      if (explains(again.fit) && again.fit.covered > measured.fit.covered + kBetter) measured = again;
-    }
-    out.lost = !explains(measured.fit);
-    out.residual = measured.fit.residual_pixels;
-    out.surprise = measured.surprise;
-    const silhouette::FrameFit& fit = measured.fit;
-    const bool folded = shown_share(filter, views, fit.theta, fit.edge_offset) * fit.covered <
-                        kShown * std::max(fit.inside, kLostShare);
-    // a first mask that shows less rope than there is must not be believed: any shape that fits it is wrong
-    if (!filter.whole && !out.lost && !folded)
-      filter.whole = shown_share(filter, views, predicted.mean.head(n), filter.edge_offset) > kShown;
-    if (!filter.whole && filter.hidden_since == kNever) filter.hidden_since = view.time;
-    const bool hidden = !filter.whole && view.time - filter.hidden_since < kLongHidden;
-    out.doubtful = !filter.whole || folded || fit.covered < kUnexplained;
-    believed = !out.lost && !folded && !hidden;
-    if (!out.lost && !believed) filter.last_like = filter.last_seen = view.time;  // something of the rope is there
-    // take the colors, the force and the masks' edge offset from a frame that is explained
-    if (believed) {
-      filter.last_seen = view.time;
-      filter.belief = measured.belief;
-      if (filter.compare_colors) look_at_colors(filter, views, *filter.belief, out);
-      if (first || out.likeness.value_or(1.0) >= kUnlike) filter.last_like = view.time;
-      learn_force(filter, view.time);
-      learn_clock(filter, views, predicted, measured.fit.theta);
-      const double gain = 1.0 / kOffsetFrames;
-      filter.edge_offset += gain * (measured.fit.edge_offset - filter.edge_offset);
-      filter.edge_offset_variance =
-          std::max(kLeastOffsetDeviation * kLeastOffsetDeviation, filter.edge_offset_variance * (1.0 - gain));
-    }
+struct Attempt {
+  Belief predicted;
+  Measured measured;
+};
+
+// Predicts and measures; where the model does not explain the frame, again with a force that may change, and then with
+// a blow; where the masks are not explained, or not all of them, from a wide belief.
+Attempt measure_frame(Filter& filter, Belief predicted, std::span<const capture::View* const> views) {
+  const double time = views.front()->time;
+  const bool first = !filter.belief, in_contact = time <= filter.contact_until;
+  const auto surprising = [](const Measured& m) { return m.surprise > kSurprise || !explains(m.fit); };
+  Attempt out{std::move(predicted), {}};
+  out.measured = measure(filter, out.predicted, views, !first);
+  if (!first && surprising(out.measured)) {
+    filter.contact_until = time + kContactMemory;
+    const auto try_with = [&](Contact contact) {
+      out.predicted = predict(filter, *filter.belief, time, contact);
+      out.measured = measure(filter, out.predicted, views, true);
+    };
+    if (!in_contact) try_with(Contact::touched);
+    if (filter.shifts && surprising(out.measured)) try_with(Contact::struck);
   }
-  if (!believed) {
-    filter.belief = predicted;
-    out.lost = out.lost || view.time - filter.last_seen > kLongUnseen;
-  } else if (view.time - filter.last_like > kLongUnlike) {  // search again where the twin alone would be
-    filter.belief = first_belief(filter, view.time);
-    out.lost = true;
+  if (!explains(out.measured.fit) || out.measured.fit.covered < kUnexplained) {
+    const int n = filter.model.chain.angles();
+    Belief wide = first_belief(filter, time);
+    wide.covariance.diagonal().head(n).array() += kLostAngle * kLostAngle;
+    wide.covariance.diagonal().segment(n, n).array() += kLostRate * kLostRate;
+    Measured again = measure(filter, wide, views, false);
+    if (explains(again.fit) && again.fit.covered > out.measured.fit.covered + kBetter) out.measured = std::move(again);
   }
-  out.doubtful = !out.lost && (out.doubtful || out.likeness.value_or(1.0) < kUnlike);
-  if (out.lost) filter.whole = false, filter.hidden_since = kNever;
-  // report, with the uncertainty of the model's shape
-  filter.lost = out.lost;
+  return out;
+}
+
+// Whether the frame is believed: its masks are explained, and by a rope that is seen as a whole.
+bool judge(Filter& filter, std::span<const capture::View* const> views, const Attempt& attempt, Estimate& out) {
+  const silhouette::FrameFit& fit = attempt.measured.fit;
+  out.lost = !explains(fit);
+  out.residual = fit.residual_pixels;
+  out.surprise = attempt.measured.surprise;
+  const bool folded =
+      shown_share(filter, views, fit.theta, fit.edge_offset) * fit.covered < kShown * std::max(fit.inside, kLostShare);
+  // a first mask that shows less rope than there is must not be believed: any shape that fits it is wrong
+  const int n = filter.model.chain.angles();
+  if (!filter.whole && !out.lost && !folded)
+    filter.whole = shown_share(filter, views, attempt.predicted.mean.head(n), filter.edge_offset) > kShown;
+  if (!filter.whole && filter.hidden_since == kNever) filter.hidden_since = out.time;
+  const bool hidden = !filter.whole && out.time - filter.hidden_since < kLongHidden;
+  out.doubtful = !filter.whole || folded || fit.covered < kUnexplained;
+  const bool believed = !out.lost && !folded && !hidden;
+  if (!out.lost && !believed) filter.last_like = filter.last_seen = out.time;  // something of the rope is there
+  return believed;
+}
+
+// Takes state, colors, force, clock and the masks' edge offset from a frame that is explained.
+void learn(Filter& filter, std::span<const capture::View* const> views, const Attempt& attempt, bool first,
+           Estimate& out) {
+  filter.last_seen = out.time;
+  filter.belief = attempt.measured.belief;
+  if (filter.compare_colors) look_at_colors(filter, views, *filter.belief, out);
+  if (first || out.likeness.value_or(1.0) >= kUnlike) filter.last_like = out.time;
+  learn_force(filter, out.time);
+  learn_clock(filter, views, attempt.predicted, attempt.measured.fit.theta);
+  const double gain = 1.0 / kOffsetFrames;
+  filter.edge_offset += gain * (attempt.measured.fit.edge_offset - filter.edge_offset);
+  filter.edge_offset_variance =
+      std::max(kLeastOffsetDeviation * kLeastOffsetDeviation, filter.edge_offset_variance * (1.0 - gain));
+}
+
+// What is believed, with the uncertainty of the model's shape.
+void report(const Filter& filter, std::span<const capture::View* const> views, Estimate& out) {
+  const int n = filter.model.chain.angles();
   out.theta = filter.belief->mean.head(n);
   out.thetadot = filter.belief->mean.segment(n, n);
   out.covariance = filter.belief->covariance.topLeftCorner(2 * n, 2 * n);
@@ -670,8 +664,43 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
   out.covariance.topLeftCorner(n, n) += chain::shape_covariance(filter.model.chain, shape, out.theta);
   for (const capture::View* const v : views)
     out.iou +=
-        tube_iou(filter.model.chain, base_at(filter, view.time).pose, out.theta, *v, filter.cameras.at(v->camera)) /
-        views.size();
+        tube_iou(filter.model.chain, base_at(filter, out.time).pose, out.theta, *v, filter.cameras.at(v->camera)) /
+        static_cast<double>(views.size());
+}
+
+}  // namespace
+
+Estimate update(Filter& filter, std::span<const capture::View* const> views) {
+  CHAINSPLAT_CHECK(!views.empty(), "no view");
+  const capture::View& view = *views.front();
+  const bool first = !filter.belief;
+  Belief predicted = first ? first_belief(filter, view.time)
+                           : predict(filter, *filter.belief, view.time,
+                                     view.time <= filter.contact_until ? Contact::touched : Contact::none);
+  if (first) filter.last_seen = view.time;
+
+  Estimate out;
+  out.frame = view.frame;
+  out.time = view.time;
+  out.seen = std::any_of(views.begin(), views.end(), [](const capture::View* v) { return has_mask(*v); });
+  bool believed = false;
+  if (out.seen) {
+    const Attempt attempt = measure_frame(filter, predicted, views);
+    believed = judge(filter, views, attempt, out);
+    if (believed) learn(filter, views, attempt, first, out);
+    predicted = attempt.predicted;
+  }
+  if (!believed) {
+    filter.belief = std::move(predicted);
+    out.lost = out.lost || view.time - filter.last_seen > kLongUnseen;
+  } else if (view.time - filter.last_like > kLongUnlike) {  // search again where the twin alone would be
+    filter.belief = first_belief(filter, view.time);
+    out.lost = true;
+  }
+  out.doubtful = !out.lost && (out.doubtful || out.likeness.value_or(1.0) < kUnlike);
+  if (out.lost) filter.whole = false, filter.hidden_since = kNever;
+  filter.lost = out.lost;
+  report(filter, views, out);
   return out;
 }
 

@@ -49,17 +49,11 @@ struct Mistake {
   std::function<void(Setup&)> mend;
 };
 
-bool shows_object(const capture::View& view) {
-  for (std::size_t i = 3; i < view.rgba.size(); i += 4)
-    if (view.rgba[i] != 0) return true;
-  return false;
-}
-
 // Frames that every camera sees the object in, where there are such, spread over the recording.
 std::vector<Frame> spread_frames(const Capture& capture) {
   std::vector<Frame> all;
   for (const capture::View& view : capture.views) {
-    if (view.camera != capture.views.front().camera || !shows_object(view)) continue;
+    if (view.camera != capture.views.front().camera || !estimation::has_mask(view)) continue;
     all.push_back({view.time, {}});
   }
   std::vector<Frame> out;
@@ -68,7 +62,7 @@ std::vector<Frame> spread_frames(const Capture& capture) {
     for (int c = 0; c < static_cast<int>(capture.cameras.size()); ++c) {
       const capture::View* nearest = nullptr;
       for (const capture::View& view : capture.views)
-        if (view.camera == c && shows_object(view) &&
+        if (view.camera == c && estimation::has_mask(view) &&
             (!nearest || std::abs(view.time - frame.time) < std::abs(nearest->time - frame.time)))
           nearest = &view;
       if (nearest) frame.views.push_back(nearest);
