@@ -798,10 +798,12 @@ TEST_CASE("warnings name unknown keys, missing numbers and single cameras") {
   Warnings warnings;
   made.json["cameras"][0]["distorsion"] = {0, 0, 0, 0, 0};
   made.json["weather"] = "fine";
+  made.json["sigma"] = {{"cameras", {{"rotation", 0.01}}}};  // of which camera?
   made.json.erase("gravity");
   made.load();
   CHECK(warnings.mention("cameras[0].distorsion: unknown key, ignored; is 'distortion' meant?"));
   CHECK(warnings.mention("weather: unknown key"));
+  CHECK(warnings.mention("sigma.cameras.rotation: unknown key"));
   CHECK(warnings.mention("gravity: is missing"));
   made.json["cameras"].erase(1);
   made.load();

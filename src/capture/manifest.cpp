@@ -87,16 +87,17 @@ class Reader {
   }
 
   // Doubts unknown keys, and suggests the nearest known one where it is similar.
-  void know(std::initializer_list<const char*> known) const {
-    if (!object_) return;
+  void know(const std::vector<std::string>& known) const {
+    if (!object_ || known.empty()) return;
     int unknown = 0;
     for (const auto& item : object_->items()) {
       const std::string key = item.key().substr(0, 40);  // more characters than any known key has
-      if (std::any_of(known.begin(), known.end(), [&](const char* k) { return key == k; })) continue;
+      if (std::any_of(known.begin(), known.end(), [&](const std::string& k) { return key == k; })) continue;
       if (++unknown > kMostUnknown) continue;
-      const char* nearest = *std::min_element(known.begin(), known.end(), [&](const char* a, const char* b) {
+      const auto further = [&](const std::string& a, const std::string& b) {
         return edit_distance(key, a) < edit_distance(key, b);
-      });
+      };
+      const std::string& nearest = *std::min_element(known.begin(), known.end(), further);
       const bool similar = edit_distance(key, nearest) <= std::max<int>(2, static_cast<int>(key.size()) / 3);
       doubt(key, std::string("unknown key, ignored") + (similar ? "; is " + in_quotes(nearest) + " meant?" : ""));
     }
@@ -703,6 +704,9 @@ void read_sigma(const Reader& reader, Capture& capture) {
     }
   };
   const Reader cameras = reader.child("cameras", false, "{ \"cam0\": { \"rotation\": 0.002 } }");
+  std::vector<std::string> names;
+  for (const Camera& camera : capture.cameras) names.push_back(camera.name);
+  cameras.know(names);
   for (const Camera& camera : capture.cameras) {
     const Reader node = cameras.child(camera.name, false, "{ \"rotation\": 0.002 }");
     if (node.present()) node.know({"rotation", "translation", "focal", "time", "mask_offset"});
