@@ -26,10 +26,10 @@ class Torsion {
 
  private:
   struct Joint {
-    double k[2], rest[2], twist;            // N m/rad, rad, N m/rad
-    double theta[2], rolled[2];             // the angles, and the rest angles rolled
-    double tau, delta[2], bend[3];          // delta by alpha and beta, and twice: aa, ab, bb
-    double by_chi, by_chi_twice, mixed[2];  // of the bending energy
+    double k[2], rest[2], twist;                             // N m/rad, rad, N m/rad
+    double theta[2] = {}, rolled[2] = {};                    // the angles, and the rest angles rolled
+    double tau = 0.0, delta[2] = {}, bend[3] = {};           // delta by alpha and beta, and twice: aa, ab, bb
+    double by_chi = 0.0, by_chi_twice = 0.0, mixed[2] = {};  // of the bending energy
   };
   void evaluate(Joint& joint, double before, double after) const;
   void gradient();               // of E by the rolls, and its tridiagonal matrix

@@ -41,13 +41,15 @@ struct Canvas {
     return capture::distort(camera, capture::project(camera, p));
   }
   void line(const Vector3& from, const Vector3& to, int size, const Color& color) {
-    std::optional<Vector2> last;
+    Vector2 last(0.0, 0.0);
+    bool seen = false;  // `last`
     for (int i = 0; i <= kSamples; ++i) {
       const auto at = pixel(from + (to - from) * (double(i) / kSamples));
-      if (at && last && (*at - *last).norm() < 2.0 * image.width)
-        for (int k = 0, n = 1 + static_cast<int>((*at - *last).norm()); k <= n; ++k)
-          dot(*last + (*at - *last) * (double(k) / n), size, color);
-      last = at;
+      if (at && seen && (*at - last).norm() < 2.0 * image.width)
+        for (int k = 0, n = 1 + static_cast<int>((*at - last).norm()); k <= n; ++k)
+          dot(last + (*at - last) * (double(k) / n), size, color);
+      seen = at.has_value();
+      if (seen) last = *at;
     }
   }
 };
