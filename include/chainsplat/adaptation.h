@@ -18,7 +18,7 @@ struct Options {
   double memory = 5.0;        // s; infinite: nothing is forgotten
   double spread = 0.5;        // sd of a log or logit, or 0.1 rad of a rest angle times this over 0.5, when all is
                               // forgotten: how far a parameter may have moved
-  double disturbance = 2.0;   // rad/s^2 a frame, accelerations that the model lacks (mathematics.md 6)
+  double disturbance = 2.0;   // rad/s^2 per frame, accelerations that the model lacks (mathematics.md 6)
   double least_sigma = 2e-3;  // rad, of an estimated angle, whatever the estimator claims
   double inflation = 2.0;     // of the claimed sigma: errors of neighboring frames go together
   double longest_gap = 0.25;  // s without a frame, after which the state starts anew

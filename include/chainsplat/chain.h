@@ -37,7 +37,7 @@ struct Chain {
   int last_angle(int link) const;  // k(j): index of the last angle that moves `link`, -1 for link 0
 };
 
-// `joints` joints at s_j = (j - 1) L / joints (mathematics.md 2.1 [D]). Axes a joint: a; a, b = d x a; with twist also
+// `joints` joints at s_j = (j - 1) L / joints (mathematics.md 2.1 [D]). Axes per joint: a; a, b = d x a; with twist also
 // d. `first_joint` moves the first one: s_j = first_joint + (j-1)(L - first_joint)/joints.
 Chain make_chain(double length, double diameter, const Vector3& direction, const Vector3& bending_axis, int joints,
                  Bending bending, bool twist, double first_joint = 0.0);

@@ -29,22 +29,22 @@ enum class Integrator { rodas3, implicit_velocity_euler };  // mathematics.md 4 
 // indexed k - 1.
 struct Parameters {
   std::vector<double> link_mass;         // kg
-  std::vector<double> viscous_friction;  // N s/m a link, against the table
-  std::vector<double> coulomb_friction;  // effective coefficient a link, -
-  std::vector<double> air_linear;        // N s/m a link, across the rope
-  std::vector<double> air_quadratic;     // N s^2/m^2 a link, across the rope
-  std::vector<double> stiffness;         // N m/rad an angle
+  std::vector<double> viscous_friction;  // N s/m per link, against the table
+  std::vector<double> coulomb_friction;  // effective coefficient per link, -
+  std::vector<double> air_linear;        // N s/m per link, across the rope
+  std::vector<double> air_quadratic;     // N s^2/m^2 per link, across the rope
+  std::vector<double> stiffness;         // N m/rad per angle
   std::vector<double> rest_angle;        // rad
-  std::vector<double> damping;           // N m s/rad
-  // m, an angle, planar chains on a table only; empty: 0. Friction grips a rope at its underside and rolls it, and what
+  std::vector<double> damping;           // N m s/rad per angle
+  // m per angle, planar chains on a table only; empty: 0. Friction grips a rope at its underside and rolls it, and what
   // it is naturally curved out of the table's plane turns into the plane: torque -roll_lever_k sum_j share_kj f_j, f_j
   // the friction across link j (along bending axis x link), share_kj = min(s_k, middle of j) / L. It is k r L B/C for a
   // natural curvature k out of the plane, radius r, bending stiffness B and torsional stiffness C.
   std::vector<double> roll_lever;
-  // Dry friction in bending (mathematics.md 3.10), an angle; both empty: none. The moment of joints that slip, N m, and
+  // Dry friction in bending (mathematics.md 3.10), per angle; both empty: none. The moment of joints that slip, N m, and
   // the bend over which it builds up after a change of direction, rad. Angles that twist the rope have none.
   std::vector<double> bending_friction, bending_friction_angle;
-  // N m/rad, a joint of two bending angles; empty: what the rope is naturally bent keeps its place about the links.
+  // N m/rad per joint of two bending angles; empty: what the rope is naturally bent keeps its place about the links.
   // Else the rope twists freely within the links until all its moments about itself balance (mathematics.md 3.11).
   std::vector<double> torsional_stiffness;
   double tip_mass = 0.0;                // kg, point mass at the free end
@@ -55,7 +55,7 @@ struct Parameters {
   double coulomb_speed = 0.002;         // v_s, m/s
   double drag_speed = 0.001;            // v_eps, m/s
   Integrator integrator = Integrator::rodas3;
-  int substeps = 4;  // a frame of 1/30 s
+  int substeps = 4;  // per frame of 1/30 s
 };
 
 // Speed below which friction in bending is a spring, rad/s: slow for every motion that a camera sees. It rounds the
@@ -197,16 +197,16 @@ struct BaseGrid {
 };
 // Steps for an interval of seconds with `substeps` per 1/30 s, at least one.
 int step_count(double interval, int substeps);
-// From `start` through all `times` (increasing, the first >= start), `substeps` a 1/30 s, equal within each interval.
+// From `start` through all `times` (increasing, the first >= start), `substeps` per 1/30 s, equal within each interval.
 BaseGrid sample_base(const BaseFunction& base, double start, const std::vector<double>& times, int substeps);
 
 // One unknown's derivative: d(Parameters) and d(initial state). Empty arrays mean zeros. dynamics/parametrization.h
 // makes them.
 struct Tangent {
-  std::vector<double> link_mass, viscous_friction, coulomb_friction, air_linear, air_quadratic;  // a link
-  std::vector<double> stiffness, rest_angle, damping, roll_lever;                                // an angle
-  std::vector<double> bending_friction, bending_friction_angle;                                  // an angle
-  std::vector<double> torsional_stiffness;                                                       // a joint
+  std::vector<double> link_mass, viscous_friction, coulomb_friction, air_linear, air_quadratic;  // per link
+  std::vector<double> stiffness, rest_angle, damping, roll_lever;                                // per angle
+  std::vector<double> bending_friction, bending_friction_angle;                                  // per angle
+  std::vector<double> torsional_stiffness;                                                       // per joint
   double tip_mass = 0.0;
   VectorX theta, thetadot, friction_state;
 };

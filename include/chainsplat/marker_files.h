@@ -9,7 +9,7 @@ namespace chainsplat::identification {
 
 struct MarkerFile {
   std::vector<trajectory::Sample> base;  // every row
-  Markers markers;                       // rows at most 30 a second
+  Markers markers;                       // rows, at most 30 per second
 };
 
 // '# marker NAME ARCLENGTH' lines, then 'time,bx,by,bz,bqw,bqx,bqy,bqz,NAME_x,NAME_y,NAME_z,...' and rows; empty or

@@ -157,7 +157,7 @@ StateFit fit_state(const chain::Chain& chain, const trajectory::BaseMotion& base
 // did.
 struct LoopOptions {
   bool feedback = true;                       // else the plan is played as it is
-  double rate = 10.0;                         // replans a second
+  double rate = 10.0;                         // replans per second
   Vector3 target_velocity = Vector3::Zero();  // m/s; seen by the replanning only, the plan knows the first place
 };
 struct LoopResult {

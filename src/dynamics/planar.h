@@ -16,7 +16,7 @@
 
 namespace chainsplat::dynamics {
 
-// One axis a joint, all along the bending axis.
+// One axis per joint, all along the bending axis.
 bool is_planar(const chain::Chain& chain);
 
 class PlanarEngine : public Engine {

@@ -8,7 +8,7 @@ namespace {
 
 constexpr double kFrame = 1.0 / 30.0;  // s, what `substeps` counts in
 constexpr int kMaxRefinement = 32;     // of the steps of a diverging rollout
-constexpr int kMostSteps = 4000000;    // a step is kept with its motion: 1 GiB. At 8 steps a frame more than four hours
+constexpr int kMostSteps = 4000000;    // a step is kept with its motion: 1 GiB. At 8 steps per frame more than four hours
 constexpr double kJerkStep = 0.01;     // of a step, for the one-sided difference of the base acceleration
 
 }  // namespace
@@ -202,7 +202,7 @@ chain::States rollout(const Model& model, const BaseFunction& base, const Initia
   throw WorkError("rollout",
                   "the motion diverged at " + core::exact(last.time) + " s in joint " +
                       std::to_string(model.chain.child_link[last.angle]) + " even with " +
-                      std::to_string(model.parameters.substeps * kMaxRefinement) + " steps a frame",
+                      std::to_string(model.parameters.substeps * kMaxRefinement) + " steps per frame",
                   "check the base trajectory for jumps and the parameters for tiny masses or huge frictions");
 }
 

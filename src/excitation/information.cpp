@@ -5,7 +5,7 @@
 namespace chainsplat::excitation {
 namespace {
 
-// As identification weighs them: two points a link, and neighbors in space and time err alike (mathematics.md 5).
+// As identification weighs them: two points per link, and neighbors in space and time err alike (mathematics.md 5).
 constexpr double kShare = 1.0 / 9.0;
 constexpr double kThetaSd = 0.02;  // rad, of the recognized initial angles
 constexpr double kRateSd = 0.5;    // rad/s

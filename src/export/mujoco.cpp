@@ -18,7 +18,7 @@ namespace {
 
 constexpr double kTimestep = 1.0 / 2400.0;  // s; MuJoCo's steps are of first order: 0.002 degrees after 5 s
 constexpr double kHeavy = 1e4;              // kg and kg m^2 of the base's joints: no rope moves them
-constexpr double kBaseRate = 240.0;         // rows a second of the base's motion, cubic between them
+constexpr double kBaseRate = 240.0;         // rows per second of the base's motion, cubic between them
 // Drag comes from thin massless ellipsoids in a medium so light that nothing else of it is felt: F = density C pi r h
 // |v| v.
 constexpr double kDensity = 1e-3, kThin = 1e-4, kHalfLength = 0.1;  // kg/m^3, m, of a link

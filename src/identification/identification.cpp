@@ -237,7 +237,7 @@ struct Rollouts {
   std::vector<BaseGrid> grids;
   std::vector<chain::States> states;
   std::vector<dynamics::Sensitivities> slopes;
-  std::vector<std::vector<MatrixX>> values;  // whitened residuals: a recording, a frame
+  std::vector<std::vector<MatrixX>> values;  // whitened residuals per recording and frame
 
   Rollouts(const Problem& problem, double horizon, bool fine)
       : states(problem.parts.size()), slopes(problem.parts.size()) {

@@ -16,11 +16,11 @@ constexpr double kSmoothSd = 0.3;    // rad, between the same axes of neighborin
 constexpr double kRateSd = 9.0;      // rad/s, from one time to the next
 constexpr double kStretch = 0.05;    // of a rope, and
 constexpr double kMountMost = 0.03;  // m, of a marker's mount: how far beyond its arclength a marker may be
-constexpr int kIterations = 30;      // of Levenberg-Marquardt, a time
+constexpr int kIterations = 30;      // of Levenberg-Marquardt, per time
 constexpr double kConverged = 1e-9;  // rad, largest step
 constexpr double kFarthest = 1e4;    // m, from the grasp: no slip of a tracker, but damage
 constexpr double kDoubt = 0.5;       // deviations: markers farther off, RMS, may mean that the rope was folded wrongly
-constexpr int kAimIterations = 8;    // of Gauss-Newton, a joint,
+constexpr int kAimIterations = 8;    // of Gauss-Newton, per joint,
 constexpr double kAimDamping = 0.1;  // with this added to squared sines: full steps stay below a right angle
 
 void check(const chain::Chain& chain, const trajectory::Trajectory& base, const Markers& markers) {

@@ -17,7 +17,7 @@ constexpr double kAngleMaskWeight = 5.0;
 constexpr double kTrustedStep = 0.01;  // rad
 
 // `fast` trains the Gaussians with these.
-constexpr int kBatch = 3;                                     // views a step
+constexpr int kBatch = 3;                                     // views per step
 constexpr splat::LossWeights kLossWeights{
     1.0f, 0.0f, 0.3f};  // without the mask black hides transparency (design.md, 'Recognition')
 // `fraction`: 0 at the start, 1 at the end of all steps; rates fall by ten. `scale`: of the usual ones.

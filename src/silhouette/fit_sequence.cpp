@@ -22,7 +22,7 @@ constexpr double kMoreResidualPixels = 0.5;  // px more
 constexpr double kLost = 0.6;                // share covered or inside under which a frame is sought from scratch
 constexpr double kBetter = 0.9;              // share of the old cost that a new fit must stay under
 
-constexpr double kFewViews = 1.5;               // views a frame, in the mean, that count as one camera
+constexpr double kFewViews = 1.5;               // views per frame, in the mean, that count as one camera
 constexpr double kCommonOffsetDeviation = 0.1;  // px, of the masks' offset learned from all frames
 
 // Smoothing over time: random angular accelerations of this size (measured on moving ropes: 3.5 to 5.2 rad/s^2 RMS over

@@ -15,7 +15,7 @@ using math::VectorX;
 namespace {
 
 // the two stages
-constexpr int kReverseSamples = 4;      // centerline samples a link that must lie in the mask
+constexpr int kReverseSamples = 4;      // centerline samples per link that must lie in the mask
 constexpr double kReverseWeight = 0.5;  // of all of them together, against all mask pixels of the view
 
 // blobs

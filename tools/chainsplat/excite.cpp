@@ -21,7 +21,7 @@ using Json = nlohmann::ordered_json;
 
 struct Request {
   std::string run, out, axes;
-  double rate = 100.0, noise = 0.0;  // rows a second; mm, 0: from the recording
+  double rate = 100.0, noise = 0.0;  // rows per second; mm, 0: from the recording
   bool force = false;
   excitation::Options options;
 };
