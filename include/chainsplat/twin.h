@@ -21,6 +21,8 @@
 //                   weak* [ { singular_value, direction { name: component } } ]: combinations of parameters that the
 //                   data hardly determine;
 //                   solver* { reason, iterations, initial_cost, final_cost, worst_step }: how the fit ended (solve.h)
+//   properties*     what a rope is known by (properties.h); validity* acceleration, speed, curvature: each { value, unit },
+//                   the largest that the dynamics were identified from (validity.h)
 //   corrections     cameras { name { rotation, translation, focal, time, mask_offset; calibration } }, base { time },
 //                   grasp { translation }, object { length, diameter }: each { value, sigma, state } (corrections.h);
 //                   absent where nothing was estimated
@@ -39,6 +41,7 @@
 #include "chainsplat/core.h"
 #include "chainsplat/dynamics.h"
 #include "chainsplat/splat.h"
+#include "chainsplat/validity.h"
 
 namespace chainsplat::twin {
 
@@ -72,6 +75,7 @@ struct Twin {
   std::optional<dynamics::InitialState> initial;
   dynamics::Estimates estimates;
   Provenance provenance;
+  std::optional<Validity> validity;  // of all recordings that the dynamics were identified from; none: not known
   bool known_mass = false;
   capture::Corrections corrections;        // of the recording, which everything later on the same cameras goes by
   std::vector<capture::Finding> verdict;   // what was found wrong or doubtful; empty: nothing

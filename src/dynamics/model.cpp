@@ -1,6 +1,7 @@
 #include <cmath>
 #include <functional>
 
+#include "chainsplat/dynamics/base_wrench.h"
 #include "planar.h"
 
 namespace chainsplat::dynamics {
@@ -173,6 +174,31 @@ VectorX forward_dynamics(const Model& model, const trajectory::BaseMotion& base,
   if (!engine.factor_mass()) throw_singular(model, engine.singular_angle);
   engine.accelerate();
   return engine.acceleration;
+}
+
+// The engine's bodies share one frame, so the force of all bodies beyond the base acts between it and the rope.
+Vector6 base_wrench(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
+                    const VectorX& thetadot, const VectorX& friction_state) {
+  check_state(model, theta, thetadot);
+  Engine engine(model);
+  engine.friction_state = friction_state;
+  engine.place(base, theta, thetadot, false);
+  if (!engine.factor_mass()) throw_singular(model, engine.singular_angle);
+  engine.accelerate();
+  engine.inverse_torque();
+  return engine.body_force.front();
+}
+
+std::vector<Vector6> base_wrenches(const Model& model, const trajectory::Trajectory& base,
+                                   const chain::States& states) {
+  CHAINSPLAT_CHECK(states.thetadot.size() == states.time.size(), std::to_string(states.thetadot.size()));
+  const std::vector<VectorX> friction =
+      states.friction_state.empty() ? friction_states(model, states.theta) : states.friction_state;
+  std::vector<Vector6> out;
+  for (std::size_t i = 0; i < states.time.size(); ++i)
+    out.push_back(base_wrench(model, base.at(states.time[i]), states.theta[i], states.thetadot[i],
+                              friction.empty() ? VectorX() : friction[i]));
+  return out;
 }
 
 VectorX forward_dynamics_articulated(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,

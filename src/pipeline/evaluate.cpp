@@ -16,7 +16,7 @@ namespace chainsplat::pipeline {
 namespace {
 
 constexpr double kTimeSlack = 1e-6;  // s: times in text files are rounded
-constexpr const char* kExampleRate = "give rows a second, for example 30";
+constexpr const char* kExampleRate = "give rows per second, for example 30";
 
 // Marker files begin with what their markers are (formats.md 4.1), states with a head line. A pipe can be read only
 // once: it gives states.
@@ -111,6 +111,8 @@ RolloutResult rollout(const Path& run, const RolloutOptions& options, const core
     throw InputError((options.base.empty() ? run : options.base).string(), "the base motion ends before the start",
                      "give a base motion that goes on after it");
   result.states = dynamics::rollout(model, base, initial, times);
+  twin::warn_beyond(result.twin.validity, twin::validity_of(result.twin.chain, base, result.states),
+                    (options.base.empty() ? run : options.base).string());
   return result;
 }
 

@@ -42,11 +42,13 @@ identification::Options identification_options(const twin::Twin& twin, bool pape
   return options;
 }
 
-void adopt(twin::Twin& twin, identification::Result found) {
+void adopt(twin::Twin& twin, const trajectory::Trajectory& base, identification::Result found) {
+  twin.validity = twin::validity_of(twin.chain, base, found.rollout);
   twin.parameters = std::move(found.parameters);
   twin.initial = std::move(found.initial);
   twin.estimates = std::move(found.estimates);
   twin.rollout = std::move(found.rollout);
+  judge_motion(twin, base);
 }
 
 void tell_fit(const std::string& stage, const solve::Summary& summary) {
@@ -56,7 +58,7 @@ void tell_fit(const std::string& stage, const solve::Summary& summary) {
 
 void identify_states(twin::Twin& twin, const trajectory::Trajectory& base, bool paper, std::uint64_t seed) {
   const Stopwatch watch(twin, "identify");
-  adopt(twin, identification::identify(twin.chain, base, twin.states, identification_options(twin, paper, seed)));
+  adopt(twin, base, identification::identify(twin.chain, base, twin.states, identification_options(twin, paper, seed)));
   tell_fit("identify", *twin.estimates.solver);
 }
 
@@ -159,11 +161,14 @@ void identify_several(std::vector<twin::Twin>& twins, const std::vector<Path>& r
   check_same_rope(twins[0].chain, found, runs);
   say_fit(found, runs);
   for (std::size_t i = 0; i < twins.size(); ++i) {
-    adopt(twins[i], std::move(found[i]));
+    adopt(twins[i], recordings[i].base, std::move(found[i]));
     tell_fit("identify", *twins[i].estimates.solver);
     twins[i].known_mass = options.mass.has_value();
     twins[i].provenance.mass = twins[0].provenance.mass;
   }
+  twin::Validity all;
+  for (const twin::Twin& twin : twins) all = twin::larger(all, *twin.validity);
+  for (twin::Twin& twin : twins) twin.validity = all;
 }
 
 void identify_one(twin::Twin& twin, const Path& run, const IdentifyOptions& options) {
@@ -236,13 +241,17 @@ IdentifyResult identify_markers(const Path& run, const std::vector<Path>& files,
     twin.states = std::move(fitted.states);
     if (options.shape_only) {
       twin.parameters.reset(), twin.initial.reset();
-      twin.estimates = {}, twin.rollout = {};
+      twin.estimates = {}, twin.rollout = {}, twin.validity.reset();
     } else {
       std::vector<identification::Result> found =
           identification::identify(twin.chain, recordings, identification_options(twin, false, options.seed));
       check_same_rope(twin.chain, found, files);
       say_fit(found, files);
-      adopt(twin, std::move(found[0]));
+      twin::Validity all;
+      for (std::size_t i = 0; i < found.size(); ++i)
+        all = twin::larger(all, twin::validity_of(twin.chain, recordings[i].base, found[i].rollout));
+      adopt(twin, recordings[0].base, std::move(found[0]));
+      twin.validity = all;
       tell_fit("identify", *twin.estimates.solver);
     }
     twin.provenance.options["markers"] = names;

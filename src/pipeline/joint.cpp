@@ -40,7 +40,7 @@ solve::Summary refine(twin::Twin& twin, const capture::Capture& capture, gpu::De
   }
   twin.gaussians = std::move(found.gaussians);
   twin.states = std::move(found.states);
-  adopt(twin, std::move(found.identified));
+  adopt(twin, capture.base, std::move(found.identified));
   twin.provenance.joint = true;
   return found.summary;
 }

@@ -36,7 +36,11 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
 
 // What the twin and its capture say of how to identify it.
 identification::Options identification_options(const twin::Twin& twin, bool paper, std::uint64_t seed);
-void adopt(twin::Twin& twin, identification::Result found);
+// What the verdict says of the identified motion (twin.rollout) beside the recognized one (twin.states), anew.
+void judge_motion(twin::Twin& twin, const trajectory::Trajectory& base);
+
+// Takes what identification found; `base`: of the recording, for the twin's validity.
+void adopt(twin::Twin& twin, const trajectory::Trajectory& base, identification::Result found);
 
 // Tells the listener how a stage's fit ended: a record {"stage", "solver"} and a detail.
 void tell_fit(const std::string& stage, const solve::Summary& summary);

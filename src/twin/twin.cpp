@@ -692,8 +692,12 @@ void save(const Twin& twin, const Path& run) {
            {"chain", chain_json(twin)},
            {"identification", identification_json(twin)}};
   if (twin.parameters) out["properties"] = properties_json(twin);
-  if (!twin.corrections.empty()) {
-    out["corrections"] = to_json(twin.corrections);
+  if (twin.validity)
+    out["validity"] = {{"acceleration", {{"value", twin.validity->acceleration}, {"unit", "m/s^2"}}},
+                       {"speed", {{"value", twin.validity->speed}, {"unit", "m/s"}}},
+                       {"curvature", {{"value", twin.validity->curvature}, {"unit", "1/m"}}}};
+  if (!twin.corrections.empty()) out["corrections"] = to_json(twin.corrections);
+  if (!twin.corrections.empty() || !twin.verdict.empty()) {
     out["verdict"] = to_json(twin.verdict);
     out["trusted"] = twin.trusted();
   }
@@ -760,7 +764,12 @@ Twin load(const Path& run) {
     if (initial.has("friction_state")) twin.initial->friction_state = initial["friction_state"].vector(angles);
   }
   twin.provenance = read_provenance(top["provenance"]);
-  // files of older versions have neither
+  // files of older versions have none of these
+  if (top.has("validity")) {
+    const Node validity = top["validity"];
+    const auto value = [&](const char* key) { return validity[key]["value"].not_negative(); };
+    twin.validity = Validity{value("acceleration"), value("speed"), value("curvature")};
+  }
   if (top.has("corrections")) twin.corrections = read_corrections(top["corrections"]);
   if (top.has("verdict")) twin.verdict = read_verdict(top["verdict"]);
 

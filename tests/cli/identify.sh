@@ -52,6 +52,19 @@ expect_code 0 'identify --json'
 expect_output '"weak"' 'identify --json'
 expect_error 2 '(one|other).csv: is of another rope' identify "$work/twin" --markers "$work/one.csv" "$work/other.csv"
 
+# what was not in its recording is warned of, and what the gripper must hold is the rope's weight in the mean
+run rollout "$work/twin" --base "$work/one.tum" -o "$work/states.csv" --wrench "$work/wrench.csv"
+expect_code 0 'rollout --wrench'
+grep -q 'identified in' "$work/stderr" && fail 'rollout: the motion of the recording is said to be beyond it'
+awk -F, 'NR == 1 && $0 != "time,fx,fy,fz,mx,my,mz" { exit 1 }
+  NR > 1 { z += $4; n++ } END { exit !(n > 50 && z / n > 0.95 * 0.06 * 9.81 && z / n < 1.05 * 0.06 * 9.81) }' "$work/wrench.csv" ||
+  fail 'rollout --wrench: not the weight of 60 g in the mean'
+awk '/^#/ { next } { $1 /= 3; print }' "$work/one.tum" >"$work/fast.tum"
+run rollout "$work/twin" --base "$work/fast.tum" -o "$work/states.csv"
+expect_code 0 'rollout of a fast motion'
+grep -q 'fast.tum: the .* times what the twin was identified in' "$work/stderr" || fail 'rollout: no warning of a motion three times as fast'
+expect_error 2 'folder does not exist' rollout "$work/twin" --base "$work/one.tum" -o "$work/s.csv" --wrench "$work/no/such/folder.csv"
+
 # several runs: recognized states stand for themselves
 for name in one two other; do
   run new -o "$work/run_$name" --length 0.3 --joints 4 --bending planar --mass 0.06

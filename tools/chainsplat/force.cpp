@@ -221,6 +221,7 @@ void force(const Globals& globals, const ForceRequest& request) {
     const std::size_t count = states.time.size();
     if (count < 3) throw InputError(source, few, more);
     check_time(states.time.front(), states.time.back());
+    twin::warn_beyond(twin.validity, twin::validity_of(twin.chain, base, states), source);
     const force::Motion motion = force::smooth(states);
     const ContactAt contact =
         with_near(contact_of(request, nearest, (states.time.back() - states.time.front()) / (count - 1.0)));

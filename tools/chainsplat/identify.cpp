@@ -114,6 +114,9 @@ void identify(const Globals& globals, const Request& request) {
     std::cout << twin::describe(
         twin::properties(dynamics::make_model(twin.chain, *twin.parameters), twin.estimates, twin.known_mass));
   for (const std::string& run : request.runs) std::cout << "twin: " << run << "\n";
+  for (std::size_t i = 0; i < result.twins.size(); ++i)
+    for (const capture::Finding& finding : result.twins[i].verdict)
+      std::cout << (result.twins.size() > 1 ? request.runs[i] + ": " : "") << core::printable(finding.text) << "\n";
 }
 
 pipeline::OnlineResult identified_online(const OnlineRequest& request) {

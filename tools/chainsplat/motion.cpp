@@ -8,6 +8,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/capture.h"
+#include "chainsplat/dynamics/base_wrench.h"
 #include "chainsplat/pipeline.h"
 #include "chainsplat/render.h"
 #include "chainsplat/run_folder.h"
@@ -22,7 +23,7 @@ namespace fs = std::filesystem;
 using Json = nlohmann::ordered_json;
 
 struct RolloutRequest {
-  std::string run, base, out, centerline, initial;
+  std::string run, base, out, centerline, wrench, initial;
   double rate = 30.0;
 };
 
@@ -33,23 +34,39 @@ Path base_file_of(const std::string& states) {
   return Path(states).replace_extension(".base.tum");
 }
 
+std::string wrench_csv(const std::vector<double>& times, const std::vector<math::Vector6>& wrenches) {
+  std::string out = "time,fx,fy,fz,mx,my,mz\n";
+  for (std::size_t i = 0; i < times.size(); ++i) {
+    out += core::exact(times[i]);
+    for (const int k : {3, 4, 5, 0, 1, 2}) out += "," + core::exact(wrenches[i][k]);
+    out += "\n";
+  }
+  return out;
+}
+
 void rollout(const Globals& globals, const RolloutRequest& request) {
   pipeline::RolloutOptions options;
   if (!request.base.empty()) options.base = input_path(request.base);
   if (!request.initial.empty()) options.initial = input_path(request.initial);
   options.rate = request.rate;
   options.check();
-  if (globals.json && (request.out == "-" || request.centerline == "-"))
+  if (globals.json && (request.out == "-" || request.centerline == "-" || request.wrench == "-"))
     throw InputError("--json", "standard output is wanted by '-' too", "name a file");
   pipeline::check_output_file(request.out);
-  if (!request.centerline.empty()) pipeline::check_output_file(request.centerline);
-  for (const std::string& out : {request.out, request.centerline})
+  for (const std::string& out : {request.centerline, request.wrench})
+    if (!out.empty()) pipeline::check_output_file(out);
+  for (const std::string& out : {request.out, request.centerline, request.wrench})
     if (!out.empty()) check_not_input(out, request.run, {request.base, request.initial});
   const auto [twin, base, states] = pipeline::rollout(request.run, options, terminal());
   write_result(request.out, twin::states_csv(states));
   const Path kept_base = base_file_of(request.out);
   if (!kept_base.empty()) core::write_file(kept_base, trajectory::write_tum(base.samples()));
   if (!request.centerline.empty()) write_result(request.centerline, twin::centerline_csv(twin.chain, states, base));
+  if (!request.wrench.empty()) {
+    const dynamics::Model model = dynamics::make_model(twin.chain, *twin.parameters);
+    write_result(request.wrench, wrench_csv(states.time, dynamics::base_wrenches(model, base, states)));
+    if (!twin.known_mass) core::warn(request.run + ": the rope's mass is not known; wrenches are per kilogram of rope");
+  }
   if (!globals.json) {
     say(std::to_string(states.time.size()) + " rows" + (request.out == "-" ? "" : ": " + request.out));
     return;
@@ -58,6 +75,7 @@ void rollout(const Globals& globals, const RolloutRequest& request) {
   document["states"] = request.out;
   if (!kept_base.empty()) document["base"] = kept_base.string();
   if (!request.centerline.empty()) document["centerline"] = request.centerline;
+  if (!request.wrench.empty()) document["wrench"] = request.wrench;
   document["rows"] = states.time.size();
   document["start"] = states.time.front();
   document["end"] = states.time.back();
@@ -198,6 +216,10 @@ void add_motion_commands(CLI::App& app, const Globals& globals, Job& job) {
   roller->add_option("--rate", request->rate, "Rows a second (default 30)")->type_name("HZ");
   roller
       ->add_option("--centerline", request->centerline, "Also write the world points of the grasp, joints and free end")
+      ->type_name("FILE.csv");
+  roller
+      ->add_option("--wrench", request->wrench,
+                   "Also write what the gripper exerts on the rope: force, and moment about the grasp; N, N m, world axes")
       ->type_name("FILE.csv");
   roller
       ->add_option("--initial", request->initial,

@@ -254,7 +254,12 @@ void plan(const Globals& globals, PlanRequest& request) {
   const std::vector<double> times = planning::row_times(plan.motion.end(), request.rate);
   core::write_file(out / "base.tum", planning::motion_tum(played, times));
   core::write_file(out / "base.csv", planning::motion_csv(played, times));
-  core::write_file(out / "states.csv", twin::states_csv(planning::predict(problem, played, times)));
+  const chain::States predicted = planning::predict(problem, played, times);
+  core::write_file(out / "states.csv", twin::states_csv(predicted));
+  twin::warn_beyond(
+      twin.validity,
+      twin::validity_of(problem.model.chain, trajectory::fit(trajectory::read_tum(out / "base.tum"), request.out), predicted),
+      request.out);
   core::write_file(out / "picture.svg", planning::picture_svg(problem, options, plan));
   const std::string document = planning::plan_json(problem, options, plan, request.horizon, simulated);
   core::write_file(out / "plan.json", document);

@@ -5,6 +5,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/pipeline.h"
+#include "chainsplat/properties.h"
 #include "chainsplat/run_folder.h"
 #include "cli.h"
 
@@ -47,7 +48,7 @@ Json summary_json(const pipeline::TrainResult& result, const std::string& run) {
     if (*metrics) document[name] = Json::parse(eval::to_json(**metrics))["mean"];
   for (const auto& [stage, summary] : result.fits) document["solver"][stage] = summary;
   document["seconds"] = twin.provenance.seconds;
-  if (!twin.corrections.empty()) {
+  if (!twin.corrections.empty() || !twin.verdict.empty()) {
     document["verdict"] = twin::to_json(twin.verdict);
     document["trusted"] = twin.trusted();
   }
@@ -67,6 +68,9 @@ void train(const Globals& globals, const Request& request) {
   if (result.recognized) rows.push_back({"recognized", &result.recognized->mean});
   if (result.rollout) rows.push_back({"rollout", &result.rollout->mean});
   if (!rows.empty()) std::cout << metrics_table(rows);
+  if (const twin::Twin& twin = result.twin; twin.parameters)
+    std::cout << twin::describe(
+        twin::properties(dynamics::make_model(twin.chain, *twin.parameters), twin.estimates, twin.known_mass));
   std::cout << "twin: " << request.out << "\nreport: " << (Path(request.out) / pipeline::kReportFile).string() << "\n";
   for (const capture::Finding& finding : result.twin.verdict) std::cout << core::printable(finding.text) << "\n";
   if (!request.picture.empty() && result.recognized) std::cout << "picture: " << request.picture << "\n";

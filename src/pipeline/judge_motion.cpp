@@ -1,0 +1,101 @@
+// judge_motion.cpp - how far the identified motion can be trusted, in plain words.
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <string>
+#include <vector>
+
+#include "pipeline/stages.h"
+
+namespace chainsplat::pipeline {
+namespace {
+
+using capture::Finding;
+
+constexpr const char *kMisfit = "identification-misfit", *kUnexcited = "unexcited";
+// Share of the length by which the identified motion misses the recognized one, RMS over nodes and frames. Ropes that
+// the model can follow leave 0.1 to 0.4 %; a base one frame late, taken as given, 3 %.
+constexpr double kDoubtful = 0.01, kUseless = 0.02;
+constexpr double kStill = 2.0;  // of an angle's variation over its noise; swings leave 4 and more at the free end
+constexpr std::size_t kFramesOfMotion = 15;  // half a second
+constexpr double kMillimeters = 1e3;
+
+struct Misfit {
+  double rms = 0.0;  // m
+  std::size_t worst = 0;
+};
+Misfit misfit_of(const twin::Twin& twin, const trajectory::Trajectory& base) {
+  Misfit out;
+  double sum = 0.0, worst = -1.0, count = 0.0;
+  for (std::size_t i = 0; i < twin.states.time.size(); ++i) {
+    const math::Pose pose = base.pose(twin.states.time[i]);
+    const auto nodes = [&](const math::VectorX& theta) {
+      return chain::nodes(twin.chain, chain::link_motions(twin.chain, theta, pose));
+    };
+    const math::MatrixX apart = nodes(twin.states.theta[i]) - nodes(twin.rollout.theta[i]);
+    const double square = apart.squaredNorm();
+    sum += square, count += static_cast<double>(apart.cols() - 1);  // the grasp is the same
+    if (square > worst) worst = square, out.worst = i;
+  }
+  out.rms = std::sqrt(sum / std::max(1.0, count));
+  return out;
+}
+
+void judge_misfit(twin::Twin& twin, const trajectory::Trajectory& base) {
+  if (twin.states.time.empty() || twin.rollout.time.size() != twin.states.time.size()) return;
+  const Misfit misfit = misfit_of(twin, base);
+  if (misfit.rms < kDoubtful * twin.chain.length) return;
+  const bool useless = misfit.rms > kUseless * twin.chain.length;
+  char text[256];
+  std::snprintf(text, sizeof text, "the identified motion misses the recognized one by %.1f mm RMS, most at %.2f s: %s",
+                kMillimeters * misfit.rms, twin.states.time[misfit.worst],
+                useless ? "do not trust its dynamics; base motion, clock or the rope's kind is not what was given"
+                        : "its predictions are no better than that");
+  twin.verdict.push_back({kMisfit, "object", kMillimeters * misfit.rms, 0.0, "mm", false, !useless, false,
+                          static_cast<int>(misfit.worst), text});
+}
+
+// Joints that the motion hardly bends, from 1: their angles vary little more than their noise, which second differences
+// tell from a motion that many frames show.
+std::vector<int> still_joints(const twin::Twin& twin) {
+  const chain::Chain& chain = twin.chain;
+  const std::vector<math::VectorX>& theta = twin.states.theta;
+  std::vector<int> out;
+  if (theta.size() < kFramesOfMotion) return out;
+  const auto count = static_cast<double>(theta.size());
+  std::vector<double> moved(chain.links(), 0.0), noise(chain.links(), 0.0);  // rad^2
+  for (int k = 0; k < chain.angles(); ++k) {
+    double mean = 0.0, square = 0.0, jumps = 0.0;
+    for (std::size_t i = 0; i < theta.size(); ++i) {
+      mean += theta[i][k] / count, square += theta[i][k] * theta[i][k] / count;
+      if (i < 2) continue;
+      const double jump = theta[i][k] - 2.0 * theta[i - 1][k] + theta[i - 2][k];
+      jumps += jump * jump / (count - 2.0);
+    }
+    moved[chain.child_link[k]] += square - mean * mean;
+    noise[chain.child_link[k]] += jumps / 6.0;  // 1 + 4 + 1 times the variance of independent noise
+  }
+  for (int joint = 1; joint < chain.links(); ++joint)
+    if (moved[joint] < kStill * kStill * noise[joint]) out.push_back(joint);
+  return out;
+}
+
+void judge_excitation(twin::Twin& twin) {
+  const std::vector<int> still = still_joints(twin);
+  if (still.empty()) return;
+  std::string joints;
+  for (const int joint : still) joints += (joints.empty() ? "" : ", ") + std::to_string(joint);
+  twin.verdict.push_back({kUnexcited, "object", static_cast<double>(still.size()), 0.0, "1", false, true, false, -1,
+                          "the motion hardly bends joint" + std::string(still.size() > 1 ? "s " : " ") + joints +
+                              ": stiffness and damping there are guesses; `chainsplat excite` proposes a motion"});
+}
+
+}  // namespace
+
+void judge_motion(twin::Twin& twin, const trajectory::Trajectory& base) {
+  std::erase_if(twin.verdict, [](const Finding& f) { return f.code == kMisfit || f.code == kUnexcited; });
+  judge_misfit(twin, base);
+  judge_excitation(twin);
+}
+
+}  // namespace chainsplat::pipeline

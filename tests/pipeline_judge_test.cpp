@@ -1,0 +1,76 @@
+#include <doctest/doctest.h>
+#include <cmath>
+#include <random>
+
+#include "pipeline/stages.h"
+
+using namespace chainsplat;
+
+namespace {
+
+constexpr int kJoints = 4, kFrames = 60;
+constexpr double kNoise = 1e-3;  // rad
+
+// A rope of 0.4 m whose first two joints swing and whose others do not, seen with noise, and predicted without.
+twin::Twin make_twin(double swing, double prediction) {
+  twin::Twin twin;
+  twin.chain = chain::make_chain(0.4, 0.01, -math::Vector3::UnitZ(), math::Vector3::UnitY(), kJoints,
+                                 chain::Bending::planar, false, 0.0);
+  std::mt19937 random(7);
+  std::normal_distribution<double> normal(0.0, kNoise);
+  for (int i = 0; i < kFrames; ++i) {
+    const double t = i / 30.0, angle = swing * std::sin(6.0 * t);
+    math::VectorX theta = math::VectorX::Zero(kJoints);
+    theta[0] = theta[1] = angle;
+    twin.rollout.time.push_back(t), twin.states.time.push_back(t);
+    twin.rollout.theta.push_back(theta);
+    twin.rollout.theta.back()[0] += prediction;
+    for (int k = 0; k < kJoints; ++k) theta[k] += normal(random);
+    twin.states.theta.push_back(theta);
+  }
+  return twin;
+}
+
+const trajectory::Trajectory& still_base() {
+  static const trajectory::Trajectory base = trajectory::fit({{0.0, {}}}, "base");
+  return base;
+}
+
+const capture::Finding* finding(const twin::Twin& twin, const std::string& code) {
+  for (const capture::Finding& f : twin.verdict)
+    if (f.code == code) return &f;
+  return nullptr;
+}
+
+}  // namespace
+
+TEST_CASE("joints that no motion bends are named") {
+  twin::Twin twin = make_twin(0.2, 0.0);
+  pipeline::judge_motion(twin, still_base());
+  REQUIRE(twin.verdict.size() == 1);
+  const capture::Finding* const found = finding(twin, "unexcited");
+  REQUIRE(found);
+  CHECK(found->value == 2.0);
+  CHECK(found->trusted);
+  CHECK(found->text.find("joints 3, 4:") != std::string::npos);
+  pipeline::judge_motion(twin, still_base());
+  CHECK(twin.verdict.size() == 1);  // anew, not beside the old one
+  twin = make_twin(0.0, 0.0);
+  pipeline::judge_motion(twin, still_base());
+  CHECK(finding(twin, "unexcited")->value == kJoints);
+}
+
+TEST_CASE("a motion that misses what was recognized is doubted, and then not trusted") {
+  // a turn about the grasp by a moves points at s by a s: RMS over four equal links a 0.4 m sqrt((1 + 4 + 9 + 16)/64)
+  const double reach = 0.4 * std::sqrt(30.0 / 64.0 * 4.0 / 5.0);  // the first joint, at the grasp, is a node, too
+  for (const double share : {0.005, 0.015, 0.03}) {
+    twin::Twin twin = make_twin(0.2, share * 0.4 / reach);
+    pipeline::judge_motion(twin, still_base());
+    const capture::Finding* const found = finding(twin, "identification-misfit");
+    REQUIRE((found != nullptr) == (share > 0.01));
+    if (!found) continue;
+    CHECK(found->value == doctest::Approx(1e3 * share * 0.4).epsilon(0.05));
+    CHECK(found->trusted == (share < 0.02));
+    CHECK(twin.trusted() == found->trusted);
+  }
+}
