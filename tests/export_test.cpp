@@ -270,10 +270,44 @@ TEST_CASE("files by ending") {
   CHECK(!std::filesystem::exists(folder.path / "b.glb"));
 }
 
+TEST_CASE("glTF's cameras see points where the capture's do, and the root tells what the rope is") {
+  const twin::Twin twin = test::small_twin();
+  capture::Camera camera;
+  camera.name = "left";
+  camera.width = 640, camera.height = 480;
+  camera.fx = 500.0, camera.fy = 520.0, camera.cx = 320.0, camera.cy = 240.0;
+  camera.world_from_camera = {Eigen::AngleAxisd(2.0, math::Vector3(1, 2, -2) / 3.0).toRotationMatrix(),
+                              math::Vector3(0.4, -0.7, 0.5)};
+  exports::GltfOptions options;
+  options.cameras = {camera};
+  options.properties = {{"bending_stiffness", "N m^2", 4e-4, 1e-5}, {"tip_mass", "kg", 0.0, NAN}};
+  const tinygltf::Model model =
+      loaded(exports::gltf(twin.gaussians, twin.chain, twin.states, test::moving_base(1.0), true, options), true);
+  REQUIRE(model.cameras.size() == 1);
+  const tinygltf::PerspectiveCamera& lens = model.cameras[0].perspective;
+  const std::vector<math::Pose> world = world_transforms(model, 0);
+  const math::Pose seen_from = world.back();
+  REQUIRE(model.nodes.back().name == "left");
+  const math::Vector3 in_camera(0.1, -0.05, 0.8), point = camera.world_from_camera * in_camera;
+  const math::Vector3 there = seen_from.inverse() * (y_up() * point);
+  REQUIRE(there.z() < 0.0);  // in front
+  const double half = std::tan(0.5 * lens.yfov);
+  const math::Vector2 pixel(320.0 * (1.0 + there.x() / -there.z() / (half * lens.aspectRatio)),
+                            240.0 * (1.0 - there.y() / -there.z() / half));
+  CHECK((pixel - capture::project(camera, in_camera)).norm() < 1e-6);
+  CHECK(model.cameras[0].extras.Get("cx").GetNumberAsDouble() == 320.0);
+  const tinygltf::Value rope = model.nodes[0].extras.Get("rope");
+  CHECK(rope.Get("length").GetNumberAsDouble() == twin.chain.length);
+  CHECK(rope.Get("properties").Get("bending_stiffness").Get("sigma").GetNumberAsDouble() == 1e-5);
+  CHECK(!rope.Get("properties").Get("tip_mass").Has("sigma"));
+}
+
 TEST_CASE("a tube rides on the links: where a vertex has one link, it is where the chain carries it") {
   const twin::Twin twin = test::small_twin();
   const trajectory::Trajectory base = test::moving_base(1.0);
-  const tinygltf::Model model = loaded(exports::gltf(twin.gaussians, twin.chain, twin.states, base, true, true), true);
+  const tinygltf::Model model = loaded(exports::gltf(twin.gaussians, twin.chain, twin.states, base, true,
+                                                     {.mesh = true, .cameras = {}, .properties = {}}),
+                                       true);
   REQUIRE(model.skins.size() == 1);
   const tinygltf::Node& node = model.nodes.back();
   REQUIRE(node.name == "tube");

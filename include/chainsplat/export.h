@@ -18,6 +18,7 @@
 #include <vector>
 #include "chainsplat/capture.h"
 #include "chainsplat/chain.h"
+#include "chainsplat/properties.h"
 #include "chainsplat/trajectory.h"
 #include "chainsplat/twin.h"
 
@@ -31,15 +32,23 @@ std::vector<Path> files(const Path& file);
 
 bool for_viewers(const Path& file);  // whether it is a format in which others draw the Gaussians: .glb, .gltf, .ply
 
+// What a glTF file holds beside splats, chain and motion.
+struct GltfOptions {
+  bool mesh = false;                     // the rope as a skinned tube
+  std::vector<capture::Camera> cameras;  // as glTF's; what those lack (lens, principal point) stands in their extras
+  std::vector<twin::Property> properties = {};  // in the extras of the root node
+};
+
 // Writes them. An empty `motion` means the home configuration without animation; a default-constructed `base` is at
 // rest at the world origin. Throws InputError for an unknown ending (listing the known ones) and for a twin without the
-// data that the format needs, WorkError if the file cannot be written. `mesh`: of glTF.
+// data that the format needs, WorkError if the file cannot be written. Other formats than
+// glTF take no notice of `options`.
 void write(const twin::Twin& twin, const chain::States& motion, const trajectory::Trajectory& base, const Path& file,
-           bool mesh = false);
+           const GltfOptions& options = {});
 
-// Returns the bytes of a .glb (`binary`) or .gltf file. `mesh`: with the rope as a skinned tube beside the splats.
+// Returns the bytes of a .glb (`binary`) or .gltf file.
 std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, const chain::States& motion,
-                 const trajectory::Trajectory& base, bool binary, bool mesh = false);
+                 const trajectory::Trajectory& base, bool binary, const GltfOptions& options = {});
 
 // The link with the largest probability of Gaussian `i`.
 int surest_link(const splat::Gaussians& gaussians, int i);

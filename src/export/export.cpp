@@ -46,7 +46,7 @@ bool for_viewers(const Path& file) {
 }
 
 void write(const twin::Twin& twin, const chain::States& motion, const trajectory::Trajectory& base, const Path& file,
-           bool mesh) {
+           const GltfOptions& options) {
   const std::string ending = ending_of(file);
   const std::vector<Path> names = files(file);
   std::vector<std::string> bytes;
@@ -65,7 +65,7 @@ void write(const twin::Twin& twin, const chain::States& motion, const trajectory
   } else {
     require(twin.gaussians.count > 0, file, "the twin has no Gaussians yet", "recognize it first, or export .csv");
     bytes = {ending == ".ply" ? twin::gaussians_ply(twin.gaussians)
-                              : gltf(twin.gaussians, twin.chain, motion, base, ending == ".glb", mesh)};
+                              : gltf(twin.gaussians, twin.chain, motion, base, ending == ".glb", options)};
   }
   for (std::size_t i = 0; i < names.size(); ++i) core::write_file(names[i], bytes[i]);
 }

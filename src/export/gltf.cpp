@@ -100,6 +100,8 @@ class Builder {
   tinygltf::Model& model_;
 };
 
+constexpr double kFar = 1000.0;  // m, beyond every scene; the writer always writes one
+
 tinygltf::Primitive primitive(Builder& builder, const splat::Gaussians& g, const std::vector<int>& members,
                               const Vector3& link_origin) {
   const int coefficients = g.sh_coefficients();
@@ -180,6 +182,50 @@ void add_tube(tinygltf::Model& model, Builder& builder, const splat::Gaussians& 
   model.nodes.push_back(node);
 }
 
+// A camera below the root. glTF's look along -z with y up, and know neither a lens nor a principal point beside the
+// middle: both stand in its extras.
+void add_camera(tinygltf::Model& model, const capture::Camera& from) {
+  tinygltf::Camera camera;
+  camera.type = "perspective";
+  camera.name = from.name;
+  camera.perspective.yfov = 2.0 * std::atan(0.5 * from.height / from.fy);
+  camera.perspective.aspectRatio = from.width * from.fy / (from.fx * from.height);
+  camera.perspective.znear = image_model::kNear;
+  camera.perspective.zfar = kFar;
+  tinygltf::Value::Object extras;
+  for (const auto& [name, value] : {std::pair{"fx", from.fx}, {"fy", from.fy}, {"cx", from.cx}, {"cy", from.cy}})
+    extras[name] = tinygltf::Value(value);
+  extras["width"] = tinygltf::Value(from.width), extras["height"] = tinygltf::Value(from.height);
+  tinygltf::Value::Array lens;
+  for (const double coefficient : from.distortion) lens.emplace_back(coefficient);
+  extras["distortion"] = tinygltf::Value(lens);
+  camera.extras = tinygltf::Value(extras);
+  tinygltf::Node node;
+  node.name = from.name;
+  node.camera = static_cast<int>(model.cameras.size());
+  math::Matrix3 rotation = from.world_from_camera.rotation;
+  rotation.rightCols<2>() *= -1.0;
+  const std::array<double, 4> turn = quaternion(rotation, {0, 0, 0, 1});
+  node.rotation.assign(turn.begin(), turn.end());
+  node.translation.assign(from.world_from_camera.translation.begin(), from.world_from_camera.translation.end());
+  model.cameras.push_back(camera);
+  model.nodes[0].children.push_back(static_cast<int>(model.nodes.size()));
+  model.nodes.push_back(node);
+}
+
+// What the rope is, for programs that read extras: lengths in m, properties as in twin.json.
+tinygltf::Value about(const chain::Chain& chain, const std::vector<twin::Property>& properties) {
+  tinygltf::Value::Object rope, all;
+  rope["length"] = tinygltf::Value(chain.length), rope["diameter"] = tinygltf::Value(chain.diameter);
+  for (const twin::Property& p : properties) {
+    tinygltf::Value::Object one{{"value", tinygltf::Value(p.value)}, {"unit", tinygltf::Value(p.unit)}};
+    if (std::isfinite(p.sigma)) one["sigma"] = tinygltf::Value(p.sigma);
+    all[p.name] = tinygltf::Value(one);
+  }
+  if (!all.empty()) rope["properties"] = tinygltf::Value(all);
+  return tinygltf::Value(tinygltf::Value::Object{{"rope", tinygltf::Value(rope)}});
+}
+
 // Poses of all link frames at one time, each in its parent's frame (link 0: in the world).
 std::vector<math::Pose> local_poses(const chain::Chain& chain, const math::VectorX& theta, const math::Pose& base) {
   const std::vector<math::Pose> motions = chain::link_motions(chain, theta, base);
@@ -195,7 +241,7 @@ std::vector<math::Pose> local_poses(const chain::Chain& chain, const math::Vecto
 }  // namespace
 
 std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, const chain::States& motion,
-                 const trajectory::Trajectory& base, bool binary, bool with_tube) {
+                 const trajectory::Trajectory& base, bool binary, const GltfOptions& options) {
   CHAINSPLAT_CHECK(gaussians.links == chain.links(), std::to_string(gaussians.links));
   const int links = chain.links();
   tinygltf::Model model;
@@ -214,6 +260,7 @@ std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, c
   root.name = "z_up";
   root.rotation = {-kHalfRoot, 0.0, 0.0, kHalfRoot};
   root.children = {1};
+  root.extras = about(chain, options.properties);
   model.nodes.push_back(root);
   std::vector<std::vector<int>> members(links);
   for (int i = 0; i < gaussians.count; ++i) members[surest_link(gaussians, i)].push_back(i);
@@ -240,7 +287,8 @@ std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, c
   scene.nodes = {0};
   model.scenes.push_back(scene);
   model.defaultScene = 0;
-  if (with_tube) add_tube(model, builder, gaussians, chain);
+  for (const capture::Camera& camera : options.cameras) add_camera(model, camera);
+  if (options.mesh) add_tube(model, builder, gaussians, chain);
 
   // animation: translation of the base, rotation of every link
   if (moving) {

@@ -97,15 +97,22 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
   const trajectory::Trajectory base = !request.base.empty() ? pipeline::read_base(input_path(request.base))
                                       : !beside.empty()     ? pipeline::read_base(beside)
                                                             : pipeline::own_base(request.run);
-  if (!request.raw && twin.gaussians.count > 0 && exports::for_viewers(request.out)) {
-    if (const std::optional<capture::Capture> recording = pipeline::own_recording(twin, request.run))
+  exports::GltfOptions options;
+  options.mesh = request.mesh;
+  if (twin.parameters)
+    options.properties =
+        twin::properties(dynamics::make_model(twin.chain, *twin.parameters), twin.estimates, twin.known_mass);
+  if (twin.gaussians.count > 0 && exports::for_viewers(request.out)) {
+    const std::optional<capture::Capture> recording = pipeline::own_recording(twin, request.run);
+    if (recording) options.cameras = recording->cameras;
+    if (recording && !request.raw)
       twin.gaussians =
           exports::with_low_pass(twin.gaussians, twin.chain, twin.states, recording->base, recording->cameras);
-    else
+    else if (!request.raw)
       core::warn(request.run +
                  ": its capture is not there any more; the Gaussians are as trained, thin in other viewers");
   }
-  exports::write(twin, motion, base, request.out, request.mesh);
+  exports::write(twin, motion, base, request.out, options);
   if (globals.json) {
     nlohmann::ordered_json document{{"output", request.out}, {"files", nlohmann::ordered_json::array()}};
     for (const Path& file : files) document["files"].push_back(file.string());
