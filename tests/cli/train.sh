@@ -105,6 +105,15 @@ expect_code 0 render
 for ending in png mask.png depth.exr; do
   [ "$(ls "$work/frames/cam1" | grep -c "^[0-9]*\.$ending\$")" -eq 12 ] || fail "render: not 12 files *.$ending"
 done
+# on what the camera recorded: outside of the rope the outline's picture is the recorded one, whose first pixel is not black
+run render "$work/whole" --camera "$demo:cam1" --layout outline -o "$work/outline"
+expect_code 0 'render --layout outline'
+[ "$(ls "$work/outline/cam1" | wc -l)" -eq 12 ] || fail 'render --layout: not 12 frames'
+cmp -s "$work/outline/cam1/000000.png" "$work/frames/cam1/000000.png" && fail 'render --layout outline: draws the twin alone'
+run render "$work/whole" --camera "$demo:cam1" --layout side-by-side -o "$work/beside.mp4"
+expect_code 0 'render --layout side-by-side, a video'
+expect_error 2 'side-by-side, overlay' render "$work/whole" --camera "$demo:cam1" --layout beside -o "$work/none"
+expect_error 2 'undistorted' render "$work/whole" --camera "$demo:cam1" --layout wipe --undistorted -o "$work/none"
 expect_error 2 'frames: is there already and not empty' render "$work/whole" --camera "$demo:cam0" -o "$work/frames"
 [ -e "$work/frames/cam0" ] && fail 'render: writes into a folder that is not empty'
 run render "$work/whole" --camera "$demo:cam0" -o "$work/frames" --force

@@ -3,12 +3,14 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <functional>
 #include <iostream>
 #include <memory>
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/capture.h"
 #include "chainsplat/dynamics/base_wrench.h"
+#include "chainsplat/layout.h"
 #include "chainsplat/pipeline.h"
 #include "chainsplat/render.h"
 #include "chainsplat/run_folder.h"
@@ -83,7 +85,7 @@ void rollout(const Globals& globals, const RolloutRequest& request) {
 }
 
 struct RenderRequest {
-  std::string run, states, base, camera, out;
+  std::string run, states, base, camera, out, layout = "drawn";
   bool mask = false, depth = false, undistorted = false, force = false;
 };
 
@@ -93,8 +95,8 @@ std::string frame_name(int frame, const char* ending) {
   return text;
 }
 
-// The camera's times and, as a motion of its own may be longer than the recording, as many more at its rate. A motion at
-// quite other times is drawn from its beginning on.
+// The camera's times and, as a motion of its own may be longer than the recording, as many more at its rate. A motion
+// at quite other times is drawn from its beginning on.
 std::vector<double> frame_times(const std::vector<double>& recorded, const chain::States& states) {
   constexpr double kRate = 30.0;  // frames per second, for a camera of one frame
   const double known = render::median_interval(recorded), interval = known > 0.0 ? known : 1.0 / kRate;
@@ -110,9 +112,39 @@ std::vector<double> frame_times(const std::vector<double>& recorded, const chain
   return times;
 }
 
+// The picture of every frame, in order; what the camera recorded is read in parts, so that a recording may be long.
+void each_picture(const Path& capture, const capture::Camera& camera, std::size_t recorded, render::Layout layout,
+                  const std::vector<render::Frame>& frames,
+                  const std::function<void(const render::Frame& frame, const capture::Image8& picture)>& use) {
+  constexpr std::size_t kPixelsAtOnce = 32u << 20;  // 128 MiB
+  const int at_once = static_cast<int>(
+      std::max<std::size_t>(1, kPixelsAtOnce / (static_cast<std::size_t>(camera.width) * camera.height)));
+  capture::LoadOptions load;
+  load.undistort = false, load.masked = false, load.camera = camera.name;
+  std::vector<capture::View> views;
+  for (const render::Frame& frame : frames) {
+    capture::Image8 seen;
+    if (layout != render::Layout::drawn && frame.frame < static_cast<int>(recorded)) {
+      if (views.empty() || frame.frame >= load.last) {
+        load.first = frame.frame, load.last = std::min(static_cast<int>(recorded), frame.frame + at_once);
+        views = capture::load(capture, load).views;
+      }
+      const capture::View& view = views[frame.frame - load.first];
+      seen = {view.width, view.height, 3, {}};
+      for (std::size_t i = 0; i < view.rgba.size(); i += 4)
+        seen.pixels.insert(seen.pixels.end(), &view.rgba[i], &view.rgba[i] + 3);
+    }
+    const double last = std::max(1, frames.back().frame - frames.front().frame);
+    use(frame, render::laid_out(layout, frame, camera, seen, (frame.frame - frames.front().frame) / last));
+  }
+}
+
 void render(const Globals& globals, const RenderRequest& request) {
   const Path out = request.out;
   const bool video = out.extension() == ".mp4";
+  const render::Layout layout = render::read_layout(request.layout);
+  if (layout != render::Layout::drawn && request.undistorted)
+    throw InputError("--undistorted", "what was recorded has the lens distortion", "leave it or --layout out");
   const auto [folder, camera_name] = split_camera(request.camera);
   if (video) {
     pipeline::check_output_file(request.out);
@@ -139,8 +171,12 @@ void render(const Globals& globals, const RenderRequest& request) {
                                                             : capture.base;
   if (!request.states.empty() && !own_base)
     core::warn(request.states + ": no base motion lies beside it; that of " + folder + " is taken");
-  if (own_base)
-    for (std::vector<double>& times : capture.times) times = frame_times(times, states);
+  std::vector<std::size_t> recorded;  // how many of a camera's times are those of its frames
+  for (std::vector<double>& times : capture.times) {
+    const std::vector<double> own = times;
+    if (own_base) times = frame_times(own, states);
+    recorded.push_back(times.front() == own.front() ? own.size() : 0);
+  }
   if (video && capture.cameras.size() != 1)
     throw InputError(request.camera, "has " + std::to_string(capture.cameras.size()) + " cameras and a video shows one",
                      "name it, for example " + folder + ":" + capture.cameras.front().name);
@@ -173,23 +209,24 @@ void render(const Globals& globals, const RenderRequest& request) {
         render::frames(engine, twin.gaussians, twin.chain, states, base, camera, static_cast<int>(c), times, options);
     if (video) {
       std::vector<capture::Image8> images;
-      for (const render::Frame& frame : frames) images.push_back(render::color_image(frame, camera));
+      each_picture(folder, camera, recorded[c], layout, frames,
+                   [&](const render::Frame&, const capture::Image8& picture) { images.push_back(picture); });
       const double rate = times.size() > 1 ? double(times.size() - 1) / (times.back() - times.front()) : 30.0;
       capture::write_video(out, rate, images);
     } else {
       core::make_folder(out / camera.name);
-      for (std::size_t f = 0; f < frames.size(); ++f) {
-        const render::Frame& frame = frames[f];
-        const Path stem = out / camera.name;
-        capture::write_png(stem / frame_name(frame.frame, ".png"), render::color_image(frame, camera));
-        if (request.mask)
-          capture::write_png(stem / frame_name(frame.frame, ".mask.png"), render::mask_image(frame, camera));
-        if (request.depth)
-          capture::write_depth_exr(stem / frame_name(frame.frame, ".depth.exr"), camera.width, camera.height,
-                                   render::depth_image(frame, camera));
-        core::report({"write " + camera.name, static_cast<std::int64_t>(f + 1),
-                      static_cast<std::int64_t>(frames.size()), NAN, NAN, ""});
-      }
+      std::int64_t done = 0;
+      each_picture(
+          folder, camera, recorded[c], layout, frames, [&](const render::Frame& frame, const capture::Image8& picture) {
+            const Path stem = out / camera.name;
+            capture::write_png(stem / frame_name(frame.frame, ".png"), picture);
+            if (request.mask)
+              capture::write_png(stem / frame_name(frame.frame, ".mask.png"), render::mask_image(frame, camera));
+            if (request.depth)
+              capture::write_depth_exr(stem / frame_name(frame.frame, ".depth.exr"), camera.width, camera.height,
+                                       render::depth_image(frame, camera));
+            core::report({"write " + camera.name, ++done, static_cast<std::int64_t>(frames.size()), NAN, NAN, ""});
+          });
     }
     total += frames.size();
     document["cameras"][camera.name] = frames.size();
@@ -218,8 +255,9 @@ void add_motion_commands(CLI::App& app, const Globals& globals, Job& job) {
       ->add_option("--centerline", request->centerline, "Also write the world points of the grasp, joints and free end")
       ->type_name("FILE.csv");
   roller
-      ->add_option("--wrench", request->wrench,
-                   "Also write what the gripper exerts on the rope: force, and moment about the grasp; N, N m, world axes")
+      ->add_option(
+          "--wrench", request->wrench,
+          "Also write what the gripper exerts on the rope: force, and moment about the grasp; N, N m, world axes")
       ->type_name("FILE.csv");
   roller
       ->add_option("--initial", request->initial,
@@ -239,10 +277,16 @@ void add_motion_commands(CLI::App& app, const Globals& globals, Job& job) {
   renderer->add_option("-o,--output", drawing->out, "Folder for CAMERA/000000.png ..., or a video that ends in .mp4")
       ->required()
       ->type_name("OUT");
-  renderer->add_option("--base", drawing->base, "Base motion (default: the one kept beside the states, else that of --camera's capture)")
+  renderer
+      ->add_option("--base", drawing->base,
+                   "Base motion (default: the one kept beside the states, else that of --camera's capture)")
       ->type_name("FILE.tum");
   renderer->add_flag("--mask", drawing->mask, "Also 000000.mask.png: 255 where the rope covers half or more");
   renderer->add_flag("--depth", drawing->depth, "Also 000000.depth.exr: meters along the optical axis, 0 = none");
+  renderer
+      ->add_option("--layout", drawing->layout,
+                   "drawn (default), or on what the camera recorded: side-by-side, overlay, wipe, outline, error")
+      ->type_name("NAME");
   renderer->add_flag("--undistorted", drawing->undistorted, "Leave the lens distortion out");
   renderer->add_flag("--force", drawing->force, "Write into a folder that is not empty");
   renderer->callback([&globals, &job, drawing] { job = [&globals, drawing] { render(globals, *drawing); }; });
