@@ -14,6 +14,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/capture.h"
+#include "chainsplat/encode.h"
 
 using namespace chainsplat;
 using capture::Camera;
@@ -1042,4 +1043,10 @@ TEST_CASE("written images and videos come back") {
   const Image8 small = filled(3, [](int, int) { return std::array<double, 3>{1, 2, 3}; });
   CHECK_THROWS_AS(capture::write_png(folder.path / "missing" / "a.png", small), WorkError);
   CHECK_THROWS_AS(capture::write_video(folder.path / "missing" / "a.mp4", 30.0, {small}), WorkError);
+  {
+    capture::VideoWriter writer(folder.path / "left.mp4", 30.0);
+    writer.add(small);
+  }
+  for (const auto& entry : std::filesystem::directory_iterator(folder.path))
+    CHECK_FALSE(contains(entry.path().string(), "left.mp4"));  // nor its temporary file
 }

@@ -1,4 +1,4 @@
-// src/capture/image_files.h - reading of single images with OpenImageIO's ImageInput, without its cache.
+// src/capture/image_files.h - reading of single images of a capture.
 //
 // All readers throw InputError when the image is missing, unreadable or of another size than expected.
 #pragma once

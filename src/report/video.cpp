@@ -1,9 +1,7 @@
 // video.cpp - what a camera saw, as small JPEG pictures.
-#include <OpenImageIO/filesystem.h>
-#include <OpenImageIO/imageio.h>
-
 #include <algorithm>
 
+#include "chainsplat/encode.h"
 #include "chainsplat/render.h"
 #include "chainsplat/report.h"
 
@@ -14,7 +12,7 @@ namespace {
 constexpr int kWidth = 480;                       // px, at most: a phone's, and half of a usual camera's
 constexpr int kMostPictures = 300;                // 10 s at 30 Hz; longer recordings lose frames evenly
 constexpr std::size_t kPixelsAtOnce = 32u << 20;  // that are loaded, 128 MiB
-constexpr const char* kCompression = "jpeg:60";   // about 8 kB for 480 x 360
+constexpr int kQuality = 60;                      // of JPEG: about 8 kB for 480 x 360
 
 // The RGB picture of a whole view with its sides divided by `shrink`, every pixel the mean of what it covers.
 capture::Image8 shrunk(const capture::View& view, int shrink) {
@@ -31,18 +29,6 @@ capture::Image8 shrunk(const capture::View& view, int shrink) {
             static_cast<std::uint8_t>((sum + shrink * shrink / 2) / (shrink * shrink));
       }
   return out;
-}
-
-std::string jpeg(const capture::Image8& image) {
-  std::vector<unsigned char> bytes;
-  OIIO::Filesystem::IOVecOutput sink(bytes);
-  OIIO::ImageSpec spec(image.width, image.height, image.channels, OIIO::TypeDesc::UINT8);
-  spec.attribute("Compression", kCompression);
-  const auto output = OIIO::ImageOutput::create("picture.jpg");
-  const bool written = output && output->set_ioproxy(&sink) && output->open("picture.jpg", spec) &&
-                       output->write_image(OIIO::TypeDesc::UINT8, image.pixels.data()) && output->close();
-  if (!written) throw WorkError("video", "OpenImageIO cannot write JPEG into memory", "leave `video` out");
-  return std::string(bytes.begin(), bytes.end());
 }
 
 }  // namespace
@@ -69,7 +55,7 @@ Video read_video(const Path& capture, const std::string& camera, const twin::Twi
     for (const capture::View& view : capture::load(capture, load).views) {
       if (view.frame % every != 0 || !render::covered(twin.states, times[view.frame], interval)) continue;
       out.times.push_back(times[view.frame]);
-      out.jpegs.push_back(jpeg(shrunk(view, shrink)));
+      out.jpegs.push_back(capture::jpeg(shrunk(view, shrink), kQuality));
     }
     core::stop_if_requested();
   }

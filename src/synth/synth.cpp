@@ -5,6 +5,9 @@
 #include <cstdio>
 #include <limits>
 #include <nlohmann/json.hpp>
+#include <optional>
+
+#include "chainsplat/encode.h"
 
 namespace chainsplat::synth {
 
@@ -137,7 +140,9 @@ void write(splat::Engine& engine, const twin::Twin& twin, const chain::States& s
     render::Options drawing;
     drawing.depth = options.depth;
     drawing.interval = render::median_interval(scene.times[c]);
-    std::vector<capture::Image8> movie;
+    const double interval = render::median_interval(times[c]);
+    std::optional<capture::VideoWriter> movie;
+    if (options.video) movie.emplace(folder / (name + ".mp4"), interval > 0.0 ? 1.0 / interval : kUsualRate);
     render::for_batches(engine, twin.gaussians, twin.chain, states, scene.base, camera, static_cast<int>(c), times[c],
                         drawing, [&](std::vector<render::Frame>& batch) {
                           std::vector<capture::Image8> images(batch.size());
@@ -151,16 +156,14 @@ void write(splat::Engine& engine, const twin::Twin& twin, const chain::States& s
                               capture::write_depth_png(folder / "depth" / name / file, camera.width, camera.height,
                                                        render::depth_image(frame, camera), kDepthScale);
                           });
-                          if (options.video) std::move(images.begin(), images.end(), std::back_inserter(movie));
+                          if (movie)
+                            for (const capture::Image8& image : images) movie->add(image);
                           done += batch.size();
                           constexpr double kNone = std::numeric_limits<double>::quiet_NaN();
                           core::report({"synth", static_cast<std::int64_t>(done), static_cast<std::int64_t>(total),
                                         kNone, kNone, camera.name});
                         });
-    if (options.video) {
-      const double interval = render::median_interval(times[c]);
-      capture::write_video(folder / (name + ".mp4"), interval > 0.0 ? 1.0 / interval : kUsualRate, movie);
-    }
+    if (movie) movie->finish();
   }
 
   // the base trajectory that the frames were drawn with (smoothed, at its sample times), the truth, and capture.json

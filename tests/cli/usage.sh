@@ -120,4 +120,11 @@ code=$?
 expect_code 2 'rollout with standard error closed'
 [ -e "$work/log.jsonl" ] || fail 'rollout with standard error closed: no log'
 [ -s "$work/log.jsonl" ] && fail "rollout with standard error closed: in its log '$(cat "$work/log.jsonl")'"
+
+# the libraries that bring hundreds of others are loaded where an image is read, and missed there in one line
+ldd "$program" | grep -E 'OpenImageIO|libav' && fail 'the program itself links OpenImageIO or libav'
+cp "$program" "$work/alone"
+[ "$("$work/alone" --version)" = "$("$program" --version)" ] || fail 'alone: no version'
+program=$work/alone
+expect_error 1 'chainsplat_(images|videos).so: cannot be loaded .*; install' check "$source_dir/assets/demo_free_30"
 finish

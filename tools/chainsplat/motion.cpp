@@ -7,9 +7,11 @@
 #include <iostream>
 #include <memory>
 #include <nlohmann/json.hpp>
+#include <optional>
 
 #include "chainsplat/capture.h"
 #include "chainsplat/dynamics/base_wrench.h"
+#include "chainsplat/encode.h"
 #include "chainsplat/layout.h"
 #include "chainsplat/pipeline.h"
 #include "chainsplat/render.h"
@@ -112,32 +114,39 @@ std::vector<double> frame_times(const std::vector<double>& recorded, const chain
   return times;
 }
 
-// The picture of every frame, in order; what the camera recorded is read in parts, so that a recording may be long.
-void each_picture(const Path& capture, const capture::Camera& camera, std::size_t recorded, render::Layout layout,
-                  const std::vector<render::Frame>& frames,
-                  const std::function<void(const render::Frame& frame, const capture::Image8& picture)>& use) {
-  constexpr std::size_t kPixelsAtOnce = 32u << 20;  // 128 MiB
-  const int at_once = static_cast<int>(
-      std::max<std::size_t>(1, kPixelsAtOnce / (static_cast<std::size_t>(camera.width) * camera.height)));
-  capture::LoadOptions load;
-  load.undistort = false, load.masked = false, load.camera = camera.name;
-  std::vector<capture::View> views;
-  for (const render::Frame& frame : frames) {
-    capture::Image8 seen;
-    if (layout != render::Layout::drawn && frame.frame < static_cast<int>(recorded)) {
-      if (views.empty() || frame.frame >= load.last) {
-        load.first = frame.frame, load.last = std::min(static_cast<int>(recorded), frame.frame + at_once);
-        views = capture::load(capture, load).views;
-      }
-      const capture::View& view = views[frame.frame - load.first];
-      seen = {view.width, view.height, 3, {}};
-      for (std::size_t i = 0; i < view.rgba.size(); i += 4)
-        seen.pixels.insert(seen.pixels.end(), &view.rgba[i], &view.rgba[i] + 3);
-    }
-    const double last = std::max(1, frames.back().frame - frames.front().frame);
-    use(frame, render::laid_out(layout, frame, camera, seen, (frame.frame - frames.front().frame) / last));
+// What a camera recorded, read in parts, so that a recording may be long.
+class Recorded {
+ public:
+  // `frames`: that may be asked for, from the first on.
+  Recorded(Path capture, const capture::Camera& camera, std::size_t frames)
+      : capture_(std::move(capture)), frames_(static_cast<int>(frames)) {
+    constexpr std::size_t kPixelsAtOnce = 32u << 20;  // 128 MiB
+    at_once_ = static_cast<int>(
+        std::max<std::size_t>(1, kPixelsAtOnce / (static_cast<std::size_t>(camera.width) * camera.height)));
+    load_.undistort = false, load_.masked = false, load_.camera = camera.name;
   }
-}
+  // RGB; empty where there is none. Frames are asked for in order.
+  capture::Image8 at(int frame) {
+    if (frame >= frames_) return {};
+    if (views_.empty() || frame >= load_.last) {
+      load_.first = frame, load_.last = std::min(frames_, frame + at_once_);
+      views_.clear();
+      views_ = capture::load(capture_, load_).views;
+    }
+    const capture::View& view = views_[frame - load_.first];
+    capture::Image8 out{view.width, view.height, 3, {}};
+    out.pixels.reserve(view.rgba.size() / 4 * 3);
+    for (std::size_t i = 0; i < view.rgba.size(); i += 4)
+      out.pixels.insert(out.pixels.end(), &view.rgba[i], &view.rgba[i] + 3);
+    return out;
+  }
+
+ private:
+  Path capture_;
+  capture::LoadOptions load_;
+  std::vector<capture::View> views_;
+  int frames_, at_once_ = 1;
+};
 
 void render(const Globals& globals, const RenderRequest& request) {
   const Path out = request.out;
@@ -205,31 +214,38 @@ void render(const Globals& globals, const RenderRequest& request) {
   for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
     const capture::Camera& camera = capture.cameras[c];
     const std::vector<double>& times = capture.times[c];
-    const std::vector<render::Frame> frames =
-        render::frames(engine, twin.gaussians, twin.chain, states, base, camera, static_cast<int>(c), times, options);
-    if (video) {
-      std::vector<capture::Image8> images;
-      each_picture(folder, camera, recorded[c], layout, frames,
-                   [&](const render::Frame&, const capture::Image8& picture) { images.push_back(picture); });
-      const double rate = times.size() > 1 ? double(times.size() - 1) / (times.back() - times.front()) : 30.0;
-      capture::write_video(out, rate, images);
-    } else {
-      core::make_folder(out / camera.name);
-      std::int64_t done = 0;
-      each_picture(
-          folder, camera, recorded[c], layout, frames, [&](const render::Frame& frame, const capture::Image8& picture) {
-            const Path stem = out / camera.name;
-            capture::write_png(stem / frame_name(frame.frame, ".png"), picture);
-            if (request.mask)
-              capture::write_png(stem / frame_name(frame.frame, ".mask.png"), render::mask_image(frame, camera));
-            if (request.depth)
-              capture::write_depth_exr(stem / frame_name(frame.frame, ".depth.exr"), camera.width, camera.height,
-                                       render::depth_image(frame, camera));
-            core::report({"write " + camera.name, ++done, static_cast<std::int64_t>(frames.size()), NAN, NAN, ""});
-          });
-    }
-    total += frames.size();
-    document["cameras"][camera.name] = frames.size();
+    const double interval = render::median_interval(times);
+    const auto count =
+        std::count_if(times.begin(), times.end(), [&](double time) { return render::covered(states, time, interval); });
+    const Path stem = out / camera.name;
+    std::optional<capture::VideoWriter> movie;
+    if (video)
+      movie.emplace(out, times.size() > 1 ? double(times.size() - 1) / (times.back() - times.front()) : 30.0);
+    else
+      core::make_folder(stem);
+    Recorded seen(folder, camera, layout == render::Layout::drawn ? 0 : recorded[c]);
+    std::size_t written = 0;
+    const auto write = [&](std::vector<render::Frame>& batch) {
+      for (const render::Frame& frame : batch) {
+        const double share = static_cast<double>(frame.frame) / std::max<std::size_t>(1, times.size() - 1);
+        const capture::Image8 picture = render::laid_out(layout, frame, camera, seen.at(frame.frame), share);
+        if (movie)
+          movie->add(picture);
+        else
+          capture::write_png(stem / frame_name(frame.frame, ".png"), picture);
+        if (request.mask)
+          capture::write_png(stem / frame_name(frame.frame, ".mask.png"), render::mask_image(frame, camera));
+        if (request.depth)
+          capture::write_depth_exr(stem / frame_name(frame.frame, ".depth.exr"), camera.width, camera.height,
+                                   render::depth_image(frame, camera));
+        core::report({"write " + camera.name, static_cast<std::int64_t>(++written), count, NAN, NAN, ""});
+      }
+    };
+    render::for_batches(engine, twin.gaussians, twin.chain, states, base, camera, static_cast<int>(c), times, options,
+                        write);
+    if (movie) movie->finish();
+    total += written;
+    document["cameras"][camera.name] = written;
   }
   if (globals.json)
     std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";

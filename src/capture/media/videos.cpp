@@ -19,9 +19,9 @@ extern "C" {
 #include <new>
 #include <thread>
 
-#include "chainsplat/capture.h"
+#include "src/capture/media.h"
 
-namespace chainsplat::capture {
+namespace chainsplat::capture::media {
 
 namespace {
 
@@ -108,7 +108,7 @@ double claimed_rate(const AVStream& video) {
 
 // Opens a camera with raw frames where it has them in the requested size and rate, otherwise with JPEG frames if these
 // come nearer. On USB 2 many cameras have only small or slow raw frames, and larger or faster ones as JPEG.
-Opened open_camera_as_asked(const Path& file, const DeviceFormat& format) {
+Opened open_camera_as_asked(const Path& file, const DeviceFormat& format, const Host& host) {
   constexpr double kEnough = 0.95;  // share of the requested rate that counts as reached
   const auto merit = [&](const Opened& opened) {
     const AVCodecParameters& is = *opened.video().codecpar;
@@ -128,16 +128,14 @@ Opened open_camera_as_asked(const Path& file, const DeviceFormat& format) {
     }
   }
   if (const auto [sized, rate] = merit(opened); sized && rate > 0.0 && rate < kEnough * format.rate)
-    core::warn(file.string() + ": gives " + core::exact(rate) + " frames a second in this size instead of " +
-               core::exact(format.rate));
+    host.warn(file.string() + ": gives " + core::exact(rate) + " frames a second in this size instead of " +
+              core::exact(format.rate));
   return opened;
 }
 
-Opened open_video(const Path& file, const DeviceFormat& format = {}) {
-  silence();
+Opened open_recording(const Path& file) {
   std::error_code error;
   if (!std::filesystem::exists(file, error)) throw InputError(file.string(), "does not exist", "check the path");
-  if (is_device(file)) return open_camera_as_asked(file, format);
   AVFormatContext* raw = nullptr;
   AVDictionary* only = nullptr;
   av_dict_set(&only, "format_whitelist", kContainers, 0);
@@ -160,7 +158,7 @@ Opened open_video(const Path& file, const DeviceFormat& format = {}) {
 // misses frames; without the thread up to 32 of them would wait and age in the driver's queue.
 class NewestFrame {
  public:
-  explicit NewestFrame(AVFormatContext& camera) : thread_([this, &camera] { fetch(camera); }) {}
+  NewestFrame(AVFormatContext& camera, const Host& host) : host_(host), thread_([this, &camera] { fetch(camera); }) {}
   ~NewestFrame() {
     stop_ = true;
     thread_.join();
@@ -176,7 +174,7 @@ class NewestFrame {
     std::unique_lock lock(mutex_);
     while (!fresh_) {
       if (code_ < 0) return code_;
-      if (const int signal = core::stop_requested()) throw Interrupted(signal);
+      if (const int signal = host_.stop_requested()) throw Interrupted(signal);
       if (core::seconds_now() - begun > kSilence) return AVERROR(ETIMEDOUT);
       came_.wait_for(lock, kAttention);
     }
@@ -225,6 +223,7 @@ class NewestFrame {
     }
   }
 
+  Host host_;
   std::mutex mutex_;
   std::condition_variable came_;
   std::atomic<bool> stop_{false};
@@ -264,7 +263,7 @@ int matrix(AVColorSpace space) {
 
 }  // namespace
 
-struct VideoReader::Implementation {
+struct Decoder {
   Path file;
   Opened input;
   Owned<AVCodecContext> decoder;
@@ -287,41 +286,8 @@ struct VideoReader::Implementation {
   void convert(Image8& rgb);
 };
 
-VideoReader::VideoReader(const Path& file, int threads, const DeviceFormat& format)
-    : implementation_(std::make_unique<Implementation>()) {
-  // open the input and a decoder for it
-  Implementation& self = *implementation_;
-  self.file = file;
-  self.input = open_video(file, format);
-  const AVCodecParameters& parameters = *self.input.video().codecpar;
-  const AVCodec* codec = avcodec_find_decoder(parameters.codec_id);
-  if (!codec)
-    throw InputError(file.string(), std::string("no decoder for ") + avcodec_get_name(parameters.codec_id),
-                     "write it as H.264");
-  self.decoder.reset(avcodec_alloc_context3(codec));
-  avcodec_parameters_to_context(self.decoder.get(), &parameters);
-  self.decoder->thread_count = std::max(1, threads);
-  self.decoder->max_pixels = kMostPixels;  // a damaged header may claim any size
-  self.decoder->pkt_timebase = self.input.video().time_base;
-  const int code = avcodec_open2(self.decoder.get(), codec, nullptr);
-  if (code < 0) throw InputError(file.string(), "cannot be decoded (" + error_text(code) + ")", "write it as H.264");
-  // a camera: skipping frames needs an encoding in which each can be read alone
-  if (!is_device(file)) return;
-  const AVCodecDescriptor* kind = avcodec_descriptor_get(parameters.codec_id);
-  if (!kind || !(kind->props & AV_CODEC_PROP_INTRA_ONLY))
-    throw InputError(file.string(),
-                     std::string("sends ") + avcodec_get_name(parameters.codec_id) +
-                         ", whose frames cannot be read without the ones before",
-                     "set it to raw frames or MJPEG");
-  self.camera = std::make_unique<NewestFrame>(*self.input.format);
-}
-
-VideoReader::~VideoReader() = default;
-VideoReader::VideoReader(VideoReader&&) noexcept = default;
-VideoReader& VideoReader::operator=(VideoReader&&) noexcept = default;
-
 // Decodes the next frame in display order into `frame`. Returns false at the end.
-bool VideoReader::Implementation::decode() {
+bool Decoder::decode() {
   if (camera) {
     decode_newest();
     return true;
@@ -349,7 +315,7 @@ bool VideoReader::Implementation::decode() {
 }
 
 // Decodes the newest frame of a camera into `frame`, waiting for the next one where it is damaged.
-void VideoReader::Implementation::decode_newest() {
+void Decoder::decode_newest() {
   for (;;) {
     int code = camera->wait_for_newest(*packet, frames, first_stamp);
     if (code < 0)
@@ -366,7 +332,7 @@ void VideoReader::Implementation::decode_newest() {
 }
 
 // Converts `frame` to RGB.
-void VideoReader::Implementation::convert(Image8& rgb) {
+void Decoder::convert(Image8& rgb) {
   const int width = frame->width, height = frame->height;
   if (width <= 0 || height <= 0 || static_cast<std::int64_t>(width) * height > kMostPixels)
     throw InputError(file.string(),
@@ -403,31 +369,60 @@ void VideoReader::Implementation::convert(Image8& rgb) {
                 row);
 }
 
-bool VideoReader::next(Image8& rgb) {
-  if (!implementation_->decode()) return false;
-  implementation_->convert(rgb);
-  if (!device()) ++implementation_->frames;
+namespace {
+
+Decoder* open(const Path& file, int threads, const DeviceFormat& format, const Host& host) {
+  // open the input and a decoder for it
+  silence();
+  auto self = std::make_unique<Decoder>();
+  self->file = file;
+  self->input = is_device(file) ? open_camera_as_asked(file, format, host) : open_recording(file);
+  const AVCodecParameters& parameters = *self->input.video().codecpar;
+  const AVCodec* codec = avcodec_find_decoder(parameters.codec_id);
+  if (!codec)
+    throw InputError(file.string(), std::string("no decoder for ") + avcodec_get_name(parameters.codec_id),
+                     "write it as H.264");
+  self->decoder.reset(avcodec_alloc_context3(codec));
+  avcodec_parameters_to_context(self->decoder.get(), &parameters);
+  self->decoder->thread_count = std::max(1, threads);
+  self->decoder->max_pixels = kMostPixels;  // a damaged header may claim any size
+  self->decoder->pkt_timebase = self->input.video().time_base;
+  const int code = avcodec_open2(self->decoder.get(), codec, nullptr);
+  if (code < 0) throw InputError(file.string(), "cannot be decoded (" + error_text(code) + ")", "write it as H.264");
+  // a camera: skipping frames needs an encoding in which each can be read alone
+  if (!is_device(file)) return self.release();
+  const AVCodecDescriptor* kind = avcodec_descriptor_get(parameters.codec_id);
+  if (!kind || !(kind->props & AV_CODEC_PROP_INTRA_ONLY))
+    throw InputError(file.string(),
+                     std::string("sends ") + avcodec_get_name(parameters.codec_id) +
+                         ", whose frames cannot be read without the ones before",
+                     "set it to raw frames or MJPEG");
+  self->camera = std::make_unique<NewestFrame>(*self->input.format, host);
+  return self.release();
+}
+
+void close(Decoder* decoder) { delete decoder; }
+
+bool next(Decoder& decoder, Image8* rgb) {
+  if (!decoder.decode()) return false;
+  if (rgb) decoder.convert(*rgb);
+  if (!decoder.camera) ++decoder.frames;
   return true;
 }
 
-bool VideoReader::skip() {
-  if (!implementation_->decode()) return false;
-  if (!device()) ++implementation_->frames;
-  return true;
-}
+bool device(const Decoder& decoder) { return decoder.camera != nullptr; }
 
-bool VideoReader::device() const { return implementation_->camera != nullptr; }
+int frames(const Decoder& decoder) { return decoder.frames; }
 
-int VideoReader::frames() const { return implementation_->frames; }
+double rate(const Decoder& decoder) { return claimed_rate(decoder.input.video()); }
 
-double VideoReader::rate() const { return claimed_rate(implementation_->input.video()); }
+double time(const Decoder& decoder) { return decoder.seconds(decoder.frame->best_effort_timestamp); }
 
-double VideoReader::time() const { return implementation_->seconds(implementation_->frame->best_effort_timestamp); }
-
-double VideoReader::first_time() const { return implementation_->seconds(implementation_->first_stamp); }
+double first_time(const Decoder& decoder) { return decoder.seconds(decoder.first_stamp); }
 
 VideoFacts video_facts(const Path& file) {
-  Opened input = open_video(file);
+  silence();
+  Opened input = open_recording(file);
   const AVStream& video = input.video();
   VideoFacts facts;
   facts.width = video.codecpar->width;
@@ -441,20 +436,38 @@ VideoFacts video_facts(const Path& file) {
   return facts;
 }
 
-void write_video(const Path& file, double rate, const std::vector<Image8>& frames) {
-  silence();
-  CHAINSPLAT_CHECK(!frames.empty() && rate > 0.0, file.string());
-  const int width = frames.front().width, height = frames.front().height;
-  for (const Image8& frame : frames)
-    CHAINSPLAT_CHECK(frame.width == width && frame.height == height && frame.channels == frames.front().channels &&
-                         (frame.channels == 3 || frame.channels == 4) &&
-                         frame.pixels.size() == static_cast<std::size_t>(width) * height * frame.channels,
-                     "frames of one size, RGB or RGBA");
-  const auto fail = [&](const std::string& what, int code) {
+}  // namespace
+
+// A video as it is written: H.264 in MP4 under a temporary name until it is finished.
+struct Encoder {
+  Path file, temporary;
+  double rate = 0.0;
+  int width = 0, height = 0, channels = 0;  // of the first frame
+  std::int64_t count = 0;
+  Owned<AVCodecContext> encoder;
+  struct CloseOutput {
+    void operator()(AVFormatContext* c) const {
+      if (c->pb) avio_closep(&c->pb);
+      avformat_free_context(c);
+    }
+  };
+  std::unique_ptr<AVFormatContext, CloseOutput> output;
+  AVStream* stream = nullptr;  // of `output`
+  Owned<SwsContext> scaler;
+  Owned<AVFrame> rgb;
+  Owned<AVPacket> packet{av_packet_alloc()};
+
+  [[noreturn]] void fail(const std::string& what, int code) const {
     throw WorkError(file.string(), what + (code < 0 ? " (" + error_text(code) + ")" : ""),
                     "check the folder, the free space and the encoders of libav");
-  };
+  }
+  void begin(const Image8& first);
+  void drain();
+};
 
+// Chooses the encoder by the first frame and writes the file's header.
+void Encoder::begin(const Image8& first) {
+  width = first.width, height = first.height, channels = first.channels;
   // choose the encoder; the quality is visually close to lossless and keeps a camera's noise
   constexpr const char* kX264Quality = "16";
   constexpr int kMpeg4Quality = 3;
@@ -466,7 +479,7 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
   if (!even && !x264) fail("an odd size needs libx264", 0);
 
   // set it up
-  Owned<AVCodecContext> encoder(avcodec_alloc_context3(codec));
+  encoder.reset(avcodec_alloc_context3(codec));
   const AVRational frame_rate = av_d2q(rate, 1001000);
   encoder->width = width;
   encoder->height = height;
@@ -491,85 +504,117 @@ void write_video(const Path& file, double rate, const std::vector<Image8>& frame
   int code = avcodec_open2(encoder.get(), codec, nullptr);
   if (code < 0) fail("the encoder refuses", code);
 
-  // open the file under a temporary name and write its header
-  const Path temporary = file.string() + ".tmp" + std::to_string(::getpid());
+  // open the file and write its header
   AVFormatContext* raw = nullptr;
   code = avformat_alloc_output_context2(&raw, nullptr, "mp4", temporary.c_str());
   if (code < 0) fail("no mp4 writer in libav", code);
-  struct FreeOutput {
-    void operator()(AVFormatContext* c) const {
-      if (c->pb) avio_closep(&c->pb);
-      avformat_free_context(c);
-    }
-  };
-  std::unique_ptr<AVFormatContext, FreeOutput> output(raw);
+  output.reset(raw);
   output->flags |= AVFMT_FLAG_BITEXACT;  // writes no version and no date
-  const auto clean = [&](const std::string& what, int reason) {
-    output.reset();
-    ::unlink(temporary.c_str());
-    fail(what, reason);
-  };
-  AVStream* stream = avformat_new_stream(raw, nullptr);
+  stream = avformat_new_stream(raw, nullptr);
   stream->time_base = encoder->time_base;
   stream->avg_frame_rate = frame_rate;
   avcodec_parameters_from_context(stream->codecpar, encoder.get());
   code = avio_open(&raw->pb, temporary.c_str(), AVIO_FLAG_WRITE);
-  if (code < 0) clean("cannot be opened for writing", code);
+  if (code < 0) fail("cannot be opened for writing", code);
   code = avformat_write_header(raw, nullptr);
-  if (code < 0) clean("writing failed", code);
+  if (code < 0) fail("writing failed", code);
 
-  // convert, encode and write every frame
-  const AVPixelFormat source = frames.front().channels == 3 ? AV_PIX_FMT_RGB24 : AV_PIX_FMT_RGBA;
-  Owned<SwsContext> scaler(
+  // the way from RGB
+  const AVPixelFormat source = channels == 3 ? AV_PIX_FMT_RGB24 : AV_PIX_FMT_RGBA;
+  scaler.reset(
       sws_getContext(width, height, source, width, height, encoder->pix_fmt, SWS_BICUBIC, nullptr, nullptr, nullptr));
-  const Owned<AVFrame> rgb = padded_frame(width, height, source);
-  if (!scaler) clean("no way from RGB to the encoder's format", 0);
+  rgb = padded_frame(width, height, source);
+  if (!scaler) fail("no way from RGB to the encoder's format", 0);
   constexpr int kOne = 1 << 16;
   sws_setColorspaceDetails(scaler.get(), sws_getCoefficients(SWS_CS_DEFAULT), 1, sws_getCoefficients(SWS_CS_ITU601), 0,
                            0, kOne, kOne);
+}
 
-  Owned<AVPacket> packet(av_packet_alloc());
-  const auto drain = [&] {
-    for (;;) {
-      int got = avcodec_receive_packet(encoder.get(), packet.get());
-      if (got == AVERROR(EAGAIN) || got == AVERROR_EOF) return;
-      if (got >= 0) {
-        packet->stream_index = stream->index;
-        packet->duration = 1;
-        av_packet_rescale_ts(packet.get(), encoder->time_base, stream->time_base);
-        got = av_interleaved_write_frame(raw, packet.get());
-      }
-      if (got < 0) clean("writing failed", got);
+// Writes what the encoder has ready.
+void Encoder::drain() {
+  for (;;) {
+    int got = avcodec_receive_packet(encoder.get(), packet.get());
+    if (got == AVERROR(EAGAIN) || got == AVERROR_EOF) return;
+    if (got >= 0) {
+      packet->stream_index = stream->index;
+      packet->duration = 1;
+      av_packet_rescale_ts(packet.get(), encoder->time_base, stream->time_base);
+      got = av_interleaved_write_frame(output.get(), packet.get());
     }
-  };
-  for (std::size_t k = 0; k < frames.size(); ++k) {
-    // a new frame each time, because the encoder keeps references to earlier ones
-    const Owned<AVFrame> picture = padded_frame(width, height, encoder->pix_fmt);
-    picture->color_range = encoder->color_range;
-    picture->colorspace = encoder->colorspace;
-    const std::size_t row = static_cast<std::size_t>(frames[k].channels) * width;
-    for (int y = 0; y < height; ++y)
-      std::memcpy(rgb->data[0] + static_cast<std::ptrdiff_t>(y) * rgb->linesize[0], &frames[k].pixels[y * row], row);
-    sws_scale(scaler.get(), rgb->data, rgb->linesize, 0, height, picture->data, picture->linesize);
-    picture->pts = static_cast<std::int64_t>(k);
-    code = avcodec_send_frame(encoder.get(), picture.get());
-    if (code < 0) clean("encoding failed", code);
-    drain();
-  }
-  // flush the encoder, close the file and give it its name
-  code = avcodec_send_frame(encoder.get(), nullptr);
-  if (code < 0) clean("encoding failed", code);
-  drain();
-  code = av_write_trailer(raw);
-  if (code >= 0) code = avio_closep(&raw->pb);
-  if (code < 0) clean("writing failed", code);
-  output.reset();
-  std::error_code error;
-  std::filesystem::rename(temporary, file, error);
-  if (error) {
-    ::unlink(temporary.c_str());
-    fail("renaming failed (" + error.message() + ")", 0);
+    if (got < 0) fail("writing failed", got);
   }
 }
 
-}  // namespace chainsplat::capture
+namespace {
+
+Encoder* create(const Path& file, double frame_rate) {
+  silence();
+  CHAINSPLAT_CHECK(frame_rate > 0.0, file.string());
+  auto self = std::make_unique<Encoder>();
+  self->file = file;
+  self->temporary = file.string() + ".tmp" + std::to_string(::getpid());
+  self->rate = frame_rate;
+  return self.release();
+}
+
+void add(Encoder& self, const Image8& frame) {
+  CHAINSPLAT_CHECK(frame.width > 0 && frame.height > 0 && (frame.channels == 3 || frame.channels == 4) &&
+                       frame.pixels.size() == static_cast<std::size_t>(frame.width) * frame.height * frame.channels,
+                   "an RGB or RGBA picture");
+  if (!self.encoder) self.begin(frame);
+  CHAINSPLAT_CHECK(frame.width == self.width && frame.height == self.height && frame.channels == self.channels,
+                   "frames of one size");
+  // a new frame each time, because the encoder keeps references to earlier ones
+  const Owned<AVFrame> picture = padded_frame(self.width, self.height, self.encoder->pix_fmt);
+  picture->color_range = self.encoder->color_range;
+  picture->colorspace = self.encoder->colorspace;
+  const std::size_t row = static_cast<std::size_t>(frame.channels) * self.width;
+  for (int y = 0; y < self.height; ++y)
+    std::memcpy(self.rgb->data[0] + static_cast<std::ptrdiff_t>(y) * self.rgb->linesize[0], &frame.pixels[y * row], row);
+  sws_scale(self.scaler.get(), self.rgb->data, self.rgb->linesize, 0, self.height, picture->data, picture->linesize);
+  picture->pts = self.count++;
+  const int code = avcodec_send_frame(self.encoder.get(), picture.get());
+  if (code < 0) self.fail("encoding failed", code);
+  self.drain();
+}
+
+// Flushes the encoder, closes the file and gives it its name.
+void finish(Encoder& self) {
+  CHAINSPLAT_CHECK(self.count > 0, self.file.string());
+  int code = avcodec_send_frame(self.encoder.get(), nullptr);
+  if (code < 0) self.fail("encoding failed", code);
+  self.drain();
+  code = av_write_trailer(self.output.get());
+  if (code >= 0) code = avio_closep(&self.output->pb);
+  if (code < 0) self.fail("writing failed", code);
+  self.output.reset();
+  std::error_code error;
+  std::filesystem::rename(self.temporary, self.file, error);
+  if (error) self.fail("renaming failed (" + error.message() + ")", 0);
+  self.temporary.clear();
+}
+
+void discard(Encoder* self) {
+  self->output.reset();
+  if (!self->temporary.empty()) ::unlink(self->temporary.c_str());
+  delete self;
+}
+
+}  // namespace
+
+const VideoLibrary chainsplat_videos = {.version = CHAINSPLAT_VERSION,
+                                        .open = open,
+                                        .close = close,
+                                        .next = next,
+                                        .device = device,
+                                        .frames = frames,
+                                        .rate = rate,
+                                        .time = time,
+                                        .first_time = first_time,
+                                        .video_facts = video_facts,
+                                        .create = create,
+                                        .add = add,
+                                        .finish = finish,
+                                        .discard = discard};
+
+}  // namespace chainsplat::capture::media

@@ -1,5 +1,5 @@
-#include "image_files.h"
-
+// Single images with OpenImageIO's ImageInput and ImageOutput, without its cache.
+#include <OpenImageIO/filesystem.h>
 #include <OpenImageIO/imageio.h>
 #include <unistd.h>
 #include <zlib.h>
@@ -11,7 +11,9 @@
 #include <string>
 #include <string_view>
 
-namespace chainsplat::capture {
+#include "src/capture/media.h"
+
+namespace chainsplat::capture::media {
 
 namespace {
 
@@ -163,8 +165,6 @@ void write_image(const Path& file, const std::string& format, const OIIO::ImageS
   }
 }
 
-}  // namespace
-
 std::vector<std::uint8_t> read_mask(const Path& file, int width, int height) {
   const auto input = open_image(file);
   require_size(file, input->spec(), width, height);
@@ -233,4 +233,29 @@ void write_depth_exr(const Path& file, int width, int height, const std::vector<
   write_image(file, "openexr", spec, OIIO::TypeDesc::FLOAT, meters.data());
 }
 
-}  // namespace chainsplat::capture
+// A quality of 1 to 100.
+std::string jpeg(const Image8& image, int quality) {
+  std::vector<unsigned char> bytes;
+  OIIO::Filesystem::IOVecOutput sink(bytes);
+  OIIO::ImageSpec spec(image.width, image.height, image.channels, OIIO::TypeDesc::UINT8);
+  spec.attribute("Compression", "jpeg:" + std::to_string(quality));
+  const auto output = OIIO::ImageOutput::create("picture.jpg");
+  const bool written = output && output->set_ioproxy(&sink) && output->open("picture.jpg", spec) &&
+                       output->write_image(OIIO::TypeDesc::UINT8, image.pixels.data()) && output->close();
+  if (!written) throw WorkError("picture", "OpenImageIO cannot write JPEG into memory", "install it with libjpeg");
+  return std::string(bytes.begin(), bytes.end());
+}
+
+}  // namespace
+
+const ImageLibrary chainsplat_images = {.version = CHAINSPLAT_VERSION,
+                                        .read_mask = read_mask,
+                                        .read_rgb = read_rgb,
+                                        .read_depth = read_depth,
+                                        .read_image8 = read_image8,
+                                        .write_png = write_png,
+                                        .write_depth_png = write_depth_png,
+                                        .write_depth_exr = write_depth_exr,
+                                        .jpeg = jpeg};
+
+}  // namespace chainsplat::capture::media

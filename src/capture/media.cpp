@@ -1,0 +1,111 @@
+#include "media.h"
+
+#include <dlfcn.h>
+
+#include <cstring>
+
+#include "chainsplat/encode.h"
+#include "image_files.h"
+
+namespace chainsplat::capture {
+
+namespace {
+
+// Returns the table of a library of this program, which lies where the program's run path says: beside it in the build
+// folder, in a folder of the program's own where it is installed. It stays loaded until the process ends.
+template <class Library>
+const Library& load_library(const std::string& name) {
+  const std::string file = name + ".so";
+  constexpr const char* kMend = "install chainsplat again, with the packages that it needs";
+  void* const library = ::dlopen(file.c_str(), RTLD_LAZY | RTLD_LOCAL);
+  const void* const table = library ? ::dlsym(library, name.c_str()) : nullptr;
+  if (!table) {
+    const char* const reason = ::dlerror();
+    throw WorkError(file, std::string("cannot be loaded (") + (reason ? reason : "it is empty") + ")", kMend);
+  }
+  const auto& out = *static_cast<const Library*>(table);
+  if (std::strcmp(out.version, CHAINSPLAT_VERSION) != 0)
+    throw WorkError(file, std::string("is of version ") + out.version + ", the program of " CHAINSPLAT_VERSION, kMend);
+  return out;
+}
+
+const media::ImageLibrary& images() {
+  static const media::ImageLibrary& library = load_library<media::ImageLibrary>("chainsplat_images");
+  return library;
+}
+
+const media::VideoLibrary& videos() {
+  static const media::VideoLibrary& library = load_library<media::VideoLibrary>("chainsplat_videos");
+  return library;
+}
+
+}  // namespace
+
+std::vector<std::uint8_t> read_mask(const Path& file, int width, int height) {
+  return images().read_mask(file, width, height);
+}
+
+std::vector<std::uint8_t> read_rgb(const Path& file, int width, int height) {
+  return images().read_rgb(file, width, height);
+}
+
+std::vector<float> read_depth(const Path& file, int width, int height, double scale) {
+  return images().read_depth(file, width, height, scale);
+}
+
+Image8 read_image8(const Path& file) { return images().read_image8(file); }
+
+void write_png(const Path& file, const Image8& image) { images().write_png(file, image); }
+
+void write_depth_png(const Path& file, int width, int height, const std::vector<float>& meters, double scale) {
+  images().write_depth_png(file, width, height, meters, scale);
+}
+
+void write_depth_exr(const Path& file, int width, int height, const std::vector<float>& meters) {
+  images().write_depth_exr(file, width, height, meters);
+}
+
+std::string jpeg(const Image8& image, int quality) { return images().jpeg(image, quality); }
+
+struct VideoReader::Implementation {
+  media::Decoder& decoder;
+  ~Implementation() { videos().close(&decoder); }
+};
+
+VideoReader::VideoReader(const Path& file, int threads, const DeviceFormat& format)
+    : implementation_(new Implementation{*videos().open(file, threads, format, {core::warn, core::stop_requested})}) {}
+
+VideoReader::~VideoReader() = default;
+VideoReader::VideoReader(VideoReader&&) noexcept = default;
+VideoReader& VideoReader::operator=(VideoReader&&) noexcept = default;
+
+bool VideoReader::next(Image8& rgb) { return videos().next(implementation_->decoder, &rgb); }
+bool VideoReader::skip() { return videos().next(implementation_->decoder, nullptr); }
+bool VideoReader::device() const { return videos().device(implementation_->decoder); }
+int VideoReader::frames() const { return videos().frames(implementation_->decoder); }
+double VideoReader::rate() const { return videos().rate(implementation_->decoder); }
+double VideoReader::time() const { return videos().time(implementation_->decoder); }
+double VideoReader::first_time() const { return videos().first_time(implementation_->decoder); }
+
+VideoFacts video_facts(const Path& file) { return videos().video_facts(file); }
+
+struct VideoWriter::Implementation {
+  media::Encoder& encoder;
+  ~Implementation() { videos().discard(&encoder); }
+};
+
+VideoWriter::VideoWriter(const Path& file, double rate)
+    : implementation_(new Implementation{*videos().create(file, rate)}) {}
+
+VideoWriter::~VideoWriter() = default;
+
+void VideoWriter::add(const Image8& frame) { videos().add(implementation_->encoder, frame); }
+void VideoWriter::finish() { videos().finish(implementation_->encoder); }
+
+void write_video(const Path& file, double rate, const std::vector<Image8>& frames) {
+  VideoWriter writer(file, rate);
+  for (const Image8& frame : frames) writer.add(frame);
+  writer.finish();
+}
+
+}  // namespace chainsplat::capture

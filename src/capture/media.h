@@ -1,0 +1,55 @@
+// src/capture/media.h - images and videos are read and written by two shared libraries of the program's own, loaded at
+// first use: OpenImageIO and libav bring some 330 further libraries, and most commands need none of them.
+//
+// chainsplat_images.so is src/capture/media/images.cpp, chainsplat_videos.so is src/capture/media/videos.cpp. Each
+// exports one table of functions under its own name, and these functions do what those of capture.h and image_files.h
+// do that are named like them. They throw the same exceptions. A library has a copy of `core` to itself, so that what
+// belongs to the process as a whole, its listener and the request to stop, reaches it through Host.
+#pragma once
+#include "chainsplat/capture.h"
+
+namespace chainsplat::capture::media {
+
+struct ImageLibrary {
+  const char* version;  // of the program that it was built with
+  std::vector<std::uint8_t> (*read_mask)(const Path& file, int width, int height);
+  std::vector<std::uint8_t> (*read_rgb)(const Path& file, int width, int height);
+  std::vector<float> (*read_depth)(const Path& file, int width, int height, double scale);
+  Image8 (*read_image8)(const Path& file);
+  void (*write_png)(const Path& file, const Image8& image);
+  void (*write_depth_png)(const Path& file, int width, int height, const std::vector<float>& meters, double scale);
+  void (*write_depth_exr)(const Path& file, int width, int height, const std::vector<float>& meters);
+  std::string (*jpeg)(const Image8& image, int quality);
+};
+
+struct Host {
+  void (*warn)(const std::string& line);
+  int (*stop_requested)() noexcept;
+};
+
+struct Decoder;  // an opened video or camera
+struct Encoder;  // a video that is being written
+
+struct VideoLibrary {
+  const char* version;
+  Decoder* (*open)(const Path& file, int threads, const DeviceFormat& format, const Host& host);
+  void (*close)(Decoder* decoder);
+  bool (*next)(Decoder& decoder, Image8* rgb);  // null: without the conversion to RGB
+  bool (*device)(const Decoder& decoder);
+  int (*frames)(const Decoder& decoder);
+  double (*rate)(const Decoder& decoder);
+  double (*time)(const Decoder& decoder);
+  double (*first_time)(const Decoder& decoder);
+  VideoFacts (*video_facts)(const Path& file);
+  Encoder* (*create)(const Path& file, double rate);
+  void (*add)(Encoder& encoder, const Image8& frame);
+  void (*finish)(Encoder& encoder);
+  void (*discard)(Encoder* encoder);  // removes the file where it is not finished
+};
+
+extern "C" {
+extern const ImageLibrary chainsplat_images;
+extern const VideoLibrary chainsplat_videos;
+}
+
+}  // namespace chainsplat::capture::media
