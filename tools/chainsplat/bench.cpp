@@ -25,6 +25,7 @@
 #include "chainsplat/run_folder.h"
 #include "chainsplat/splat.h"
 #include "cli.h"
+#include "machine.h"
 
 namespace chainsplat::tools {
 
@@ -224,6 +225,10 @@ std::vector<std::vector<std::uint8_t>> make_targets(splat::Engine& engine, const
   return targets;
 }
 
+Json rates_json(const MachineRates& rates) {
+  return {{"gflops", rates.gflops}, {"gigabytes_per_second", rates.gigabytes_per_second}};
+}
+
 std::string passes_text(const std::map<std::string, double>& passes) {
   std::vector<std::pair<double, std::string>> order;
   for (const auto& [label, milliseconds] : passes) order.emplace_back(-milliseconds, label);
@@ -237,6 +242,7 @@ std::string passes_text(const std::map<std::string, double>& passes) {
 }
 
 Json bench_case(gpu::Device& device, const Case& what, int repeats, std::uint64_t seed, bool table) {
+  const MachineRates machine = measure_machine();
   const Scene scene = make_scene(what, seed + 1);
   splat::Engine engine(device);
   const auto targets = make_targets(engine, scene, what, seed + 2);
@@ -262,6 +268,7 @@ Json bench_case(gpu::Device& device, const Case& what, int repeats, std::uint64_
   entry["views"] = what.views;
   entry["links"] = what.joints + 1;
   entry["cropped"] = !what.whole;
+  entry["machine"] = rates_json(machine);
   for (const auto& [name, measured] : works) {
     entry[name] = {{"median_ms", measured.median}, {"least_ms", measured.least}, {"processor_ms", measured.processor}};
     for (const auto& [label, milliseconds] : measured.passes) entry[name]["passes_ms"][label] = milliseconds;
@@ -272,7 +279,8 @@ Json bench_case(gpu::Device& device, const Case& what, int repeats, std::uint64_
          << std::setw(8) << (what.whole ? "whole" : "cropped") << std::right << std::setw(10) << what.gaussians
          << std::setw(6) << what.views << std::setw(6) << what.joints + 1;
     for (const auto& [name, measured] : works) line << std::setw(9) << measured.median;
-    line << std::setw(9) << works[2].second.least << std::setw(9) << works[2].second.processor << "   "
+    line << std::setw(9) << works[2].second.least << std::setw(9) << works[2].second.processor << std::setw(9)
+         << machine.gflops << std::setw(7) << machine.gigabytes_per_second << "   "
          << passes_text(works[2].second.passes);
     std::cout << line.str() << std::endl;
   }
@@ -284,12 +292,13 @@ Json bench_case(gpu::Device& device, const Case& what, int repeats, std::uint64_
 Json bench_capture(gpu::Device& device, const Path& folder, std::uint64_t seed) {
   Json entry;
   entry["name"] = folder.filename().string();
-  double start = core::seconds_now();
+  entry["machine"] = rates_json(measure_machine());
+  double start = core::seconds_now(), used = processor_seconds();
   const auto lap = [&](const char* stage) {
     if (const int signal = core::stop_requested()) throw Interrupted(signal);
-    const double now = core::seconds_now();
-    entry["seconds"][stage] = now - start;
-    start = core::seconds_now();
+    entry["seconds"][stage] = core::seconds_now() - start;
+    entry["processor_seconds"][stage] = processor_seconds() - used;
+    start = core::seconds_now(), used = processor_seconds();
   };
   const capture::Capture capture = capture::load(folder);
   lap("load");
@@ -365,7 +374,8 @@ void bench(const Globals& globals, const Request& request) {
   if (!globals.json && !cases.empty())
     std::cout << gpu::info(*device).name << ", milliseconds a submission, medians of " << request.repeats << "\n"
               << "                                                              with D-SSIM\n"
-              << "scene         gaussians views links     draw     step   median    least processor   its passes\n";
+              << "scene         gaussians views links     draw     step   median    least processor  GFLOP/s   GB/s   its "
+                 "passes\n";
   for (const Case& what : cases)
     document["results"].push_back(bench_case(*device, what, request.repeats, globals.seed, !globals.json));
   std::vector<double> held;  // MiB after each training
@@ -378,7 +388,9 @@ void bench(const Globals& globals, const Request& request) {
       const Json& estimate = entry["estimate"];
       std::cout << " " << entry["frames_drawn"] << " frames drawn; estimate " << std::setprecision(0)
                 << estimate["frames_per_second"].get<double>() << " frames/s, 99 % within " << std::setprecision(2)
-                << estimate["p99_ms"].get<double>() << " ms\n";
+                << estimate["p99_ms"].get<double>() << " ms; the machine " << std::setprecision(0)
+                << entry["machine"]["gflops"].get<double>() << " GFLOP/s, " << std::setprecision(1)
+                << entry["machine"]["gigabytes_per_second"].get<double>() << " GB/s\n";
     }
     held.push_back(memory_mib());
     entry["memory_mib"] = held.back();
