@@ -10,11 +10,11 @@ namespace {
 constexpr double kLimitWeight = 1.0;   // m^2: 1 % too fast costs as much as 10 mm
 constexpr double kLimitMargin = 0.97;  // of a limit, where its cost begins: verified on a finer grid afterwards
 constexpr double kClearanceWeight = 30.0;
-constexpr double kClearanceMargin = 0.004;  // m
-constexpr double kRestTime = 0.01;          // s: 10 cm/s left on the table cost as much as 1 mm
-constexpr double kNegligible = 1e-7;        // weight in the soft minimum
-constexpr int kHermiteSteps = 16;           // between two nodes, for the hard minimum
-constexpr double kLimitInterval = 0.02;     // s, between tests of limits and obstacles
+constexpr double kNear = 0.04;           // m beyond it, as far as a step may carry a point
+constexpr double kRestTime = 0.01;       // s: 10 cm/s left on the table cost as much as 1 mm
+constexpr double kNegligible = 1e-7;     // weight in the soft minimum
+constexpr int kHermiteSteps = 16;        // between two nodes, for the hard minimum
+constexpr double kLimitInterval = 0.02;  // s, between tests of limits and obstacles
 
 // 3 x unknowns: a world point fixed to link `link`.
 MatrixX point_slope(const Task& task, const chain::Chain& chain, const Rollout& rollout, const MatrixX& axes, int node,
@@ -131,9 +131,7 @@ Soft soft_minimum(const Task& task, const dynamics::Model& model, const Rollout&
 
 }  // namespace
 
-Part part_of(const Options& options, bool tabletop) {
-  return options.part.value_or(tabletop ? Part::rope : Part::tip);
-}
+Part part_of(const Options& options, bool tabletop) { return options.part.value_or(tabletop ? Part::rope : Part::tip); }
 
 Nearest nearest(const chain::Chain& chain, const std::vector<math::Pose>& motions, Part part, const Vector3& target) {
   const int last = chain.links() - 1;
@@ -213,16 +211,19 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
         const auto motions = chain::link_motions(chain, rollout.theta[node], base);
         MatrixX axes;
         watch(task, chain, motions, [&](int link, const Vector3& point, double distance, const Vector3& outward) {
-          const double residual = kClearanceMargin - distance;
-          if (residual <= 0.0) return;
+          const double residual = sharpness.clearance - distance;
+          if (residual <= (derivatives ? -kNear : 0.0)) return;
           const double weight = task.limit_weight * kClearanceWeight / samples;
           if (!derivatives) {
             sum.value += weight * residual * residual;
             return;
           }
           if (axes.size() == 0) axes = chain::world_axes(chain, rollout.theta[node], base);
-          const MatrixX slope = point_slope(task, chain, rollout, axes, node, link, point);
-          add(sum, weight, residual, -(slope.transpose() * outward));
+          VectorX slope = -(point_slope(task, chain, rollout, axes, node, link, point).transpose() * outward);
+          for (Eigen::Index i = 0; i < size; ++i)
+            if (task.held[i]) slope[i] = 0.0;
+          if (residual > 0.0) add(sum, weight, residual, slope);
+          sum.near.push_back({residual, weight, std::move(slope)});
         });
       }
   }

@@ -27,6 +27,15 @@ struct Task {
 struct Sharpness {
   double soft_minimum = 1e5;  // nu, m^-2
   double smoothness = 1e-7;   // alpha, beta of mathematics.md 8, of the mean squared acceleration, s^4
+  double clearance = 0.004;   // m from obstacles, below which they cost: they are looked at every 20 ms only
+};
+
+// A point of rope or gripper near an obstacle: `weight` times the square of `residual` counts where that is positive,
+// and is a part of the gradient and curvature then.
+struct Near {
+  double residual = 0.0;  // m
+  double weight = 0.0;
+  VectorX slope;  // of the residual
 };
 
 struct Evaluation {
@@ -35,7 +44,8 @@ struct Evaluation {
   double miss = 0.0;       // m, hard minimum over the nodes, mean (or worst) of the samples
   double violation = 0.0;  // m^2, the part of limits, obstacles and, on a table, speed left in the end
   VectorX gradient;
-  MatrixX curvature;  // Gauss-Newton, positive semidefinite
+  MatrixX curvature;       // Gauss-Newton, positive semidefinite
+  std::vector<Near> near;  // with derivatives: what a step may run into, or leave
 };
 Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& sharpness, bool derivatives);
 

@@ -16,13 +16,13 @@ constexpr struct {
 } kCoarse[] = {{1e3, 1e-6, 4, 10}, {1e4, 1e-7, 5, 14}};
 constexpr double kFinalSharpness = 1e5, kSharpest = 1e6;  // m^-2
 constexpr double kFinalSmoothness = 3e-9;
+constexpr double kFinalClearance = 0.001;  // m; a target may lie as near to an obstacle
 constexpr int kFinalSteps = 9, kFinalEvaluations = 20;
 constexpr int kPolishSteps = 4;          // with exact derivatives, each as dear as seven others
 constexpr double kWorthPolish = 2.0;     // of the tolerance
 constexpr double kEnough = 0.1;          // of the tolerance: no further iteration is made
 constexpr int kFineCost = 2;             // evaluations with coarse steps that one with full steps costs
 constexpr int kMostSpent = 160;          // of them, after which nothing further is tried
-constexpr int kGenerous = 4;             // times as many where there are obstacles, around which few starts lead
 constexpr double kGoodMiss = 0.3;        // of the tolerance: no further start is tried
 constexpr double kStrictLimits = 100.0;  // times the usual weight
 // Starts optimized side by side; the next group only where the last failed.
@@ -116,8 +116,7 @@ void validate(const Problem& problem, const Options& options) {
     Rollout start;
     start.base = {task.grid.fixed[0]}, start.theta = {problem.initial.theta};
     if (clearance(task, problem.model, start) < 0.0)
-      throw InputError(options.spheres.empty() ? "`boxes`" : "`spheres`",
-                       "rope or gripper touch it at the start",
+      throw InputError(options.spheres.empty() ? "`boxes`" : "`spheres`", "rope or gripper touch it at the start",
                        "move it, or give the gripper's size with `gripper_radius`");
   }
 }
@@ -127,7 +126,7 @@ struct Found {
   Hit hit;
   Peaks peaks;
   double clearance = 0.0;
-  bool good = false;  // finite, within the limits, clear of the obstacles
+  bool good = false;   // finite, within the limits, clear of the obstacles
   int iterations = 0;  // evaluations spent on it
   solve::Summary summary;
 };
@@ -173,15 +172,13 @@ bool better(const Found& a, const Found& b, const Options& options) {
   return merit(a, options) < merit(b, options);
 }
 
-int generous(const Task& task) { return task.options->spheres.empty() && task.options->boxes.empty() ? 1 : kGenerous; }
-
 // With coarse steps and a soft minimum that is sharpened.
 Found approach(const Task& coarse, VectorX unknowns) {
   Found found;
   found.unknowns = std::move(unknowns);
   for (const auto& stage : kCoarse)
-    improve(coarse, {stage.sharpness, stage.smoothness},
-            {.steps = stage.steps, .evaluations = generous(coarse) * stage.evaluations}, found);
+    improve(coarse, {stage.sharpness, stage.smoothness}, {.steps = stage.steps, .evaluations = stage.evaluations},
+            found);
   judge(coarse, found);
   return found;
 }
@@ -191,25 +188,25 @@ void finish(const Task& fine, Found& found) {
   const Options& options = *fine.options;
   Task quick = fine;
   quick.exact = false;
-  const Sharpness last{kFinalSharpness, kFinalSmoothness};
+  const Sharpness last{kFinalSharpness, kFinalSmoothness, kFinalClearance};
   const double enough = kEnough * options.tolerance;
-  improve(quick, last, {.steps = kFinalSteps, .evaluations = generous(fine) * kFinalEvaluations, .enough = enough},
-          found);
+  improve(quick, last, {.steps = kFinalSteps, .evaluations = kFinalEvaluations, .enough = enough}, found);
   judge(fine, found);
   if (!std::isfinite(found.hit.miss)) return;
   if (!found.good) {  // a far target pulls harder than the limits push: once more with limits that count more
     quick.limit_weight = kStrictLimits;
-    improve(quick, last, {.steps = kFinalSteps, .evaluations = generous(fine) * kFinalEvaluations}, found);
+    improve(quick, {kFinalSharpness, kFinalSmoothness}, {.steps = kFinalSteps, .evaluations = kFinalEvaluations},
+            found);
     judge(fine, found);
   }
   if (found.good && merit(found, options) <= kGoodMiss * options.tolerance) return;
-  if (generous(fine) == 1 && !(merit(found, options) <= kWorthPolish * options.tolerance)) return;
+  if (!(merit(found, options) <= kWorthPolish * options.tolerance)) return;
   // what is left: the soft minimum likes to stay near for long, and derivatives of lower order end too early
   Task exact = fine;
   exact.limit_weight = quick.limit_weight;
   Found polished = found;
   const Effort dear{.steps = kPolishSteps, .evaluations = 3 * kPolishSteps, .hopeful = false, .enough = enough};
-  improve(exact, {kSharpest, kFinalSmoothness}, dear, polished);
+  improve(exact, {kSharpest, kFinalSmoothness, kFinalClearance}, dear, polished);
   judge(fine, polished);
   found.iterations = polished.iterations;
   if (better(polished, found, options)) found = std::move(polished);
@@ -237,6 +234,15 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
   for (int i = 0; i < options.starts; ++i)
     starts.push_back(random_unknowns(coarse, random, random.uniform(kLeastLoad, kMostLoad)));
   for (VectorX& q : starts) q += rest;
+  // a motion that obstacles do not touch is found as if they were not there, and one that they do is a start: it hits
+  std::optional<Found> direct;
+  if (!options.spheres.empty() || !options.boxes.empty()) {
+    Options free = options;
+    free.spheres.clear(), free.boxes.clear();
+    direct = solve(problem, free, models, motion, initial, target, terminal, out_of_reach, tried, iterations);
+    judge(fine, *direct);
+    if (direct->good) return *direct;
+  }
   tried += static_cast<int>(starts.size());
   // the best first, as they come near with the links that count; rolled out with the identified parameters only
   const auto ranked = [&](const Task& task) {
@@ -256,7 +262,11 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
   // that failed every other start draws the free end alone.
   Task tip = coarse;
   tip.first_link = problem.model.chain.links() - 1;
-  const std::vector<int> order = ranked(coarse);
+  std::vector<int> order = ranked(coarse);
+  if (direct) {
+    order.insert(order.begin(), static_cast<int>(starts.size()));
+    starts.push_back(direct->unknowns);
+  }
   std::vector<int> tip_order;
 
   // samples have a spread that no motion removes
@@ -266,7 +276,6 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
   std::vector<Found> near;  // where a start led with coarse steps, not gone further
   std::optional<Found> best;
   int spent = 0;  // evaluations with coarse steps, or what costs as much
-  const int most_spent = generous(coarse) * kMostSpent;
   const auto go_further = [&](Found found) {
     found.iterations = 0;
     finish(fine, found);
@@ -277,7 +286,7 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
   std::size_t next = 0, next_tip = 0;
   int groups = 0;
   for (const int group : kGroups) {
-    if (spent > most_spent || (out_of_reach && groups == kOutOfReach)) break;
+    if (spent > kMostSpent || (out_of_reach && groups == kOutOfReach)) break;
     ++groups;
     std::vector<std::pair<const Task*, int>> chosen;  // with the start
     if (group > 1 && problem.tabletop && coarse.part == Part::rope && tip_order.empty()) tip_order = ranked(tip);
@@ -303,7 +312,7 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
     if (best && good(*best)) return *best;
     if (best && best->good && models.size() > 1 && group > 1) return *best;
   }
-  for (int i = 0; i < kLastTries && !near.empty() && !(best && (good(*best) || spent > most_spent)); ++i) {
+  for (int i = 0; i < kLastTries && !near.empty() && !(best && (good(*best) || spent > kMostSpent)); ++i) {
     go_further(near.front());
     near.erase(near.begin());
   }

@@ -13,6 +13,7 @@ constexpr double kIdle = 0.03;       // of the squared miss: steps that decrease
 constexpr int kIdleSteps = 3;        // so many end it
 constexpr double kConverged = 1e-4;  // relative decrease of the objective
 constexpr double kNothing = 1e-11;   // m^2, (3 um)^2: a smaller decrease does not count
+constexpr int kMostSides = 8;        // solutions of a step, each with the obstacles that the last one runs into
 
 }  // namespace
 
@@ -104,6 +105,25 @@ solve::Summary minimize(const Task& task, VectorX& unknowns, const Sharpness& sh
     // the metric has no part in directions without acceleration; held unknowns have no row
     matrix.diagonal().array() += 1e-12 * scale;
     step = -matrix.ldlt().solve(now.gradient);
+    // Squares that count on one side only: what the step runs into joins them, what it leaves drops out. Without this a
+    // step along an obstacle is refused again and again.
+    VectorX gradient = now.gradient;
+    std::vector<char> counts(now.near.size());
+    for (std::size_t k = 0; k < now.near.size(); ++k) counts[k] = now.near[k].residual > 0.0;
+    for (int round = 0; round < kMostSides; ++round) {
+      bool changed = false;
+      for (std::size_t k = 0; k < now.near.size(); ++k) {
+        const Near& near = now.near[k];
+        const bool then = near.residual + near.slope.dot(step) > 0.0;
+        if (then == static_cast<bool>(counts[k])) continue;
+        const double weight = then ? 2.0 * near.weight : -2.0 * near.weight;
+        gradient += weight * near.residual * near.slope;
+        matrix += weight * near.slope * near.slope.transpose();
+        counts[k] = then, changed = true;
+      }
+      if (!changed) break;
+      step = -matrix.ldlt().solve(gradient);
+    }
     for (Eigen::Index i = 0; i < step.size(); ++i)
       if (task.held[i]) step[i] = 0.0;
     return true;
@@ -116,7 +136,11 @@ solve::Summary minimize(const Task& task, VectorX& unknowns, const Sharpness& sh
     return {};
   };
   callbacks.rejected = [&](const VectorX& step) -> std::optional<solve::Reason> {
-    const double foretold = -step.dot(now.gradient + 0.5 * (now.curvature * step));
+    double foretold = -step.dot(now.gradient + 0.5 * (now.curvature * step));
+    for (const Near& near : now.near) {
+      const double then = near.residual + near.slope.dot(step);
+      if ((then > 0.0) != (near.residual > 0.0)) foretold += (then > 0.0 ? -1.0 : 1.0) * near.weight * then * then;
+    }
     if (!(foretold > kNothing)) return solve::Reason::no_decrease;
     return {};
   };
@@ -128,8 +152,8 @@ solve::Summary minimize(const Task& task, VectorX& unknowns, const Sharpness& sh
   options.longest = effort.longest;
   options.euclidean = true;
   options.eager = effort.hopeful;
-  options.damping = {.first = effort.damping, .raise = effort.more_damping, .lower = kLessDamping,
-                     .least = kLeastDamping};
+  options.damping = {
+      .first = effort.damping, .raise = effort.more_damping, .lower = kLessDamping, .least = kLeastDamping};
   return solve::least_squares(unknowns, callbacks, options);
 }
 
