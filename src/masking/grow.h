@@ -1,14 +1,18 @@
 // The rope in pictures of one moment, before its colors are known: where a tube of the known length and diameter that
-// begins at the grasp best separates the colors inside from those beside it.
+// begins at the grasp best separates the colors inside from those on either side of it.
 //
-// A chain is laid link by link, in space, so that all cameras must agree. Its evidence is the Bayes factor of two
-// populations, the sampled colors inside and beside the tube, against a single one. Each population is a
-// Dirichlet-multinomial, so that few samples prove little and an unknown color favors neither. Where something hides
-// the rope from a camera there is only one population, which adds no evidence.
+// A chain is laid link by link, in space, so that all cameras must agree. Its evidence has two parts. Colors: the Bayes
+// factor of two populations, the sampled colors inside and beside the tube, against a single one. Each population is a
+// Dirichlet-multinomial, so that few samples prove little and an unknown color favors neither; the side that differs
+// less counts, since one alone is a step, as at a window's edge, and no rope. Outlines: how seldom a place of this
+// picture, taken at random, contrasts as much with both sides at the rope's width. Where something hides the rope from a
+// camera there is only one population, which adds no evidence. What is known besides (gravity, by how much the grasp may
+// be off, a point on the rope) joins as a prior.
 #pragma once
 #include <span>
 
 #include "chainsplat/masking.h"
+#include "src/masking/tube.h"
 
 namespace chainsplat::masking {
 
@@ -17,6 +21,15 @@ struct Shot {
   Picture picture;  // undistorted
   const capture::Camera* camera = nullptr;
   math::Pose camera_from_base;
+  std::vector<math::Vector2> on_rope;  // px, undistorted: points that the user says lie on the rope
+  std::optional<Box> bounds;           // the rope lies in here
+};
+
+// What is known of the rope besides its size.
+struct Clues {
+  math::Vector3 down = math::Vector3::Zero();  // unit, base frame, where it hangs at rest; zero: it need not
+  math::Vector3 grasp = math::Vector3::Zero();  // m, base frame: the grasp is thought to be off by this,
+  double grasp_deviation = 0.0;                // m, and how sure that is; 0: it is exactly there
 };
 
 // Numbers of samples inside and beside the tube per coarse color.
@@ -31,11 +44,13 @@ Tally scaled(const Tally& tally, int samples);
 
 struct Grown {
   math::VectorX theta;
+  math::Vector3 shift = math::Vector3::Zero();  // m, base frame: the grasp is off by this
   double evidence = 0.0;       // nats per sample, log of the Bayes factor: 0 (none) to log 2 (colors never shared)
   std::vector<Tally> tallies;  // per shot, of this moment alone
 };
 
 // Grows a chain without twist joints. `known`: per shot, the colors known from other moments; empty: none.
-Grown grow(const chain::Chain& chain, std::span<const Shot> shots, std::span<const Tally> known);
+Grown grow(const chain::Chain& chain, std::span<const Shot> shots, std::span<const Tally> known,
+           const Clues& clues = {});
 
 }  // namespace chainsplat::masking

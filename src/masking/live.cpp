@@ -107,7 +107,7 @@ capture::View mask(Live& live, const capture::Image8& recorded, const math::Pose
   std::optional<math::VectorX> place = theta;
   const int joints = live.chain.links() - 1;
   if (!theta && (live.chain.angles() == joints || live.chain.angles() == 2 * joints)) {  // without twist joints
-    const Shot shot{picture, &camera, camera.world_from_camera.inverse() * base};
+    const Shot shot{picture, &camera, camera.world_from_camera.inverse() * base, {}, {}};
     const Grown grown = grow(live.chain, {&shot, 1}, {});
     if (grown.evidence > kLeastEvidence) place = grown.theta;
   }

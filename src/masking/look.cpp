@@ -233,6 +233,18 @@ Background median_background(std::span<const Picture> frames, std::span<const Tu
   return out;
 }
 
+Background empty_scene(const capture::Image8& picture) {
+  constexpr double kNoise = 4.0;  // gray levels, of one picture
+  Background out;
+  const std::size_t pixels = static_cast<std::size_t>(picture.width) * picture.height;
+  out.rgb.resize(3 * pixels);
+  for (std::size_t i = 0; i < pixels; ++i)
+    for (int c = 0; c < 3; ++c)
+      out.rgb[3 * i + c] = picture.pixels[picture.channels * i + (picture.channels >= 3 ? c : 0)];
+  out.noise.assign(pixels, noise_level(kNoise));
+  return out;
+}
+
 std::uint8_t noise_level(double deviation) {
   return static_cast<std::uint8_t>(std::clamp(deviation, kLeastNoise, kMostNoise) + 0.5);
 }

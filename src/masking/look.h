@@ -47,6 +47,9 @@ void count_colors(Look& appearance, const Picture& picture, const Tube& tube, co
 // empty when unknown.
 Background median_background(std::span<const Picture> frames, std::span<const Tube> covered, int least);
 
+// Returns the background that one picture of the scene without the rope shows.
+Background empty_scene(const capture::Image8& picture);
+
 // Returns a standard deviation in gray levels as Background stores it.
 std::uint8_t noise_level(double deviation);
 

@@ -7,6 +7,7 @@
 #include "chainsplat/silhouette.h"
 #include "src/masking/grow.h"
 #include "src/masking/look.h"
+#include "src/masking/ribbon.h"
 
 namespace chainsplat::masking {
 
@@ -43,6 +44,14 @@ constexpr double kFitMargin = 0.5;
 constexpr int kRounds = 2;            // of cutting, fitting and learning
 constexpr double kCenter = 0.5;       // of the radius; pixels deeper inside than this count as the centerline
 constexpr double kLeastInside = 0.4;  // mean share of the centerline in the masks, below which there is no rope
+// a few stills
+constexpr int kStills = 8;                  // frames per camera, up to which a capture is one of stills
+constexpr double kGraspDeviation = 0.006;   // m, of the grasp: hand-eye calibrations of laboratories are 3 to 14 mm off,
+constexpr double kGraspScatter = 0.0025;    // m, and from still to still
+constexpr double kLeastStillEvidence = 0.02;  // nats per sample
+constexpr double kFacing = 0.5;  // cosine between view and bending axis, above which one camera sees the rope's plane
+constexpr double kFirstWidth = 0.2, kKnownWidth = 0.12;  // deviation of the width before and after it was measured
+constexpr double kLeastWidth = 0.6, kMostWidth = 1.7;    // of the given diameter, as far as it is believed to be wrong
 
 struct Recording {
   const Path& path;
@@ -87,18 +96,17 @@ struct Samples {
   }
 };
 
-// Grows a chain in each moment of the first camera that has samples, together with the other cameras' pictures of that
-// moment. Throws InputError where no moment shows a rope.
-chain::States grow_moments(const Recording& recording, const chain::Chain& chain,
-                           const std::vector<capture::Camera>& cameras, const std::vector<Samples>& samples) {
-  const capture::Capture& scene = recording.capture;
-  // collect the pictures of each moment
+// Pictures taken at one time.
+struct Moment {
+  double time = 0.0;
+  std::vector<Shot> shots;
+  std::vector<int> cameras;  // by shot
+};
+
+// The moments of the first camera that has samples, together with the other cameras' pictures of that moment.
+std::vector<Moment> moments_of(const capture::Capture& scene, const std::vector<capture::Camera>& cameras,
+                               const std::vector<Samples>& samples) {
   const auto first = std::find_if(samples.begin(), samples.end(), [](const Samples& s) { return !s.frames.empty(); });
-  struct Moment {
-    double time = 0.0;
-    std::vector<Shot> shots;
-    std::vector<int> cameras;  // by shot
-  };
   std::vector<Moment> moments;
   for (const View& one : first->frames) {
     Moment moment{one.time, {}, {}};
@@ -108,14 +116,24 @@ chain::States grow_moments(const Recording& recording, const chain::Chain& chain
         return std::abs(a.time - one.time) < std::abs(b.time - one.time);
       });
       if (nearest == frames.end() || std::abs(nearest->time - one.time) > kSameMoment) continue;
-      moment.shots.push_back(
-          {picture_of(*nearest), &cameras[c], cameras[c].world_from_camera.inverse() * scene.base.pose(nearest->time)});
+      moment.shots.push_back({picture_of(*nearest), &cameras[c],
+                              cameras[c].world_from_camera.inverse() * scene.base.pose(nearest->time), {}, {}});
       moment.cameras.push_back(static_cast<int>(c));
     }
     moments.push_back(std::move(moment));
   }
+  return moments;
+}
+
+[[noreturn]] void throw_nothing(const Recording& recording) {
+  throw InputError(recording.path.string(), "nothing like the rope is found at the grasp",
+                   "check cameras, base, length and direction (chainsplat check), or use `command`");
+}
+
+// Grows a chain in each moment of a recording. Throws InputError where no moment shows a rope.
+chain::States grow_moments(const Recording& recording, const chain::Chain& chain, const std::vector<Moment>& moments) {
   // first from each moment's own colors, then also from those of the moments that show the rope best
-  std::vector<Tally> known(cameras.size());
+  std::vector<Tally> known(recording.capture.cameras.size());
   std::vector<Grown> grown(moments.size());
   double best = 0.0;
   for (int pass = 0; pass < 2; ++pass) {
@@ -127,9 +145,7 @@ chain::States grow_moments(const Recording& recording, const chain::Chain& chain
     if (core::stop_requested()) throw Interrupted(core::stop_requested());
     best = 0.0;
     for (const Grown& one : grown) best = std::max(best, one.evidence);
-    if (best < kLeastEvidence)
-      throw InputError(recording.path.string(), "nothing like the rope is found at the grasp",
-                       "check cameras, base, length and direction (chainsplat check), or use `command`");
+    if (best < kLeastEvidence) throw_nothing(recording);
     if (pass == 1) break;
     for (std::size_t i = 0; i < moments.size(); ++i)
       for (std::size_t k = 0; grown[i].evidence > kTrusted * best && k < moments[i].cameras.size(); ++k)
@@ -202,6 +218,174 @@ Image8 recorded_mask(const View& view, const capture::Camera& camera) {
   return mask;
 }
 
+// The chain that masks are made about. One camera does not see depth: its chain is planar, in the rope's own plane where
+// the camera sees that from the side, else in the plane through the rope's direction that faces it.
+chain::Chain chain_for(const capture::Capture& scene) {
+  const int joints =
+      std::clamp(static_cast<int>(scene.length / (kLinkDiameters * scene.diameter)), kFewestJoints, kMostJoints);
+  const bool one = scene.cameras.size() == 1 && !scene.tabletop;
+  math::Vector3 axis = scene.bending_axis;
+  if (one) {
+    const math::Pose base = scene.base.pose(scene.times[0].empty() ? 0.0 : scene.times[0].front());
+    const capture::Camera& camera = scene.cameras[0];
+    const math::Vector3 view =
+        base.rotation.transpose() * (base.translation - camera.world_from_camera.translation).normalized();
+    const math::Vector3 facing = view - view.dot(scene.direction) * scene.direction;
+    if (std::abs(view.dot(axis)) < kFacing && facing.norm() > kFacing) axis = facing.normalized();
+  }
+  return chain::make_chain(scene.length, scene.diameter, scene.direction, axis, joints,
+                           scene.tabletop || one ? chain::Bending::planar : chain::Bending::spatial, false);
+}
+
+// Adds the user's help to a moment's shots.
+void add_hints(const Options& options, const std::vector<capture::Camera>& recorded, const std::vector<Samples>& samples,
+               Moment& moment) {
+  for (std::size_t k = 0; k < moment.shots.size(); ++k) {
+    const int c = moment.cameras[k];
+    int frame = 0;
+    for (const View& view : samples[c].frames)
+      if (picture_of(view).pixels == moment.shots[k].picture.pixels) frame = view.frame;
+    const auto meant = [&](const auto& hint) { return hint.camera == c && hint.frame.value_or(frame) == frame; };
+    for (const PointHint& hint : options.points)
+      if (meant(hint)) moment.shots[k].on_rope.push_back(capture::undistort(recorded[c], Vector2(hint.x, hint.y)));
+    for (const BoxHint& hint : options.boxes)
+      if (meant(hint)) {
+        const Vector2 a = capture::undistort(recorded[c], Vector2(hint.x0, hint.y0)),
+                      b = capture::undistort(recorded[c], Vector2(hint.x1, hint.y1));
+        moment.shots[k].bounds = Box{static_cast<int>(std::floor(a.x())), static_cast<int>(std::floor(a.y())),
+                                     static_cast<int>(std::ceil(b.x())), static_cast<int>(std::ceil(b.y()))};
+      }
+  }
+}
+
+// The mask of what lies inside the tube.
+View inside_of(const Tube& tube, const View& picture) {
+  View out;
+  out.camera = picture.camera, out.frame = picture.frame, out.time = picture.time;
+  if (tube.box.empty()) return out;
+  out.x0 = tube.box.x0, out.y0 = tube.box.y0, out.width = tube.box.width(), out.height = tube.box.height();
+  out.rgba.assign(static_cast<std::size_t>(4) * out.width * out.height, 0);
+  for (int y = tube.box.y0; y < tube.box.y1; ++y)
+    for (int x = tube.box.x0; x < tube.box.x1; ++x) {
+      if (tube.at(x, y) >= 0.0f) continue;
+      std::uint8_t* const to = &out.rgba[4 * (static_cast<std::size_t>(y - out.y0) * out.width + x - out.x0)];
+      std::copy_n(&picture.rgba[4 * (static_cast<std::size_t>(y) * picture.width + x)], 3, to);
+      to[3] = 255;
+    }
+  return out;
+}
+
+// The masks of a few stills, each by itself: ribbons about chains that are grown in every moment.
+Summary make_stills(const Recording& recording, const Options& options, const chain::Chain& given,
+                    const std::vector<capture::Camera>& pinholes, const std::vector<Samples>& samples,
+                    const Sink& sink) {
+  const capture::Capture& scene = recording.capture;
+  const int cameras = static_cast<int>(scene.cameras.size());
+  std::vector<Moment> moments = moments_of(scene, pinholes, samples);
+  for (Moment& moment : moments) add_hints(options, scene.cameras, samples, moment);
+  chain::Chain chain = given;
+  // grow: first each moment by itself, then with the grasp and the colors that the moments agree upon
+  std::vector<Grown> grown(moments.size());
+  std::vector<Tally> known(cameras);
+  math::Vector3 grasp = math::Vector3::Zero();
+  for (int pass = 0; pass < 2; ++pass) {
+    core::parallel_for(static_cast<std::int64_t>(moments.size()), [&](std::int64_t i) {
+      Clues clues;
+      clues.grasp = grasp;
+      clues.grasp_deviation = pass ? kGraspScatter : kGraspDeviation;
+      if (!scene.tabletop && scene.gravity.norm() > 0.0)
+        clues.down = scene.base.pose(moments[i].time).rotation.transpose() * scene.gravity.normalized();
+      std::vector<Tally> of_shots;
+      for (const int c : moments[i].cameras) of_shots.push_back(known[c]);
+      grown[i] = grow(chain, moments[i].shots, of_shots, clues);
+    });
+    if (core::stop_requested()) throw Interrupted(core::stop_requested());
+    double best = 0.0;
+    for (const Grown& one : grown) best = std::max(best, one.evidence);
+    if (best < kLeastStillEvidence) throw_nothing(recording);
+    if (pass == 1 || moments.size() == 1) break;
+    for (int axis = 0; axis < 3; ++axis) {
+      std::vector<double> values;
+      for (const Grown& one : grown) values.push_back(one.shift[axis]);
+      grasp[axis] = math::median(values);
+    }
+    for (std::size_t i = 0; i < moments.size(); ++i)
+      for (std::size_t k = 0; grown[i].evidence > kTrusted * best && k < moments[i].cameras.size(); ++k)
+        add(known[moments[i].cameras[k]], grown[i].tallies[k]);
+    for (Tally& tally : known) tally = scaled(tally, kKnownSamples);
+  }
+  // what is drawn about: the moment nearest in time
+  struct Still {
+    const View* view;
+    int moment;
+    Axis along;    // of the grown chain
+    Ribbon ribbon;
+  };
+  std::vector<std::vector<Still>> stills(cameras);
+  const auto base_at = [&](const Still& still) {
+    math::Pose base = scene.base.pose(still.view->time);
+    base.translation = base * grown[still.moment].shift;
+    return base;
+  };
+  for (int c = 0; c < cameras; ++c)
+    for (const View& view : samples[c].frames) {
+      int nearest = 0;
+      for (int i = 1; i < static_cast<int>(moments.size()); ++i)
+        if (std::abs(moments[i].time - view.time) < std::abs(moments[nearest].time - view.time)) nearest = i;
+      stills[c].push_back({&view, nearest, {}, {}});
+    }
+  // colors from the grown tubes, then from the ribbons; the width that the ribbons have in common
+  std::vector<Look> looks(cameras);
+  double width = 1.0;
+  for (int round = 0; round < 3; ++round) {
+    std::vector<double> widths;
+    for (int c = 0; c < cameras; ++c) {
+      looks[c] = {};
+      if (c < static_cast<int>(options.empty.size()) && options.empty[c]) looks[c].background = empty_scene(*options.empty[c]);
+      for (Still& still : stills[c]) {
+        const View& view = *still.view;
+        const bool by_ribbon = round && still.ribbon.axis.points.size() > 1;
+        still.along = axis(chain, base_at(still), grown[still.moment].theta, pinholes[c], 0.0, chain.length);
+        const Tube tube = masking::tube(by_ribbon ? still.ribbon.axis : still.along, view.width, view.height,
+                                        std::max(kAboutPixels, 0.0));
+        count_colors(looks[c], picture_of(view), tube, reach(chain, base_at(still), pinholes[c]), chain,
+                     by_ribbon ? kFitMargin : kGrownMargin * tube.radius);
+      }
+      settle(looks[c]);
+      core::parallel_for(static_cast<std::int64_t>(stills[c].size()), [&](std::int64_t i) {
+        Still& still = stills[c][i];
+        RibbonOptions ribbon;
+        ribbon.width = width;
+        ribbon.width_deviation = round ? kKnownWidth : kFirstWidth;
+        still.ribbon = find_ribbon(looks[c], picture_of(*still.view), still.along, chain.length, ribbon);
+      });
+      for (const Still& still : stills[c])
+        if (!still.ribbon.axis.points.empty()) widths.push_back(still.ribbon.width);
+    }
+    if (widths.empty()) throw_nothing(recording);
+    if (round < 2) width = std::clamp(math::median(widths), kLeastWidth, kMostWidth);
+  }
+  Summary summary;
+  summary.grasp = grown[0].shift;
+  for (int c = 0; c < cameras; ++c)
+    for (const Still& still : stills[c]) {
+      const Tube tube = masking::tube(still.ribbon.axis, still.view->width, still.view->height, 0.0);
+      const View view = inside_of(tube, *still.view);
+      const Evidence seen = evidence(picture_of(*still.view), still.ribbon.axis, chain.length);
+      if (std::getenv("CHAINSPLAT_DEBUG"))
+        std::fprintf(stderr, "DEBUG %d %d evidence %.3f shift %.1f %.1f %.1f mm width %.3f edges %.3f steady %.3f even %.3f separate %.3f\n",
+                     c, still.view->frame, grown[still.moment].evidence, 1e3 * grown[still.moment].shift.x(),
+                     1e3 * grown[still.moment].shift.y(), 1e3 * grown[still.moment].shift.z(), still.ribbon.width,
+                     seen.edges, seen.steady, seen.even, seen.separate);
+      ++summary.frames;
+      summary.empty += view.width == 0;
+      summary.inside += view.width != 0;
+      sink(c, still.view->frame, recorded_mask(view, scene.cameras[c]), score(seen));
+    }
+  summary.inside /= summary.frames;
+  return summary;
+}
+
 }  // namespace
 
 Summary make(const Path& path, const Options& options, const Sink& sink) {
@@ -215,11 +399,7 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
   for (int c = 0; c < cameras; ++c) total += frames_of(recording, c);
   if (total == 0) throw InputError(path.string(), "has no frame in the range asked for", "choose frames that it has");
 
-  const int joints =
-      std::clamp(static_cast<int>(scene.length / (kLinkDiameters * scene.diameter)), kFewestJoints, kMostJoints);
-  const chain::Chain chain =
-      chain::make_chain(scene.length, scene.diameter, scene.direction, scene.bending_axis, joints,
-                        scene.tabletop ? chain::Bending::planar : chain::Bending::spatial, false);
+  const chain::Chain chain = chain_for(scene);
 
   // sample frames of every camera
   std::vector<capture::Camera> pinholes = scene.cameras;  // the cameras of undistorted pictures
@@ -241,6 +421,10 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
       tell("samples", views.size());
     });
   }
+  int longest = 0;
+  for (int c = 0; c < cameras; ++c) longest = std::max(longest, frames_of(recording, c));
+  if (longest <= kStills) return make_stills(recording, options, chain, pinholes, samples, sink);
+
   // learns every camera's appearance from its samples, with a chain for each and, if there are any, their masks
   std::vector<Look> looks(cameras);
   const auto learn = [&](const chain::States& states, const std::vector<View>* masks) {
@@ -267,7 +451,7 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
     }
   };
   Summary summary;
-  chain::States states = grow_moments(recording, chain, pinholes, samples);
+  chain::States states = grow_moments(recording, chain, moments_of(scene, pinholes, samples));
   learn(states, nullptr);
   // cuts the masks of all frames about the chains and passes them to `consume` block by block
   const auto masks_by = [&](double place, const char* note, const std::function<void(std::vector<View>&)>& consume) {
@@ -298,9 +482,7 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
     summary.inside = 0.0;
     for (const silhouette::FrameFit& frame : fit.frames) summary.inside += frame.inside;
     if (!fit.frames.empty()) summary.inside /= static_cast<double>(fit.frames.size());
-    if (summary.inside < kLeastInside)
-      throw InputError(path.string(), "nothing like the rope is found at the grasp",
-                       "check cameras, base, length and direction (chainsplat check), or use `command`");
+    if (summary.inside < kLeastInside) throw_nothing(recording);
     states = fit.states;
     learn(states, &masked.views);
   }
@@ -312,7 +494,7 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
       summary.inside += share_inside(chain, scene.base.pose(view.time), chain::interpolate(states, view.time),
                                      scene.cameras[view.camera], view);
       summary.empty += view.width == 0;
-      sink(view.camera, view.frame, recorded_mask(view, scene.cameras[view.camera]));
+      sink(view.camera, view.frame, recorded_mask(view, scene.cameras[view.camera]), 1.0);
     }
   });
   summary.inside /= summary.frames;

@@ -16,17 +16,11 @@ constexpr double kSpacing = 0.003;  // m along the rope between the tube's sampl
 constexpr int kMostSamples = 4096;  // but no more samples than this in all, which bounds ropes longer than 12 m,
 constexpr double kNotBelow = 0.05;  // and at least this many diameters apart, because each visits all pixels around it
 
-struct Sample {
-  Vector2 at;        // px
-  double radius;     // px
-  double arclength;  // m
-};
-
 }  // namespace
 
-Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta, const capture::Camera& camera,
-          double from, double to, double reach) {
-  Tube out;
+Axis axis(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta, const capture::Camera& camera,
+          double from, double to) {
+  Axis out;
   // sample the centerline
   const double spacing = std::max(kSpacing, kNotBelow * chain.diameter);
   const int count = std::max(2, static_cast<int>(std::min<double>(kMostSamples, std::ceil((to - from) / spacing))) + 1);
@@ -36,30 +30,44 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
   math::MatrixX line = chain::centerline(chain, motions, arclengths);
   for (int i = 0; i < count; ++i)
     if (arclengths[i] > chain.length) line.col(i) = motions.back() * Vector3(arclengths[i] * chain.direction);
-  // project them, and bound the tube's pixels
+  // project them
   const math::Pose camera_from_world = camera.world_from_camera.inverse();
-  std::vector<Sample> samples;
-  double bulge = 0.0;  // radii, half the short axis of the free end's disc as an ellipse in the picture
-  double x0 = 1e9, y0 = 1e9, x1 = -1e9, y1 = -1e9;
   for (int i = 0; i < count; ++i) {
     const Vector3 p = camera_from_world * Vector3(line.col(i));
     if (p.z() < image_model::kNear) continue;
-    const Sample s{capture::project(camera, p), 0.25 * chain.diameter * (camera.fx + camera.fy) / p.z(), arclengths[i]};
+    out.points.push_back(
+        {capture::project(camera, p), 0.25 * chain.diameter * (camera.fx + camera.fy) / p.z(), arclengths[i]});
+    if (i > 0) {
+      const Vector3 along = camera_from_world.rotation * Vector3(line.col(i) - line.col(i - 1));
+      out.bulge = std::abs(along.normalized().dot(p.normalized()));
+    }
+  }
+  if (out.points.size() < 2) out.points.clear();
+  return out;
+}
+
+Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta, const capture::Camera& camera,
+          double from, double to, double reach) {
+  return tube(axis(chain, base, theta, camera, from, to), camera.width, camera.height, reach);
+}
+
+Tube tube(const Axis& axis, int width, int height, double reach) {
+  Tube out;
+  const std::vector<AxisPoint>& samples = axis.points;
+  if (samples.size() < 2) return out;
+  // bound the tube's pixels
+  const double bulge = axis.bulge;
+  double x0 = 1e9, y0 = 1e9, x1 = -1e9, y1 = -1e9;
+  for (const AxisPoint& s : samples) {
     const double around = s.radius + reach + 1.0;
     x0 = std::min(x0, s.at.x() - around), x1 = std::max(x1, s.at.x() + around);
     y0 = std::min(y0, s.at.y() - around), y1 = std::max(y1, s.at.y() + around);
     out.radius += s.radius;
-    samples.push_back(s);
-    if (i > 0) {
-      const Vector3 along = camera_from_world.rotation * Vector3(line.col(i) - line.col(i - 1));
-      bulge = std::abs(along.normalized().dot(p.normalized()));
-    }
   }
-  if (samples.size() < 2) return out;
   out.radius /= static_cast<double>(samples.size());
   const auto whole = [](double value, int size) { return static_cast<int>(std::clamp(value, 0.0, 1.0 * size)); };
-  out.box = {whole(std::floor(x0), camera.width), whole(std::floor(y0), camera.height),
-             whole(std::ceil(x1), camera.width), whole(std::ceil(y1), camera.height)};
+  out.box = {whole(std::floor(x0), width), whole(std::floor(y0), height), whole(std::ceil(x1), width),
+             whole(std::ceil(y1), height)};
   if (out.box.empty()) return out;
   out.outside.assign(static_cast<std::size_t>(out.box.width()) * out.box.height(), Tube::kFar);
   out.along.assign(out.outside.size(), 0.0f);
@@ -125,7 +133,7 @@ Tube tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX
   }
   // near an end, pixels inside are no deeper than the end is near, and pixels beyond it are at least that far outside,
   // even where the round joint of the previous segment reaches
-  const auto cap = [&](const Sample& end, const Vector2& outward, bool free_end) {
+  const auto cap = [&](const AxisPoint& end, const Vector2& outward, bool free_end) {
     const double around = end.radius + reach;
     const double near = 2.0 * around * (samples.back().arclength - samples.front().arclength) /
                         std::max(1.0, (samples.back().at - samples.front().at).norm());  // m

@@ -33,6 +33,21 @@ struct Tube {
   static constexpr float kFar = 1e6f;
 };
 
+struct AxisPoint {
+  math::Vector2 at;        // px
+  double radius = 0.0;     // px
+  double arclength = 0.0;  // m
+};
+// The axis of a tube in a picture, of at least two points, or empty where the rope is behind the camera.
+struct Axis {
+  std::vector<AxisPoint> points;
+  double bulge = 0.0;  // radii, half the short axis of the free end's disc as an ellipse in the picture
+};
+Axis axis(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta, const capture::Camera& camera,
+          double from, double to);
+// The tube about an axis in a picture of this size.
+Tube tube(const Axis& axis, int width, int height, double reach);
+
 // Projects a cylinder bent along the chain, flat where it begins and with the ellipse of its end disc where it ends.
 // `from`, `to`: arclengths in m; beyond the free end it continues straight. `reach`: px beyond the outline that are
 // filled in. The camera must have no distortion.

@@ -1,0 +1,39 @@
+// The rope in one picture as a ribbon: a pair of outlines found along a rough axis, where colors change on either side.
+//
+// A grown or fitted chain lies within about a radius of the rope and has one width. Where the background is not known,
+// as in a few stills, the outlines themselves say where the rope is and how wide: the picture is straightened along the
+// axis, and the cheapest pair of outlines, left and right, is found by dynamic programming over the arclength. What
+// counts: colors inside and outside, color steps at both outlines, a width and a place that change little along the
+// rope, and a width near the usual one, except at the tip, where a connector may be.
+#pragma once
+#include "src/masking/look.h"
+
+namespace chainsplat::masking {
+
+struct RibbonOptions {
+  double width = 1.0;            // usual width as a share of the axis' own,
+  double width_deviation = 0.2;  // and how sure that is
+  double slack = 0.01;           // m, by which the rope may end or come out of the gripper elsewhere
+};
+
+struct Ribbon {
+  Axis axis;           // what lies between the outlines; empty where nothing is seen
+  double width = 1.0;  // median width as a share of that of the axis it was sought about
+  double score = 0.0;  // 0 to 1: how much this looks like one rope from the grasp to its end; design.md
+};
+
+// `along`: the rough axis. `length`: the rope's, m.
+Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, double length,
+                   const RibbonOptions& options = {});
+
+// How a ribbon looks by itself, whatever it was found by.
+struct Evidence {
+  double edges = 0.0;      // share of the length that differs from both sides by more than the picture's usual contrast
+  double steady = 0.0;     // share of the length whose color is that of most of the rope
+  double even = 0.0;       // share of the length whose width is nearly the usual one
+  double separate = 0.0;   // mean contrast with the sides over the contrast along the rope itself, 0 to 1
+};
+Evidence evidence(const Picture& picture, const Axis& axis, double length);
+double score(const Evidence& evidence);
+
+}  // namespace chainsplat::masking
