@@ -64,15 +64,14 @@ capture::View cut(const Look& appearance, const Picture& picture, const capture:
                   const chain::Chain& chain, const math::Pose& base, const std::optional<math::VectorX>& theta,
                   double doubt = 1.0);
 
-// Help by the user, in recorded pixels. Without a frame it holds for all frames of the camera.
+// Help by the user, in recorded pixels of one frame, or of all frames of the camera.
 struct PointHint {
-  int camera = 0;
-  std::optional<int> frame;
+  int camera = 0, frame = 0;
   double x = 0.0, y = 0.0;  // lies on the rope
 };
 struct BoxHint {
   int camera = 0;
-  std::optional<int> frame;
+  std::optional<int> frame;                         // none: all
   double x0 = 0.0, y0 = 0.0, x1 = 0.0, y1 = 0.0;  // the rope lies in here
 };
 
@@ -86,20 +85,30 @@ struct Options {
 // Receives the mask of one frame in recorded pixels, one channel, 0 or 255, and its score, 0 to 1: how much the picture
 // shows one rope there, from the grasp to its end, judged from the picture's own edges and colors. Masks with a score
 // below kDoubtful are probably wrong (IoU below 0.8).
-constexpr double kDoubtful = 0.5;
+constexpr double kDoubtful = 0.85;
 using Sink = std::function<void(int camera, int frame, const capture::Image8& mask, double score)>;
 
 struct Summary {
   int frames = 0;     // of all cameras
   int empty = 0;      // number of masks in which nothing was found
   double inside = 0;  // mean share of the chain's centerline that lies in the masks; low: hidden, or masks are wrong
-  math::Vector3 grasp = math::Vector3::Zero();  // m, base frame: where the grasp is found, off what is given
+  math::Vector3 grasp = math::Vector3::Zero();  // m, base frame: by how much the grasp is off, at most; stills only
 };
 
 // Makes the masks of a whole capture, by camera, then by frame; masks that the capture has are ignored. A few stills
 // have no background to learn and no motion to smooth: each is then judged by itself, and the grasp may be off by 1 cm.
 // Throws InputError when the capture is unusable, has no frames, or shows nothing like the rope at the grasp.
 Summary make(const Path& capture, const Options& options, const Sink& sink);
+
+// One picture of a contact sheet: as recorded, RGB, with its mask.
+struct PreviewTile {
+  std::string camera;
+  int frame = 0;
+  capture::Image8 picture, mask;
+  std::optional<double> score;
+};
+// Returns the pictures side by side, each at most 640 px wide, with the mask's outline and the score.
+capture::Image8 contact_sheet(const std::vector<PreviewTile>& tiles);
 
 // The state of live masking, while the rope is followed. It learns the background where the rope is not, and the colors
 // of what is masked.

@@ -237,6 +237,15 @@ chain::Chain chain_for(const capture::Capture& scene) {
                            scene.tabletop || one ? chain::Bending::planar : chain::Bending::spatial, false);
 }
 
+const Image8* empty_of(const Options& options, int camera) {
+  return camera < static_cast<int>(options.empty.size()) && options.empty[camera] ? &*options.empty[camera] : nullptr;
+}
+
+bool pointed_at(const Options& options, int camera, int frame) {
+  return std::any_of(options.points.begin(), options.points.end(),
+                     [&](const PointHint& hint) { return hint.camera == camera && hint.frame == frame; });
+}
+
 // Adds the user's help to a moment's shots.
 void add_hints(const Options& options, const std::vector<capture::Camera>& recorded, const std::vector<Samples>& samples,
                Moment& moment) {
@@ -245,11 +254,11 @@ void add_hints(const Options& options, const std::vector<capture::Camera>& recor
     int frame = 0;
     for (const View& view : samples[c].frames)
       if (picture_of(view).pixels == moment.shots[k].picture.pixels) frame = view.frame;
-    const auto meant = [&](const auto& hint) { return hint.camera == c && hint.frame.value_or(frame) == frame; };
     for (const PointHint& hint : options.points)
-      if (meant(hint)) moment.shots[k].on_rope.push_back(capture::undistort(recorded[c], Vector2(hint.x, hint.y)));
+      if (hint.camera == c && hint.frame == frame)
+        moment.shots[k].on_rope.push_back(capture::undistort(recorded[c], Vector2(hint.x, hint.y)));
     for (const BoxHint& hint : options.boxes)
-      if (meant(hint)) {
+      if (hint.camera == c && hint.frame.value_or(frame) == frame) {
         const Vector2 a = capture::undistort(recorded[c], Vector2(hint.x0, hint.y0)),
                       b = capture::undistort(recorded[c], Vector2(hint.x1, hint.y1));
         moment.shots[k].bounds = Box{static_cast<int>(std::floor(a.x())), static_cast<int>(std::floor(a.y())),
@@ -341,7 +350,7 @@ Summary make_stills(const Recording& recording, const Options& options, const ch
     std::vector<double> widths;
     for (int c = 0; c < cameras; ++c) {
       looks[c] = {};
-      if (c < static_cast<int>(options.empty.size()) && options.empty[c]) looks[c].background = empty_scene(*options.empty[c]);
+      if (empty_of(options, c)) looks[c].background = empty_scene(*empty_of(options, c));
       for (Still& still : stills[c]) {
         const View& view = *still.view;
         const bool by_ribbon = round && still.ribbon.axis.points.size() > 1;
@@ -366,17 +375,13 @@ Summary make_stills(const Recording& recording, const Options& options, const ch
     if (round < 2) width = std::clamp(math::median(widths), kLeastWidth, kMostWidth);
   }
   Summary summary;
-  summary.grasp = grown[0].shift;
+  for (const Grown& one : grown)
+    if (one.shift.norm() > summary.grasp.norm()) summary.grasp = one.shift;
   for (int c = 0; c < cameras; ++c)
     for (const Still& still : stills[c]) {
       const Tube tube = masking::tube(still.ribbon.axis, still.view->width, still.view->height, 0.0);
       const View view = inside_of(tube, *still.view);
-      const Evidence seen = evidence(picture_of(*still.view), still.ribbon.axis, chain.length);
-      if (std::getenv("CHAINSPLAT_DEBUG"))
-        std::fprintf(stderr, "DEBUG %d %d evidence %.3f shift %.1f %.1f %.1f mm width %.3f edges %.3f steady %.3f even %.3f separate %.3f\n",
-                     c, still.view->frame, grown[still.moment].evidence, 1e3 * grown[still.moment].shift.x(),
-                     1e3 * grown[still.moment].shift.y(), 1e3 * grown[still.moment].shift.z(), still.ribbon.width,
-                     seen.edges, seen.steady, seen.even, seen.separate);
+      const Evidence seen = evidence(picture_of(*still.view), still.ribbon.axis);
       ++summary.frames;
       summary.empty += view.width == 0;
       summary.inside += view.width != 0;
@@ -417,7 +422,7 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
         std::max(1, frames_of(recording, c) / static_cast<int>(std::clamp<double>(room, kLeastSamples, kSamples)));
     each_block(recording, c, [&](std::vector<View>& views) {
       for (View& view : views)
-        if ((view.frame - recording.first) % stride == 0) samples[c].frames.push_back(std::move(view));
+        if ((view.frame - recording.first) % stride == 0 || pointed_at(options, c, view.frame)) samples[c].frames.push_back(std::move(view));
       tell("samples", views.size());
     });
   }
@@ -447,33 +452,42 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
       }
       settle(looks[c]);
       looks[c].background =
-          median_background(pictures, tubes, std::max(kLeastSamples, static_cast<int>(kLeastUncovered * tubes.size())));
+          empty_of(options, c)
+              ? empty_scene(*empty_of(options, c))
+              : median_background(pictures, tubes,
+                                  std::max(kLeastSamples, static_cast<int>(kLeastUncovered * tubes.size())));
     }
   };
   Summary summary;
-  chain::States states = grow_moments(recording, chain, moments_of(scene, pinholes, samples));
+  std::vector<Moment> moments = moments_of(scene, pinholes, samples);
+  for (Moment& moment : moments) add_hints(options, scene.cameras, samples, moment);
+  chain::States states = grow_moments(recording, chain, moments);
   learn(states, nullptr);
   // cuts the masks of all frames about the chains and passes them to `consume` block by block
-  const auto masks_by = [&](double place, const char* note, const std::function<void(std::vector<View>&)>& consume) {
+  using Consume = std::function<void(std::vector<View>&, const std::vector<double>& scores)>;
+  const auto masks_by = [&](double place, const char* note, const Consume& consume) {
     for (int c = 0; c < cameras; ++c)
       each_block(recording, c, [&](std::vector<View>& views) {
+        std::vector<double> scores(views.size());
         core::parallel_for(static_cast<std::int64_t>(views.size()), [&](std::int64_t i) {
           if (core::stop_requested()) throw Interrupted(core::stop_requested());
           View& view = views[i];
           View masked = cut(looks[c], picture_of(view), pinholes[c], chain, scene.base.pose(view.time),
                             at(states, view.time), place);
           masked.camera = c, masked.frame = view.frame, masked.time = view.time;
+          scores[i] = score(evidence(picture_of(view), axis(chain, scene.base.pose(view.time), at(states, view.time),
+                                                            pinholes[c], 0.0, chain.length)));
           view = std::move(masked);
           tell(note, 1);
         });
-        consume(views);
+        consume(views, scores);
       });
   };
   // rounds of masks, chains fitted to them, and appearance learned from both
   for (int round = 0; round < kRounds; ++round) {
     capture::Capture masked = scene;
     masked.views.clear();
-    masks_by(round ? 1.0 : kRoughPlace, round ? "cut" : "rough masks", [&](std::vector<View>& views) {
+    masks_by(round ? 1.0 : kRoughPlace, round ? "cut" : "rough masks", [&](std::vector<View>& views, const auto&) {
       for (View& view : views) masked.views.push_back(std::move(view));
     });
     const bool anything = std::any_of(masked.views.begin(), masked.views.end(), [](const View& v) { return v.width; });
@@ -488,13 +502,15 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
   }
   summary.inside = 0.0;
   // the final masks
-  masks_by(1.0, "cut", [&](std::vector<View>& views) {
-    for (const View& view : views) {
+  masks_by(1.0, "cut", [&](std::vector<View>& views, const std::vector<double>& scores) {
+    for (std::size_t i = 0; i < views.size(); ++i) {
+      const View& view = views[i];
       ++summary.frames;
       summary.inside += share_inside(chain, scene.base.pose(view.time), chain::interpolate(states, view.time),
                                      scene.cameras[view.camera], view);
       summary.empty += view.width == 0;
-      sink(view.camera, view.frame, recorded_mask(view, scene.cameras[view.camera]), 1.0);
+      sink(view.camera, view.frame, recorded_mask(view, scene.cameras[view.camera]),
+           view.width ? scores[i] : 0.0);
     }
   });
   summary.inside /= summary.frames;

@@ -12,7 +12,7 @@ namespace {
 
 // the straightened picture, in usual radii
 constexpr double kStep = 0.5, kLeastStep = 0.7;  // along: radii, and at least so many px
-constexpr double kAcross = 0.16, kLeastAcross = 0.4;  // across: radii, and px
+constexpr double kAcross = 0.16, kLeastAcross = 0.25;  // across: radii, and px
 constexpr double kReach = 3.2, kMoreReach = 2.0;      // on either side: radii, and so many px more
 constexpr int kMostStations = 4096, kMostAcross = 64;
 // what counts, per radius of length
@@ -27,6 +27,12 @@ constexpr double kMove = 0.35;      // for each step of an outline across, from 
 constexpr double kLeastWidth = 0.5, kMostWidth = 2.9;  // of the usual one
 // the ends
 constexpr double kEndSigma = 0.4;  // of the slack
+constexpr double kEndStep = 4.0;   // of a full step of color along the rope there
+
+// the evidence
+constexpr double kSeen = 10.0;        // gray levels, the least contrast that is one
+constexpr double kLeastSpread = 6.0;  // gray levels, of the rope's colors along it,
+constexpr double kUnlike = 4.0;       // and times their usual spread, from where on it is another color
 
 double square(double x) { return x * x; }
 
@@ -155,6 +161,7 @@ Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, 
     int a, b;
   };
   const double usual = options.width * radius;  // px
+  const auto usual_at = [&](int i) { return options.width * std::max(0.5, stations[i].radius); };
   std::vector<State> states;
   std::vector<int> index(static_cast<std::size_t>(columns + 1) * (columns + 1), -1);
   for (int a = 1; a < columns; ++a)
@@ -167,7 +174,8 @@ Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, 
   if (states.empty()) return out;
   const double weight = ds / radius;  // facts of one station
   const auto cost_of = [&](int i, const State& s, const std::vector<double>& sums) {
-    const double wide = 0.5 * (s.b - s.a) * du / usual, middle = (0.5 * (s.a + s.b) - 0.5 - half) * du / usual;
+    const double expected = usual_at(i);
+    const double wide = 0.5 * (s.b - s.a) * du / expected, middle = (0.5 * (s.a + s.b) - 0.5 - half) * du / expected;
     const bool tip = stations[i].arclength > (1.0 - kTipShare) * length && wide > 1.0;
     const double width = tip ? kWiderTip * (wide - 1.0) : 0.5 * square((wide - 1.0) / options.width_deviation);
     return weight * (width + 0.5 * square(middle / kCenter) - kColor * (sums[s.b] - sums[s.a]) * du / radius -
@@ -213,28 +221,44 @@ Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, 
     for (int k = way[i].a; k < way[i].b; ++k) inside += odds[at(i, k)] / (way[i].b - way[i].a);
     speaks[i] = weight * (std::clamp(inside, -1.0, 1.0) + std::clamp(edges[i] / typical - 0.5, -0.5, 0.5));
   }
+  // the change of color along the rope, from the radius before a station to the one from it on
+  std::vector<Color> middle(count);
+  for (int i = 0; i < count; ++i) {
+    const int center = (way[i].a + way[i].b) / 2, around = (way[i].b - way[i].a) / 4;
+    for (int k = center - around; k <= center + around; ++k)
+      for (int c = 0; c < 3; ++c) middle[i][c] += colors[at(i, k)][c] / static_cast<float>(2 * around + 1);
+  }
+  const auto change = [&](int i) {
+    Color before{}, after{};
+    if (i - about < 0 || i + about > count) return 0.0;
+    for (int j = 0; j < about; ++j)
+      for (int c = 0; c < 3; ++c) {
+        before[c] += middle[i - 1 - j][c] / static_cast<float>(about);
+        after[c] += middle[i + j][c] / static_cast<float>(about);
+      }
+    const double d = difference(before, after);
+    return kEndStep * d / (d + kFullStep);
+  };
   const double sigma = std::max(1e-4, kEndSigma * options.slack);
   int begin = 0, end = count;
   double most = -1e300, sum = 0.0;
   for (int i = count - 1; i >= 0 && stations[i].arclength > -options.slack; --i) {
     sum += speaks[i];
     if (stations[i].arclength > 2.0 * options.slack) continue;
-    const double value = sum - 0.5 * square(std::max(0.0, -stations[i].arclength) / sigma);
+    const double value = sum + change(i) - 0.5 * square(std::max(0.0, -stations[i].arclength) / sigma);
     if (value > most) most = value, begin = i;
   }
   most = -1e300, sum = 0.0;
   for (int i = 0; i < count; ++i) {
     sum += speaks[i];
     if (stations[i].arclength < length - options.slack) continue;
-    const double value = sum - 0.5 * square((stations[i].arclength - length) / sigma);
+    const double value = sum + change(i + 1) - 0.5 * square((stations[i].arclength - length) / sigma);
     if (value > most) most = value, end = i + 1;
   }
   if (end - begin < 4) return out;
   std::vector<double> widths;
   for (int i = begin; i < end; ++i) {
     const double left = (way[i].a - 0.5 - half) * du, right = (way[i].b - 0.5 - half) * du;
-    const double span = stations[i].radius / radius;
-    (void)span;
     out.axis.points.push_back({stations[i].at + 0.5 * (left + right) * stations[i].across, 0.5 * (right - left),
                                stations[i].arclength});
     if (stations[i].arclength < (1.0 - kTipShare) * length) widths.push_back(0.5 * (right - left) / stations[i].radius);
@@ -244,18 +268,17 @@ Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, 
   return out;
 }
 
-Evidence evidence(const Picture& picture, const Axis& axis, double length) {
+Evidence evidence(const Picture& picture, const Axis& axis) {
   Evidence out;
   const std::vector<AxisPoint>& points = axis.points;
   const int count = static_cast<int>(points.size());
   if (count < 4) return out;
   // the colors inside and on either side, averaged over about a diameter of length
   std::vector<Color> sides[3];
-  std::vector<double> radii;
   double pixels = 0.0;
   for (int i = 1; i < count; ++i) pixels += (points[i].at - points[i - 1].at).norm();
   double radius = 0.0;
-  for (const AxisPoint& p : points) radii.push_back(p.radius), radius += p.radius / count;
+  for (const AxisPoint& p : points) radius += p.radius / count;
   const int about = std::max(1, static_cast<int>(radius / std::max(0.1, pixels / count)));
   for (int i = 0; i < count; ++i) {
     const AxisPoint& p = points[i];
@@ -292,24 +315,17 @@ Evidence evidence(const Picture& picture, const Axis& axis, double length) {
   }
   std::vector<double> spread;
   for (const Color& one : sides[1]) spread.push_back(difference(one, usual));
-  const double typical = std::max(6.0, median_of(spread));
-  const double width = median_of(radii);
-  double contrast = 0.0;
+  const double typical = std::max(kLeastSpread, median_of(spread));
   for (int i = 0; i < count; ++i) {
     const double left = difference(sides[1][i], sides[0][i]), right = difference(sides[1][i], sides[2][i]);
     const double least = std::min(left, right);
-    contrast += least / count;
-    out.edges += (least > 10.0) / (1.0 * count);
-    out.steady += (spread[i] < 4.0 * typical) / (1.0 * count);
-    out.even += (std::abs(radii[i] / width - 1.0) < 0.35) / (1.0 * count);
+    out.edges += (least > kSeen) / (1.0 * count);
+    out.steady += (spread[i] < kUnlike * typical) / (1.0 * count);
   }
-  double along = 0.0;
-  for (const double one : spread) along += one / count;
-  out.separate = contrast / (contrast + along + 4.0);
-  (void)length;
   return out;
 }
 
-double score(const Evidence& e) { return std::clamp(e.edges * e.steady, 0.0, 1.0); }
+// A stretch that does not differ from what is beside it may still be the rope, one of another color hardly is.
+double score(const Evidence& e) { return std::clamp(std::sqrt(e.edges) * e.steady * e.steady, 0.0, 1.0); }
 
 }  // namespace chainsplat::masking

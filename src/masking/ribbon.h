@@ -19,21 +19,18 @@ struct RibbonOptions {
 struct Ribbon {
   Axis axis;           // what lies between the outlines; empty where nothing is seen
   double width = 1.0;  // median width as a share of that of the axis it was sought about
-  double score = 0.0;  // 0 to 1: how much this looks like one rope from the grasp to its end; design.md
 };
 
 // `along`: the rough axis. `length`: the rope's, m.
 Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, double length,
                    const RibbonOptions& options = {});
 
-// How a ribbon looks by itself, whatever it was found by.
+// How a tube looks by itself, whatever it was found by: shares of its length.
 struct Evidence {
-  double edges = 0.0;      // share of the length that differs from both sides by more than the picture's usual contrast
-  double steady = 0.0;     // share of the length whose color is that of most of the rope
-  double even = 0.0;       // share of the length whose width is nearly the usual one
-  double separate = 0.0;   // mean contrast with the sides over the contrast along the rope itself, 0 to 1
+  double edges = 0.0;   // that differ in color from both sides
+  double steady = 0.0;  // that have the color of most of it
 };
-Evidence evidence(const Picture& picture, const Axis& axis, double length);
-double score(const Evidence& evidence);
+Evidence evidence(const Picture& picture, const Axis& axis);
+double score(const Evidence& evidence);  // as masking.h tells it
 
 }  // namespace chainsplat::masking

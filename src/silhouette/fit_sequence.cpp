@@ -252,10 +252,39 @@ SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capt
   return out;
 }
 
+namespace {
+
+// How far the masks are from a sequence's fits, in the median over the frames that show anything.
+struct Misfit {
+  double residual = 0.0, covered = 0.0, inside = 0.0;
+};
+Misfit misfit(const SequenceFit& fit) {
+  std::vector<double> residual, covered, inside;
+  for (const FrameFit& frame : fit.frames) {
+    if (frame.residual_pixels <= 0.0) continue;
+    residual.push_back(frame.residual_pixels);
+    covered.push_back(frame.covered);
+    inside.push_back(frame.inside);
+  }
+  if (residual.empty()) return {};
+  return {math::median(residual), math::median(covered), math::median(inside)};
+}
+
+bool one_camera(const capture::Capture& capture) {
+  const Frames frames = frames_of(capture);
+  double views = 0.0, count = 0.0;
+  for (const std::vector<int>& of_frame : frames.views)
+    if (!of_frame.empty()) views += static_cast<double>(of_frame.size()), ++count;
+  return views < kFewViews * count;
+}
+
+}  // namespace
+
 BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::Capture& capture,
                              const SequenceFit& fit) {
   constexpr double kSmall = 1e-3;  // m
   constexpr double kDeviations = 3.0;
+  constexpr double kClearly = 1.5, kClearlyPixels = 0.3, kClearlyShare = 0.05;  // by which a planar fit must be worse
   constexpr int kPoints = 97;  // along the centerline
   BendingChoice choice;
   if (capture.tabletop) {
@@ -287,8 +316,18 @@ BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::C
   if (weights == 0.0) return choice;
   choice.out_of_plane_rms = std::sqrt(square / weights);
   choice.deviation = std::sqrt(variance / weights);
-  if (choice.out_of_plane_rms < std::max(kSmall, kDeviations * choice.deviation))
+  if (choice.out_of_plane_rms < std::max(kSmall, kDeviations * choice.deviation)) {
     choice.bending = chain::Bending::planar;
+  } else if (one_camera(capture)) {
+    // The width of the masks alone tells depth: errors of the outline, alike along the rope, look like a bend.
+    const chain::Chain& s = spatial_chain;
+    const chain::Chain planar = chain::make_chain(s.length, s.diameter, s.direction, s.bending_axis, s.links() - 1,
+                                                  chain::Bending::planar, false, s.joint_arclength[0]);
+    const Misfit with = misfit(fit), without = misfit(fit_sequence(planar, capture));
+    const bool worse = without.residual > kClearly * with.residual + kClearlyPixels ||
+                       without.covered < with.covered - kClearlyShare || without.inside < with.inside - kClearlyShare;
+    if (!worse) choice.bending = chain::Bending::planar;
+  }
   return choice;
 }
 

@@ -4,6 +4,7 @@
 
 #include <CLI/CLI.hpp>
 #include <algorithm>
+#include <cmath>
 #include <cstdlib>
 #include <iostream>
 #include <memory>
@@ -23,10 +24,14 @@ using Json = nlohmann::ordered_json;
 
 constexpr std::uint8_t kInside = 128;  // mask values from here on are object (formats.md 1.5)
 constexpr std::string_view kImageName = "{image}", kMaskName = "{mask}";  // in the line of a command
-constexpr double kDoubtful = 0.85;  // share of the chain's centerline in the masks under which they may be wrong
+constexpr double kMostlyInside = 0.85;  // share of the chain's centerline in the masks under which they may be wrong
+constexpr double kFarGrasp = 0.014;  // m, more than calibrations of laboratories are wrong by
+constexpr int kPreviewFrames = 4;  // pictures of a camera on the contact sheet
+constexpr int kNamedFrames = 8;    // poor frames that a warning names
 
 struct Request {
-  std::string capture, out, command, frames;
+  std::string capture, out, command, frames, preview;
+  std::vector<std::string> points, boxes, empty;
   bool force = false;
 };
 
@@ -148,6 +153,144 @@ double iou(const capture::Image8& mask, const capture::Image8& other) {
   return either ? static_cast<double>(both) / static_cast<double>(either) : 1.0;
 }
 
+int camera_named(const capture::Capture& scene, const std::string& name, const std::string& where) {
+  std::string names;
+  for (std::size_t c = 0; c < scene.cameras.size(); ++c) {
+    if (scene.cameras[c].name == name) return static_cast<int>(c);
+    names += (c ? ", " : "") + scene.cameras[c].name;
+  }
+  throw InputError(where, "the capture has no camera " + name, "it has " + names);
+}
+
+// Reads CAMERA[:FRAME]:NUMBER,NUMBER,... with `count` numbers.
+struct Hint {
+  int camera = 0;
+  std::optional<int> frame;
+  std::vector<double> numbers;
+};
+Hint read_hint(const std::string& text, const std::string& option, std::size_t count, const capture::Capture& scene) {
+  const std::string where = option + " " + text;
+  const auto refuse = [&] {
+    throw InputError(where, "is not CAMERA:" + std::string(count == 2 ? "X,Y" : "X0,Y0,X1,Y1"),
+                     "in recorded pixels, as in " + option + (count == 2 ? " cam0:412,230" : " cam0:300,80,560,470") +
+                         "; with a frame as in cam0:12:...");
+  };
+  const std::size_t first = text.find(':'), last = text.rfind(':');
+  if (first == std::string::npos) refuse();
+  Hint out;
+  out.camera = camera_named(scene, text.substr(0, first), where);
+  const auto number = [&](const std::string& part) {
+    char* end = nullptr;
+    const double value = std::strtod(part.c_str(), &end);
+    if (part.empty() || *end || !std::isfinite(value)) refuse();
+    return value;
+  };
+  if (last != first) {
+    const double frame = number(text.substr(first + 1, last - first - 1));
+    if (frame < 0.0 || frame != std::floor(frame) || frame >= static_cast<double>(scene.times[out.camera].size()))
+      throw InputError(where, "there is no such frame",
+                       "the camera has " + std::to_string(scene.times[out.camera].size()) + ", counted from 0");
+    out.frame = static_cast<int>(frame);
+  }
+  std::string rest = text.substr(last + 1) + ",";
+  for (std::size_t comma; (comma = rest.find(',')) != std::string::npos; rest = rest.substr(comma + 1))
+    out.numbers.push_back(number(rest.substr(0, comma)));
+  if (out.numbers.size() != count) refuse();
+  const capture::Camera& camera = scene.cameras[out.camera];
+  for (std::size_t i = 0; i < count; ++i)
+    if (count == 2 && (out.numbers[i] < 0.0 || out.numbers[i] > (i % 2 ? camera.height : camera.width)))
+      throw InputError(where, "lies outside of the picture",
+                       "it has " + std::to_string(camera.width) + "x" + std::to_string(camera.height) + " pixels");
+  return out;
+}
+
+masking::Options read_hints(const Request& request, const capture::Capture& scene, int first) {
+  masking::Options options;
+  for (const std::string& text : request.points) {
+    const Hint hint = read_hint(text, "--point", 2, scene);
+    options.points.push_back({hint.camera, hint.frame.value_or(first), hint.numbers[0], hint.numbers[1]});
+  }
+  for (const std::string& text : request.boxes) {
+    const Hint hint = read_hint(text, "--box", 4, scene);
+    const std::vector<double>& n = hint.numbers;
+    options.boxes.push_back({hint.camera, hint.frame, std::min(n[0], n[2]), std::min(n[1], n[3]), std::max(n[0], n[2]),
+                             std::max(n[1], n[3])});
+  }
+  options.empty.resize(scene.cameras.size());
+  for (const std::string& text : request.empty) {
+    const std::size_t equals = text.find('=');
+    if (equals == std::string::npos)
+      throw InputError("--empty " + text, "is not CAMERA=FILE", "as in --empty cam0=empty.png");
+    const int c = camera_named(scene, text.substr(0, equals), "--empty " + text);
+    const Path file = text.substr(equals + 1);
+    capture::Image8 picture = capture::read_image8(file);
+    if (picture.width != scene.cameras[c].width || picture.height != scene.cameras[c].height)
+      throw InputError(file.string(),
+                       "has " + std::to_string(picture.width) + "x" + std::to_string(picture.height) +
+                           " pixels, its camera " + std::to_string(scene.cameras[c].width) + "x" +
+                           std::to_string(scene.cameras[c].height),
+                       "give a picture of the same camera without the rope");
+    if (scene.cameras[c].distorted())
+      throw InputError(file.string(), "its camera has lens distortion, which is not taken out of it",
+                       "undistort the recording first, or leave --empty out");
+    options.empty[c] = std::move(picture);
+  }
+  return options;
+}
+
+// The score of one mask.
+struct Score {
+  int camera, frame;
+  double score;
+};
+
+// Warns of the cameras whose masks are probably wrong, with their frames.
+void warn_of_poor(const std::vector<Score>& scores, const capture::Capture& scene, const std::string& into) {
+  for (std::size_t c = 0; c < scene.cameras.size(); ++c) {
+    std::string frames;
+    int poor = 0, all = 0;
+    for (const Score& one : scores) {
+      if (one.camera != static_cast<int>(c)) continue;
+      ++all;
+      if (one.score >= masking::kDoubtful) continue;
+      if (++poor <= kNamedFrames) frames += (poor > 1 ? ", " : "") + std::to_string(one.frame);
+    }
+    if (poor == 0) continue;
+    if (poor > kNamedFrames) frames += ", ...";
+    core::warn(into + ": " + scene.cameras[c].name + ": " + std::to_string(poor) + " of " + std::to_string(all) +
+               " masks are probably wrong (frame" + (poor > 1 ? "s " : " ") + frames +
+               "); look at them (--preview), show the rope (--point " + scene.cameras[c].name +
+               ":X,Y) or use --command");
+  }
+}
+
+// The contact sheet: some frames of every camera, spread over the recording.
+capture::Image8 preview_of(const Request& request, const capture::Capture& scene, const std::vector<Score>& scores,
+                           const std::vector<Pattern>& masks, int first, int last) {
+  std::vector<masking::PreviewTile> tiles;
+  for (int c = 0; c < static_cast<int>(scene.cameras.size()); ++c) {
+    const int all = static_cast<int>(scene.times[c].size()), end = last < 0 ? all : std::min(all, last);
+    const int count = std::min(kPreviewFrames, end - first);
+    for (int k = 0; k < count; ++k) {
+      const int frame = first + (count > 1 ? k * (end - 1 - first) / (count - 1) : 0);
+      capture::LoadOptions one;
+      one.masked = one.undistort = false;
+      one.camera = scene.cameras[c].name;
+      one.first = frame, one.last = frame + 1;
+      for (const capture::View& view : capture::load(request.capture, one).views) {
+        masking::PreviewTile tile{scene.cameras[c].name, frame, {view.width, view.height, 3, {}}, {}, {}};
+        for (std::size_t i = 0; i < view.rgba.size(); i += 4)
+          tile.picture.pixels.insert(tile.picture.pixels.end(), &view.rgba[i], &view.rgba[i] + 3);
+        tile.mask = capture::read_image8(masks[c].file(frame));
+        for (const Score& score : scores)
+          if (score.camera == c && score.frame == frame) tile.score = score.score;
+        tiles.push_back(std::move(tile));
+      }
+    }
+  }
+  return masking::contact_sheet(tiles);
+}
+
 void make_masks(const Globals& globals, const Request& request) {
   const auto [first, last] = capture::read_frame_range(request.frames, "--frames");
   const bool in_place = request.out.empty();
@@ -161,6 +304,9 @@ void make_masks(const Globals& globals, const Request& request) {
   capture::LoadOptions headers;
   headers.images = false;
   const capture::Capture scene = capture::load(request.capture, headers);
+  if (!request.command.empty() && !(request.points.empty() && request.boxes.empty() && request.empty.empty()))
+    throw InputError("--command", "does not go with --point, --box and --empty", "give one or the other");
+  masking::Options options = read_hints(request, scene, first);
   std::error_code error;
   const Path file =
       fs::is_directory(request.capture, error) ? Path(request.capture) / "capture.json" : Path(request.capture);
@@ -215,11 +361,24 @@ void make_masks(const Globals& globals, const Request& request) {
   };
 
   masking::Summary summary;
+  std::vector<Score> scores;
   if (request.command.empty()) {
-    masking::Options options;
     options.first = first;
     options.last = last;
-    summary = masking::make(request.capture, options, keep);
+    summary = masking::make(request.capture, options,
+                            [&](int camera, int frame, const capture::Image8& mask, double score) {
+                              keep(camera, frame, mask);
+                              scores.push_back({camera, frame, score});
+                            });
+    std::string table = "camera,frame,score\n";
+    for (const Score& one : scores) {
+      char line[48];
+      std::snprintf(line, sizeof line, ",%d,%.3f\n", one.frame, one.score);
+      table += scene.cameras[one.camera].name + line;
+    }
+    const Path folder = in_place ? scene.folder / "masks" : Path(request.out);
+    core::make_folder(folder);
+    core::write_file(folder / "scores.csv", table);
   } else {
     const Exchange exchange;
     std::int64_t total = 0;
@@ -258,14 +417,28 @@ void make_masks(const Globals& globals, const Request& request) {
   if (summary.empty > 0)
     core::warn(into + ": " + std::to_string(summary.empty) + " of " + std::to_string(summary.frames) +
                " masks are empty; the rope is hidden or was not found there");
-  if (request.command.empty() && summary.inside < kDoubtful)
+  warn_of_poor(scores, scene, into);
+  if (summary.grasp.norm() > kFarGrasp) {
+    char text[160];
+    std::snprintf(text, sizeof text, ": the rope seems to begin %.0f mm from the grasp that is given, at [%.0f, %.0f, %.0f]",
+                  1e3 * summary.grasp.norm(), 1e3 * summary.grasp.x(), 1e3 * summary.grasp.y(), 1e3 * summary.grasp.z());
+    core::warn(into + text + " mm in the base frame; check the base's poses and the cameras, and look at the masks");
+  }
+  if (request.command.empty() && summary.inside < kMostlyInside)
     core::warn(into + ": only " + std::to_string(std::lround(100.0 * summary.inside)) +
                " % of the rope lies in the masks; look at them before you use them, or use --command");
+  if (!request.preview.empty())
+    capture::write_png(request.preview, preview_of(request, scene, scores, wanted, first, last));
+  int poor = 0;
+  for (const Score& one : scores) poor += one.score < masking::kDoubtful;
   Json document;
   document["masks"] = into;
   document["frames"] = summary.frames;
   document["empty"] = summary.empty;
-  if (request.command.empty()) document["inside"] = summary.inside;
+  if (request.command.empty()) document["inside"] = summary.inside, document["poor"] = poor;
+  if (summary.grasp.norm() > 0.0)
+    document["grasp_offset"] = {summary.grasp.x(), summary.grasp.y(), summary.grasp.z()};
+  if (!request.preview.empty()) document["preview"] = request.preview;
   for (std::size_t c = 0; c < cameras; ++c)
     if (agreement.frames[c] > 0) document["iou"][scene.cameras[c].name] = agreement.sum[c] / agreement.frames[c];
   if (globals.json) {
@@ -300,6 +473,24 @@ void add_mask_command(CLI::App& app, const Globals& globals, Job& job) {
                    "write, 255 for the object; example: 'segment {image} --out {mask}'")
       ->type_name("LINE");
   command->add_option("--frames", request->frames, "Only frames A to B - 1, with -o")->type_name("A:B");
+  command
+      ->add_option("--point", request->points,
+                   "A point on the rope, as clicked, in recorded pixels of the first frame (or CAMERA:FRAME:X,Y);\n"
+                   "may be given several times")
+      ->type_name("CAMERA:X,Y")
+      ->allow_extra_args(false);
+  command
+      ->add_option("--box", request->boxes,
+                   "The rope lies in this box, in recorded pixels, in all frames (or CAMERA:FRAME:...)")
+      ->type_name("CAMERA:X0,Y0,X1,Y1")
+      ->allow_extra_args(false);
+  command->add_option("--empty", request->empty, "A picture of the camera without the rope")
+      ->type_name("CAMERA=FILE")
+      ->allow_extra_args(false);
+  command
+      ->add_option("--preview", request->preview,
+                   "Also write a contact sheet: some frames of every camera with the masks' outlines and scores")
+      ->type_name("FILE.png");
   command->add_flag("--force", request->force, "Replace masks that are there");
   command->callback([&globals, &job, request] { job = [&globals, request] { make_masks(globals, *request); }; });
 }
