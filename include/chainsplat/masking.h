@@ -71,7 +71,7 @@ struct PointHint {
 };
 struct BoxHint {
   int camera = 0;
-  std::optional<int> frame;                         // none: all
+  std::optional<int> frame;                       // none: all
   double x0 = 0.0, y0 = 0.0, x1 = 0.0, y1 = 0.0;  // the rope lies in here
 };
 

@@ -22,11 +22,11 @@ constexpr int kBins = 8 * 8 * 8;
 // where colors are sampled
 constexpr double kHeard = 0.05;                                          // concentration per color, Dirichlet prior
 constexpr std::array kInside = {-0.75, -0.45, -0.15, 0.15, 0.45, 0.75};  // radii across the rope
-constexpr std::array kBeside = {1.3, 1.7, 2.1};           // radii, clear of an outline that is a little off,
-constexpr std::array kLeastBeside = {0.8, 1.3, 1.8};      // and at least so many px beyond it, clear of its blur
-constexpr double kWidest = 4.0;  // px, radius beyond which pictures are made smaller: texture and noise average out
-constexpr double kSpacing = 0.5;                                   // radii between stations along the rope,
-constexpr int kMostStations = 256;        // but no more stations than this, so that a thin rope is sampled sparsely
+constexpr std::array kBeside = {1.3, 1.7, 2.1};       // radii, clear of an outline that is a little off,
+constexpr std::array kLeastBeside = {0.8, 1.3, 1.8};  // and at least so many px beyond it, clear of its blur
+constexpr double kWidest = 4.0;     // px, radius beyond which pictures are made smaller: texture and noise average out
+constexpr double kSpacing = 0.5;    // radii between stations along the rope,
+constexpr int kMostStations = 256;  // but no more stations than this, so that a thin rope is sampled sparsely
 constexpr double kHiddenByGripper = 1.0;  // diameters of rope at the grasp that are not sampled
 constexpr double kSeenFromSide = 0.3;     // share of a link's length; one that appears shorter shows no sides
 // the beam search over the joints' angles, and its refinement
@@ -42,14 +42,14 @@ constexpr int kSweeps = 2;  // over all angles per refinement
 // how a rope hangs: it turns down along its length, and up only as far as it was bent before
 constexpr double kRise = 5.0 * M_PI / 180;  // standard deviation of a joint's turn away from gravity
 // where the grasp is uncertain
-constexpr double kFarthestGrasp = 2.5;  // deviations that are tried,
-constexpr double kGraspStep = 0.7;      // in steps of this many diameters,
-constexpr int kMostGraspSteps = 3;      // but at most so many on either side
+constexpr double kFarthestGrasp = 2.5;                        // deviations that are tried,
+constexpr double kGraspStep = 0.7;                            // in steps of this many diameters,
+constexpr int kMostGraspSteps = 3;                            // but at most so many on either side
 constexpr std::array kGraspRefinements = {0.35, 0.18, 0.09};  // diameters
 // evidence of the outlines
 constexpr int kRandomPlaces = 4000;
-constexpr double kSurprise = 1.0;      // nats, the mean of a random place, which counts as nothing
-constexpr double kMostSurprise = 4.0;  // nats
+constexpr double kSurprise = 1.0;          // nats, the mean of a random place, which counts as nothing
+constexpr double kMostSurprise = 4.0;      // nats
 constexpr double kFactsPerDiameter = 1.0;  // stations within a diameter see the same edges
 // what the user says
 constexpr double kOnRope = 60.0;    // nats for each point that the rope runs through,
@@ -353,8 +353,9 @@ struct Search {
     return sum - 0.5 * rise * rise / (kRise * kRise);
   }
   double believed(const Vector3& shift) const {
-    return clues.grasp_deviation > 0.0 ? -0.5 * (shift - clues.grasp).squaredNorm() / (clues.grasp_deviation * clues.grasp_deviation)
-                                       : 0.0;
+    return clues.grasp_deviation > 0.0
+               ? -0.5 * (shift - clues.grasp).squaredNorm() / (clues.grasp_deviation * clues.grasp_deviation)
+               : 0.0;
   }
   double hints(std::uint64_t reached) const { return kOnRope * std::popcount(reached); }
 

@@ -5,9 +5,9 @@
 // factor of two populations, the sampled colors inside and beside the tube, against a single one. Each population is a
 // Dirichlet-multinomial, so that few samples prove little and an unknown color favors neither; the side that differs
 // less counts, since one alone is a step, as at a window's edge, and no rope. Outlines: how seldom a place of this
-// picture, taken at random, contrasts as much with both sides at the rope's width. Where something hides the rope from a
-// camera there is only one population, which adds no evidence. What is known besides (gravity, by how much the grasp may
-// be off, a point on the rope) joins as a prior.
+// picture, taken at random, contrasts as much with both sides at the rope's width. Where something hides the rope from
+// a camera there is only one population, which adds no evidence. What is known besides (gravity, by how much the grasp
+// may be off, a point on the rope) joins as a prior.
 #pragma once
 #include <span>
 
@@ -27,9 +27,9 @@ struct Shot {
 
 // What is known of the rope besides its size.
 struct Clues {
-  math::Vector3 down = math::Vector3::Zero();  // unit, base frame, where it hangs at rest; zero: it need not
+  math::Vector3 down = math::Vector3::Zero();   // unit, base frame, where it hangs at rest; zero: it need not
   math::Vector3 grasp = math::Vector3::Zero();  // m, base frame: the grasp is thought to be off by this,
-  double grasp_deviation = 0.0;                // m, and how sure that is; 0: it is exactly there
+  double grasp_deviation = 0.0;                 // m, and how sure that is; 0: it is exactly there
 };
 
 // Numbers of samples inside and beside the tube per coarse color.

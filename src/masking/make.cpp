@@ -45,9 +45,9 @@ constexpr int kRounds = 2;            // of cutting, fitting and learning
 constexpr double kCenter = 0.5;       // of the radius; pixels deeper inside than this count as the centerline
 constexpr double kLeastInside = 0.4;  // mean share of the centerline in the masks, below which there is no rope
 // a few stills
-constexpr int kStills = 8;                  // frames per camera, up to which a capture is one of stills
-constexpr double kGraspDeviation = 0.006;   // m, of the grasp: hand-eye calibrations of laboratories are 3 to 14 mm off,
-constexpr double kGraspScatter = 0.0025;    // m, and from still to still
+constexpr int kStills = 8;                 // frames per camera, up to which a capture is one of stills
+constexpr double kGraspDeviation = 0.006;  // m, of the grasp: hand-eye calibrations of laboratories are 3 to 14 mm off,
+constexpr double kGraspScatter = 0.0025;   // m, and from still to still
 constexpr double kLeastStillEvidence = 0.02;  // nats per sample
 constexpr double kFacing = 0.5;  // cosine between view and bending axis, above which one camera sees the rope's plane
 constexpr double kFirstWidth = 0.2, kKnownWidth = 0.12;  // deviation of the width before and after it was measured
@@ -116,8 +116,11 @@ std::vector<Moment> moments_of(const capture::Capture& scene, const std::vector<
         return std::abs(a.time - one.time) < std::abs(b.time - one.time);
       });
       if (nearest == frames.end() || std::abs(nearest->time - one.time) > kSameMoment) continue;
-      moment.shots.push_back({picture_of(*nearest), &cameras[c],
-                              cameras[c].world_from_camera.inverse() * scene.base.pose(nearest->time), {}, {}});
+      moment.shots.push_back({picture_of(*nearest),
+                              &cameras[c],
+                              cameras[c].world_from_camera.inverse() * scene.base.pose(nearest->time),
+                              {},
+                              {}});
       moment.cameras.push_back(static_cast<int>(c));
     }
     moments.push_back(std::move(moment));
@@ -218,8 +221,8 @@ Image8 recorded_mask(const View& view, const capture::Camera& camera) {
   return mask;
 }
 
-// The chain that masks are made about. One camera does not see depth: its chain is planar, in the rope's own plane where
-// the camera sees that from the side, else in the plane through the rope's direction that faces it.
+// The chain that masks are made about. One camera does not see depth: its chain is planar, in the rope's own plane
+// where the camera sees that from the side, else in the plane through the rope's direction that faces it.
 chain::Chain chain_for(const capture::Capture& scene) {
   const int joints =
       std::clamp(static_cast<int>(scene.length / (kLinkDiameters * scene.diameter)), kFewestJoints, kMostJoints);
@@ -247,8 +250,8 @@ bool pointed_at(const Options& options, int camera, int frame) {
 }
 
 // Adds the user's help to a moment's shots.
-void add_hints(const Options& options, const std::vector<capture::Camera>& recorded, const std::vector<Samples>& samples,
-               Moment& moment) {
+void add_hints(const Options& options, const std::vector<capture::Camera>& recorded,
+               const std::vector<Samples>& samples, Moment& moment) {
   for (std::size_t k = 0; k < moment.shots.size(); ++k) {
     const int c = moment.cameras[k];
     int frame = 0;
@@ -327,7 +330,7 @@ Summary make_stills(const Recording& recording, const Options& options, const ch
   struct Still {
     const View* view;
     int moment;
-    Axis along;    // of the grown chain
+    Axis along;  // of the grown chain
     Ribbon ribbon;
   };
   std::vector<std::vector<Still>> stills(cameras);
@@ -422,7 +425,8 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
         std::max(1, frames_of(recording, c) / static_cast<int>(std::clamp<double>(room, kLeastSamples, kSamples)));
     each_block(recording, c, [&](std::vector<View>& views) {
       for (View& view : views)
-        if ((view.frame - recording.first) % stride == 0 || pointed_at(options, c, view.frame)) samples[c].frames.push_back(std::move(view));
+        if ((view.frame - recording.first) % stride == 0 || pointed_at(options, c, view.frame))
+          samples[c].frames.push_back(std::move(view));
       tell("samples", views.size());
     });
   }
@@ -509,8 +513,7 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
       summary.inside += share_inside(chain, scene.base.pose(view.time), chain::interpolate(states, view.time),
                                      scene.cameras[view.camera], view);
       summary.empty += view.width == 0;
-      sink(view.camera, view.frame, recorded_mask(view, scene.cameras[view.camera]),
-           view.width ? scores[i] : 0.0);
+      sink(view.camera, view.frame, recorded_mask(view, scene.cameras[view.camera]), view.width ? scores[i] : 0.0);
     }
   });
   summary.inside /= summary.frames;

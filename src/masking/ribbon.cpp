@@ -11,9 +11,9 @@ using math::Vector2;
 namespace {
 
 // the straightened picture, in usual radii
-constexpr double kStep = 0.5, kLeastStep = 0.7;  // along: radii, and at least so many px
+constexpr double kStep = 0.5, kLeastStep = 0.7;        // along: radii, and at least so many px
 constexpr double kAcross = 0.16, kLeastAcross = 0.25;  // across: radii, and px
-constexpr double kReach = 3.2, kMoreReach = 2.0;      // on either side: radii, and so many px more
+constexpr double kReach = 3.2, kMoreReach = 2.0;       // on either side: radii, and so many px more
 constexpr int kMostStations = 4096, kMostAcross = 64;
 // what counts, per radius of length
 constexpr double kColor = 0.25;     // per unit of log odds and radius of width
@@ -45,7 +45,7 @@ Color color_at(const Picture& picture, const Vector2& at) {
   const double a = x - u, b = y - v;
   const int right = std::min(u + 1, picture.width - 1), below = std::min(v + 1, picture.height - 1);
   const std::uint8_t *const p = pixel(picture, u, v), *const q = pixel(picture, right, v),
-                           *const r = pixel(picture, u, below), *const s = pixel(picture, right, below);
+                            *const r = pixel(picture, u, below), *const s = pixel(picture, right, below);
   Color out;
   for (int c = 0; c < 3; ++c)
     out[c] = static_cast<float>((1 - b) * ((1 - a) * p[c] + a * q[c]) + b * ((1 - a) * r[c] + a * s[c]));
@@ -133,9 +133,9 @@ Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, 
       colors[at(i, k)] = color_at(picture, place);
       const int x = std::clamp(static_cast<int>(place.x()), 0, picture.width - 1),
                 y = std::clamp(static_cast<int>(place.y()), 0, picture.height - 1);
-      odds[at(i, k)] = std::clamp(
-          color_odds(known, pixel(picture, x, y)) + 2.0 * difference_odds(look.background, picture, x, y), -kMostOdds,
-          kMostOdds);
+      odds[at(i, k)] =
+          std::clamp(color_odds(known, pixel(picture, x, y)) + 2.0 * difference_odds(look.background, picture, x, y),
+                     -kMostOdds, kMostOdds);
     }
   }
   // steps between columns: the colors on either side, averaged over a radius of length
@@ -153,7 +153,8 @@ Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, 
     }
   for (int i = 0; i < count; ++i)
     for (int k = 1; k < columns; ++k) {  // between the columns k - 1 and k
-      const double d = difference(mean[at(i, std::max(0, k - apart))], mean[at(i, std::min(columns - 1, k + apart - 1))]);
+      const double d =
+          difference(mean[at(i, std::max(0, k - apart))], mean[at(i, std::min(columns - 1, k + apart - 1))]);
       steps[at(i, k)] = d / (d + kFullStep);
     }
   // states: the left outline lies before column a, the right one before column b
@@ -213,8 +214,7 @@ Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, 
   }
   // where it begins and ends: what each station says for the rope, summed up
   std::vector<double> edges, speaks(count);
-  for (int i = 0; i < count; ++i)
-    edges.push_back(std::min(steps[at(i, way[i].a)], steps[at(i, way[i].b)]));
+  for (int i = 0; i < count; ++i) edges.push_back(std::min(steps[at(i, way[i].a)], steps[at(i, way[i].b)]));
   const double typical = std::max(0.05, median_of(edges));
   for (int i = 0; i < count; ++i) {
     double inside = 0.0;
@@ -259,8 +259,8 @@ Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, 
   std::vector<double> widths;
   for (int i = begin; i < end; ++i) {
     const double left = (way[i].a - 0.5 - half) * du, right = (way[i].b - 0.5 - half) * du;
-    out.axis.points.push_back({stations[i].at + 0.5 * (left + right) * stations[i].across, 0.5 * (right - left),
-                               stations[i].arclength});
+    out.axis.points.push_back(
+        {stations[i].at + 0.5 * (left + right) * stations[i].across, 0.5 * (right - left), stations[i].arclength});
     if (stations[i].arclength < (1.0 - kTipShare) * length) widths.push_back(0.5 * (right - left) / stations[i].radius);
   }
   out.axis.bulge = along.bulge;
@@ -288,7 +288,8 @@ Evidence evidence(const Picture& picture, const Axis& axis) {
       Color sum{};
       int n = 0;
       for (const double u : {-0.5, 0.0, 0.5}) {
-        const double off = part == 1 ? u * p.radius : (part - 1) * (p.radius + std::max(1.2, (0.5 + 0.5 * u) * p.radius));
+        const double off =
+            part == 1 ? u * p.radius : (part - 1) * (p.radius + std::max(1.2, (0.5 + 0.5 * u) * p.radius));
         const Color one = color_at(picture, p.at + off * across);
         for (int c = 0; c < 3; ++c) sum[c] += one[c];
         ++n;

@@ -284,8 +284,8 @@ BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::C
                              const SequenceFit& fit) {
   constexpr double kSmall = 1e-3;  // m
   constexpr double kDeviations = 3.0;
-  constexpr double kClearly = 1.5, kClearlyPixels = 0.3, kClearlyShare = 0.05;  // by which a planar fit must be worse
-  constexpr int kPoints = 97;  // along the centerline
+  constexpr double kClearly = 1.5, kClearlyPixels = 0.3, kClearlyShare = 0.15;  // by which a planar fit must be worse
+  constexpr int kPoints = 97;                                                   // along the centerline
   BendingChoice choice;
   if (capture.tabletop) {
     choice.bending = chain::Bending::planar;
@@ -325,7 +325,7 @@ BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::C
                                                   chain::Bending::planar, false, s.joint_arclength[0]);
     const Misfit with = misfit(fit), without = misfit(fit_sequence(planar, capture));
     const bool worse = without.residual > kClearly * with.residual + kClearlyPixels ||
-                       without.covered < with.covered - kClearlyShare || without.inside < with.inside - kClearlyShare;
+                       without.covered + without.inside < with.covered + with.inside - kClearlyShare;
     if (!worse) choice.bending = chain::Bending::planar;
   }
   return choice;

@@ -25,9 +25,9 @@ using Json = nlohmann::ordered_json;
 constexpr std::uint8_t kInside = 128;  // mask values from here on are object (formats.md 1.5)
 constexpr std::string_view kImageName = "{image}", kMaskName = "{mask}";  // in the line of a command
 constexpr double kMostlyInside = 0.85;  // share of the chain's centerline in the masks under which they may be wrong
-constexpr double kFarGrasp = 0.014;  // m, more than calibrations of laboratories are wrong by
-constexpr int kPreviewFrames = 4;  // pictures of a camera on the contact sheet
-constexpr int kNamedFrames = 8;    // poor frames that a warning names
+constexpr double kFarGrasp = 0.014;     // m, more than calibrations of laboratories are wrong by
+constexpr int kPreviewFrames = 4;       // pictures of a camera on the contact sheet
+constexpr int kNamedFrames = 8;         // poor frames that a warning names
 
 struct Request {
   std::string capture, out, command, frames, preview;
@@ -365,11 +365,11 @@ void make_masks(const Globals& globals, const Request& request) {
   if (request.command.empty()) {
     options.first = first;
     options.last = last;
-    summary = masking::make(request.capture, options,
-                            [&](int camera, int frame, const capture::Image8& mask, double score) {
-                              keep(camera, frame, mask);
-                              scores.push_back({camera, frame, score});
-                            });
+    summary =
+        masking::make(request.capture, options, [&](int camera, int frame, const capture::Image8& mask, double score) {
+          keep(camera, frame, mask);
+          scores.push_back({camera, frame, score});
+        });
     std::string table = "camera,frame,score\n";
     for (const Score& one : scores) {
       char line[48];
@@ -420,8 +420,9 @@ void make_masks(const Globals& globals, const Request& request) {
   warn_of_poor(scores, scene, into);
   if (summary.grasp.norm() > kFarGrasp) {
     char text[160];
-    std::snprintf(text, sizeof text, ": the rope seems to begin %.0f mm from the grasp that is given, at [%.0f, %.0f, %.0f]",
-                  1e3 * summary.grasp.norm(), 1e3 * summary.grasp.x(), 1e3 * summary.grasp.y(), 1e3 * summary.grasp.z());
+    std::snprintf(
+        text, sizeof text, ": the rope seems to begin %.0f mm from the grasp that is given, at [%.0f, %.0f, %.0f]",
+        1e3 * summary.grasp.norm(), 1e3 * summary.grasp.x(), 1e3 * summary.grasp.y(), 1e3 * summary.grasp.z());
     core::warn(into + text + " mm in the base frame; check the base's poses and the cameras, and look at the masks");
   }
   if (request.command.empty() && summary.inside < kMostlyInside)
@@ -436,8 +437,7 @@ void make_masks(const Globals& globals, const Request& request) {
   document["frames"] = summary.frames;
   document["empty"] = summary.empty;
   if (request.command.empty()) document["inside"] = summary.inside, document["poor"] = poor;
-  if (summary.grasp.norm() > 0.0)
-    document["grasp_offset"] = {summary.grasp.x(), summary.grasp.y(), summary.grasp.z()};
+  if (summary.grasp.norm() > 0.0) document["grasp_offset"] = {summary.grasp.x(), summary.grasp.y(), summary.grasp.z()};
   if (!request.preview.empty()) document["preview"] = request.preview;
   for (std::size_t c = 0; c < cameras; ++c)
     if (agreement.frames[c] > 0) document["iou"][scene.cameras[c].name] = agreement.sum[c] / agreement.frames[c];
