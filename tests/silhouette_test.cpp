@@ -354,6 +354,30 @@ TEST_CASE("a sequence: velocity, frames without masks, bending") {
   CHECK_THROWS_AS(silhouette::fit_sequence(planar, flat), InputError);
 }
 
+TEST_CASE("of one camera a planar fit must be clearly worse before a rope is spatial") {
+  // a planar rope whose masks are wider at its lower end (a connector), which alone would be depth
+  const Chain planar = rope(Bending::planar), spatial = rope(Bending::spatial);
+  capture::Capture still = film(planar, 2, [&](double) { return bent(planar, 0.9); });
+  std::erase_if(still.views, [](const capture::View& view) { return view.camera != 0; });
+  for (capture::View& view : still.views) {
+    const std::vector<std::uint8_t> old = view.rgba;
+    for (int y = 2 * view.height / 3; y < view.height; ++y)
+      for (int x = 3; x + 3 < view.width; ++x)
+        for (int k = -3; k <= 3; ++k) {
+          const std::size_t to = 4 * (static_cast<std::size_t>(y) * view.width + x);
+          if (old[to + 4 * k + 3]) std::fill_n(&view.rgba[to], 4, std::uint8_t{255});
+        }
+  }
+  const silhouette::SequenceFit fit = silhouette::fit_sequence(spatial, still);
+  const silhouette::BendingChoice choice = silhouette::choose_bending(spatial, still, fit);
+  CHECK(choice.out_of_plane_rms > 3.0 * choice.deviation);  // what was asked before
+  CHECK(choice.bending == Bending::planar);
+  // a rope that leaves its plane sideways in the picture is spatial, whatever the number of cameras
+  capture::Capture out = film(spatial, 2, [&](double) { return bent(spatial, 0.2, 1.2); });
+  std::erase_if(out.views, [](const capture::View& view) { return view.camera != 1; });
+  CHECK(silhouette::choose_bending(spatial, out, silhouette::fit_sequence(spatial, out)).bending == Bending::spatial);
+}
+
 TEST_CASE("the demo capture is recognized to a fraction of a millimeter, whatever the number of threads") {
   const Path folder = Path(CHAINSPLAT_SOURCE_DIR) / "assets/demo_free_30";
   const capture::Capture demo = capture::load(folder);
