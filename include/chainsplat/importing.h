@@ -79,6 +79,10 @@ struct Imported {
 // write.
 Imported import_capture(const Path& out, const Options& options);
 
+// Poses of the flange in the log's world, s by the log's clock, m. Rows that repeat a time are left out. Adds to
+// `notes` how the file was read. Throws InputError.
+std::vector<trajectory::Sample> read_base_log(const Options& options, std::vector<std::string>& notes);
+
 // The calibration formats that are read, for messages and for --help.
 std::string known_calibrations();
 

@@ -7,10 +7,6 @@
 
 namespace chainsplat::importing {
 
-// Poses of the flange in the log's world, s by the log's clock, m. Rows that repeat a time are left out. Adds to
-// `notes` how the file was read. Throws InputError.
-std::vector<trajectory::Sample> read_base_log(const Options& options, std::vector<std::string>& notes);
-
 // A serial arm from a URDF: the joints from its root to one link.
 struct Arm {
   struct Joint {

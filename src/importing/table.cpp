@@ -6,6 +6,7 @@
 #include <cstdio>
 #include <ctime>
 
+#include "chainsplat/media.h"
 #include "document.h"
 
 namespace chainsplat::importing {

@@ -40,9 +40,6 @@ double unit_scale(const std::string& unit);
 // are not Unix times.
 std::string stamp_unit(const std::vector<double>& stamps);
 
-// Times from a file: one per line, or a table's column of times. In s. `unit` empty: by name or size. Throws
-// InputError.
-std::vector<double> read_stamps(const Path& file, const std::string& key, const std::string& unit, std::string& note);
 // The column of a table that holds the time, by its name.
 std::optional<std::size_t> time_column(const Table& table);
 // The times of a table in s, from one column or from seconds and nanoseconds in two. `note`: how they were read.

@@ -106,6 +106,7 @@ int run(int argc, char** argv) {
   tools::add_diff_command(app, globals, job);
   tools::add_new_command(app, globals, job);
   tools::add_import_command(app, globals, job);
+  tools::add_calibrate_command(app, globals, job);
   tools::add_mask_command(app, globals, job);
   tools::add_bench_command(app, globals, job);
   tools::add_describe_commands(app, job);

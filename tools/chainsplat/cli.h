@@ -47,6 +47,7 @@ void add_batch_command(CLI::App& app, const Globals& globals, Job& job);  // bat
 void add_diff_command(CLI::App& app, const Globals& globals, Job& job);   // diff
 void add_mask_command(CLI::App& app, const Globals& globals, Job& job);
 void add_import_command(CLI::App& app, const Globals& globals, Job& job);
+void add_calibrate_command(CLI::App& app, const Globals& globals, Job& job);
 void add_bench_command(CLI::App& app, const Globals& globals, Job& job);
 void add_describe_commands(CLI::App& app, Job& job);  // completions, manual
 

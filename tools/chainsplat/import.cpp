@@ -4,9 +4,9 @@
 #include <iostream>
 #include <memory>
 #include <nlohmann/json.hpp>
-#include <span>
 
 #include "chainsplat/importing.h"
+#include "camera_options.h"
 #include "cli.h"
 
 namespace chainsplat::tools {
@@ -21,46 +21,6 @@ struct Request {
   std::vector<std::string> cameras, calibrations, poses_of, masks, timestamps, rates, starts;
   importing::Options options;
 };
-
-// 'NAME=VALUE'; a value alone is for every camera that has none of its own.
-void give(std::vector<importing::CameraRequest>& cameras, const std::vector<std::string>& texts,
-          const std::string& option, const std::function<void(importing::CameraRequest&, const std::string&)>& set) {
-  for (const bool named : {false, true})
-    for (const std::string& text : texts) {
-      const std::size_t equals = text.find('=');
-      const std::string name = text.substr(0, equals);
-      const auto camera = std::find_if(cameras.begin(), cameras.end(), [&](const auto& c) { return c.name == name; });
-      const bool own = equals != std::string::npos && camera != cameras.end();
-      if (own && named) set(*camera, text.substr(equals + 1));
-      if (own || named) continue;
-      std::error_code error;
-      if (equals != std::string::npos && !std::filesystem::exists(text, error)) {
-        std::string list;
-        for (const auto& c : cameras) list += (list.empty() ? "" : ", ") + c.name;
-        throw InputError(option, "'" + name + "' is no camera", "there are " + list);
-      }
-      for (importing::CameraRequest& each : cameras) set(each, text);
-    }
-}
-
-// '0.3', '30cm', '300 mm': a number and one of the units, of which the first is meant where none is named.
-struct Unit {
-  const char* name;
-  double scale;
-};
-constexpr Unit kLengths[] = {{"m", 1.0}, {"cm", 1e-2}, {"mm", 1e-3}}, kMasses[] = {{"kg", 1.0}, {"g", 1e-3}};
-
-double quantity(const std::string& text, const std::string& option, std::span<const Unit> units) {
-  const std::size_t digit = text.find_last_of("0123456789.");
-  const std::size_t end = digit == std::string::npos ? 0 : digit + 1;
-  std::string unit = text.substr(end);
-  unit.erase(0, unit.find_first_not_of(' '));
-  if (unit.empty()) unit = units.front().name;
-  for (const Unit& known : units)
-    if (unit == known.name) return known.scale * numbers(text.substr(0, end), option, 1)[0];
-  throw InputError(option, "'" + text + "' has no unit that is known",
-                   std::string("write a number, in ") + units.front().name);
-}
 
 // '-z', or three numbers.
 math::Vector3 direction(const std::string& text, const std::string& option) {
@@ -93,18 +53,15 @@ void read_cameras(Request& request) {
     camera.images = text.substr(equals + 1);
     cameras.push_back(camera);
   }
-  give(cameras, request.calibrations, "--calibration",
-       [](auto& camera, const std::string& text) { camera.calibration = importing::read_source(text); });
-  give(cameras, request.masks, "--masks", [](auto& camera, const std::string& text) { camera.masks = text; });
-  give(cameras, request.timestamps, "--timestamps",
-       [](auto& camera, const std::string& text) { camera.timestamps = text; });
-  give(cameras, request.rates, "--rate",
-       [](auto& camera, const std::string& text) { camera.rate = numbers(text, "--rate", 1)[0]; });
-  give(cameras, request.starts, "--start", [](auto& camera, const std::string& text) {
+  give_to_cameras<importing::CameraRequest>(cameras, request.calibrations, "--calibration", [](auto& camera, const std::string& text) { camera.calibration = importing::read_source(text); });
+  give_to_cameras<importing::CameraRequest>(cameras, request.masks, "--masks", [](auto& camera, const std::string& text) { camera.masks = text; });
+  give_to_cameras<importing::CameraRequest>(cameras, request.timestamps, "--timestamps", [](auto& camera, const std::string& text) { camera.timestamps = text; });
+  give_to_cameras<importing::CameraRequest>(cameras, request.rates, "--rate", [](auto& camera, const std::string& text) { camera.rate = numbers(text, "--rate", 1)[0]; });
+  give_to_cameras<importing::CameraRequest>(cameras, request.starts, "--start", [](auto& camera, const std::string& text) {
     camera.find_start = text == "auto";
     if (!camera.find_start) camera.start = numbers(text, "--start", 1)[0];
   });
-  give(cameras, request.poses_of, "--pose", [](auto& camera, const std::string& text) {
+  give_to_cameras<importing::CameraRequest>(cameras, request.poses_of, "--pose", [](auto& camera, const std::string& text) {
     const importing::Source source = importing::read_source(text);
     std::error_code error;
     if (!std::filesystem::exists(source.file, error) && std::count(text.begin(), text.end(), ',') == 6)
