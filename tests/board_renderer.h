@@ -1,6 +1,6 @@
-// tests/board_renderer.h - pictures of a printed board with known truth, by casting rays: nothing here is the code under
-// test. What is black is read from the printed page (SVG), as a printer would; the lens is OpenCV's published model,
-// undone by iteration.
+// tests/board_renderer.h - pictures of a printed board with known truth, by casting rays: nothing here is the code
+// under test. What is black is read from the printed page (SVG), as a printer would; the lens is OpenCV's published
+// model, undone by iteration.
 #pragma once
 #include <array>
 #include <cmath>
@@ -43,7 +43,7 @@ inline std::map<int, std::vector<Rectangle>> read_page(const std::string& svg) {
 
 class BoardRenderer {
  public:
-  static constexpr int kSamples = 3;  // rays along each side of a pixel
+  static constexpr int kSamples = 9;  // rays of a pixel
 
   BoardRenderer(const capture::Camera& camera, const calibration::Board& board) : camera_(camera) {
     for (const auto& [id, rectangles] : read_page(calibration::board_svg(board)))
@@ -57,12 +57,18 @@ class BoardRenderer {
       for (int v = cell(all_[i].y0, half_y_); v <= cell(all_[i].y1, half_y_); ++v)
         for (int u = cell(all_[i].x0, half_x_); u <= cell(all_[i].x1, half_x_); ++u)
           cells_[v * kGrid + u].push_back(static_cast<int>(i));
-    rays_.resize(static_cast<std::size_t>(camera.width) * camera.height * kSamples * kSamples);
-    for (int y = 0; y < camera.height; ++y)
-      for (int x = 0; x < camera.width; ++x)
-        for (int s = 0; s < kSamples * kSamples; ++s)
-          rays_[(static_cast<std::size_t>(y) * camera.width + x) * kSamples * kSamples + s] =
-              ray(x + (s % kSamples + 0.5) / kSamples, y + (s / kSamples + 0.5) / kSamples);
+    rays_.resize(static_cast<std::size_t>(camera.width) * camera.height * kSamples);
+    // a lattice that is shifted by chance in every pixel: a regular grid would round the place of an edge that runs
+    // along the pixels to a third of one
+    core::Random random(1);
+    for (std::size_t i = 0; i < rays_.size(); i += kSamples) {
+      const double x = static_cast<double>(i / kSamples % camera.width),
+                   y = static_cast<double>(i / kSamples / camera.width);
+      const double shift_x = random.uniform(), shift_y = random.uniform();
+      for (int s = 0; s < kSamples; ++s)
+        rays_[i + s] = ray(x + std::fmod(s / double(kSamples) + shift_x, 1.0),
+                           y + std::fmod(4 * s % kSamples / double(kSamples) + shift_y, 1.0));
+    }
   }
 
   // Gray levels, `black` and `white` of the print on a background between them; blurred by a Gaussian of `blur` px,
@@ -75,15 +81,15 @@ class BoardRenderer {
     const math::Vector3 origin = board_from_camera.translation;
     for (std::size_t i = 0; i < light.size(); ++i) {
       double sum = 0.0;
-      for (int s = 0; s < kSamples * kSamples; ++s) {
-        const std::array<float, 2>& r = rays_[i * kSamples * kSamples + s];
+      for (int s = 0; s < kSamples; ++s) {
+        const std::array<float, 2>& r = rays_[i * kSamples + s];
         const math::Vector3 direction = board_from_camera.rotation * math::Vector3(r[0], r[1], 1.0);
         const double t = -origin.z() / direction.z();
         const double x = origin.x() + t * direction.x(), y = origin.y() + t * direction.y();
         const bool page = t > 0 && origin.z() > 0 && std::abs(x) < half_x_ + margin_ && std::abs(y) < half_y_ + margin_;
         sum += !page ? kBackground : black(x, y) ? kBlack : kWhite;
       }
-      light[i] = static_cast<float>(sum / (kSamples * kSamples));
+      light[i] = static_cast<float>(sum / kSamples);
     }
     if (blur > 0.0) light = blurred(blurred(light, width, height, blur, 1), width, height, blur, width);
     capture::Image8 out{width, height, 1, {}};
@@ -119,14 +125,15 @@ class BoardRenderer {
     const int reach = static_cast<int>(std::ceil(4.0 * sigma));
     std::vector<double> kernel;
     double sum = 0.0;
-    for (int i = -reach; i <= reach; ++i) kernel.push_back(std::exp(-0.5 * i * i / (sigma * sigma))), sum += kernel.back();
+    for (int i = -reach; i <= reach; ++i)
+      kernel.push_back(std::exp(-0.5 * i * i / (sigma * sigma))), sum += kernel.back();
     std::vector<float> out(in.size());
     for (int y = 0; y < height; ++y)
       for (int x = 0; x < width; ++x) {
         double value = 0.0;
         for (int i = -reach; i <= reach; ++i) {
-          const int at = stride == 1 ? std::clamp(x + i, 0, width - 1) + y * width
-                                     : x + std::clamp(y + i, 0, height - 1) * width;
+          const int at =
+              stride == 1 ? std::clamp(x + i, 0, width - 1) + y * width : x + std::clamp(y + i, 0, height - 1) * width;
           value += kernel[i + reach] * in[at];
         }
         out[static_cast<std::size_t>(y) * width + x] = static_cast<float>(value / sum);

@@ -1,4 +1,4 @@
-// chainsplat/calibration.h - cameras from videos of a printed board: intrinsics, poses and clocks (mathematics.md 9).
+// chainsplat/calibration.h - cameras from videos of a printed board: intrinsics, poses and clocks (mathematics.md 12).
 //
 // The board is a grid of AprilTags (tag36h11), or a single one. What is found, all at once by damped least squares with
 // robust weights: each camera's focal lengths, principal point and five lens coefficients, its pose, and the pose of
@@ -95,7 +95,7 @@ struct CameraResult {
 
 struct Finding {
   bool bad = false;  // the calibration must not be used as it is; else: look at it
-  std::string code;  // as in formats.md 4.6
+  std::string code;  // as in formats.md 5.11
   std::string camera;
   std::string text;  // what is bad, and what to do
 };

@@ -96,8 +96,8 @@ Board read_board(const Path& file) {
 }
 
 std::string write_board(const Board& board) {
-  const Json json{{"format", kFormat},       {"family", "tag36h11"},         {"columns", board.columns},
-                  {"rows", board.rows},      {"tag_size", board.tag_size},   {"spacing", board.spacing},
+  const Json json{{"format", kFormat},         {"family", "tag36h11"},       {"columns", board.columns},
+                  {"rows", board.rows},        {"tag_size", board.tag_size}, {"spacing", board.spacing},
                   {"first_id", board.first_id}};
   return json.dump(1) + "\n";
 }

@@ -14,13 +14,13 @@ using math::VectorX;
 
 namespace {
 
-constexpr double kRobust = 3.0;      // scaled residuals beyond this count linearly (Huber)
-constexpr double kLost = 1e4;        // scaled residual of a corner that the camera cannot see at all
-constexpr double kHeld = 1e-9;       // rad, m: what is not to move
-constexpr double kNear = 0.01;       // m in front of the camera
+constexpr double kRobust = 3.0;  // scaled residuals beyond this count linearly (Huber)
+constexpr double kLost = 1e4;    // scaled residual of a corner that the camera cannot see at all
+constexpr double kHeld = 1e-9;   // rad, m: what is not to move
+constexpr double kNear = 0.01;   // m in front of the camera
 // What is assumed of everything beforehand, so weakly that it only shows where the views tell nothing
-constexpr double kAnyFocal = 10.0, kAnyCenter = 0.5;                   // times the image's width
-constexpr double kAnyDistortion[] = {1.0, 1.0, 0.05, 0.05, 1.0};       // k1 k2 p1 p2 k3
+constexpr double kAnyFocal = 10.0, kAnyCenter = 0.5;                       // times the image's width
+constexpr double kAnyDistortion[] = {1.0, 1.0, 0.05, 0.05, 1.0};           // k1 k2 p1 p2 k3
 constexpr double kAnyRotation = 10.0, kAnyPlace = 100.0, kAnyClock = 1.0;  // rad, m, s
 
 // d(exp(w) p) = -hat(exp(w) p) left_jacobian(w) dw
@@ -175,13 +175,13 @@ double evaluate(const Bundle& start, const VectorX& x, solve::ArrowEquations* eq
     const bool held = !start.robot && m == start.held_moment && start.held_camera < 0;
     if (!start.robot && !held) return;
     // the robot's error; its rotation vector is small, so that it is moved by what is in front
-    const Vector3 turn = start.robot ? math::log_so3(math::exp_so3(own.head<3>()) * moment.pose.rotation)
-                                     : Vector3(own.head<3>());
+    const Vector3 turn =
+        start.robot ? math::log_so3(math::exp_so3(own.head<3>()) * moment.pose.rotation) : Vector3(own.head<3>());
     const Vector3 shift = start.robot ? Vector3(moment.pose.translation + own.tail<3>()) : Vector3(own.tail<3>());
     for (int k = 0; k < 6; ++k) {
       const double deviation = held ? kHeld : k < 3 ? start.robot_rotation : start.robot_position;
-      add_prior(k < 3 ? turn(k) : shift(k - 3), deviation, part.cost,
-                equations ? &part.local.matrix(k, k) : nullptr, equations ? &part.local.gradient(k) : nullptr);
+      add_prior(k < 3 ? turn(k) : shift(k - 3), deviation, part.cost, equations ? &part.local.matrix(k, k) : nullptr,
+                equations ? &part.local.gradient(k) : nullptr);
     }
   });
   double cost = 0.0;
@@ -209,13 +209,11 @@ double evaluate(const Bundle& start, const VectorX& x, solve::ArrowEquations* eq
     prior(first + 3, camera.cy - 0.5 * camera.height, kAnyCenter * width);
     for (int k = 0; k < 5; ++k) prior(first + 4 + k, camera.distortion[k], kAnyDistortion[k]);
     const bool held = !start.robot && static_cast<int>(c) == start.held_camera;
-    for (int k = 0; k < 6; ++k)
-      prior(first + 9 + k, x(first + 9 + k), held ? kHeld : k < 3 ? kAnyRotation : kAnyPlace);
+    for (int k = 0; k < 6; ++k) prior(first + 9 + k, x(first + 9 + k), held ? kHeld : k < 3 ? kAnyRotation : kAnyPlace);
     prior(first + 15, x(first + 15), start.robot ? kAnyClock : kHeld);
   }
   if (start.robot)
-    for (int k = 0; k < 6; ++k)
-      prior(shared - 6 + k, x(shared - 6 + k), k < 3 ? kAnyRotation : kAnyPlace);
+    for (int k = 0; k < 6; ++k) prior(shared - 6 + k, x(shared - 6 + k), k < 3 ? kAnyRotation : kAnyPlace);
   if (equations) *equations = std::move(sum);
   return cost;
 }

@@ -1,5 +1,5 @@
-// src/calibration/bundle.h - the joint problem: cameras, the board on the flange and the board's pose at every moment, as
-// least squares in arrow form (mathematics.md 9.2). It sees corners and times, no images.
+// src/calibration/bundle.h - the joint problem: cameras, the board on the flange and the board's pose at every moment,
+// as least squares in arrow form (mathematics.md 12.2). It sees corners and times, no images.
 #pragma once
 #include <optional>
 #include <vector>
@@ -40,7 +40,7 @@ struct Bundle {
   math::Pose flange_from_board;
   const trajectory::Trajectory* robot = nullptr;          // world_from_flange; none: the board is moved by hand
   double robot_position = 1e-3, robot_rotation = 0.0015;  // m, rad: prior of Moment::pose, with a robot
-  int held_camera = 0;   // without a robot: whose pose is the world, -1: the board's at `held_moment`
+  int held_camera = 0;  // without a robot: whose pose is the world, -1: the board's at `held_moment`
   int held_moment = -1;
 };
 
@@ -66,7 +66,7 @@ void set_scales(Bundle& bundle, std::optional<double> absorbed = {});
 struct Certainty {
   math::MatrixX covariance;
   double position_square = 0.0, rotation_square = 0.0;  // m^2, rad^2
-  double absorbed = 0.0;  // degrees of freedom of the corners that all unknowns take
+  double absorbed = 0.0;                                // degrees of freedom of the corners that all unknowns take
 };
 Certainty certainty(const Bundle& bundle);
 

@@ -26,15 +26,15 @@ namespace {
 
 constexpr std::size_t kAloneViews = 60;  // of a camera by itself
 constexpr int kFirstSteps = 40, kSteps = 25;
-constexpr int kLensRounds = 3;           // corners depend on the lens, the lens on the corners
-constexpr int kScaleRounds = 8;          // of the robot's and the corners' scatter
-constexpr double kSettled = 0.01;        // relative change of the scatter
-constexpr double kGoodStart = 3.0;       // px: with more another focal length is tried
-constexpr double kOtherFocals[] = {0.6, 1.0, 2.0};          // times the image's width
+constexpr int kLensRounds = 3;                                  // corners depend on the lens, the lens on the corners
+constexpr int kScaleRounds = 8;                                 // of the robot's and the corners' scatter
+constexpr double kSettled = 0.01;                               // relative change of the scatter
+constexpr double kGoodStart = 3.0;                              // px: with more another focal length is tried
+constexpr double kOtherFocals[] = {0.6, 1.0, 2.0};              // times the image's width
 constexpr double kLeastPosition = 1e-5, kLeastRotation = 1e-5;  // m, rad: of a robot's scatter
 constexpr std::size_t kFewestViews = 3;
-constexpr double kInset = 0.02;          // of the image: where its edge is judged
-constexpr int kAcross = 8, kDown = 6;    // regions that are counted as covered
+constexpr double kInset = 0.02;        // of the image: where its edge is judged
+constexpr int kAcross = 8, kDown = 6;  // regions that are counted as covered
 
 capture::Camera first_lens(const Recording& recording) {
   capture::Camera camera;
@@ -45,8 +45,7 @@ capture::Camera first_lens(const Recording& recording) {
 }
 
 void drop_poor(std::vector<Moment>& moments) {
-  for (Moment& moment : moments)
-    std::erase_if(moment.views, [](const View& view) { return view.corners.size() < 4; });
+  for (Moment& moment : moments) std::erase_if(moment.views, [](const View& view) { return view.corners.size() < 4; });
   std::erase_if(moments, [](const Moment& moment) { return moment.views.empty(); });
 }
 
@@ -100,8 +99,7 @@ Alone calibrate_alone(const Recording& recording, std::vector<View> views, const
   for (View& view : views) view.camera = 0, set_corners(view, recording, board, lens);
   std::erase_if(views, [](const View& view) { return view.corners.size() < 4; });
   if (views.empty())
-    throw InputError(recording.media.source.string(),
-                     recording.name + " sees the board, but nowhere with sharp edges",
+    throw InputError(recording.media.source.string(), recording.name + " sees the board, but nowhere with sharp edges",
                      "hold it nearer and stiller, in more light");
   std::vector<const View*> all;
   for (const View& view : views) all.push_back(&view);
@@ -127,8 +125,7 @@ Alone calibrate_alone(const Recording& recording, std::vector<View> views, const
     for (const double factor : kOtherFocals)
       if (Alone other = begin(factor * lens.width); other.rms < best.rms) best = std::move(other);
   for (int round = 0; round < kLensRounds; ++round) {
-    for (Moment& moment : best.bundle.moments)
-      set_corners(moment.views[0], recording, board, best.bundle.cameras[0]);
+    for (Moment& moment : best.bundle.moments) set_corners(moment.views[0], recording, board, best.bundle.cameras[0]);
     drop_poor(best.bundle.moments);
     set_scales(best.bundle);
     best.summary = fit(best.bundle, kSteps);
@@ -163,8 +160,7 @@ void begin_with_robot(Bundle& bundle, std::vector<std::vector<View>>& views, con
     if (first - margin > motion.end() || last + margin < motion.start())
       throw InputError(options.log.base.file.string(),
                        "covers " + range(motion.start() + robot.origin, motion.end() + robot.origin) + ", and " +
-                           request.name + " sees the board from " +
-                           range(first + robot.origin, last + robot.origin),
+                           request.name + " sees the board from " + range(first + robot.origin, last + robot.origin),
                        "give both by one clock with `timestamps` or `start`, or `start` " + request.name + "=auto");
     for (const View& view : views[c])
       if (const auto pose = place(view, bundle.cameras[c])) placed[c].push_back({view.time, *pose});
@@ -244,8 +240,7 @@ std::vector<bool> chain_cameras(Bundle& bundle) {
       for (std::size_t b = 0; b < count; ++b)
         if (placed[a] && !placed[b] && between[a][b].size() > most) from = a, to = b, most = between[a][b].size();
     if (most == 0) break;
-    bundle.cameras[to].world_from_camera =
-        bundle.cameras[from].world_from_camera * middle_pose(between[from][to], 0.5);
+    bundle.cameras[to].world_from_camera = bundle.cameras[from].world_from_camera * middle_pose(between[from][to], 0.5);
     placed[to] = true;
   }
   for (Moment& moment : bundle.moments) {
@@ -317,8 +312,7 @@ void describe_camera(const Bundle& bundle, int camera, const MatrixX& covariance
         covered[static_cast<int>(v * kDown) * kAcross + static_cast<int>(u * kAcross)] = true;
         regions[static_cast<int>(v * 3) * 3 + static_cast<int>(u * 3)] = true;
       }
-      const Pose camera_from_board =
-          out.camera.world_from_camera.inverse() * board_in_world(bundle, moment, view);
+      const Pose camera_from_board = out.camera.world_from_camera.inverse() * board_in_world(bundle, moment, view);
       const double facing = std::abs(camera_from_board.rotation.col(2).dot(camera_from_board.translation.normalized()));
       out.tilt = std::max(out.tilt, std::acos(std::min(facing, 1.0)));
     }
@@ -333,7 +327,8 @@ void describe_camera(const Bundle& bundle, int camera, const MatrixX& covariance
   for (const double v : {kInset, 0.5, 1.0 - kInset})
     for (const double u : {kInset, 0.5, 1.0 - kInset}) {
       const Vector2 straight = capture::undistort(still, {u * still.width, v * still.height});
-      const Vector3 point = depth * Vector3((straight.x() - still.cx) / still.fx, (straight.y() - still.cy) / still.fy, 1.0);
+      const Vector3 point =
+          depth * Vector3((straight.x() - still.cx) / still.fx, (straight.y() - still.cy) / still.fy, 1.0);
       Eigen::Matrix<double, 2, 3> by_point;
       Eigen::Matrix<double, 2, kLensUnknowns> by_lens;
       if (!point.allFinite() || !pixel_of(still, point, by_point, by_lens)) {
@@ -356,7 +351,8 @@ void Options::check() const {
   for (std::size_t i = 0; i < cameras.size(); ++i) {
     const std::string& name = cameras[i].name;
     if (name.empty() || name.size() > 64 || name[0] == '.' ||
-        name.find_first_not_of("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789-_.") != std::string::npos)
+        name.find_first_not_of("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789-_.") !=
+            std::string::npos)
       throw InputError("`camera`", "'" + name + "' is no name of a camera", "use letters, digits, -, _ and .");
     if (name == "calibration")
       throw InputError("`camera`", "'calibration' is the name of the result", "call the camera something else");
@@ -412,8 +408,8 @@ Calibration calibrate(const Path& out_folder, const Options& options) {
     for (View& view : views[c]) set_corners(view, recordings[c], out.board, bundle.cameras[c]);
     std::erase_if(views[c], [](const View& view) { return view.corners.size() < 4; });
   }
-  core::report({"calibrate", static_cast<std::int64_t>(count), static_cast<std::int64_t>(count) + 1, NAN, NAN,
-                "all together"});
+  core::report(
+      {"calibrate", static_cast<std::int64_t>(count), static_cast<std::int64_t>(count) + 1, NAN, NAN, "all together"});
   std::vector<bool> placed(count, true);
   const auto all_views = [&] {
     std::vector<View> all;
@@ -430,9 +426,9 @@ Calibration calibrate(const Path& out_folder, const Options& options) {
   } else {
     bundle.moments = grouped(all_views(), bundle.clocks, interval);
     placed = chain_cameras(bundle);
-    out.world = options.world == World::board
-                    ? "the board's frame where " + recordings[0].name + " sees it first (x right, y up the page, z out of it)"
-                    : "the frame of " + recordings[0].name;
+    out.world = options.world == World::board ? "the board's frame where " + recordings[0].name +
+                                                    " sees it first (x right, y up the page, z out of it)"
+                                              : "the frame of " + recordings[0].name;
     if (options.world == World::board) turn_to_board(bundle);
   }
   out.notes.push_back("poses are in " + out.world);

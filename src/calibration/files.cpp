@@ -46,9 +46,9 @@ Json list(const Vector3& v) { return {v.x(), v.y(), v.z()}; }
 // As in capture.json, without images and times.
 Json camera_json(const CameraResult& result) {
   const capture::Camera& camera = result.camera;
-  Json json{{"name", camera.name}, {"width", camera.width}, {"height", camera.height},
-            {"fx", camera.fx},     {"fy", camera.fy},       {"cx", camera.cx},
-            {"cy", camera.cy},     {"distortion", camera.distortion}};
+  Json json{
+      {"name", camera.name}, {"width", camera.width}, {"height", camera.height}, {"fx", camera.fx},
+      {"fy", camera.fy},     {"cx", camera.cx},       {"cy", camera.cy},         {"distortion", camera.distortion}};
   if (result.placed) json["world_from_camera"] = pose_json(camera.world_from_camera);
   return json;
 }
@@ -84,7 +84,8 @@ Path draw(const Path& out, const Recording& recording, const Bundle& bundle, int
   const math::MatrixX r = residuals(bundle, *moment, *worst, nullptr);
   for (Eigen::Index i = 0; i < r.cols(); ++i) {
     const Vector2& at = worst->corners[i].pixel;
-    for (int k = 0; k < 40; ++k) dot(image, at + kCircle * Vector2(std::cos(k * M_PI / 20), std::sin(k * M_PI / 20)), kGreen);
+    for (int k = 0; k < 40; ++k)
+      dot(image, at + kCircle * Vector2(std::cos(k * M_PI / 20), std::sin(k * M_PI / 20)), kGreen);
     if (!r.col(i).allFinite()) continue;
     const Vector2 computed = at + r.col(i);
     line(image, at, at + kLonger * r.col(i), kYellow);

@@ -12,14 +12,13 @@ using math::Vector2;
 
 namespace {
 
-constexpr int kBatch = 32;               // frames that are held at once
-constexpr int kOtherLooks = 12;          // frames in which other families are sought
-constexpr double kMoved = 0.004;         // of the image's width: less is the same view again
-constexpr double kUnlike = 0.02;         // the same, between any two views without a robot
-constexpr std::size_t kMostViews = 250;  // of a camera
-constexpr int kEnough = 20;              // moments for each camera, before faster motion is let in
+constexpr int kBatch = 32;                              // frames that are held at once
+constexpr int kOtherLooks = 12;                         // frames in which other families are sought
+constexpr double kMoved = 0.004;                        // of the image's width: less is the same view again
+constexpr double kUnlike = 0.02;                        // the same, between any two views without a robot
+constexpr std::size_t kMostViews = 250;                 // of a camera
+constexpr int kEnough = 20;                             // moments for each camera, before faster motion is let in
 constexpr double kStill[] = {0.5, 1.0, 2.0, 4.0, 1e9};  // px from frame to frame
-
 
 // Mean distance of the tags' corners that both frames have, px; infinite where they have none in common.
 double distance(const Frame& a, const Frame& b) {
@@ -119,7 +118,7 @@ Recording open_recording(const CameraRequest& request, const std::string& time_u
       throw InputError("`rate`", core::exact(rate) + " frames per second are not supported", "give 0.1 to 1e6");
     for (int k = 0; k < frames; ++k) out.times.push_back(request.start.value_or(0.0) - origin + k / rate);
     note = core::brief(rate) + " frames per second" +
-           (request.rate            ? ""
+           (request.rate           ? ""
             : out.media.rate > 0.0 ? " by the video's header"
                                    : ", assumed, since images have no rate") +
            (request.find_start ? ", start to be found"
@@ -155,9 +154,8 @@ void look(std::vector<Recording>& recordings, const Board& board) {
     const auto flush = [&] {
       std::vector<std::vector<Tag>> found(batch.size());
       std::vector<std::map<int, int>> strangers(batch.size());
-      core::parallel_for(static_cast<std::int64_t>(batch.size()), [&](std::int64_t i) {
-        found[i] = find_tags(batch[i].second, board, strangers[i]);
-      });
+      core::parallel_for(static_cast<std::int64_t>(batch.size()),
+                         [&](std::int64_t i) { found[i] = find_tags(batch[i].second, board, strangers[i]); });
       for (std::size_t i = 0; i < batch.size(); ++i) {
         for (const auto& [id, count] : strangers[i]) others[id] += count;
         if (found[i].size() >= fewest)
@@ -195,15 +193,14 @@ std::vector<View> thinned(const Recording& recording, int camera) {
 
 std::vector<Moment> grouped(std::vector<View> views, const std::vector<double>& clocks, double interval) {
   const auto time = [&](const View& view) { return view.time + clocks[view.camera]; };
-  std::sort(views.begin(), views.end(), [&](const View& a, const View& b) {
-    return time(a) != time(b) ? time(a) < time(b) : a.camera < b.camera;
-  });
+  std::sort(views.begin(), views.end(),
+            [&](const View& a, const View& b) { return time(a) != time(b) ? time(a) < time(b) : a.camera < b.camera; });
   std::vector<Moment> moments;
   double begin = -std::numeric_limits<double>::infinity();
   for (View& view : views) {
-    const bool other = time(view) - begin > 0.5 * interval ||
-                       std::any_of(moments.back().views.begin(), moments.back().views.end(),
-                                   [&](const View& v) { return v.camera == view.camera; });
+    const bool other =
+        time(view) - begin > 0.5 * interval || std::any_of(moments.back().views.begin(), moments.back().views.end(),
+                                                           [&](const View& v) { return v.camera == view.camera; });
     if (other) moments.emplace_back(), begin = time(view);
     moments.back().views.push_back(std::move(view));
   }

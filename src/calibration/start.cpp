@@ -16,12 +16,12 @@ using math::VectorX;
 
 namespace {
 
-constexpr double kLeastTurn = 0.1;         // rad, between two views whose turns tell the clock
-constexpr double kClockStep = 0.01;        // s
-constexpr double kTurnStep = 0.005;       // s, at which the robot's turns are looked up
-constexpr double kTurnError = 0.01;        // rad, of a good view
-constexpr double kDistinct = 2.0;          // the best clock's misfit must be less than that of others by this factor
-constexpr double kOtherClock = 0.2;        // s: this far away is another clock
+constexpr double kLeastTurn = 0.1;   // rad, between two views whose turns tell the clock
+constexpr double kClockStep = 0.01;  // s
+constexpr double kTurnStep = 0.005;  // s, at which the robot's turns are looked up
+constexpr double kTurnError = 0.01;  // rad, of a good view
+constexpr double kDistinct = 2.0;    // the best clock's misfit must be less than that of others by this factor
+constexpr double kOtherClock = 0.2;  // s: this far away is another clock
 constexpr double kDegree = std::numbers::pi / 180.0;
 
 // Homography from the board's plane to the image, both in the given coordinates; by the direct linear transformation.
@@ -48,8 +48,8 @@ std::optional<Matrix3> homography(const std::vector<Vector2>& board, const std::
   const Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, 9, 9>> axes(sum);
   if (!(axes.eigenvalues()(1) > 1e-10 * axes.eigenvalues()(8))) return {};
   const Eigen::Matrix<double, 9, 1> h = axes.eigenvectors().col(0);
-  const Matrix3 out = from_image.inverse() * Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>>(h.data()) *
-                      from_board;
+  const Matrix3 out =
+      from_image.inverse() * Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>>(h.data()) * from_board;
   if (!out.allFinite()) return {};
   return out;
 }
@@ -107,8 +107,7 @@ Pose middle_pose(const std::vector<Pose>& poses, double arm) {
   for (std::size_t i = 0; i < poses.size(); ++i) {
     double sum = 0.0;
     for (const Pose& other : poses)
-      sum += (poses[i].translation - other.translation).norm() +
-             arm * angle_between(poses[i].rotation, other.rotation);
+      sum += (poses[i].translation - other.translation).norm() + arm * angle_between(poses[i].rotation, other.rotation);
     if (sum < least) least = sum, best = i;
   }
   return poses[best];
@@ -189,8 +188,8 @@ std::optional<HandEye> hand_eye(const std::vector<Placed>& views, const trajecto
       Eigen::Matrix<double, 3, 6> row;
       row << Matrix3::Identity(), -flanges[i].rotation;
       normal += row.transpose() * row;
-      right += row.transpose() * (flanges[i].translation -
-                                  out.world_from_camera.rotation * views[i].camera_from_board.translation);
+      right += row.transpose() *
+               (flanges[i].translation - out.world_from_camera.rotation * views[i].camera_from_board.translation);
     }
     const VectorX t = normal.ldlt().solve(right);
     if (!t.allFinite()) return {};

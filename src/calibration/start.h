@@ -1,4 +1,5 @@
-// src/calibration/start.h - where the joint fit begins: closed forms that are good to a few percent (mathematics.md 9.1).
+// src/calibration/start.h - where the joint fit begins: closed forms that are good to a few percent
+// (mathematics.md 12.1).
 #pragma once
 #include <optional>
 #include <vector>

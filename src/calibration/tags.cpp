@@ -21,19 +21,20 @@ using math::Vector2;
 
 namespace {
 
-constexpr int kCorrectedBits = 1;        // more lets chance through
-constexpr double kClearest = 35.0;       // gray levels between a bit and the threshold; what is less is no tag
+constexpr int kCorrectedBits = 1;         // more lets chance through
+constexpr double kClearest = 35.0;        // gray levels between a bit and the threshold; what is less is no tag
 constexpr int kLargeImage = 1600 * 1200;  // px; in larger ones quads are sought at half the size
-constexpr double kEnds = 0.15;           // of an edge, at either end, that are not measured: the corner rounds it
-constexpr double kWindow = 0.45;         // of a cell: how far from the edge is looked; then comes another edge
+constexpr double kEnds = 0.15;            // of an edge, at either end, that are not measured: the corner rounds it
+constexpr double kWindow = 0.5;           // of a cell: how far from the edge is looked
 constexpr double kWidestWindow = 4.0, kNarrowestWindow = 1.2;  // px
 constexpr double kStep = 0.25;                                 // px, between samples across the edge
 constexpr int kRounds = 12;                                    // of centering the window
 constexpr double kCentered = 0.003;                            // px
 constexpr double kLeastContrast = 20.0;                        // gray levels across an edge
-constexpr std::size_t kFewestPoints = 5;                       // of an edge
-constexpr double kOutlier = 3.5;                               // standard deviations from the line
-constexpr double kFloor = 0.02;                                // px: what light and blur do to a line as a whole
+constexpr int kDepth = 3;                 // cells behind an edge that blur may bring into its window
+constexpr std::size_t kFewestPoints = 5;  // of an edge
+constexpr double kOutlier = 3.5;          // standard deviations from the line
+constexpr double kFloor = 0.02;           // px: what light and blur do to a line as a whole
 
 struct Family {
   const char* name;
@@ -86,34 +87,76 @@ double intensity(const Gray& image, const Vector2& at) {
   return (1 - v) * ((1 - u) * p[0] + u * p[1]) + v * ((1 - u) * p[image.width] + u * p[image.width + 1]);
 }
 
-// How far along `outward` (unit) from `from` the step from black to white is: the center of gravity of the slope, in a
-// bell-shaped window that is centered on it. Blur that is alike on both sides does not move it. NaN: there is none.
-double step_along(const Gray& image, const Vector2& from, const Vector2& outward, double window) {
+double bell(double s, double sigma) {
+  return std::exp(-0.5 * s * s / (sigma * sigma)) / (sigma * std::sqrt(2.0 * M_PI));
+}
+double ramp(double s, double sigma) { return 0.5 * std::erfc(-s / (sigma * M_SQRT2)); }
+
+// The steps of brightness behind an edge, deeper in the tag, which blur brings into the window.
+struct Behind {
+  double cell = 0.0;                  // px, between them
+  std::array<double, kDepth> rise{};  // of brightness, outward, at 1, 2, ... cells inside; of the edge's own
+};
+struct Step {
+  double at = NAN;    // px, along the normal
+  double blur = NAN;  // px, standard deviation of the slope
+};
+
+// Where along `outward` (unit) from `from` the step from black to white is: the center of gravity of the slope, in a
+// bell-shaped window that is centered on it, without the slopes of the steps behind it under a blur of `blur` (0: not
+// known). Blur that is alike on both sides does not move it.
+Step step_along(const Gray& image, const Vector2& from, const Vector2& outward, double window, const Behind& behind,
+                double blur) {
   const int half = static_cast<int>(std::ceil(window / kStep));
+  const double narrow = 0.25 * window * window;  // variance of the window
+  Step out;
   double at = 0.0;
   for (int round = 0; round < kRounds; ++round) {
-    double sum = 0.0, moment = 0.0, square = 0.0, weights = 0.0, contrast = 0.0;
+    double sum = 0.0, moment = 0.0, square = 0.0, contrast = 0.0, own = 0.0, other = 0.0, other_moment = 0.0;
     double before = intensity(image, from + (at - (half + 0.5) * kStep) * outward);
     for (int i = -half; i <= half; ++i) {
       const double after = intensity(image, from + (at + (i + 0.5) * kStep) * outward);
       const double s = i * kStep, slope = after - before, w = std::exp(-2.0 * s * s / (window * window));
-      sum += w * slope, moment += w * slope * s, square += w * slope * s * s, weights += w, contrast += slope;
+      sum += w * slope, moment += w * slope * s, square += w * slope * s * s, contrast += slope;
       before = after;
+      if (!(blur > 0.0)) continue;
+      own += w * bell(s, blur);
+      for (int k = 0; k < kDepth; ++k) {
+        const double extra = behind.rise[k] * bell(s + (k + 1) * behind.cell, blur);
+        other += w * extra, other_moment += w * extra * s;
+      }
     }
-    if (!(contrast > kLeastContrast) || !(sum > 0.0)) return NAN;
+    if (!(contrast > kLeastContrast) || !(sum > 0.0)) return {};
+    double variance = std::clamp(square / sum, 0.0, 0.9 * narrow);
+    if (blur > 0.0) {
+      const double size = sum / (own + other);  // brightness of the edge's own step, by the sample's length
+      moment -= size * other_moment, sum -= size * other;
+      variance = std::min(1.0 / (1.0 / (blur * blur) + 1.0 / narrow), 0.9 * narrow);
+      if (!(sum > 0.0)) return {};
+    }
     // the window draws the center of gravity to its own middle: by as much as it narrows the slope
-    const double variance = std::clamp(square / sum, 0.0, 0.9 * 0.25 * window * window);
-    const double move = moment / sum / (1.0 - variance / (0.25 * window * window));
+    const double move = moment / sum / (1.0 - variance / narrow);
     at += std::clamp(move, -0.5 * window, 0.5 * window);
-    if (!(std::abs(at) < 1.5 * window)) return NAN;
-    if (std::abs(move) < kCentered) return at;
+    if (!(std::abs(at) < 1.5 * window)) return {};
+    if (std::abs(move) >= kCentered) continue;
+    out.at = at, out.blur = 1.0 / std::sqrt(std::max(1.0 / variance - 1.0 / narrow, 1e-3));
+    break;
   }
-  return NAN;
+  return out;
 }
 
 double cross(const Vector2& a, const Vector2& b) { return a.x() * b.y() - a.y() * b.x(); }
 
-std::vector<Vector2> edge_points(const Gray& image, const std::array<Vector2, 4>& quad, int k) {
+// Whether the cell is white that lies `along` an edge from its first corner and `deep` in the tag.
+bool white(const std::array<bool, kCells * kCells>& black, int edge, int along, int deep) {
+  const int last = kCells - 1;
+  const int row = edge == 0 ? last - deep : edge == 1 ? last - along : edge == 2 ? deep : along;
+  const int column = edge == 0 ? along : edge == 1 ? last - deep : edge == 2 ? last - along : deep;
+  return !black[row * kCells + column];
+}
+
+std::vector<Vector2> edge_points(const Gray& image, const Tag& tag, int k) {
+  const std::array<Vector2, 4>& quad = tag.rough;
   const Vector2 a = quad[k], b = quad[(k + 1) % 4], along = b - a;
   const double length = along.norm();
   if (!(length > 1.0)) return {};
@@ -124,11 +167,37 @@ std::vector<Vector2> edge_points(const Gray& image, const std::array<Vector2, 4>
   const double cell = 0.5 * (std::abs(cross(along, c - a)) + std::abs(cross(along, d - a))) / length / kCells;
   const double window = std::clamp(kWindow * cell, kNarrowestWindow, kWidestWindow);
   const int count = static_cast<int>(std::clamp((1.0 - 2.0 * kEnds) * length, 1.0, 100.0));
+  const auto place = [&](int i) { return kEnds + (1.0 - 2.0 * kEnds) * (i + 0.5) / count; };
+  const auto black = black_cells(tag.id);
+  // brightness of the tag behind the edge, blurred along it
+  const auto behind = [&](int i, double blur) {
+    Behind out{cell, {}};
+    double outer = 0.0;
+    for (int deep = 1; deep <= kDepth; ++deep) {
+      double light = 0.0;
+      for (int cell_along = 0; cell_along < kCells; ++cell_along)
+        if (white(black, k, cell_along, deep)) {
+          const double u = (place(i) - cell_along / double(kCells)) * length;
+          light += blur > 0.0 ? ramp(u, blur) - ramp(u - length / kCells, blur) : u >= 0 && u < length / kCells;
+        }
+      out.rise[deep - 1] = outer - light;
+      outer = light;
+    }
+    return out;
+  };
+  // first where black reaches deeper than the border: there is no other step, and the blur is seen
+  std::vector<double> blurs;
+  for (int i = 0; i < count; ++i)
+    if (behind(i, 0.3 * cell).rise[0] > -0.1)
+      if (const Step step = step_along(image, a + place(i) * along, outward, window, {cell, {}}, 0.0);
+          std::isfinite(step.at))
+        blurs.push_back(step.blur);
+  const double blur = blurs.empty() ? 0.0 : std::clamp(math::median(blurs), 0.3, 0.5 * cell);
   std::vector<Vector2> points;
   for (int i = 0; i < count; ++i) {
-    const Vector2 from = a + (kEnds + (1.0 - 2.0 * kEnds) * (i + 0.5) / count) * along;
-    const double s = step_along(image, from, outward, window);
-    if (std::isfinite(s)) points.push_back(from + s * outward);
+    const Vector2 from = a + place(i) * along;
+    const Step step = step_along(image, from, outward, window, behind(i, blur), blur);
+    if (std::isfinite(step.at)) points.push_back(from + step.at * outward);
   }
   if (2 * points.size() < static_cast<std::size_t>(count) || points.size() < kFewestPoints) points.clear();
   return points;
@@ -175,32 +244,38 @@ Gray gray(const capture::Image8& image) {
   out.pixels.resize(static_cast<std::size_t>(image.width) * image.height);
   for (std::size_t i = 0; i < out.pixels.size(); ++i) {
     const std::uint8_t* p = &image.pixels[i * image.channels];
-    out.pixels[i] = image.channels >= 3 ? static_cast<std::uint8_t>((77 * p[0] + 150 * p[1] + 29 * p[2] + 128) >> 8)
-                                        : p[0];
+    out.pixels[i] =
+        image.channels >= 3 ? static_cast<std::uint8_t>((77 * p[0] + 150 * p[1] + 29 * p[2] + 128) >> 8) : p[0];
   }
   return out;
 }
 
-int tags_in_family() {
-  static const int count = [] {
+namespace {
+
+using Cells = std::array<bool, kCells * kCells>;
+
+// All tags of the family. All is black, the border of one cell too, but for a code's ones, of which the first is the
+// highest.
+const std::vector<Cells>& all_cells() {
+  static const std::vector<Cells> all = [] {
     const FamilyPointer tags(kFamily.create(), kFamily.destroy);
-    return static_cast<int>(tags->ncodes);
+    CHAINSPLAT_CHECK(tags->width_at_border == kCells, std::to_string(tags->width_at_border));
+    std::vector<Cells> out(tags->ncodes);
+    for (std::uint32_t id = 0; id < tags->ncodes; ++id) {
+      out[id].fill(true);
+      for (std::uint32_t bit = 0; bit < tags->nbits; ++bit)
+        if (tags->codes[id] >> (tags->nbits - 1 - bit) & 1)
+          out[id][tags->bit_y[bit] * kCells + tags->bit_x[bit]] = false;
+    }
+    return out;
   }();
-  return count;
+  return all;
 }
 
-std::array<bool, kCells * kCells> black_cells(int id) {
-  const FamilyPointer tags(kFamily.create(), kFamily.destroy);
-  CHAINSPLAT_CHECK(id >= 0 && id < static_cast<int>(tags->ncodes), std::to_string(id));
-  // all is black, its border of one cell too, but for the code's ones, of which the first is the highest
-  std::array<bool, kCells * kCells> black;
-  black.fill(true);
-  CHAINSPLAT_CHECK(tags->width_at_border == kCells, std::to_string(tags->width_at_border));
-  for (std::uint32_t bit = 0; bit < tags->nbits; ++bit)
-    if (tags->codes[id] >> (tags->nbits - 1 - bit) & 1)
-      black[tags->bit_y[bit] * kCells + tags->bit_x[bit]] = false;
-  return black;
-}
+}  // namespace
+
+int tags_in_family() { return static_cast<int>(all_cells().size()); }
+Cells black_cells(int id) { return all_cells().at(id); }
 
 std::vector<Tag> find_tags(const Gray& image, const Board& board, std::map<int, int>& others) {
   std::map<int, std::vector<Found>> by_id;
@@ -210,7 +285,7 @@ std::vector<Tag> find_tags(const Gray& image, const Board& board, std::map<int, 
     if (!board.has(id)) others[id] += 1;
     if (!board.has(id) || found.size() != 1) continue;
     Tag tag{id, found[0].corners, {}};
-    for (int k = 0; k < 4; ++k) tag.edges[k] = edge_points(image, tag.rough, k);
+    for (int k = 0; k < 4; ++k) tag.edges[k] = edge_points(image, tag, k);
     tags.push_back(std::move(tag));
   }
   return tags;

@@ -25,8 +25,8 @@ int tags_in_family();
 // corner k + 1.
 struct Tag {
   int id = 0;
-  std::array<math::Vector2, 4> rough;                // the corners as the detector has them, px
-  std::array<std::vector<math::Vector2>, 4> edges;   // empty where the edge is not sharp enough
+  std::array<math::Vector2, 4> rough;               // the corners as the detector has them, px
+  std::array<std::vector<math::Vector2>, 4> edges;  // empty where the edge is not sharp enough
 };
 // Tags of the board, in the order of their numbers; one that is seen twice is left out. Adds the numbers of tags of the
 // family that the board does not have to `others`.

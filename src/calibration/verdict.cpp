@@ -23,8 +23,8 @@ constexpr Limit kRobotPosition{0.0015, 0.005};
 constexpr Limit kRobotRotation{0.2, 1.0};  // degrees
 constexpr double kClock = 0.003;           // s
 constexpr int kFewViews = 15, kTooFewViews = 4;
-constexpr double kTilted = 20.0, kTurned = 10.0;   // degrees
-constexpr double kDisagree = 1.5, kApart = 0.1;  // ratio to the camera alone, and px
+constexpr double kTilted = 20.0, kTurned = 10.0;  // degrees
+constexpr double kDisagree = 1.5, kApart = 0.1;   // ratio to the camera alone, and px
 constexpr double kDegrees = 180.0 / std::numbers::pi;
 
 std::string text(const char* format, auto... values) {
@@ -59,9 +59,10 @@ void judge(Calibration& calibration, const std::vector<Evidence>& evidence, doub
                camera.views == 1 ? "view" : "views"));
     if (camera.tilt * kDegrees < kTilted)
       say(false, "no_tilt", name,
-          text("%s: the board was tilted by %.0f degrees at most: tilt it by 30 to 45 degrees to each side, which tells "
-               "the focal length",
-               name.c_str(), camera.tilt * kDegrees));
+          text(
+              "%s: the board was tilted by %.0f degrees at most: tilt it by 30 to 45 degrees to each side, which tells "
+              "the focal length",
+              name.c_str(), camera.tilt * kDegrees));
     const double focal = std::max(d.fx / camera.camera.fx, d.fy / camera.camera.fy);
     if (!(focal < kFocal.doubt))
       say(!(focal < kFocal.bad), "focal", name,

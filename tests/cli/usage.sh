@@ -8,7 +8,7 @@ expect_code 0 --version
 expect_output '^chainsplat [0-9]+\.[0-9]+\.[0-9]+$' --version
 run --help
 expect_code 0 --help
-for command in train recognize identify new import check mask rollout render eval export synth estimate force plan excite batch diff bench doctor; do
+for command in train recognize identify new calibrate import check mask rollout render eval export synth estimate force plan excite batch diff bench doctor; do
   expect_output "^ +$command " --help
   run "$command" --help
   expect_code 0 "$command --help"

@@ -7,8 +7,8 @@
 #include <nlohmann/json.hpp>
 #include <numbers>
 
-#include "chainsplat/calibration.h"
 #include "camera_options.h"
+#include "chainsplat/calibration.h"
 #include "cli.h"
 
 namespace chainsplat::tools {
@@ -84,8 +84,8 @@ std::string table(const calibration::Calibration& result) {
   if (result.robot) {
     const Eigen::Quaterniond q(result.flange_from_board.rotation);
     const math::Vector3 t = result.flange_from_board.translation;
-    out += text("board on the flange: %.5f,%.5f,%.5f,%.5f,%.5f,%.5f,%.5f +- %.2g mm, %.2g degrees\n", t.x(), t.y(), t.z(),
-                q.x(), q.y(), q.z(), q.w(), 1e3 * result.board_position_deviation.maxCoeff(),
+    out += text("board on the flange: %.5f,%.5f,%.5f,%.5f,%.5f,%.5f,%.5f +- %.2g mm, %.2g degrees\n", t.x(), t.y(),
+                t.z(), q.x(), q.y(), q.z(), q.w(), 1e3 * result.board_position_deviation.maxCoeff(),
                 result.board_rotation_deviation.maxCoeff() * kDegrees);
     out += text("robot and board scatter by %.2g mm and %.2g degrees\n", 1e3 * result.robot_position,
                 result.robot_rotation * kDegrees);
@@ -107,14 +107,17 @@ void calibrate(const Globals& globals, Request& request) {
     camera.name = word.substr(0, equals), camera.images = word.substr(equals + 1);
     options.cameras.push_back(std::move(camera));
   }
-  give_to_cameras<calibration::CameraRequest>(options.cameras, request.timestamps, "--timestamps",
-                  [](auto& camera, const std::string& value) { camera.stamps = importing::read_source(value); });
-  give_to_cameras<calibration::CameraRequest>(options.cameras, request.rates, "--rate",
-                  [](auto& camera, const std::string& value) { camera.rate = numbers(value, "--rate", 1)[0]; });
-  give_to_cameras<calibration::CameraRequest>(options.cameras, request.starts, "--start", [](auto& camera, const std::string& value) {
-    camera.find_start = value == "auto";
-    if (!camera.find_start) camera.start = numbers(value, "--start", 1)[0];
-  });
+  give_to_cameras<calibration::CameraRequest>(
+      options.cameras, request.timestamps, "--timestamps",
+      [](auto& camera, const std::string& value) { camera.stamps = importing::read_source(value); });
+  give_to_cameras<calibration::CameraRequest>(
+      options.cameras, request.rates, "--rate",
+      [](auto& camera, const std::string& value) { camera.rate = numbers(value, "--rate", 1)[0]; });
+  give_to_cameras<calibration::CameraRequest>(options.cameras, request.starts, "--start",
+                                              [](auto& camera, const std::string& value) {
+                                                camera.find_start = value == "auto";
+                                                if (!camera.find_start) camera.start = numbers(value, "--start", 1)[0];
+                                              });
   options.board = request.board;
   if (!request.base.empty()) options.log.base = importing::read_source(request.base);
   options.world = request.world == "board" ? calibration::World::board : calibration::World::camera;
@@ -149,7 +152,8 @@ void add_calibrate_command(CLI::App& app, const Globals& globals, Job& job) {
       "calibrate", "Intrinsics, poses and clocks of cameras from videos of a printed board; the board itself");
   auto request = std::make_shared<Request>();
   calibration::Options& options = request->options;
-  command->add_option("OUT", request->out, "Folder for the result: NAME.json of every camera, calibration.json, pictures");
+  command->add_option("OUT", request->out,
+                      "Folder for the result: NAME.json of every camera, calibration.json, pictures");
   const auto several = [&](const char* name, std::vector<std::string>& into, const char* help, const char* type) {
     command->add_option(name, into, help)->type_name(type)->allow_extra_args(false);
   };
@@ -157,13 +161,15 @@ void add_calibrate_command(CLI::App& app, const Globals& globals, Job& job) {
           "NAME=VIDEO");
   command->add_option("--board", request->board, "The board, as --board-svg writes it")->type_name("FILE.json");
   command
-      ->add_option("--base", request->base,
-                   "Log of the robot that moved the board, as of import: TUM, or a table with named columns.\nThe poses "
-                   "are then in its world (default: a hand moved it)")
+      ->add_option(
+          "--base", request->base,
+          "Log of the robot that moved the board, as of import: TUM, or a table with named columns.\nThe poses "
+          "are then in its world (default: a hand moved it)")
       ->type_name("FILE[#NAME]");
   command
-      ->add_option("--world", request->world,
-                   "Without --base, whose frame the poses are in: camera (the first), or board (where it is seen first)")
+      ->add_option(
+          "--world", request->world,
+          "Without --base, whose frame the poses are in: camera (the first), or board (where it is seen first)")
       ->check(CLI::IsMember({"camera", "board"}));
   several("--timestamps", request->timestamps, "Times of its frames, one per line or a table's column",
           "NAME=FILE[#COLUMN]");
@@ -176,9 +182,11 @@ void add_calibrate_command(CLI::App& app, const Globals& globals, Job& job) {
       ->type_name("time=NAME,...");
   command->add_option("--urdf", options.log.urdf, "The arm, where the log has its joint angles")->type_name("FILE");
   command->add_option("--flange", options.log.flange, "Link of the URDF (default: the last one)")->type_name("LINK");
-  command->add_option("--base-unit", options.log.base_unit, "Of the log's positions: m, cm, mm (default: by name or size)");
+  command->add_option("--base-unit", options.log.base_unit,
+                      "Of the log's positions: m, cm, mm (default: by name or size)");
   command->add_option("--time-unit", options.log.time_unit, "Of all stamps: s, ms, us, ns (default: by name or size)");
-  command->add_option("--angle-unit", options.log.angle_unit, "Of the log's angles: rad, deg (default: by name or size)");
+  command->add_option("--angle-unit", options.log.angle_unit,
+                      "Of the log's angles: rad, deg (default: by name or size)");
   command->add_option("--rotation", options.log.rotation,
                       "What rx, ry, rz are: rotvec, rpy (default: rotvec in rad, rpy in deg)");
   command->add_option("--board-svg", request->svg, "Write a board to print, and FILE.json beside it; nothing else")

@@ -5,8 +5,8 @@
 #include <memory>
 #include <nlohmann/json.hpp>
 
-#include "chainsplat/importing.h"
 #include "camera_options.h"
+#include "chainsplat/importing.h"
 #include "cli.h"
 
 namespace chainsplat::tools {
@@ -53,22 +53,30 @@ void read_cameras(Request& request) {
     camera.images = text.substr(equals + 1);
     cameras.push_back(camera);
   }
-  give_to_cameras<importing::CameraRequest>(cameras, request.calibrations, "--calibration", [](auto& camera, const std::string& text) { camera.calibration = importing::read_source(text); });
-  give_to_cameras<importing::CameraRequest>(cameras, request.masks, "--masks", [](auto& camera, const std::string& text) { camera.masks = text; });
-  give_to_cameras<importing::CameraRequest>(cameras, request.timestamps, "--timestamps", [](auto& camera, const std::string& text) { camera.timestamps = text; });
-  give_to_cameras<importing::CameraRequest>(cameras, request.rates, "--rate", [](auto& camera, const std::string& text) { camera.rate = numbers(text, "--rate", 1)[0]; });
-  give_to_cameras<importing::CameraRequest>(cameras, request.starts, "--start", [](auto& camera, const std::string& text) {
-    camera.find_start = text == "auto";
-    if (!camera.find_start) camera.start = numbers(text, "--start", 1)[0];
-  });
-  give_to_cameras<importing::CameraRequest>(cameras, request.poses_of, "--pose", [](auto& camera, const std::string& text) {
-    const importing::Source source = importing::read_source(text);
-    std::error_code error;
-    if (!std::filesystem::exists(source.file, error) && std::count(text.begin(), text.end(), ',') == 6)
-      camera.world_from_camera = importing::read_frame(text, "--pose");
-    else
-      camera.pose = source;
-  });
+  give_to_cameras<importing::CameraRequest>(
+      cameras, request.calibrations, "--calibration",
+      [](auto& camera, const std::string& text) { camera.calibration = importing::read_source(text); });
+  give_to_cameras<importing::CameraRequest>(cameras, request.masks, "--masks",
+                                            [](auto& camera, const std::string& text) { camera.masks = text; });
+  give_to_cameras<importing::CameraRequest>(cameras, request.timestamps, "--timestamps",
+                                            [](auto& camera, const std::string& text) { camera.timestamps = text; });
+  give_to_cameras<importing::CameraRequest>(
+      cameras, request.rates, "--rate",
+      [](auto& camera, const std::string& text) { camera.rate = numbers(text, "--rate", 1)[0]; });
+  give_to_cameras<importing::CameraRequest>(cameras, request.starts, "--start",
+                                            [](auto& camera, const std::string& text) {
+                                              camera.find_start = text == "auto";
+                                              if (!camera.find_start) camera.start = numbers(text, "--start", 1)[0];
+                                            });
+  give_to_cameras<importing::CameraRequest>(
+      cameras, request.poses_of, "--pose", [](auto& camera, const std::string& text) {
+        const importing::Source source = importing::read_source(text);
+        std::error_code error;
+        if (!std::filesystem::exists(source.file, error) && std::count(text.begin(), text.end(), ',') == 6)
+          camera.world_from_camera = importing::read_frame(text, "--pose");
+        else
+          camera.pose = source;
+      });
 }
 
 void import_capture(const Globals& globals, Request& request) {
