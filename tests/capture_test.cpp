@@ -366,6 +366,16 @@ TEST_CASE("undistortion: straight pixels, masks, and edges that are not darkened
       }
     CHECK(wrong < 0.06 * object);  // only edge pixels may differ
   }
+  // a frame that is in memory gives the same view
+  const Capture straight = made.load(options);
+  const Image8 picture = capture::read_image8(made.path() / numbered("cam0", 1));
+  const Image8 coverage = capture::read_image8(made.path() / numbered("masks/cam0", 1));
+  const View from_memory = capture::view_of(straight.cameras[0], picture, coverage);
+  CHECK(from_memory.rgba == straight.views[1].rgba);
+  CHECK(from_memory.x0 == straight.views[1].x0);
+  CHECK(from_memory.y0 == straight.views[1].y0);
+  CHECK(capture::view_of(straight.cameras[0], picture, filled(1, [](int, int) { return std::array<double, 3>{}; })).width == 0);
+  CHECK_THROWS_AS(capture::view_of(straight.cameras[0], coverage, coverage), InputError);
   // without undistortion the pixels are those of the files
   options.undistort = false;
   const Capture recorded = made.load(options);

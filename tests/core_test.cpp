@@ -1,4 +1,5 @@
 #include "chainsplat/core.h"
+#include "chainsplat/json.h"
 #include "chainsplat/text.h"
 
 #include <doctest/doctest.h>

@@ -149,6 +149,10 @@ struct Image8 {
   std::vector<std::uint8_t> pixels;
 };
 Image8 read_image8(const Path& file);
+// A frame that is in memory already, as a view: the undistorted crop of a recorded picture (RGB) about its mask (one
+// channel, 128 and more: the object). Where the mask is empty the view is (width 0). `margin`: as in LoadOptions. Throws
+// InputError for pictures that are not of the camera's size.
+View view_of(const Camera& camera, const Image8& picture, const Image8& mask, int margin = 24);
 void write_png(const Path& file, const Image8& image);
 void write_depth_exr(const Path& file, int width, int height, const std::vector<float>& meters);
 // Writes 16-bit values, value x scale = m; 0 stands for none (depths that are <= 0 or do not fit).

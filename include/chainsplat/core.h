@@ -8,7 +8,6 @@
 #include <cstdint>
 #include <filesystem>
 #include <functional>
-#include <nlohmann/json_fwd.hpp>
 #include <stdexcept>
 #include <string>
 #include <string_view>
@@ -79,7 +78,7 @@ struct Listener {
   std::function<void(const std::string&)> message;  // one line, what was found or done
   std::function<void(const std::string&)>
       detail;  // the same for who wants to know more: seconds of a stage, the device
-  std::function<void(const nlohmann::ordered_json&)> record;  // for a log, beside progress: how a stage's fit ended
+  std::function<void(const std::string&)> record;  // a JSON object for a log, beside progress: how a stage's fit ended
   std::function<bool()> stop;  // asked after every progress: true ends the work as SIGINT does, with a checkpoint
 };
 // One listener for the whole process; the default hears nothing. May be called from any thread, as those below.
@@ -99,7 +98,7 @@ class ListenerScope {
 void warn(const std::string& line);  // one line that names the assumption made
 void say(const std::string& line);
 void say_more(const std::string& line);
-void record(const nlohmann::ordered_json& entry);
+void record(const std::string& json);
 void report(const Progress& progress);
 
 // The tool's signal handler sets the request, and long work polls it between its steps.
@@ -124,13 +123,6 @@ void make_folder(const Path& folder);
 // Returns the whole file. Throws InputError that names `path` when the file is missing, unreadable or larger than 1 GiB
 // (the bound exists because a pipe or device may never end).
 std::string read_file(const Path& path);
-// Parses JSON from outside with a bound on its nesting: the JSON library frees, copies and prints a document by
-// recursion, so a file of nothing but brackets would overflow the stack. Throws nlohmann::json::exception when the text
-// is not JSON, has a number beyond double, or is nested deeper than kDeepestJson.
-constexpr int kDeepestJson = 64;
-nlohmann::ordered_json parse_json(std::string_view text);
-// As parse_json(), but returns a value whose is_discarded() is true instead of throwing.
-nlohmann::ordered_json parse_json_or_discard(std::string_view text);
 // One line of a table of comma-separated numbers, without its line end and trailing spaces.
 struct TableLine {
   int number;  // in the file, counted from 1

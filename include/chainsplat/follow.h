@@ -1,9 +1,10 @@
-// chainsplat/follow.h - a rope followed frame by frame: frames from a capture, a video, a V4L2 device or standard
-// input, and an estimate for each.
+// chainsplat/follow.h - a rope followed frame by frame, and an estimate for each: frames that a program of one's own
+// has in memory (Tracker), or those of a capture, a video, a V4L2 device or standard input (Follower).
 #pragma once
 #include <functional>
 #include <memory>
 #include <optional>
+#include <span>
 #include <string>
 #include <vector>
 
@@ -57,6 +58,44 @@ FrameSource open_frames(const SourceOptions& options);
 // newton: outlines, then the colors inside them, drawn on the device; silhouette: outlines alone, without a device;
 // adam: the paper's, ten Adam steps on the rendering loss from the last frame's angles, without deviations.
 enum class Solver { newton, silhouette, adam };
+
+struct TrackerOptions {
+  std::optional<Solver> solver;     // none: newton, and silhouette where there is no device
+  std::string device;               // Vulkan device, its number or a part of its name; empty: chosen
+  std::string name = "the frames";  // whose they are, in messages
+};
+
+// Follows a rope through frames that come from anywhere, one moment after the other. One thread at a time.
+class Tracker {
+ public:
+  // `cameras`: as they are believed to be (as_corrected()). `base` is asked at times up to a frame's own, by any
+  // thread; before `start`, s, the rope is taken to rest. `unverified`: by camera, as as_corrected() says; empty: none.
+  // Throws InputError for a twin without states or Gaussians that the solver needs, and where there is no such device.
+  Tracker(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
+          double start, const TrackerOptions& options = {}, const std::vector<char>& unverified = {});
+  ~Tracker();
+  Tracker(Tracker&&) noexcept;
+  Tracker& operator=(Tracker&&) noexcept;
+
+  // The next moment, seen by one camera or by several at nearly one time: undistorted crops with their masks
+  // (capture::view_of(), View::camera an index into `cameras`). Times increase. Throws InputError where they do not.
+  estimation::Estimate update(std::span<const capture::View> views);
+  // The view of a whole picture (RGB, as recorded) of the first camera, for update(): its mask is made here, from the
+  // twin's colors, or from what is not black where the first picture was masked before.
+  capture::View mask(const capture::Image8& picture, double time);
+
+  const twin::Twin& twin() const;
+  const dynamics::Model& model() const;
+  const std::vector<capture::Camera>& cameras() const;
+
+ private:
+  struct Implementation;
+  std::unique_ptr<Implementation> implementation_;
+};
+// Cameras as they were given, with what the twin knows of them. `unverified`, if not null, gets by camera whether the
+// twin was made with another calibration, which then stays as it is.
+std::vector<capture::Camera> as_corrected(const capture::Corrections& corrections, std::vector<capture::Camera> cameras,
+                                          std::vector<char>* unverified = nullptr);
 
 struct FollowOptions {
   SourceOptions source;

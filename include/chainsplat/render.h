@@ -49,6 +49,19 @@ capture::Image8 color_image(const Frame& frame, const capture::Camera& camera);
 capture::Image8 mask_image(const Frame& frame, const capture::Camera& camera);
 std::vector<float> depth_image(const Frame& frame, const capture::Camera& camera);
 
+// Whole images of many frames in one piece of memory each, image after image, row-major: for programs that draw into
+// memory. Black, 0 and no depth where nothing is drawn.
+struct Images {
+  int count = 0, width = 0, height = 0;
+  std::vector<std::uint8_t> rgb;   // count x height x width x 3
+  std::vector<std::uint8_t> mask;  // count x height x width, 255 or 0
+  std::vector<float> depth;        // count x height x width, m; empty unless asked for
+};
+// One image for each of `times`, s, also where the states do not cover it: then nothing is drawn.
+Images images(splat::Engine& engine, const splat::Gaussians& gaussians, const chain::Chain& chain,
+              const chain::States& states, const trajectory::Trajectory& base, const capture::Camera& camera,
+              const std::vector<double>& times, const Options& options = {});
+
 // Pixel rectangle [x0, x1) x [y0, y1) of the undistorted image outside which no replica's alpha reaches 1/255.
 struct Bounds {
   int x0 = 0, y0 = 0, x1 = 0, y1 = 0;

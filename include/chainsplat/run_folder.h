@@ -52,7 +52,7 @@ class ProgressLog {
  public:
   explicit ProgressLog(const Path& file);  // throws InputError where it cannot be opened
   void write(const core::Progress& progress);
-  void write(nlohmann::ordered_json entry);  // at once, with the seconds
+  void write(const std::string& json);  // an object, at once, with the seconds
 
  private:
   std::ofstream file_;

@@ -48,8 +48,6 @@ const char* name(Reason reason);         // as in JSON: "last_iteration"
 std::optional<Reason> reason_of(const std::string& name);
 // One line: "stopped at its last iteration (25): cost 3.1 to 1.2, last step 0.004".
 std::string describe(const Summary& summary);
-// {"reason", "iterations", "initial_cost", "final_cost", "worst_step"}; costs that are not known are null.
-void to_json(nlohmann::ordered_json& out, const Summary& summary);
 // Several fits told as one: the worst reason, the most iterations, the sums of the costs, the longest last step.
 Summary together(std::span<const Summary> fits);
 

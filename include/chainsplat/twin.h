@@ -31,7 +31,6 @@
 //   provenance      version, capture, capture_hash, options, seed, device, driver, durations { stage: s }
 #pragma once
 #include <map>
-#include <nlohmann/json_fwd.hpp>
 #include <optional>
 #include <string>
 #include <vector>
@@ -84,10 +83,6 @@ struct Twin {
   chain::States states;        // recognized, at every frame
   chain::States rollout;
 };
-
-// The findings and the corrections as twin.json has them.
-nlohmann::ordered_json to_json(const std::vector<capture::Finding>& verdict);
-nlohmann::ordered_json to_json(const capture::Corrections& corrections);
 
 // Writes twin.json, gaussians.ply, states.csv, rollout.csv (those that exist) and creates the folder. Each file is
 // replaced atomically, twin.json last. Throws WorkError. Doubles read back exactly. twin.json does not represent all

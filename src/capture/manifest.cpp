@@ -9,6 +9,7 @@
 #include <nlohmann/json.hpp>
 #include <set>
 
+#include "chainsplat/json.h"
 #include "chainsplat/text.h"
 
 namespace chainsplat::capture {

@@ -381,4 +381,25 @@ void add_depth(const Manifest& manifest, std::vector<View>& views) {
   });
 }
 
+View view_of(const Camera& camera, const Image8& picture, const Image8& mask, int margin) {
+  const auto check = [&](const char* what, const Image8& image, int channels) {
+    const std::size_t pixels = static_cast<std::size_t>(camera.width) * camera.height;
+    if (image.width == camera.width && image.height == camera.height && image.channels == channels &&
+        image.pixels.size() == pixels * channels)
+      return;
+    throw InputError(what,
+                     "is " + std::to_string(image.width) + "x" + std::to_string(image.height) + " pixels of " +
+                         std::to_string(image.channels) + " channels, and " + camera.name + " has " +
+                         std::to_string(camera.width) + "x" + std::to_string(camera.height) + " of " +
+                         std::to_string(channels),
+                     "give whole frames as they were recorded");
+  };
+  check("`picture`", picture, 3);
+  check("`mask`", mask, 1);
+  View view;
+  cut_mask(view, camera, mask.pixels, camera.distorted(), margin);
+  fill_color(view, camera, picture.pixels, camera.distorted());
+  return view;
+}
+
 }  // namespace chainsplat::capture

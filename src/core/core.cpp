@@ -103,9 +103,9 @@ void say_more(const std::string& line) {
   if (current_listener.detail) current_listener.detail(line);
 }
 
-void record(const nlohmann::ordered_json& entry) {
+void record(const std::string& json) {
   std::lock_guard lock(listener_mutex);
-  if (current_listener.record) current_listener.record(entry);
+  if (current_listener.record) current_listener.record(json);
 }
 
 void report(const Progress& progress) {

@@ -1,6 +1,7 @@
-#include <nlohmann/json.hpp>
+#include "chainsplat/json.h"
 
-#include "chainsplat/core.h"
+#include <nlohmann/json.hpp>
+#include <string>
 
 namespace chainsplat::core {
 

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "chainsplat/core.h"
+#include "chainsplat/json.h"
 
 namespace chainsplat::estimation {
 

@@ -8,6 +8,8 @@
 #include <charconv>
 #include <cmath>
 
+#include "chainsplat/json.h"
+
 namespace chainsplat::importing {
 
 namespace {

@@ -8,6 +8,7 @@
 #include <optional>
 
 #include "chainsplat/batch.h"
+#include "chainsplat/json.h"
 #include "chainsplat/run_folder.h"
 
 namespace chainsplat::pipeline {

@@ -11,6 +11,7 @@
 #include <set>
 
 #include "chainsplat/batch.h"
+#include "chainsplat/json.h"
 #include "chainsplat/pipeline.h"
 
 namespace chainsplat::pipeline {

@@ -5,6 +5,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/batch.h"
+#include "chainsplat/json.h"
 #include "chainsplat/run_folder.h"
 
 namespace chainsplat::pipeline {

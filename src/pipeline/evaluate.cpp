@@ -9,13 +9,13 @@
 #include "chainsplat/marker_files.h"
 #include "chainsplat/motion_files.h"
 #include "chainsplat/pipeline.h"
+#include "chainsplat/rope.h"
 #include "chainsplat/run_folder.h"
 
 namespace chainsplat::pipeline {
 
 namespace {
 
-constexpr double kTimeSlack = 1e-6;  // s: times in text files are rounded
 constexpr const char* kExampleRate = "give rows per second, for example 30";
 
 // Marker files begin with what their markers are (formats.md 4.1), states with a head line. A pipe can be read only
@@ -23,12 +23,6 @@ constexpr const char* kExampleRate = "give rows per second, for example 30";
 bool is_marker_file(const Path& file) {
   std::error_code ignored;
   return std::filesystem::is_regular_file(file, ignored) && core::read_file(file).starts_with("#");
-}
-
-// A rope that was held in this shape and let go: friction in bending has built up on the way there from its rest.
-math::VectorX friction_of_shape(const dynamics::Model& model, const math::Pose& base, const math::VectorX& theta) {
-  if (model.parameters.bending_friction.empty()) return {};
-  return dynamics::friction_states(model, {dynamics::static_equilibrium(model, base).theta, theta}).back();
 }
 
 // Where the rollout starts (formats.md 2.4, rollout).
@@ -52,14 +46,10 @@ dynamics::InitialState start_of(const Path& run, const RolloutOptions& options, 
     // the states of the twin's own motion keep their time
     if (options.base.empty() && states.time[0] >= base.start() && states.time[0] < base.end())
       initial.time = states.time[0];
-    initial.theta = states.theta[0];
-    if (!states.thetadot.empty())
-      initial.thetadot = states.thetadot[0];
-    else
+    if (states.thetadot.empty())
       core::warn(options.initial.string() + ": no thetadot columns; the rope is assumed to start at rest");
-    initial.friction_state = states.thetadot.empty() || states.thetadot[0].isZero(0.0)
-                                 ? friction_of_shape(model, base.pose(initial.time), initial.theta)
-                                 : dynamics::friction_state_in_motion(model, initial.theta, initial.thetadot);
+    initial = state_at(model, base.pose(initial.time), initial.time, states.theta[0],
+                       states.thetadot.empty() ? initial.thetadot : states.thetadot[0]);
   } else if (options.base.empty()) {
     if (!twin.initial)
       throw InputError(run.string() + "/twin.json", "has no initial state",
@@ -103,10 +93,7 @@ RolloutResult rollout(const Path& run, const RolloutOptions& options, const core
   result.base = options.base.empty() ? own_base(run) : read_base(options.base);
   const trajectory::Trajectory& base = result.base;
   const dynamics::InitialState initial = start_of(run, options, result.twin, model, base);
-  planning::check_rate(options.rate, base.end() - initial.time, kExampleRate);
-  std::vector<double> times;
-  for (int k = 0; initial.time + k / options.rate <= base.end() + kTimeSlack; ++k)
-    times.push_back(initial.time + k / options.rate);
+  const std::vector<double> times = times_of(base, initial.time, options.rate);
   if (times.empty())
     throw InputError((options.base.empty() ? run : options.base).string(), "the base motion ends before the start",
                      "give a base motion that goes on after it");

@@ -87,6 +87,154 @@ std::string name_of(const SourceOptions& source) {
 
 }  // namespace
 
+struct Tracker::Implementation {
+  Implementation(const twin::Twin& twin, const std::vector<capture::Camera>& cameras,
+                 const std::vector<char>& unverified, dynamics::BaseFunction base, double start,
+                 const TrackerOptions& options);
+
+  TrackerOptions options;
+  twin::Twin twin;
+  estimation::Filter filter;
+  gpu::DevicePtr device;
+  std::optional<splat::Engine> engine;  // none: outlines alone
+  std::optional<estimation::AdamFollower> adam;
+  std::optional<bool> masked_before;                       // by the first picture
+  std::optional<masking::Live> live;                       // masks made here
+  std::array<int, 4> masked = {0, 0, 0, 0};                // crop of the last mask: x0, y0, width, height
+  double last = -std::numeric_limits<double>::infinity();  // s, of the last frame
+
+  void open_engine();
+  void look_at_colors(double start);
+  void start_adam();
+  void look_at_first_picture(const capture::Image8& picture);
+
+  // Where the rope is expected at `time`; none where that is not known.
+  std::optional<math::VectorX> expected(double time) const {
+    if (!adam) return estimation::expected(filter, time);
+    return adam->theta.size() > 0 ? std::optional<math::VectorX>(adam->theta) : std::nullopt;
+  }
+};
+
+Tracker::Implementation::Implementation(const twin::Twin& followed, const std::vector<capture::Camera>& cameras,
+                                        const std::vector<char>& unverified, dynamics::BaseFunction base, double start,
+                                        const TrackerOptions& wanted)
+    : options(wanted), twin(followed) {
+  if (cameras.empty()) throw InputError("`cameras`", "there is none", "give those whose frames will come");
+  if (!twin.parameters)
+    core::warn("the twin: its dynamics are not identified; angles are assumed to go on at constant rate");
+  filter = estimation::start(twin, cameras, std::move(base), start);
+  filter.unverified = unverified;
+  for (std::size_t c = 0; c < unverified.size(); ++c)
+    if (unverified[c])
+      core::warn(cameras[c].name + ": the twin was not made with this calibration; deviations allow for its errors");
+  open_engine();
+  if (options.solver == Solver::adam)
+    start_adam();
+  else if (engine)
+    look_at_colors(start);
+}
+
+void Tracker::Implementation::open_engine() {
+  if (options.solver != Solver::silhouette && twin.gaussians.count > 0) {
+    try {
+      device = gpu::open_device({.selector = options.device});
+      engine.emplace(*device);
+    } catch (const InputError& error) {
+      if (options.solver || !options.device.empty()) throw;  // asked for
+      core::warn(std::string(error.what()) + "; the rope is followed by its outline alone");
+    }
+  }
+  if (options.solver == Solver::adam && !engine)
+    throw InputError("`solver`", "adam draws the twin, and it has no Gaussians", "train it first");
+}
+
+void Tracker::Implementation::look_at_colors(double start) {
+  engine->set_gaussians(twin.gaussians);
+  filter.compare_colors = [this](Views views, std::span<const std::vector<math::Pose>> motions) {
+    std::vector<splat::ViewSpec> specs;
+    std::vector<const std::vector<std::uint8_t>*> pixels;
+    for (std::size_t v = 0; v < views.size(); ++v) {
+      const capture::View& view = *views[v];
+      specs.push_back({&filter.cameras.at(view.camera), view.x0, view.y0, view.width, view.height, motions[v]});
+      pixels.push_back(&view.rgba);
+    }
+    return engine->color_sums(twin.chain, specs, pixels);
+  };
+  warm_up(filter, start);
+}
+
+void Tracker::Implementation::start_adam() {
+  adam = estimation::start_adam(filter, [this](const capture::View& view, const std::vector<math::Pose>& motions) {
+    const capture::Camera& camera = filter.cameras.at(view.camera);
+    const splat::ViewSpec spec{&camera, view.x0, view.y0, view.width, view.height, motions};
+    const std::vector<std::uint8_t>* const target = &view.rgba;
+    splat::Gradients gradients;
+    engine->loss(twin.gaussians, {&spec, 1}, {&target, 1}, {}, static_cast<double>(camera.width) * camera.height,
+                 &gradients);
+    return std::move(gradients.link_twists.front());
+  });
+}
+
+// The first picture shows whether masks have to be made.
+void Tracker::Implementation::look_at_first_picture(const capture::Image8& picture) {
+  masked_before = black_about(picture);
+  if (*masked_before) return;
+  filter.options = estimation::options_for_live_masks(twin.tabletop);
+  const std::vector<std::uint8_t> colors = twin_colors(twin);
+  if (colors.empty())
+    core::warn(options.name + ": is not masked, and the twin has no colors to find the rope by; what is " +
+               "not black is taken for the rope");
+  else
+    live = masking::start(filter.cameras[0], twin.chain, colors);
+}
+
+Tracker::Tracker(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
+                 double start, const TrackerOptions& options, const std::vector<char>& unverified)
+    : implementation_(std::make_unique<Implementation>(twin, cameras, unverified, std::move(base), start, options)) {}
+Tracker::~Tracker() = default;
+Tracker::Tracker(Tracker&&) noexcept = default;
+Tracker& Tracker::operator=(Tracker&&) noexcept = default;
+
+estimation::Estimate Tracker::update(std::span<const capture::View> views) {
+  Implementation& t = *implementation_;
+  if (views.empty()) throw InputError(t.options.name, "the moment has no view", "give one, which may be empty");
+  for (const capture::View& view : views)
+    if (view.camera < 0 || view.camera >= static_cast<int>(t.filter.cameras.size()))
+      throw InputError(t.options.name, "there is no camera " + std::to_string(view.camera), "count them from 0");
+  if (!(views[0].time > t.last))
+    throw InputError(t.options.name, core::exact(views[0].time) + " s is not after the frame before",
+                     "give times that increase");
+  t.last = views[0].time;
+  std::vector<const capture::View*> pointers;
+  for (const capture::View& view : views) pointers.push_back(&view);
+  return t.adam ? estimation::update(*t.adam, pointers) : estimation::update(t.filter, pointers);
+}
+
+capture::View Tracker::mask(const capture::Image8& picture, double time) {
+  Implementation& t = *implementation_;
+  const capture::Camera& camera = t.filter.cameras[0];
+  if (!t.masked_before) t.look_at_first_picture(picture);
+  const auto marked = [&](capture::View view) {
+    view.time = time;
+    return view;
+  };
+  if (!t.live) return marked(bright_view(picture, camera));
+  const math::Pose pose = t.filter.base(time).pose;
+  const std::optional<math::VectorX> theta = t.expected(time);
+  constexpr int kMarksEvery = 10;  // frames; the rope shows nearly the same side
+  if (t.engine && t.live->frames % kMarksEvery == 0) {
+    const math::VectorX near = theta.value_or(t.filter.rest);  // marks stay on the rope wherever it lies
+    masking::learn_marks(*t.live, drawn_view(*t.engine, t.twin, camera, pose, near, t.masked), pose, near);
+  }
+  capture::View view = masking::mask(*t.live, picture, pose, theta);
+  t.masked = {view.x0, view.y0, view.width, view.height};
+  return marked(std::move(view));
+}
+
+const twin::Twin& Tracker::twin() const { return implementation_->twin; }
+const dynamics::Model& Tracker::model() const { return implementation_->filter.model; }
+const std::vector<capture::Camera>& Tracker::cameras() const { return implementation_->filter.cameras; }
+
 void FollowOptions::check() const {
   if (drop < 1) throw InputError("`drop`", "must be 1 or more", "give 2 for every second frame");
 }
@@ -97,33 +245,12 @@ struct Follower::Implementation {
   Path run;
   FollowOptions options;
   std::string source_name, base_name;
-  twin::Twin twin;
   FrameSource source;
   trajectory::Trajectory base;
-  estimation::Filter filter;
-  gpu::DevicePtr device;
-  std::optional<splat::Engine> engine;  // none: outlines alone
-  std::optional<estimation::AdamFollower> adam;
-  std::optional<bool> masked_before;         // by the first picture
-  std::optional<masking::Live> live;         // masks made here
-  std::array<int, 4> masked = {0, 0, 0, 0};  // crop of the last mask: x0, y0, width, height
+  std::optional<Tracker> tracker;
 
   void open_base();
-  void open_engine();
-  void look_at_colors();
-  void start_adam();
-  void look_at_first_picture(const capture::Image8& picture);
-  capture::View mask(const capture::Image8& picture, const math::Pose& pose, const std::optional<math::VectorX>& theta);
   void check_time(const LiveFrame& frame, bool first) const;
-
-  estimation::Estimate update(Views views) {
-    return adam ? estimation::update(*adam, views) : estimation::update(filter, views);
-  }
-  // Where the rope is expected at `time`; none where that is not known.
-  std::optional<math::VectorX> expected(double time) const {
-    if (!adam) return estimation::expected(filter, time);
-    return adam->theta.size() > 0 ? std::optional<math::VectorX>(adam->theta) : std::nullopt;
-  }
 };
 
 Follower::Implementation::Implementation(const Path& folder, const FollowOptions& wanted)
@@ -132,24 +259,13 @@ Follower::Implementation::Implementation(const Path& folder, const FollowOptions
       source_name(name_of(wanted.source)),
       base_name(wanted.base.empty() ? source_name : wanted.base.string()) {
   options.check();
-  twin = load_twin(run);
-  if (!twin.parameters)
-    core::warn(run.string() + ": its dynamics are not identified; angles are assumed to go on at constant rate");
+  const twin::Twin twin = load_twin(run);
   options.source.corrections = twin.corrections;
   source = open_frames(options.source);
   open_base();
-  filter = estimation::start(
-      twin, source.cameras, [this](double time) { return base.at(time); }, base.start());
-  filter.unverified = source.unverified;
-  for (std::size_t c = 0; c < source.cameras.size(); ++c)
-    if (source.unverified[c])
-      core::warn(source.cameras[c].name +
-                 ": the twin was not made with this calibration; deviations allow for its errors");
-  open_engine();
-  if (options.solver == Solver::adam)
-    start_adam();
-  else if (engine)
-    look_at_colors();
+  tracker.emplace(
+      twin, source.cameras, [this](double time) { return base.at(time); }, base.start(),
+      TrackerOptions{options.solver, options.device, source_name}, source.unverified);
 }
 
 void Follower::Implementation::open_base() {
@@ -162,75 +278,6 @@ void Follower::Implementation::open_base() {
     base = trajectory::fit({{own.start(), own.pose(own.start())}}, run.string());
     core::warn("`base`: is missing; the base is assumed to rest where the twin's capture began");
   }
-}
-
-void Follower::Implementation::open_engine() {
-  if (options.solver != Solver::silhouette && twin.gaussians.count > 0) {
-    try {
-      device = gpu::open_device({.selector = options.device});
-      engine.emplace(*device);
-    } catch (const InputError& error) {
-      if (options.solver || !options.device.empty()) throw;  // asked for
-      core::warn(std::string(error.what()) + "; the rope is followed by its outline alone");
-    }
-  }
-  if (options.solver == Solver::adam && !engine)
-    throw InputError("`solver`", "adam draws the twin, and " + run.string() + " has no Gaussians", "train it first");
-}
-
-void Follower::Implementation::look_at_colors() {
-  engine->set_gaussians(twin.gaussians);
-  filter.compare_colors = [this](Views views, std::span<const std::vector<math::Pose>> motions) {
-    std::vector<splat::ViewSpec> specs;
-    std::vector<const std::vector<std::uint8_t>*> pixels;
-    for (std::size_t v = 0; v < views.size(); ++v) {
-      const capture::View& view = *views[v];
-      specs.push_back({&source.cameras.at(view.camera), view.x0, view.y0, view.width, view.height, motions[v]});
-      pixels.push_back(&view.rgba);
-    }
-    return engine->color_sums(twin.chain, specs, pixels);
-  };
-  warm_up(filter, base.start());
-}
-
-void Follower::Implementation::start_adam() {
-  adam = estimation::start_adam(filter, [this](const capture::View& view, const std::vector<math::Pose>& motions) {
-    const capture::Camera& camera = source.cameras.at(view.camera);
-    const splat::ViewSpec spec{&camera, view.x0, view.y0, view.width, view.height, motions};
-    const std::vector<std::uint8_t>* const target = &view.rgba;
-    splat::Gradients gradients;
-    engine->loss(twin.gaussians, {&spec, 1}, {&target, 1}, {}, static_cast<double>(camera.width) * camera.height,
-                 &gradients);
-    return std::move(gradients.link_twists.front());
-  });
-}
-
-// The first picture shows whether masks have to be made.
-void Follower::Implementation::look_at_first_picture(const capture::Image8& picture) {
-  masked_before = black_about(picture);
-  if (*masked_before) return;
-  filter.options = estimation::options_for_live_masks(twin.tabletop);
-  const std::vector<std::uint8_t> colors = twin_colors(twin);
-  if (colors.empty())
-    core::warn(source_name + ": is not masked, and the twin has no colors to find the rope by; what is " +
-               "not black is taken for the rope");
-  else
-    live = masking::start(source.cameras[0], twin.chain, colors);
-}
-
-// The mask of a picture; `theta` is where the rope is expected, none when that is not known.
-capture::View Follower::Implementation::mask(const capture::Image8& picture, const math::Pose& pose,
-                                             const std::optional<math::VectorX>& theta) {
-  if (!masked_before) look_at_first_picture(picture);
-  if (!live) return bright_view(picture, source.cameras[0]);
-  constexpr int kMarksEvery = 10;  // frames; the rope shows nearly the same side
-  if (engine && live->frames % kMarksEvery == 0) {
-    const math::VectorX near = theta.value_or(filter.rest);  // marks stay on the rope wherever it lies
-    masking::learn_marks(*live, drawn_view(*engine, twin, source.cameras[0], pose, near, masked), pose, near);
-  }
-  capture::View view = masking::mask(*live, picture, pose, theta);
-  masked = {view.x0, view.y0, view.width, view.height};
-  return view;
 }
 
 // Whether the base's motion is known then.
@@ -268,21 +315,18 @@ void Follower::follow(const std::function<void(const Followed&)>& each) {
     if (read % f.options.drop != 0) continue;
     f.check_time(frame, read == 0);
     if (!f.source.masked) {
-      made.assign(1, f.mask(frame.picture, f.base.pose(frame.time), f.expected(frame.time)));
+      made.assign(1, f.tracker->mask(frame.picture, frame.time));
       made[0].frame = frame.frame;
-      made[0].time = frame.time;
     }
     const std::vector<capture::View>& views = f.source.masked ? frame.views : made;
-    std::vector<const capture::View*> pointers;
-    for (const capture::View& view : views) pointers.push_back(&view);
-    const estimation::Estimate estimate = f.update(pointers);
+    const estimation::Estimate estimate = f.tracker->update(views);
     each({frame, views, estimate, core::seconds_now() - frame.arrived});
   }
 }
 
-const twin::Twin& Follower::twin() const { return implementation_->twin; }
-const dynamics::Model& Follower::model() const { return implementation_->filter.model; }
+const twin::Twin& Follower::twin() const { return implementation_->tracker->twin(); }
+const dynamics::Model& Follower::model() const { return implementation_->tracker->model(); }
 const trajectory::Trajectory& Follower::base() const { return implementation_->base; }
-const std::vector<capture::Camera>& Follower::cameras() const { return implementation_->source.cameras; }
+const std::vector<capture::Camera>& Follower::cameras() const { return implementation_->tracker->cameras(); }
 
 }  // namespace chainsplat::pipeline

@@ -121,9 +121,7 @@ FrameSource open_stream(const SourceOptions& options) {
   const bool standard_input = options.source == "-";
   double rate = options.rate > 0.0 ? options.rate : calibration.rate, start = calibration.start;
   FrameSource source;
-  source.unverified = {is_unverified(options.corrections, calibration.camera)};
-  source.cameras = {calibration.camera};
-  if (!source.unverified[0]) source.cameras[0] = capture::corrected(options.corrections, calibration.camera);
+  source.cameras = as_corrected(options.corrections, {calibration.camera}, &source.unverified);
   const double late = capture::value_of(options.corrections, calibration.camera.name, "time");
   std::shared_ptr<capture::VideoReader> reader;
   if (!standard_input) {
@@ -173,6 +171,17 @@ FrameSource open_stream(const SourceOptions& options) {
 }
 
 }  // namespace
+
+std::vector<capture::Camera> as_corrected(const capture::Corrections& corrections, std::vector<capture::Camera> cameras,
+                                          std::vector<char>* unverified) {
+  if (unverified) unverified->clear();
+  for (capture::Camera& camera : cameras) {
+    const bool unknown = is_unverified(corrections, camera);
+    if (unverified) unverified->push_back(unknown);
+    if (!unknown) camera = capture::corrected(corrections, camera);
+  }
+  return cameras;
+}
 
 FrameSource open_frames(const SourceOptions& options) {
   if (options.calibration.empty()) {

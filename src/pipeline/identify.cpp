@@ -5,6 +5,7 @@
 
 #include "chainsplat/marker_files.h"
 #include "chainsplat/run_folder.h"
+#include "chainsplat/solve_json.h"
 #include "pipeline/stages.h"
 
 namespace chainsplat::pipeline {
@@ -52,7 +53,7 @@ void adopt(twin::Twin& twin, const trajectory::Trajectory& base, identification:
 }
 
 void tell_fit(const std::string& stage, const solve::Summary& summary) {
-  core::record({{"stage", stage}, {"solver", summary}});
+  core::record(nlohmann::ordered_json{{"stage", stage}, {"solver", summary}}.dump());
   core::say_more(stage + ": " + solve::describe(summary));
 }
 

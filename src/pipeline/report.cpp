@@ -1,4 +1,5 @@
 // report.cpp - the page of a run, from what stands in its folder and from its capture.
+#include "chainsplat/json.h"
 #include "chainsplat/report.h"
 
 #include <cmath>

@@ -13,6 +13,7 @@
 #include <cstring>
 #include <nlohmann/json.hpp>
 
+#include "chainsplat/json.h"
 #include "chainsplat/recognition.h"
 #include "chainsplat/text.h"
 
@@ -273,10 +274,11 @@ void ProgressLog::write(const core::Progress& progress) {
   record["total"] = progress.total;
   record["loss"] = progress.loss;  // NaN is written as null
   record["psnr"] = progress.psnr;
-  write(std::move(record));
+  write(record.dump(-1, ' ', false, nlohmann::json::error_handler_t::replace));
 }
 
-void ProgressLog::write(nlohmann::ordered_json entry) {
+void ProgressLog::write(const std::string& json) {
+  nlohmann::ordered_json entry = core::parse_json(json);
   entry["seconds"] = std::round((core::seconds_now() - opened_) * 1e3) / 1e3;
   file_ << entry.dump(-1, ' ', false, nlohmann::json::error_handler_t::replace) << std::endl;
 }

@@ -355,9 +355,9 @@ void run_logged(Training& t, bool was_there, core::Listener listener) {
       log.write(progress);
     };
     const auto recorded = listener.record;
-    listener.record = [&](const nlohmann::ordered_json& entry) {
-      if (recorded) recorded(entry);
-      log.write(entry);
+    listener.record = [&](const std::string& json) {
+      if (recorded) recorded(json);
+      log.write(json);
     };
     const core::ListenerScope logged(listener);
     run_stages(t);

@@ -3,6 +3,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/motion_files.h"
+#include "chainsplat/solve_json.h"
 
 namespace chainsplat::planning {
 

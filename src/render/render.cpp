@@ -199,31 +199,67 @@ std::vector<Frame> frames(splat::Engine& engine, const splat::Gaussians& gaussia
   return out;
 }
 
+namespace {
+
+void paste_color(const Frame& frame, const capture::Camera& camera, std::uint8_t* rgb) {
+  paste(frame, camera, [&](std::size_t from, std::size_t to) {
+    for (int c = 0; c < 3; ++c)
+      rgb[3 * to + c] =
+          static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(frame.picture.rgba[4 * from + c], 0.0f, 1.0f)));
+  });
+}
+
+void paste_mask(const Frame& frame, const capture::Camera& camera, std::uint8_t* mask) {
+  paste(frame, camera, [&](std::size_t from, std::size_t to) {
+    mask[to] = frame.picture.rgba[4 * from + 3] >= kSolid ? 255 : 0;
+  });
+}
+
+void paste_depth(const Frame& frame, const capture::Camera& camera, float* depth) {
+  if (frame.picture.depth.empty()) return;
+  paste(frame, camera, [&](std::size_t from, std::size_t to) { depth[to] = frame.picture.depth[from]; });
+}
+
+}  // namespace
+
 capture::Image8 color_image(const Frame& frame, const capture::Camera& camera) {
   capture::Image8 image{camera.width, camera.height, 3, {}};
   image.pixels.assign(3u * camera.width * camera.height, 0);
-  paste(frame, camera, [&](std::size_t from, std::size_t to) {
-    for (int c = 0; c < 3; ++c)
-      image.pixels[3 * to + c] =
-          static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(frame.picture.rgba[4 * from + c], 0.0f, 1.0f)));
-  });
+  paste_color(frame, camera, image.pixels.data());
   return image;
 }
 
 capture::Image8 mask_image(const Frame& frame, const capture::Camera& camera) {
   capture::Image8 image{camera.width, camera.height, 1, {}};
   image.pixels.assign(static_cast<std::size_t>(camera.width) * camera.height, 0);
-  paste(frame, camera, [&](std::size_t from, std::size_t to) {
-    image.pixels[to] = frame.picture.rgba[4 * from + 3] >= kSolid ? 255 : 0;
-  });
+  paste_mask(frame, camera, image.pixels.data());
   return image;
 }
 
 std::vector<float> depth_image(const Frame& frame, const capture::Camera& camera) {
   std::vector<float> image(static_cast<std::size_t>(camera.width) * camera.height, 0.0f);
-  if (frame.picture.depth.empty()) return image;
-  paste(frame, camera, [&](std::size_t from, std::size_t to) { image[to] = frame.picture.depth[from]; });
+  paste_depth(frame, camera, image.data());
   return image;
+}
+
+Images images(splat::Engine& engine, const splat::Gaussians& gaussians, const chain::Chain& chain,
+              const chain::States& states, const trajectory::Trajectory& base, const capture::Camera& camera,
+              const std::vector<double>& times, const Options& options) {
+  Images out{static_cast<int>(times.size()), camera.width, camera.height, {}, {}, {}};
+  const std::size_t pixels = static_cast<std::size_t>(camera.width) * camera.height;
+  out.rgb.resize(3 * pixels * times.size());
+  out.mask.resize(pixels * times.size());
+  if (options.depth) out.depth.resize(pixels * times.size());
+  for_batches(engine, gaussians, chain, states, base, camera, 0, times, options, [&](std::vector<Frame>& batch) {
+    core::parallel_for(static_cast<std::int64_t>(batch.size()), [&](std::int64_t k) {
+      const Frame& frame = batch[static_cast<std::size_t>(k)];
+      const std::size_t first = pixels * static_cast<std::size_t>(frame.frame);
+      paste_color(frame, camera, &out.rgb[3 * first]);
+      paste_mask(frame, camera, &out.mask[first]);
+      if (options.depth) paste_depth(frame, camera, &out.depth[first]);
+    });
+  });
+  return out;
 }
 
 }  // namespace chainsplat::render

@@ -5,6 +5,7 @@
 
 #include "chainsplat/image_model.h"
 #include "chainsplat/report.h"
+#include "chainsplat/twin_json.h"
 #include "report_page.h"
 
 namespace chainsplat::report {

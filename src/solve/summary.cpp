@@ -4,6 +4,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/solve.h"
+#include "chainsplat/solve_json.h"
 
 namespace chainsplat::solve {
 namespace {

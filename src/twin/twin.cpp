@@ -6,8 +6,11 @@
 #include <limits>
 #include <nlohmann/json.hpp>
 
+#include "chainsplat/json.h"
 #include "chainsplat/properties.h"
+#include "chainsplat/solve_json.h"
 #include "chainsplat/twin.h"
+#include "chainsplat/twin_json.h"
 
 namespace chainsplat::twin {
 

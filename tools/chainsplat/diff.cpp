@@ -8,6 +8,7 @@
 #include <nlohmann/json.hpp>
 #include <set>
 
+#include "chainsplat/json.h"
 #include "chainsplat/run_folder.h"
 #include "cli.h"
 

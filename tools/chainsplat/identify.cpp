@@ -12,6 +12,7 @@
 #include "chainsplat/pipeline.h"
 #include "chainsplat/properties.h"
 #include "chainsplat/run_folder.h"
+#include "chainsplat/solve_json.h"
 #include "cli.h"
 
 namespace chainsplat::tools {

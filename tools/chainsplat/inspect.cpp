@@ -10,6 +10,7 @@
 #include "chainsplat/capture.h"
 #include "chainsplat/gpu.h"
 #include "chainsplat/pipeline.h"
+#include "chainsplat/twin_json.h"
 #include "cli.h"
 
 namespace chainsplat::tools {

@@ -11,6 +11,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/capture.h"
+#include "chainsplat/json.h"
 #include "chainsplat/masking.h"
 #include "chainsplat/run_folder.h"
 #include "cli.h"

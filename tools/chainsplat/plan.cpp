@@ -11,9 +11,10 @@
 
 #include "chainsplat/capture.h"
 #include "chainsplat/estimation.h"
-#include "chainsplat/identification.h"
+#include "chainsplat/json.h"
 #include "chainsplat/motion_files.h"
 #include "chainsplat/planning.h"
+#include "chainsplat/rope.h"
 #include "chainsplat/run_folder.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
@@ -34,34 +35,6 @@ struct PlanRequest {
   planning::LoopOptions loop;
   planning::Options options;
 };
-
-constexpr const char* kAssumed =
-    "mass, stiffness, damping and friction are assumed, and the rope may miss by centimeters";
-
-// Planning needs numbers for everything: a mass of 60 g per 30 cm and the centers of identification's priors, alike at
-// all joints.
-dynamics::Parameters assumed_parameters(const twin::Twin& twin) {
-  constexpr double kMass = 0.2;  // kg/m
-  const chain::Chain& chain = twin.chain;
-  dynamics::Parameters p;
-  const double torque = identification::kStiffnessPart * kMass * chain.length * twin.gravity.norm() * chain.length;
-  for (int link = 1; link < chain.links(); ++link) {
-    const double length = chain.link_end(link) - chain.link_start(link);
-    p.link_mass.push_back(kMass * length);
-    p.viscous_friction.push_back(0.0);
-    p.coulomb_friction.push_back(twin.tabletop ? identification::kCoulombMean : 0.0);
-    p.air_linear.push_back(0.0);
-    p.air_quadratic.push_back(twin.tabletop ? 0.0 : identification::kDragPerDiameter * chain.diameter * length);
-  }
-  p.stiffness.assign(chain.angles(), torque);
-  p.rest_angle.assign(chain.angles(), 0.0);
-  p.damping.assign(chain.angles(), identification::kRetardation * torque);
-  p.radius = 0.5 * chain.diameter;
-  p.gravity = twin.gravity;
-  if (twin.tabletop) p.table_normal = twin.table_normal.value_or(math::Vector3::UnitZ());
-  p.substeps = twin.tabletop ? 8 : 4;
-  return p;
-}
 
 // The rope as one camera sees it in its first frame, and the base where it is then; taken to be at rest, since one
 // image shows no speed.
@@ -96,34 +69,15 @@ void start_from_image(const std::string& source, const twin::Twin& twin, plannin
   say(text);
 }
 
-planning::Problem make_problem(const PlanRequest& request, const twin::Twin& twin) {
-  planning::Problem problem;
-  dynamics::Parameters parameters;
-  if (twin.parameters) {
-    parameters = *twin.parameters;
-  } else {
-    core::warn(request.run + ": its dynamics are not identified; " + kAssumed);
-    parameters = assumed_parameters(twin);
-  }
-  problem.model = dynamics::make_model(twin.chain, parameters);
-  problem.tabletop = twin.tabletop;
-  problem.table_point = twin.table_point;
-  const trajectory::Trajectory base = pipeline::own_base(request.run);
-  problem.base = base.pose(base.start());
-  problem.estimates = twin.estimates;
-  const int angles = twin.chain.angles();
-  problem.initial.thetadot = math::VectorX::Zero(angles);
+planning::Problem make_problem(const PlanRequest& request, const pipeline::Rope& rope) {
+  planning::Problem problem = pipeline::planning_problem(rope);
   if (!request.initial.empty()) {
-    const chain::States given = twin::read_states(input_path(request.initial), angles);
+    const chain::States given = twin::read_states(input_path(request.initial), rope.twin.chain.angles());
     if (given.time.empty()) throw InputError(request.initial, "has no rows", "give at least one");
     problem.initial.theta = given.theta[0];
     if (!given.thetadot.empty()) problem.initial.thetadot = given.thetadot[0];
   } else if (!request.state_from.empty()) {
-    start_from_image(request.state_from, twin, problem);
-  } else if (twin.tabletop) {
-    problem.initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
-  } else {
-    problem.initial.theta = dynamics::static_equilibrium(problem.model, problem.base).theta;
+    start_from_image(request.state_from, rope.twin, problem);
   }
   return problem;
 }
@@ -204,8 +158,7 @@ void plan(const Globals& globals, PlanRequest& request) {
   }
   const std::string mend = "name another folder or give --force to write into it";
   pipeline::check_output_folder(request.out, request.force, mend);
-  const twin::Twin twin = pipeline::load_twin(request.run);
-  planning::Problem problem = make_problem(request, twin);
+  planning::Problem problem = make_problem(request, pipeline::load_rope(request.run));
   for (const std::string& text : request.targets) {
     const std::string random = "random:";
     if (text.rfind(random, 0) == 0) {

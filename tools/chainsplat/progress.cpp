@@ -169,8 +169,8 @@ core::Listener terminal() {
   listener.progress = on_progress;
   listener.message = say;
   listener.detail = say_more;
-  listener.record = [](const nlohmann::ordered_json& entry) {
-    if (screen.log) screen.log->write(entry);
+  listener.record = [](const std::string& json) {
+    if (screen.log) screen.log->write(json);
   };
   return listener;
 }

@@ -7,6 +7,8 @@
 #include "chainsplat/pipeline.h"
 #include "chainsplat/properties.h"
 #include "chainsplat/run_folder.h"
+#include "chainsplat/solve_json.h"
+#include "chainsplat/twin_json.h"
 #include "cli.h"
 
 namespace chainsplat::tools {

@@ -1,0 +1,16 @@
+// chainsplat/json.h - JSON from outside, read with bounds. Not installed: no header that is names the JSON library.
+#pragma once
+#include <nlohmann/json_fwd.hpp>
+#include <string_view>
+
+namespace chainsplat::core {
+
+// Parses JSON from outside with a bound on its nesting: the JSON library frees, copies and prints a document by
+// recursion, so a file of nothing but brackets would overflow the stack. Throws nlohmann::json::exception when the text
+// is not JSON, has a number beyond double, or is nested deeper than kDeepestJson.
+constexpr int kDeepestJson = 64;
+nlohmann::ordered_json parse_json(std::string_view text);
+// As parse_json(), but returns a value whose is_discarded() is true instead of throwing.
+nlohmann::ordered_json parse_json_or_discard(std::string_view text);
+
+}  // namespace chainsplat::core
