@@ -34,3 +34,4 @@ std::span<const std::uint32_t> shader_code(std::string_view name) {
 add_library(chainsplat_shaders STATIC ${shader_dir}/shader_code.cpp ${shader_headers})
 target_include_directories(chainsplat_shaders PRIVATE ${shader_dir})
 target_compile_features(chainsplat_shaders PRIVATE cxx_std_20)
+set_target_properties(chainsplat_shaders PROPERTIES POSITION_INDEPENDENT_CODE ON)
