@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""docs/api.md names everything that the API's headers declare, and nothing else.
+"""docs/api.md names everything that the API's headers declare, and nothing else; what uses the API includes no other header.
 
   tests/api_names.py [--list]
 
@@ -56,7 +56,7 @@ def names(text):
 def rows():
     out = {}
     for line in (ROOT / "docs/api.md").read_text().split("\n"):
-        if m := re.match(r"\| \[(\w+)\.h\]\([^)]*\) \|(.*)\|", line):
+        if m := re.match(r"\| \[([\w/]+)\.h\]\([^)]*\) \|(.*)\|", line):
             out[m[1]] = set(re.findall(r"`(\w+)`", m[2]))
     return out
 
@@ -66,6 +66,12 @@ if sys.argv[1:] == ["--list"]:
         print(header, " ".join(f"`{name}`" for name in sorted(names((ROOT / f"include/chainsplat/{header}.h").read_text()))))
     sys.exit()
 faults, told = [], rows()
+beneath = re.search(r"set\(beneath ([^)]*)\)", CMAKE)[1].split()
+for folder in (*(f"include/chainsplat/{header}.h" for header in HEADERS + beneath), "python/src/*", "examples/*.cpp", "tests/package/cpp/*"):
+    for file in ROOT.glob(folder):
+        for header in re.findall(r'#include ["<]chainsplat/([\w/]+)\.h', file.read_text()):
+            if header not in HEADERS + beneath:
+                faults.append(f"{file.relative_to(ROOT)}: includes {header}.h, which is not installed")
 for header in HEADERS:
     real = names((ROOT / f"include/chainsplat/{header}.h").read_text())
     if not real:

@@ -10,6 +10,8 @@
 #include <numeric>
 #include <vector>
 
+#include "chainsplat/solve_json.h"
+
 using namespace chainsplat;
 using namespace chainsplat::solve;
 

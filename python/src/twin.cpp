@@ -6,7 +6,6 @@
 #include "chainsplat/motion_files.h"
 #include "chainsplat/properties.h"
 #include "chainsplat/render.h"
-#include "chainsplat/run_folder.h"
 #include "module.h"
 #include "twin.h"
 
@@ -121,7 +120,8 @@ std::shared_ptr<render::Images> draw(Twin& twin, const chain::States& states, co
                                      const std::optional<Trajectory>& base,
                                      const std::optional<std::vector<double>>& times, bool depth, bool undistorted) {
   return unlocked([&] {
-    pipeline::check_drawable(twin.rope.twin, twin.rope.run);
+    if (twin.rope.twin.gaussians.count == 0)
+      throw InputError(twin.rope.run.string(), "has no Gaussians to draw", "recognize it from images first");
     const std::lock_guard lock(twin.drawing);  // one picture at a time on the device
     if (!twin.engine) {
       twin.device = gpu::open_device({.selector = twin.device_name});

@@ -3,7 +3,6 @@
 
 #include "chainsplat/dynamics.h"
 #include "chainsplat/render.h"
-#include "chainsplat/run_folder.h"
 #include "module.h"
 
 namespace chainsplat::python {
@@ -87,7 +86,7 @@ void add_types(py::module_& m) {
       .def(py::init(&make_trajectory), arg("time"), arg("poses"),
            "time: (T,), s, increasing. poses: (T, 4, 4), base to world, m. One pose: at rest.")
       .def_static(
-          "read", [](const Path& file) { return unlocked([&] { return pipeline::read_base(file); }); }, arg("file"),
+          "read", [](const Path& file) { return unlocked([&] { return trajectory::fit(trajectory::read_tum(file), file.string()); }); }, arg("file"),
           "Reads 'timestamp tx ty tz qx qy qz qw' a line (TUM).")
       .def(
           "write", [](const Trajectory& t, const Path& file) { core::write_file(file, write_tum(t.samples())); },

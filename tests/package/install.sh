@@ -33,6 +33,12 @@ for part in "$work"/part_*; do  # in the opposite order, so that none leans on t
   c++ -std=c++20 -fsyntax-only -Wall -Wextra $flags "$part.cpp" || fail "installed headers do not compile"
 done
 
+# so does what docs/api.md shows: its blocks, one after the other, as one program
+awk '/^```cpp/ { n++; inside = 1; if (n == 2) print "#include <cstdio>\nint main() {"; next } /^```/ { inside = 0 } inside
+  END { print "}" }' "$here/../../docs/api.md" >"$work/shown.cpp"
+# shellcheck disable=SC2086
+c++ -std=c++20 -fsyntax-only $flags "$work/shown.cpp" || fail 'docs/api.md does not compile'
+
 # only the library's own names are exported
 others=$(nm -DC --defined-only "$library/libchainsplat.so" | cut -c20- | grep -vE 'chainsplat::|^[AVWTBDR] *$' | head -3 || true)
 [ -z "$others" ] || fail "the library exports $others"
