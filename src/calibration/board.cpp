@@ -4,6 +4,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/calibration.h"
+#include "chainsplat/json.h"
 #include "chainsplat/text.h"
 #include "tags.h"
 

@@ -4,6 +4,8 @@
 #include <cmath>
 #include <nlohmann/json.hpp>
 
+#include "chainsplat/solve_json.h"
+
 namespace chainsplat::calibration {
 
 namespace fs = std::filesystem;
