@@ -170,7 +170,10 @@ void add_twin(py::module_& m) {
           [](const Twin& t, const Path& file, const std::optional<chain::States>& states,
              const std::optional<Trajectory>& base, bool mesh) {
             const chain::States& own = t.rope.twin.rollout.time.empty() ? t.rope.twin.states : t.rope.twin.rollout;
-            unlocked([&] { exports::write(t.rope.twin, states ? *states : own, base_or_own(t, base), file, mesh); });
+            unlocked([&] {
+              exports::write(t.rope.twin, states ? *states : own, base_or_own(t, base), file,
+                             {.mesh = mesh, .cameras = {}, .properties = {}});
+            });
           },
           arg("file"), arg("states") = py::none(), arg("base") = py::none(), arg("mesh") = false,
           "Writes .glb, .gltf, .ply, .csv, .npz or .xml (MuJoCo), with a motion: the rollout, unless `states` are "

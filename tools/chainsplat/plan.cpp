@@ -158,7 +158,8 @@ void plan(const Globals& globals, PlanRequest& request) {
   }
   const std::string mend = "name another folder or give --force to write into it";
   pipeline::check_output_folder(request.out, request.force, mend);
-  planning::Problem problem = make_problem(request, pipeline::load_rope(request.run));
+  const pipeline::Rope rope = pipeline::load_rope(request.run);
+  planning::Problem problem = make_problem(request, rope);
   for (const std::string& text : request.targets) {
     const std::string random = "random:";
     if (text.rfind(random, 0) == 0) {
@@ -209,10 +210,10 @@ void plan(const Globals& globals, PlanRequest& request) {
   core::write_file(out / "base.csv", planning::motion_csv(played, times));
   const chain::States predicted = planning::predict(problem, played, times);
   core::write_file(out / "states.csv", twin::states_csv(predicted));
-  twin::warn_beyond(
-      twin.validity,
-      twin::validity_of(problem.model.chain, trajectory::fit(trajectory::read_tum(out / "base.tum"), request.out), predicted),
-      request.out);
+  twin::warn_beyond(rope.twin.validity,
+                    twin::validity_of(problem.model.chain,
+                                      trajectory::fit(trajectory::read_tum(out / "base.tum"), request.out), predicted),
+                    request.out);
   core::write_file(out / "picture.svg", planning::picture_svg(problem, options, plan));
   const std::string document = planning::plan_json(problem, options, plan, request.horizon, simulated);
   core::write_file(out / "plan.json", document);
@@ -228,10 +229,11 @@ void plan(const Globals& globals, PlanRequest& request) {
   }
   char text[256];
   const planning::Hit& worst = planning::worst_hit(plan);
-  std::snprintf(text, sizeof text,
-                "%s: miss %.2f mm at %.2f s, %.0f mm along the rope, peak %.2f m/s and %.1f m/s^2, planned in %.2f s: %s",
-                plan.reached ? "reached" : "cannot be reached", 1e3 * worst.miss, worst.time, 1e3 * worst.arclength,
-                plan.peaks.velocity, plan.peaks.acceleration, plan.seconds, request.out.c_str());
+  std::snprintf(
+      text, sizeof text,
+      "%s: miss %.2f mm at %.2f s, %.0f mm along the rope, peak %.2f m/s and %.1f m/s^2, planned in %.2f s: %s",
+      plan.reached ? "reached" : "cannot be reached", 1e3 * worst.miss, worst.time, 1e3 * worst.arclength,
+      plan.peaks.velocity, plan.peaks.acceleration, plan.seconds, request.out.c_str());
   say(text);
   if (!plan.reached && !solve::converged(plan.summary)) say("its last fit: " + solve::describe(plan.summary));
   for (const auto& [name, loop] : simulated) {
@@ -253,15 +255,15 @@ void add_planning_commands(CLI::App& app, const Globals& globals, Job& job) {
   planning::Limits& limits = request->options.limits;
   planner->add_option("RUN", request->run, "Run folder of an identified twin")->required();
   planner
-      ->add_option(
-          "--target", request->targets,
-          "Point to hit, m, world: in free space at any time, on a table at the end, at rest.\n"
-          "Several are hit one after the other. random:SEED: a point that a random motion passes")
+      ->add_option("--target", request->targets,
+                   "Point to hit, m, world: in free space at any time, on a table at the end, at rest.\n"
+                   "Several are hit one after the other. random:SEED: a point that a random motion passes")
       ->required()
       ->type_name("X,Y,Z");
   planner
-      ->add_option("--hit", request->hit,
-                   "With what: tip, the nearest point of the last link or of the whole rope (default: tip, on a table rope)")
+      ->add_option(
+          "--hit", request->hit,
+          "With what: tip, the nearest point of the last link or of the whole rope (default: tip, on a table rope)")
       ->check(CLI::IsMember({"tip", "last-link", "rope"}));
   planner->add_option("-o,--output", request->out, "Folder for base.tum, base.csv, states.csv, plan.json, picture.svg")
       ->required()
