@@ -360,8 +360,58 @@ TEST_CASE("a target behind a keep-out sphere is reached around it") {
   options.axes = {Axis::x, Axis::z};
   const Vector3 p = problem.base.translation;
   problem.targets = {p + Vector3(0.3, 0, -0.25)};
+  const Plan free = plan(problem, options);
+  // what is not in the way changes nothing
+  options.spheres = {{p + Vector3(0, 1.5, 0), 0.03}};
+  CHECK(unknowns_of(plan(problem, options).motion) == unknowns_of(free.motion));
+  // and what is, is kept clear of, by a way that an evaluation on another grid sees
   options.spheres = {{p + Vector3(0.18, 0, -0.27), 0.03}};
-  CHECK(plan(problem, options).reached);
+  const auto nearest_to_sphere = [&](const Plan& made) {
+    double least = 1e9;
+    std::vector<double> times;
+    for (int k = 1; k <= 700; ++k) times.push_back(made.motion.end() * k / 700);
+    const chain::States states = predict(problem, made.motion, times);
+    for (std::size_t k = 0; k < times.size(); ++k) {
+      const auto motions =
+          chain::link_motions(problem.model.chain, states.theta[k], base_at(made.motion, times[k]).pose);
+      const MatrixX nodes = chain::nodes(problem.model.chain, motions);
+      for (Eigen::Index i = 0; i < nodes.cols(); ++i)
+        least = std::min(least, (nodes.col(i) - options.spheres[0].center).norm());
+    }
+    return least;
+  };
+  const Plan around = plan(problem, options);
+  CHECK(around.reached);
+  CHECK(nearest_to_sphere(around) > 0.03 + 0.01 - 1e-4);
+  CHECK(nearest_to_sphere(free) < 0.03 + 0.01 - 1e-3);  // else the test would show nothing
+}
+
+TEST_CASE("what a step may run into is told with its slope") {
+  const Problem problem = problem_of(chain::Bending::planar, false);
+  Options options;
+  options.axes = {Axis::x, Axis::z};
+  const Vector3 p = problem.base.translation;
+  options.spheres = {{p + Vector3(0.06, 0, -0.25), 0.03}};
+  Motion motion = empty_motion(problem, options);
+  append_piece(motion, 0.0, 1.0);
+  const Task task = make_task(problem, options, {&problem.model}, motion, problem.initial, p + Vector3(0.2, 0, -0.25), 2);
+  VectorX q = VectorX::Zero(2 * kPerAxis);
+  q[kBasisCount] = 0.01;
+  const Sharpness sharpness{1e4, 1e-7};
+  const Evaluation here = evaluate(task, q, sharpness, true);
+  REQUIRE(here.good);
+  REQUIRE(!here.near.empty());
+  VectorX step = VectorX::Zero(q.size());
+  step[3] = 1e-5, step[kBasisCount] = 1e-5;
+  const Evaluation there = evaluate(task, q + step, sharpness, true);
+  REQUIRE(there.near.size() == here.near.size());
+  int moved = 0;
+  for (std::size_t k = 0; k < here.near.size(); ++k) {
+    const double change = there.near[k].residual - here.near[k].residual;
+    CHECK(change == doctest::Approx(here.near[k].slope.dot(step)).epsilon(0.02).scale(1e-6));
+    moved += std::abs(change) > 1e-6;
+  }
+  CHECK(moved > 0);
 }
 
 TEST_CASE("a horizon of its own is the shortest that reaches; samples of the parameters spread the miss") {

@@ -10,6 +10,7 @@ namespace {
 constexpr double kLimitWeight = 1.0;   // m^2: 1 % too fast costs as much as 10 mm
 constexpr double kLimitMargin = 0.97;  // of a limit, where its cost begins: verified on a finer grid afterwards
 constexpr double kClearanceWeight = 30.0;
+constexpr double kNearLimit = 0.3;       // of a limit below it, as far as a step may raise a value
 constexpr double kNear = 0.04;           // m beyond it, as far as a step may carry a point
 constexpr double kRestTime = 0.01;       // s: 10 cm/s left on the table cost as much as 1 mm
 constexpr double kNegligible = 1e-7;     // weight in the soft minimum
@@ -179,6 +180,14 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
     for (const Soft& s : soft) sum.value += s.value / samples, sum.miss += s.miss / samples;
   }
 
+  // a square that counts above zero only, with what a step may do to it
+  const auto add_one_sided = [&](double residual, double weight, VectorX slope) {
+    if (residual > 0.0) add(sum, weight, residual, slope);
+    if (!derivatives) return;
+    for (Eigen::Index i = 0; i < size; ++i)
+      if (task.held[i]) slope[i] = 0.0;
+    sum.near.push_back({residual, weight, std::move(slope)});
+  };
   double counted = sum.value;  // what is no violation
   for (int m = 0; m < samples; ++m) {
     const dynamics::Model& model = *task.models[m];
@@ -219,11 +228,8 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
             return;
           }
           if (axes.size() == 0) axes = chain::world_axes(chain, rollout.theta[node], base);
-          VectorX slope = -(point_slope(task, chain, rollout, axes, node, link, point).transpose() * outward);
-          for (Eigen::Index i = 0; i < size; ++i)
-            if (task.held[i]) slope[i] = 0.0;
-          if (residual > 0.0) add(sum, weight, residual, slope);
-          sum.near.push_back({residual, weight, std::move(slope)});
+          add_one_sided(residual, weight,
+                        -(point_slope(task, chain, rollout, axes, node, link, point).transpose() * outward));
         });
       }
   }
@@ -234,7 +240,7 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
   const auto limit = [&](const Basis& b, const Coordinates& c, int derivative, double most, bool yaw) {
     const double value = yaw ? std::abs(c(3, derivative)) : c.col(derivative).head<3>().norm();
     const double residual = value / most - kLimitMargin;
-    if (residual <= 0.0) return;
+    if (residual <= (derivatives ? -kNearLimit : 0.0)) return;
     if (!derivatives) {
       sum.value += task.limit_weight * kLimitWeight * residual * residual;
       return;
@@ -246,7 +252,7 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
       const double direction = c(static_cast<int>(axis), derivative) / value;
       slope.segment(static_cast<Eigen::Index>(a) * kPerAxis, kPerAxis) = direction / most * b.col(derivative);
     }
-    add(sum, task.limit_weight * kLimitWeight, residual, slope);
+    add_one_sided(residual, task.limit_weight * kLimitWeight, std::move(slope));
   };
   const Limits& limits = options.limits;
   const bool smooth = task.motion.window == Window::smooth;
@@ -283,10 +289,10 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
       if (node % stride != 0) continue;
       const double offset = base[node](row, 0) - origin;
       const double residual = std::abs(offset) / most - kLimitMargin;
-      if (residual <= 0.0) continue;
+      if (residual <= (derivatives ? -kNearLimit : 0.0)) continue;
       VectorX slope = VectorX::Zero(size);
       slope.segment(first, kPerAxis) = (offset < 0.0 ? -1.0 : 1.0) / most * b.col(0);
-      add(sum, task.limit_weight * kLimitWeight, residual, slope);
+      add_one_sided(residual, task.limit_weight * kLimitWeight, std::move(slope));
     }
   }
   sum.violation = sum.value - counted;
