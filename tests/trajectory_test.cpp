@@ -237,6 +237,24 @@ TEST_CASE("large offsets and long, dense recordings keep their digits") {
   CHECK(std::sqrt(squares / count) < 0.05);
 }
 
+TEST_CASE("the poses of a few stills are met, however little they have in common") {
+  for (const int count : {3, 4, 5, 8, 20}) {
+    std::vector<trajectory::Sample> samples;
+    for (int k = 0; k < count; ++k) {
+      math::Pose pose;
+      pose.translation = Vector3(0.1 * ((k * 7) % 5), 0.05 * ((k * 3) % 4), 0.02 * (k % 2));
+      pose.rotation = math::exp_so3(Vector3(0.0, 0.2 * ((k * 5) % 3), 0.0));
+      samples.push_back({1.0 * k, pose});
+    }
+    const Trajectory fitted = trajectory::fit(samples, "test");
+    for (const trajectory::Sample& sample : samples) {
+      CAPTURE(count);
+      CHECK((fitted.pose(sample.time).translation - sample.pose.translation).norm() < 1e-4);
+      CHECK((fitted.pose(sample.time).rotation - sample.pose.rotation).norm() < 1e-3);
+    }
+  }
+}
+
 TEST_CASE("TUM files: read, written, refused with file and line") {
   const Folder folder;
   const Path file = folder.path / "base.tum";

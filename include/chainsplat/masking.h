@@ -3,11 +3,13 @@
 //
 // The method uses that the rope is a tube of known length and diameter that begins at the base's pose, seen by known
 // cameras. In some moments a chain is grown from the grasp so that its tube best separates the colors inside from those
-// beside it, in all cameras together; nothing need move for that. These tubes show the colors of the rope and of its
-// surroundings and the background. A graph cut in a band around the tube then labels each pixel from log odds of color,
-// difference from the background and place, and of whether the picture changes at the tube's outline at all or
-// something hides the rope, with contours along the picture's edges. The masks give a better chain (silhouette.h), and
-// that gives better masks. A gripper, a finger or a shadow is outside the tube, unlike the rope in color, or both.
+// on either side, in all cameras together; nothing need move for that. These tubes show the colors of the rope and of
+// its surroundings. Of a video they also show the background: a graph cut in a band around the tube then labels each
+// pixel from log odds of color, difference from the background and place, and of whether the picture changes at the
+// tube's outline at all or something hides the rope, with contours along the picture's edges. The masks give a better
+// chain (silhouette.h), and that gives better masks. A gripper, a finger or a shadow is outside the tube, unlike the
+// rope in color, or both. A few stills have no such background: there the mask is the best pair of outlines along the
+// chain (src/masking/ribbon.h). Every mask gets a score.
 //
 // Pictures are in undistorted pixels unless a function says otherwise. Results do not depend on time or threads.
 #pragma once
@@ -77,9 +79,10 @@ struct BoxHint {
 
 struct Options {
   int first = 0, last = -1;  // frames [first, last) of each camera; last < 0: to the end
-  std::vector<PointHint> points;
-  std::vector<BoxHint> boxes;
-  std::vector<std::optional<capture::Image8>> empty;  // by camera: a recorded picture of the scene without the rope
+  std::vector<PointHint> points = {};
+  std::vector<BoxHint> boxes = {};
+  std::vector<std::optional<capture::Image8>> empty =
+      {};  // by camera: a recorded picture of the scene without the rope
 };
 
 // Receives the mask of one frame in recorded pixels, one channel, 0 or 255, and its score, 0 to 1: how much the picture
@@ -95,8 +98,9 @@ struct Summary {
   math::Vector3 grasp = math::Vector3::Zero();  // m, base frame: by how much the grasp is off, at most; stills only
 };
 
-// Makes the masks of a whole capture, by camera, then by frame; masks that the capture has are ignored. A few stills
-// have no background to learn and no motion to smooth: each is then judged by itself, and the grasp may be off by 1 cm.
+// Makes the masks of a whole capture, by camera, then by frame; masks that the capture has are ignored. At most eight
+// frames a camera are stills: they have no background to learn and no motion to smooth. Each is judged by itself, from
+// its outlines too, the grasp may be off by 1 cm, and the rope hangs at rest.
 // Throws InputError when the capture is unusable, has no frames, or shows nothing like the rope at the grasp.
 Summary make(const Path& capture, const Options& options, const Sink& sink);
 

@@ -33,6 +33,7 @@ constexpr double kSeenFromSide = 0.3;     // share of a link's length; one that 
 constexpr int kBeam = 48;          // number of ropes that are kept per link,
 constexpr int kBroadBeam = 128;    // and where the grasp is uncertain, so that there are many beginnings
 constexpr double kSameTip = 0.25;  // diameters; of ropes whose tips are nearer than this only the best is kept
+constexpr double kElsewhere = 4.0, kElsewhereShare = 0.06;  // diameters, share of the length: tips farther apart differ
 constexpr double kPlanarStep = 5.0 * M_PI / 180, kSpatialStep = 7.5 * M_PI / 180;
 constexpr int kPlanarSteps = 9, kSpatialSteps = 4;  // number of angles tried on either side, per axis of a joint
 constexpr double kBend = 15.0 * M_PI / 180;         // prior standard deviation of a joint's angle
@@ -344,9 +345,17 @@ struct Search {
     if (!planar) out = out * Eigen::AngleAxisd(other, second).toRotationMatrix();
     return out;
   }
-  // The log prior of a joint's turn from one direction of the rope to the next, up to a constant.
-  double believed(double first, double other, const Vector3& before, const Vector3& after) const {
+  // The log prior of joint j's turn from one direction of the rope to the next, up to a constant; `theta` holds the
+  // angles of the joints before it. The first joint is where the gripper may hold the rope askew.
+  double believed(int j, const VectorX& theta, double first, double other, const Vector3& before,
+                  const Vector3& after) const {
     double sum = -0.5 * (first * first + other * other) / (kBend * kBend);
+    const int axes = planar ? 1 : 2, last = axes * (j - 2);
+    if (clues.bend_change > 0.0 && j > 2) {
+      double change = (first - theta[last]) * (first - theta[last]);
+      if (!planar) change += (other - theta[last + 1]) * (other - theta[last + 1]);
+      sum -= 0.5 * change / (clues.bend_change * clues.bend_change);
+    }
     if (clues.down.isZero()) return sum;
     const auto from_down = [&](const Vector3& v) { return std::acos(std::clamp(v.dot(clues.down), -1.0, 1.0)); };
     const double rise = std::max(0.0, from_down(after) - from_down(before));
@@ -372,7 +381,7 @@ struct Search {
       const int k = axes * (j - 1);
       rotation = turned(rotation, theta[k], planar ? 0.0 : theta[k + 1]);
       const Vector3 along = rotation * chain.direction;
-      sum += believed(theta[k], planar ? 0.0 : theta[k + 1], before, along);
+      sum += believed(j, theta, theta[k], planar ? 0.0 : theta[k + 1], before, along);
       sum += link(tallies, at, along, chain.link_start(j), chain.link_end(j), true);
       const Vector3 next = at + (chain.link_end(j) - chain.link_start(j)) * along;
       if (points) reach_points(at, next, reached);
@@ -473,7 +482,7 @@ Grown grow(const chain::Chain& chain, std::span<const Shot> shots, std::span<con
           std::uint64_t reached = rope.reached;
           if (search.points) search.reach_points(rope.tip, tip, reached);
           candidates.push_back({parent, first, other,
-                                rope.score + gain + search.believed(first, other, before, along) +
+                                rope.score + gain + search.believed(j, rope.theta, first, other, before, along) +
                                     search.hints(reached) - search.hints(rope.reached),
                                 tip, reached});
         }
@@ -497,6 +506,11 @@ Grown grow(const chain::Chain& chain, std::span<const Shot> shots, std::span<con
     }
     beam = std::move(next);
   }
+
+  Grown out;
+  for (const Rope& rope : beam)
+    if ((rope.tip - beam[0].tip).norm() > std::max(kElsewhere * chain.diameter, kElsewhereShare * chain.length))
+      out.margin = std::min(out.margin, beam[0].score - rope.score);
 
   // refine the best: its beginning, single angles, pairs of angles that shift the rest of the rope, triples that move
   // one link
@@ -529,7 +543,6 @@ Grown grow(const chain::Chain& chain, std::span<const Shot> shots, std::span<con
           }
         }
     }
-  Grown out;
   out.theta = theta;
   out.shift = shift;
   // the evidence and the tallies of this moment alone

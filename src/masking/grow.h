@@ -29,7 +29,8 @@ struct Shot {
 struct Clues {
   math::Vector3 down = math::Vector3::Zero();   // unit, base frame, where it hangs at rest; zero: it need not
   math::Vector3 grasp = math::Vector3::Zero();  // m, base frame: the grasp is thought to be off by this,
-  double grasp_deviation = 0.0;                 // m, and how sure that is; 0: it is exactly there
+  double bend_change = 0.0;      // rad, by which neighboring joints' angles differ, as in a stiff cable; 0: unknown
+  double grasp_deviation = 0.0;  // m, and how sure that is; 0: it is exactly there
 };
 
 // Numbers of samples inside and beside the tube per coarse color.
@@ -45,6 +46,7 @@ Tally scaled(const Tally& tally, int samples);
 struct Grown {
   math::VectorX theta;
   math::Vector3 shift = math::Vector3::Zero();  // m, base frame: the grasp is off by this
+  double margin = 1e9;         // nats, by which the best rope that ends elsewhere is worse; large where there is none
   double evidence = 0.0;       // nats per sample, log of the Bayes factor: 0 (none) to log 2 (colors never shared)
   std::vector<Tally> tallies;  // per shot, of this moment alone
 };

@@ -48,10 +48,15 @@ constexpr double kLeastInside = 0.4;  // mean share of the centerline in the mas
 constexpr int kStills = 8;                 // frames per camera, up to which a capture is one of stills
 constexpr double kGraspDeviation = 0.006;  // m, of the grasp: hand-eye calibrations of laboratories are 3 to 14 mm off,
 constexpr double kGraspScatter = 0.0025;   // m, and from still to still
+constexpr double kHangingBendChange = 6.0 * M_PI / 180, kLyingBendChange = 10.0 * M_PI / 180;  // of neighboring joints
+constexpr double kSureMargin = 25.0;  // nats, by which a rope must be better than those that end elsewhere; with none
+constexpr double kUnsure = 0.7;       // its score is multiplied by this
 constexpr double kLeastStillEvidence = 0.02;  // nats per sample
 constexpr double kFacing = 0.5;  // cosine between view and bending axis, above which one camera sees the rope's plane
-constexpr double kFirstWidth = 0.2, kKnownWidth = 0.12;  // deviation of the width before and after it was measured
-constexpr double kLeastWidth = 0.6, kMostWidth = 1.7;    // of the given diameter, as far as it is believed to be wrong
+constexpr double kFirstWidth = 0.2, kFirstBroadWidth = 0.4,
+                 kKnownWidth = 0.12;                   // deviation of the width before and after it was measured
+constexpr double kBroad = 4.0;                         // px, of a radius beyond which blur hardly changes a width
+constexpr double kLeastWidth = 0.6, kMostWidth = 1.7;  // of the given diameter, as far as it is believed to be wrong
 
 struct Recording {
   const Path& path;
@@ -304,6 +309,7 @@ Summary make_stills(const Recording& recording, const Options& options, const ch
     core::parallel_for(static_cast<std::int64_t>(moments.size()), [&](std::int64_t i) {
       Clues clues;
       clues.grasp = grasp;
+      clues.bend_change = scene.tabletop ? kLyingBendChange : kHangingBendChange;
       clues.grasp_deviation = pass ? kGraspScatter : kGraspDeviation;
       if (!scene.tabletop && scene.gravity.norm() > 0.0)
         clues.down = scene.base.pose(moments[i].time).rotation.transpose() * scene.gravity.normalized();
@@ -332,6 +338,7 @@ Summary make_stills(const Recording& recording, const Options& options, const ch
     int moment;
     Axis along;  // of the grown chain
     Ribbon ribbon;
+    bool broad;  // enough pixels across that blur hardly changes the width
   };
   std::vector<std::vector<Still>> stills(cameras);
   const auto base_at = [&](const Still& still) {
@@ -344,7 +351,7 @@ Summary make_stills(const Recording& recording, const Options& options, const ch
       int nearest = 0;
       for (int i = 1; i < static_cast<int>(moments.size()); ++i)
         if (std::abs(moments[i].time - view.time) < std::abs(moments[nearest].time - view.time)) nearest = i;
-      stills[c].push_back({&view, nearest, {}, {}});
+      stills[c].push_back({&view, nearest, {}, {}, false});
     }
   // colors from the grown tubes, then from the ribbons; the width that the ribbons have in common
   std::vector<Look> looks(cameras);
@@ -360,6 +367,7 @@ Summary make_stills(const Recording& recording, const Options& options, const ch
         still.along = axis(chain, base_at(still), grown[still.moment].theta, pinholes[c], 0.0, chain.length);
         const Tube tube = masking::tube(by_ribbon ? still.ribbon.axis : still.along, view.width, view.height,
                                         std::max(kAboutPixels, 0.0));
+        still.broad = tube.radius > kBroad;
         count_colors(looks[c], picture_of(view), tube, reach(chain, base_at(still), pinholes[c]), chain,
                      by_ribbon ? kFitMargin : kGrownMargin * tube.radius);
       }
@@ -368,7 +376,7 @@ Summary make_stills(const Recording& recording, const Options& options, const ch
         Still& still = stills[c][i];
         RibbonOptions ribbon;
         ribbon.width = width;
-        ribbon.width_deviation = round ? kKnownWidth : kFirstWidth;
+        ribbon.width_deviation = round ? kKnownWidth : still.broad ? kFirstBroadWidth : kFirstWidth;
         still.ribbon = find_ribbon(looks[c], picture_of(*still.view), still.along, chain.length, ribbon);
       });
       for (const Still& still : stills[c])
@@ -384,11 +392,13 @@ Summary make_stills(const Recording& recording, const Options& options, const ch
     for (const Still& still : stills[c]) {
       const Tube tube = masking::tube(still.ribbon.axis, still.view->width, still.view->height, 0.0);
       const View view = inside_of(tube, *still.view);
+      // another way from the grasp that explains the picture nearly as well: another cable that crosses, perhaps
+      const double sure = std::min(1.0, kUnsure + (1.0 - kUnsure) * grown[still.moment].margin / kSureMargin);
       const Evidence seen = evidence(picture_of(*still.view), still.ribbon.axis);
       ++summary.frames;
       summary.empty += view.width == 0;
       summary.inside += view.width != 0;
-      sink(c, still.view->frame, recorded_mask(view, scene.cameras[c]), score(seen));
+      sink(c, still.view->frame, recorded_mask(view, scene.cameras[c]), sure * score(seen));
     }
   summary.inside /= summary.frames;
   return summary;

@@ -30,9 +30,11 @@ constexpr double kEndSigma = 0.4;  // of the slack
 constexpr double kEndStep = 4.0;   // of a full step of color along the rope there
 
 // the evidence
-constexpr double kSeen = 10.0;        // gray levels, the least contrast that is one
-constexpr double kLeastSpread = 6.0;  // gray levels, of the rope's colors along it,
-constexpr double kUnlike = 4.0;       // and times their usual spread, from where on it is another color
+constexpr double kSeen = 10.0;              // gray levels, the least contrast that is one
+constexpr double kLeastSpread = 6.0;        // gray levels, of the rope's colors along it,
+constexpr int kParts = 6, kOtherParts = 3;  // of the rope; in so many others a color must come back,
+constexpr double kAlike = 14.0;             // to within so many gray levels
+constexpr double kUnlike = 4.0;             // and times their usual spread, from where on it is another color
 
 double square(double x) { return x * x; }
 
@@ -317,11 +319,18 @@ Evidence evidence(const Picture& picture, const Axis& axis) {
   std::vector<double> spread;
   for (const Color& one : sides[1]) spread.push_back(difference(one, usual));
   const double typical = std::max(kLeastSpread, median_of(spread));
+  // a rope with marks has several colors, but each of them in several places
+  const auto elsewhere = [&](int i) {
+    std::array<bool, kParts> has{};
+    const int own = i * kParts / count;
+    for (int j = 0; j < count; ++j)
+      if (j * kParts / count != own && difference(sides[1][i], sides[1][j]) < kAlike) has[j * kParts / count] = true;
+    return std::count(has.begin(), has.end(), true) >= kOtherParts;
+  };
   for (int i = 0; i < count; ++i) {
     const double left = difference(sides[1][i], sides[0][i]), right = difference(sides[1][i], sides[2][i]);
-    const double least = std::min(left, right);
-    out.edges += (least > kSeen) / (1.0 * count);
-    out.steady += (spread[i] < kUnlike * typical) / (1.0 * count);
+    out.edges += (std::min(left, right) > kSeen) / (1.0 * count);
+    out.steady += (spread[i] < kUnlike * typical || elsewhere(i)) / (1.0 * count);
   }
   return out;
 }

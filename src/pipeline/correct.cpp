@@ -203,10 +203,18 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   out.verdict = find_mistakes(capture);
   judge_mass(capture, out.verdict);
   if (!out.verdict.empty() && !anyway) return out;
-  const chain::Bending kind = capture.tabletop ? chain::Bending::planar : chain::Bending::spatial;
-  const chain::Chain chain = chain::make_chain(capture.length, capture.diameter, capture.direction,
-                                               capture.bending_axis, kJoints, kind, false);
-  const silhouette::SequenceFit sequence = silhouette::fit_sequence(chain, capture);
+  const auto chain_of = [&](chain::Bending kind) {
+    return chain::make_chain(capture.length, capture.diameter, capture.direction, capture.bending_axis, kJoints, kind,
+                             false);
+  };
+  chain::Chain chain = chain_of(capture.tabletop ? chain::Bending::planar : chain::Bending::spatial);
+  silhouette::SequenceFit sequence = silhouette::fit_sequence(chain, capture);
+  // one camera does not see depth, into which a chain that bends in space would fold
+  if (!capture.tabletop && capture.cameras.size() == 1 &&
+      silhouette::choose_bending(chain, capture, sequence).bending == chain::Bending::planar) {
+    chain = chain_of(chain::Bending::planar);
+    sequence = silhouette::fit_sequence(chain, capture);
+  }
   silhouette::CorrectionOptions options;
   options.held = fixed;
   silhouette::CorrectionFit fit = silhouette::fit_corrections(chain, capture, sequence, options);

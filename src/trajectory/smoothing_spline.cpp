@@ -18,6 +18,11 @@ constexpr double kKnotSpacing = 0.5;  // of the median sample interval; closer s
 // 1 / (1 + lambda omega^6) with omega in radians per sample: the least passes everything below the Nyquist frequency,
 // the greatest leaves a parabola of some thousand samples.
 constexpr double kLeastExponent = -4.0, kGreatestExponent = 12.0, kExponentStep = 0.25;
+// Poses of stills are no samples of one motion: so few, or so far apart, they are met, since what is between them does
+// not matter and cross validation would take the changes from one to the next for noise.
+constexpr int kFewest = 9;
+constexpr double kLongestInterval = 0.2;  // s, median
+constexpr double kStillsStrength = 1e-7;
 // Points and weights of Gauss-Legendre quadrature on [-1, 1]; three points are exact for |f'''|^2, of degree four.
 constexpr double kGaussPoint[3] = {-0.774596669241483377, 0.0, 0.774596669241483377};
 constexpr double kGaussWeight[3] = {5.0 / 9, 8.0 / 9, 5.0 / 9};
@@ -167,8 +172,10 @@ SplineFit fit_spline(const std::vector<double>& times, const Points& values) {
   // solve for every smoothing strength and keep the one with the least cross-validation score
   SplineFit best;
   double best_score = std::numeric_limits<double>::infinity();
-  for (double exponent = kLeastExponent; exponent <= kGreatestExponent; exponent += kExponentStep) {
-    Band normal = data + std::pow(10.0, exponent) * penalty;
+  const bool stills = samples < kFewest || unit >= kLongestInterval;
+  const double greatest = stills ? kLeastExponent : kGreatestExponent;
+  for (double exponent = kLeastExponent; exponent <= greatest; exponent += kExponentStep) {
+    Band normal = data + (stills ? kStillsStrength : std::pow(10.0, exponent)) * penalty;
     factor(normal);
     Points coefficients = right;
     solve(normal, coefficients);
@@ -184,7 +191,7 @@ SplineFit fit_spline(const std::vector<double>& times, const Points& values) {
     if (!(score < best_score) && exponent > kLeastExponent) continue;
     best_score = score;
     best.spline.coefficients = coefficients;
-    best.noise = left_over > 1e-9 * samples ? std::sqrt(squares / (3.0 * left_over)) : 0.0;
+    best.noise = left_over > 1e-9 * samples && !stills ? std::sqrt(squares / (3.0 * left_over)) : 0.0;
     best.degrees_of_freedom = freedom;
   }
   // return to seconds and to the values' own origin

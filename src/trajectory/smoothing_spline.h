@@ -2,7 +2,7 @@
 //
 // The minimizer of  sum_k |f(t_k) - y_k|^2 + lambda integral |f'''|^2 dt  over all functions is a quintic spline with
 // its knots at the samples. It is C^4, so acceleration and jerk are continuous. lambda is chosen from the data alone,
-// by generalized cross validation (Craven & Wahba 1979).
+// by generalized cross validation (Craven & Wahba 1979); few samples, or samples far apart, are met instead.
 #pragma once
 #include <vector>
 #include "chainsplat/math.h"
