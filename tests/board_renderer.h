@@ -58,8 +58,8 @@ class BoardRenderer {
         for (int u = cell(all_[i].x0, half_x_); u <= cell(all_[i].x1, half_x_); ++u)
           cells_[v * kGrid + u].push_back(static_cast<int>(i));
     rays_.resize(static_cast<std::size_t>(camera.width) * camera.height * kSamples);
-    // a lattice that is shifted by chance in every pixel: a regular grid would round the place of an edge that runs
-    // along the pixels to a third of one
+    // a Fibonacci lattice that is shifted by chance in every pixel: a regular grid would round the place of an edge
+    // that runs along the pixels to a third of one
     core::Random random(1);
     for (std::size_t i = 0; i < rays_.size(); i += kSamples) {
       const double x = static_cast<double>(i / kSamples % camera.width),
@@ -67,7 +67,7 @@ class BoardRenderer {
       const double shift_x = random.uniform(), shift_y = random.uniform();
       for (int s = 0; s < kSamples; ++s)
         rays_[i + s] = ray(x + std::fmod(s / double(kSamples) + shift_x, 1.0),
-                           y + std::fmod(4 * s % kSamples / double(kSamples) + shift_y, 1.0));
+                           y + std::fmod(0.618033988749895 * s + shift_y, 1.0));
     }
   }
 

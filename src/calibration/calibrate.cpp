@@ -147,6 +147,18 @@ struct Robot {
 
 std::string range(double first, double last) { return core::brief(first) + " to " + core::brief(last) + " s"; }
 
+// Throws InputError where the camera's times lie outside of the robot's log, however its clock is turned.
+void check_overlap(const Options& options, std::size_t camera, const Robot& robot, double first, double last,
+                   const std::string& what) {
+  const CameraRequest& request = options.cameras[camera];
+  const trajectory::Trajectory& motion = robot.motion;
+  if (request.find_start || (first - kClockSearch <= motion.end() && last + kClockSearch >= motion.start())) return;
+  throw InputError(options.log.base.file.string(),
+                   "covers " + range(motion.start() + robot.origin, motion.end() + robot.origin) + ", and " +
+                       request.name + what + range(first + robot.origin, last + robot.origin),
+                   "give both by one clock with `timestamps` or `start`, or `start` " + request.name + "=auto");
+}
+
 // Clocks, cameras' poses and the board's pose on the flange, to begin with.
 void begin_with_robot(Bundle& bundle, std::vector<std::vector<View>>& views, const std::vector<Recording>& recordings,
                       const Options& options, const Robot& robot, std::vector<std::string>& notes) {
@@ -156,12 +168,7 @@ void begin_with_robot(Bundle& bundle, std::vector<std::vector<View>>& views, con
   for (std::size_t c = 0; c < views.size(); ++c) {
     const CameraRequest& request = options.cameras[c];
     const double first = recordings[c].seen.front().time, last = recordings[c].seen.back().time;
-    const double margin = request.find_start ? std::numeric_limits<double>::infinity() : kClockSearch;
-    if (first - margin > motion.end() || last + margin < motion.start())
-      throw InputError(options.log.base.file.string(),
-                       "covers " + range(motion.start() + robot.origin, motion.end() + robot.origin) + ", and " +
-                           request.name + " sees the board from " + range(first + robot.origin, last + robot.origin),
-                       "give both by one clock with `timestamps` or `start`, or `start` " + request.name + "=auto");
+    check_overlap(options, c, robot, first, last, " sees the board from ");
     for (const View& view : views[c])
       if (const auto pose = place(view, bundle.cameras[c])) placed[c].push_back({view.time, *pose});
     const double from = request.find_start ? motion.start() - last : -kClockSearch;
@@ -386,6 +393,9 @@ Calibration calibrate(const Path& out_folder, const Options& options) {
   std::vector<Recording> recordings;
   for (const CameraRequest& request : options.cameras)
     recordings.push_back(open_recording(request, options.log.time_unit, robot.origin, out.notes));
+  if (out.robot)
+    for (std::size_t c = 0; c < recordings.size(); ++c)
+      check_overlap(options, c, robot, recordings[c].times.front(), recordings[c].times.back(), " is recorded from ");
   look(recordings, out.board);
 
   const std::size_t count = recordings.size();

@@ -26,6 +26,7 @@ constexpr double kClearest = 35.0;        // gray levels between a bit and the t
 constexpr int kLargeImage = 1600 * 1200;  // px; in larger ones quads are sought at half the size
 constexpr double kEnds = 0.15;            // of an edge, at either end, that are not measured: the corner rounds it
 constexpr double kWindow = 0.5;           // of a cell: how far from the edge is looked
+constexpr double kWideWindow = 0.8;       // of a cell, where nothing else is near
 constexpr double kWidestWindow = 4.0, kNarrowestWindow = 1.2;  // px
 constexpr double kStep = 0.25;                                 // px, between samples across the edge
 constexpr int kRounds = 12;                                    // of centering the window
@@ -107,12 +108,13 @@ struct Step {
 // known). Blur that is alike on both sides does not move it.
 Step step_along(const Gray& image, const Vector2& from, const Vector2& outward, double window, const Behind& behind,
                 double blur) {
-  const int half = static_cast<int>(std::ceil(window / kStep));
-  const double narrow = 0.25 * window * window;  // variance of the window
+  const int half = static_cast<int>(std::ceil(1.5 * window / kStep));  // three of its standard deviations
+  const double narrow = 0.25 * window * window;                        // variance of the window
   Step out;
   double at = 0.0;
   for (int round = 0; round < kRounds; ++round) {
-    double sum = 0.0, moment = 0.0, square = 0.0, contrast = 0.0, own = 0.0, other = 0.0, other_moment = 0.0;
+    double sum = 0.0, moment = 0.0, square = 0.0, contrast = 0.0, own = 0.0, other = 0.0, other_moment = 0.0,
+           other_square = 0.0;
     double before = intensity(image, from + (at - (half + 0.5) * kStep) * outward);
     for (int i = -half; i <= half; ++i) {
       const double after = intensity(image, from + (at + (i + 0.5) * kStep) * outward);
@@ -123,16 +125,16 @@ Step step_along(const Gray& image, const Vector2& from, const Vector2& outward, 
       own += w * bell(s, blur);
       for (int k = 0; k < kDepth; ++k) {
         const double extra = behind.rise[k] * bell(s + (k + 1) * behind.cell, blur);
-        other += w * extra, other_moment += w * extra * s;
+        other += w * extra, other_moment += w * extra * s, other_square += w * extra * s * s;
       }
     }
     if (!(contrast > kLeastContrast) || !(sum > 0.0)) return {};
-    double variance = std::clamp(square / sum, 0.0, 0.9 * narrow);
+    double variance = std::clamp(square / sum, 0.0, 0.9 * narrow);  // of the slope in the window
     if (blur > 0.0) {
       const double size = sum / (own + other);  // brightness of the edge's own step, by the sample's length
-      moment -= size * other_moment, sum -= size * other;
-      variance = std::min(1.0 / (1.0 / (blur * blur) + 1.0 / narrow), 0.9 * narrow);
+      moment -= size * other_moment, sum -= size * other, square -= size * other_square;
       if (!(sum > 0.0)) return {};
+      variance = std::clamp(square / sum, 0.0, 0.9 * narrow);
     }
     // the window draws the center of gravity to its own middle: by as much as it narrows the slope
     const double move = moment / sum / (1.0 - variance / narrow);
@@ -169,30 +171,38 @@ std::vector<Vector2> edge_points(const Gray& image, const Tag& tag, int k) {
   const int count = static_cast<int>(std::clamp((1.0 - 2.0 * kEnds) * length, 1.0, 100.0));
   const auto place = [&](int i) { return kEnds + (1.0 - 2.0 * kEnds) * (i + 0.5) / count; };
   const auto black = black_cells(tag.id);
-  // brightness of the tag behind the edge, blurred along it
+  // brightness of the tag behind the edge, blurred along it; a tilted tag's cells lie aslant behind it
+  const double aslant = (0.5 * (c + d) - 0.5 * (a + b)).dot(along) / length / kCells;  // px, from cell to cell
   const auto behind = [&](int i, double blur) {
     Behind out{cell, {}};
-    double outer = 0.0;
     for (int deep = 1; deep <= kDepth; ++deep) {
-      double light = 0.0;
-      for (int cell_along = 0; cell_along < kCells; ++cell_along)
-        if (white(black, k, cell_along, deep)) {
-          const double u = (place(i) - cell_along / double(kCells)) * length;
-          light += blur > 0.0 ? ramp(u, blur) - ramp(u - length / kCells, blur) : u >= 0 && u < length / kCells;
-        }
-      out.rise[deep - 1] = outer - light;
-      outer = light;
+      const double at = place(i) * length - deep * aslant;
+      const auto light = [&](int row) {
+        double sum = 0.0;
+        for (int column = 0; column < kCells; ++column)
+          if (white(black, k, column, row)) {
+            const double u = at - column * length / kCells;
+            sum += blur > 0.0 ? ramp(u, blur) - ramp(u - length / kCells, blur) : u >= 0 && u < length / kCells;
+          }
+        return sum;
+      };
+      out.rise[deep - 1] = light(deep - 1) - light(deep);
     }
     return out;
   };
-  // first where black reaches deeper than the border: there is no other step, and the blur is seen
-  std::vector<double> blurs;
-  for (int i = 0; i < count; ++i)
-    if (behind(i, 0.3 * cell).rise[0] > -0.1)
-      if (const Step step = step_along(image, a + place(i) * along, outward, window, {cell, {}}, 0.0);
-          std::isfinite(step.at))
-        blurs.push_back(step.blur);
-  const double blur = blurs.empty() ? 0.0 : std::clamp(math::median(blurs), 0.3, 0.5 * cell);
+  // the blur is seen best where black reaches deeper than the border; then with what else there is
+  const double wide = std::clamp(kWideWindow * cell, kNarrowestWindow, kWidestWindow);
+  double blur = 0.0;
+  for (const double lightest : {0.1, 0.3, 0.3}) {
+    std::vector<double> blurs;
+    for (int i = 0; i < count; ++i) {
+      const Behind other = behind(i, blur > 0.0 ? blur : 0.3 * cell);
+      if (other.rise[0] < -lightest) continue;
+      const Step step = step_along(image, a + place(i) * along, outward, wide, other, blur);
+      if (std::isfinite(step.at)) blurs.push_back(step.blur);
+    }
+    blur = blurs.empty() ? std::max(blur, 0.2 * cell) : std::clamp(math::median(blurs), 0.3, cell);
+  }
   std::vector<Vector2> points;
   for (int i = 0; i < count; ++i) {
     const Vector2 from = a + place(i) * along;

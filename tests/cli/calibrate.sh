@@ -73,7 +73,7 @@ refused 'gone.json' "${cam[@]}" --board "$work/gone.json"
 refused "'cam7' is no camera; there are cam0" "${cam[@]}" --board "$board" --rate cam7=10
 refused "'auto' needs the robot's motion" "${cam[@]}" --board "$board" --start auto
 refused "the world is the robot's" "${cam[@]}" --board "$board" --base "$raw/robot.tum" --world board
-refused 'robot.tum: covers 0 to 4.5 s, and cam0 sees the board from 7' "${cam[@]}" --board "$board" --base "$raw/robot.tum" --start 70
+refused 'robot.tum: covers 0 to 4.5 s, and cam0 is recorded from 70 to 72.3 s' "${cam[@]}" --board "$board" --base "$raw/robot.tum" --start 70
 sed 's/"first_id": 5/"first_id": 300/' "$board" >"$work/other.json"
 refused 'cam0.mp4: cam0 never sees the board in 24 frames, but the tags 5, 6, .*and the board has 300 to 305' "${cam[@]}" --board "$work/other.json"
 sed 's/"first_id"/"first"/' "$board" >"$work/other.json"
