@@ -269,7 +269,8 @@ TEST_CASE("what of the rope hits is what was asked for, and it is said where alo
     CHECK(found.hits[0].arclength >= first);
     // the point at that arclength is where the hit says
     const chain::States there = predict(problem, found.motion, {found.hits[0].time});
-    const auto motions = chain::link_motions(problem.model.chain, there.theta[0], base_at(found.motion, found.hits[0].time).pose);
+    const auto motions =
+        chain::link_motions(problem.model.chain, there.theta[0], base_at(found.motion, found.hits[0].time).pose);
     const Vector3 point = motions.back() * (found.hits[0].arclength * problem.model.chain.direction);
     CHECK((point - found.hits[0].point).norm() < 1e-3);
   }
@@ -394,7 +395,8 @@ TEST_CASE("what a step may run into is told with its slope") {
   options.spheres = {{p + Vector3(0.06, 0, -0.25), 0.03}};
   Motion motion = empty_motion(problem, options);
   append_piece(motion, 0.0, 1.0);
-  const Task task = make_task(problem, options, {&problem.model}, motion, problem.initial, p + Vector3(0.2, 0, -0.25), 2);
+  const Task task =
+      make_task(problem, options, {&problem.model}, motion, problem.initial, p + Vector3(0.2, 0, -0.25), 2);
   VectorX q = VectorX::Zero(2 * kPerAxis);
   q[kBasisCount] = 0.01;
   const Sharpness sharpness{1e4, 1e-7};

@@ -9,11 +9,11 @@ using math::Vector2;
 
 namespace {
 
-constexpr std::size_t kBatchPixels = 2u << 20;  // per batch: 32 MiB of float colors, several dozen frames of a rope
-constexpr std::size_t kImagePixels = 64u << 20;  // of a batch's whole images, which its user may make all at once
-constexpr int kBorderStep = 8;                  // px between the border points that bound a warped rectangle
-constexpr double kTimeSlack = 1e-9;             // s; covers the rounding of frame times
-constexpr float kSolid = 0.5f;                  // least alpha of the object (formats.md 5.4)
+constexpr std::size_t kBatchPixels = 2u << 20;   // per batch: 32 MiB of float colors, several dozen frames of a rope
+constexpr std::size_t kImagePixels = 32u << 20;  // of a batch's whole images, which its user may make all at once
+constexpr int kBorderStep = 8;                   // px between the border points that bound a warped rectangle
+constexpr double kTimeSlack = 1e-9;              // s; covers the rounding of frame times
+constexpr float kSolid = 0.5f;                   // least alpha of the object (formats.md 5.4)
 
 Bounds cut(const Bounds& a, const Bounds& b) {
   return {std::max(a.x0, b.x0), std::max(a.y0, b.y0), std::min(a.x1, b.x1), std::min(a.y1, b.y1)};
@@ -162,7 +162,8 @@ void for_batches(splat::Engine& engine, const splat::Gaussians& gaussians, const
     std::size_t last = first, pixels = 0;
     std::vector<splat::ViewSpec> views;
     std::vector<std::size_t> of_view;
-    const std::size_t most = std::max<std::size_t>(1, kImagePixels / (static_cast<std::size_t>(camera.width) * camera.height));
+    const std::size_t most =
+        std::max<std::size_t>(1, kImagePixels / (static_cast<std::size_t>(camera.width) * camera.height));
     for (; last < std::min(plans.size(), first + most) && pixels < kBatchPixels; ++last) {
       const Plan& plan = plans[last];
       if (plan.drawn.empty()) continue;

@@ -372,10 +372,11 @@ void bench(const Globals& globals, const Request& request) {
   document["repeats"] = request.repeats;
   document["results"] = Json::array();
   if (!globals.json && !cases.empty())
-    std::cout << gpu::info(*device).name << ", milliseconds a submission, medians of " << request.repeats << "\n"
-              << "                                                              with D-SSIM\n"
-              << "scene         gaussians views links     draw     step   median    least processor  GFLOP/s   GB/s   its "
-                 "passes\n";
+    std::cout
+        << gpu::info(*device).name << ", milliseconds a submission, medians of " << request.repeats << "\n"
+        << "                                                              with D-SSIM\n"
+        << "scene         gaussians views links     draw     step   median    least processor  GFLOP/s   GB/s   its "
+           "passes\n";
   for (const Case& what : cases)
     document["results"].push_back(bench_case(*device, what, request.repeats, globals.seed, !globals.json));
   std::vector<double> held;  // MiB after each training

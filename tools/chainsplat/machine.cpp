@@ -16,22 +16,21 @@ constexpr int kTurns = 4000000;             // of the loop below: some 10 to 30 
 constexpr int kSums = 10;                   // independent ones: latency times the adders of a core
 constexpr std::size_t kCopied = 96u << 20;  // bytes, of all threads together: beyond the caches
 
-// A function that runs kTurns x kSums multiply-adds of vectors with so many lanes, for the processors that `target` names.
-// A macro and no template, because a compiler takes vectors apart before it puts a template into a function for another
-// processor.
-#define CHAINSPLAT_MULTIPLY_ADD(name, lanes, target)                             \
-  target float name(float start) {                                               \
-    using Vector = float __attribute__((vector_size(4 * (lanes))));              \
-    Vector sums[kSums], factor = Vector{} + 0.999f, term = Vector{} + start;     \
-    for (int i = 0; i < kSums; ++i) sums[i] = term + static_cast<float>(i);      \
-    for (int turn = 0; turn < kTurns; ++turn) {                                  \
-      _Pragma("GCC unroll 10") for (int i = 0; i < kSums; ++i)                   \
-        sums[i] = sums[i] * factor + term;                                       \
-    }                                                                            \
-    float out = 0.0f;                                                            \
-    for (int i = 0; i < kSums; ++i)                                              \
-      for (int lane = 0; lane < (lanes); ++lane) out += sums[i][lane];           \
-    return out;                                                                  \
+// A function that runs kTurns x kSums multiply-adds of vectors with so many lanes, for the processors that `target`
+// names. A macro and no template, because a compiler takes vectors apart before it puts a template into a function for
+// another processor.
+#define CHAINSPLAT_MULTIPLY_ADD(name, lanes, target)                                              \
+  target float name(float start) {                                                                \
+    using Vector = float __attribute__((vector_size(4 * (lanes))));                               \
+    Vector sums[kSums], factor = Vector{} + 0.999f, term = Vector{} + start;                      \
+    for (int i = 0; i < kSums; ++i) sums[i] = term + static_cast<float>(i);                       \
+    for (int turn = 0; turn < kTurns; ++turn) {                                                   \
+      _Pragma("GCC unroll 10") for (int i = 0; i < kSums; ++i) sums[i] = sums[i] * factor + term; \
+    }                                                                                             \
+    float out = 0.0f;                                                                             \
+    for (int i = 0; i < kSums; ++i)                                                               \
+      for (int lane = 0; lane < (lanes); ++lane) out += sums[i][lane];                            \
+    return out;                                                                                   \
   }
 
 struct Loop {
@@ -79,7 +78,8 @@ MachineRates measure_machine() {
   }
   // what nobody looks at would not be computed
   if (std::count(results.begin(), results.end(), 0.0f) != 0 || to[0].front() != from[0].front()) return {};
-  const double operations = 2.0 * kTurns * kSums * loop.lanes * threads, bytes = 2.0 * static_cast<double>(part) * threads;
+  const double operations = 2.0 * kTurns * kSums * loop.lanes * threads,
+               bytes = 2.0 * static_cast<double>(part) * threads;
   return {1e-9 * kRounds * operations / computing, 1e-9 * kRounds * bytes / copying};
 }
 

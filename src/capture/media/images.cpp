@@ -67,7 +67,8 @@ bool is_damaged_exr(const Path& file) {
   for (std::string name, type; std::getline(stream, name, '\0') && !name.empty();) {
     unsigned char b[4] = {};
     if (!std::getline(stream, type, '\0') || !stream.read(reinterpret_cast<char*>(b), sizeof b)) return true;
-    const std::uint32_t length = std::uint32_t{b[3]} << 24u | std::uint32_t{b[2]} << 16u | std::uint32_t{b[1]} << 8u | b[0];
+    const std::uint32_t length =
+        std::uint32_t{b[3]} << 24u | std::uint32_t{b[2]} << 16u | std::uint32_t{b[1]} << 8u | b[0];
     if (length > at_most) return true;
     stream.seekg(length, std::ios::cur);
   }
@@ -83,11 +84,19 @@ const char* format_of(const Path& file) {
     const char* format;
   };
   using namespace std::string_view_literals;
-  constexpr Start kStarts[] = {{"\x89PNG\r\n\x1a\n"sv, "png"}, {"\xff\xd8\xff"sv, "jpeg"},   {"BM"sv, "bmp"},
-                               {"II\x2a\0"sv, "tiff"},          {"MM\0\x2a"sv, "tiff"},      {"II\x2b\0"sv, "tiff"},
-                               {"MM\0\x2b"sv, "tiff"},          {"\x76\x2f\x31\x01"sv, "openexr"},
-                               {"P2"sv, "pnm"},                 {"P3"sv, "pnm"},             {"P5"sv, "pnm"},
-                               {"P6"sv, "pnm"},                 {"RIFF"sv, "webp"}};
+  constexpr Start kStarts[] = {{"\x89PNG\r\n\x1a\n"sv, "png"},
+                               {"\xff\xd8\xff"sv, "jpeg"},
+                               {"BM"sv, "bmp"},
+                               {"II\x2a\0"sv, "tiff"},
+                               {"MM\0\x2a"sv, "tiff"},
+                               {"II\x2b\0"sv, "tiff"},
+                               {"MM\0\x2b"sv, "tiff"},
+                               {"\x76\x2f\x31\x01"sv, "openexr"},
+                               {"P2"sv, "pnm"},
+                               {"P3"sv, "pnm"},
+                               {"P5"sv, "pnm"},
+                               {"P6"sv, "pnm"},
+                               {"RIFF"sv, "webp"}};
   char bytes[8] = {};
   std::ifstream stream(file, std::ios::binary);
   stream.read(bytes, sizeof bytes);
@@ -198,10 +207,10 @@ Image8 read_image8(const Path& file) {
   const OIIO::ImageSpec& spec = input->spec();
   // no camera gives the expected size here, so the total is bounded
   if (static_cast<std::int64_t>(spec.width) * spec.height * spec.nchannels > kMostPixels)
-    throw InputError(file.string(),
-                     "claims " + size_text(spec.width, spec.height) + " pixels of " + std::to_string(spec.nchannels) +
-                         " channels",
-                     "write it again with fewer");
+    throw InputError(
+        file.string(),
+        "claims " + size_text(spec.width, spec.height) + " pixels of " + std::to_string(spec.nchannels) + " channels",
+        "write it again with fewer");
   return {spec.width, spec.height, spec.nchannels,
           read_pixels<std::uint8_t>(*input, file, OIIO::TypeDesc::UINT8, spec.nchannels)};
 }

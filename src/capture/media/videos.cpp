@@ -570,7 +570,8 @@ void add(Encoder& self, const Image8& frame) {
   picture->colorspace = self.encoder->colorspace;
   const std::size_t row = static_cast<std::size_t>(frame.channels) * self.width;
   for (int y = 0; y < self.height; ++y)
-    std::memcpy(self.rgb->data[0] + static_cast<std::ptrdiff_t>(y) * self.rgb->linesize[0], &frame.pixels[y * row], row);
+    std::memcpy(self.rgb->data[0] + static_cast<std::ptrdiff_t>(y) * self.rgb->linesize[0], &frame.pixels[y * row],
+                row);
   sws_scale(self.scaler.get(), self.rgb->data, self.rgb->linesize, 0, self.height, picture->data, picture->linesize);
   picture->pts = self.count++;
   const int code = avcodec_send_frame(self.encoder.get(), picture.get());
