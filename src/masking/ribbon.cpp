@@ -20,6 +20,7 @@ constexpr double kColor = 0.25;     // per unit of log odds and radius of width
 constexpr double kMostOdds = 2.5;   // of one sample
 constexpr double kEdge = 1.6;       // of a full step at one outline,
 constexpr double kFullStep = 25.0;  // gray levels at which a step counts half
+constexpr double kSteepest = 0.5;   // radii, about a place, among which the steepest counts
 constexpr double kCenter = 0.8;     // radii, deviation of the rope's middle from the axis
 constexpr double kWiderTip = 0.3;   // deviation of the width where a connector may be, per unit of width
 constexpr double kTipShare = 0.15;  // of the length
@@ -153,12 +154,19 @@ Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, 
         for (int c = 0; c < 3; ++c) sum[c] += colors[at(j, k)][c];
       for (int c = 0; c < 3; ++c) mean[at(i, k)][c] = sum[c] / static_cast<float>(n);
     }
-  for (int i = 0; i < count; ++i)
-    for (int k = 1; k < columns; ++k) {  // between the columns k - 1 and k
-      const double d =
-          difference(mean[at(i, std::max(0, k - apart))], mean[at(i, std::min(columns - 1, k + apart - 1))]);
-      steps[at(i, k)] = d / (d + kFullStep);
+  // a full step counts fully at its steepest place only, which is where the outline is
+  const int near = std::max(1, static_cast<int>(kSteepest * radius / du));
+  std::vector<double> across(columns, 0.0);
+  for (int i = 0; i < count; ++i) {
+    for (int k = 1; k < columns; ++k)  // between the columns k - 1 and k
+      across[k] = difference(mean[at(i, std::max(0, k - apart))], mean[at(i, std::min(columns - 1, k + apart - 1))]);
+    for (int k = 1; k < columns; ++k) {
+      const auto first = across.begin() + std::max(1, k - near),
+                 last = across.begin() + std::min(columns, k + near + 1);
+      const double d = across[k];
+      steps[at(i, k)] = d * d / (std::max(1e-9, *std::max_element(first, last)) * (d + kFullStep));
     }
+  }
   // states: the left outline lies before column a, the right one before column b
   struct State {
     int a, b;
