@@ -74,3 +74,26 @@ TEST_CASE("a motion that misses what was recognized is doubted, and then not tru
     CHECK(twin.trusted() == found->trusted);
   }
 }
+
+TEST_CASE("a plane that the views do not tell is told") {
+  using chain::Bending;
+  const auto judged = [](Bending bending, double out_of_plane, double deviation) {
+    twin::Twin twin = make_twin(0.2, 0.0);
+    pipeline::judge_bending(twin, {bending, out_of_plane, deviation});
+    return twin;
+  };
+  // three cameras that see a rope in its plane; a table; a rope that is modeled in space
+  CHECK(judged(Bending::planar, 0.6e-3, 0.3e-3).verdict.empty());
+  CHECK(judged(Bending::planar, 0.0, 0.0).verdict.empty());
+  CHECK(judged(Bending::spatial, 30e-3, 1e-3).verdict.empty());
+  // one camera: much is found, or nothing is known
+  for (const auto& [out_of_plane, deviation] : {std::pair{6e-3, 0.5e-3}, {0.0, 6e-3}}) {
+    const twin::Twin twin = judged(Bending::planar, out_of_plane, deviation);
+    const capture::Finding* const found = finding(twin, "out-of-plane");
+    REQUIRE(found);
+    CHECK(found->value == doctest::Approx(1e3 * out_of_plane));
+    CHECK(found->deviation == doctest::Approx(1e3 * deviation));
+    CHECK(found->text.find("6.0 mm") != std::string::npos);
+    CHECK(found->trusted);
+  }
+}

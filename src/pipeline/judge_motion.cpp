@@ -1,4 +1,4 @@
-// judge_motion.cpp - how far the identified motion can be trusted, in plain words.
+// judge_motion.cpp - how far the recognized and the identified motion can be trusted, in plain words.
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
@@ -12,12 +12,14 @@ namespace {
 
 using capture::Finding;
 
-constexpr const char *kMisfit = "identification-misfit", *kUnexcited = "unexcited";
+constexpr const char *kMisfit = "identification-misfit", *kUnexcited = "unexcited", *kOutOfPlane = "out-of-plane";
 // Share of the length by which the identified motion misses the recognized one, RMS over nodes and frames. Ropes that
 // the model can follow leave 0.1 to 0.4 %; a base one frame late, taken as given, 3 %.
 constexpr double kDoubtful = 0.01, kUseless = 0.02;
 constexpr double kStill = 2.0;  // of an angle's variation over its noise; swings leave 4 and more at the free end
 constexpr std::size_t kFramesOfMotion = 15;  // half a second
+// Share of the length by which a rope may leave its plane unseen before that is told: what three cameras are off by.
+constexpr double kUnseen = 0.005;
 constexpr double kMillimeters = 1e3;
 
 struct Misfit {
@@ -91,6 +93,19 @@ void judge_excitation(twin::Twin& twin) {
 }
 
 }  // namespace
+
+void judge_bending(twin::Twin& twin, const silhouette::BendingChoice& choice) {
+  const double unseen = std::hypot(choice.out_of_plane_rms, choice.deviation);  // m
+  if (choice.bending != chain::Bending::planar || unseen < kUnseen * twin.chain.length) return;
+  char text[320];
+  std::snprintf(text, sizeof text,
+                "the cameras do not tell whether the rope stays in a plane: leaving it by %.1f mm RMS would look nearly the "
+                "same, and the twin's places are not known better than that; a second camera tells, and where the rope does "
+                "leave its plane `bending` spatial is nearer",
+                kMillimeters * unseen);
+  twin.verdict.push_back({kOutOfPlane, "object", kMillimeters * choice.out_of_plane_rms, kMillimeters * choice.deviation,
+                          "mm", false, true, false, -1, text});
+}
 
 void judge_motion(twin::Twin& twin, const trajectory::Trajectory& base) {
   std::erase_if(twin.verdict, [](const Finding& f) { return f.code == kMisfit || f.code == kUnexcited; });

@@ -6,6 +6,7 @@
 #include "chainsplat/gpu.h"
 #include "chainsplat/identification.h"
 #include "chainsplat/pipeline.h"
+#include "chainsplat/silhouette.h"
 #include "chainsplat/solve.h"
 
 namespace chainsplat::pipeline {
@@ -36,6 +37,8 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
 
 // What the twin and its capture say of how to identify it.
 identification::Options identification_options(const twin::Twin& twin, bool paper, std::uint64_t seed);
+// Adds to the verdict what the views left open about the plane that a planar twin bends in, where that is much.
+void judge_bending(twin::Twin& twin, const silhouette::BendingChoice& choice);
 // What the verdict says of the identified motion (twin.rollout) beside the recognized one (twin.states), anew.
 void judge_motion(twin::Twin& twin, const trajectory::Trajectory& base);
 

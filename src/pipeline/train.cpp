@@ -296,6 +296,7 @@ void recognize(Training& t) {
   if (!t.options.bending && t.options.mode == twin::Mode::fast) {
     char text[96];
     std::snprintf(text, sizeof text, " bending (out of plane: %.2f mm)", 1e3 * found.bending.out_of_plane_rms);
+    judge_bending(t.twin, found.bending);
     core::say((found.bending.bending == chain::Bending::planar ? "planar" : "spatial") + std::string(text));
   }
   tell_fit("recognize", found.summary);
