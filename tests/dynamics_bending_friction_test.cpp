@@ -46,7 +46,7 @@ std::vector<double> times_to(double end, int count) {
 InitialState start_of(const Model& model) {
   const int n = model.chain.angles();
   InitialState start{0.0, VectorX::Zero(n), VectorX::Zero(n), VectorX::Zero(n)};
-  for (int k = 0; k < n; ++k) start.theta[k] = 0.3 - 0.1 * k, start.friction_state[k] = 0.2 * (k % 3) - 0.1;
+  for (int k = 0; k < n; ++k) start.theta[k] = 0.3 - 0.1 * k, start.internal_state[k] = 0.2 * (k % 3) - 0.1;
   return start;
 }
 
@@ -77,7 +77,7 @@ TEST_CASE("friction in bending agrees with an explicit solution of its equations
       return out;
     };
     VectorX y(3 * n);
-    y << start.theta, start.thetadot, start.friction_state;
+    y << start.theta, start.thetadot, start.internal_state;
     constexpr double kEnd = 0.8, kStep = 2e-4;
     for (int k = 0; k < std::lround(kEnd / kStep); ++k) {
       const double t = k * kStep;
@@ -93,13 +93,13 @@ TEST_CASE("friction in bending agrees with an explicit solution of its equations
     const double coarse = off(4), fine = off(64);
     CHECK(coarse < 6e-3);  // rad, over a motion of 0.5 rad; corners where joints turn back
     CHECK(fine < 3e-4);
-    CHECK((states.friction_state[0] - y.tail(n)).cwiseAbs().maxCoeff() < 5e-3);
+    CHECK((states.internal_state[0] - y.tail(n)).cwiseAbs().maxCoeff() < 5e-3);
     // and without friction the rope is elsewhere
     Model smooth = model;
     smooth.parameters.bending_friction.clear(), smooth.parameters.bending_friction_angle.clear();
     REQUIRE(simulate(smooth, grid_of(4.0, {kEnd}, 64), {0.0, start.theta, start.thetadot}, states));
     CHECK((states.theta[0] - y.head(n)).cwiseAbs().maxCoeff() > 0.05);
-    CHECK(states.friction_state.empty());
+    CHECK(states.internal_state.empty());
   }
 }
 
@@ -113,7 +113,7 @@ TEST_CASE("friction of no moment changes no bit") {
     REQUIRE(simulate(none, grid, start, a));
     REQUIRE(simulate(without, grid, start.theta, start.thetadot, b));
     for (std::size_t k = 0; k < a.theta.size(); ++k) CHECK((a.theta[k] - b.theta[k]).norm() == 0.0);
-    CHECK(a.friction_state.empty());
+    CHECK(a.internal_state.empty());
   }
 }
 
@@ -121,7 +121,7 @@ TEST_CASE("a bend that is given builds the moment up and turns it round") {
   const Model model = make_rope(chain::Bending::planar, 0.004, 0.05);
   const double angle = model.parameters.bending_friction_angle[0];
   const auto bent = [](double to) { return VectorX::Constant(3, to).eval(); };
-  const auto z = friction_states(model, {bent(0.0), bent(0.03), bent(0.3), bent(0.28), bent(-0.3)});
+  const auto z = internal_states(model, {bent(0.0), bent(0.03), bent(0.3), bent(0.28), bent(-0.3)});
   CHECK(z[1][0] == doctest::Approx(1.0 - std::exp(-0.03 / angle)));
   CHECK(z[2][0] == doctest::Approx(1.0 - std::exp(-0.3 / angle)));
   CHECK(z[3][0] == doctest::Approx(-1.0 + (z[2][0] + 1.0) * std::exp(-0.02 / angle)));
@@ -130,11 +130,11 @@ TEST_CASE("a bend that is given builds the moment up and turns it round") {
   const Model spatial = make_rope(chain::Bending::spatial, 0.004, 0.05, true);
   VectorX from = VectorX::Zero(9), to = from;
   to[0] = 0.3, to[1] = 0.4, to[2] = 0.7;
-  const VectorX in_two = friction_states(spatial, {from, to}).back();
+  const VectorX in_two = internal_states(spatial, {from, to}).back();
   CHECK(in_two[0] == doctest::Approx(0.6).epsilon(1e-3));
   CHECK(in_two[1] == doctest::Approx(0.8).epsilon(1e-3));
   CHECK(in_two[2] == 0.0);  // twists
-  CHECK(friction_states(make_rope(chain::Bending::planar, 0.0, 0.05), {bent(0.0)}).empty());
+  CHECK(internal_states(make_rope(chain::Bending::planar, 0.0, 0.05), {bent(0.0)}).empty());
 }
 
 TEST_CASE("derivatives of a rollout with friction in bending agree with differences") {
@@ -148,7 +148,7 @@ TEST_CASE("derivatives of a rollout with friction in bending agree with differen
     std::vector<Tangent> unknowns(6);
     unknowns[0].bending_friction = model.parameters.bending_friction;
     unknowns[1].bending_friction_angle = model.parameters.bending_friction_angle;
-    unknowns[2].friction_state = VectorX::Unit(n, 1);
+    unknowns[2].internal_state = VectorX::Unit(n, 1);
     unknowns[3].theta = VectorX::Unit(n, 0);
     unknowns[4].thetadot = VectorX::Unit(n, n - 1);
     unknowns[5].stiffness = model.parameters.stiffness;
@@ -167,7 +167,7 @@ TEST_CASE("derivatives of a rollout with friction in bending agree with differen
         InitialState from = start;
         if (unknowns[i].theta.size()) from.theta += by * unknowns[i].theta;
         if (unknowns[i].thetadot.size()) from.thetadot += by * unknowns[i].thetadot;
-        if (unknowns[i].friction_state.size()) from.friction_state += by * unknowns[i].friction_state;
+        if (unknowns[i].internal_state.size()) from.internal_state += by * unknowns[i].internal_state;
         chain::States out;
         REQUIRE(simulate(make_model(model.chain, p), grid, from, out));
         return out;
@@ -233,11 +233,11 @@ TEST_CASE("a stepper carries the friction state along, and bad friction is refus
   chain::States states;
   REQUIRE(simulate(model, grid, start, states));
   Stepper stepper(model);
-  VectorX theta = start.theta, thetadot = start.thetadot, z = start.friction_state;
+  VectorX theta = start.theta, thetadot = start.thetadot, z = start.internal_state;
   for (std::size_t k = 0; k + 1 < grid.nodes.size(); ++k)
     REQUIRE(stepper.step(grid.nodes[k], grid.nodes[k + 1].motion, theta, thetadot, &z));
   CHECK((theta - states.theta[0]).norm() == 0.0);
-  CHECK((z - states.friction_state[0]).norm() == 0.0);
+  CHECK((z - states.internal_state[0]).norm() == 0.0);
   const auto refused = [&](const auto& change) {
     Parameters p = model.parameters;
     change(p);

@@ -141,7 +141,7 @@ TEST_CASE("tangents agree with central differences of the moved parameters, for 
       const InitialState moved_up = moved(zero, all, at + step), moved_down = moved(zero, all, at - step);
       for (const auto& [value, slope] : {std::pair{&InitialState::theta, &Tangent::theta},
                                          {&InitialState::thetadot, &Tangent::thetadot},
-                                         {&InitialState::friction_state, &Tangent::friction_state}}) {
+                                         {&InitialState::internal_state, &Tangent::internal_state}}) {
         const VectorX difference = (moved_up.*value - moved_down.*value) / (2.0 * kStep);
         const VectorX& s = found[i].*slope;
         CHECK((difference - (s.size() ? s : VectorX::Zero(difference.size()).eval())).norm() < 1e-9);

@@ -165,7 +165,7 @@ TEST_CASE("torsion, friction in bending and a payload read back, in a file that 
   dynamics::Parameters& p = *twin.parameters;
   const int n = twin.chain.angles();
   for (int k = 0; k < n; ++k) p.bending_friction.push_back(0.01 / (k + 3)), p.bending_friction_angle.push_back(0.1 / 3);
-  twin.initial->friction_state = math::VectorX::LinSpaced(n, -1.0, 0.7);
+  twin.initial->internal_state = math::VectorX::LinSpaced(n, -1.0, 0.7);
   twin.provenance.payload = {0.1 / 3, 0.01 / 3};
   twin::save(twin, folder.path / "run");
   CHECK(format() == "chainsplat-twin/2");
@@ -175,7 +175,7 @@ TEST_CASE("torsion, friction in bending and a payload read back, in a file that 
   CHECK(same_all(read.parameters->bending_friction, p.bending_friction));
   CHECK(same_all(read.parameters->bending_friction_angle, p.bending_friction_angle));
   CHECK(same_all(read.parameters->torsional_stiffness, p.torsional_stiffness));
-  CHECK(same_all(read.initial->friction_state, twin.initial->friction_state));
+  CHECK(same_all(read.initial->internal_state, twin.initial->internal_state));
   REQUIRE(read.provenance.payload.has_value());
   CHECK(same(read.provenance.payload->mass, 0.1 / 3));
   CHECK(same(read.provenance.payload->sigma, 0.01 / 3));

@@ -108,7 +108,7 @@ struct States {
   std::vector<VectorX> theta;       // rad, n each
   std::vector<VectorX> thetadot;    // rad/s
   std::vector<MatrixX> covariance;  // rad^2, n x n, of theta
-  std::vector<VectorX> friction_state = {};  // of ropes with friction in bending, as in dynamics::InitialState
+  std::vector<VectorX> internal_state = {};  // of ropes that have one, as in dynamics::InitialState
 };
 // theta at any time: cubic (Catmull-Rom on the given times), clamped outside by linear extrapolation of at most one
 // interval.

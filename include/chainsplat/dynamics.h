@@ -45,7 +45,8 @@ struct Parameters {
   // the bend over which it builds up after a change of direction, rad. Angles that twist the rope have none.
   std::vector<double> bending_friction, bending_friction_angle;
   // N m/rad per joint of two bending angles; empty: what the rope is naturally bent keeps its place about the links.
-  // Else the rope twists freely within the links until all its moments about itself balance (mathematics.md 3.11).
+  // Else the rope rolls within the links as its moments about itself ask, with the retardation time of its bending
+  // (mathematics.md 3.11).
   std::vector<double> torsional_stiffness;
   double tip_mass = 0.0;                // kg, point mass at the free end
   double radius = 0.0;                  // m, of the cylinder that gives the links' inertia; 0 allowed
@@ -69,9 +70,10 @@ double total_mass(const Parameters& parameters);
 struct InitialState {
   double time = 0.0;
   VectorX theta, thetadot;  // rad, rad/s
-  // The share of the friction moment that each angle's bending has built up, from -1 to 1, for ropes with friction in
-  // bending; empty: 0, a rope that has come to rest by ever smaller swings.
-  VectorX friction_state = {};
+  // What else the rope remembers. First, with friction in bending, the share of its moment that each angle's bending has
+  // built up, from -1 to 1; then, with torsion, each joint's roll of the material in its link, rad. What is missing is
+  // that of a rope that has come to rest at theta by ever smaller swings: shares of 0, rolls of least elastic energy.
+  VectorX internal_state = {};
 };
 
 // What identification says of its numbers; one entry per fitted number, in the order of the covariance. Names are those
@@ -115,7 +117,7 @@ trajectory::BaseMotion at_rest(const math::Pose& pose);
 VectorX inverse_dynamics(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                          const VectorX& thetadot, const VectorX& thetaddot);
 // -K (theta - theta_0) - D thetadot. n, N m. What follows here about single states leaves friction in bending out,
-// whose moment is of the past (friction_states()).
+// whose moment is of the past (internal_states()), and takes a rope that twists for one whose rolls have come to rest.
 VectorX joint_law(const Model& model, const VectorX& theta, const VectorX& thetadot);
 // M(theta), n x n, kg m^2. mathematics.md 3.4.
 MatrixX mass_matrix(const Model& model, const VectorX& theta);
@@ -178,11 +180,12 @@ struct Equilibrium {
 };
 Equilibrium static_equilibrium(const Model& model, const math::Pose& base, const VectorX& start = {});
 
-// The friction states of InitialState along given motion, from `before` (empty: 0) at its first time: exact where the
-// angles of a joint go straight from one time to the next. Empty for a rope without friction in bending.
-std::vector<VectorX> friction_states(const Model& model, const std::vector<VectorX>& theta, const VectorX& before = {});
-// Where only one state is known: those of joints that have moved on at their present rates until here. Empty as above.
-VectorX friction_state_in_motion(const Model& model, const VectorX& theta, const VectorX& thetadot);
+// The internal states of InitialState along given motion, from `before` (empty: 0) at its first time: shares of friction
+// are exact where the angles of a joint go straight from one time to the next, rolls those of a rope at rest. Empty for
+// a rope without any.
+std::vector<VectorX> internal_states(const Model& model, const std::vector<VectorX>& theta, const VectorX& before = {});
+// Where only one state is known: that of joints that have moved on at their present rates until here. Empty as above.
+VectorX internal_state_in_motion(const Model& model, const VectorX& theta, const VectorX& thetadot);
 
 // The base motion on the integrator's own time grid, sampled once for many rollouts.
 struct BaseGrid {
@@ -208,7 +211,7 @@ struct Tangent {
   std::vector<double> bending_friction, bending_friction_angle;                                  // per angle
   std::vector<double> torsional_stiffness;                                                       // per joint
   double tip_mass = 0.0;
-  VectorX theta, thetadot, friction_state;
+  VectorX theta, thetadot, internal_state;
 };
 // d(joint law - tau_ID) / d unknowns at fixed thetaddot = a, n x unknowns; M^-1 of it is da / d unknowns. The tangents'
 // initial states have no part in it.
@@ -263,10 +266,10 @@ class Stepper {
   // thetaddot of the free motion as forward_dynamics(); NaN where M is singular. Valid until the next call.
   const VectorX& acceleration(const trajectory::BaseMotion& base, const VectorX& theta, const VectorX& thetadot);
   // From `now` (motion, jerk, step) to the base motion `next`, with the model's integrator; `substeps` are the
-  // caller's. `friction_state`, where given, goes along; without it friction in bending starts at 0. False where the
-  // state leaves all bounds or M is singular.
+  // caller's. `internal_state`, where given, goes along; without it, or where it is empty, it starts as
+  // InitialState's. False where the state leaves all bounds or M is singular.
   bool step(const BaseGrid::Node& now, const trajectory::BaseMotion& next, VectorX& theta, VectorX& thetadot,
-            VectorX* friction_state = nullptr);
+            VectorX* internal_state = nullptr);
 
  private:
   std::unique_ptr<Step> step_;

@@ -76,6 +76,9 @@ class Parameters:
     stiffness: _Numbers
     rest_angle: _Numbers
     damping: _Numbers
+    bending_friction: _Numbers
+    bending_friction_angle: _Numbers
+    torsional_stiffness: _Numbers
     tip_mass: float
     gravity: _Numbers
     substeps: int

@@ -198,6 +198,10 @@ void add_types(py::module_& m) {
   add_list(parameters, "stiffness", &Parameters::stiffness, "N m/rad, by angle");
   add_list(parameters, "rest_angle", &Parameters::rest_angle, "rad, by angle");
   add_list(parameters, "damping", &Parameters::damping, "N m s/rad, by angle");
+  add_list(parameters, "bending_friction", &Parameters::bending_friction, "N m, by angle; (0,): none");
+  add_list(parameters, "bending_friction_angle", &Parameters::bending_friction_angle, "rad, by angle");
+  add_list(parameters, "torsional_stiffness", &Parameters::torsional_stiffness,
+           "N m/rad, by joint of two angles; (0,): the rope does not twist");
   parameters.def_readwrite("tip_mass", &Parameters::tip_mass, "kg")
       .def_readwrite("gravity", &Parameters::gravity, "(3,), m/s^2, world")
       .def_readwrite("substeps", &Parameters::substeps, "steps of the integrator in 1/30 s")

@@ -175,6 +175,7 @@ class Module(unittest.TestCase):
         def rolled(stiffness=0.0, theta=0.0, rate=0.0):
             parameters = cs.Parameters(self.twin.parameters)
             parameters.stiffness = parameters.stiffness * np.exp(stiffness)
+            parameters.torsional_stiffness = parameters.torsional_stiffness * np.exp(stiffness)  # goes along
             at = initial[0].copy(), initial[1].copy()
             at[0][1] += theta
             at[1][4] += rate

@@ -121,7 +121,7 @@ bool ParameterFilter::Belief::predict(double later, const dynamics::BaseFunction
   chain::States states;
   dynamics::Sensitivities slopes;
   const dynamics::BaseGrid grid = dynamics::sample_base(base, time, {later}, now.substeps);
-  const dynamics::InitialState state{time, theta, thetadot, dynamics::friction_state_in_motion(model, theta, thetadot)};
+  const dynamics::InitialState state{time, theta, thetadot, dynamics::internal_state_in_motion(model, theta, thetadot)};
   if (!dynamics::simulate(model, grid, state, states, tangents, &slopes)) return false;
   MatrixX transition = MatrixX::Identity(size, size);
   transition.topRows(n) = slopes.theta[0];

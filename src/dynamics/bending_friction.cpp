@@ -73,22 +73,4 @@ void BendingFriction::follow(const VectorX& from, const VectorX& to, VectorX& z)
   }
 }
 
-std::vector<VectorX> friction_states(const Model& model, const std::vector<VectorX>& theta, const VectorX& before) {
-  const BendingFriction friction(model);
-  if (!friction.present) return {};
-  std::vector<VectorX> out;
-  VectorX z = before.size() ? before : VectorX::Zero(model.chain.angles()).eval();
-  for (std::size_t k = 0; k < theta.size(); ++k) {
-    if (k > 0) friction.follow(theta[k - 1], theta[k], z);
-    out.push_back(z);
-  }
-  return out;
-}
-
-VectorX friction_state_in_motion(const Model& model, const VectorX& theta, const VectorX& thetadot) {
-  if (model.parameters.bending_friction.empty()) return {};
-  constexpr double kWhile = 0.1;  // s: a small part of a swing, and long enough for most to slip
-  return friction_states(model, {theta - kWhile * thetadot, theta}).back();
-}
-
 }  // namespace chainsplat::dynamics

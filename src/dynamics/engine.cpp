@@ -36,6 +36,8 @@ RigidInertia world_inertia(double mass, double center, double transverse, double
 
 Engine::Engine(const Model& m) : model(m), angles(m.chain.angles()), link_count(m.chain.links() - 1), torsion_(m) {
   const Parameters& p = model.parameters;
+  slips_ =
+      std::any_of(p.bending_friction.begin(), p.bending_friction.end(), [](double moment) { return moment > 0.0; });
   table_ = p.table_normal.has_value();
   normal_ = table_ ? *p.table_normal : Vector3::Zero();
   normal_gravity_ = std::abs(p.gravity.dot(normal_));
@@ -172,11 +174,17 @@ void Engine::set_state(const VectorX& theta, const VectorX& thetadot) {
   const Parameters& p = model.parameters;
   for (int k = 0; k < angles; ++k)
     torque[k] = -p.stiffness[k] * (theta[k] - p.rest_angle[k]) - p.damping[k] * thetadot[k];
+  const Eigen::Index known = internal_state.size();
+  shares_ = slips_ ? std::min<Eigen::Index>(known, angles) : 0;
   if (torsion_.present) {
-    torsion_.place(theta);
+    settled_ = known < shares_ + torsion_.rolls;
+    if (settled_)
+      torsion_.settle(theta);
+    else
+      torsion_.place(theta, thetadot, internal_state.tail(torsion_.rolls));
     for (int k = 0; k < angles; ++k) torque[k] = torsion_.torque()[k] - p.damping[k] * thetadot[k];
   }
-  for (Eigen::Index k = 0; k < friction_state.size(); ++k) torque[k] -= p.bending_friction[k] * friction_state[k];
+  for (Eigen::Index k = 0; k < shares_; ++k) torque[k] -= p.bending_friction[k] * internal_state[k];
 }
 
 void Engine::add_roll() {
@@ -195,7 +203,8 @@ void Engine::linearize_roll() {
 void Engine::joint_forces(const Tangent& d, Eigen::Ref<VectorX> column) const {
   const Parameters& p = model.parameters;
   column.setZero();
-  if (torsion_.present) torsion_.add_unknown(d, column);
+  if (torsion_.present && settled_) torsion_.add_settled_unknown(d, column);
+  if (torsion_.present && !settled_) torsion_.add_unknown(d, column, nullptr);
   if (!d.stiffness.empty() && !torsion_.present)
     for (int k = 0; k < angles; ++k) column[k] -= d.stiffness[k] * (theta_[k] - p.rest_angle[k]);
   if (!d.rest_angle.empty() && !torsion_.present)
@@ -203,7 +212,7 @@ void Engine::joint_forces(const Tangent& d, Eigen::Ref<VectorX> column) const {
   if (!d.damping.empty())
     for (int k = 0; k < angles; ++k) column[k] -= d.damping[k] * thetadot_[k];
   if (!d.bending_friction.empty())
-    for (Eigen::Index k = 0; k < friction_state.size(); ++k) column[k] -= d.bending_friction[k] * friction_state[k];
+    for (Eigen::Index k = 0; k < shares_; ++k) column[k] -= d.bending_friction[k] * internal_state[k];
   if (!rolls) return;
   if (!d.roll_lever.empty())
     for (int k = 0; k < angles; ++k) column[k] -= d.roll_lever[k] * roll_share.row(k).dot(roll_friction);
@@ -385,7 +394,11 @@ void Engine::linearize(const Vector6& base_jerk) {
       damping(k, k) += p.damping[k];
     }
   }
-  if (torsion_.present) torsion_.add_stiffness(stiffness);
+  if (torsion_.present && settled_) torsion_.add_settled_stiffness(stiffness);
+  if (torsion_.present && !settled_) {
+    torsion_.linearize();
+    stiffness += torsion_.stiffness(), damping += torsion_.damping();
+  }
   for (int j = 0; rolls && j < link_count; ++j) {
     roll_by_time[j] = dot(roll_slope_[j], base_turn);
     for (int i = 0; i < links[j].end_angle; ++i)

@@ -69,8 +69,8 @@ class Engine {
   // The calls build on one another: place, factor_mass, accelerate, linearize, unknown_forces.
   // Poses, axes, velocities, M, bias; with `slopes` also what linearize needs.
   virtual void place(const trajectory::BaseMotion& base, const VectorX& theta, const VectorX& thetadot, bool slopes);
-  bool factor_mass();  // false, and `singular_angle`, where M is not positive definite
-  void accelerate();   // acceleration = M^-1 force
+  bool factor_mass();                 // false, and `singular_angle`, where M is not positive definite
+  void accelerate();                  // acceleration = M^-1 force
   void solve_mass(MatrixX& x) const;  // x = M^-1 x
   // Adds `acceleration` to the placed bodies (once a place): fills body_force and `inverse`.
   void inverse_torque();
@@ -82,19 +82,22 @@ class Engine {
   virtual void unknown_forces(std::span<const Tangent> unknowns, MatrixX& forces);
   bool articulated_acceleration();  // acceleration by the articulated body algorithm; allocates; false as factor_mass
 
+  Torsion& torsion() { return torsion_; }  // placed with the engine, linearized with it where it is not settled
+  const Torsion& torsion() const { return torsion_; }
+
   const Model& model;
   int angles, link_count;
   int singular_angle = -1;
   std::vector<LinkConstants> links;
 
-  VectorX friction_state;  // of bending, for place(); empty: no friction
+  VectorX internal_state;  // for place(); empty: no friction in bending, and a rope that twists is settled
   VectorX torque;          // joint law, and friction in bending
-  VectorX bias;          // tau_ID at zero acceleration
-  VectorX force;         // torque - bias = M a
-  VectorX acceleration;  // a
-  VectorX inverse;       // tau_ID at `acceleration`
-  MatrixX mass;          // M, both triangles
-  MatrixX cholesky;      // lower triangle
+  VectorX bias;            // tau_ID at zero acceleration
+  VectorX force;           // torque - bias = M a
+  VectorX acceleration;    // a
+  VectorX inverse;         // tau_ID at `acceleration`
+  MatrixX mass;            // M, both triangles
+  MatrixX cholesky;        // lower triangle
   MatrixX stiffness, damping;
   VectorX drive_rate;
 
@@ -137,6 +140,9 @@ class Engine {
   bool table_ = false;
   VectorX theta_, thetadot_;
   Torsion torsion_;
+  bool slips_ = false;               // it has friction in bending
+  bool settled_ = true;              // its rolls are those at rest
+  Eigen::Index shares_ = 0;          // of friction in bending, at the beginning of internal_state
   Vector3 bending_axis_;             // world
   std::vector<Vector6> roll_slope_;  // df_j / dV_j
   std::vector<Vector3> local_axis_;

@@ -50,6 +50,7 @@ Model make_model(const chain::Chain& chain, const Parameters& p) {
     require(p.integrator == Integrator::rodas3, "friction in bending needs the integrator rodas3", "choose it");
   }
   if (!p.torsional_stiffness.empty()) {
+    require(p.integrator == Integrator::rodas3, "torsion needs the integrator rodas3", "choose it");
     check_array(p.torsional_stiffness, links, "torsional_stiffness");
     require(angles == 2 * links && !chain::has_twist(chain),
             "torsional_stiffness is given for a chain whose joints do not bend in two directions", "leave it empty");
@@ -140,7 +141,7 @@ VectorX joint_law(const Model& model, const VectorX& theta, const VectorX& theta
   VectorX torque(theta.size());
   const Parameters& p = model.parameters;
   if (Torsion torsion(model); torsion.present) {
-    torsion.place(theta);
+    torsion.settle(theta);
     for (Eigen::Index k = 0; k < theta.size(); ++k) torque[k] = torsion.torque()[k] - p.damping[k] * thetadot[k];
     return torque;
   }
@@ -178,10 +179,10 @@ VectorX forward_dynamics(const Model& model, const trajectory::BaseMotion& base,
 
 // The engine's bodies share one frame, so the force of all bodies beyond the base acts between it and the rope.
 Vector6 base_wrench(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
-                    const VectorX& thetadot, const VectorX& friction_state) {
+                    const VectorX& thetadot, const VectorX& internal_state) {
   check_state(model, theta, thetadot);
   Engine engine(model);
-  engine.friction_state = friction_state;
+  engine.internal_state = internal_state;
   engine.place(base, theta, thetadot, false);
   if (!engine.factor_mass()) throw_singular(model, engine.singular_angle);
   engine.accelerate();
@@ -192,12 +193,12 @@ Vector6 base_wrench(const Model& model, const trajectory::BaseMotion& base, cons
 std::vector<Vector6> base_wrenches(const Model& model, const trajectory::Trajectory& base,
                                    const chain::States& states) {
   CHAINSPLAT_CHECK(states.thetadot.size() == states.time.size(), std::to_string(states.thetadot.size()));
-  const std::vector<VectorX> friction =
-      states.friction_state.empty() ? friction_states(model, states.theta) : states.friction_state;
+  const std::vector<VectorX> internal =
+      states.internal_state.empty() ? internal_states(model, states.theta) : states.internal_state;
   std::vector<Vector6> out;
   for (std::size_t i = 0; i < states.time.size(); ++i)
     out.push_back(base_wrench(model, base.at(states.time[i]), states.theta[i], states.thetadot[i],
-                              friction.empty() ? VectorX() : friction[i]));
+                              internal.empty() ? VectorX() : internal[i]));
   return out;
 }
 
@@ -294,7 +295,7 @@ double potential_energy(const Model& model, const math::Pose& base, const Vector
     if (link + 1 == chain.links()) energy -= p.tip_mass * gravity.dot(motions[link] * (end * chain.direction));
   }
   if (Torsion torsion(model); torsion.present) {
-    torsion.place(theta);
+    torsion.settle(theta);
     return energy + torsion.energy();
   }
   for (int k = 0; k < chain.angles(); ++k) {

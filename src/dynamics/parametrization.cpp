@@ -77,7 +77,7 @@ const Row kRows[] = {
     {Quantity::thetadot, "thetadot", "rad/s", 1.0, Per::angle, How::addition, {}, own, &InitialState::thetadot,
      &Tangent::thetadot},
     {Quantity::friction_state, "friction_state", "1", 0.3, Per::angle, How::addition, {}, own,
-     &InitialState::friction_state, &Tangent::friction_state},
+     &InitialState::internal_state, &Tangent::internal_state},
 };
 // clang-format on
 

@@ -8,8 +8,8 @@ namespace {
 
 constexpr double kFrame = 1.0 / 30.0;  // s, what `substeps` counts in
 constexpr int kMaxRefinement = 32;     // of the steps of a diverging rollout
-constexpr int kMostSteps = 4000000;    // a step is kept with its motion: 1 GiB. At 8 steps per frame more than four hours
-constexpr double kJerkStep = 0.01;     // of a step, for the one-sided difference of the base acceleration
+constexpr int kMostSteps = 4000000;  // a step is kept with its motion: 1 GiB. At 8 steps per frame more than four hours
+constexpr double kJerkStep = 0.01;   // of a step, for the one-sided difference of the base acceleration
 
 }  // namespace
 
@@ -65,15 +65,18 @@ bool integrate(const Model& model, const BaseGrid& grid, const InitialState& ini
                Variation* variation, Sensitivities* sensitivities, Divergence* divergence) {
   const int n = model.chain.angles();
   CHAINSPLAT_CHECK(initial.theta.size() == n && initial.thetadot.size() == n, std::to_string(initial.theta.size()));
-  CHAINSPLAT_CHECK(initial.friction_state.size() == 0 || initial.friction_state.size() == n,
-                   std::to_string(initial.friction_state.size()));
   CHAINSPLAT_CHECK(!variation || model.parameters.integrator == Integrator::rodas3,
                    "variational equation with the Euler step");
   Step step(model);
   Factor other_factor(n);
   VectorX theta = initial.theta, thetadot = initial.thetadot;
-  const bool friction = step.friction.present;
-  if (friction && initial.friction_state.size()) step.friction_state = initial.friction_state;
+  const bool internal = step.internal.present;
+  CHAINSPLAT_CHECK(initial.internal_state.size() == 0 || initial.internal_state.size() == n ||
+                       initial.internal_state.size() == step.internal.size,
+                   std::to_string(initial.internal_state.size()));
+  if (internal) step.internal_state = step.internal.start(step.engine, initial.internal_state, theta);
+  if (internal && variation)
+    step.internal.start_slopes(step.engine, initial.internal_state, variation->x, variation->tangents, variation->z);
 
   std::size_t count = 0;
   const auto write = [&](double time) {
@@ -81,8 +84,8 @@ bool integrate(const Model& model, const BaseGrid& grid, const InitialState& ini
       states.time.emplace_back(), states.theta.emplace_back(), states.thetadot.emplace_back();
     if (states.thetadot.size() <= count) states.thetadot.resize(count + 1);
     states.time[count] = time, states.theta[count] = theta, states.thetadot[count] = thetadot;
-    if (friction && states.friction_state.size() <= count) states.friction_state.resize(count + 1);
-    if (friction) states.friction_state[count] = step.friction_state;
+    if (internal && states.internal_state.size() <= count) states.internal_state.resize(count + 1);
+    if (internal) states.internal_state[count] = step.internal_state;
     if (variation) {
       if (sensitivities->theta.size() <= count)
         sensitivities->theta.emplace_back(), sensitivities->thetadot.emplace_back();
@@ -92,7 +95,7 @@ bool integrate(const Model& model, const BaseGrid& grid, const InitialState& ini
   };
   const auto finish = [&](bool good) {
     states.time.resize(count), states.theta.resize(count), states.thetadot.resize(count);
-    states.friction_state.resize(friction ? count : 0);
+    states.internal_state.resize(internal ? count : 0);
     if (variation) sensitivities->theta.resize(count), sensitivities->thetadot.resize(count);
     return good;
   };
@@ -108,16 +111,18 @@ bool integrate(const Model& model, const BaseGrid& grid, const InitialState& ini
     if (!step.bounded(theta, thetadot)) return failed();
     if ((!last || variation) && !step.linearize(now, theta, thetadot)) return failed();
     if (variation && (node == 0 || variation->exact)) {
-      if (!variation->start(step.engine, step.friction, node)) return failed();
+      if (!variation->start(step.engine, step.internal, node)) return failed();
     } else if (variation) {
       const double half = 0.5 * last_step;
       const bool same = !last && std::abs(last_step - now.step) <= 1e-9 * now.step;
       if (!same) {
         other_factor.matrix = step.engine.mass + half * step.engine.damping + (half * half) * step.engine.stiffness;
-        if (friction) step.friction.add_to(half, other_factor.matrix);
+        if (internal && !step.internal.prepare(half)) return failed();
+        if (internal) step.internal.add_to(other_factor.matrix);
         if (!other_factor.factor()) return failed();
       }
-      variation->advance(step.engine, step.friction, same ? step.factor : other_factor, node, half);
+      variation->advance(step.engine, step.internal, same ? step.factor : other_factor, node, half);
+      if (internal && !same && !last && !step.internal.prepare(0.5 * now.step)) return failed();
     }
     if (now.output) write(now.time);
     if (last) break;
@@ -133,13 +138,12 @@ bool simulate(const Model& model, const BaseGrid& grid, const InitialState& init
               std::span<const Tangent> unknowns, Sensitivities* sensitivities, Divergence* divergence) {
   if (!sensitivities || unknowns.empty()) return integrate(model, grid, initial, states, nullptr, nullptr, divergence);
   const auto forces = [&](Engine& engine, std::size_t, double, MatrixX& out) { engine.unknown_forces(unknowns, out); };
-  const bool friction = BendingFriction(model).present;
-  Variation variation(model.chain.angles(), static_cast<Eigen::Index>(unknowns.size()), forces, {}, false, friction);
+  Variation variation(model.chain.angles(), static_cast<Eigen::Index>(unknowns.size()), forces, {}, false,
+                      InternalState(model).size);
   variation.tangents = unknowns;
   for (Eigen::Index p = 0; p < variation.x.cols(); ++p) {
     if (unknowns[p].theta.size()) variation.x.col(p) = unknowns[p].theta;
     if (unknowns[p].thetadot.size()) variation.y.col(p) = unknowns[p].thetadot;
-    if (friction && unknowns[p].friction_state.size()) variation.z.col(p) = unknowns[p].friction_state;
   }
   return integrate(model, grid, initial, states, &variation, sensitivities, divergence);
 }
@@ -158,8 +162,7 @@ bool simulate(const Model& model, const BaseGrid& grid, const InitialState& init
     unknowns.torques(node, after, slopes, out);
     out = -out;
   };
-  Variation variation(model.chain.angles(), unknowns.count, forces, unknowns.motion, exact,
-                      BendingFriction(model).present);
+  Variation variation(model.chain.angles(), unknowns.count, forces, unknowns.motion, exact, InternalState(model).size);
   return integrate(model, grid, initial, states, &variation, &sensitivities, nullptr);
 }
 

@@ -27,15 +27,16 @@ Step::Step(const Model& model)
     : engine_(make_engine(model)),
       stage_(make_engine(model)),
       engine(*engine_),
-      friction(model),
+      internal(model),
       factor(model.chain.angles()),
       rodas_(model.parameters.integrator == Integrator::rodas3),
-      stage_friction_(friction) {
+      stage_internal_(internal) {
   const int n = model.chain.angles();
   for (VectorX* v : {&right_theta_, &stage_theta_, &stage_thetadot_, &stage_acceleration_, &work_}) v->setZero(n);
   for (int i = 0; i < 4; ++i) k_theta_[i].setZero(n), k_rate_[i].setZero(n);
-  if (!friction.present) return;
-  for (VectorX* v : {&friction_state, &right_z_, &stage_z_, &k_z_[0], &k_z_[1], &k_z_[2], &k_z_[3]}) v->setZero(n);
+  if (!internal.present) return;
+  for (VectorX* v : {&internal_state, &right_z_, &stage_z_, &k_z_[0], &k_z_[1], &k_z_[2], &k_z_[3]})
+    v->setZero(internal.size);
 }
 
 bool Step::bounded(const VectorX& theta, const VectorX& thetadot) {
@@ -55,9 +56,9 @@ bool Step::factor_mass(Engine& at) {
 }
 
 bool Step::linearize(const BaseGrid::Node& now, const VectorX& theta, const VectorX& thetadot) {
-  engine.friction_state = friction_state;
+  engine.internal_state = internal_state;
   engine.place(now.motion, theta, thetadot, true);
-  if (friction.present) friction.linearize(thetadot, friction_state);
+  if (internal.present) internal.linearize(engine, thetadot, internal_state);
   // M a = force, so the first stage needs no factor of M; the tangents need a itself
   if (!factor_mass(engine)) return false;
   engine.accelerate();
@@ -66,38 +67,39 @@ bool Step::linearize(const BaseGrid::Node& now, const VectorX& theta, const Vect
   const double g = rodas_ ? 0.5 * now.step : now.step;
   factor.matrix = engine.mass + g * engine.damping;
   if (rodas_) factor.matrix += (g * g) * engine.stiffness;
-  if (friction.present) friction.add_to(g, factor.matrix);
+  if (internal.present && !internal.prepare(g)) return false;
+  if (internal.present) internal.add_to(factor.matrix);
   return factor.factor();
 }
 
 // Acceleration at the stage's state under the base motion of the next node.
 bool Step::evaluate(const trajectory::BaseMotion& motion, bool slopes) {
   if (!bounded(stage_theta_, stage_thetadot_)) return false;
-  stage_->friction_state = stage_z_;
+  stage_->internal_state = stage_z_;
   stage_->place(motion, stage_theta_, stage_thetadot_, slopes);
   if (!factor_mass(*stage_)) return false;
   stage_->accelerate();
   if (slopes) stage_->linearize(Vector6::Zero());
-  if (friction.present) stage_friction_.linearize(stage_thetadot_, stage_z_);
+  if (internal.present) stage_internal_.linearize(*stage_, stage_thetadot_, stage_z_);
   return true;
 }
 
 // (1/G - J) k = r for r = (right_theta, M^-1 of `work`, right_z), G = gamma H: mathematics.md 4
 void Step::solve_stage(int i, double g) {
   work_.noalias() -= g * (engine.stiffness * right_theta_);
-  if (friction.present) friction.take_off(g, right_z_, work_);
+  if (internal.present) internal.take_off(right_theta_, right_z_, work_);
   work_ *= g;
   factor.solve(work_);
   k_rate_[i] = work_;
   k_theta_[i] = g * (right_theta_ + work_);
-  if (!friction.present) return;
+  if (!internal.present) return;
   k_z_[i] = right_z_;
-  friction.solve(g, work_, k_z_[i]);
+  internal.solve(k_theta_[i], k_rate_[i], k_z_[i]);
 }
 
-void Step::right_friction(int i, double h) {
-  if (!friction.present) return;
-  right_z_ = i < 2 ? friction.rate() : stage_friction_.rate();
+void Step::right_internal(int i, double h) {
+  if (!internal.present) return;
+  right_z_ = i < 2 ? internal.rate() : stage_internal_.rate();
   add_history(i, h, k_z_, right_z_);
 }
 
@@ -109,39 +111,39 @@ bool Step::vary_stage(int i, double h, std::size_t node, const VectorX& theta, c
     v.right = v.y, v.work = v.acceleration, v.right_z = v.z_rate;
   } else {
     v.right = v.stage_y;
-    v.force(*stage_, stage_friction_, node + 1, 0.0, v.stage_x, v.stage_y, v.stage_z, v.work);
+    v.force(*stage_, stage_internal_, node + 1, 0.0, v.stage_x, v.stage_y, v.stage_z, v.work);
     stage_->solve_mass(v.work);
-    if (friction.present) stage_friction_.slope(v.stage_y, v.stage_z, v.right_z);
+    if (internal.present) stage_internal_.slope(v.stage_x, v.stage_y, v.stage_z, v.right_z);
   }
   add_history(i, h, v.k_x, v.right);
   add_history(i, h, v.k_y, v.work);
-  if (friction.present) add_history(i, h, v.k_z, v.right_z);
+  if (internal.present) add_history(i, h, v.k_z, v.right_z);
   for (const double e : {kProbe, -kProbe}) {
     const double after = e * h * kTimeWeight[i];
     v.probe_theta = theta + e * k_theta_[i], v.probe_rate = thetadot + e * k_rate_[i];
-    if (friction.present) {
-      stage_->friction_state = friction_state + e * k_z_[i];
-      stage_friction_.linearize(v.probe_rate, stage_->friction_state);
-      stage_friction_.slope(v.y, v.z, v.k_z[i]);
-      v.right_z += v.k_z[i] / (2.0 * e);
-    }
+    if (internal.present) stage_->internal_state = internal_state + e * k_z_[i];
     stage_->place(v.base(node, after), v.probe_theta, v.probe_rate, true);
     if (!factor_mass(*stage_)) return false;
     stage_->accelerate();
     stage_->linearize(Vector6::Zero());
-    v.force(*stage_, stage_friction_, node, after, v.x, v.y, v.z, v.k_y[i]);
+    if (internal.present) {
+      stage_internal_.linearize(*stage_, v.probe_rate, stage_->internal_state);
+      stage_internal_.slope(v.x, v.y, v.z, v.k_z[i]);
+      v.right_z += v.k_z[i] / (2.0 * e);
+    }
+    v.force(*stage_, stage_internal_, node, after, v.x, v.y, v.z, v.k_y[i]);
     stage_->solve_mass(v.k_y[i]);
     v.work += v.k_y[i] / (2.0 * e);
   }
   v.k_y[i].noalias() = engine.mass * v.work;
   v.k_y[i].noalias() -= g * (engine.stiffness * v.right);
-  if (friction.present) friction.take_off(g, v.right_z, v.k_y[i]);
+  if (internal.present) internal.take_off(v.right, v.right_z, v.k_y[i]);
   v.k_y[i] *= g;
   for (Eigen::Index p = 0; p < v.k_y[i].cols(); ++p) factor.solve(v.k_y[i].col(p));
   v.k_x[i] = g * (v.right + v.k_y[i]);
-  if (!friction.present) return true;
+  if (!internal.present) return true;
   v.k_z[i] = v.right_z;
-  friction.solve(g, v.k_y[i], v.k_z[i]);
+  internal.solve(v.k_x[i], v.k_y[i], v.k_z[i]);
   return true;
 }
 
@@ -162,16 +164,16 @@ bool Step::advance(double h, const trajectory::BaseMotion& next, VectorX& theta,
     add_history(i, h, k_theta_, right_theta_);
     work_ = engine.force + (kTimeWeight[i] * h) * engine.drive_rate;
     if (i == 1) work_.noalias() += (4.0 / h) * (engine.mass * k_rate_[0]);
-    right_friction(i, h);
+    right_internal(i, h);
     solve_stage(i, g);
     if (v && !vary_stage(i, h, node, theta, thetadot, *v)) return false;
   }
   // stages 3 and 4: f at states of their own
   stage_theta_ = theta + 2.0 * k_theta_[0];
   stage_thetadot_ = thetadot + 2.0 * k_rate_[0];
-  if (friction.present) stage_z_ = friction_state + 2.0 * k_z_[0];
+  if (internal.present) stage_z_ = internal_state + 2.0 * k_z_[0];
   if (v) v->stage_x = v->x + 2.0 * v->k_x[0], v->stage_y = v->y + 2.0 * v->k_y[0];
-  if (v && friction.present) v->stage_z = v->z + 2.0 * v->k_z[0];
+  if (v && internal.present) v->stage_z = v->z + 2.0 * v->k_z[0];
   for (int i = 2; i < 4; ++i) {
     if (!evaluate(next, v)) return false;
     right_theta_ = stage_thetadot_;
@@ -179,49 +181,50 @@ bool Step::advance(double h, const trajectory::BaseMotion& next, VectorX& theta,
     stage_acceleration_ = stage_->acceleration;
     add_history(i, h, k_rate_, stage_acceleration_);
     work_.noalias() = engine.mass * stage_acceleration_;
-    right_friction(i, h);
+    right_internal(i, h);
     solve_stage(i, g);
     if (v && !vary_stage(i, h, node, theta, thetadot, *v)) return false;
     stage_theta_ += k_theta_[i];
     stage_thetadot_ += k_rate_[i];
-    if (friction.present) stage_z_ += k_z_[i];
+    if (internal.present) stage_z_ += k_z_[i];
     if (v) v->stage_x += v->k_x[i], v->stage_y += v->k_y[i];
-    if (v && friction.present) v->stage_z += v->k_z[i];
+    if (v && internal.present) v->stage_z += v->k_z[i];
   }
   theta = stage_theta_, thetadot = stage_thetadot_;
-  if (friction.present) friction_state = stage_z_;
+  if (internal.present) internal_state = stage_z_;
   if (v) v->x = v->stage_x, v->y = v->stage_y;
-  if (v && friction.present) v->z = v->stage_z;
+  if (v && internal.present) v->z = v->stage_z;
   return true;
 }
 
-Variation::Variation(int n, Eigen::Index unknowns, Forces forces, Base base_motion, bool is_exact, bool friction)
+Variation::Variation(int n, Eigen::Index unknowns, Forces forces, Base base_motion, bool is_exact,
+                     Eigen::Index internal)
     : forces_of(std::move(forces)), base(std::move(base_motion)), exact(is_exact), mass_(n) {
   for (MatrixX* m : {&x, &y, &acceleration, &forces_, &predicted_x_, &predicted_y_}) m->setZero(n, unknowns);
-  if (!friction) return;
+  if (internal == 0) return;
   for (MatrixX* m : {&z, &z_rate, &predicted_z_, &right_z, &stage_z, &k_z[0], &k_z[1], &k_z[2], &k_z[3]})
-    m->setZero(n, unknowns);
+    m->setZero(internal, unknowns);
 }
 
-void Variation::force(Engine& engine, const BendingFriction& friction, std::size_t node, double after,
-                      const MatrixX& s_x, const MatrixX& s_y, const MatrixX& s_z, MatrixX& forces) {
+void Variation::force(Engine& engine, const InternalState& internal, std::size_t node, double after, const MatrixX& s_x,
+                      const MatrixX& s_y, const MatrixX& s_z, MatrixX& forces) {
   forces_of(engine, node, after, forces_);
   forces.noalias() = forces_ - engine.stiffness * s_x - engine.damping * s_y;
-  if (friction.present) friction.take_off_moment(s_z, forces);
+  if (internal.present) internal.take_off_moment(s_z, forces);
 }
 
-bool Variation::start(Engine& engine, const BendingFriction& friction, std::size_t node) {
-  force(engine, friction, node, 0.0, x, y, z, acceleration);
+bool Variation::start(Engine& engine, const InternalState& internal, std::size_t node) {
+  force(engine, internal, node, 0.0, x, y, z, acceleration);
   mass_.matrix = engine.mass;
   if (!mass_.factor()) return false;
   for (Eigen::Index p = 0; p < acceleration.cols(); ++p) mass_.solve(acceleration.col(p));
-  if (!friction.present) return true;
-  friction.slope(y, z, z_rate);
-  friction.add_unknowns(tangents, z_rate);
+  if (!internal.present) return true;
+  internal.slope(x, y, z, z_rate);
+  internal.add_unknowns(tangents, z_rate);
   return true;
 }
 
-void Variation::advance(Engine& engine, const BendingFriction& friction, const Factor& factor, std::size_t node,
+void Variation::advance(Engine& engine, const InternalState& internal, const Factor& factor, std::size_t node,
                         double g) {
   forces_of(engine, node, 0.0, forces_);
   predicted_y_ = y + g * acceleration;
@@ -229,20 +232,20 @@ void Variation::advance(Engine& engine, const BendingFriction& friction, const F
   acceleration.noalias() = -engine.stiffness * predicted_x_;
   acceleration.noalias() -= engine.damping * predicted_y_;
   acceleration += forces_;
-  if (friction.present) {
+  if (internal.present) {
     // z_rate = (z - predicted z) / g; its solve() wants that over g, and the rates' own part
     predicted_z_ = z + g * z_rate;
     z = predicted_z_ / g;
-    friction.add_unknowns(tangents, z);
+    internal.add_unknowns(tangents, z);
     z_rate = z;
-    friction.solve(g, predicted_y_, z_rate);
-    friction.take_off_moment(z_rate, acceleration);
+    internal.solve(predicted_x_, predicted_y_, z_rate);
+    internal.take_off_moment(z_rate, acceleration);
   }
   for (Eigen::Index p = 0; p < acceleration.cols(); ++p) factor.solve(acceleration.col(p));
   y = predicted_y_ + g * acceleration;
   x = predicted_x_ + (g * g) * acceleration;
-  if (!friction.present) return;
-  friction.solve(g, y, z);
+  if (!internal.present) return;
+  internal.solve(x, y, z);
   z_rate = (z - predicted_z_) / g;
 }
 
@@ -251,7 +254,7 @@ Stepper::~Stepper() = default;
 
 const VectorX& Stepper::acceleration(const trajectory::BaseMotion& base, const VectorX& theta,
                                      const VectorX& thetadot) {
-  step_->engine.friction_state.resize(0);
+  step_->engine.internal_state.resize(0);
   step_->engine.place(base, theta, thetadot, false);
   if (!step_->engine.factor_mass())
     step_->engine.acceleration.setConstant(NAN);
@@ -261,16 +264,12 @@ const VectorX& Stepper::acceleration(const trajectory::BaseMotion& base, const V
 }
 
 bool Stepper::step(const BaseGrid::Node& now, const trajectory::BaseMotion& next, VectorX& theta, VectorX& thetadot,
-                   VectorX* friction_state) {
-  if (step_->friction.present) {
-    if (friction_state && friction_state->size())
-      step_->friction_state = *friction_state;
-    else
-      step_->friction_state.setZero();
-  }
+                   VectorX* internal_state) {
+  if (step_->internal.present)
+    step_->internal_state = step_->internal.start(step_->engine, internal_state ? *internal_state : VectorX(), theta);
   const bool good = step_->linearize(now, theta, thetadot) && step_->advance(now.step, next, theta, thetadot) &&
                     step_->bounded(theta, thetadot);
-  if (friction_state && step_->friction.present) *friction_state = step_->friction_state;
+  if (internal_state && step_->internal.present) *internal_state = step_->internal_state;
   return good;
 }
 

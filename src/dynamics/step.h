@@ -1,62 +1,18 @@
 // Private to dynamics: one step of the integrators (mathematics.md 4), the factorization that its parts share, and the
 // derivatives that go along. No allocation after construction.
 #pragma once
-#include <cmath>
 #include <functional>
 #include <vector>
 
-#include "bending_friction.h"
+#include "factor.h"
+#include "internal_state.h"
 #include "planar.h"
 
 namespace chainsplat::dynamics {
 
-// LU with partial pivoting in place, for a few dozen unknowns.
-class Factor {
- public:
-  explicit Factor(int n) : pivot_(n), inverse_(n) { matrix.resize(n, n); }
-  MatrixX matrix;  // set it, then factor()
-
-  bool factor() {
-    const int n = static_cast<int>(matrix.rows());
-    for (int j = 0; j < n; ++j) {
-      int best = j;
-      for (int i = j + 1; i < n; ++i)
-        if (std::abs(matrix(i, j)) > std::abs(matrix(best, j))) best = i;
-      pivot_[j] = best;
-      if (!(std::abs(matrix(best, j)) > 0.0)) return false;
-      if (best != j) matrix.row(j).swap(matrix.row(best));
-      const double scale = inverse_[j] = 1.0 / matrix(j, j);
-      for (int i = j + 1; i < n; ++i) matrix(i, j) *= scale;
-      for (int k = j + 1; k < n; ++k) {
-        const double factor = matrix(j, k);
-        for (int i = j + 1; i < n; ++i) matrix(i, k) -= factor * matrix(i, j);
-      }
-    }
-    return true;
-  }
-  template <class Column>
-  void solve(Column&& x) const {
-    const int n = static_cast<int>(matrix.rows());
-    for (int j = 0; j < n; ++j)
-      if (pivot_[j] != j) std::swap(x[j], x[pivot_[j]]);
-    for (int j = 0; j < n; ++j) {
-      const double value = x[j];
-      for (int i = j + 1; i < n; ++i) x[i] -= value * matrix(i, j);
-    }
-    for (int j = n - 1; j >= 0; --j) {
-      const double value = x[j] *= inverse_[j];
-      for (int i = 0; i < j; ++i) x[i] -= value * matrix(i, j);
-    }
-  }
-
- private:
-  std::vector<int> pivot_;
-  std::vector<double> inverse_;  // of the pivots
-};
-
-// A rollout's derivatives by unknowns, at the present node: S' = J S + b with S = (x, y), all n x unknowns. `start`, then
-// `advance` from node to node, is the trapezoidal rule. Where `exact`, Step::advance takes x and y along instead: then
-// they are the derivatives of the discrete RODAS3 map. A Rosenbrock stage (1/G - J) k_i = r_i has
+// A rollout's derivatives by unknowns, at the present node: S' = J S + b with S = (x, y), all n x unknowns. `start`,
+// then `advance` from node to node, is the trapezoidal rule. Where `exact`, Step::advance takes x and y along instead:
+// then they are the derivatives of the discrete RODAS3 map. A Rosenbrock stage (1/G - J) k_i = r_i has
 //   (1/G - J) dk_i = dr_i + d/de [J(s + e k_i, t + e H gamma_i) S + b(same)],  s = (theta, thetadot):
 // the second derivatives enter only along k_i, two further linearizations per stage.
 struct Variation {
@@ -70,23 +26,23 @@ struct Variation {
   bool exact = false;
   MatrixX x, y;          // d theta / d unknowns, d thetadot / d unknowns
   MatrixX acceleration;  // y'
-  // The same of the state of friction in bending, where there is one: z and z', by unknowns with tangents of it.
+  // The same of the internal state, where there is one: z and z', by unknowns with tangents of it.
   MatrixX z, z_rate;
   std::span<const Tangent> tangents;
 
-  Variation(int n, Eigen::Index unknowns, Forces forces_of, Base base, bool exact, bool friction);
-  // The acceleration at a node where engine and friction are linearized. False where the mass matrix is singular.
-  bool start(Engine& engine, const BendingFriction& friction, std::size_t node);
-  // Engine and friction are linearized at the new node; `factor` holds M + g damping + g^2 stiffness there, with the
-  // friction's part, g half the step before.
-  void advance(Engine& engine, const BendingFriction& friction, const Factor& factor, std::size_t node, double g);
+  Variation(int n, Eigen::Index unknowns, Forces forces_of, Base base, bool exact, Eigen::Index internal);
+  // The acceleration at a node where engine and internal state are linearized. False where the mass matrix is singular.
+  bool start(Engine& engine, const InternalState& internal, std::size_t node);
+  // Both are linearized at the new node; `factor` holds M + g damping + g^2 stiffness there, with the internal state's
+  // part, which is prepared for g, half the step before.
+  void advance(Engine& engine, const InternalState& internal, const Factor& factor, std::size_t node, double g);
 
   // Step's own, for `exact`: what multiplies 1/G - J, and the stages
   MatrixX right, work, stage_x, stage_y, k_x[4], k_y[4];
   MatrixX right_z, stage_z, k_z[4];
   VectorX probe_theta, probe_rate;
-  // forces = b + J S at (s_x, s_y, s_z): forces_of - stiffness s_x - damping s_y - friction's moment s_z
-  void force(Engine& engine, const BendingFriction& friction, std::size_t node, double after, const MatrixX& s_x,
+  // forces = b + J S at (s_x, s_y, s_z): forces_of - stiffness s_x - damping s_y - the internal state's moment s_z
+  void force(Engine& engine, const InternalState& internal, std::size_t node, double after, const MatrixX& s_x,
              const MatrixX& s_y, const MatrixX& s_z, MatrixX& forces);
 
  private:
@@ -105,10 +61,10 @@ class Step {
   bool advance(double h, const trajectory::BaseMotion& next, VectorX& theta, VectorX& thetadot,
                Variation* variation = nullptr, std::size_t node = 0);
 
-  Engine& engine;            // at the node
-  BendingFriction friction;  // there, too
-  VectorX friction_state;    // there; of the model's size where it has friction in bending, else empty
-  Factor factor;             // M + G C + G^2 K (Euler: M + h C), and the friction's part
+  Engine& engine;          // at the node
+  InternalState internal;  // there, too
+  VectorX internal_state;  // there; empty where the rope has none
+  Factor factor;           // M + G C + G^2 K (Euler: M + h C), and the internal state's part
   // After a failure: the first angle beyond all bounds, or without inertia.
   int bad_angle = 0;
   bool singular = false;
@@ -120,13 +76,13 @@ class Step {
   bool factor_mass(Engine& at);
   bool evaluate(const trajectory::BaseMotion& motion, bool slopes);
   void solve_stage(int i, double g);
-  void right_friction(int i, double h);  // right_z_ of stage i
+  void right_internal(int i, double h);  // right_z_ of stage i
   bool vary_stage(int i, double h, std::size_t node, const VectorX& theta, const VectorX& thetadot, Variation& v);
 
   bool rodas_;
   VectorX right_theta_, stage_theta_, stage_thetadot_, stage_acceleration_, work_;
   VectorX k_theta_[4], k_rate_[4];
-  BendingFriction stage_friction_;
+  InternalState stage_internal_;
   VectorX right_z_, stage_z_, k_z_[4];
 };
 

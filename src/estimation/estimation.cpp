@@ -232,7 +232,7 @@ Motion move(const Filter& filter, const Belief& belief, double time) {
     dynamics::Sensitivities sensitivities;
     const VectorX theta = belief.mean.head(n), thetadot = belief.mean.segment(n, n);
     const dynamics::InitialState now{belief.time, theta, thetadot,
-                                     dynamics::friction_state_in_motion(model, theta, thetadot)};
+                                     dynamics::internal_state_in_motion(model, theta, thetadot)};
     if (dynamics::simulate(model, grid, now, states, tangents, &sensitivities)) {
       out.theta = states.theta.back();
       out.thetadot = states.thetadot.back();

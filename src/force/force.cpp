@@ -56,7 +56,9 @@ Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> de
   Frame out;
   // the residual and the configuration
   out.residual = residual_torque(model, base, theta, thetadot, thetaddot);
-  const VectorX slip = dynamics::friction_state_in_motion(model, theta, thetadot);
+  VectorX slip;  // shares of friction in bending
+  if (!p.bending_friction.empty())
+    if (const VectorX z = dynamics::internal_state_in_motion(model, theta, thetadot); z.size() >= n) slip = z.head(n);
   for (Eigen::Index k = 0; k < slip.size(); ++k) out.residual[k] += p.bending_friction[k] * slip[k];
   out.axes = chain::world_axes(chain, theta, base.pose);
   out.motions = chain::link_motions(chain, theta, base.pose);
@@ -88,8 +90,7 @@ Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> de
   // and an error that grows toward the grasp, as a small force at every joint and at the free end would cause
   const double error = options.gravity_deviation * dynamics::total_mass(p) * p.gravity.norm();
   const MatrixX nodes = chain::nodes(chain, out.motions);
-  out.covariance += error * error *
-                    chain::displacement_metric(chain::link_end_jacobians(chain, out.axes, out.motions));
+  out.covariance += error * error * chain::displacement_metric(chain::link_end_jacobians(chain, out.axes, out.motions));
 
   out.sliding_covariance = out.covariance;
   // friction at rest balances any force up to its limit; neighbors are correlated, as they were dragged there together
@@ -469,7 +470,8 @@ std::optional<Estimate> update(Live& live, double time, const VectorX& theta, co
   while (live.states.time.size() - old > kLiveLag + 3 && live.states.time[old] < time - kLiveWindow) ++old;
   live.states.time.erase(live.states.time.begin(), live.states.time.begin() + old);
   live.states.theta.erase(live.states.theta.begin(), live.states.theta.begin() + old);
-  if (!live.states.covariance.empty()) live.states.covariance.erase(live.states.covariance.begin(), live.states.covariance.begin() + old);
+  if (!live.states.covariance.empty())
+    live.states.covariance.erase(live.states.covariance.begin(), live.states.covariance.begin() + old);
   if (live.taken <= kLiveLag) return {};
   return live_line(live, live.states.time.size() - 1 - kLiveLag);
 }

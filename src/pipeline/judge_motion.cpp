@@ -98,13 +98,14 @@ void judge_bending(twin::Twin& twin, const silhouette::BendingChoice& choice) {
   const double unseen = std::hypot(choice.out_of_plane_rms, choice.deviation);  // m
   if (choice.bending != chain::Bending::planar || unseen < kUnseen * twin.chain.length) return;
   char text[320];
-  std::snprintf(text, sizeof text,
-                "the cameras do not tell whether the rope stays in a plane: leaving it by %.1f mm RMS would look nearly the "
-                "same, and the twin's places are not known better than that; a second camera tells, and where the rope does "
-                "leave its plane `bending` spatial is nearer",
-                kMillimeters * unseen);
-  twin.verdict.push_back({kOutOfPlane, "object", kMillimeters * choice.out_of_plane_rms, kMillimeters * choice.deviation,
-                          "mm", false, true, false, -1, text});
+  std::snprintf(
+      text, sizeof text,
+      "the cameras do not tell whether the rope stays in a plane: leaving it by %.1f mm RMS would look nearly the "
+      "same, and the twin's places are not known better than that; a second camera tells, and where the rope does "
+      "leave its plane `bending` spatial is nearer",
+      kMillimeters * unseen);
+  twin.verdict.push_back({kOutOfPlane, "object", kMillimeters * choice.out_of_plane_rms,
+                          kMillimeters * choice.deviation, "mm", false, true, false, -1, text});
 }
 
 void judge_motion(twin::Twin& twin, const trajectory::Trajectory& base) {

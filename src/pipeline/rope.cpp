@@ -52,8 +52,10 @@ dynamics::InitialState at_rest(const Rope& rope, const dynamics::Model& model, c
 
 void check_state(const Rope& rope, const dynamics::InitialState& initial) {
   const int angles = rope.twin.chain.angles();
+  const Eigen::Index internal = initial.internal_state.size();
+  const auto rolls = static_cast<Eigen::Index>(model_of(rope).parameters.torsional_stiffness.size());
   if (initial.theta.size() != angles || initial.thetadot.size() != angles ||
-      (initial.friction_state.size() != 0 && initial.friction_state.size() != angles))
+      (internal != 0 && internal != angles && internal != rolls && internal != angles + rolls))
     throw InputError("`initial`", "has not " + std::to_string(angles) + " angles and rates, as the rope has",
                      "give theta and thetadot of that length");
 }
@@ -111,11 +113,11 @@ dynamics::InitialState rest_state(const Rope& rope, const math::Pose& base, doub
 dynamics::InitialState state_at(const dynamics::Model& model, const math::Pose& base, double time,
                                 const math::VectorX& theta, const math::VectorX& thetadot) {
   dynamics::InitialState initial{time, theta, thetadot, {}};
-  if (model.parameters.bending_friction.empty()) return initial;
-  initial.friction_state =
+  if (model.parameters.bending_friction.empty()) return initial;  // rolls come to rest by themselves
+  initial.internal_state =
       thetadot.isZero(0.0)
-          ? dynamics::friction_states(model, {dynamics::static_equilibrium(model, base).theta, theta}).back()
-          : dynamics::friction_state_in_motion(model, theta, thetadot);
+          ? dynamics::internal_states(model, {dynamics::static_equilibrium(model, base).theta, theta}).back()
+          : dynamics::internal_state_in_motion(model, theta, thetadot);
   return initial;
 }
 

@@ -250,7 +250,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
     const MatrixX speeds = centerline_velocity(truth.chain, state.theta, state.thetadot, here, true_seen);
     dynamics::InitialState found = fit_state(chain, here, seen, points, speeds, last_seen.theta).state;
     found.time = now;
-    found.friction_state = dynamics::friction_state_in_motion(problem.model, found.theta, found.thetadot);
+    found.internal_state = dynamics::internal_state_in_motion(problem.model, found.theta, found.thetadot);
     return found;
   };
   const int intervals = std::max(1, static_cast<int>(std::ceil(end * loop.rate - 1e-9)));
@@ -339,7 +339,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
       out.states.thetadot.push_back(states.thetadot[i]);
     }
     state.theta = states.theta.back(), state.thetadot = states.thetadot.back();
-    if (!states.friction_state.empty()) state.friction_state = states.friction_state.back();
+    if (!states.internal_state.empty()) state.internal_state = states.internal_state.back();
   }
 
   // the same part of the true rope that counts for the twin

@@ -36,8 +36,8 @@ void correct(ParameterCorrection& correction, const dynamics::BaseFunction& base
   chain::States states;
   dynamics::Sensitivities slopes;
   dynamics::InitialState start = before;
-  if (start.friction_state.size() == 0)
-    start.friction_state = dynamics::friction_state_in_motion(correction.model, before.theta, before.thetadot);
+  if (start.internal_state.size() == 0)
+    start.internal_state = dynamics::internal_state_in_motion(correction.model, before.theta, before.thetadot);
   if (!dynamics::simulate(correction.model, grid, start, states, tangents, &slopes)) return;
 
   // angles count by how far they move the rope

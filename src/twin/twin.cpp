@@ -198,8 +198,10 @@ Json chain_json(const Twin& twin) {
   if (twin.initial) {
     out["initial_state"] = {
         {"time", twin.initial->time}, {"theta", list(twin.initial->theta)}, {"thetadot", list(twin.initial->thetadot)}};
-    if (twin.initial->friction_state.size())
-      out["initial_state"]["friction_state"] = list(twin.initial->friction_state);
+    // rolls are not kept: they begin at rest
+    if (const Eigen::Index n = twin.chain.angles();
+        p && !p->bending_friction.empty() && twin.initial->internal_state.size() >= n)
+      out["initial_state"]["friction_state"] = list(math::VectorX(twin.initial->internal_state.head(n)));
   }
   return out;
 }
@@ -221,7 +223,8 @@ Json about_json(const Twin& twin) {
             {"inertia", "links are uniform cylinders; tip_mass is a point at the free end"}};
   if (!twin.parameters->torsional_stiffness.empty())
     laws["torsion"] =
-        "the rope twists within its links with torsional_stiffness, in equilibrium (docs/mathematics.md 3.11)";
+        "the rope twists within its links with torsional_stiffness and the retardation time damping/stiffness "
+        "(docs/mathematics.md 3.11)";
   if (!twin.parameters->bending_friction.empty())
     laws["bending_friction"] =
         "torque = -bending_friction z, dz/dt = (thetadot - |thetadot| z) / bending_friction_angle (Dahl); "
@@ -764,7 +767,7 @@ Twin load(const Path& run) {
     const Node initial = node["initial_state"];
     twin.initial = dynamics::InitialState{initial["time"].number(), initial["theta"].vector(angles),
                                           initial["thetadot"].vector(angles)};
-    if (initial.has("friction_state")) twin.initial->friction_state = initial["friction_state"].vector(angles);
+    if (initial.has("friction_state")) twin.initial->internal_state = initial["friction_state"].vector(angles);
   }
   twin.provenance = read_provenance(top["provenance"]);
   // files of older versions have none of these
