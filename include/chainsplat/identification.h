@@ -49,6 +49,7 @@ struct Options {
   // taken if the evidence is for them (mathematics.md 5.10).
   bool ask_for_more = true;
   bool fit_stiffness = true;            // else 0
+  bool fit_torsion = true;              // in free space, of chains that bend in space (mathematics.md 3.11)
   bool per_joint = true;                // stiffness, damping and mass vary smoothly along the rope
   bool friction_per_link = true;        // else one Coulomb coefficient for the whole rope
   std::vector<Prior> priors;

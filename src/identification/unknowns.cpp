@@ -21,7 +21,11 @@ constexpr double kHeldCoulombSd = 1.5;  // the same where the fingers lift the r
 constexpr double kHeldDiameters = 3.0;  // from the grasp
 constexpr double kSameSd = 1e-4;        // of a link's own part where all links are to have one coefficient
 constexpr double kTwistSd = 0.7;        // of all twist stiffnesses over the bending ones
-constexpr double kPaperMassSd = 0.3;    // mass of one link about the mean, [P]
+// Torsional over bending stiffness: 1/(1 + Poisson's ratio) of a round rod of one material, with the ratio of most
+// plastics and metals; strands that slide make it softer, a braided sheath stiffer.
+constexpr double kPoissonRatio = 0.35;
+constexpr double kTorsionSd = 0.5;
+constexpr double kPaperMassSd = 0.3;  // mass of one link about the mean, [P]
 constexpr double kViscousSd = 1.0;
 constexpr double kRestSd = 0.3;  // rad
 constexpr double kBendingFrictionSd = 1.5;
@@ -43,6 +47,12 @@ TipPrior tip_prior(const Options& options, const Extras& extras, double total_ma
   if (!options.tip_mass) return extras.payload ? TipPrior{kPayloadPart, kPayloadSd} : TipPrior{kTipPart, kTipSd};
   const double part = *options.tip_mass / total_mass;
   return {part, std::max(kLeastTipSd, options.tip_mass_deviation / (*options.tip_mass * (1.0 - part)))};
+}
+
+// A rope that bends in space twists where it is naturally bent. On a table it lies on its side.
+bool twists_within_links(const chain::Chain& chain, const Options& options) {
+  return options.fit_torsion && !options.tabletop && !chain::has_twist(chain) &&
+         chain.angles() == 2 * (chain.links() - 1);
 }
 
 }  // namespace
@@ -99,6 +109,10 @@ Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const 
     if (options.per_joint && n > 1 && chain.child_link[1] == 1 && !chain::is_twist(chain, 1))
       add(Quantity::grasp_stiffness, 0, 0.0, kGraspSd);
     if (chain::has_twist(chain)) add(Quantity::twist_stiffness, 0, 0.0, kTwistSd);
+    if (twists_within_links(chain, options)) {
+      for (int k = 0; k < n; k += 2) unit.torsional_stiffness.push_back(unit.stiffness[k]);
+      add(Quantity::torsional_stiffness, 0, -std::log(1.0 + kPoissonRatio), kTorsionSd);
+    }
   } else {
     u.held.emplace_back("stiffness", options.paper ? "0, as in the paper" : "held at 0 on request");
   }
