@@ -2,6 +2,7 @@
 // program says of the same motion, for tests/cli/exports.sh, which runs them.
 #include <doctest/doctest.h>
 
+#include <cmath>
 #include <cstdlib>
 
 #include "chainsplat/export.h"
@@ -35,6 +36,21 @@ twin::Twin table_twin() {
   return twin;
 }
 
+// A rope that is naturally bent, twists within its links, and whose strands rub.
+twin::Twin twisting_twin() {
+  twin::Twin twin = test::small_twin(chain::Bending::spatial);
+  dynamics::Parameters& p = *twin.parameters;
+  const int n = twin.chain.angles();
+  for (int k = 0; k < n; ++k) {
+    p.rest_angle[k] = 0.4 * std::cos(1.3 * k);
+    p.stiffness[k] += 6e-3, p.damping[k] += 3e-4;
+    p.bending_friction.push_back(5e-4), p.bending_friction_angle.push_back(0.05);
+    if (k % 2 == 0) p.torsional_stiffness.push_back(0.7 * p.stiffness[k]);
+  }
+  twin.initial->internal_state = math::VectorX::LinSpaced(n, -0.5, 0.7);
+  return twin;
+}
+
 void write_all(twin::Twin twin, const Path& folder) {
   const trajectory::Trajectory base = test::moving_base(kSeconds);
   core::make_folder(folder);
@@ -63,6 +79,7 @@ TEST_CASE("exports for NumPy and MuJoCo: every file that was named, the same byt
   for (double& b : free.parameters->air_linear) b = 2e-4;
   write_all(free, folder / "free");
   write_all(table_twin(), folder / "table");
+  write_all(twisting_twin(), folder / "twisting");
   for (const char* const name : {"rope.xml", "rope_base.csv", "rope_play.py", "twin.npz", "twin.py"})
     CHECK(std::filesystem::file_size(folder / "free" / name) > 100);
   CHECK(exports::files("a/rope.xml") == std::vector<Path>{"a/rope.xml", "a/rope_base.csv", "a/rope_play.py"});

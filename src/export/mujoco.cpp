@@ -177,6 +177,14 @@ std::string custom(const twin::Twin& twin, double start) {
   std::string out = "  <custom>\n" + numeric("start_time", {start}) + numeric("direction", three(chain.direction)) +
                     numeric("first_joint", {chain.link_start(1)}) + numeric("link_length", lengths) +
                     numeric("air_linear", p.air_linear);
+  if (!p.torsional_stiffness.empty()) out += numeric("torsional_stiffness", p.torsional_stiffness);
+  if (!p.bending_friction.empty()) {
+    std::vector<double> shares(p.bending_friction.size(), 0.0);
+    const Eigen::Index known = std::min<Eigen::Index>(twin.initial->internal_state.size(), chain.angles());
+    for (Eigen::Index k = 0; k < known; ++k) shares[static_cast<std::size_t>(k)] = twin.initial->internal_state[k];
+    out += numeric("bending_friction", p.bending_friction) +
+           numeric("bending_friction_angle", p.bending_friction_angle) + numeric("friction_state", shares);
+  }
   if (p.table_normal) {
     const double pressure = std::abs(p.gravity.dot(*p.table_normal));
     for (std::size_t j = 0; j < lengths.size(); ++j)
@@ -215,6 +223,8 @@ std::string head(const twin::Twin& twin, const std::string& stem) {
       (p.table_normal ? " and adds the table's friction,\n     which MJCF cannot say: without it the rope "
                         "slides freely. The table carries the weight"
                       : "") +
+      (p.torsional_stiffness.empty() ? "" : " and lets the rope twist\n     within its links, which MJCF cannot say") +
+      (p.bending_friction.empty() ? "" : " and adds friction in bending,\n     which MJCF cannot say") +
       ".\n     Contacts are off: give geoms contype and conaffinity where the rope is to touch things. -->\n";
   return out + "<mujoco" + attribute("model", escaped(twin.provenance.capture)) + ">\n" +
          "  <compiler angle=\"radian\" autolimits=\"true\" inertiafromgeom=\"false\"/>\n  <option" +

@@ -181,6 +181,12 @@ void add_parameters(Arrays& arrays, const twin::Twin& twin) {
        {std::pair("stiffness", &p.stiffness), std::pair("rest_angle", &p.rest_angle), std::pair("damping", &p.damping)})
     arrays.numbers(name, {angles}, *values);
   if (!p.roll_lever.empty()) arrays.numbers("roll_lever", {angles}, p.roll_lever);
+  if (!p.torsional_stiffness.empty())
+    arrays.numbers("torsional_stiffness", {p.torsional_stiffness.size()}, p.torsional_stiffness);
+  if (!p.bending_friction.empty()) {
+    arrays.numbers("bending_friction", {angles}, p.bending_friction);
+    arrays.numbers("bending_friction_angle", {angles}, p.bending_friction_angle);
+  }
   for (const auto& [name, values] :
        {std::pair("link_mass", &p.link_mass), std::pair("viscous_friction", &p.viscous_friction),
         std::pair("coulomb_friction", &p.coulomb_friction), std::pair("air_linear", &p.air_linear),

@@ -3,8 +3,9 @@
 
 The base follows ROPE_base.csv. Its joints are so heavy that the rope cannot move them; before every step they are set to
 the prescribed place and speed and pushed by what their acceleration needs (a weld to a mocap body would lag by a
-millimeter, and a base without its acceleration swings the rope by centimeters less). What MJCF has no law for, friction
-spread along links that lie on a table, and drag that is proportional to speed, is added as passive forces.
+millimeter, and a base without its acceleration swings the rope by centimeters less). What MJCF has no law for is added as
+passive forces: friction spread along links that lie on a table, drag that is proportional to speed, the rope's twist within
+its links (with their rolls as states of their own), and dry friction in bending.
 """
 import argparse
 import pathlib
@@ -45,6 +46,56 @@ class Base:
                 (1 - u) * np.r_[a[7:10], a[17:20]] + u * np.r_[b[7:10], b[17:20]])
 
 
+class Twist:
+    """How a rope of universal joints twists within its links: chainsplat's docs/mathematics.md 3.11, in its symbols."""
+
+    LEAST_RETARDATION = 1e-3  # s
+    FOLDED, SMOOTH = 0.05, 0.01  # of a joint that is folded back, which has no twist of its own
+
+    def __init__(self, twist, stiffness, damping, rest, angles):
+        pairs = [np.reshape(x, (-1, 2)) for x in (stiffness, damping, rest)]
+        (self.k, self.d, self.rest), self.c, m = pairs, twist, len(twist)
+        self.dc = twist * np.maximum(self.d.sum(1) / self.k.sum(1), self.LEAST_RETARDATION)
+        self.by_chi, self.by_tau = (np.eye(m) + np.eye(m, k=-1)) / 2, np.eye(m) - np.eye(m, k=-1)
+        self.roll, self.turning = np.zeros(m), np.zeros(m)
+        for _ in range(30):  # begins at rest
+            forces, slopes = self.elastic(angles)[2:]
+            self.roll -= np.linalg.solve(self.over_rolls(*slopes), self.by_chi.T @ forces[0] + self.by_tau.T @ forces[1])
+
+    def over_rolls(self, chi, tau):
+        return self.by_chi.T @ (chi[:, None] * self.by_chi) + self.by_tau.T @ (tau[:, None] * self.by_tau)
+
+    def elastic(self, angles):
+        """Torques on the angles beside -k (angle - rest), d delta / d angle; dE/d(chi, tau) and their slopes."""
+        chi, (ca, cb), (sa, sb) = self.by_chi @ self.roll, np.cos(angles).T, np.sin(angles).T
+        (a0, b0), w = self.rest.T, (1 + ca) * (1 + cb) / 4
+        fade = self.SMOOTH * np.exp(-w / self.FOLDED)
+        q, q_w = 4 * (w + fade), 4 * (1 - fade / self.FOLDED)
+        u = sa * sb / q
+        a0, b0 = np.cos(chi) * a0 - np.sin(chi) * b0, np.sin(chi) * a0 + np.cos(chi) * b0
+        delta = 2 * np.stack([ca * sb + u * q_w * sa * (1 + cb) / 4, sa * cb + u * q_w * (1 + ca) * sb / 4], 1)
+        delta /= (q * (1 + u * u))[:, None]
+        moment = self.c * (self.by_tau @ self.roll + 2 * np.arctan(u))
+        x, y = (angles - np.stack([a0, b0], 1)).T
+        (ka, kb) = self.k.T
+        torque = self.k * (np.stack([a0, b0], 1) - self.rest) - moment[:, None] * delta
+        return (torque, delta, (ka * x * b0 - kb * y * a0, moment),
+                (ka * (x * a0 + b0 * b0) + kb * (y * b0 + a0 * a0), self.c))
+
+    def torque(self, angles, rates):
+        torque, delta, forces, _ = self.elastic(angles)
+        (a, b), (va, vb), (da, db) = angles.T, rates.T, self.d.T
+        twisting = np.sum(delta * rates, 1)
+        self.turning = -np.linalg.solve(
+            self.over_rolls(da * b * b + db * a * a, self.dc),
+            self.by_chi.T @ (forces[0] + da * b * va - db * a * vb) + self.by_tau.T @ (forces[1] + self.dc * twisting))
+        chi, tau = self.by_chi @ self.turning, self.by_tau @ self.turning + twisting
+        return torque - np.stack([da * chi * b, -db * chi * a], 1) - (self.dc * tau)[:, None] * delta
+
+    def advance(self, seconds):
+        self.roll = self.roll + seconds * self.turning
+
+
 class Rope:
     def __init__(self, file):
         self.model = m = mujoco.MjModel.from_xml_path(str(file))
@@ -60,13 +111,27 @@ class Rope:
         self.child = [self.links.index(m.jnt_bodyid[1 + 3 + k]) for k in range(m.njnt - 4)]
         ends = np.cumsum(self.length) + n["first_joint"][0]
         self.share = np.minimum((ends - self.length)[self.child][:, None], (ends - self.length / 2)[None]) / ends[-1]
-        if self.normal is not None or self.linear.any():
-            mujoco.set_mjcb_passive(self.passive)
         mujoco.mj_resetDataKeyframe(m, self.data, 0)
         self.data.time = self.start
+        self.twist = self.slip = None
+        if "torsional_stiffness" in n:
+            self.twist = Twist(n["torsional_stiffness"], m.jnt_stiffness[4:], m.dof_damping[6:], m.qpos_spring[7:],
+                               self.data.qpos[7:].reshape(-1, 2))
+        if "bending_friction" in n:
+            self.slip, self.slip_moment, self.slip_angle = n["friction_state"].copy(), n["bending_friction"], n["bending_friction_angle"]
+            bends = np.abs(m.jnt_axis[4:] @ self.direction) < 0.5
+            self.with_slip = bends * (np.equal.outer(self.child, self.child) & bends)  # bending angles of one joint
+        if self.normal is not None or self.linear.any() or self.twist or self.slip is not None:
+            mujoco.set_mjcb_passive(self.passive)
 
     def passive(self, m, d):
         if m.nv != self.model.nv:
+            return
+        if self.twist:
+            d.qfrc_passive[6:] += self.twist.torque(d.qpos[7:].reshape(-1, 2), d.qvel[6:].reshape(-1, 2)).ravel()
+        if self.slip is not None:
+            d.qfrc_passive[6:] -= self.slip_moment * self.slip
+        if self.normal is None and not self.linear.any():
             return
         twist, sums = np.zeros(6), np.zeros(len(self.links))
         for j, body in enumerate(self.links):
@@ -91,12 +156,23 @@ class Rope:
         self.data.qpos[:7], self.data.qvel[:6] = place, speed
         self.data.qfrc_applied[:6] = self.heavy * acceleration
 
+    def remember(self, seconds):
+        """What the rope remembers goes on by a step: its rolls, and the shares of friction in bending (Dahl's law)."""
+        if self.twist:
+            self.twist.advance(seconds)
+        if self.slip is not None:
+            rate = self.data.qvel[6:]
+            speed = np.sqrt(self.with_slip @ rate**2)
+            ahead = np.divide(rate, speed, out=np.zeros_like(rate), where=speed > 0)
+            self.slip = ahead + (self.slip - ahead) * np.exp(-speed * seconds / self.slip_angle)
+
     def advance(self, time):
         """Steps up to `time`, s, and returns the joint angles, rad."""
         steps = max(0, round((time - self.data.time) / self.model.opt.timestep))
         for _ in range(steps):
             self.set_base(self.data.time)
             mujoco.mj_step(self.model, self.data)
+            self.remember(self.model.opt.timestep)
         self.set_base(self.data.time)
         mujoco.mj_forward(self.model, self.data)
         return self.data.qpos[7:].copy()

@@ -10,7 +10,7 @@ if ! "$python" -c 'import numpy' 2>/dev/null; then
 fi
 CHAINSPLAT_TEST_EXPORTS=$work/made "$2" --test-case='exports for NumPy*' >"$work/stderr" 2>&1 || fail 'test_export makes no files'
 
-poses() {  # free or table
+poses() {  # free, table or twisting
   (cd "$work/made/$1" && "$python" - <<'PYTHON') || fail "$1: twin.py or the arrays are wrong"
 import numpy as np
 from twin import Twin
@@ -35,9 +35,10 @@ PYTHON
 }
 poses free
 poses table
+poses twisting
 
 if "$python" -c 'import mujoco' 2>/dev/null; then
-  moves() {  # free or table, degrees
+  moves() {  # free, table or twisting; degrees
     (cd "$work/made/$1" && "$python" rope_play.py -o played.csv && "$python" - "$2" <<'PYTHON') || fail "$1: MuJoCo moves it otherwise"
 import sys
 import numpy as np
@@ -50,6 +51,7 @@ assert np.sqrt((error**2).mean()) <= float(sys.argv[1])
 PYTHON
   }
   moves free 0.01
+  moves twisting 0.02
   moves table 0.02
 else
   echo "MuJoCo is not compared: $python has no mujoco"
