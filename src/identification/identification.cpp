@@ -808,21 +808,24 @@ std::vector<Result> fit_parts(const chain::Chain& chain, std::vector<Part> parts
 
 dynamics::InitialState fit_initial(const chain::Chain& chain, const dynamics::Parameters& parameters,
                                    const trajectory::Trajectory& base, const Markers& markers, double seconds) {
+  constexpr int kIterations = 30, kMostRefinement = 32;  // of the steps, as a rollout refines them
   Options options;
   options.tabletop = parameters.table_normal.has_value();
-  options.substeps = parameters.substeps;
-  std::vector<Part> parts{make_part(chain, base, fit_markers(chain, base, markers).states, options, &markers)};
-  parts[0].unknowns = make_state_unknowns(chain, parameters, parts[0].start);
-  const Problem problem = make_problem(chain, std::move(parts));
-  constexpr int kIterations = 30;
-  Fit fit;
-  fit.p = problem.mean;
-  improve(problem, seconds, true, kIterations, fit);
-  if (fit.cost == kInfinity)
-    throw WorkError("identify", "no initial state gave a rollout that stays finite", "check the markers and the twin");
-  dynamics::InitialState found = apply(chain, problem.parts[0].unknowns, problem.of_part(fit.p, 0)).initial;
-  found.time = problem.parts[0].times[0];
-  return found;
+  const chain::States shapes = fit_markers(chain, base, markers).states;
+  for (int refinement = 1; refinement <= kMostRefinement; refinement *= 2) {
+    options.substeps = refinement * parameters.substeps;
+    std::vector<Part> parts{make_part(chain, base, shapes, options, &markers)};
+    parts[0].unknowns = make_state_unknowns(chain, parameters, parts[0].start);
+    const Problem problem = make_problem(chain, std::move(parts));
+    Fit fit;
+    fit.p = problem.mean;
+    improve(problem, seconds, true, kIterations, fit);
+    if (fit.cost == kInfinity) continue;
+    dynamics::InitialState found = apply(chain, problem.parts[0].unknowns, problem.of_part(fit.p, 0)).initial;
+    found.time = problem.parts[0].times[0];
+    return found;
+  }
+  throw WorkError("identify", "no initial state gave a rollout that stays finite", "check the markers and the twin");
 }
 
 std::vector<Result> identify(const chain::Chain& chain, std::span<const Recording> recordings, const Options& options) {
