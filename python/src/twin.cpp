@@ -6,6 +6,7 @@
 #include "chainsplat/motion_files.h"
 #include "chainsplat/properties.h"
 #include "chainsplat/render.h"
+#include "chainsplat/validity.h"
 #include "module.h"
 #include "twin.h"
 
@@ -55,10 +56,12 @@ chain::States rollout(const Twin& twin, const std::optional<Trajectory>& base, c
                       const std::optional<Parameters>& parameters) {
   return unlocked([&] {
     const InitialState start = start_of(twin, base, initial, times);
-    const std::vector<double> at = times_or(twin, base, start, times, rate);
-    if (!parameters) return dynamics::rollout(model_of(twin.rope), base_or_own(twin, base), start, at);
-    return dynamics::rollout(dynamics::make_model(twin.rope.twin.chain, *parameters), base_or_own(twin, base), start,
-                             at);
+    const Trajectory under = base_or_own(twin, base);
+    const chain::Chain& chain = twin.rope.twin.chain;
+    const dynamics::Model model = parameters ? dynamics::make_model(chain, *parameters) : model_of(twin.rope);
+    chain::States found = dynamics::rollout(model, under, start, times_or(twin, base, start, times, rate));
+    twin::warn_beyond(twin.rope.twin.validity, twin::validity_of(chain, under, found), "rollout");
+    return found;
   });
 }
 
@@ -282,7 +285,8 @@ void add_twin(py::module_& m) {
       .def("rollout", &rollout, arg("base") = py::none(), arg("initial") = py::none(), arg("times") = py::none(),
            arg("rate") = 30.0, arg("parameters") = py::none(),
            "States under a base's motion (None: its own), as the command rollout. initial: (theta, thetadot); None: as "
-           "identified, under another base at rest. times: s, increasing; None: `rate` a second while the base moves.")
+           "identified, under another base at rest. times: s, increasing; None: `rate` a second while the base moves. "
+           "Motion beyond what the twin was identified in is warned of in the log.")
       .def("rollout_batch", &rollout_batch, arg("parameters") = py::none(), arg("bases") = py::none(),
            arg("initials") = py::none(), arg("times") = py::none(), arg("rate") = 30.0,
            "Many rollouts on all cores. Lists of one length, or of one entry for all. Returns time (T,), theta and "

@@ -162,6 +162,14 @@ class Module(unittest.TestCase):
         np.testing.assert_allclose(np.cov(drawn.T) / scale, told / scale, atol=0.12)
         np.testing.assert_allclose(drawn.mean(0), self.twin.parameters.rest_angle[[0, 3]], atol=4 * np.sqrt(scale.max() / 2000))
 
+    def test_a_motion_beyond_the_identified_one_is_warned_of(self):
+        poses = np.stack([np.eye(4)] * 61)
+        poses[:, :3, 3] = self.twin.base.pose(0.0)[:3, 3]
+        poses[:, 0, 3] += 0.05 * np.sin(np.linspace(0.0, 0.5, 61) * 4 * np.pi) ** 2  # 30 m/s^2
+        with self.assertLogs("chainsplat", "WARNING") as log:
+            self.twin.rollout(cs.Trajectory(np.linspace(0.0, 0.5, 61), poses))
+        self.assertIn("what the twin was identified in", log.output[0])
+
     def test_derivatives_are_differences(self):
         times = np.linspace(0.0, 0.5, 16)
         initial = (self.twin.states.theta[0], np.zeros(6))
