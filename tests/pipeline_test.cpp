@@ -217,4 +217,13 @@ TEST_CASE("a job file becomes the jobs of a batch") {
   core::write_file(folder.path / "jobs.toml", "captures = [\"captures/*\"]\nsettings = { joints = 0 }\n");
   CHECK_THROWS_WITH_AS(pipeline::read_job_file(folder.path / "jobs.toml"),
                        doctest::Contains("`joints` 0 is not from 1"), InputError);
+  // letters beyond ASCII: in texts of every kind and in comments
+  for (const char* const name : {"é", "è", "ê", "ë"}) std::filesystem::create_directories(folder.path / "named" / name);
+  core::write_file(folder.path / "jobs.toml",
+                   "\xEF\xBB\xBF# ü\ncaptures = [\"named/é\", 'named/è', \"\"\"named/\\\nê\"\"\", "
+                   "'''named/ë''']\n");
+  CHECK(pipeline::read_job_file(folder.path / "jobs.toml").jobs.size() == 4);
+  core::write_file(folder.path / "jobs.toml", "captures = [\"a\\\"#\"] # \"\né = 1\n");
+  CHECK_THROWS_WITH_AS(pipeline::read_job_file(folder.path / "jobs.toml"),
+                       doctest::Contains("line 2: has a letter beyond ASCII outside of quotes"), InputError);
 }

@@ -178,6 +178,37 @@ void check_dots(std::string_view text, const std::string& name) {
   }
 }
 
+// TOML has letters beyond ASCII in texts and comments only. toml++ 3.3 runs past the end of a table where it meets some
+// of them elsewhere.
+void check_letters(std::string_view text, const std::string& name) {
+  constexpr std::string_view kByteOrderMark = "\xEF\xBB\xBF";
+  std::string_view closing;  // of the text or the comment that we are in; empty: in neither
+  int line = 1;
+  for (std::size_t i = text.starts_with(kByteOrderMark) ? kByteOrderMark.size() : 0; i < text.size(); ++i) {
+    const std::string_view rest = text.substr(i);
+    line += rest[0] == '\n';
+    if (closing.empty()) {
+      if (static_cast<unsigned char>(rest[0]) >= 0x80)
+        throw InputError(name + ": line " + std::to_string(line), "has a letter beyond ASCII outside of quotes",
+                         "put what is not a number into quotes");
+      for (const std::string_view opening : {"\"\"\"", "'''", "\"", "'", "#"})
+        if (rest.starts_with(opening)) {
+          closing = opening == "#" ? "\n" : opening;
+          i += opening.size() - 1;
+          break;
+        }
+    } else if (closing[0] == '"' && rest[0] == '\\') {
+      ++i;
+      line += i < text.size() && text[i] == '\n';
+    } else if (rest.starts_with(closing)) {
+      i += closing.size() - 1;
+      closing = {};
+    } else if (rest[0] == '\n' && closing.size() == 1) {
+      closing = {};  // a text that its line does not close: toml++ says so
+    }
+  }
+}
+
 }  // namespace
 
 BatchPlan read_job_file(const Path& file) {
@@ -186,6 +217,7 @@ BatchPlan read_job_file(const Path& file) {
   try {
     const std::string text = core::read_file(file);
     check_dots(text, name);
+    check_letters(text, name);
     document = toml::parse(text, name);
   } catch (const toml::parse_error& error) {
     throw InputError(name + ": line " + std::to_string(error.source().begin.line), std::string(error.description()),
