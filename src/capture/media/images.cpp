@@ -17,7 +17,8 @@ namespace chainsplat::capture::media {
 
 namespace {
 
-constexpr int kMostChannels = 8;  // enough for colors, alpha and depth; a damaged header may claim any number
+constexpr int kMostChannels = 8;    // enough for colors, alpha and depth; a damaged header may claim any number
+constexpr int kMostSide = 1 << 16;  // pixels; OpenImageIO reads 64 rows at a time, however wide they are
 
 // Returns what is wrong with a PNG, or an empty text where it is whole or the file is no PNG. It is found here because
 // libpng would print a line of its own.
@@ -126,11 +127,13 @@ std::unique_ptr<OIIO::ImageInput> open_image(const Path& file) {
     throw InputError(file.string(), "is not a readable image", "write it again as PNG");
   }
   if (spec.width < 1 || spec.height < 1 || spec.depth > 1 || spec.deep || spec.nchannels < 1 ||
-      spec.nchannels > kMostChannels || static_cast<std::int64_t>(spec.width) * spec.height > kMostPixels)
+      spec.nchannels > kMostChannels || std::max(spec.width, spec.height) > kMostSide ||
+      static_cast<std::int64_t>(spec.width) * spec.height > kMostPixels)
     throw InputError(file.string(),
                      "claims " + std::to_string(spec.width) + "x" + std::to_string(spec.height) + "x" +
                          std::to_string(spec.depth) + " pixels of " + std::to_string(spec.nchannels) + " channels",
-                     "write it again as PNG of at most " + std::to_string(kMostPixels >> 20) + " million pixels");
+                     "write it again as PNG of at most " + std::to_string(kMostPixels >> 20) + " million pixels, " +
+                         std::to_string(kMostSide) + " a side");
   input->threads(1);  // files are read in parallel already
   return input;
 }
