@@ -135,6 +135,7 @@ TEST_CASE("a bend that is given builds the moment up and turns it round") {
   CHECK(in_two[1] == doctest::Approx(0.8).epsilon(1e-3));
   CHECK(in_two[2] == 0.0);  // twists
   CHECK(internal_states(make_rope(chain::Bending::planar, 0.0, 0.05), {bent(0.0)}).empty());
+  CHECK(internal_state_in_motion(make_rope(chain::Bending::planar, 0.0, 0.05), bent(0.0), bent(0.1)).size() == 0);
 }
 
 TEST_CASE("derivatives of a rollout with friction in bending agree with differences") {

@@ -93,7 +93,8 @@ std::vector<VectorX> internal_states(const Model& model, const std::vector<Vecto
 VectorX internal_state_in_motion(const Model& model, const VectorX& theta, const VectorX& thetadot) {
   if (model.parameters.bending_friction.empty() && model.parameters.torsional_stiffness.empty()) return {};
   constexpr double kWhile = 0.1;  // s: a small part of a swing, and long enough for most joints to slip
-  return internal_states(model, {theta - kWhile * thetadot, theta}).back();
+  const std::vector<VectorX> states = internal_states(model, {theta - kWhile * thetadot, theta});
+  return states.empty() ? VectorX() : states.back();  // a friction of zero keeps none
 }
 
 }  // namespace chainsplat::dynamics
