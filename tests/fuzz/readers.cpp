@@ -318,6 +318,7 @@ void video(std::string_view bytes) {
 
 const std::map<std::string, Read> kReaders = {
     {"batch", batch},
+    {"board", board},
     {"calibration", calibration},
     {"camera", camera},
     {"checkpoint", checkpoint},

@@ -25,6 +25,7 @@ dynamics::Parameters parameters_of_two_joints();
 
 using Read = void (*)(std::string_view);
 void batch(std::string_view bytes);
+void board(std::string_view bytes);
 void calibration(std::string_view bytes);
 void checkpoint(std::string_view bytes);
 void colmap(std::string_view bytes);
