@@ -1024,6 +1024,12 @@ TEST_CASE("written images and videos come back") {
   for (int i = 0; i < 13 * 7; ++i) depth.push_back(static_cast<float>(random.uniform(0, 3)));
   capture::write_depth_exr(folder.path / "a.depth.exr", 13, 7, depth);
   CHECK(capture::read_image8(folder.path / "a.depth.exr").width == 13);
+  std::string bytes = core::read_file(folder.path / "a.depth.exr");
+  const std::string window = std::string("dataWindow") + '\0' + "box2i" + '\0';
+  bytes[bytes.find(window) + window.size()] = 15;  // bytes of the attribute, which are 16 always
+  core::write_file(folder.path / "short.exr", bytes);
+  CHECK_THROWS_WITH_AS(capture::read_image8(folder.path / "short.exr"), doctest::Contains("is damaged"), InputError);
+  std::filesystem::remove(folder.path / "short.exr");
 
   for (const auto& [width, height] : {std::pair{64, 48}, std::pair{33, 21}}) {
     std::vector<Image8> frames;

@@ -226,4 +226,7 @@ TEST_CASE("a job file becomes the jobs of a batch") {
   core::write_file(folder.path / "jobs.toml", "captures = [\"a\\\"#\"] # \"\né = 1\n");
   CHECK_THROWS_WITH_AS(pipeline::read_job_file(folder.path / "jobs.toml"),
                        doctest::Contains("line 2: has a letter beyond ASCII outside of quotes"), InputError);
+  core::write_file(folder.path / "jobs.toml", "seeds = [1]  # it's one\ncaptures = 9'\xC7\xBD'\n");
+  CHECK_THROWS_WITH_AS(pipeline::read_job_file(folder.path / "jobs.toml"),
+                       doctest::Contains("line 2: has a letter beyond ASCII outside of quotes"), InputError);
 }

@@ -182,7 +182,9 @@ void check_dots(std::string_view text, const std::string& name) {
 // of them elsewhere.
 void check_letters(std::string_view text, const std::string& name) {
   constexpr std::string_view kByteOrderMark = "\xEF\xBB\xBF";
+  constexpr std::string_view kBeforeText = "\n=[{,.";  // a quote after anything else opens none
   std::string_view closing;  // of the text or the comment that we are in; empty: in neither
+  char before = '\n';        // the last letter but blanks
   int line = 1;
   for (std::size_t i = text.starts_with(kByteOrderMark) ? kByteOrderMark.size() : 0; i < text.size(); ++i) {
     const std::string_view rest = text.substr(i);
@@ -192,18 +194,21 @@ void check_letters(std::string_view text, const std::string& name) {
         throw InputError(name + ": line " + std::to_string(line), "has a letter beyond ASCII outside of quotes",
                          "put what is not a number into quotes");
       for (const std::string_view opening : {"\"\"\"", "'''", "\"", "'", "#"})
-        if (rest.starts_with(opening)) {
+        if (rest.starts_with(opening) && (opening == "#" || kBeforeText.find(before) != std::string_view::npos)) {
           closing = opening == "#" ? "\n" : opening;
           i += opening.size() - 1;
           break;
         }
+      if (rest[0] != ' ' && rest[0] != '\t' && rest[0] != '\r') before = rest[0];
     } else if (closing[0] == '"' && rest[0] == '\\') {
       ++i;
       line += i < text.size() && text[i] == '\n';
     } else if (rest.starts_with(closing)) {
+      if (rest[0] == '\n') before = '\n';
       i += closing.size() - 1;
       closing = {};
     } else if (rest[0] == '\n' && closing.size() == 1) {
+      before = '\n';
       closing = {};  // a text that its line does not close: toml++ says so
     }
   }

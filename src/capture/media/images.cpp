@@ -7,6 +7,7 @@
 #include <cmath>
 #include <filesystem>
 #include <fstream>
+#include <map>
 #include <memory>
 #include <string>
 #include <string_view>
@@ -56,23 +57,66 @@ std::string damage_of_png(const Path& file) {
   }
 }
 
-// Returns whether a file that begins as an EXR has a header that is cut off or has an attribute longer than the file:
-// OpenEXR would allocate the attribute's claimed length before it reads.
+std::uint32_t little_endian(std::string_view bytes) {
+  std::uint32_t value = 0;
+  for (int i = 3; i >= 0; --i) value = value << 8u | static_cast<unsigned char>(bytes[static_cast<std::size_t>(i)]);
+  return value;
+}
+
+// Returns whether OpenEXR reads exactly `bytes` as an attribute of this type. Of most types it reads what the type has,
+// whatever length the file gives, and goes on behind that; texts and previews are as long as they say themselves.
+bool is_sound_attribute(const std::string& type, std::string_view bytes) {
+  static const std::map<std::string, std::size_t> length_of = {
+      {"box2f", 16},    {"box2i", 16},   {"chromaticities", 32}, {"compression", 1}, {"deepImageState", 1},
+      {"double", 8},    {"envmap", 1},   {"float", 4},           {"int", 4},         {"keycode", 28},
+      {"lineOrder", 1}, {"m33d", 72},    {"m33f", 36},           {"m44d", 128},      {"m44f", 64},
+      {"rational", 8},  {"tiledesc", 9}, {"timecode", 8},        {"v2d", 16},        {"v2f", 8},
+      {"v2i", 8},       {"v3d", 24},     {"v3f", 12},            {"v3i", 12}};
+  if (const auto known = length_of.find(type); known != length_of.end()) return bytes.size() == known->second;
+  if (type == "chlist") {
+    constexpr std::size_t kChannelLength = 16;  // after its name; the list ends with an empty one
+    while (!bytes.empty() && bytes[0] != '\0') {
+      const std::size_t end = bytes.find('\0');
+      if (end == std::string_view::npos || bytes.size() - end <= kChannelLength) return false;
+      bytes.remove_prefix(end + 1 + kChannelLength);
+    }
+    return bytes.size() == 1;
+  }
+  if (type == "preview") {  // width, height, four bytes a pixel
+    if (bytes.size() < 8) return false;
+    return 8 + 4 * std::uint64_t{little_endian(bytes)} * little_endian(bytes.substr(4)) == bytes.size();
+  }
+  if (type == "stringvector") {
+    while (bytes.size() >= 4 && little_endian(bytes) <= bytes.size() - 4) bytes.remove_prefix(4 + little_endian(bytes));
+    return bytes.empty();
+  }
+  return true;
+}
+
+// Returns whether a file that begins as an EXR has a header that is cut off or has an attribute that is not as long as
+// the file says: OpenEXR would allocate the claimed length before it reads, or take what comes next for a length.
 bool is_damaged_exr(const Path& file) {
   std::ifstream stream(file, std::ios::binary);
   constexpr std::string_view kSignature = "\x76\x2f\x31\x01";
-  char start[8] = {};  // signature and version
+  constexpr unsigned kManyParts = 0x10;  // in the version's second byte: headers follow each other up to an empty one
+  char start[8] = {};                    // signature and version
   if (!stream.read(start, sizeof start) || !std::string_view(start, sizeof start).starts_with(kSignature)) return false;
+  const bool many_parts = static_cast<unsigned char>(start[5]) & kManyParts;
   std::error_code error;
   const std::uintmax_t at_most = std::filesystem::file_size(file, error);
-  for (std::string name, type; std::getline(stream, name, '\0') && !name.empty();) {
-    unsigned char b[4] = {};
-    if (!std::getline(stream, type, '\0') || !stream.read(reinterpret_cast<char*>(b), sizeof b)) return true;
-    const std::uint32_t length =
-        std::uint32_t{b[3]} << 24u | std::uint32_t{b[2]} << 16u | std::uint32_t{b[1]} << 8u | b[0];
-    if (length > at_most) return true;
-    stream.seekg(length, std::ios::cur);
-  }
+  bool empty = false;
+  do {
+    empty = true;
+    for (std::string name, type; std::getline(stream, name, '\0') && !name.empty();) {
+      empty = false;
+      char b[4] = {};
+      if (!std::getline(stream, type, '\0') || !stream.read(b, sizeof b)) return true;
+      const std::uint32_t length = little_endian({b, sizeof b});
+      if (length > at_most) return true;
+      std::string bytes(length, '\0');
+      if (!stream.read(bytes.data(), length) || !is_sound_attribute(type, bytes)) return true;
+    }
+  } while (many_parts && !empty && stream);
   return !stream;  // the file ends before its header does
 }
 
