@@ -226,7 +226,12 @@ TEST_CASE("a job file becomes the jobs of a batch") {
   core::write_file(folder.path / "jobs.toml", "captures = [\"a\\\"#\"] # \"\né = 1\n");
   CHECK_THROWS_WITH_AS(pipeline::read_job_file(folder.path / "jobs.toml"),
                        doctest::Contains("line 2: has a letter beyond ASCII outside of quotes"), InputError);
-  core::write_file(folder.path / "jobs.toml", "seeds = [1]  # it's one\ncaptures = 9'\xC7\xBD'\n");
+  // what is no TOML even without them, and a text that ends with more quotes than opened it
+  for (const char* const text : {"captures = 9'\xC7\xBD'\n", "captures = +[\"b\n\xC4\x8B", "a = 1\n[\"\xC7\xBD\n"}) {
+    core::write_file(folder.path / "jobs.toml", text);
+    CHECK_THROWS_WITH_AS(pipeline::read_job_file(folder.path / "jobs.toml"), doctest::Contains("line "), InputError);
+  }
+  core::write_file(folder.path / "jobs.toml", "settings = { a = \"\"\"b\"\"\"\", \xC3\xA9 = 1 }\n");
   CHECK_THROWS_WITH_AS(pipeline::read_job_file(folder.path / "jobs.toml"),
-                       doctest::Contains("line 2: has a letter beyond ASCII outside of quotes"), InputError);
+                       doctest::Contains("line 1: has a letter beyond ASCII outside of quotes"), InputError);
 }

@@ -178,13 +178,20 @@ void check_dots(std::string_view text, const std::string& name) {
   }
 }
 
+constexpr std::string_view kByteOrderMark = "\xEF\xBB\xBF";
+
+// The text with an x for every byte beyond ASCII.
+std::string in_ascii(std::string text) {
+  const std::size_t from = text.starts_with(kByteOrderMark) ? kByteOrderMark.size() : 0;
+  for (std::size_t i = from; i < text.size(); ++i)
+    if (static_cast<unsigned char>(text[i]) >= 0x80) text[i] = 'x';
+  return text;
+}
+
 // TOML has letters beyond ASCII in texts and comments only. toml++ 3.3 runs past the end of a table where it meets some
-// of them elsewhere.
+// of them elsewhere. `text` must be TOML but for them.
 void check_letters(std::string_view text, const std::string& name) {
-  constexpr std::string_view kByteOrderMark = "\xEF\xBB\xBF";
-  constexpr std::string_view kBeforeText = "\n=[{,.";  // a quote after anything else opens none
   std::string_view closing;  // of the text or the comment that we are in; empty: in neither
-  char before = '\n';        // the last letter but blanks
   int line = 1;
   for (std::size_t i = text.starts_with(kByteOrderMark) ? kByteOrderMark.size() : 0; i < text.size(); ++i) {
     const std::string_view rest = text.substr(i);
@@ -194,21 +201,20 @@ void check_letters(std::string_view text, const std::string& name) {
         throw InputError(name + ": line " + std::to_string(line), "has a letter beyond ASCII outside of quotes",
                          "put what is not a number into quotes");
       for (const std::string_view opening : {"\"\"\"", "'''", "\"", "'", "#"})
-        if (rest.starts_with(opening) && (opening == "#" || kBeforeText.find(before) != std::string_view::npos)) {
+        if (rest.starts_with(opening)) {
           closing = opening == "#" ? "\n" : opening;
           i += opening.size() - 1;
           break;
         }
-      if (rest[0] != ' ' && rest[0] != '\t' && rest[0] != '\r') before = rest[0];
     } else if (closing[0] == '"' && rest[0] == '\\') {
       ++i;
       line += i < text.size() && text[i] == '\n';
     } else if (rest.starts_with(closing)) {
-      if (rest[0] == '\n') before = '\n';
       i += closing.size() - 1;
+      if (closing.size() == 3)  // up to two quotes of the text itself come before
+        while (i + 1 < text.size() && text[i + 1] == closing[0]) ++i;
       closing = {};
     } else if (rest[0] == '\n' && closing.size() == 1) {
-      before = '\n';
       closing = {};  // a text that its line does not close: toml++ says so
     }
   }
@@ -222,6 +228,7 @@ BatchPlan read_job_file(const Path& file) {
   try {
     const std::string text = core::read_file(file);
     check_dots(text, name);
+    document = toml::parse(in_ascii(text), name);
     check_letters(text, name);
     document = toml::parse(text, name);
   } catch (const toml::parse_error& error) {

@@ -63,9 +63,14 @@ std::string error_text(int code) {
 }
 
 // Keeps libav from writing to standard error, because the library does not print.
-void silence() {
+// libav's settings of the whole process: it prints nothing, and a damaged file gets no more memory than a frame needs.
+void prepare() {
+  constexpr std::size_t kMostAllocation = std::size_t{5} * kMostPixels;  // bytes; a frame has four a pixel at most
   static std::once_flag once;
-  std::call_once(once, [] { av_log_set_level(AV_LOG_QUIET); });
+  std::call_once(once, [] {
+    av_log_set_level(AV_LOG_QUIET);
+    av_max_alloc(kMostAllocation);
+  });
 }
 
 // An opened file or camera and the index of its video stream.
@@ -373,7 +378,7 @@ namespace {
 
 Decoder* open(const Path& file, int threads, const DeviceFormat& format, const Host& host) {
   // open the input and a decoder for it
-  silence();
+  prepare();
   auto self = std::make_unique<Decoder>();
   self->file = file;
   self->input = is_device(file) ? open_camera_as_asked(file, format, host) : open_recording(file);
@@ -421,7 +426,7 @@ double time(const Decoder& decoder) { return decoder.seconds(decoder.frame->best
 double first_time(const Decoder& decoder) { return decoder.seconds(decoder.first_stamp); }
 
 VideoFacts video_facts(const Path& file) {
-  silence();
+  prepare();
   Opened input = open_recording(file);
   const AVStream& video = input.video();
   VideoFacts facts;
@@ -548,7 +553,7 @@ void Encoder::drain() {
 namespace {
 
 Encoder* create(const Path& file, double frame_rate) {
-  silence();
+  prepare();
   CHAINSPLAT_CHECK(frame_rate > 0.0, file.string());
   auto self = std::make_unique<Encoder>();
   self->file = file;
