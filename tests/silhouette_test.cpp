@@ -354,6 +354,63 @@ TEST_CASE("a sequence: velocity, frames without masks, bending") {
   CHECK_THROWS_AS(silhouette::fit_sequence(planar, flat), InputError);
 }
 
+TEST_CASE("a rope has as many joints as its bends ask for and its masks can tell") {
+  constexpr int kJoints = 12;
+  constexpr double kBend = 0.2;  // rad at every joint
+  for (const Bending bending : {Bending::planar, Bending::spatial}) {
+    const Chain fine = chain::make_chain(kLength, kDiameter, -Vector3::UnitZ(), Vector3::UnitY(), kJoints, bending,
+                                         bending == Bending::spatial);
+    silhouette::SequenceFit fit;
+    for (int f = 0; f < 4; ++f) {
+      fit.states.time.push_back(f / 30.0);
+      VectorX theta = VectorX::Zero(fine.angles());
+      for (int i = 0; i < fine.angles(); ++i) theta[i] = chain::is_twist(fine, i) ? 1.0 : 0.0;  // which bends nothing
+      const int axes = fine.angles() / kJoints;
+      for (int j = 0; j < kJoints; ++j) theta[j * axes + (axes > 1 && j % 2 ? 1 : 0)] = kBend;
+      fit.states.theta.push_back(theta);
+      silhouette::FrameFit frame;
+      frame.residual_pixels = 0.5;
+      frame.covariance = math::MatrixX::Identity(fine.angles(), fine.angles());
+      fit.frames.push_back(frame);
+    }
+    // a circle's arc and the line that fits it best, by numbers
+    constexpr int kSamples = 20001;
+    double mean = 0.0, square = 0.0;
+    for (int i = 0; i < kSamples; ++i) {
+      const double height = kLength / kJoints / kBend * std::cos(kBend * (i / (kSamples - 1.0) - 0.5));
+      mean += height / kSamples;
+      square += height * height / kSamples;
+    }
+    silhouette::JointChoice choice = silhouette::choose_joints(fine, fit);
+    CHECK(choice.bow == doctest::Approx(std::sqrt(square - mean * mean)).epsilon(0.01));
+    CHECK(choice.joints == 8);  // angles that are open to a radian
+    // the deviation shrinks with the angles'; the bow of n joints is that of 12 times (12 / n)^2
+    const double unit = choice.deviation;
+    const auto joints_at = [&](double deviation) {
+      for (silhouette::FrameFit& frame : fit.frames)
+        frame.covariance = math::MatrixX::Identity(fine.angles(), fine.angles()) * std::pow(deviation / unit, 2);
+      return silhouette::choose_joints(fine, fit).joints;
+    };
+    CHECK(joints_at(2.26 * choice.bow) == 8);
+    CHECK(joints_at(2.24 * choice.bow) == 12);
+    CHECK(joints_at(1.01 * choice.bow) == 12);
+    CHECK(joints_at(0.99 * choice.bow) == 16);
+    CHECK(joints_at(0.1 * choice.bow) == 16);
+    // twice the frames that say nothing change nothing; four times as many that do halve what is open
+    const double before = silhouette::choose_joints(fine, fit).deviation;
+    for (int f = 0; f < 4; ++f) {
+      fit.states.theta.push_back(VectorX::Zero(fine.angles()));
+      fit.frames.emplace_back();
+    }
+    CHECK(silhouette::choose_joints(fine, fit).deviation == before);
+    for (int f = 0; f < 12; ++f) {
+      fit.states.theta.push_back(fit.states.theta[0]);
+      fit.frames.push_back(fit.frames[0]);
+    }
+    CHECK(silhouette::choose_joints(fine, fit).deviation == doctest::Approx(0.5 * before));
+  }
+}
+
 TEST_CASE("of one camera a planar fit must be clearly worse before a rope is spatial") {
   // a planar rope that is given 6 % too long, which depth alone would explain
   const Chain planar = rope(Bending::planar), spatial = rope(Bending::spatial);

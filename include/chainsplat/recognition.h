@@ -17,7 +17,7 @@ namespace chainsplat::recognition {
 enum class Mode { fast, paper };
 
 struct Options {
-  int joints = 8;
+  std::optional<int> joints;              // none: as many as the rope's bends ask for (silhouette::choose_joints)
   std::optional<chain::Bending> bending;  // none: auto (design.md, 'Recognition')
   bool twist = false;
   int every = 5;  // frames that train the Gaussians
@@ -36,6 +36,7 @@ struct Result {
   splat::Gaussians gaussians;
   chain::States states;  // every frame time of the first camera, with thetadot and, if known, covariances
   silhouette::BendingChoice bending;
+  silhouette::JointChoice joints;  // 0 where their number was given
   // Of the last refinement of all frames' angles together: one step per frame in `fast`, checked where it is long; rad.
   solve::Summary summary;
 };

@@ -76,6 +76,15 @@ struct BendingChoice {
 BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::Capture& capture,
                              const SequenceFit& fit);
 
+// design.md, 'Recognition', --joints auto: the fewest of 8, 12 and 16 joints with whose straight links the rope's curve is
+// followed as closely as all masks together can tell, else 16. `fit` is that of `chain`, whose joints are evenly spaced.
+struct JointChoice {
+  int joints = 0;
+  double bow = 0.0;        // of the rope beside the links of `chain`, RMS over the rope and the frames, m
+  double deviation = 0.0;  // what the masks of all frames leave open about the centerline, standard deviation, m
+};
+JointChoice choose_joints(const chain::Chain& chain, const SequenceFit& fit);
+
 // --- what the recording was given wrongly
 // ------------------------------------------------------------------------------
 

@@ -36,7 +36,7 @@ constexpr double kFringe = 0.6;     // px
 // What no correction explains.
 constexpr double kMisfit = 1.5;    // px RMS of a camera's outlines, of which straight links leave 0.3 to 0.4
 constexpr double kForeign = 0.25;  // share of the outline that is not the rope's: blobs, occluders, or a wrong length
-constexpr double kFold = 2.4;      // rad at one of the user's joints: no rope bends so far at one place
+constexpr double kFold = 2.4;      // rad over two joints: no rope bends so far at one place
 constexpr double kLightest = 15.0, kHeaviest = 20000.0;  // kg/m^3; foam and tungsten
 constexpr double kFartherThanAny = 0.15;                 // share of the length by which no ruler is wrong
 
@@ -162,7 +162,7 @@ void judge_folds(const silhouette::CorrectionFit& fit, std::vector<Finding>& ver
   for (std::size_t f = 0; f < fit.theta.size(); ++f) {
     for (int k = 0; k < chain.angles(); ++k) {
       if (chain::is_twist(chain, k) || chain.child_link[k] == 1) continue;  // the first turns in the gripper
-      double bend = fit.theta[f][k];  // over a joint of the user's: this one and the next about the same axis
+      double bend = fit.theta[f][k];  // over two: this one and the next about the same axis
       for (int l = k + 1; l < chain.angles(); ++l) {
         if (chain.child_link[l] != chain.child_link[k] + 1) continue;
         if (std::abs(chain.axes[l].head<3>().dot(chain.axes[k].head<3>())) < 0.5) continue;

@@ -56,7 +56,7 @@ twin::Provenance recognition_provenance(const TrainOptions& options) {
   p.every = options.every;
   p.frames = options.frames;
   p.mode = options.mode;
-  p.options = {{"joints", std::to_string(options.joints)},
+  p.options = {{"joints", options.joints ? std::to_string(*options.joints) : "auto"},
                {"bending", !options.bending                             ? "auto"
                            : *options.bending == chain::Bending::planar ? "planar"
                                                                         : "spatial"},

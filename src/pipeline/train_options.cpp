@@ -53,8 +53,8 @@ std::vector<std::string> read_groups(const std::string& text, const std::string&
 }  // namespace
 
 void TrainOptions::check() const {
-  if (joints < 1 || joints > kMostJoints)
-    throw InputError("`joints`", std::to_string(joints) + " is not from 1 to " + std::to_string(kMostJoints),
+  if (joints && (*joints < 1 || *joints > kMostJoints))
+    throw InputError("`joints`", std::to_string(*joints) + " is not from 1 to " + std::to_string(kMostJoints),
                      "give for example 8");
   if (every < 1) throw InputError("`every`", std::to_string(every) + " is not above 0", "give for example 5");
   if (frames.first < 0 || (frames.last >= 0 && frames.last <= frames.first))
@@ -88,7 +88,8 @@ const std::vector<Setting>& settings() {
 
 void set(TrainOptions& options, const std::string& name, const std::string& text, const std::string& where) {
   if (name == "joints") {
-    options.joints = whole_number(text, where);
+    options.joints.reset();
+    if (text != "auto") options.joints = whole_number(text, where);
   } else if (name == "bending") {
     const std::string kind = choice(text, {"auto", "planar", "spatial"}, where);
     options.bending.reset();

@@ -71,15 +71,16 @@ double mean(const std::vector<double>& values) {
 Result recognize_fast(gpu::Device& device, const capture::Capture& capture, const Options& options) {
   Result result;
   const std::string job = job_text(capture, options);
-  const auto make = [&](chain::Bending bending) {
-    return chain::make_chain(capture.length, capture.diameter, capture.direction, capture.bending_axis, options.joints,
-                             bending, options.twist);
+  const auto make = [&](chain::Bending bending, int joints) {
+    return chain::make_chain(capture.length, capture.diameter, capture.direction, capture.bending_axis, joints, bending,
+                             options.twist);
   };
   const int total_steps = kRounds * kSteps + kFinalSteps;
   constexpr double kLeastBudget = 300, kMostBudget = 6000;  // of the automatic choice: short stubs and thin cables
   const double by_size = std::clamp(kGaussiansADiameter * capture.length / capture.diameter, kLeastBudget, kMostBudget);
   const int budget = options.budget > 0 ? options.budget : static_cast<int>(std::lround(by_size));
   const int added_a_round = std::max(1, budget / 10);
+  constexpr int kFirstJoints = 12;  // which most ropes end with
   int first_round = 0;
   StepWatch watch;
   splat::Gaussians gaussians;
@@ -91,7 +92,8 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   if (before) {
     result.bending = {before->spatial ? chain::Bending::spatial : chain::Bending::planar, before->out_of_plane_rms,
                       before->deviation};
-    result.chain = make(result.bending.bending);
+    const chain::Chain joint = make(result.bending.bending, 1);
+    result.chain = make(result.bending.bending, static_cast<int>(before->states.theta.at(0).size()) / joint.angles());
     states = before->states;
     gaussians = before->gaussians;
     first_round = before->stage;
@@ -103,14 +105,17 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     const chain::Bending first =
         options.bending.value_or(capture.tabletop ? chain::Bending::planar : chain::Bending::spatial);
     result.bending.bending = first;
-    result.chain = make(first);
+    int joints = options.joints.value_or(kFirstJoints);
+    result.chain = make(first, joints);
     silhouette::SequenceFit fit = silhouette::fit_sequence(result.chain, capture);
-    if (decide) {
-      result.bending = silhouette::choose_bending(result.chain, capture, fit);
-      if (result.bending.bending == chain::Bending::planar) {
-        result.chain = make(chain::Bending::planar);
-        fit = silhouette::fit_sequence(result.chain, capture);
-      }
+    if (decide) result.bending = silhouette::choose_bending(result.chain, capture, fit);
+    if (!options.joints) {
+      result.joints = silhouette::choose_joints(result.chain, fit);
+      joints = result.joints.joints;
+    }
+    if (result.bending.bending != first || joints != result.chain.links() - 1) {
+      result.chain = make(result.bending.bending, joints);
+      fit = silhouette::fit_sequence(result.chain, capture);
     }
     states = fit.states;
     // what the silhouettes know stays known: appearance alone would pull angles to explain rolling and shading

@@ -14,6 +14,7 @@ namespace chainsplat::recognition {
 
 namespace {
 
+constexpr int kJoints = 8;
 constexpr int kOpacityReset = 3000, kLastOpacityReset = 12000;  // iterations
 constexpr float kResetOpacity = 0.01f;
 constexpr int kLinkResets[] = {1500, 4500, 7500, 10500};
@@ -97,7 +98,7 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
   const std::string job = job_text(capture, options);
   result.bending.bending = options.bending.value_or(chain::Bending::planar);
   result.chain = chain::make_chain(capture.length, capture.diameter, capture.direction, capture.bending_axis,
-                                   options.joints, result.bending.bending, options.twist);
+                                   options.joints.value_or(kJoints), result.bending.bending, options.twist);
   const chain::Chain& chain = result.chain;
   chain::States states;
   std::vector<double> times;

@@ -46,7 +46,8 @@ std::string job_text(const capture::Capture& capture, const Options& options) {
     geometry.insert(geometry.end(), {pose.translation.x(), pose.translation.y(), pose.translation.z(), camera.fx});
   }
   std::ostringstream text;
-  text << "capture " << capture.hash << "\nframes " << frames << "\n--joints " << options.joints << "\n--bending "
+  text << "capture " << capture.hash << "\nframes " << frames << "\n--joints "
+       << (options.joints ? std::to_string(*options.joints) : "auto") << "\n--bending "
        << bending << "\n--twist " << (options.twist ? "yes" : "no") << "\n--every " << options.every << "\n--mode "
        << (options.mode == Mode::paper ? "paper" : "fast") << "\n--seed " << options.seed << "\nbudget "
        << options.budget << "\nstep " << core::exact(options.step) << "\npaper's Gaussians "

@@ -331,4 +331,38 @@ BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::C
   return choice;
 }
 
+JointChoice choose_joints(const chain::Chain& chain, const SequenceFit& fit) {
+  constexpr std::array kCounts{8, 12, 16};
+  constexpr int kPoints = 25;  // along the centerline
+  std::vector<chain::MaterialPoint> points;
+  for (const double arclength : chain::equal_arclengths(chain, kPoints))
+    points.push_back(chain::centerline_point(chain, arclength));
+  const int joints = chain.links() - 1, axes_per_joint = chain.angles() / joints;
+  double bend = 0.0, variance = 0.0, frames = 0.0;
+  for (std::size_t f = 0; f < fit.states.theta.size(); ++f) {
+    const FrameFit& frame = fit.frames[f];
+    if (frame.residual_pixels <= 0.0) continue;  // nothing was seen
+    const VectorX& theta = fit.states.theta[f];
+    // without the first joint, where the grasp bends the rope at once
+    for (int i = axes_per_joint; i < chain.angles(); ++i)
+      if (!chain::is_twist(chain, i)) bend += theta[i] * theta[i] / (joints - 1);
+    const auto motions = chain::link_motions(chain, theta, Pose{});
+    const MatrixX axes = chain::world_axes(chain, theta, Pose{});
+    for (const MatrixX& jacobian : chain::point_jacobians(chain, axes, motions, points))
+      variance += (jacobian * frame.covariance * jacobian.transpose()).trace() / kPoints;
+    frames += 1.0;
+  }
+  JointChoice choice{kCounts.front(), 0.0, 0.0};
+  if (frames == 0.0) return choice;
+  // an arc of angle a over a length h is a h / sqrt(720) RMS from the straight line that fits it best
+  choice.bow = chain.length / joints * std::sqrt(std::max(0.0, bend / frames) / 720.0);
+  choice.deviation = std::sqrt(variance) / frames;  // an error that all frames share shows where one alone would not
+  for (const int count : kCounts) {
+    choice.joints = count;
+    const double finer = static_cast<double>(count) / joints;
+    if (choice.bow <= choice.deviation * finer * finer) break;
+  }
+  return choice;
+}
+
 }  // namespace chainsplat::silhouette

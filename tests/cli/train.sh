@@ -54,7 +54,7 @@ small_before=("${small[@]}") stopped_before=$(files "$work/stopped") whole_befor
 small=(--joints 3 --bending planar)
 other 'frames 0:12, not 2:14' "--frames '0:12', not '2:14'" --frames 2:14
 small=(--bending planar --frames 0:12)
-other '--joints 3, not 8' "--joints '3', not '8'"
+other '--joints 3, not auto' "--joints '3', not 'auto'"
 small=("${small_before[@]}")
 other '--seed 0, not 7' "--seed '0', not '7'" --seed 7
 [ "$stopped_before" = "$(files "$work/stopped")" ] || fail 'train --resume of another job: the checkpoint changed'

@@ -20,12 +20,13 @@ using Json = nlohmann::ordered_json;
 struct Request {
   std::string capture, out, picture;
   std::string stages;  // empty: all
-  std::string bending = "auto", mode = "fast", frames;
+  std::string joints = "auto", bending = "auto", mode = "fast", frames;
   pipeline::TrainOptions options;
 };
 
 pipeline::TrainOptions options_of(const Request& request, const Globals& globals) {
   pipeline::TrainOptions options = request.options;
+  pipeline::set(options, "joints", request.joints, "`joints`");
   pipeline::set(options, "bending", request.bending, "`bending`");
   pipeline::set(options, "mode", request.mode, "`mode`");
   pipeline::set(options, "stages", request.stages, "`stages`");
@@ -84,9 +85,10 @@ void add_recognition_options(CLI::App& command, Request& request) {
   command.add_option("-o,--output", request.out, "Run folder to make: the twin")->required()->type_name("RUN");
   command.add_flag("--force", options.force, "Begin again in a run folder that is not empty");
   command.add_flag("--resume", options.resume, "Continue in a run folder that was left unfinished");
-  command.add_option("--joints", options.joints, "Joints along the rope (default 8)")
-      ->check(CLI::Range(1, pipeline::kMostJoints))
-      ->type_name("N");
+  command
+      .add_option("--joints", request.joints,
+                  "Joints along the rope, 1 to 64 (default: 8, 12 or 16, as many as its bends ask for)")
+      ->type_name("N|auto");
   command
       .add_option(
           "--bending", request.bending,
