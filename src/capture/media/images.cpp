@@ -57,6 +57,8 @@ std::string damage_of_png(const Path& file) {
   }
 }
 
+constexpr std::size_t kExrChannelLength = 16;  // bytes of a channel in an EXR's list of them, after its name
+
 std::uint32_t little_endian(std::string_view bytes) {
   std::uint32_t value = 0;
   for (int i = 3; i >= 0; --i) value = value << 8u | static_cast<unsigned char>(bytes[static_cast<std::size_t>(i)]);
@@ -66,19 +68,37 @@ std::uint32_t little_endian(std::string_view bytes) {
 // Returns whether OpenEXR reads exactly `bytes` as an attribute of this type. Of most types it reads what the type has,
 // whatever length the file gives, and goes on behind that; texts and previews are as long as they say themselves.
 bool is_sound_attribute(const std::string& type, std::string_view bytes) {
-  static const std::map<std::string, std::size_t> length_of = {
-      {"box2f", 16},    {"box2i", 16},   {"chromaticities", 32}, {"compression", 1}, {"deepImageState", 1},
-      {"double", 8},    {"envmap", 1},   {"float", 4},           {"int", 4},         {"keycode", 28},
-      {"lineOrder", 1}, {"m33d", 72},    {"m33f", 36},           {"m44d", 128},      {"m44f", 64},
-      {"rational", 8},  {"tiledesc", 9}, {"timecode", 8},        {"v2d", 16},        {"v2f", 8},
-      {"v2i", 8},       {"v3d", 24},     {"v3f", 12},            {"v3i", 12}};
+  static const std::map<std::string, std::size_t> length_of = {{"box2f", 16},
+                                                               {"box2i", 16},
+                                                               {"chromaticities", 32},
+                                                               {"compression", 1},
+                                                               {"deepImageState", 1},
+                                                               {"double", 8},
+                                                               {"envmap", 1},
+                                                               {"float", 4},
+                                                               {"int", 4},
+                                                               {"keycode", 28},
+                                                               {"lineOrder", 1},
+                                                               {"m33d", 72},
+                                                               {"m33f", 36},
+                                                               {"m44d", 128},
+                                                               {"m44f", 64},
+                                                               {"rational", 8},
+                                                               {"tiledesc", 9},
+                                                               {"timecode", 8},
+                                                               {"v2d", 16},
+                                                               {"v2f", 8},
+                                                               {"v2i", 8},
+                                                               {"v3d", 24},
+                                                               {"v3f", 12},
+                                                               {"v3i", 12}};
   if (const auto known = length_of.find(type); known != length_of.end()) return bytes.size() == known->second;
   if (type == "chlist") {
-    constexpr std::size_t kChannelLength = 16;  // after its name; the list ends with an empty one
+    // the list ends with an empty name
     while (!bytes.empty() && bytes[0] != '\0') {
       const std::size_t end = bytes.find('\0');
-      if (end == std::string_view::npos || bytes.size() - end <= kChannelLength) return false;
-      bytes.remove_prefix(end + 1 + kChannelLength);
+      if (end == std::string_view::npos || bytes.size() - end <= kExrChannelLength) return false;
+      bytes.remove_prefix(end + 1 + kExrChannelLength);
     }
     return bytes.size() == 1;
   }
@@ -93,14 +113,38 @@ bool is_sound_attribute(const std::string& type, std::string_view bytes) {
   return true;
 }
 
-// Returns whether a file that begins as an EXR has a header that is cut off or has an attribute that is not as long as
-// the file says: OpenEXR would allocate the claimed length before it reads, or take what comes next for a length.
-bool is_damaged_exr(const Path& file) {
+// Returns what in a sound attribute would make OpenEXR ask for more memory than any image here needs, or an empty text.
+std::string excess_of_attribute(const std::string& name, const std::string& type, std::string_view bytes) {
+  const auto number = [&](std::size_t at) {
+    return std::int64_t{static_cast<std::int32_t>(little_endian(bytes.substr(at)))};
+  };
+  const auto excess = [](const char* what, std::int64_t width, std::int64_t height) {
+    const bool small =
+        width >= 1 && height >= 1 && width <= kMostSide && height <= kMostSide && width * height <= kMostPixels;
+    return small ? ""
+                 : "claims " + std::string(what) + " of " + std::to_string(width) + "x" + std::to_string(height) +
+                       " pixels";
+  };
+  if (name == "dataWindow" && type == "box2i")  // first and last column and row
+    return excess("an image", number(8) - number(0) + 1, number(12) - number(4) + 1);
+  if (type == "tiledesc") return excess("tiles", number(0), number(4));
+  if (type == "chlist") {
+    std::size_t channels = 0;
+    for (std::size_t at = 0; bytes[at] != '\0'; at = bytes.find('\0', at) + 1 + kExrChannelLength) ++channels;
+    if (channels > kMostChannels) return "claims " + std::to_string(channels) + " channels";
+  }
+  return "";
+}
+
+// Returns what is wrong with an EXR's header, or an empty text where it is sound or the file is no EXR. OpenEXR would
+// allocate the claimed length of an attribute and the claimed lines of pixels before it reads them.
+std::string damage_of_exr(const Path& file) {
   std::ifstream stream(file, std::ios::binary);
   constexpr std::string_view kSignature = "\x76\x2f\x31\x01";
   constexpr unsigned kManyParts = 0x10;  // in the version's second byte: headers follow each other up to an empty one
-  char start[8] = {};                    // signature and version
-  if (!stream.read(start, sizeof start) || !std::string_view(start, sizeof start).starts_with(kSignature)) return false;
+  const std::string damaged = "is damaged";
+  char start[8] = {};  // signature and version
+  if (!stream.read(start, sizeof start) || !std::string_view(start, sizeof start).starts_with(kSignature)) return "";
   const bool many_parts = static_cast<unsigned char>(start[5]) & kManyParts;
   std::error_code error;
   const std::uintmax_t at_most = std::filesystem::file_size(file, error);
@@ -110,14 +154,15 @@ bool is_damaged_exr(const Path& file) {
     for (std::string name, type; std::getline(stream, name, '\0') && !name.empty();) {
       empty = false;
       char b[4] = {};
-      if (!std::getline(stream, type, '\0') || !stream.read(b, sizeof b)) return true;
+      if (!std::getline(stream, type, '\0') || !stream.read(b, sizeof b)) return damaged;
       const std::uint32_t length = little_endian({b, sizeof b});
-      if (length > at_most) return true;
+      if (length > at_most) return damaged;
       std::string bytes(length, '\0');
-      if (!stream.read(bytes.data(), length) || !is_sound_attribute(type, bytes)) return true;
+      if (!stream.read(bytes.data(), length) || !is_sound_attribute(type, bytes)) return damaged;
+      if (const std::string excess = excess_of_attribute(name, type, bytes); !excess.empty()) return excess;
     }
   } while (many_parts && !empty && stream);
-  return !stream;  // the file ends before its header does
+  return stream ? "" : damaged;  // the file ends before its header does
 }
 
 // Returns the name of OpenImageIO's reader for the format that the file's first bytes show, or null for another format.
@@ -159,7 +204,8 @@ std::unique_ptr<OIIO::ImageInput> open_image(const Path& file) {
     throw InputError(file.string(), "is not a file", "check the path and the frame numbers");
   if (const std::string damage = damage_of_png(file); !damage.empty())
     throw InputError(file.string(), damage, "write it again");
-  if (is_damaged_exr(file)) throw InputError(file.string(), "is damaged", "write it again");
+  if (const std::string damage = damage_of_exr(file); !damage.empty())
+    throw InputError(file.string(), damage, "write it again");
   OIIO::ImageSpec options;
   options.attribute("oiio:UnassociatedAlpha", 1);  // keep colors as stored, not multiplied by alpha
   const char* const format = format_of(file);
