@@ -46,8 +46,25 @@ class Factor {
       for (int i = 0; i < j; ++i) x[i] -= value * matrix(i, j);
     }
   }
+  // The same of every column, with the same bits: many at a time, row by row.
+  template <class Columns>
+  void solve_columns(Columns&& x) const {
+    const int n = static_cast<int>(matrix.rows());
+    if (x.cols() == 1) return solve(x.col(0));
+    rows_ = x;
+    for (int j = 0; j < n; ++j)
+      if (pivot_[j] != j) rows_.row(j).swap(rows_.row(pivot_[j]));
+    for (int j = 0; j < n; ++j)
+      for (int i = j + 1; i < n; ++i) rows_.row(i) -= matrix(i, j) * rows_.row(j);
+    for (int j = n - 1; j >= 0; --j) {
+      rows_.row(j) *= inverse_[j];
+      for (int i = 0; i < j; ++i) rows_.row(i) -= matrix(i, j) * rows_.row(j);
+    }
+    x = rows_;
+  }
 
  private:
+  mutable Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor> rows_;  // of solve_columns
   std::vector<int> pivot_;
   std::vector<double> inverse_;  // of the pivots
 };

@@ -36,9 +36,9 @@ class InternalState {
     if (friction_.present) friction_.slope(v, z, out);
     if (rolls_ == 0) return;
     auto to = out.bottomRows(rolls_);
-    to = torsion_->rate_by_angle().lazyProduct(x);
-    to += torsion_->rate_by_rate().lazyProduct(v);
-    to += torsion_->rate_by_roll().lazyProduct(z.bottomRows(rolls_));
+    to.noalias() = torsion_->rate_by_angle() * x;
+    to.noalias() += torsion_->rate_by_rate() * v;
+    to.noalias() += torsion_->rate_by_roll() * z.bottomRows(rolls_);
   }
   // T for this g. All below are for the g prepared last.
   bool prepare(double g);
@@ -50,9 +50,9 @@ class InternalState {
     if (friction_.present) friction_.solve(g_, v, right);
     if (rolls_ == 0) return;
     auto to = right.bottomRows(rolls_);
-    to += torsion_->rate_by_angle().lazyProduct(x);
-    to += torsion_->rate_by_rate().lazyProduct(v);
-    for (Eigen::Index p = 0; p < to.cols(); ++p) factor_.solve(to.col(p));
+    to.noalias() += torsion_->rate_by_angle() * x;
+    to.noalias() += torsion_->rate_by_rate() * v;
+    factor_.solve_columns(to);
   }
   // to -= F T (right_z + g P right_theta)
   template <class X, class Z, class To>
@@ -60,15 +60,15 @@ class InternalState {
     if (friction_.present) friction_.take_off(g_, right_z, to);
     if (rolls_ == 0) return;
     work_ = right_z.bottomRows(rolls_);
-    work_ += g_ * torsion_->rate_by_angle().lazyProduct(right_theta);
-    for (Eigen::Index p = 0; p < work_.cols(); ++p) factor_.solve(work_.col(p));
-    to -= torsion_->moment().lazyProduct(work_);
+    work_.noalias() += g_ * torsion_->rate_by_angle() * right_theta;
+    factor_.solve_columns(work_);
+    to.noalias() -= torsion_->moment() * work_;
   }
   // to -= F z
   template <class Z, class To>
   void take_off_moment(const Z& z, To&& to) const {
     if (friction_.present) friction_.take_off_moment(z, to);
-    if (rolls_ > 0) to -= torsion_->moment().lazyProduct(z.bottomRows(rolls_));
+    if (rolls_ > 0) to.noalias() -= torsion_->moment() * z.bottomRows(rolls_);
   }
   // Adds d z' / d(unknown p) at the linearized state to column p.
   void add_unknowns(std::span<const Tangent> unknowns, MatrixX& to) const;

@@ -139,7 +139,7 @@ bool Step::vary_stage(int i, double h, std::size_t node, const VectorX& theta, c
   v.k_y[i].noalias() -= g * (engine.stiffness * v.right);
   if (internal.present) internal.take_off(v.right, v.right_z, v.k_y[i]);
   v.k_y[i] *= g;
-  for (Eigen::Index p = 0; p < v.k_y[i].cols(); ++p) factor.solve(v.k_y[i].col(p));
+  factor.solve_columns(v.k_y[i]);
   v.k_x[i] = g * (v.right + v.k_y[i]);
   if (!internal.present) return true;
   v.k_z[i] = v.right_z;
@@ -217,7 +217,7 @@ bool Variation::start(Engine& engine, const InternalState& internal, std::size_t
   force(engine, internal, node, 0.0, x, y, z, acceleration);
   mass_.matrix = engine.mass;
   if (!mass_.factor()) return false;
-  for (Eigen::Index p = 0; p < acceleration.cols(); ++p) mass_.solve(acceleration.col(p));
+  mass_.solve_columns(acceleration);
   if (!internal.present) return true;
   internal.slope(x, y, z, z_rate);
   internal.add_unknowns(tangents, z_rate);
@@ -241,7 +241,7 @@ void Variation::advance(Engine& engine, const InternalState& internal, const Fac
     internal.solve(predicted_x_, predicted_y_, z_rate);
     internal.take_off_moment(z_rate, acceleration);
   }
-  for (Eigen::Index p = 0; p < acceleration.cols(); ++p) factor.solve(acceleration.col(p));
+  factor.solve_columns(acceleration);
   y = predicted_y_ + g * acceleration;
   x = predicted_x_ + (g * g) * acceleration;
   if (!internal.present) return;

@@ -82,6 +82,39 @@ std::size_t frames_within(const Part& part, double horizon) {
   return std::clamp<std::size_t>(count, 3, part.times.size());
 }
 
+// A motion with its derivatives, some unknowns on each thread. Every group moves the rope itself again; which unknowns
+// are one does not depend on the number of threads, so that the bits do not either.
+bool simulate_in_groups(const dynamics::Model& model, const BaseGrid& grid, const dynamics::InitialState& initial,
+                        std::span<const dynamics::Tangent> unknowns, chain::States& states,
+                        dynamics::Sensitivities& sensitivities) {
+  constexpr std::size_t kGroup = 64;  // at least: their derivatives take several times as long as the motion
+  const std::size_t count = std::max<std::size_t>(1, unknowns.size() / kGroup);
+  const auto first = [&](std::size_t group) { return group * unknowns.size() / count; };
+  std::vector<chain::States> moved(count);
+  std::vector<dynamics::Sensitivities> slopes(count);
+  std::vector<char> good(count);
+  core::parallel_for(static_cast<std::int64_t>(count), [&](std::int64_t i) {
+    const auto group = static_cast<std::size_t>(i);
+    good[group] = dynamics::simulate(model, grid, initial, moved[group],
+                                     unknowns.subspan(first(group), first(group + 1) - first(group)), &slopes[group]);
+  });
+  states = std::move(moved[0]);
+  const auto gather = [&](std::vector<MatrixX> dynamics::Sensitivities::*quantity) {
+    (sensitivities.*quantity).resize(states.theta.size());
+    for (std::size_t k = 0; k < states.theta.size(); ++k) {
+      MatrixX& all = (sensitivities.*quantity)[k];
+      all.resize(model.chain.angles(), static_cast<Eigen::Index>(unknowns.size()));
+      for (std::size_t i = 0; i < count; ++i) {
+        const MatrixX& some = (slopes[i].*quantity)[k];
+        all.middleCols(static_cast<Eigen::Index>(first(i)), some.cols()) = some;
+      }
+    }
+  };
+  if (std::find(good.begin(), good.end(), 0) != good.end()) return false;
+  gather(&dynamics::Sensitivities::theta);
+  return true;
+}
+
 bool simulate(const Part& part, const BaseGrid& grid, const VectorX& p, chain::States& states,
               dynamics::Sensitivities* sensitivities = nullptr) {
   const State state = apply(part.chain, part.unknowns, p);
@@ -89,7 +122,7 @@ bool simulate(const Part& part, const BaseGrid& grid, const VectorX& p, chain::S
   if (!sensitivities) return dynamics::simulate(model, grid, state.initial, states);
   const auto unknowns = tangents(part.chain, part.unknowns, p);
   if (model.parameters.integrator == dynamics::Integrator::rodas3)
-    return dynamics::simulate(model, grid, state.initial, states, unknowns, sensitivities);
+    return simulate_in_groups(model, grid, state.initial, unknowns, states, *sensitivities);
   // the Euler step has no variational equation: differences of rollouts
   if (!dynamics::simulate(model, grid, state.initial.theta, state.initial.thetadot, states)) return false;
   const std::size_t frames = states.theta.size();
