@@ -781,7 +781,8 @@ std::string to_json(const Estimate& estimate, double latency, bool rates) {
   for (Eigen::Index row = 0; row < rows; ++row)
     for (Eigen::Index column = 0; column <= row; ++column)
       covariance.push_back(rounded(estimate.covariance(row, column)));
-  const VectorX variance = estimate.covariance.diagonal().head(std::min<Eigen::Index>(n, estimate.covariance.rows()));
+  VectorX variance;  // none by Adam
+  if (estimate.covariance.size() > 0) variance = estimate.covariance.diagonal().head(n);
   const Json line{{"frame", estimate.frame},
                   {"time", estimate.time},
                   {"theta", list(estimate.theta)},

@@ -6,6 +6,7 @@
 #include <toml++/toml.h>
 
 #include <algorithm>
+#include <cstdio>
 #include <map>
 #include <nlohmann/json.hpp>
 #include <set>
@@ -188,36 +189,72 @@ std::string in_ascii(std::string text) {
   return text;
 }
 
-// TOML has letters beyond ASCII in texts and comments only. toml++ 3.3 runs past the end of a table where it meets some
-// of them elsewhere. `text` must be TOML but for them.
-void check_letters(std::string_view text, const std::string& name) {
+// Appends the letter that begins at text[i], which is beyond ASCII, as TOML's escape, and returns its bytes. What is no
+// UTF-8 is left as it is, for toml++ to refuse.
+std::size_t append_escaped(std::string_view text, std::size_t i, std::string& out) {
+  const auto byte = [&](std::size_t at) { return at < text.size() ? static_cast<unsigned char>(text[at]) : 0u; };
+  const unsigned lead = byte(i);
+  const std::size_t length = lead >= 0xF0 ? 4 : lead >= 0xE0 ? 3 : 2;
+  unsigned code = lead & (0xFFu >> (length + 1));
+  for (std::size_t k = 1; k < length; ++k) {
+    if ((byte(i + k) & 0xC0u) != 0x80u) {
+      out += text[i];
+      return 1;
+    }
+    code = code << 6u | (byte(i + k) & 0x3Fu);
+  }
+  char escape[11] = {};
+  std::snprintf(escape, sizeof escape, "\\U%08X", code);
+  out += escape;
+  return length;
+}
+
+// The same text without letters beyond ASCII, which TOML has in texts and comments only: toml++ 3.3 runs past the end of
+// a table where it asks whether one of them is white space, even after a backslash that ends a line. Those in texts
+// within single quotes stay; it does not ask there. `text` must be TOML but for such letters elsewhere, which are refused.
+std::string with_escapes(std::string_view text, const std::string& name) {
+  std::string out;
   std::string_view closing;  // of the text or the comment that we are in; empty: in neither
   int line = 1;
+  const auto keep = [&](std::size_t from, std::size_t count) { out += text.substr(from, count); };
   for (std::size_t i = text.starts_with(kByteOrderMark) ? kByteOrderMark.size() : 0; i < text.size(); ++i) {
     const std::string_view rest = text.substr(i);
+    const bool letter = static_cast<unsigned char>(rest[0]) >= 0x80;
     line += rest[0] == '\n';
     if (closing.empty()) {
-      if (static_cast<unsigned char>(rest[0]) >= 0x80)
+      if (letter)
         throw InputError(name + ": line " + std::to_string(line), "has a letter beyond ASCII outside of quotes",
                          "put what is not a number into quotes");
+      std::size_t length = 1;
       for (const std::string_view opening : {"\"\"\"", "'''", "\"", "'", "#"})
         if (rest.starts_with(opening)) {
           closing = opening == "#" ? "\n" : opening;
-          i += opening.size() - 1;
+          length = opening.size();
           break;
         }
+      keep(i, length);
+      i += length - 1;
     } else if (closing[0] == '"' && rest[0] == '\\') {
+      keep(i, 2);
       ++i;
       line += i < text.size() && text[i] == '\n';
     } else if (rest.starts_with(closing)) {
-      i += closing.size() - 1;
-      if (closing.size() == 3)  // up to two quotes of the text itself come before
-        while (i + 1 < text.size() && text[i + 1] == closing[0]) ++i;
+      std::size_t length = closing.size();
+      if (length == 3)  // up to two quotes of the text itself come before
+        while (length < rest.size() && rest[length] == closing[0]) ++length;
+      keep(i, length);
+      i += length - 1;
       closing = {};
-    } else if (rest[0] == '\n' && closing.size() == 1) {
-      closing = {};  // a text that its line does not close: toml++ says so
+    } else if (letter && closing == "\n") {
+      out += 'x';
+    } else if (letter && closing[0] == '"') {
+      i += append_escaped(text, i, out) - 1;
+    } else {
+      keep(i, 1);
+      if (rest[0] == '\n' && closing.size() == 1) closing = {};  // a text that its line does not close: toml++ says so
     }
   }
+  return out;
 }
 
 }  // namespace
@@ -228,9 +265,8 @@ BatchPlan read_job_file(const Path& file) {
   try {
     const std::string text = core::read_file(file);
     check_dots(text, name);
-    document = toml::parse(in_ascii(text), name);
-    check_letters(text, name);
-    document = toml::parse(text, name);
+    static_cast<void>(toml::parse(in_ascii(text), name));  // throws where it is no TOML
+    document = toml::parse(with_escapes(text, name), name);
   } catch (const toml::parse_error& error) {
     throw InputError(name + ": line " + std::to_string(error.source().begin.line), std::string(error.description()),
                      "write it as TOML, see 'chainsplat batch --help'");
