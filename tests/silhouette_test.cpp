@@ -373,6 +373,8 @@ TEST_CASE("a rope has as many joints as its bends ask for and its masks can tell
       frame.covariance = math::MatrixX::Identity(fine.angles(), fine.angles());
       fit.frames.push_back(frame);
     }
+    // neighboring joints of a rope whose curvature changes steadily differ by the square of a link's length
+    CHECK(chain::neighbor_difference(fine, 0.3) == doctest::Approx(0.3 * std::pow(8.0 / kJoints, 2)));
     // a circle's arc and the line that fits it best, by numbers
     constexpr int kSamples = 20001;
     double mean = 0.0, square = 0.0;

@@ -77,6 +77,9 @@ MatrixX displacement_metric(const std::vector<MatrixX>& jacobians, const VectorX
 // between 0 and 1 tells them apart.
 bool is_twist(const Chain& chain, int angle);
 bool has_twist(const Chain& chain);
+// A deviation of the difference of neighboring joints' angles, given for eight joints, for this chain: a rope's curvature
+// changes along it whatever the number of its joints, so that the difference goes with the square of a link's length.
+double neighbor_difference(const Chain& chain, double of_eight);
 
 // What straight links and a tube of constant width cannot follow: the variance, m^2 per coordinate, of the position of
 // every link's end (links 1..), and the covariance of the angles that follows from it, rad^2, n x n (mathematics.md

@@ -130,6 +130,11 @@ bool has_twist(const Chain& chain) {
   return false;
 }
 
+double neighbor_difference(const Chain& chain, double of_eight) {
+  const double finer = 8.0 / (chain.links() - 1);
+  return of_eight * finer * finer;
+}
+
 int link_at(const Chain& chain, double arclength) {
   const auto end = std::upper_bound(chain.joint_arclength.begin(), chain.joint_arclength.end(), arclength);
   return static_cast<int>(end - chain.joint_arclength.begin());

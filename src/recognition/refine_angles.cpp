@@ -220,7 +220,7 @@ Refined refine_angles(const chain::Chain& chain, const capture::Capture& capture
         cost += view_equations.cost;
         ++s;
       }
-      cost += smoothness(chain, descent.trial, options.smooth_sigma, next);
+      cost += smoothness(chain, descent.trial, chain::neighbor_difference(chain, options.smooth_sigma), next);
       if (!prior.mean.empty()) {
         const math::VectorX away = descent.trial - prior.mean[selected[f]];
         const math::VectorX pull = prior.information[selected[f]] * away;
@@ -251,7 +251,8 @@ Refined refine_angles(const chain::Chain& chain, const capture::Capture& capture
     const math::MatrixX unit = math::MatrixX::Identity(chain.angles(), chain.angles());
     out.covariances.push_back(normal.size() > 0 ? math::MatrixX((normal + 1e-6 * unit).inverse()) : unit);
     // where a part of the rope is hardly seen, elimination without symmetry loses the sign of small variances
-    if (!math::is_covariance(out.covariances.back())) out.covariances.back() = (normal + 1e-6 * unit).ldlt().solve(unit);
+    if (!math::is_covariance(out.covariances.back()))
+      out.covariances.back() = (normal + 1e-6 * unit).ldlt().solve(unit);
   }
   out.summary = solve::together(summaries);
   return out;

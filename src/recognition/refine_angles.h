@@ -31,13 +31,14 @@ LinkEquations link_equations(const chain::Chain& chain, const capture::Camera& c
 struct RefineOptions {
   int iterations = 3;
   double mask_weight = 1.0;
-  double smooth_sigma = 0.15;  // rad, prior on the difference of neighboring joints' same-axis angles
+  double smooth_sigma =
+      0.15;              // rad, prior on the difference of neighboring joints' same-axis angles, with eight joints
   double trusted = 0.0;  // rad: a step that changes no angle by more is a frame's last and not drawn to be checked
 };
 
 struct Refined {
-  solve::Summary summary;  // of all frames together; steps in rad
-  int steps = 0;           // that were taken, of all frames
+  solve::Summary summary;                  // of all frames together; steps in rad
+  int steps = 0;                           // that were taken, of all frames
   std::vector<math::MatrixX> covariances;  // of each refined frame
 };
 

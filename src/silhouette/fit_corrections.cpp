@@ -23,7 +23,6 @@ constexpr double kLongestStep = 50.0;     // the same, in one step
 constexpr double kWidestCut = 30.0;       // px
 constexpr double kNarrowing = 0.6;        // of that cut from step to step
 constexpr double kWideEnd = 8.0;          // half widths: the reach of the free end as long as the cut is wide
-constexpr double kJointDifference = 0.3;  // rad, deviation of the difference of neighboring angles with eight joints
 constexpr double kTableTilt = 0.002;      // rad, deviation of the bending plane from the table's
 constexpr double kLeastSize = 0.5;        // share of the given length and diameter below which no correction goes
 // The priors' penalty is kTails / 2 ln(1 + |y|^2 / kTails) in units of their deviation: nearly a Gaussian's for what a
@@ -367,11 +366,7 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
                             {},
                             kWidestCut,
                             kWideEnd};
-  // bends between neighbors shrink with the square of the links' length, as curvature changes along the rope
-  Options smooth;
-  const double difference = kJointDifference * std::pow(8.0 / (chain.links() - 1), 2);
-  smooth.joint_smoothness = 1.0 / (difference * difference);
-  problem.prior = joint_prior(chain, smooth);
+  problem.prior = joint_prior(chain, {});
   const int n = chain.angles(), m = layout.size;
   for (int k = 0; k < n; ++k) problem.held.push_back(chain::is_twist(chain, k));
   const std::vector<VectorX> theta = choose_frames(sequence, options.frames, capture, problem);

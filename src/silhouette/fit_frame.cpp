@@ -30,7 +30,7 @@ constexpr double kFirstCut = 8.0;   // px, Tukey's cut-off before residuals are 
 constexpr double kFineStep = 1e-5;  // rad
 
 // priors, rad
-constexpr double kJointDifference = 0.3;  // between neighboring joints, along one axis
+constexpr double kJointDifference = 0.3;  // between neighboring joints of eight, along one axis
 constexpr double kJointSize = 1.5;        // of an angle
 constexpr double kWarmChange = 0.2;       // from the frame before: 6 rad/s at 30 Hz
 constexpr double kTwist = 0.5;            // unseen by silhouettes, held
@@ -153,8 +153,8 @@ std::vector<VectorX> cold_starts(const chain::Chain& chain, const VectorX& start
 
 MatrixX joint_prior(const chain::Chain& chain, const Options& options) {
   const int n = chain.angles();
-  const double difference =
-      options.joint_smoothness > 0.0 ? options.joint_smoothness : 1.0 / (kJointDifference * kJointDifference);
+  const double deviation = chain::neighbor_difference(chain, kJointDifference);
+  const double difference = options.joint_smoothness > 0.0 ? options.joint_smoothness : 1.0 / (deviation * deviation);
   MatrixX information = MatrixX::Identity(n, n) / (kJointSize * kJointSize);
   for (int k = 0; k < n; ++k) {
     const int l = neighbor(chain, k);
