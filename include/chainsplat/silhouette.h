@@ -66,8 +66,8 @@ struct SequenceFit {
 };
 SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capture, const Options& options = {});
 
-// design.md, 'Recognition', --bending auto: planar on a table, or where a spatial fit is out of plane by less than 1 mm or
-// 3 deviations RMS, or where of one camera a planar fit explains the outlines nearly as well; else spatial.
+// design.md, 'Recognition', --bending auto: planar on a table, or where a spatial fit is out of plane by less than 1 mm
+// or 3 deviations RMS, or where of one camera a planar fit explains the outlines nearly as well; else spatial.
 struct BendingChoice {
   chain::Bending bending = chain::Bending::spatial;
   double out_of_plane_rms = 0.0;  // m; 0 when not measured
@@ -76,17 +76,18 @@ struct BendingChoice {
 BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::Capture& capture,
                              const SequenceFit& fit);
 
-// design.md, 'Recognition', --joints auto: the fewest of 8, 12 and 16 joints with whose straight links the rope's curve is
-// followed as closely as all masks together can tell, else 16. `fit` is that of `chain`, whose joints are evenly spaced.
+// design.md, 'Recognition', --joints auto: the fewest of 8, 12 and 16 joints with whose straight links the rope's curve
+// is followed as closely as all masks together can tell, else 16. `fit` is that of `chain`, whose joints are evenly
+// spaced.
 struct JointChoice {
   int joints = 0;
+  int tried = 0;           // joints of `chain`
   double bow = 0.0;        // of the rope beside the links of `chain`, RMS over the rope and the frames, m
   double deviation = 0.0;  // what the masks of all frames leave open about the centerline, standard deviation, m
 };
 JointChoice choose_joints(const chain::Chain& chain, const SequenceFit& fit);
 
-// --- what the recording was given wrongly
-// ------------------------------------------------------------------------------
+// --- what the recording was given wrongly ----------------------------------------------------------------------------
 
 struct CorrectionOptions {
   std::vector<std::string> held;  // groups of corrected_quantities() that are not varied

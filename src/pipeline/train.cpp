@@ -187,8 +187,8 @@ void choose_work(Training& t) {
   if (t.identify && !named && !t.joint && frames < kLeastFrames) {
     t.identify = t.roll_out = false;
     core::warn(std::to_string(frames) + (frames == 1 ? " frame: " : " frames: ") +
-               "the rope is recognized, and its dynamics are not identified, for which " + std::to_string(kLeastFrames) +
-               " frames or more of a motion are needed");
+               "the rope is recognized, and its dynamics are not identified, for which " +
+               std::to_string(kLeastFrames) + " frames or more of a motion are needed");
   }
 }
 
@@ -298,6 +298,13 @@ void recognize(Training& t) {
     std::snprintf(text, sizeof text, " bending (out of plane: %.2f mm)", 1e3 * found.bending.out_of_plane_rms);
     judge_bending(t.twin, found.bending);
     core::say((found.bending.bending == chain::Bending::planar ? "planar" : "spatial") + std::string(text));
+  }
+  if (found.joints.joints > 0) {
+    char text[160];
+    std::snprintf(text, sizeof text,
+                  "%d joints (with %d the rope would curve %.2f mm beside its links; the masks leave %.2f mm open)",
+                  found.joints.joints, found.joints.tried, 1e3 * found.joints.bow, 1e3 * found.joints.deviation);
+    core::say_more(text);
   }
   tell_fit("recognize", found.summary);
   t.result.fits.emplace_back("recognize", found.summary);

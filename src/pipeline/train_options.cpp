@@ -12,11 +12,11 @@ namespace {
 
 constexpr std::array<const char*, 4> kStages = {"recognize", "identify", "rollout", "evaluate"};
 
-int whole_number(const std::string& text, const std::string& where) {
+int whole_number(const std::string& text, const std::string& where, const std::string& mend = "give one") {
   int value = 0;
   const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), value);
   if (error != std::errc() || end != text.data() + text.size())
-    throw InputError(where, "'" + text + "' is not a whole number", "give one");
+    throw InputError(where, "'" + text + "' is not a whole number", mend);
   return value;
 }
 
@@ -89,7 +89,7 @@ const std::vector<Setting>& settings() {
 void set(TrainOptions& options, const std::string& name, const std::string& text, const std::string& where) {
   if (name == "joints") {
     options.joints.reset();
-    if (text != "auto") options.joints = whole_number(text, where);
+    if (text != "auto") options.joints = whole_number(text, where, "give one, or auto");
   } else if (name == "bending") {
     const std::string kind = choice(text, {"auto", "planar", "spatial"}, where);
     options.bending.reset();

@@ -36,4 +36,6 @@ struct Frames {
 };
 Frames frames_of(const capture::Capture& capture);
 
+constexpr double kFewViews = 1.5;  // views per frame, in the mean, that count as one camera
+
 }  // namespace chainsplat::silhouette

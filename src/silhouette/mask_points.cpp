@@ -5,12 +5,13 @@
 #include <cmath>
 #include <numeric>
 
+#include "chainsplat/image_model.h"
+
 namespace chainsplat::silhouette {
 
 namespace {
 
-constexpr int kInside = 128;            // coverage from here on is object (formats.md 1.5)
-constexpr double kLevel = 127.5;        // coverage at the outline
+constexpr double kLevel = image_model::kObjectMask - 0.5;  // coverage at the outline
 constexpr double kSpeck = 0.02;         // share of the largest blob's area under which a blob is noise
 constexpr int kSpeckPixels = 4;         // px, the same for small masks
 constexpr std::size_t kMostBlobs = 64;  // a rope cut by fingers has a few; more are noise
@@ -33,10 +34,10 @@ std::vector<Run> connected_runs(const capture::View& view) {
     const std::size_t row_begin = runs.size();
     const std::uint8_t* const row = view.rgba.data() + 4 * static_cast<std::size_t>(y) * view.width + 3;
     for (int x = 0; x < view.width;) {
-      while (x < view.width && row[4 * x] < kInside) ++x;
+      while (x < view.width && row[4 * x] < image_model::kObjectMask) ++x;
       if (x == view.width) break;
       const int begin = x;
-      while (x < view.width && row[4 * x] >= kInside) ++x;
+      while (x < view.width && row[4 * x] >= image_model::kObjectMask) ++x;
       runs.push_back({y, begin, x, static_cast<int>(runs.size())});
     }
     std::size_t a = above;

@@ -2,168 +2,20 @@
 #include <OpenImageIO/filesystem.h>
 #include <OpenImageIO/imageio.h>
 #include <unistd.h>
-#include <zlib.h>
 
 #include <cmath>
 #include <filesystem>
 #include <fstream>
-#include <map>
 #include <memory>
 #include <string>
 #include <string_view>
 
 #include "src/capture/media.h"
+#include "src/capture/media/damage.h"
 
 namespace chainsplat::capture::media {
 
 namespace {
-
-constexpr int kMostChannels = 8;    // enough for colors, alpha and depth; a damaged header may claim any number
-constexpr int kMostSide = 1 << 16;  // pixels; OpenImageIO reads 64 rows at a time, however wide they are
-
-// Returns what is wrong with a PNG, or an empty text where it is whole or the file is no PNG. It is found here because
-// libpng would print a line of its own.
-std::string damage_of_png(const Path& file) {
-  std::ifstream stream(file, std::ios::binary);
-  constexpr std::string_view kSignature = "\x89PNG\r\n\x1a\n";
-  constexpr std::uint32_t kLargestSide = 1u << 15;  // px, the same as for capture.json
-  constexpr const char* kCutOff = "is cut off";
-  char start[8] = {};
-  if (!stream.read(start, sizeof start) || std::string_view(start, sizeof start) != kSignature) return "";
-  const auto number = [&stream] {
-    unsigned char b[4] = {};
-    stream.read(reinterpret_cast<char*>(b), sizeof b);
-    return std::uint32_t{b[0]} << 24u | std::uint32_t{b[1]} << 16u | std::uint32_t{b[2]} << 8u | b[3];
-  };
-  std::error_code error;
-  const std::uintmax_t at_most = std::filesystem::file_size(file, error);
-  for (std::vector<char> chunk;;) {  // each chunk has its length, name, data and the checksum of name and data
-    const std::uint32_t length = number();
-    if (!stream || length > at_most) return kCutOff;
-    chunk.resize(length + 4);
-    if (!stream.read(chunk.data(), static_cast<std::streamsize>(chunk.size()))) return kCutOff;
-    const std::uint32_t sum = number();
-    if (!stream) return kCutOff;
-    if (::crc32(0, reinterpret_cast<const Bytef*>(chunk.data()), static_cast<uInt>(chunk.size())) != sum)
-      return "is damaged";
-    const std::string_view name(chunk.data(), 4);
-    if (name == "IHDR" && length >= 8)
-      for (const std::size_t at : {4u, 8u}) {
-        std::uint32_t side = 0;
-        for (std::size_t i = 0; i < 4; ++i) side = side << 8u | static_cast<unsigned char>(chunk[at + i]);
-        if (side == 0 || side > kLargestSide) return "claims a side of " + std::to_string(side) + " pixels";
-      }
-    if (name == "IEND") return "";
-  }
-}
-
-constexpr std::size_t kExrChannelLength = 16;  // bytes of a channel in an EXR's list of them, after its name
-
-std::uint32_t little_endian(std::string_view bytes) {
-  std::uint32_t value = 0;
-  for (int i = 3; i >= 0; --i) value = value << 8u | static_cast<unsigned char>(bytes[static_cast<std::size_t>(i)]);
-  return value;
-}
-
-// Returns whether OpenEXR reads exactly `bytes` as an attribute of this type. Of most types it reads what the type has,
-// whatever length the file gives, and goes on behind that; texts and previews are as long as they say themselves.
-bool is_sound_attribute(const std::string& type, std::string_view bytes) {
-  static const std::map<std::string, std::size_t> length_of = {{"box2f", 16},
-                                                               {"box2i", 16},
-                                                               {"chromaticities", 32},
-                                                               {"compression", 1},
-                                                               {"deepImageState", 1},
-                                                               {"double", 8},
-                                                               {"envmap", 1},
-                                                               {"float", 4},
-                                                               {"int", 4},
-                                                               {"keycode", 28},
-                                                               {"lineOrder", 1},
-                                                               {"m33d", 72},
-                                                               {"m33f", 36},
-                                                               {"m44d", 128},
-                                                               {"m44f", 64},
-                                                               {"rational", 8},
-                                                               {"tiledesc", 9},
-                                                               {"timecode", 8},
-                                                               {"v2d", 16},
-                                                               {"v2f", 8},
-                                                               {"v2i", 8},
-                                                               {"v3d", 24},
-                                                               {"v3f", 12},
-                                                               {"v3i", 12}};
-  if (const auto known = length_of.find(type); known != length_of.end()) return bytes.size() == known->second;
-  if (type == "chlist") {
-    // the list ends with an empty name
-    while (!bytes.empty() && bytes[0] != '\0') {
-      const std::size_t end = bytes.find('\0');
-      if (end == std::string_view::npos || bytes.size() - end <= kExrChannelLength) return false;
-      bytes.remove_prefix(end + 1 + kExrChannelLength);
-    }
-    return bytes.size() == 1;
-  }
-  if (type == "preview") {  // width, height, four bytes a pixel
-    if (bytes.size() < 8) return false;
-    return 8 + 4 * std::uint64_t{little_endian(bytes)} * little_endian(bytes.substr(4)) == bytes.size();
-  }
-  if (type == "stringvector") {
-    while (bytes.size() >= 4 && little_endian(bytes) <= bytes.size() - 4) bytes.remove_prefix(4 + little_endian(bytes));
-    return bytes.empty();
-  }
-  return true;
-}
-
-// Returns what in a sound attribute would make OpenEXR ask for more memory than any image here needs, or an empty text.
-std::string excess_of_attribute(const std::string& name, const std::string& type, std::string_view bytes) {
-  const auto number = [&](std::size_t at) {
-    return std::int64_t{static_cast<std::int32_t>(little_endian(bytes.substr(at)))};
-  };
-  const auto excess = [](const char* what, std::int64_t width, std::int64_t height) {
-    const bool small =
-        width >= 1 && height >= 1 && width <= kMostSide && height <= kMostSide && width * height <= kMostPixels;
-    return small ? ""
-                 : "claims " + std::string(what) + " of " + std::to_string(width) + "x" + std::to_string(height) +
-                       " pixels";
-  };
-  if (name == "dataWindow" && type == "box2i")  // first and last column and row
-    return excess("an image", number(8) - number(0) + 1, number(12) - number(4) + 1);
-  if (type == "tiledesc") return excess("tiles", number(0), number(4));
-  if (type == "chlist") {
-    std::size_t channels = 0;
-    for (std::size_t at = 0; bytes[at] != '\0'; at = bytes.find('\0', at) + 1 + kExrChannelLength) ++channels;
-    if (channels > kMostChannels) return "claims " + std::to_string(channels) + " channels";
-  }
-  return "";
-}
-
-// Returns what is wrong with an EXR's header, or an empty text where it is sound or the file is no EXR. OpenEXR would
-// allocate the claimed length of an attribute and the claimed lines of pixels before it reads them.
-std::string damage_of_exr(const Path& file) {
-  std::ifstream stream(file, std::ios::binary);
-  constexpr std::string_view kSignature = "\x76\x2f\x31\x01";
-  constexpr unsigned kManyParts = 0x10;  // in the version's second byte: headers follow each other up to an empty one
-  const std::string damaged = "is damaged";
-  char start[8] = {};  // signature and version
-  if (!stream.read(start, sizeof start) || !std::string_view(start, sizeof start).starts_with(kSignature)) return "";
-  const bool many_parts = static_cast<unsigned char>(start[5]) & kManyParts;
-  std::error_code error;
-  const std::uintmax_t at_most = std::filesystem::file_size(file, error);
-  bool empty = false;
-  do {
-    empty = true;
-    for (std::string name, type; std::getline(stream, name, '\0') && !name.empty();) {
-      empty = false;
-      char b[4] = {};
-      if (!std::getline(stream, type, '\0') || !stream.read(b, sizeof b)) return damaged;
-      const std::uint32_t length = little_endian({b, sizeof b});
-      if (length > at_most) return damaged;
-      std::string bytes(length, '\0');
-      if (!stream.read(bytes.data(), length) || !is_sound_attribute(type, bytes)) return damaged;
-      if (const std::string excess = excess_of_attribute(name, type, bytes); !excess.empty()) return excess;
-    }
-  } while (many_parts && !empty && stream);
-  return stream ? "" : damaged;  // the file ends before its header does
-}
 
 // Returns the name of OpenImageIO's reader for the format that the file's first bytes show, or null for another format.
 // Without a name OpenImageIO tries all its readers, and some pass the file to libraries that open any other file or

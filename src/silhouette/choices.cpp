@@ -1,0 +1,126 @@
+// What a rope's first fit decides of its chain: in how many directions its joints bend, and how many there are.
+#include <array>
+#include <cmath>
+
+#include "src/silhouette/frame.h"
+
+namespace chainsplat::silhouette {
+
+using math::MatrixX;
+using math::Pose;
+using math::VectorX;
+
+namespace {
+
+// How far the masks are from a sequence's fits, in the median over the frames that show anything.
+struct Misfit {
+  double residual = 0.0, covered = 0.0, inside = 0.0;
+};
+Misfit misfit(const SequenceFit& fit) {
+  std::vector<double> residual, covered, inside;
+  for (const FrameFit& frame : fit.frames) {
+    if (frame.residual_pixels <= 0.0) continue;
+    residual.push_back(frame.residual_pixels);
+    covered.push_back(frame.covered);
+    inside.push_back(frame.inside);
+  }
+  if (residual.empty()) return {};
+  return {math::median(residual), math::median(covered), math::median(inside)};
+}
+
+bool one_camera(const capture::Capture& capture) {
+  const Frames frames = frames_of(capture);
+  double views = 0.0, count = 0.0;
+  for (const std::vector<int>& of_frame : frames.views)
+    if (!of_frame.empty()) views += static_cast<double>(of_frame.size()), ++count;
+  return views < kFewViews * count;
+}
+
+}  // namespace
+
+BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::Capture& capture,
+                             const SequenceFit& fit) {
+  constexpr double kSmall = 1e-3;  // m
+  constexpr double kDeviations = 3.0;
+  constexpr double kClearly = 1.5, kClearlyPixels = 0.3, kClearlyShare = 0.15;  // by which a planar fit must be worse
+  constexpr int kPoints = 97;                                                   // along the centerline
+  BendingChoice choice;
+  if (capture.tabletop) {
+    choice.bending = chain::Bending::planar;
+    return choice;
+  }
+  const std::vector<double> arclengths = chain::equal_arclengths(spatial_chain, kPoints);
+  double square = 0.0, variance = 0.0, weights = 0.0;  // frames that see little of the third dimension count little
+  for (std::size_t f = 0; f < fit.states.theta.size(); ++f) {
+    if (fit.frames[f].residual_pixels <= 0.0) continue;  // nothing was seen
+    const VectorX& theta = fit.states.theta[f];
+    const auto motions = chain::link_motions(spatial_chain, theta, Pose{});
+    const MatrixX points = chain::centerline(spatial_chain, motions, arclengths);
+    const MatrixX axes = chain::world_axes(spatial_chain, theta, Pose{});
+    double frame_square = 0.0, frame_variance = 0.0;
+    for (int i = 0; i < kPoints; ++i) {
+      const double out_of_plane = spatial_chain.bending_axis.dot(points.col(i));
+      const MatrixX jacobian =
+          chain::point_jacobian(spatial_chain, axes, chain::link_at(spatial_chain, arclengths[i]), points.col(i));
+      const Eigen::RowVectorXd row = spatial_chain.bending_axis.transpose() * jacobian;
+      frame_square += out_of_plane * out_of_plane / kPoints;
+      frame_variance += row.dot(fit.frames[f].covariance * row.transpose()) / kPoints;
+    }
+    const double weight = 1.0 / (frame_variance + kSmall * kSmall);
+    weights += weight;
+    square += weight * frame_square;
+    variance += weight * frame_variance;
+  }
+  if (weights == 0.0) return choice;
+  choice.out_of_plane_rms = std::sqrt(square / weights);
+  choice.deviation = std::sqrt(variance / weights);
+  if (choice.out_of_plane_rms < std::max(kSmall, kDeviations * choice.deviation)) {
+    choice.bending = chain::Bending::planar;
+  } else if (one_camera(capture)) {
+    // The width of the masks alone tells depth: errors of the outline, alike along the rope, look like a bend.
+    const chain::Chain& s = spatial_chain;
+    const chain::Chain planar = chain::make_chain(s.length, s.diameter, s.direction, s.bending_axis, s.links() - 1,
+                                                  chain::Bending::planar, false, s.joint_arclength[0]);
+    const Misfit with = misfit(fit), without = misfit(fit_sequence(planar, capture));
+    const bool worse = without.residual > kClearly * with.residual + kClearlyPixels ||
+                       without.covered + without.inside < with.covered + with.inside - kClearlyShare;
+    if (!worse) choice.bending = chain::Bending::planar;
+  }
+  return choice;
+}
+
+JointChoice choose_joints(const chain::Chain& chain, const SequenceFit& fit) {
+  constexpr std::array kCounts{8, 12, 16};
+  constexpr int kPoints = 25;  // along the centerline
+  std::vector<chain::MaterialPoint> points;
+  for (const double arclength : chain::equal_arclengths(chain, kPoints))
+    points.push_back(chain::centerline_point(chain, arclength));
+  const int joints = chain.links() - 1, axes_per_joint = chain.angles() / joints;
+  double bend = 0.0, variance = 0.0, frames = 0.0;
+  for (std::size_t f = 0; f < fit.states.theta.size(); ++f) {
+    const FrameFit& frame = fit.frames[f];
+    if (frame.residual_pixels <= 0.0) continue;  // nothing was seen
+    const VectorX& theta = fit.states.theta[f];
+    // without the first joint, where the grasp bends the rope at once
+    for (int i = axes_per_joint; i < chain.angles(); ++i)
+      if (!chain::is_twist(chain, i)) bend += theta[i] * theta[i] / (joints - 1);
+    const auto motions = chain::link_motions(chain, theta, Pose{});
+    const MatrixX axes = chain::world_axes(chain, theta, Pose{});
+    for (const MatrixX& jacobian : chain::point_jacobians(chain, axes, motions, points))
+      variance += (jacobian * frame.covariance * jacobian.transpose()).trace() / kPoints;
+    frames += 1.0;
+  }
+  JointChoice choice{kCounts.front(), joints, 0.0, 0.0};
+  if (frames == 0.0) return choice;
+  // an arc of angle a over a length h is a h / sqrt(720) RMS from the straight line that fits it best
+  choice.bow = chain.length / joints * std::sqrt(std::max(0.0, bend / frames) / 720.0);
+  choice.deviation = std::sqrt(variance) / frames;  // an error that all frames share shows where one alone would not
+  for (const int count : kCounts) {
+    choice.joints = count;
+    const double finer = static_cast<double>(count) / joints;
+    if (choice.bow <= choice.deviation * finer * finer) break;
+  }
+  return choice;
+}
+
+}  // namespace chainsplat::silhouette
