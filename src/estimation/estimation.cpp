@@ -384,7 +384,7 @@ double shown_share(const Filter& filter, std::span<const capture::View* const> v
   double most = 0.0;
   for (const capture::View* const view : views) {
     int pixels = 0;
-    for (std::size_t i = 3; i < view->rgba.size(); i += 4) pixels += view->rgba[i] >= 128;
+    for (std::size_t i = 3; i < view->rgba.size(); i += 4) pixels += view->rgba[i] >= image_model::kObjectMask;
     const double tube = tube_area(filter.model.chain, base_at(filter, view->time).pose, theta,
                                   filter.cameras.at(view->camera), edge_offset);
     if (tube > 0.0) most = std::max(most, pixels / tube);
@@ -503,7 +503,7 @@ Belief first_belief(const Filter& filter, double time) {
 
 bool has_mask(const capture::View& view) {
   for (std::size_t i = 3; i < view.rgba.size(); i += 4)
-    if (view.rgba[i] >= 128) return true;
+    if (view.rgba[i] >= image_model::kObjectMask) return true;
   return false;
 }
 
@@ -760,7 +760,7 @@ double tube_iou(const chain::Chain& chain, const Pose& base, const VectorX& thet
     for (int x = left; x < right; ++x) {
       const int u = x - view.x0, v = y - view.y0;
       const bool in_mask = u >= 0 && v >= 0 && u < view.width && v < view.height &&
-                           view.rgba[4 * (static_cast<std::size_t>(v) * view.width + u) + 3] >= 128;
+                           view.rgba[4 * (static_cast<std::size_t>(v) * view.width + u) + 3] >= image_model::kObjectMask;
       const bool in_tube = tube[static_cast<std::size_t>(y - top) * width + x - left] != 0;
       both += in_mask && in_tube;
       either += in_mask || in_tube;

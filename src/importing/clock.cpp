@@ -4,6 +4,8 @@
 #include <cmath>
 #include <limits>
 
+#include "chainsplat/image_model.h"
+
 namespace chainsplat::importing {
 
 using math::Vector2;
@@ -52,7 +54,7 @@ std::vector<SeenRope> seen_ropes(const Media& masks, const MaskRule& rule, doubl
     const capture::Image8 mask = lens ? undistort(*lens, binary_mask(image, rule)) : binary_mask(image, rule);
     std::vector<Eigen::Vector2f> points;
     for (std::size_t i = 0; i < mask.pixels.size(); ++i)
-      if (mask.pixels[i] >= 128) {
+      if (mask.pixels[i] >= image_model::kObjectMask) {
         const Vector2 at(static_cast<double>(i % mask.width) + 0.5, static_cast<double>(i / mask.width) + 0.5);
         points.push_back(capture::undistort(camera, at).cast<float>());
       }

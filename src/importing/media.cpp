@@ -5,6 +5,7 @@
 #include <cctype>
 #include <cstdio>
 
+#include "chainsplat/image_model.h"
 #include "document.h"
 
 namespace chainsplat::importing {
@@ -243,7 +244,7 @@ std::string write_masks(const Media& media, const Take& take, const MaskRule& ru
     const capture::Image8 mask = binary_mask(image, rule);
     if (!lens) return mask;
     capture::Image8 straight = undistort(*lens, mask);
-    for (std::uint8_t& value : straight.pixels) value = value >= 128 ? 255 : 0;
+    for (std::uint8_t& value : straight.pixels) value = value >= image_model::kObjectMask ? 255 : 0;
     return straight;
   });
 }

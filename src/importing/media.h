@@ -2,6 +2,7 @@
 #pragma once
 #include <string>
 
+#include "chainsplat/image_model.h"
 #include "chainsplat/media.h"
 #include "lens.h"
 
@@ -16,7 +17,7 @@ std::string write_frames(const Media& media, const Take& take, const Undistortio
 struct MaskRule {
   bool alpha = false;  // the alpha channel counts, else the brightest color
   int label = -1;      // this value alone is the rope; -1: from `threshold` on
-  int threshold = 128;
+  int threshold = image_model::kObjectMask;
   bool inverted = false;  // the rope is dark
   std::string note;
 };

@@ -4,6 +4,7 @@
 #include <opencv2/core.hpp>
 #include <opencv2/imgproc.hpp>
 
+#include "chainsplat/image_model.h"
 #include "chainsplat/masking.h"
 
 namespace chainsplat::masking {
@@ -25,7 +26,7 @@ cv::Mat drawn(const PreviewTile& tile) {
   // the outline in the small picture: where a pixel's neighborhood has both
   cv::Mat small, wide, narrow;
   cv::resize(mask, small, out.size(), 0, 0, cv::INTER_AREA);
-  cv::threshold(small, small, 127, 255, cv::THRESH_BINARY);
+  cv::threshold(small, small, image_model::kObjectMask - 1, 255, cv::THRESH_BINARY);
   cv::dilate(small, wide, cv::Mat::ones(3, 3, CV_8U));
   const bool poor = tile.score && *tile.score < kDoubtful;
   const cv::Scalar color = poor ? kPoor : kGood;

@@ -19,6 +19,7 @@
 
 #include "chainsplat/estimation.h"
 #include "chainsplat/eval.h"
+#include "chainsplat/image_model.h"
 #include "chainsplat/pipeline.h"
 #include "chainsplat/recognition.h"
 #include "chainsplat/render.h"
@@ -217,7 +218,7 @@ std::vector<std::vector<std::uint8_t>> make_targets(splat::Engine& engine, const
     for (std::size_t k = 0; k < picture.rgba.size(); ++k)
       targets.back()[k] = static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(picture.rgba[k], 0.0f, 1.0f)));
     for (std::size_t k = 3; k < targets.back().size(); k += 4) {
-      const bool object = targets.back()[k] >= 128;
+      const bool object = targets.back()[k] >= image_model::kObjectMask;
       targets.back()[k] = object ? 255 : 0;
       if (!object) std::fill_n(targets.back().begin() + static_cast<std::ptrdiff_t>(k) - 3, 3, 0);
     }

@@ -11,6 +11,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/capture.h"
+#include "chainsplat/image_model.h"
 #include "chainsplat/json.h"
 #include "chainsplat/masking.h"
 #include "chainsplat/run_folder.h"
@@ -23,7 +24,6 @@ namespace {
 namespace fs = std::filesystem;
 using Json = nlohmann::ordered_json;
 
-constexpr std::uint8_t kInside = 128;  // mask values from here on are object (formats.md 1.5)
 constexpr std::string_view kImageName = "{image}", kMaskName = "{mask}";  // in the line of a command
 constexpr double kMostlyInside = 0.85;  // share of the chain's centerline in the masks under which they may be wrong
 // m, more than calibrations of laboratories are wrong by: across the rope, and along it too, where the gripper hides it
@@ -131,9 +131,9 @@ capture::Image8 mask_by_command(const std::string& command, const capture::View&
     int value = 0;
     for (int c = 0; c < colors; ++c) value = std::max<int>(value, result.pixels[channels * i + c]);
     brightest = std::max(brightest, value);
-    out.pixels[i] = value >= kInside ? 255 : 0;
+    out.pixels[i] = value >= image_model::kObjectMask ? 255 : 0;
   }
-  if (brightest > 0 && brightest < kInside)
+  if (brightest > 0 && brightest < image_model::kObjectMask)
     throw WorkError(where, "the command's mask has no value above " + std::to_string(brightest),
                     "the object must be 255 and the rest 0");
   return out;
@@ -148,7 +148,8 @@ struct Agreement {
 double iou(const capture::Image8& mask, const capture::Image8& other) {
   std::int64_t both = 0, either = 0;
   for (std::size_t i = 0; i < mask.pixels.size(); ++i) {
-    const bool a = mask.pixels[i] >= kInside, b = other.pixels[other.channels * i] >= kInside;
+    const bool a = mask.pixels[i] >= image_model::kObjectMask,
+               b = other.pixels[other.channels * i] >= image_model::kObjectMask;
     both += a && b;
     either += a || b;
   }
