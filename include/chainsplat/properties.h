@@ -11,7 +11,8 @@ namespace chainsplat::twin {
 struct Property {
   std::string name, unit;  // "bending_stiffness", "N m^2"
   double value = 0.0;
-  double sigma = 0.0;  // standard deviation by the estimates' covariance; NaN where that is not known
+  double sigma = 0.0;  // standard deviation by the estimates' covariance and, of a friction coefficient, by how much
+                       // the links' own differ; NaN where that is not known
 };
 
 // Of a rope; those that it does not have are left out: damping ratio and first frequency of ropes on a table, a

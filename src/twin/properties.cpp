@@ -35,7 +35,8 @@ void add_first_mode(const dynamics::Model& model, VectorX& near, std::vector<Pro
   out.push_back({"first_frequency", "Hz", turn / (2.0 * M_PI)});
 }
 
-// `near`: the shape at rest, of a rope that is much the same; empty: not known.
+// Each with the deviation that the covariance cannot know of, mostly 0. `near`: the shape at rest, of a rope that is
+// much the same; empty: not known.
 std::vector<Property> values(const dynamics::Model& model, bool known_mass, VectorX& near) {
   const dynamics::Parameters& p = model.parameters;
   const chain::Chain& chain = model.chain;
@@ -63,7 +64,14 @@ std::vector<Property> values(const dynamics::Model& model, bool known_mass, Vect
   if (!p.bending_friction.empty()) out.push_back({"bending_friction", "N m" + per_mass, friction / bends});
   if (!p.table_normal) add_first_mode(model, near, out);
   out.push_back({"mass_per_length", known_mass ? "kg/m" : "1/m", mass / length});
-  if (p.table_normal) out.push_back({"friction_coefficient", "1", held / mass});
+  if (p.table_normal) {
+    // one coefficient belongs to the two materials: what the links' differ by is error
+    const double mean = held / mass;
+    double square = 0.0;
+    for (std::size_t j = 0; j < p.link_mass.size(); ++j)
+      square += p.link_mass[j] * std::pow(p.coulomb_friction[j] - mean, 2);
+    out.push_back({"friction_coefficient", "1", mean, std::sqrt(square / mass)});
+  }
   out.push_back({"tip_mass", known_mass ? "kg" : "1", p.tip_mass});
   return out;
 }
@@ -100,7 +108,7 @@ std::vector<Property> properties(const dynamics::Model& model, const dynamics::E
   }
   const MatrixX covariance = slopes * estimates.covariance(known, known) * slopes.transpose();
   for (std::size_t k = 0; k < out.size(); ++k)
-    out[k].sigma = std::sqrt(std::max(0.0, covariance(static_cast<Eigen::Index>(k), static_cast<Eigen::Index>(k))));
+    out[k].sigma = std::hypot(out[k].sigma, std::sqrt(std::max(0.0, covariance.diagonal()[static_cast<int>(k)])));
   return out;
 }
 
