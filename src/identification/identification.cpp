@@ -98,20 +98,15 @@ bool simulate_in_groups(const dynamics::Model& model, const BaseGrid& grid, cons
     good[group] = dynamics::simulate(model, grid, initial, moved[group],
                                      unknowns.subspan(first(group), first(group + 1) - first(group)), &slopes[group]);
   });
-  states = std::move(moved[0]);
-  const auto gather = [&](std::vector<MatrixX> dynamics::Sensitivities::*quantity) {
-    (sensitivities.*quantity).resize(states.theta.size());
-    for (std::size_t k = 0; k < states.theta.size(); ++k) {
-      MatrixX& all = (sensitivities.*quantity)[k];
-      all.resize(model.chain.angles(), static_cast<Eigen::Index>(unknowns.size()));
-      for (std::size_t i = 0; i < count; ++i) {
-        const MatrixX& some = (slopes[i].*quantity)[k];
-        all.middleCols(static_cast<Eigen::Index>(first(i)), some.cols()) = some;
-      }
-    }
-  };
   if (std::find(good.begin(), good.end(), 0) != good.end()) return false;
-  gather(&dynamics::Sensitivities::theta);
+  states = std::move(moved[0]);
+  sensitivities.theta.resize(states.theta.size());
+  for (std::size_t k = 0; k < states.theta.size(); ++k) {
+    MatrixX& all = sensitivities.theta[k];
+    all.resize(model.chain.angles(), static_cast<Eigen::Index>(unknowns.size()));
+    for (std::size_t i = 0; i < count; ++i)
+      all.middleCols(static_cast<Eigen::Index>(first(i)), slopes[i].theta[k].cols()) = slopes[i].theta[k];
+  }
   return true;
 }
 

@@ -31,8 +31,7 @@ LinkEquations link_equations(const chain::Chain& chain, const capture::Camera& c
 struct RefineOptions {
   int iterations = 3;
   double mask_weight = 1.0;
-  double smooth_sigma =
-      0.15;              // rad, prior on the difference of neighboring joints' same-axis angles, with eight joints
+  double smooth_sigma = 0.15;  // rad, prior of neighboring joints (chain::neighbor_difference)
   double trusted = 0.0;  // rad: a step that changes no angle by more is a frame's last and not drawn to be checked
 };
 
