@@ -278,7 +278,7 @@ TEST_CASE("glTF's cameras see points where the capture's do, and the root tells 
   camera.fx = 500.0, camera.fy = 520.0, camera.cx = 320.0, camera.cy = 240.0;
   camera.world_from_camera = {Eigen::AngleAxisd(2.0, math::Vector3(1, 2, -2) / 3.0).toRotationMatrix(),
                               math::Vector3(0.4, -0.7, 0.5)};
-  exports::GltfOptions options;
+  exports::Options options;
   options.cameras = {camera};
   options.properties = {{"bending_stiffness", "N m^2", 4e-4, 1e-5}, {"tip_mass", "kg", 0.0, NAN}};
   const tinygltf::Model model =

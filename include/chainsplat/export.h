@@ -9,8 +9,8 @@
 //   .ply        gaussians.ply of the run folder: home configuration, base frame. Some PLY viewers show it with y down.
 //   .csv        the states, and beside them NAME.centerline.csv: the nodes in the world frame.
 //   .npz        NumPy arrays of everything (states, covariances, poses, parameters, Gaussians), and beside them
-//   NAME.py, which
-//               poses the twin.
+//               NAME.py, which poses the twin.
+//   .mcap       a recording for Foxglove and rerun (mcap.h).
 //   .xml        MJCF for MuJoCo, and beside it NAME_base.csv and NAME_play.py, which plays it as the twin moves.
 // The namespace is not `export`, which is a keyword.
 #pragma once
@@ -32,23 +32,23 @@ std::vector<Path> files(const Path& file);
 
 bool for_viewers(const Path& file);  // whether it is a format in which others draw the Gaussians: .glb, .gltf, .ply
 
-// What a glTF file holds beside splats, chain and motion.
-struct GltfOptions {
-  bool mesh = false;                     // the rope as a skinned tube
-  std::vector<capture::Camera> cameras;  // as glTF's; what those lack (lens, principal point) stands in their extras
-  std::vector<twin::Property> properties = {};  // in the extras of the root node
+// What a file holds beside the rope and its motion.
+struct Options {
+  bool mesh = false;                     // glTF: the rope as a skinned tube
+  std::vector<capture::Camera> cameras;  // glTF: what its cameras lack (lens, principal point) stands in their extras
+  std::vector<twin::Property> properties = {};  // glTF: in the extras of the root node
+  Path capture = {};                            // MCAP: whose pictures it shows; empty: none
 };
 
 // Writes them. An empty `motion` means the home configuration without animation; a default-constructed `base` is at
 // rest at the world origin. Throws InputError for an unknown ending (listing the known ones) and for a twin without the
-// data that the format needs, WorkError if the file cannot be written. Other formats than
-// glTF take no notice of `options`.
+// data that the format needs, WorkError if the file cannot be written.
 void write(const twin::Twin& twin, const chain::States& motion, const trajectory::Trajectory& base, const Path& file,
-           const GltfOptions& options = {});
+           const Options& options = {});
 
 // Returns the bytes of a .glb (`binary`) or .gltf file.
 std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, const chain::States& motion,
-                 const trajectory::Trajectory& base, bool binary, const GltfOptions& options = {});
+                 const trajectory::Trajectory& base, bool binary, const Options& options = {});
 
 // The link with the largest probability of Gaussian `i`.
 int surest_link(const splat::Gaussians& gaussians, int i);

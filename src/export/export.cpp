@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cctype>
 
+#include "chainsplat/mcap.h"
+
 namespace chainsplat::exports {
 
 namespace {
@@ -28,7 +30,7 @@ void require(bool there, const Path& file, const std::string& what, const std::s
 }  // namespace
 
 const std::vector<std::string>& endings() {
-  static const std::vector<std::string> known{".glb", ".gltf", ".ply", ".csv", ".npz", ".xml"};
+  static const std::vector<std::string> known{".glb", ".gltf", ".ply", ".csv", ".npz", ".xml", ".mcap"};
   return known;
 }
 
@@ -46,10 +48,15 @@ bool for_viewers(const Path& file) {
 }
 
 void write(const twin::Twin& twin, const chain::States& motion, const trajectory::Trajectory& base, const Path& file,
-           const GltfOptions& options) {
+           const Options& options) {
   const std::string ending = ending_of(file);
   const std::vector<Path> names = files(file);
   std::vector<std::string> bytes;
+  if (ending == ".mcap") {
+    require(!motion.time.empty(), file, "the twin has no motion yet", "train it, or give one with `states`");
+    write_mcap(twin, motion, base, file, options.capture);
+    return;
+  }
   if (ending == ".csv") {
     require(!motion.time.empty(), file, "the twin has no motion yet", "train it, or give one with `states`");
     const trajectory::Trajectory at_rest = trajectory::fit({trajectory::Sample{}}, "rest");

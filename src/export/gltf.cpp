@@ -10,6 +10,7 @@
 
 #include "chainsplat/export.h"
 #include "chainsplat/image_model.h"
+#include "parts.h"
 #include "tube.h"
 
 namespace chainsplat::exports {
@@ -120,10 +121,7 @@ tinygltf::Primitive primitive(Builder& builder, const splat::Gaussians& g, const
     opacity.push_back(static_cast<float>(sigmoid(g.opacity_logit[i])));
     for (int l = 0; l < coefficients; ++l)
       for (int c = 0; c < 3; ++c) sh[l].push_back(g.sh[3 * (static_cast<std::size_t>(coefficients) * i + l) + c]);
-    for (int c = 0; c < 3; ++c) {
-      const double srgb = 0.5 + image_model::kSh0 * g.sh[3 * static_cast<std::size_t>(coefficients) * i + c];
-      color.push_back(static_cast<float>(linear_from_srgb(std::clamp(srgb, 0.0, 1.0))));
-    }
+    for (const double srgb : color_of(g, i)) color.push_back(static_cast<float>(linear_from_srgb(srgb)));
     color.push_back(opacity.back());
   }
 
@@ -226,22 +224,10 @@ tinygltf::Value about(const chain::Chain& chain, const std::vector<twin::Propert
   return tinygltf::Value(tinygltf::Value::Object{{"rope", tinygltf::Value(rope)}});
 }
 
-// Poses of all link frames at one time, each in its parent's frame (link 0: in the world).
-std::vector<math::Pose> local_poses(const chain::Chain& chain, const math::VectorX& theta, const math::Pose& base) {
-  const std::vector<math::Pose> motions = chain::link_motions(chain, theta, base);
-  std::vector<math::Pose> world, local;
-  for (int j = 0; j < chain.links(); ++j) {
-    const math::Pose home{math::Matrix3::Identity(), chain.link_start(j) * chain.direction};
-    world.push_back(motions[j] * home);
-    local.push_back(j == 0 ? world[0] : world[j - 1].inverse() * world[j]);
-  }
-  return local;
-}
-
 }  // namespace
 
 std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, const chain::States& motion,
-                 const trajectory::Trajectory& base, bool binary, const GltfOptions& options) {
+                 const trajectory::Trajectory& base, bool binary, const Options& options) {
   CHAINSPLAT_CHECK(gaussians.links == chain.links(), std::to_string(gaussians.links));
   const int links = chain.links();
   tinygltf::Model model;

@@ -6,7 +6,7 @@
 #include <numbers>
 
 #include "chainsplat/export.h"
-#include "chainsplat/image_model.h"
+#include "parts.h"
 #include "scripts.h"
 
 namespace chainsplat::exports {
@@ -106,17 +106,15 @@ Inertia inertia_of(const chain::Chain& chain, const dynamics::Parameters& p, int
 }
 
 // The mean color of a link's Gaussians, weighted by opacity; gray without any.
-std::array<double, 4> color_of(const splat::Gaussians& g, int link) {
+std::array<double, 4> color_of_link(const splat::Gaussians& g, int link) {
   std::array<double, 4> sum{0, 0, 0, 1};
   double weight = 0.0;
   for (int i = 0; i < g.count; ++i) {
     if (surest_link(g, i) != link) continue;
     const double opacity = 1.0 / (1.0 + std::exp(-static_cast<double>(g.opacity_logit[i])));
     weight += opacity;
-    for (int c = 0; c < 3; ++c)
-      sum[c] += opacity *
-                std::clamp(0.5 + image_model::kSh0 * g.sh[3 * static_cast<std::size_t>(g.sh_coefficients()) * i + c],
-                           0.0, 1.0);
+    const Vector3 color = color_of(g, i);
+    for (int c = 0; c < 3; ++c) sum[c] += opacity * color[c];
   }
   for (int c = 0; c < 3; ++c) sum[c] = weight > 0.0 ? std::round(1e3 * sum[c] / weight) / 1e3 : 0.5;
   return sum;
@@ -150,7 +148,7 @@ std::string body_of(const twin::Twin& twin, int link, const std::string& indent)
          "/>\n";
   out += inner + "<geom" + attribute("type", std::string("capsule")) +
          attribute("fromto", "0 0 0 " + list(Vector3(length * chain.direction))) +
-         attribute("size", 0.5 * chain.diameter) + attribute("rgba", color_of(twin.gaussians, link)) + "/>\n";
+         attribute("size", 0.5 * chain.diameter) + attribute("rgba", color_of_link(twin.gaussians, link)) + "/>\n";
   for (const auto& [place, weight] : kGauss) {
     if (p.air_quadratic[link - 1] <= 0.0) break;
     const double half = kHalfLength * length;

@@ -2,9 +2,9 @@
 #include <zlib.h>
 
 #include <cmath>
-#include <cstring>
 
 #include "chainsplat/export.h"
+#include "little_endian.h"
 #include "scripts.h"
 
 namespace chainsplat::exports {
@@ -12,14 +12,6 @@ namespace chainsplat::exports {
 using math::MatrixX;
 
 namespace {
-
-// Appends numbers little-endian, as zip and .npy have them.
-template <class Number>
-void put(std::string& out, Number value) {
-  char bytes[sizeof value];
-  std::memcpy(bytes, &value, sizeof value);
-  out.append(bytes, sizeof value);
-}
 
 // A zip archive of stored members, below 4 GiB; dates are 1 January 1980, so that the same twin gives the same bytes.
 class Archive {

@@ -4,7 +4,7 @@
 #include <cmath>
 #include <numbers>
 
-#include "chainsplat/image_model.h"
+#include "parts.h"
 
 namespace chainsplat::exports {
 
@@ -30,10 +30,7 @@ Vector3 color_at(const splat::Gaussians& g, const Vector3& point, double reach) 
     const double near = std::exp(-0.5 * away.squaredNorm() / (reach * reach) - 1e-3 * away.norm() / reach) /
                         (1.0 + std::exp(-static_cast<double>(g.opacity_logit[i])));
     weight += near;
-    for (int c = 0; c < 3; ++c)
-      sum[c] +=
-          near * std::clamp(0.5 + image_model::kSh0 * g.sh[3 * static_cast<std::size_t>(g.sh_coefficients()) * i + c],
-                            0.0, 1.0);
+    sum += near * color_of(g, i);
   }
   return sum / weight;
 }
@@ -75,7 +72,8 @@ class Builder {
     }
     tube.color.push_back(1.0f);
     // an unused place names link 0, as glTF asks
-    const bool first = on.share<1.0, second = on.share> 0.0;
+    const bool first = on.share < 1.0;
+    const bool second = on.share > 0.0;
     for (const int link : {first ? on.first : 0, second ? on.second : 0, 0, 0})
       tube.link.push_back(static_cast<std::uint16_t>(link));
     for (const double weight : {1.0 - on.share, on.share, 0.0, 0.0}) tube.weight.push_back(static_cast<float>(weight));

@@ -12,9 +12,11 @@
 #include <tuple>
 
 #include "chainsplat/capture.h"
+#include "chainsplat/encode.h"
 #include "chainsplat/estimation.h"
 #include "chainsplat/follow.h"
 #include "chainsplat/force.h"
+#include "chainsplat/mcap.h"
 #include "chainsplat/run_folder.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
@@ -25,7 +27,7 @@ namespace chainsplat::tools {
 namespace {
 
 struct EstimateRequest {
-  std::string run, camera, calibration, start, base, frames, centerline, solver;
+  std::string run, camera, calibration, start, base, frames, centerline, mcap, solver;
   double rate = 0.0;
   int drop = 1;
   int serve = 0;  // port of the live window; 0: none
@@ -95,7 +97,7 @@ pipeline::FollowOptions options_of(const Globals& globals, const EstimateRequest
   source.unix_time = request.start == "unix";
   if (!request.start.empty() && !source.unix_time) source.start = seconds_of(request.start);
   source.frames = capture::read_frame_range(request.frames, "--frames");
-  source.pictures = request.serve > 0;
+  source.pictures = request.serve > 0 || !request.mcap.empty();
   if (!request.base.empty()) options.base = input_path(request.base);
   if (request.solver == "newton") options.solver = pipeline::Solver::newton;
   if (request.solver == "silhouette") options.solver = pipeline::Solver::silhouette;
@@ -110,13 +112,38 @@ void check(const Globals& globals, const EstimateRequest& request) {
   if (globals.json)
     throw InputError("--json", "estimate writes one JSON line a frame, not one document", "leave it out");
   if (!request.centerline.empty()) pipeline::check_output_file(request.centerline);
-  if (request.centerline == "-")
-    throw InputError("--centerline", "standard output is for the estimates", "name a file");
+  if (!request.mcap.empty()) {
+    pipeline::check_output_file(request.mcap);
+    check_not_input(request.mcap, request.run, {request.camera, request.calibration, request.base});
+  }
+  for (const auto& [name, file] : {std::pair{"--centerline", request.centerline}, {"--mcap", request.mcap}})
+    if (file == "-") throw InputError(name, "standard output is for the estimates", "name a file");
   if (request.base == "-" && request.camera == "-")
     throw InputError("--base", "standard input is for the frames", "name a file");
 }
 
-// The live window, and what touches the rope in it.
+// What touches the rope while it is followed; nothing where its dynamics are not known.
+class Push {
+ public:
+  explicit Push(const pipeline::Follower& follower) {
+    if (!follower.twin().parameters) return;
+    live_.emplace();
+    live_->model = follower.model();
+    live_->deviations = force::deviations(follower.model(), follower.twin().estimates);
+    live_->base = [&follower](double time) { return follower.base().at(time); };
+  }
+  // None of a rope that may be somewhere else, and of the first frames.
+  std::optional<force::Estimate> update(const estimation::Estimate& e) {
+    if (!live_ || e.lost || e.doubtful) return {};
+    const Eigen::Index n = std::min(e.theta.size(), e.covariance.rows());  // 0: no covariance
+    return force::update(*live_, e.time, e.theta, e.covariance.topLeftCorner(n, n));
+  }
+
+ private:
+  std::optional<force::Live> live_;
+};
+
+// The live window.
 class Page {
  public:
   Page(const pipeline::Follower& follower, const EstimateRequest& request)
@@ -125,14 +152,9 @@ class Page {
                 request.run + ", " + request.camera),
         recorded_(request.calibration.empty()) {
     say("Live window: http://127.0.0.1:" + std::to_string(request.serve) + "/");
-    if (!follower.twin().parameters) return;
-    pushed_.emplace();
-    pushed_->model = follower.model();
-    pushed_->deviations = force::deviations(follower.model(), follower.twin().estimates);
-    pushed_->base = [this](double time) { return follower_.base().at(time); };
   }
 
-  void show(const pipeline::Followed& followed) {
+  void show(const pipeline::Followed& followed, const std::optional<force::Estimate>& pushed) {
     const estimation::Estimate& e = followed.estimate;
     const twin::Twin& twin = follower_.twin();
     const capture::Camera& camera = follower_.cameras()[0];
@@ -142,11 +164,7 @@ class Page {
     shown.iou = e.iou, shown.residual = e.residual, shown.seen = e.seen, shown.status = estimation::status(e);
     shown.line = recorded_line(
         camera, chain::nodes(twin.chain, chain::link_motions(twin.chain, e.theta, follower_.base().pose(e.time))));
-    if (pushed_ && !e.lost && !e.doubtful) {
-      const Eigen::Index n = std::min(e.theta.size(), e.covariance.rows());  // 0: no covariance
-      if (const auto f = force::update(*pushed_, e.time, e.theta, e.covariance.topLeftCorner(n, n)))
-        show_force(*f, twin, follower_.model(), camera, shown);
-    }
+    if (pushed) show_force(*pushed, twin, follower_.model(), camera, shown);
     if (!followed.frame.picture.pixels.empty()) shown.picture = &followed.frame.picture;
     if (!followed.views.empty()) shown.view = &followed.views[0];
     window_.show(shown);
@@ -159,17 +177,30 @@ class Page {
   const pipeline::Follower& follower_;
   Window window_;
   bool recorded_;
-  std::optional<force::Live> pushed_;
   std::optional<double> first_time_;  // s
   double begun_ = core::seconds_now();
 };
+
+void record(const pipeline::Followed& followed, const pipeline::Follower& follower,
+            const std::optional<force::Estimate>& pushed, exports::McapRecording& recording) {
+  constexpr int kQuality = 80;  // of JPEG
+  const estimation::Estimate& e = followed.estimate;
+  recording.pose(e.time, follower.base().pose(e.time), e.theta, e.thetadot);
+  recording.status(e.time, estimation::status(e), e.centerline_sigma, followed.latency);
+  if (pushed)
+    recording.force(pushed->time, pushed->point, pushed->force, pushed->sigma, pushed->touching,
+                    follower.twin().known_mass);
+  if (const capture::Image8& picture = followed.frame.picture; !picture.pixels.empty())
+    recording.picture(e.time, 0, capture::jpeg(picture, kQuality), false);
+}
 
 // What a run leaves behind at its end, however it ends.
 struct Ending {
   const EstimateRequest& request;
   const pipeline::Follower& follower;
   Tally tally;
-  chain::States states;  // of all frames, where a centerline is to be written
+  chain::States states = {};  // of all frames, where a centerline is to be written
+  std::optional<exports::McapRecording> recording = {};
 
   void keep(const pipeline::Followed& followed) {
     count(tally, followed.estimate, followed.latency);
@@ -177,7 +208,9 @@ struct Ending {
     states.time.push_back(followed.estimate.time);
     states.theta.push_back(followed.estimate.theta);
   }
-  void write() const {
+  void write() {
+    if (recording) recording->finish();
+    recording.reset();
     if (!request.centerline.empty() && !states.time.empty())
       write_result(request.centerline, twin::centerline_csv(follower.twin().chain, states, follower.base()));
   }
@@ -195,14 +228,19 @@ void estimate(const Globals& globals, const EstimateRequest& request) {
   pipeline::Follower follower(request.run, options);
   std::optional<Page> page;
   if (request.serve > 0) page.emplace(follower, request);
-  Ending ending{request, follower, {}, {}};
+  std::optional<Push> push;
+  if (page || !request.mcap.empty()) push.emplace(follower);
+  Ending ending{request, follower, {}};
+  if (!request.mcap.empty()) ending.recording.emplace(request.mcap, follower.twin().chain, follower.cameras());
   watch_signals();  // a camera never ends by itself
   try {
     follower.follow([&](const pipeline::Followed& followed) {
       ending.keep(followed);  // what cannot be printed is kept nevertheless
       std::cout << estimation::to_json(followed.estimate, followed.latency, request.covariance) << "\n";
       flush_output();
-      if (page) page->show(followed);
+      const std::optional<force::Estimate> pushed = push ? push->update(followed.estimate) : std::nullopt;
+      if (ending.recording) record(followed, follower, pushed, *ending.recording);
+      if (page) page->show(followed, pushed);
     });
   } catch (const Interrupted&) {
     ending.write();
@@ -263,6 +301,10 @@ void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job) {
   command
       ->add_option("--centerline", request->centerline, "Also write the world points of the grasp, joints and free end")
       ->type_name("FILE.csv");
+  command
+      ->add_option("--mcap", request->mcap,
+                   "Also a recording for Foxglove or rerun: pictures, transforms, joints, trust, force")
+      ->type_name("FILE.mcap");
   command
       ->add_option("--serve", request->serve,
                    "Show picture, chain, trust and latency in a browser at http://127.0.0.1:PORT/; recorded frames at\n"

@@ -76,7 +76,7 @@ void report(const Globals& globals, const ReportRequest& request) {
 
 struct ExportRequest {
   std::string run, states, base, out;
-  bool force = false, raw = false, mesh = false;
+  bool force = false, raw = false, mesh = false, no_pictures = false;
 };
 
 void export_twin(const Globals& globals, const ExportRequest& request) {
@@ -97,11 +97,17 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
   const trajectory::Trajectory base = !request.base.empty() ? pipeline::read_base(input_path(request.base))
                                       : !beside.empty()     ? pipeline::read_base(beside)
                                                             : pipeline::own_base(request.run);
-  exports::GltfOptions options;
+  exports::Options options;
   options.mesh = request.mesh;
   if (twin.parameters)
     options.properties =
         twin::properties(dynamics::make_model(twin.chain, *twin.parameters), twin.estimates, twin.known_mass);
+  if (files.front().extension() == ".mcap" && !request.no_pictures) {
+    if (const std::optional<capture::Capture> recording = pipeline::own_recording(twin, request.run))
+      options.capture = recording->folder;
+    else
+      core::warn(request.run + ": its capture is not there any more; the recording shows no pictures");
+  }
   if (twin.gaussians.count > 0 && exports::for_viewers(request.out)) {
     const std::optional<capture::Capture> recording = pipeline::own_recording(twin, request.run);
     if (recording) options.cameras = recording->cameras;
@@ -212,6 +218,7 @@ void add_result_commands(CLI::App& app, const Globals& globals, Job& job) {
   exporter->add_flag("--mesh", exporting->mesh, "In glTF also a skinned tube, for viewers that draw no splats");
   exporter->add_flag("--raw", exporting->raw,
                      "Gaussians as trained, without what our renderer adds on the image and other viewers do not");
+  exporter->add_flag("--no-pictures", exporting->no_pictures, "In MCAP without what the capture's cameras saw");
   exporter->add_flag("--force", exporting->force, "Replace files that are there");
   exporter->callback(
       [&globals, &job, exporting] { job = [&globals, exporting] { export_twin(globals, *exporting); }; });
