@@ -6,6 +6,7 @@
 #include "src/recognition/modes.h"
 #include "src/recognition/place_gaussians.h"
 #include "src/recognition/step_watch.h"
+#include "src/recognition/unseen.h"
 
 namespace chainsplat::recognition {
 
@@ -280,6 +281,13 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
         drawn.push_back({&capture.views[training.views[i]], &last_drawn[i].motions, &last_drawn[i].picture});
       add_and_prune(gaussians, chain, capture, drawn, budget, added_a_round, random);
       if (round + 1 == kShRound && gaussians.degree == 0) gaussians.resize(gaussians.count, gaussians.links, 1);
+    } else {
+      std::vector<Viewpoint> viewpoints;
+      for (const splat::ViewSpec& spec : specs)
+        viewpoints.push_back({spec.camera->world_from_camera.translation, spec.motions});
+      const int unseen = finish_unseen(chain, viewpoints, gaussians);
+      core::say_more("recognize: " + std::to_string(unseen) + " of " + std::to_string(gaussians.count) +
+                     " Gaussians lie where no camera saw the rope; their colors are guessed");
     }
   }
   // every frame: start from the silhouettes plus the correction of the training frames around it
@@ -296,8 +304,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     if (std::find(training.frames.begin(), training.frames.end(), k) == training.frames.end())
       states.theta[k] = coarse[k] + chain::interpolate(correction, states.time[k]);
   }
-  result.summary =
-      refine_all(engine, chain, capture, frames, gaussians, all_frames, kFinalIterations, prior, states);
+  result.summary = refine_all(engine, chain, capture, frames, gaussians, all_frames, kFinalIterations, prior, states);
   differentiate(states);
   result.gaussians = std::move(gaussians);
   result.states = std::move(states);
