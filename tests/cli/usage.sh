@@ -13,6 +13,7 @@ for command in train recognize identify new calibrate import check mask rollout 
   run "$command" --help
   expect_code 0 "$command --help"
   expect_output "$command" "$command --help"
+  awk 'length > 80 { exit 1 }' "$work/stdout" || fail "$command --help: a line is wider than 80 columns"
   run --help
 done
 

@@ -9,6 +9,7 @@
 
 #include "chainsplat/run_folder.h"
 #include "cli.h"
+#include "help.h"
 
 using namespace chainsplat;
 
@@ -79,7 +80,7 @@ int run(int argc, char** argv) {
   app.set_version_flag("--version", "chainsplat " CHAINSPLAT_VERSION, "Print the version and leave");
   app.require_subcommand(1);
   app.fallthrough();
-  app.get_formatter()->column_width(34);
+  app.formatter(std::make_shared<tools::Help>());
   app.add_option("--device", globals.device,
                  "Vulkan device: its number or a part of its name (see doctor; environment: CHAINSPLAT_DEVICE)")
       ->type_name("N|NAME");
@@ -110,15 +111,13 @@ int run(int argc, char** argv) {
   tools::add_mask_command(app, globals, job);
   tools::add_bench_command(app, globals, job);
   tools::add_describe_commands(app, job);
-  for (CLI::App* command : app.get_subcommands({})) {
-    command->get_formatter()->column_width(34);
+  for (CLI::App* command : app.get_subcommands({}))
     command->footer(
         "Global options (--device, --threads, --seed, -q, -v, --log, --no-progress, --json): chainsplat --help");
-  }
   app.footer(
       "Lengths in meters, angles in radians, time in seconds, mass in kilograms, forces in newtons.\n"
       "Exit codes: 0 done; 1 the work failed, what exists is kept; 2 the request or its input is wrong, nothing "
-      "written;\n"
+      "written; "
       "130, 143 interrupted, a checkpoint was left (SIGUSR1: the same and 0); 141 nobody reads the output any more.");
   try {
     app.parse(argc, argv);
