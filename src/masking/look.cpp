@@ -233,15 +233,39 @@ Background median_background(std::span<const Picture> frames, std::span<const Tu
   return out;
 }
 
-Background empty_scene(const capture::Image8& picture) {
+Background empty_scene(const capture::Image8& empty, const Picture& now) {
   constexpr double kNoise = 4.0;  // gray levels, of one picture
   Background out;
-  const std::size_t pixels = static_cast<std::size_t>(picture.width) * picture.height;
+  const std::size_t pixels = static_cast<std::size_t>(empty.width) * empty.height;
+  const int step = empty.channels >= 3 ? 1 : 0;
   out.rgb.resize(3 * pixels);
-  for (std::size_t i = 0; i < pixels; ++i)
-    for (int c = 0; c < 3; ++c)
-      out.rgb[3 * i + c] = picture.pixels[picture.channels * i + (picture.channels >= 3 ? c : 0)];
+  for (int c = 0; c < 3; ++c) {
+    // the median of the brightness of all places that are neither dark nor overexposed; the rope covers few of them
+    constexpr int kDark = 16, kBright = 250;
+    constexpr std::size_t kEvery = 7;
+    std::vector<double> ratios;
+    for (std::size_t i = 0; i < pixels; i += kEvery) {
+      const int before = empty.pixels[empty.channels * i + static_cast<std::size_t>(step * c)];
+      const int after = now.pixels[now.channels * i + static_cast<std::size_t>(c)];
+      if (before > kDark && before < kBright && after < kBright) ratios.push_back(static_cast<double>(after) / before);
+    }
+    const double exposure = ratios.empty() ? 1.0 : math::median(ratios);
+    for (std::size_t i = 0; i < pixels; ++i)
+      out.rgb[3 * i + c] = static_cast<std::uint8_t>(
+          std::min(255.0, exposure * empty.pixels[empty.channels * i + static_cast<std::size_t>(step * c)] + 0.5));
+  }
   out.noise.assign(pixels, noise_level(kNoise));
+  return out;
+}
+
+capture::Image8 difference(const capture::Image8& empty, const Picture& now) {
+  constexpr int kMagnified = 4;  // noise stays within one coarse color, a rope that is hardly seen does not
+  const Background background = empty_scene(empty, now);
+  capture::Image8 out{empty.width, empty.height, 3, std::vector<std::uint8_t>(background.rgb.size())};
+  for (std::size_t i = 0; i < background.noise.size(); ++i)
+    for (std::size_t c = 0; c < 3; ++c)
+      out.pixels[3 * i + c] = static_cast<std::uint8_t>(
+          std::min(255, kMagnified * std::abs(now.pixels[now.channels * i + c] - background.rgb[3 * i + c])));
   return out;
 }
 

@@ -47,8 +47,12 @@ void count_colors(Look& appearance, const Picture& picture, const Tube& tube, co
 // empty when unknown.
 Background median_background(std::span<const Picture> frames, std::span<const Tube> covered, int least);
 
-// Returns the background that one picture of the scene without the rope shows.
-Background empty_scene(const capture::Image8& picture);
+// Returns the background that one picture of the scene without the rope shows, with the exposure of `now`, which shows
+// the rope: cameras choose it anew.
+Background empty_scene(const capture::Image8& empty, const Picture& now);
+// Returns `now` without what the empty scene shows, for the search from scratch: differences by channel, magnified,
+// RGB.
+capture::Image8 difference(const capture::Image8& empty, const Picture& now);
 
 // Returns a standard deviation in gray levels as Background stores it.
 std::uint8_t noise_level(double deviation);

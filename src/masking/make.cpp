@@ -105,7 +105,8 @@ struct Samples {
 struct Moment {
   double time = 0.0;
   std::vector<Shot> shots;
-  std::vector<int> cameras;  // by shot
+  std::vector<int> cameras;                  // by shot
+  std::vector<capture::Image8> differences;  // that shots show where the empty scene is known
 };
 
 // The moments of the first camera that has samples, together with the other cameras' pictures of that moment.
@@ -114,7 +115,7 @@ std::vector<Moment> moments_of(const capture::Capture& scene, const std::vector<
   const auto first = std::find_if(samples.begin(), samples.end(), [](const Samples& s) { return !s.frames.empty(); });
   std::vector<Moment> moments;
   for (const View& one : first->frames) {
-    Moment moment{one.time, {}, {}};
+    Moment moment{one.time, {}, {}, {}};
     for (std::size_t c = 0; c < samples.size(); ++c) {
       const std::vector<View>& frames = samples[c].frames;
       const auto nearest = std::min_element(frames.begin(), frames.end(), [&](const View& a, const View& b) {
@@ -254,9 +255,20 @@ bool pointed_at(const Options& options, int camera, int frame) {
                      [&](const PointHint& hint) { return hint.camera == camera && hint.frame == frame; });
 }
 
+// Where the scene without the rope is known, a moment's shots show what differs from it.
+void take_away_scene(const Options& options, Moment& moment) {
+  moment.differences.reserve(moment.shots.size());
+  for (std::size_t k = 0; k < moment.shots.size(); ++k)
+    if (const Image8* const empty = empty_of(options, moment.cameras[k])) {
+      const Image8& shown = moment.differences.emplace_back(difference(*empty, moment.shots[k].picture));
+      moment.shots[k].picture = {shown.pixels.data(), shown.width, shown.height, 3};
+    }
+}
+
 // Adds the user's help to a moment's shots.
 void add_hints(const Options& options, const std::vector<capture::Camera>& recorded,
                const std::vector<Samples>& samples, Moment& moment) {
+  take_away_scene(options, moment);
   for (std::size_t k = 0; k < moment.shots.size(); ++k) {
     const int c = moment.cameras[k];
     int frame = 0;
@@ -360,7 +372,8 @@ Summary make_stills(const Recording& recording, const Options& options, const ch
     std::vector<double> widths;
     for (int c = 0; c < cameras; ++c) {
       looks[c] = {};
-      if (empty_of(options, c)) looks[c].background = empty_scene(*empty_of(options, c));
+      if (empty_of(options, c) && !stills[c].empty())
+        looks[c].background = empty_scene(*empty_of(options, c), picture_of(*stills[c].front().view));
       for (Still& still : stills[c]) {
         const View& view = *still.view;
         const bool by_ribbon = round && still.ribbon.axis.points.size() > 1;
@@ -466,8 +479,8 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
       }
       settle(looks[c]);
       looks[c].background =
-          empty_of(options, c)
-              ? empty_scene(*empty_of(options, c))
+          empty_of(options, c) && !pictures.empty()
+              ? empty_scene(*empty_of(options, c), pictures.front())
               : median_background(pictures, tubes,
                                   std::max(kLeastSamples, static_cast<int>(kLeastUncovered * tubes.size())));
     }
