@@ -19,7 +19,9 @@ int main(int count, char** arguments) {
   try {
     const pipeline::Rope rope = pipeline::load_rope(arguments[1]);
     capture::LoadOptions load;
-    load.camera = capture::load(arguments[2], {.images = false}).cameras.front().name;
+    load.images = false;
+    load.camera = capture::load(arguments[2], load).cameras.front().name;
+    load.images = true;
     const capture::Capture recorded = capture::load(arguments[2], load);
 
     pipeline::LiveBase gripper;
