@@ -27,6 +27,9 @@ namespace chainsplat::exports {
 // The endings that write() knows: ".glb", ".gltf", ...
 const std::vector<std::string>& endings();
 
+// Of a file, in lower case. Throws InputError for one that is not known, with those that are.
+std::string ending(const Path& file);
+
 // All files that write() makes for this one, itself first. Throws InputError for an unknown ending.
 std::vector<Path> files(const Path& file);
 

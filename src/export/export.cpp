@@ -9,17 +9,6 @@ namespace chainsplat::exports {
 
 namespace {
 
-// The ending in lower case. Throws InputError for one that is not known.
-std::string ending_of(const Path& file) {
-  std::string ending = file.extension().string();
-  std::transform(ending.begin(), ending.end(), ending.begin(), [](unsigned char c) { return std::tolower(c); });
-  if (std::find(endings().begin(), endings().end(), ending) != endings().end()) return ending;
-  std::string known;
-  for (const std::string& each : endings()) known += (known.empty() ? "" : ", ") + each;
-  throw InputError(file.string(), ending.empty() ? "has no ending" : "its ending '" + ending + "' is not known",
-                   "choose one of " + known);
-}
-
 // NAME.xml with `what` instead of its ending: NAME_play.py.
 Path beside(Path file, const std::string& what) { return file.replace_filename(file.stem().string() + what); }
 
@@ -34,45 +23,55 @@ const std::vector<std::string>& endings() {
   return known;
 }
 
+std::string ending(const Path& file) {
+  std::string found = file.extension().string();
+  std::transform(found.begin(), found.end(), found.begin(), [](unsigned char c) { return std::tolower(c); });
+  if (std::find(endings().begin(), endings().end(), found) != endings().end()) return found;
+  std::string known;
+  for (const std::string& each : endings()) known += (known.empty() ? "" : ", ") + each;
+  throw InputError(file.string(), found.empty() ? "has no ending" : "its ending '" + found + "' is not known",
+                   "choose one of " + known);
+}
+
 std::vector<Path> files(const Path& file) {
-  const std::string ending = ending_of(file);
-  if (ending == ".csv") return {file, beside(file, ".centerline.csv")};
-  if (ending == ".npz") return {file, beside(file, ".py")};
-  if (ending == ".xml") return {file, beside(file, "_base.csv"), beside(file, "_play.py")};
+  const std::string kind = ending(file);
+  if (kind == ".csv") return {file, beside(file, ".centerline.csv")};
+  if (kind == ".npz") return {file, beside(file, ".py")};
+  if (kind == ".xml") return {file, beside(file, "_base.csv"), beside(file, "_play.py")};
   return {file};
 }
 
 bool for_viewers(const Path& file) {
-  const std::string ending = ending_of(file);
-  return ending == ".glb" || ending == ".gltf" || ending == ".ply";
+  const std::string kind = ending(file);
+  return kind == ".glb" || kind == ".gltf" || kind == ".ply";
 }
 
 void write(const twin::Twin& twin, const chain::States& motion, const trajectory::Trajectory& base, const Path& file,
            const Options& options) {
-  const std::string ending = ending_of(file);
+  const std::string kind = ending(file);
   const std::vector<Path> names = files(file);
   std::vector<std::string> bytes;
-  if (ending == ".mcap") {
+  if (kind == ".mcap") {
     require(!motion.time.empty(), file, "the twin has no motion yet", "train it, or give one with `states`");
     write_mcap(twin, motion, base, file, options.capture);
     return;
   }
-  if (ending == ".csv") {
+  if (kind == ".csv") {
     require(!motion.time.empty(), file, "the twin has no motion yet", "train it, or give one with `states`");
     const trajectory::Trajectory at_rest = trajectory::fit({trajectory::Sample{}}, "rest");
     bytes = {twin::states_csv(motion),
              twin::centerline_csv(twin.chain, motion, base.samples().empty() ? at_rest : base)};
-  } else if (ending == ".npz") {
+  } else if (kind == ".npz") {
     bytes = {npz(twin, motion, base), npz_script()};
-  } else if (ending == ".xml") {
+  } else if (kind == ".xml") {
     require(twin.parameters && twin.initial, file, "the twin's dynamics are not identified",
             "run 'chainsplat identify'");
     MujocoFiles made = mujoco(twin, base, file.stem().string());
     bytes = {std::move(made.model), std::move(made.base), std::move(made.player)};
   } else {
     require(twin.gaussians.count > 0, file, "the twin has no Gaussians yet", "recognize it first, or export .csv");
-    bytes = {ending == ".ply" ? twin::gaussians_ply(twin.gaussians)
-                              : gltf(twin.gaussians, twin.chain, motion, base, ending == ".glb", options)};
+    bytes = {kind == ".ply" ? twin::gaussians_ply(twin.gaussians)
+                              : gltf(twin.gaussians, twin.chain, motion, base, kind == ".glb", options)};
   }
   for (std::size_t i = 0; i < names.size(); ++i) core::write_file(names[i], bytes[i]);
 }

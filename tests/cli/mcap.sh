@@ -8,6 +8,8 @@ run train "$demo" -o "$work/run" --frames 0:40
 expect_code 0 train
 run export "$work/run" -o "$work/run.mcap"
 expect_code 0 'export .mcap'
+run export "$work/run" -o "$work/RUN.MCAP"
+cmp -s "$work/run.mcap" "$work/RUN.MCAP" || fail 'the same recording twice has other bytes, or its ending in capitals other content'
 run export "$work/run" -o "$work/run.csv"
 run estimate "$work/run" --camera "$demo:cam0" --mcap "$work/live.mcap"
 expect_code 0 'estimate --mcap'

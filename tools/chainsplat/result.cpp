@@ -89,7 +89,7 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
       throw InputError(file.string(), "is there already", "name another file, or give --force to replace it");
   }
   twin::Twin twin = pipeline::load_twin(request.run);
-  if (files.front().extension() == ".npz")
+  if (exports::ending(request.out) == ".npz")
     twin.states.covariance = pipeline::read_covariances(Path(request.run) / pipeline::kCovarianceFile, twin.states);
   const chain::States motion =
       request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
@@ -102,7 +102,7 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
   if (twin.parameters)
     options.properties =
         twin::properties(dynamics::make_model(twin.chain, *twin.parameters), twin.estimates, twin.known_mass);
-  if (files.front().extension() == ".mcap" && !request.no_pictures) {
+  if (exports::ending(request.out) == ".mcap" && !request.no_pictures) {
     if (const std::optional<capture::Capture> recording = pipeline::own_recording(twin, request.run))
       options.capture = recording->folder;
     else
