@@ -71,7 +71,7 @@ void write(const twin::Twin& twin, const chain::States& motion, const trajectory
   } else {
     require(twin.gaussians.count > 0, file, "the twin has no Gaussians yet", "recognize it first, or export .csv");
     bytes = {kind == ".ply" ? twin::gaussians_ply(twin.gaussians)
-                              : gltf(twin.gaussians, twin.chain, motion, base, kind == ".glb", options)};
+                            : gltf(twin.gaussians, twin.chain, motion, base, kind == ".glb", options)};
   }
   for (std::size_t i = 0; i < names.size(); ++i) core::write_file(names[i], bytes[i]);
 }
