@@ -65,9 +65,9 @@ enum class Type {
 };
 
 struct Field {
-  int number;
-  const char* name;
-  Type type;
+  int number = 0;
+  const char* name = "";
+  Type type = Type::message;
   const char* type_name = "";  // of a message or an enumeration: ".foxglove.Vector3"
   bool repeated = false;
 };
