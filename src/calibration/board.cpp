@@ -118,7 +118,8 @@ std::string board_svg(const Board& board) {
   };
   const double cell = board.tag_size / kCells;
   for (int n = 0; n < board.tags(); ++n) {
-    const double x0 = left + n % board.columns * pitch, y0 = top + n / board.columns * pitch;
+    const int row = n / board.columns, column = n % board.columns;
+    const double x0 = left + column * pitch, y0 = top + row * pitch;
     const auto black = black_cells(board.first_id + n);
     svg += "<path id=\"tag" + std::to_string(board.first_id + n) + "\" d=\"";
     for (int y = 0; y < kCells; ++y)

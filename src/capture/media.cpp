@@ -16,7 +16,8 @@ namespace {
 template <class Library>
 const Library& load_library(const std::string& name) {
   const std::string file = name + ".so";
-  constexpr const char* kMend = "install chainsplat again, with the packages that it needs";
+  constexpr const char* kMend =
+      "install chainsplat with the packages that it needs; a wheel may be without readers of files: give arrays";
   void* const library = ::dlopen(file.c_str(), RTLD_LAZY | RTLD_LOCAL);
   const void* const table = library ? ::dlsym(library, name.c_str()) : nullptr;
   if (!table) {

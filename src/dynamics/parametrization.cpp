@@ -39,10 +39,10 @@ bool second(const chain::Chain& chain, int, int angle) { return angle == 1 && ch
 bool twists(const chain::Chain& chain, int, int angle) { return chain::is_twist(chain, angle); }
 
 struct Row {
-  Quantity quantity;
-  const char *name, *unit;
-  double scale;
-  Per per;
+  Quantity quantity = Quantity::none;
+  const char *name = "", *unit = "";
+  double scale = 1.0;
+  Per per = Per::rope;
   How how = How::addition;
   Array arrays[2] = {};
   bool (*acts)(const chain::Chain& chain, int index, int element) = own;

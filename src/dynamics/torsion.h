@@ -49,8 +49,9 @@ class Torsion {
  private:
   // Generalized forces dE/d. + dR/d.' by (alpha, beta, chi, tau), with their slopes by these and by their rates.
   struct Joint {
-    double k[2], d[2], rest[2], twist, twist_damping;     // N m/rad, N m s/rad, rad, N m/rad, N m s/rad
-    double by_damping, by_stiffness;                      // of twist_damping over twist, by each of d and of k
+    double k[2] = {}, d[2] = {}, rest[2] = {};            // N m/rad, N m s/rad, rad
+    double twist = 0.0, twist_damping = 0.0;              // N m/rad, N m s/rad
+    double by_damping = 0.0, by_stiffness = 0.0;          // of twist_damping over twist, by each of d and of k
     double angle[2] = {}, rate[2] = {}, rolled[2] = {};   // rolled: the rest angles
     double own = 0.0, delta[2] = {}, bend[3] = {};        // delta_j, by alpha and beta, and twice by aa, ab, bb
     double twisted = 0.0;                                 // tau

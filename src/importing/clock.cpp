@@ -55,7 +55,8 @@ std::vector<SeenRope> seen_ropes(const Media& masks, const MaskRule& rule, doubl
     std::vector<Eigen::Vector2f> points;
     for (std::size_t i = 0; i < mask.pixels.size(); ++i)
       if (mask.pixels[i] >= image_model::kObjectMask) {
-        const Vector2 at(static_cast<double>(i % mask.width) + 0.5, static_cast<double>(i / mask.width) + 0.5);
+        const std::size_t row = i / mask.width, column = i % mask.width;
+        const Vector2 at(static_cast<double>(column) + 0.5, static_cast<double>(row) + 0.5);
         points.push_back(capture::undistort(camera, at).cast<float>());
       }
     if (points.empty()) return;

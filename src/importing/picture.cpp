@@ -24,7 +24,7 @@ struct Canvas {
   capture::Image8 image;
   const capture::Camera& camera;
   math::Pose camera_from_world;
-  int radius;  // px, of lines
+  int radius = 0;  // px, of lines
 
   void dot(const Vector2& at, int size, const Color& color) {
     if (!at.allFinite() || at.cwiseAbs().maxCoeff() > 1e6) return;

@@ -2,7 +2,6 @@
 
 namespace chainsplat::silhouette {
 
-using capture::Correction;
 using math::MatrixX;
 using math::Pose;
 using math::Vector6;

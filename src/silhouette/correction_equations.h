@@ -26,8 +26,8 @@ using SharedRow = Eigen::Matrix<double, kSharedOfView, 1>;
 
 // Where the quantities of one camera's views stand among the shared unknowns, which are in units of their deviations.
 struct SharedPlaces {
-  std::array<int, kSharedOfView> at;   // -1: held
-  SharedRow unit = SharedRow::Zero();  // deviation of the unknown in the quantity's unit; 0: held
+  std::array<int, kSharedOfView> at{};  // -1: held
+  SharedRow unit = SharedRow::Zero();   // deviation of the unknown in the quantity's unit; 0: held
 };
 
 struct CorrectedFrame {

@@ -9,7 +9,6 @@
 namespace chainsplat::silhouette {
 
 using math::MatrixX;
-using math::Pose;
 using math::VectorX;
 
 namespace {

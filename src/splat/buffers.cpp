@@ -17,7 +17,7 @@ void Engine::State::need(Buffer& buffer, std::size_t bytes, const char* name) {
 
 void Engine::State::release_view_buffers() {
   commands.wait();
-#define ADDRESS(buffer) &buffer,
+#define ADDRESS(buffer) &(buffer),
   for (Buffer* buffer : {VIEW_BUFFERS(ADDRESS)}) *buffer = Buffer();
   instance_capacity = 0;
 }

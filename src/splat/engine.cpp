@@ -48,7 +48,7 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   clamp_margin = settings.projection_clamp ? image_model::kClampMargin : kNoClamp;
   range_limit = static_cast<std::size_t>(std::min<std::uint64_t>(device_info.max_storage_range, 1ull << 30));
 
-#define NAMED(buffer) {#buffer, &buffer},
+#define NAMED(buffer) {#buffer, &(buffer)},
   // clang-format off
   bindings = {REPLICA_BUFFERS(NAMED) VIEW_BUFFERS(NAMED)  // and those that bind() and scan() set
               {"parameters", nullptr}, {"gradient", nullptr},

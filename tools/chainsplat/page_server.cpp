@@ -32,7 +32,7 @@ bool is_this_host(std::string_view host, int port) {
 
 // How many Host headers there are, and how many of them name this machine.
 struct Hosts {
-  int port, all = 0, known = 0;
+  int port = 0, all = 0, known = 0;
 };
 
 MHD_Result look_at_header(void* context, MHD_ValueKind, const char* key, const char* value) {
@@ -67,7 +67,7 @@ MHD_Result send(MHD_Connection* connection, PageAnswer&& given) {
 }  // namespace
 
 struct PageServer::Implementation {
-  int port;
+  int port = 0;
   PageResponder respond;
   std::mutex mutex;
   std::condition_variable news;

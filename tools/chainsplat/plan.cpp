@@ -24,7 +24,6 @@ namespace chainsplat::tools {
 namespace {
 
 using Json = nlohmann::ordered_json;
-using planning::Axis;
 
 struct PlanRequest {
   std::string run, out, axes, initial, state_from, terminal, hit, horizon = "3", window = "smooth";
