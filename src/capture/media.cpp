@@ -17,7 +17,7 @@ template <class Library>
 const Library& load_library(const std::string& name) {
   const std::string file = name + ".so";
   constexpr const char* kMend =
-      "install chainsplat with the packages that it needs; a wheel may be without readers of files: give arrays";
+      "install chainsplat-media, or what chainsplat was built with; where only Python has it, give pictures as arrays";
   void* const library = ::dlopen(file.c_str(), RTLD_LAZY | RTLD_LOCAL);
   const void* const table = library ? ::dlsym(library, name.c_str()) : nullptr;
   if (!table) {
