@@ -55,9 +55,10 @@ namespace core {
 // Reports that the library has broken one of its own invariants, which is a defect and never the user's mistake. Throws
 // std::logic_error with the file, the line, the condition and `values`.
 [[noreturn]] void check_failed(const char* condition, const char* file, int line, const std::string& values);
-#define CHAINSPLAT_CHECK(condition, values)                                                       \
-  do {                                                                                            \
-    if (!(condition)) ::chainsplat::core::check_failed(#condition, __FILE__, __LINE__, (values)); \
+// The file's bare name: where the source lay must not change the program's bytes.
+#define CHAINSPLAT_CHECK(condition, values)                                                            \
+  do {                                                                                                 \
+    if (!(condition)) ::chainsplat::core::check_failed(#condition, __FILE_NAME__, __LINE__, (values)); \
   } while (false)
 
 // One state of a long task, sent to the listener (terminal bar, log file). Numbers that do not apply are NaN.
