@@ -11,7 +11,7 @@
 
 #include "chainsplat/calibration.h"
 
-namespace chainsplat::tests {
+namespace chainsplat::test {
 
 struct Rectangle {
   double x0, y0, x1, y1;  // board's frame: m, x right, y up, from the middle of all tags
@@ -148,4 +148,4 @@ class BoardRenderer {
   double half_x_ = 0.0, half_y_ = 0.0, margin_ = 0.0;
 };
 
-}  // namespace chainsplat::tests
+}  // namespace chainsplat::test

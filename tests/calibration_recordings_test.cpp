@@ -9,12 +9,14 @@
 
 #include "board_renderer.h"
 #include "chainsplat/calibration.h"
+#include "error_of.h"
 
 using namespace chainsplat;
 using namespace chainsplat::calibration;
 using math::Matrix3;
 using math::Pose;
 using math::Vector3;
+using test::error_of;
 using Json = nlohmann::ordered_json;
 
 namespace {
@@ -28,15 +30,6 @@ struct Folder {
   Folder() { std::filesystem::create_directories(path); }
   ~Folder() { std::filesystem::remove_all(path); }
 };
-
-std::string message(const std::function<void()>& act) {
-  try {
-    act();
-  } catch (const Error& error) {
-    return error.what();
-  }
-  return "";
-}
 
 bool has(const Calibration& result, const std::string& code) {
   return std::any_of(result.findings.begin(), result.findings.end(), [&](const Finding& f) { return f.code == code; });
@@ -79,7 +72,7 @@ const Pose kFlangeFromBoard{math::exp_so3({0.05, -0.08, 0.3}), {0.012, -0.02, 0.
 void render(const Path& folder, const capture::Camera& camera, const Board& board, int frames,
             const std::function<Pose(int)>& world_from_board, std::uint64_t seed) {
   std::filesystem::create_directories(folder);
-  const tests::BoardRenderer renderer(camera, board);
+  const test::BoardRenderer renderer(camera, board);
   core::parallel_for(frames, [&](std::int64_t i) {
     core::Random random(seed + 1000 * static_cast<std::uint64_t>(i));
     const Pose camera_from_board = camera.world_from_camera.inverse() * world_from_board(static_cast<int>(i));
@@ -196,7 +189,7 @@ TEST_CASE("a robot that moves a board: lenses, poses, the board on the flange, a
   {
     Options late = options;
     for (CameraRequest& request : late.cameras) request.start = 500.0;
-    const std::string line = message([&] { calibrate(folder.path / "late", late); });
+    const std::string line = error_of([&] { calibrate(folder.path / "late", late); });
     CHECK(line.find("robot.tum: covers 0 to 10 s, and cam0 is recorded from 500 to 507.4 s") != std::string::npos);
     CHECK(!std::filesystem::exists(folder.path / "late"));
   }
@@ -207,13 +200,13 @@ TEST_CASE("a robot that moves a board: lenses, poses, the board on the flange, a
     core::write_file(folder.path / "other.json", write_board(other));
     Options of_other = options;
     of_other.board = folder.path / "other.json";
-    const std::string line = message([&] { calibrate(folder.path / "other", of_other); });
+    const std::string line = error_of([&] { calibrate(folder.path / "other", of_other); });
     CHECK(line.find("cam0 never sees the board in") != std::string::npos);
     CHECK(line.find("but the tags 0, 1, 2, 3, 4, 5, 6, 7, ..., and the board has 100 to 111") != std::string::npos);
   }
   // what is there is not replaced unasked
-  CHECK(message([&] { calibrate(folder.path / "out", options); }).find("exists already") != std::string::npos);
-  CHECK(message([&] { calibrate(folder.path, options); }).find("is no calibration") != std::string::npos);
+  CHECK(error_of([&] { calibrate(folder.path / "out", options); }).find("exists already") != std::string::npos);
+  CHECK(error_of([&] { calibrate(folder.path, options); }).find("is no calibration") != std::string::npos);
 }
 
 TEST_CASE("a robot that turns the board about one axis only does not tell where the cameras are, and it is said") {
@@ -318,12 +311,12 @@ TEST_CASE("cameras that never share a view, and poor views, are said") {
       },
       1);
   options.cameras[1].images = folder.path / "empty";
-  CHECK(message([&] {
+  CHECK(error_of([&] {
           calibrate(folder.path / "none", options);
         }).find("never sees the board in 2 frames, and no other tag") != std::string::npos);
   options.cameras[1].images = folder.path / "nowhere.mp4";
-  CHECK(message([&] { calibrate(folder.path / "none", options); }).find("nowhere.mp4: does not exist") !=
+  CHECK(error_of([&] { calibrate(folder.path / "none", options); }).find("nowhere.mp4: does not exist") !=
         std::string::npos);
   options.cameras[1].name = "cam0";
-  CHECK(message([&] { calibrate(folder.path / "none", options); }).find("given twice") != std::string::npos);
+  CHECK(error_of([&] { calibrate(folder.path / "none", options); }).find("given twice") != std::string::npos);
 }

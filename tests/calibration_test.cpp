@@ -12,6 +12,7 @@
 #include "calibration/bundle.h"
 #include "calibration/start.h"
 #include "calibration/tags.h"
+#include "error_of.h"
 
 using namespace chainsplat;
 using namespace chainsplat::calibration;
@@ -19,6 +20,7 @@ using math::Matrix3;
 using math::Pose;
 using math::Vector2;
 using math::Vector3;
+using test::error_of;
 
 namespace {
 
@@ -37,15 +39,6 @@ capture::Camera wide_camera() {
 Pose facing(double x, double y, double z, const Vector3& turn) {
   const Matrix3 face = Vector3(1, -1, -1).asDiagonal();
   return {math::exp_so3(turn) * face, {x, y, z}};
-}
-
-std::string message(const std::function<void()>& act) {
-  try {
-    act();
-  } catch (const Error& error) {
-    return error.what();
-  }
-  return "";
 }
 
 // A bundle whose corners are exact: `count` moments of a board before cameras that stand in an arc.
@@ -115,7 +108,7 @@ TEST_CASE("a board is read as it was written, and what is wrong with one is said
   CHECK(read.first_id == 40);
   const auto refusal = [&](const std::string& text) {
     core::write_file(file, text);
-    return message([&] { read_board(file); });
+    return error_of([&] { read_board(file); });
   };
   const std::string good = write_board(board);
   const auto with = [&](const char* key, nlohmann::ordered_json value) {
@@ -132,7 +125,7 @@ TEST_CASE("a board is read as it was written, and what is wrong with one is said
   CHECK(refusal(with("family", "tag16h5")).find("is not supported") != std::string::npos);
   CHECK(refusal("{\"columns\": 3}").find("has no key 'format'") != std::string::npos);
   CHECK(refusal("[1]").find("is no board") != std::string::npos);
-  CHECK(message([&] { read_board(folder / "none.json"); }).find("none.json") != std::string::npos);
+  CHECK(error_of([&] { read_board(folder / "none.json"); }).find("none.json") != std::string::npos);
   std::filesystem::remove_all(folder);
 }
 
@@ -140,11 +133,11 @@ TEST_CASE("the page has each tag's black square where the board says its corners
   Board board;
   board.columns = 3, board.rows = 2, board.tag_size = 0.05, board.spacing = 0.02, board.first_id = 7;
   const std::string svg = board_svg(board);
-  const auto page = tests::read_page(svg);
+  const auto page = test::read_page(svg);
   REQUIRE(page.size() == 6);
   for (const auto& [id, rectangles] : page) {
     double x0 = 1, y0 = 1, x1 = -1, y1 = -1;
-    for (const tests::Rectangle& r : rectangles)
+    for (const test::Rectangle& r : rectangles)
       x0 = std::min(x0, r.x0), y0 = std::min(y0, r.y0), x1 = std::max(x1, r.x1), y1 = std::max(y1, r.y1);
     CHECK((board.corner(id, 0) - Vector3(x0, y0, 0)).norm() < 3e-6);  // the page has micrometers
     CHECK((board.corner(id, 1) - Vector3(x1, y0, 0)).norm() < 3e-6);
@@ -174,7 +167,7 @@ TEST_CASE("corners of rendered tags are found where they are: pixel (0, 0) is ce
       camera.distortion = {};
     else
       camera.distortion = wide_camera().distortion;
-    const tests::BoardRenderer renderer(camera, board);
+    const test::BoardRenderer renderer(camera, board);
     for (const double blur : {0.5, 1.2}) {
       CAPTURE(blur);
       Vector2 sum = Vector2::Zero();

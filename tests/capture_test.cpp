@@ -15,6 +15,7 @@
 
 #include "chainsplat/capture.h"
 #include "chainsplat/encode.h"
+#include "error_of.h"
 
 using namespace chainsplat;
 using capture::Camera;
@@ -24,6 +25,7 @@ using capture::LoadOptions;
 using capture::View;
 using math::Vector2;
 using math::Vector3;
+using test::error_of;
 using Json = nlohmann::ordered_json;
 
 namespace {
@@ -64,15 +66,6 @@ bool any_contains(const std::vector<std::string>& lines, const std::string& part
   for (const std::string& line : lines)
     if (contains(line, part)) return true;
   return false;
-}
-
-std::string error_of(const std::function<void()>& body) {
-  try {
-    body();
-  } catch (const InputError& error) {
-    return error.what();
-  }
-  return "";
 }
 
 constexpr int kWidth = 64, kHeight = 48, kFrames = 4;

@@ -10,9 +10,12 @@
 
 #include "chainsplat/trajectory.h"
 
+#include "error_of.h"
+
 using namespace chainsplat;
 using math::Vector3;
 using math::Vector6;
+using test::error_of;
 using trajectory::Sample;
 using trajectory::Trajectory;
 
@@ -26,15 +29,6 @@ struct Folder {  // a folder of this test, removed at the end
   Folder() { std::filesystem::create_directories(path); }
   ~Folder() { std::filesystem::remove_all(path); }
 };
-
-std::string error_of(const std::function<void()>& body) {
-  try {
-    body();
-  } catch (const InputError& error) {
-    return error.what();
-  }
-  return "";
-}
 
 bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 

@@ -6,21 +6,14 @@
 #include <limits>
 #include <nlohmann/json.hpp>
 
+#include "error_of.h"
 #include "small_twin.h"
 
 using namespace chainsplat;
+using test::error_of;
 using Json = nlohmann::json;
 
 namespace {
-
-std::string message_of(const std::function<void()>& work) {
-  try {
-    work();
-  } catch (const InputError& error) {
-    return error.what();
-  }
-  return "nothing was thrown";
-}
 
 bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
@@ -295,7 +288,7 @@ TEST_CASE("damage to twin.json is named by file and key") {
     else
       parent.erase(at.back());
     core::write_file(file, bad.dump());
-    return message_of([&] { twin::load(folder.path); });
+    return error_of([&] { twin::load(folder.path); });
   };
   const Json removed(Json::value_t::discarded);
   const std::tuple<const char*, Json, const char*> cases[] = {
@@ -360,9 +353,9 @@ TEST_CASE("damage to twin.json is named by file and key") {
   const std::string text = good.dump();
   for (std::size_t size = 0; size < text.size(); size += 97) {
     core::write_file(file, text.substr(0, size));
-    CHECK(contains(message_of([&] { twin::load(folder.path); }), "twin.json"));
+    CHECK(contains(error_of([&] { twin::load(folder.path); }), "twin.json"));
   }
-  CHECK(contains(message_of([&] { twin::load(folder.path / "absent"); }), "twin.json"));
+  CHECK(contains(error_of([&] { twin::load(folder.path / "absent"); }), "twin.json"));
 }
 
 TEST_CASE("states keep their digits, and damage is named by line") {
@@ -378,7 +371,7 @@ TEST_CASE("states keep their digits, and damage is named by line") {
   CHECK(twin::states_csv(states).starts_with("time,theta_1,theta_2,theta_3\n"));
   core::write_file(file, twin::states_csv(states));
   check_same_states(twin::read_states(file, 3), states);
-  CHECK(contains(message_of([&] { twin::read_states(file, 8); }), "8 angles"));
+  CHECK(contains(error_of([&] { twin::read_states(file, 8); }), "8 angles"));
 
   const std::string head = "time,theta_1\n";
   for (const auto& [text, expected] :
@@ -391,11 +384,11 @@ TEST_CASE("states keep their digits, and damage is named by line") {
                                                                   {head, "no state"},
                                                                   {"", "no state"}}) {
     core::write_file(file, text);
-    const std::string message = message_of([&] { twin::read_states(file, 1); });
+    const std::string message = error_of([&] { twin::read_states(file, 1); });
     INFO(message);
     CHECK(contains(message, expected));
   }
-  CHECK(contains(message_of([&] { twin::read_states(folder.path / "absent.csv", 1); }), "absent.csv"));
+  CHECK(contains(error_of([&] { twin::read_states(folder.path / "absent.csv", 1); }), "absent.csv"));
 }
 
 TEST_CASE("centerlines are the nodes in the world") {
@@ -475,13 +468,13 @@ TEST_CASE("other programs' splats are read; damaged ones are refused") {
   const std::string good = twin::gaussians_ply(test::small_twin(chain::Bending::planar, 20).gaussians);
   for (std::size_t size = 0; size < good.size(); size += 53) {
     core::write_file(file, good.substr(0, size));
-    CHECK(contains(message_of([&] { twin::read_ply(file); }), "g.ply"));
+    CHECK(contains(error_of([&] { twin::read_ply(file); }), "g.ply"));
   }
   const auto replaced = [&](const std::string& from, const std::string& to) {
     std::string bad = good;
     bad.replace(bad.find(from), from.size(), to);
     core::write_file(file, bad);
-    return message_of([&] { twin::read_ply(file); });
+    return error_of([&] { twin::read_ply(file); });
   };
   CHECK(contains(replaced("binary_little_endian", "ascii"), "format 'ascii'"));
   CHECK(contains(replaced("vertex 20", "vertex 99999999999999999"), "ends before"));
@@ -493,7 +486,7 @@ TEST_CASE("other programs' splats are read; damaged ones are refused") {
   const float nan = std::numeric_limits<float>::quiet_NaN();
   std::memcpy(bad.data() + bad.size() - 4, &nan, 4);
   core::write_file(file, bad);
-  CHECK(contains(message_of([&] { twin::read_ply(file); }), "link_5 of Gaussian 19"));
+  CHECK(contains(error_of([&] { twin::read_ply(file); }), "link_5 of Gaussian 19"));
 }
 
 TEST_CASE("point clouds of other programs are read") {
@@ -532,12 +525,12 @@ TEST_CASE("point clouds of other programs are read") {
       read(bytes);
       for (std::size_t size = 0; size < bytes.size(); ++size) {
         core::write_file(file, bytes.substr(0, size));
-        CHECK(contains(message_of([&] { twin::read_points(file); }), "hand.ply"));
+        CHECK(contains(error_of([&] { twin::read_points(file); }), "hand.ply"));
       }
     }
   const auto refused = [&](const std::string& bytes) {
     core::write_file(file, bytes);
-    return message_of([&] { twin::read_points(file); });
+    return error_of([&] { twin::read_points(file); });
   };
   const std::string head = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n";
   CHECK(contains(refused(head + "end_header\n1 2\n3 4\n"), "'z'"));

@@ -107,6 +107,9 @@ struct LoadOptions {
 // Loads and checks a capture. `path` is the folder or its capture.json. Throws InputError at a problem; unknown keys
 // and other doubts are warned of.
 Capture load(const Path& path, const LoadOptions& options = {});
+// How many whole frames of each of these cameras may be loaded together, so that a recording may be long: at least 1,
+// and as long as their pixels stay below 128 MiB.
+int frames_at_once(const std::vector<Camera>& cameras);
 
 // Nothing that a capture names may lie outside its folder. Where a symbolic link on the way to `file`, which is named
 // in `folder`, leads out of it, returns in words which link and where to; else an empty text. The folder itself may be
@@ -149,6 +152,7 @@ struct Image8 {
   std::vector<std::uint8_t> pixels;
 };
 Image8 read_image8(const Path& file);
+Image8 rgb(const View& view);  // of its crop
 // A frame that is in memory already, as a view: the undistorted crop of a recorded picture (RGB) about its mask (one
 // channel, 128 and more: the object). Where the mask is empty the view is (width 0). `margin`: as in LoadOptions. Throws
 // InputError for pictures that are not of the camera's size.

@@ -152,5 +152,8 @@ class Engine {
 
 // Color of one Gaussian by its spherical harmonics (mathematics.md 2.4), seen along `direction` (unit, home frame).
 math::Vector3 sh_color(const Gaussians& gaussians, int index, const math::Vector3& direction);
+// The part of it that is the same from everywhere, RGB in 0..1; setting it leaves the higher degrees as they are.
+math::Vector3 base_color(const Gaussians& gaussians, int index);
+void set_base_color(Gaussians& gaussians, int index, const math::Vector3& color);
 
 }  // namespace chainsplat::splat

@@ -402,4 +402,19 @@ View view_of(const Camera& camera, const Image8& picture, const Image8& mask, in
   return view;
 }
 
+int frames_at_once(const std::vector<Camera>& cameras) {
+  constexpr std::size_t kMostAtOnce = 32u << 20;  // px, 128 MiB of RGBA
+  std::size_t pixels = 1;
+  for (const Camera& camera : cameras) pixels += static_cast<std::size_t>(camera.width) * camera.height;
+  return static_cast<int>(std::max<std::size_t>(1, kMostAtOnce / pixels));
+}
+
+Image8 rgb(const View& view) {
+  Image8 out{view.width, view.height, 3, {}};
+  out.pixels.reserve(view.rgba.size() / 4 * 3);
+  for (std::size_t i = 0; i < view.rgba.size(); i += 4)
+    out.pixels.insert(out.pixels.end(), &view.rgba[i], &view.rgba[i] + 3);
+  return out;
+}
+
 }  // namespace chainsplat::capture

@@ -121,7 +121,7 @@ tinygltf::Primitive primitive(Builder& builder, const splat::Gaussians& g, const
     opacity.push_back(static_cast<float>(sigmoid(g.opacity_logit[i])));
     for (int l = 0; l < coefficients; ++l)
       for (int c = 0; c < 3; ++c) sh[l].push_back(g.sh[3 * (static_cast<std::size_t>(coefficients) * i + l) + c]);
-    for (const double srgb : color_of(g, i)) color.push_back(static_cast<float>(linear_from_srgb(srgb)));
+    for (const double srgb : splat::base_color(g, i)) color.push_back(static_cast<float>(linear_from_srgb(srgb)));
     color.push_back(opacity.back());
   }
 

@@ -151,7 +151,7 @@ void McapRecording::points(double seconds, const Pose& base, const VectorX& thet
     const Vector3 point = motions[surest_link(gaussians, i)] * home;
     for (const double x : point) put(data, static_cast<float>(x));
     const double alpha = 1.0 / (1.0 + std::exp(-static_cast<double>(gaussians.opacity_logit[i])));
-    for (const double x : color_of(gaussians, i)) put(data, static_cast<std::uint8_t>(std::lround(255.0 * x)));
+    for (const double x : splat::base_color(gaussians, i)) put(data, static_cast<std::uint8_t>(std::lround(255.0 * x)));
     put(data, static_cast<std::uint8_t>(std::lround(255.0 * alpha)));
   }
   Message cloud;
@@ -215,14 +215,10 @@ namespace {
 // Calls use(time, camera, JPEG) for the pictures of a capture, in the order of their times.
 void for_each_picture(const Path& capture, const capture::Capture& facts,
                       const std::function<void(double, int, const std::string&)>& use) {
-  constexpr int kQuality = 85;                      // of JPEG
-  constexpr std::size_t kPixelsAtOnce = 32u << 20;  // that are loaded, 128 MiB
-  std::size_t pixels = 1, frames = 0;
-  for (std::size_t c = 0; c < facts.cameras.size(); ++c) {
-    pixels += static_cast<std::size_t>(facts.cameras[c].width) * facts.cameras[c].height;
-    frames = std::max(frames, facts.times[c].size());
-  }
-  const int at_once = static_cast<int>(std::max<std::size_t>(1, kPixelsAtOnce / pixels));
+  constexpr int kQuality = 85;  // of JPEG
+  const int at_once = capture::frames_at_once(facts.cameras);
+  std::size_t frames = 0;
+  for (const std::vector<double>& times : facts.times) frames = std::max(frames, times.size());
   capture::LoadOptions load;
   load.masked = load.undistort = false;
   for (load.first = 0; load.first < static_cast<int>(frames); load.first = load.last) {
@@ -232,13 +228,8 @@ void for_each_picture(const Path& capture, const capture::Capture& facts,
     std::vector<const capture::View*> views;
     for (const capture::View& view : part.views) views.push_back(&view);
     std::stable_sort(views.begin(), views.end(), [&](const auto* a, const auto* b) { return time(*a) < time(*b); });
-    for (const capture::View* const view : views) {
-      capture::Image8 picture{view->width, view->height, 3, {}};
-      picture.pixels.reserve(view->rgba.size() / 4 * 3);
-      for (std::size_t i = 0; i < view->rgba.size(); ++i)
-        if (i % 4 < 3) picture.pixels.push_back(view->rgba[i]);
-      use(time(*view), view->camera, capture::jpeg(picture, kQuality));
-    }
+    for (const capture::View* const view : views)
+      use(time(*view), view->camera, capture::jpeg(capture::rgb(*view), kQuality));
     core::stop_if_requested();
   }
 }

@@ -113,7 +113,7 @@ std::array<double, 4> color_of_link(const splat::Gaussians& g, int link) {
     if (surest_link(g, i) != link) continue;
     const double opacity = 1.0 / (1.0 + std::exp(-static_cast<double>(g.opacity_logit[i])));
     weight += opacity;
-    const Vector3 color = color_of(g, i);
+    const Vector3 color = splat::base_color(g, i);
     for (int c = 0; c < 3; ++c) sum[c] += opacity * color[c];
   }
   for (int c = 0; c < 3; ++c) sum[c] = weight > 0.0 ? std::round(1e3 * sum[c] / weight) / 1e3 : 0.5;

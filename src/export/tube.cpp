@@ -30,7 +30,7 @@ Vector3 color_at(const splat::Gaussians& g, const Vector3& point, double reach) 
     const double near = std::exp(-0.5 * away.squaredNorm() / (reach * reach) - 1e-3 * away.norm() / reach) /
                         (1.0 + std::exp(-static_cast<double>(g.opacity_logit[i])));
     weight += near;
-    sum += near * color_of(g, i);
+    sum += near * splat::base_color(g, i);
   }
   return sum / weight;
 }

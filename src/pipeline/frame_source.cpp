@@ -101,13 +101,7 @@ FrameSource open_capture(const SourceOptions& options) {
           nearest = &view;
       if (nearest) frame.views.push_back(*nearest);
     }
-    if (whole) {
-      const capture::View& view = whole->views.at(at);
-      frame.picture.width = view.width, frame.picture.height = view.height, frame.picture.channels = 3;
-      frame.picture.pixels.resize(view.rgba.size() / 4 * 3);
-      for (std::size_t i = 0; i < view.rgba.size() / 4; ++i)
-        std::copy_n(&view.rgba[4 * i], 3, &frame.picture.pixels[3 * i]);
-    }
+    if (whole) frame.picture = capture::rgb(whole->views.at(at));
     ++at;
     frame.arrived = core::seconds_now();
     return true;

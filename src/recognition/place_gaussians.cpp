@@ -23,8 +23,8 @@ void set_gaussian(splat::Gaussians& g, int i, const math::Vector3& mean, double 
   for (int c = 0; c < 3; ++c) {
     g.mean[3 * i + c] = static_cast<float>(mean[c]);
     g.log_scale[3 * i + c] = static_cast<float>(std::log(sigma));
-    g.sh[3 * g.sh_coefficients() * i + c] = static_cast<float>((color[c] - 0.5) / image_model::kSh0);
   }
+  splat::set_base_color(g, i, color);
   g.opacity_logit[i] = opacity;
   for (int j = 0; j < g.links; ++j) g.link_logits[g.links * i + j] = j == link ? kOwnLinkLogit : 0.0f;
 }

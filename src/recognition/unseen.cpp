@@ -6,8 +6,6 @@
 #include <optional>
 #include <vector>
 
-#include "chainsplat/image_model.h"
-
 namespace chainsplat::recognition {
 
 namespace {
@@ -98,9 +96,7 @@ void color_trusted(const splat::Gaussians& g, const std::vector<Place>& places, 
   for (int i = 0; i < g.count; ++i) {
     if (surface.facing[surface.cell_at(places[i].arclength, places[i].angle)] < kTrusted) continue;
     const Vector3 mean(g.mean[3 * i], g.mean[3 * i + 1], g.mean[3 * i + 2]);
-    const float* const sh = &g.sh[3 * static_cast<std::size_t>(g.sh_coefficients()) * i];
-    const Vector3 color =
-        (Vector3::Constant(0.5) + image_model::kSh0 * Vector3(sh[0], sh[1], sh[2])).cwiseMax(0.0).cwiseMin(1.0);
+    const Vector3 color = splat::base_color(g, i);
     const double opacity = 1.0 / (1.0 + std::exp(-static_cast<double>(g.opacity_logit[i])));
     const int near = static_cast<int>(places[i].arclength / row_length),
               span = static_cast<int>(4.0 * reach / row_length) + 1;
@@ -215,9 +211,8 @@ int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, s
     const double wxyz[4] = {turn.w(), turn.x(), turn.y(), turn.z()};
     for (int c = 0; c < 4; ++c) gaussians.rotation[4 * i + c] = static_cast<float>(wxyz[c]);
     gaussians.opacity_logit[i] = kOpaque;
-    float* const sh = &gaussians.sh[3 * static_cast<std::size_t>(terms) * i];
-    std::fill_n(sh, 3 * terms, 0.0f);
-    for (int c = 0; c < 3; ++c) sh[c] = static_cast<float>(((*color)[c] - 0.5) / image_model::kSh0);
+    std::fill_n(&gaussians.sh[3 * static_cast<std::size_t>(terms) * i], 3 * terms, 0.0f);
+    splat::set_base_color(gaussians, i, *color);
   }
   return static_cast<int>(unseen.size());
 }

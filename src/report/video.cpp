@@ -9,10 +9,9 @@ namespace chainsplat::report {
 
 namespace {
 
-constexpr int kWidth = 480;                       // px, at most: a phone's, and half of a usual camera's
-constexpr int kMostPictures = 300;                // 10 s at 30 Hz; longer recordings lose frames evenly
-constexpr std::size_t kPixelsAtOnce = 32u << 20;  // that are loaded, 128 MiB
-constexpr int kQuality = 60;                      // of JPEG: about 8 kB for 480 x 360
+constexpr int kWidth = 480;         // px, at most: a phone's, and half of a usual camera's
+constexpr int kMostPictures = 300;  // 10 s at 30 Hz; longer recordings lose frames evenly
+constexpr int kQuality = 60;        // of JPEG: about 8 kB for 480 x 360
 
 // The RGB picture of a whole view with its sides divided by `shrink`, every pixel the mean of what it covers.
 capture::Image8 shrunk(const capture::View& view, int shrink) {
@@ -44,8 +43,7 @@ Video read_video(const Path& capture, const std::string& camera, const twin::Twi
   const double interval = render::median_interval(times);
   const int frames = static_cast<int>(times.size());
   const int every = (frames + kMostPictures - 1) / kMostPictures, shrink = (seen.width + kWidth - 1) / kWidth;
-  const int at_once =
-      static_cast<int>(std::max<std::size_t>(1, kPixelsAtOnce / (static_cast<std::size_t>(seen.width) * seen.height)));
+  const int at_once = capture::frames_at_once(facts.cameras);
   Video out;
   out.camera = seen.name;
   load.images = true;

@@ -1,6 +1,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "chainsplat/image_model.h"
 #include "chainsplat/splat.h"
 #include "shaders/shared/gaussian.h"
 
@@ -35,6 +36,18 @@ math::Vector3 sh_color(const Gaussians& gaussians, int index, const math::Vector
     for (int c = 0; c < 3; ++c) color[c] += basis * gaussians.sh[3 * (coefficients * index + l) + c];
   }
   return color.cwiseMax(0.0);
+}
+
+math::Vector3 base_color(const Gaussians& gaussians, int index) {
+  const float* const sh = &gaussians.sh[3 * static_cast<std::size_t>(gaussians.sh_coefficients()) * index];
+  return (math::Vector3::Constant(0.5) + image_model::kSh0 * math::Vector3(sh[0], sh[1], sh[2]))
+      .cwiseMax(0.0)
+      .cwiseMin(1.0);
+}
+
+void set_base_color(Gaussians& gaussians, int index, const math::Vector3& color) {
+  float* const sh = &gaussians.sh[3 * static_cast<std::size_t>(gaussians.sh_coefficients()) * index];
+  for (int c = 0; c < 3; ++c) sh[c] = static_cast<float>((color[c] - 0.5) / image_model::kSh0);
 }
 
 }  // namespace chainsplat::splat

@@ -22,7 +22,7 @@ int main(int count, char** arguments) {
     return camera.world_from_camera * math::Pose{math::exp_so3(turn) * face, place};
   };
   const math::Pose flange_from_board{math::exp_so3({0.1, 0, 0}), {0.01, 0.02, 0.05}};
-  const tests::BoardRenderer renderer(camera, board);
+  const test::BoardRenderer renderer(camera, board);
   core::Random random(4);
   std::vector<capture::Image8> frames;
   for (int i = 0; i < 24; ++i) {

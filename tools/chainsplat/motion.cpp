@@ -118,10 +118,7 @@ class Recorded {
  public:
   // `frames`: that may be asked for, from the first on.
   Recorded(Path capture, const capture::Camera& camera, std::size_t frames)
-      : capture_(std::move(capture)), frames_(static_cast<int>(frames)) {
-    constexpr std::size_t kPixelsAtOnce = 32u << 20;  // 128 MiB
-    at_once_ = static_cast<int>(
-        std::max<std::size_t>(1, kPixelsAtOnce / (static_cast<std::size_t>(camera.width) * camera.height)));
+      : capture_(std::move(capture)), frames_(static_cast<int>(frames)), at_once_(capture::frames_at_once({camera})) {
     load_.undistort = false, load_.masked = false, load_.camera = camera.name;
   }
   // RGB; empty where there is none. Frames are asked for in order.
@@ -132,19 +129,14 @@ class Recorded {
       views_.clear();
       views_ = capture::load(capture_, load_).views;
     }
-    const capture::View& view = views_[frame - load_.first];
-    capture::Image8 out{view.width, view.height, 3, {}};
-    out.pixels.reserve(view.rgba.size() / 4 * 3);
-    for (std::size_t i = 0; i < view.rgba.size(); i += 4)
-      out.pixels.insert(out.pixels.end(), &view.rgba[i], &view.rgba[i] + 3);
-    return out;
+    return capture::rgb(views_[frame - load_.first]);
   }
 
  private:
   Path capture_;
   capture::LoadOptions load_;
   std::vector<capture::View> views_;
-  int frames_, at_once_ = 1;
+  int frames_, at_once_;
 };
 
 void render(const Globals& globals, const RenderRequest& request) {
