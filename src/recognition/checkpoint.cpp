@@ -9,7 +9,7 @@ namespace chainsplat::recognition {
 
 namespace {
 
-constexpr char kMagic[] = "chainsplat-checkpoint/4\n";
+constexpr char kMagic[] = "chainsplat-checkpoint/5\n";
 constexpr char kFile[] = "recognize.bin";
 constexpr char kFileBefore[] = "recognize.before.bin";
 constexpr const char* kFiles[] = {kFile, kFileBefore};  // the newest first
@@ -105,7 +105,6 @@ std::optional<Checkpoint> parse(const std::string& bytes) {
     c.step = r.get<int>();
     c.watch.smooth_loss = r.get<double>();
     c.watch.least_loss = r.get<double>();
-    c.watch.first_loss = r.get<double>();
     c.watch.losses = r.get<int>();
     c.watch.bad_steps = r.get<int>();
     c.watch.bad_in_a_row = r.get<int>();
@@ -152,7 +151,6 @@ void save_checkpoint(const Checkpoint& c, const Path& folder) {
   w.put(c.step);
   w.put(c.watch.smooth_loss);
   w.put(c.watch.least_loss);
-  w.put(c.watch.first_loss);
   w.put(c.watch.losses);
   w.put(c.watch.bad_steps);
   w.put(c.watch.bad_in_a_row);

@@ -2,6 +2,7 @@
 #include <cmath>
 #include <numeric>
 
+#include "chainsplat/image_model.h"
 #include "src/recognition/checkpoint.h"
 #include "src/recognition/modes.h"
 #include "src/recognition/place_gaussians.h"
@@ -61,6 +62,23 @@ TrainingViews training_views(const capture::Capture& capture, const std::vector<
     }
   }
   return t;
+}
+
+// The loss of each training view where nothing is drawn.
+std::vector<double> empty_losses(const capture::Capture& capture, const TrainingViews& training) {
+  std::vector<double> out;
+  double object_pixels = 0.0;
+  for (const int v : training.views) {
+    double sum = 0.0;
+    const std::vector<std::uint8_t>& rgba = capture.views[v].rgba;
+    for (std::size_t i = 0; i < rgba.size(); i += 4) {
+      sum += kLossWeights.l1 * (rgba[i] + rgba[i + 1] + rgba[i + 2]) / 3.0 + kLossWeights.mask * rgba[i + 3];
+      object_pixels += rgba[i + 3] >= image_model::kObjectMask ? 1.0 : 0.0;
+    }
+    out.push_back(sum / 255.0);
+  }
+  for (double& loss : out) loss /= std::max(1.0, object_pixels / static_cast<double>(out.size()));
+  return out;
 }
 
 double mean(const std::vector<double>& values) {
@@ -181,6 +199,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   };
   // Adam's steps of one round (the last is the polish). Which views make a batch depends on the round alone: a resumed
   // one draws those of the steps before `first_step` again. False: the optimization ran away.
+  const std::vector<double> empty = empty_losses(capture, training);
   const auto adam = [&](int round, int first_step, core::Random& random) {
     const std::string note =
         round < kRounds ? "round " + std::to_string(round + 1) + " of " + std::to_string(kRounds) : "last polish";
@@ -202,7 +221,9 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
       if (read) {
         loss = values.total / static_cast<double>(batch.size());
         psnr = mean(values.psnr_object);
-        if (watch_loss(watch, loss) == Course::diverged) return false;
+        double nothing = 0.0;
+        for (const int v : batch) nothing += empty[v];
+        if (watch_loss(watch, values.total / nothing) == Course::diverged) return false;
         core::report({"recognize", done_steps, total_steps, loss, psnr, note});
       }
     }

@@ -12,16 +12,16 @@ double step_scale(const StepWatch& watch) {
 
 void begin_round(StepWatch& watch) { watch.smooth_loss = watch.least_loss = -1.0, watch.losses = 0; }
 
-Course watch_loss(StepWatch& watch, double loss) {
+Course watch_loss(StepWatch& watch, double relative_loss) {
   // A loss is that of a few views, and views differ. In sound trainings of six captures (free and on a table, 20 and
   // 30 cm, 320x240 and 640x480) the smoothed one was at most 1.26 times the least before it.
   constexpr double kNew = 0.3, kTooMuch = 2.0;
-  constexpr int kBegun = 5;  // losses; sound trainings have halved the first one by then
-  if (!std::isfinite(loss)) return Course::diverged;
-  if (watch.first_loss < 0) watch.first_loss = loss;
-  watch.smooth_loss = watch.smooth_loss < 0 ? loss : (1 - kNew) * watch.smooth_loss + kNew * loss;
+  constexpr double kNothing = 0.95;
+  constexpr int kBegun = 5;  // losses
+  if (!std::isfinite(relative_loss)) return Course::diverged;
+  watch.smooth_loss = watch.smooth_loss < 0 ? relative_loss : (1 - kNew) * watch.smooth_loss + kNew * relative_loss;
   watch.least_loss = watch.least_loss < 0 ? watch.smooth_loss : std::min(watch.least_loss, watch.smooth_loss);
-  if (++watch.losses >= kBegun && watch.smooth_loss > watch.first_loss) return Course::diverged;
+  if (++watch.losses >= kBegun && watch.smooth_loss > kNothing) return Course::diverged;
   return watch.smooth_loss > kTooMuch * watch.least_loss ? Course::diverged : Course::fine;
 }
 
