@@ -3,6 +3,7 @@
 
 #include <doctest/doctest.h>
 
+#include <algorithm>
 #include <cmath>
 
 namespace {
@@ -89,6 +90,31 @@ TEST_CASE("a rope that bends in a plane tells how the gripper turned it, and a t
   turned.table = capture::Table{Vector3::Zero(), Vector3(0.0, 1.0, 0.0)};
   const capture::Correction table = found(turned);
   CHECK(std::abs(table.value[0] + turn[0]) < std::abs(after.value[0] + turn[0]));
+}
+
+TEST_CASE("where masks begin parts cameras that are all too low from a longer rope, unless fingers hide it") {
+  const auto length_error = [](const capture::Capture& capture, const silhouette::CorrectionOptions& options = {}) {
+    return std::abs(capture::value_of(fit(capture, options).corrections, "object", "length"));
+  };
+  capture::Capture low = demo();
+  for (capture::Camera& camera : low.cameras) camera.world_from_camera.translation.z() -= 0.002;
+  CHECK(length_error(low) < 0.5 * length_error(low, {.held = {"masks"}}));
+
+  constexpr double kFingers = 0.008;  // m of the rope that they hide
+  capture::Capture held = demo();
+  for (capture::View& view : held.views) {
+    const math::Pose base = held.base.pose(view.time);
+    const math::Vector3 seen =
+        held.cameras[view.camera].world_from_camera.inverse() * (base * Vector3(kFingers * held.direction));
+    const capture::Camera& camera = held.cameras[view.camera];
+    const int below = static_cast<int>(std::lround(camera.fy * seen.y() / seen.z() + camera.cy)) - view.y0;
+    for (int y = 0; y < std::min(below, view.height); ++y)
+      std::fill_n(view.rgba.begin() + 4 * static_cast<std::ptrdiff_t>(y) * view.width, 4 * view.width, std::uint8_t{0});
+  }
+  const silhouette::CorrectionFit found = fit(held);
+  CHECK(capture::value_of(found.corrections, "cam0", "mask_start") == doctest::Approx(kFingers).epsilon(0.2));
+  CHECK(std::abs(capture::value_of(found.corrections, "object", "length")) < 0.005 * demo().length);
+  CHECK(found.evidence < 0.2);  // nothing else was given wrongly
 }
 
 TEST_CASE("a group that is held stays as given, and one camera alone tells clocks only") {

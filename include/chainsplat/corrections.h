@@ -26,7 +26,8 @@ struct CorrectedQuantity {
 };
 // rotation: rotation vector of a camera in its own frame (world_from_camera's rotation times its exponential), of the
 // grasp in the base frame; translation: of a camera in the world frame, of the grasp in the base frame; focal: of fx,
-// with fy in proportion; mask_offset: by how much the camera's masks are wider than the rope on each side.
+// with fy in proportion; mask_offset: by how much the camera's masks are wider than the rope on each side; mask_start:
+// how far from the grasp along the rope its masks begin.
 const std::vector<CorrectedQuantity>& corrected_quantities();
 
 // free: the recording determines it. prior: it may vary, but the recording says little beyond the given value. held:

@@ -26,6 +26,7 @@ const std::vector<CorrectedQuantity>& corrected_quantities() {
       {"camera", "focal", "focal", "px", 1, 0.0, 0.001, 1e6},
       {"camera", "time", "time", "s", 1, 0.001, 0.0, 10.0},
       {"camera", "mask_offset", "masks", "px", 1, 0.3, 0.0, 1e3},
+      {"camera", "mask_start", "masks", "m", 1, 0.0005, 0.0, 100.0},
       {"base", "time", "time", "s", 1, 0.002, 0.0, 10.0},
       {"grasp", "translation", "grasp", "m", 3, 0.0005, 0.0, 100.0},
       {"grasp", "rotation", "grasp", "rad", 3, 0.005, 0.0, 3.2},

@@ -10,12 +10,6 @@ using math::VectorX;
 namespace {
 
 constexpr double kBlobReach = 3.0;  // diameters from the chain within which a blob is the rope
-// What one pixel of outline counts against the priors, of one independent observation of a deviation of 1 px.
-// Neighboring outline and neighboring frames share the error of straight links, which pulls the grasp along the rope:
-// on recordings with truth the place of the grasp and the length were off by 10 mm with 1, by their priors with less
-// than 0.05.
-constexpr double kEvidence = 0.02;
-
 // The rope in one view, posed with the corrections, and how what the view depends on moves it. Its parts point at each
 // other.
 struct PosedView {
@@ -29,6 +23,7 @@ struct PosedView {
   MatrixX twists;            // 6 x angles, camera frame
   Vector6 base_twist;        // camera frame, of the base's own motion
   double mask_offset = 0.0;  // px
+  double mask_start = 0.0;   // m
 };
 
 void pose_view(const CorrectionProblem& fit, const CorrectedFrame& frame, int v,
@@ -44,6 +39,7 @@ void pose_view(const CorrectionProblem& fit, const CorrectedFrame& frame, int v,
 
   out.camera = capture::corrected(corrections, given);
   out.mask_offset = capture::value_of(corrections, given.name, "mask_offset");
+  out.mask_start = capture::value_of(corrections, given.name, "mask_start");
   out.frame = {&fit.masks[v], &out.camera, base.pose * capture::grasp_in_base(corrections)};
   out.problem.chain = &chain;
   ViewWork work;
@@ -77,12 +73,34 @@ SharedRow shared_row(const PosedView& view, const OutlinePoint& p, double angle_
   row[kFocal] = (p.outward.dot(from_center) + p.half_width) / camera.fx;
   row[kCameraTime] = -angle_speed - base_speed;
   row[kMaskOffset] = 1.0;
+  const bool start = p.part == OutlinePoint::Part::start;
+  row[kMaskStart] = start ? g.dot((p.segment->b - p.segment->a).normalized()) : 0.0;
   row[kBaseTime] = base_speed;
   row.segment<3>(kGrasp) = camera_from_base.transpose() * g;
   row.segment<3>(kGraspRotation) = camera_from_base.transpose() * from_grasp.cross(g);
-  row[kLength] = g.dot(from_grasp) / chain.length;
+  row[kLength] = start ? 0.0 : g.dot(from_grasp) / chain.length;
   row[kDiameter] = p.half_width / chain.diameter;
   return row;
+}
+
+// Curvature of the rope along each segment by the directions of its neighbors, camera frame, 1/m.
+std::vector<Vector3> curvatures(const std::vector<Segment>& segments) {
+  const int count = static_cast<int>(segments.size());
+  std::vector<Vector3> out;
+  for (int i = 0; i < count; ++i) {
+    const Segment &before = segments[std::max(0, i - 1)], &after = segments[std::min(count - 1, i + 1)];
+    const Vector3 turn = (after.b - after.a).normalized() - (before.b - before.a).normalized();
+    const double apart = (0.5 * (after.a + after.b) - 0.5 * (before.a + before.b)).norm();
+    out.push_back(apart > 0.0 ? Vector3(turn / apart) : Vector3::Zero());
+  }
+  return out;
+}
+
+// How far the rope, an arc between its joints, is from the point of a straight link, camera frame, m.
+Vector3 sagitta(const Segment& segment, const Vector3& curvature, const Vector3& x) {
+  const Vector3 link = segment.b - segment.a;
+  const double t = std::clamp((x - segment.a).dot(link) / link.squaredNorm(), 0.0, 1.0);
+  return -0.5 * t * (1.0 - t) * link.squaredNorm() * curvature;
 }
 
 // Normal equations of one view: its angles, then what it shares.
@@ -103,9 +121,13 @@ ViewEquations view_equations(const PosedView& view, int camera, const Correction
   MatrixX coupling = MatrixX::Zero(size, links);
   VectorX link_weight = VectorX::Constant(links, kEvidence / (kLinkOffsetDeviation * kLinkOffsetDeviation));
   VectorX link_right = VectorX::Zero(links), row(size);
+  const std::vector<Segment>& segments = view.problem.views[0].segments;
+  const std::vector<Vector3> bends = curvatures(segments);
   const auto add = [&](const OutlinePoint& p) {
-    if (p.before_grasp) return;  // the gripper's, or a cut face that is not round
-    const double residual = p.distance - view.mask_offset;
+    if (p.part == OutlinePoint::Part::before_grasp) return;  // the gripper's, or a cut face that is not round
+    double residual = p.distance - view.mask_offset;
+    if (p.part == OutlinePoint::Part::side)
+      residual -= p.gradient.dot(sagitta(*p.segment, bends[p.segment - segments.data()], p.x));
     const double weight = kEvidence * p.length * tukey_weight(residual, fit.cut);
     frame.sizes.push_back(std::abs(residual));
     sums.length += p.length;
@@ -123,15 +145,25 @@ ViewEquations view_equations(const PosedView& view, int camera, const Correction
       row[k] = link < chain.child_link[k]
                    ? 0.0
                    : moment.dot(view.twists.col(k).head<3>()) + p.gradient.dot(view.twists.col(k).tail<3>());
-    row.tail<kSharedOfView>() = places.unit.cwiseProduct(shared_row(view, p, row.head(n).dot(thetadot)));
+    const SharedRow shared = shared_row(view, p, row.head(n).dot(thetadot));
+    row.tail<kSharedOfView>() = places.unit.cwiseProduct(shared);
+    if (p.part == OutlinePoint::Part::start) {
+      sums.start_weight += weight;
+      sums.start_first += weight * residual;
+      sums.start_second += weight * residual * residual;
+      sums.start_speed += weight * std::abs(shared[kMaskStart]);
+      sums.start_bulge += weight * p.half_width;
+    }
     out.normal.selfadjointView<Eigen::Lower>().rankUpdate(row, weight);
     out.right += weight * residual * row;
     coupling.col(link) += weight * row;
     link_weight[link] += weight;
     link_right[link] += weight * residual;
   };
+  Ends ends{fit.end_reach, {}};
+  if (places.at[kMaskStart] >= 0) ends.mask_start = view.mask_start;
   for_each_outline_point(
-      chain, view.problem.views[0], [](const Edge&) {}, add, fit.end_reach);
+      chain, view.problem.views[0], [](const Edge&) {}, add, ends);
   for (int link = 0; link < links; ++link) {
     out.normal.selfadjointView<Eigen::Lower>().rankUpdate(coupling.col(link), -1.0 / link_weight[link]);
     out.right -= coupling.col(link) * (link_right[link] / link_weight[link]);

@@ -28,6 +28,14 @@ constexpr double kLeastSize = 0.5;        // share of the given length and diame
 // The priors' penalty is kTails / 2 ln(1 + |y|^2 / kTails) in units of their deviation: nearly a Gaussian's for what a
 // careful laboratory gets wrong, and for a fault ten times that nearly flat.
 constexpr double kTails = 2.0;
+// m, deviation of where masks begin in a camera before which the fingers hold the rope, or which takes them for it;
+// every second camera does. In the others they begin at the grasp.
+constexpr double kHidden = 0.01;
+// A finger's edge that crosses the cut face leaves outlines that scatter by 1 / sqrt(12) of what it covers at one side,
+// and it covers half of that in the mean.
+constexpr double kCovered = 1.7321;
+constexpr double kSharp = 0.0015;  // m, deviation above which it is not known whether it is the cut face
+constexpr double kRound = 0.25;  // deviation of how far the cut face reaches beyond its middle, of what a flat one does
 constexpr double kUnknownShare = 0.7;  // of the prior's deviation there above which a value is the prior's
 constexpr int kStretches = 12;         // of time, whose scatter tells what the equations do not know
 constexpr double kSameClock = 1e-9;    // s
@@ -65,7 +73,7 @@ bool is_held(const capture::CorrectedQuantity& quantity, const capture::Capture&
   const std::string group = quantity.group;
   const bool clock = group == "time", alone = static_cast<int>(capture.cameras.size()) < kLeastCameras;
   if (std::find(held.begin(), held.end(), group) != held.end()) return true;
-  if (alone && !clock && group != "masks") return true;
+  if (alone && !clock && quantity.name != std::string("mask_offset")) return true;
   if (clock && camera == 0) return true;  // the others count from its clock
   if (clock && camera < 0 && capture.base.samples().size() < 2) return true;
   // the first joint of a chain that bends in space takes the grasp's rotation, that of a planar one does not
@@ -109,12 +117,56 @@ std::vector<SharedPlaces> places_of(const Layout& layout, int cameras) {
   return out;
 }
 
+// Whether all masks may begin anywhere, or those begin at the grasp that do so nearly.
+enum class Starts { anywhere, at_grasp };
+
+bool is_mask_start(const Column& column) { return column.quantity->name == std::string("mask_start"); }
+
+// How little each camera's masks tell of where the rope leaves the gripper, m along it. Fingers have another shape than
+// the rope's cut face, so that the outline there scatters more than elsewhere; and no cut is quite flat.
+std::vector<double> start_deviations(const std::vector<FrameEquations>& frames) {
+  std::vector<FrameEquations::Sums> sums(frames.front().sums.size());
+  for (const FrameEquations& frame : frames)
+    for (std::size_t c = 0; c < sums.size(); ++c) {
+      sums[c].weight += frame.sums[c].weight;
+      sums[c].second += frame.sums[c].second;
+      sums[c].start_weight += frame.sums[c].start_weight;
+      sums[c].start_first += frame.sums[c].start_first;
+      sums[c].start_second += frame.sums[c].start_second;
+      sums[c].start_speed += frame.sums[c].start_speed;
+      sums[c].start_bulge += frame.sums[c].start_bulge;
+    }
+  std::vector<double> out(sums.size(), 0.0);
+  for (std::size_t c = 0; c < sums.size(); ++c) {
+    const FrameEquations::Sums& s = sums[c];
+    if (!(s.start_speed > 0.0)) continue;
+    const double mean = s.start_first / s.start_weight, bulge = s.start_bulge / s.start_weight;
+    const double excess = s.start_second / s.start_weight - mean * mean - s.second / s.weight;
+    out[c] = std::hypot(kCovered * std::sqrt(std::max(0.0, excess)), kRound * bulge) * s.start_weight / s.start_speed;
+  }
+  return out;
+}
+
+// Information, 1/m^2, about where a camera's masks begin, at x m: of a mixture of two Gaussians.
+double start_information(double x, double deviation, Starts starts) {
+  const double narrow = 1.0 / (deviation * deviation), wide = std::min(narrow, 1.0 / (kHidden * kHidden));
+  if (starts == Starts::anywhere || deviation > kSharp) return wide;
+  const double at_grasp = 1.0 / (1.0 + std::sqrt(wide / narrow) * std::exp(0.5 * x * x * (narrow - wide)));
+  return at_grasp * narrow + (1.0 - at_grasp) * wide;
+}
+
 // Information of the heavy-tailed prior about each shared unknown at x, in units of its deviation: most recordings are
-// right in most things, and wrong by much in a few.
-VectorX prior_weights(const Layout& layout, const VectorX& x) {
+// right in most things, and wrong by much in a few. `start_deviations`: by camera.
+VectorX prior_weights(const Layout& layout, const VectorX& x, Starts starts,
+                      const std::vector<double>& start_deviations) {
   VectorX out = VectorX::Ones(layout.size);
   for (const Column& column : layout.columns) {
     if (column.first < 0) continue;
+    if (is_mask_start(column)) {
+      const double unit = column.deviation, deviation = std::hypot(unit, start_deviations[column.camera]);
+      out[column.first] = unit * unit * start_information(unit * x[column.first], deviation, starts);
+      continue;
+    }
     const int size = column.quantity->size;
     out.segment(column.first, size).setConstant(1.0 / (1.0 + x.segment(column.first, size).squaredNorm() / kTails));
   }
@@ -199,8 +251,9 @@ void add_table(const capture::Capture& capture, const Layout& layout, const Vect
   }
 }
 
-Known known_at(const capture::Capture& capture, const Layout& layout, const VectorX& x) {
-  const VectorX weights = prior_weights(layout, x);
+Known known_at(const capture::Capture& capture, const Layout& layout, const VectorX& x, Starts starts,
+               const std::vector<FrameEquations>& frames) {
+  const VectorX weights = prior_weights(layout, x, starts, start_deviations(frames));
   Known known{weights.asDiagonal(), weights.cwiseProduct(x)};
   add_table(capture, layout, x, known);
   return known;
@@ -218,10 +271,24 @@ solve::ArrowEquations arrow_of(const std::vector<FrameEquations>& frames, const 
   return arrow;
 }
 
+// The square by which residuals grow where all shared unknowns are 0 but where the masks begin: fingers hide a piece of
+// the rope in many recordings that are right. `information`: of the outlines alone.
+double cost_of_given(const Layout& layout, const MatrixX& information, const VectorX& x) {
+  std::vector<int> starts, others;
+  for (const Column& column : layout.columns)
+    for (int i = 0; column.first >= 0 && i < column.quantity->size; ++i)
+      (is_mask_start(column) ? starts : others).push_back(column.first + i);
+  const VectorX given = x(others), pull = information(starts, others) * given;
+  const double with_starts = given.dot(MatrixX(information(others, others)) * given);
+  if (starts.empty()) return with_starts;
+  const MatrixX own = information(starts, starts);
+  return with_starts - pull.dot(own.completeOrthogonalDecomposition().solve(pull));
+}
+
 // Deviations of the shared unknowns: the larger of what the equations say and of what the scatter of the gradients
 // between stretches of time says (a sandwich estimate), since neighboring frames share the model's error.
-MatrixX shared_covariance(const std::vector<FrameEquations>& frames, const MatrixX& known, const VectorX& x,
-                          double& evidence) {
+MatrixX shared_covariance(const Layout& layout, const std::vector<FrameEquations>& frames, const MatrixX& known,
+                          const VectorX& x, double& evidence) {
   const Eigen::Index m = known.rows();
   MatrixX information = known, scatter = known;
   const int count = static_cast<int>(frames.size()), stretches = std::min(kStretches, count);
@@ -238,7 +305,7 @@ MatrixX shared_covariance(const std::vector<FrameEquations>& frames, const Matri
   double squares = 0.0;
   for (const FrameEquations& frame : frames)
     for (const FrameEquations::Sums& sums : frame.sums) squares += sums.second;
-  evidence = squares > 0.0 ? (x.dot(information * x) - x.dot(known * x)) / squares : 0.0;
+  evidence = squares > 0.0 ? cost_of_given(layout, information - known, x) / squares : 0.0;
   const MatrixX covariance = information.ldlt().solve(MatrixX::Identity(m, m));
   MatrixX robust = covariance * scatter * covariance;
   const VectorX grown = (covariance.diagonal().array() / robust.diagonal().array()).max(1.0).sqrt();
@@ -375,12 +442,13 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
   for (std::size_t f = 0; f < theta.size(); ++f) x.segment(m + static_cast<int>(f) * n, n) = theta[f];
   const VectorX start = x;
   double wide = kWidestCut;
+  Starts starts = Starts::anywhere;
   const auto evaluate = [&](const VectorX& at, solve::ArrowEquations* equations) {
     const std::vector<FrameEquations> frames = all_equations(problem, layout, chain, at);
     wide *= kNarrowing;
     problem.cut = std::max({cut_of(frames), kLeastCut, wide});
     if (wide <= kLeastCut) problem.end_reach = kEndReach;
-    if (equations) *equations = arrow_of(frames, known_at(capture, layout, at.head(m)));
+    if (equations) *equations = arrow_of(frames, known_at(capture, layout, at.head(m), starts, frames));
     double cost = 0.5 * at.head(m).squaredNorm();
     for (const FrameEquations& frame : frames) cost += frame.cost;
     return cost;
@@ -388,16 +456,21 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
   solve::Options solving{.steps = kSteps, .checked = false, .step_tolerance = kStep, .longest = kLongestStep};
   solving.damping.rule = solve::Damping::Rule::none;
   CorrectionFit out;
+  // which masks begin at the grasp is seen only when cameras and grasp are nearly right
+  const solve::Summary first = solve::least_squares(x, evaluate, solving);
+  starts = Starts::at_grasp;
   out.summary = solve::least_squares(x, evaluate, solving);
+  out.summary.iterations += first.iterations;
+  out.summary.initial_cost = first.initial_cost;
   if (!x.allFinite()) {
     core::warn(capture.name + ": what it was given wrongly cannot be estimated; it is taken as given");
     x = start;
   }
 
   const std::vector<FrameEquations> frames = all_equations(problem, layout, chain, x);
-  const VectorX prior = prior_weights(layout, x.head(m));
-  const MatrixX covariance =
-      shared_covariance(frames, known_at(capture, layout, x.head(m)).information, x.head(m), out.evidence);
+  const VectorX prior = prior_weights(layout, x.head(m), starts, start_deviations(frames));
+  const MatrixX covariance = shared_covariance(
+      layout, frames, known_at(capture, layout, x.head(m), starts, frames).information, x.head(m), out.evidence);
   out.corrections = corrections_at(layout, capture.cameras, x.head(m));
   set_states(layout, prior, covariance, out.corrections);
   out.covariance = covariance_of_numbers(layout, covariance);

@@ -3,6 +3,7 @@
 #pragma once
 #include <algorithm>
 #include <cmath>
+#include <optional>
 
 #include "src/silhouette/observations.h"
 
@@ -12,7 +13,7 @@ using math::Vector3;
 
 constexpr double kAligned = 0.7;   // least cosine between outline and tube normals
 constexpr double kLeastArm = 1.0;  // px, from a joint, to tell a direction from it
-constexpr double kEndReach = 2.0;  // half widths from the free end within which an outline may be the end's
+constexpr double kEndReach = 2.0;  // half widths from an end of the rope within which an outline may be the end's
 
 struct Nearest {  // place on the projected centerline nearest to a pixel
   int segment = -1;
@@ -66,38 +67,61 @@ struct OutlinePoint {
   double distance;    // px, from the tube's outline to the mask's, positive where the mask is wider
   double length;      // px of outline that it stands for
   double half_width;  // px, of the tube there
-  bool end;           // it shows the free end's disk, not the side
-  bool before_grasp;  // it is nearest to the grasp, and beyond it
+  enum class Part { side, end, start, before_grasp };
+  Part part;  // the tube's side, the free end's disk, where the mask begins, or nearest to the grasp and beyond it
 };
 
-// Calls each(edge) for every piece of outline of the active blobs, and then visit(point) where it shows the rope. The
-// free end may be `end_reach` half widths from where the chain ends.
+// Where the rope's ends are sought in a mask.
+struct Ends {
+  double reach = kEndReach;          // half widths from where they should be
+  std::optional<double> mask_start;  // m along the rope from the grasp, where the mask should begin; none: not sought
+};
+
+// An end of the rope is a flat disk, seen as an ellipse.
+struct EndDisk {
+  Vector3 x;             // its center, camera frame, m
+  Vector2 center;        // px
+  Vector2 along;         // unit, image: out of the rope
+  double radius, depth;  // px, half axes of the ellipse across and along the rope
+};
+
+inline EndDisk end_disk(const capture::Camera& camera, const Segment& s, const Vector3& x, double sign, double radius) {
+  EndDisk out{x, image_of(camera, x), sign * s.tangent, 0.0, 0.0};
+  out.radius = radius * projected_gradient(camera, x, s.normal).norm();
+  out.depth = out.radius * std::abs((s.b - s.a).normalized().dot(x.normalized()));
+  return out;
+}
+
+// Calls each(edge) for every piece of outline of the active blobs, and then visit(point) where it shows the rope.
 template <typename Each, typename Visit>
 void for_each_outline_point(const chain::Chain& chain, const ViewWork& work, const Each& each, const Visit& visit,
-                            double end_reach = kEndReach) {
+                            const Ends& ends = {}) {
   const capture::Camera& camera = *work.view->camera;
   const MaskPoints& mask = *work.view->mask;
   const double radius = 0.5 * chain.diameter;
   if (work.segments.empty()) return;
-  const Segment& last = work.segments.back();
-  const bool has_end = last.link + 1 == chain.links();
-  const Vector2 end = last.from + last.step;
-  const double end_radius = radius * projected_gradient(camera, last.b, last.normal).norm();
-  // the end is a flat disk, seen as an ellipse: this is its half axis along the rope
-  const double end_depth = end_radius * std::abs((last.b - last.a).normalized().dot(last.b.normalized()));
+  const Segment &first = work.segments.front(), &last = work.segments.back();
+  std::optional<EndDisk> end, start;
+  if (last.link + 1 == chain.links()) end = end_disk(camera, last, last.b, 1.0, radius);
+  if (ends.mask_start && chain.link_start(first.link) <= 0.0)
+    start = end_disk(camera, first, first.a + *ends.mask_start * (first.b - first.a).normalized(), -1.0, radius);
+  // whether a piece of outline shows the disk; visits it
+  const auto shows = [&](const Edge& edge, const EndDisk& disk, const Segment& segment, OutlinePoint::Part part) {
+    const Vector2 from_disk = edge.point - disk.center;
+    if (from_disk.norm() >= ends.reach * disk.radius || edge.outward.dot(disk.along) <= kAligned) return false;
+    const double side = segment.normal.dot(from_disk) / disk.radius;
+    const double bulge = disk.depth * std::sqrt(std::max(0.0, 1.0 - side * side));
+    visit(OutlinePoint{&segment, disk.x, projected_gradient(camera, disk.x, disk.along), disk.along,
+                       disk.along.dot(from_disk) - bulge, edge.weight, bulge, part});
+    return true;
+  };
   for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
     if (!work.active[b]) continue;
     for (int i = mask.blobs[b].first_edge; i < mask.blobs[b].last_edge; ++i) {
       const Edge& edge = mask.edges[i];
       each(edge);
-      const Vector2 from_end = edge.point - end;
-      if (has_end && from_end.norm() < end_reach * end_radius && edge.outward.dot(last.tangent) > kAligned) {
-        const double side = last.normal.dot(from_end) / end_radius;
-        const double bulge = end_depth * std::sqrt(std::max(0.0, 1.0 - side * side));
-        visit(OutlinePoint{&last, last.b, projected_gradient(camera, last.b, last.tangent), last.tangent,
-                           last.tangent.dot(from_end) - bulge, edge.weight, bulge, true, false});
-        continue;
-      }
+      if (end && shows(edge, *end, last, OutlinePoint::Part::end)) continue;
+      if (start && shows(edge, *start, first, OutlinePoint::Part::start)) continue;
       const Nearest at = nearest(work.segments, edge.point);
       if (past_end(work, at)) continue;
       const Segment& s = work.segments[at.segment];
@@ -112,8 +136,8 @@ void for_each_outline_point(const chain::Chain& chain, const ViewWork& work, con
       Vector3 g = projected_gradient(camera, x, m);
       const double half_width = radius * g.norm();
       g.z() -= half_width / x.z();  // farther is thinner
-      visit(OutlinePoint{&s, x, g, m, m.dot(from_center) - half_width, edge.weight, half_width, false,
-                         at.segment == 0 && at.t <= 0.0});
+      visit(OutlinePoint{&s, x, g, m, m.dot(from_center) - half_width, edge.weight, half_width,
+                         at.segment == 0 && at.t <= 0.0 ? OutlinePoint::Part::before_grasp : OutlinePoint::Part::side});
     }
   }
 }
