@@ -197,9 +197,9 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     for (const math::MatrixX& m : prior.information) c.extra.insert(c.extra.end(), m.data(), m.data() + m.size());
     save_checkpoint(c, options.checkpoint);
   };
+  const std::vector<double> empty = empty_losses(capture, training);
   // Adam's steps of one round (the last is the polish). Which views make a batch depends on the round alone: a resumed
   // one draws those of the steps before `first_step` again. False: the optimization ran away.
-  const std::vector<double> empty = empty_losses(capture, training);
   const auto adam = [&](int round, int first_step, core::Random& random) {
     const std::string note =
         round < kRounds ? "round " + std::to_string(round + 1) + " of " + std::to_string(kRounds) : "last polish";
@@ -223,7 +223,8 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
         psnr = mean(values.psnr_object);
         double nothing = 0.0;
         for (const int v : batch) nothing += empty[v];
-        if (watch_loss(watch, values.total / nothing) == Course::diverged) return false;
+        // masks of a batch may all be empty
+        if (nothing > 0.0 && watch_loss(watch, values.total / nothing) == Course::diverged) return false;
         core::report({"recognize", done_steps, total_steps, loss, psnr, note});
       }
     }

@@ -25,12 +25,6 @@ enum SharedOfView {
 };
 using SharedRow = Eigen::Matrix<double, kSharedOfView, 1>;
 
-// What one pixel of outline counts against the priors, of one independent observation of a deviation of 1 px.
-// Neighboring outline and neighboring frames share the error of straight links, which pulls the grasp along the rope:
-// on recordings with truth the place of the grasp and the length were off by 10 mm with 1, by their priors with less
-// than 0.05.
-constexpr double kEvidence = 0.02;
-
 // Where the quantities of one camera's views stand among the shared unknowns, which are in units of their deviations.
 struct SharedPlaces {
   std::array<int, kSharedOfView> at{};  // -1: held

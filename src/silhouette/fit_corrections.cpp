@@ -34,7 +34,7 @@ constexpr double kHidden = 0.01;
 // A finger's edge that crosses the cut face leaves outlines that scatter by 1 / sqrt(12) of what it covers at one side,
 // and it covers half of that in the mean.
 constexpr double kCovered = 1.7321;
-constexpr double kSharp = 0.0015;  // m, deviation above which it is not known whether it is the cut face
+constexpr double kSharp = 0.0014;  // m, start_deviations() above which it is not known whether it is the cut face
 constexpr double kRound = 0.25;  // deviation of how far the cut face reaches beyond its middle, of what a flat one does
 constexpr double kUnknownShare = 0.7;  // of the prior's deviation there above which a value is the prior's
 constexpr int kStretches = 12;         // of time, whose scatter tells what the equations do not know
@@ -150,7 +150,7 @@ std::vector<double> start_deviations(const std::vector<FrameEquations>& frames) 
 // Information, 1/m^2, about where a camera's masks begin, at x m: of a mixture of two Gaussians.
 double start_information(double x, double deviation, Starts starts) {
   const double narrow = 1.0 / (deviation * deviation), wide = std::min(narrow, 1.0 / (kHidden * kHidden));
-  if (starts == Starts::anywhere || deviation > kSharp) return wide;
+  if (starts == Starts::anywhere) return wide;
   const double at_grasp = 1.0 / (1.0 + std::sqrt(wide / narrow) * std::exp(0.5 * x * x * (narrow - wide)));
   return at_grasp * narrow + (1.0 - at_grasp) * wide;
 }
@@ -163,8 +163,10 @@ VectorX prior_weights(const Layout& layout, const VectorX& x, Starts starts,
   for (const Column& column : layout.columns) {
     if (column.first < 0) continue;
     if (is_mask_start(column)) {
-      const double unit = column.deviation, deviation = std::hypot(unit, start_deviations[column.camera]);
-      out[column.first] = unit * unit * start_information(unit * x[column.first], deviation, starts);
+      const double unit = column.deviation, untold = start_deviations[column.camera];
+      out[column.first] = unit * unit *
+                          start_information(unit * x[column.first], std::hypot(unit, untold),
+                                            untold > kSharp ? Starts::anywhere : starts);
       continue;
     }
     const int size = column.quantity->size;
