@@ -12,5 +12,8 @@ constexpr int kDeepestJson = 64;
 nlohmann::ordered_json parse_json(std::string_view text);
 // As parse_json(), but returns a value whose is_discarded() is true instead of throwing.
 nlohmann::ordered_json parse_json_or_discard(std::string_view text);
+// The value of an integer. The JSON library turns any number into an int, and one that does not fit into an undefined
+// one. Throws nlohmann::json::exception where it is none, or does not fit.
+int whole_number(const nlohmann::ordered_json& value);
 
 }  // namespace chainsplat::core

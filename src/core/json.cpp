@@ -1,5 +1,7 @@
 #include "chainsplat/json.h"
 
+#include <cstdint>
+#include <limits>
 #include <nlohmann/json.hpp>
 #include <string>
 
@@ -47,6 +49,14 @@ nlohmann::ordered_json parse_json_or_discard(std::string_view text) {
   } catch (const nlohmann::json::exception&) {
     return nlohmann::ordered_json(nlohmann::ordered_json::value_t::discarded);
   }
+}
+
+int whole_number(const nlohmann::ordered_json& value) {
+  constexpr std::int64_t kMost = std::numeric_limits<int>::max();
+  if (!value.is_number_integer() || value > kMost || value < -kMost)
+    // 302 is the library's own id for a value of another type
+    throw nlohmann::json::type_error::create(302, "is no whole number that fits", &value);
+  return value.get<int>();
 }
 
 }  // namespace chainsplat::core

@@ -41,7 +41,8 @@ std::string progress_of(const Path& run) {
   const Json record = core::parse_json_or_discard(line);
   try {
     std::string text = record.at("stage");
-    const std::int64_t step = record.value("iteration", 0), total = record.value("total", 0);
+    const auto number = [&](const char* key) { return record.contains(key) ? core::whole_number(record[key]) : 0; };
+    const int step = number("iteration"), total = number("total");
     if (total > 0) text += " " + std::to_string(step) + "/" + std::to_string(total);
     return text;
   } catch (const Json::exception&) {  // the line is not of our making
@@ -63,8 +64,8 @@ bool load_end(const Path& folder, const BatchJob& job, JobEnd& end) {
   if (!fs::exists(end_file(folder, job), error)) return false;
   const Json document = core::parse_json_or_discard(core::read_file(end_file(folder, job)));
   try {
-    end = {document.at("arguments").get<std::vector<std::string>>(), document.at("code"), document.at("stopped"),
-           document.at("seconds"), document.at("error")};
+    end = {document.at("arguments").get<std::vector<std::string>>(), core::whole_number(document.at("code")),
+           document.at("stopped"), document.at("seconds"), document.at("error")};
   } catch (const Json::exception&) {
     return false;  // then it counts as not ended, and is resumed
   }
