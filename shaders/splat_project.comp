@@ -105,5 +105,6 @@ void main() {
   splats[kSplatRows * out_index] = vec4(u, opacity, a.x.z);
   splats[kSplatRows * out_index + 1u] =
       vec4(conic, uintBitsToFloat(t0.x | t1.x << 16u));
-  splats[kSplatRows * out_index + 2u] = vec4(max(color, vec3(0.0)), uintBitsToFloat(t0.y | t1.y << 16u));
+  color = clamp(color * view.gain.xyz + view.bias.xyz, vec3(0.0), vec3(view.gain.w));
+  splats[kSplatRows * out_index + 2u] = vec4(color, uintBitsToFloat(t0.y | t1.y << 16u));
 }

@@ -45,9 +45,10 @@ void main() {
   SplatView view = views[v];
   Projection a = project(view, n, i, link);
 
-  // color: no gradient where max(0, .) is active
+  // color: no gradient where the camera cuts it off
   vec3 splat_color = splats[kSplatRows * s + 2u].xyz;
-  vec3 grad_color = vec3(sum0.w, sum1.w, blue) * vec3(greaterThan(splat_color, vec3(0.0)));
+  vec3 grad_color = vec3(sum0.w, sum1.w, blue) * view.gain.xyz * vec3(greaterThan(splat_color, vec3(0.0))) *
+                    vec3(lessThan(splat_color, vec3(view.gain.w)));
   // Sigma' = T T^T, T = J M
   vec3 h = 0.5 * sum1.xyz;  // dL/dSigma': xx, xy, yy
   vec3 grad_t0 = 2.0 * (h.x * a.t0 + h.y * a.t1);

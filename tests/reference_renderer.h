@@ -308,7 +308,9 @@ std::vector<Splat<S>> project(const Parameters<S>& g, const splat::ViewSpec& vie
       for (int c = 0; c < 3; ++c) {
         S color(0.5);
         for (int l = 0; l < g.coefficients(); ++l) color += basis[l] * g.sh[3 * (g.coefficients() * i + l) + c];
+        color = color * camera.gain[c] + S(camera.bias[c]);
         s.color[c] = value(color) > 0.0 ? color : S(0.0);
+        if (value(color) > splat::recorded_white(camera)) s.color[c] = S(1.0);
       }
       splats.push_back(s);
     }

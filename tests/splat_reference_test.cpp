@@ -233,6 +233,8 @@ TEST_CASE("the tape's gradients are those of central differences: degree 3, mask
   camera.fy = 17;
   camera.cx = 7.3;
   camera.cy = 4.6;
+  camera.gain = {0.9, 1.2, 1.05};
+  camera.bias = {0.03, -0.02, 0.01};
   reference::Parameters<double> g{3, 2, 3, {}, {}, {}, {}, {}, {}};
   const auto fill = [&](std::vector<double>& x, int count, double middle, double spread) {
     for (int k = 0; k < count; ++k) x.push_back(middle + spread * random.normal());

@@ -164,6 +164,9 @@ Scene random_scene(std::uint64_t seed, int count, int links, int degree, Logits 
   s.gaussians = random_gaussians(random, count, links, degree, logits, size);
   s.cameras = {make_camera(52, 36, 70.0, {}), make_camera(60, 41, 66.0, pose(0.05, -0.2, 0.3, 0.06, 0.01, -0.02)),
                make_camera(21, 45, 60.0, pose(0.0, 0.1, 1.4, -0.02, 0.0, 0.03))};
+  // one whose pictures are otherwise exposed, so that some colors are cut off at black and at white
+  s.cameras[1].gain = {0.8, 1.1, 1.3};
+  s.cameras[1].bias = {0.05, -0.1, 0.02};
   const std::vector<math::Pose> first = random_motions(random, links), second = random_motions(random, links);
   s.views = {{&s.cameras[0], 0, 0, 52, 36, first},
              {&s.cameras[1], 9, 5, 37, 23, second},

@@ -24,6 +24,8 @@ struct Camera {
   double fx = 0, fy = 0, cx = 0, cy = 0;  // px
   std::array<double, 5> distortion{};     // OpenCV's k1 k2 p1 p2 k3
   math::Pose world_from_camera;
+  // recorded = gain * color + bias of red, green and blue, colors in 0..1, as corrections say (formats.md 2.1.1)
+  math::Vector3 gain = math::Vector3::Ones(), bias = math::Vector3::Zero();
   bool distorted() const;
 };
 

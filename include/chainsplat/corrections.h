@@ -17,8 +17,8 @@ namespace chainsplat::capture {
 struct CorrectedQuantity {
   const char* subject;  // "camera" stands for each of them
   const char* name;     // as in twin.json
-  const char* group;    // by which it is held: cameras, focal, time, length, diameter, grasp, masks
-  const char* unit;     // rad, m, s or px
+  const char* group;    // by which it is held: cameras, focal, time, length, diameter, grasp, masks, colors
+  const char* unit;     // rad, m, s, px or 1
   int size;             // numbers
   double deviation;     // standard deviation before anything was seen, in the unit,
   double relative;      // or as a share of the given value
@@ -27,8 +27,14 @@ struct CorrectedQuantity {
 // rotation: rotation vector of a camera in its own frame (world_from_camera's rotation times its exponential), of the
 // grasp in the base frame; translation: of a camera in the world frame, of the grasp in the base frame; focal: of fx,
 // with fy in proportion; mask_offset: by how much the camera's masks are wider than the rope on each side; mask_start:
-// how far from the grasp along the rope its masks begin.
+// how far from the grasp along the rope its masks begin; gain, bias: recorded = (1 + gain) color + bias of red, green
+// and blue, colors in 0..1.
 const std::vector<CorrectedQuantity>& corrected_quantities();
+// The one of this name; `subject` as in CorrectedQuantity.
+const CorrectedQuantity& corrected_quantity(const std::string& subject, const std::string& name);
+// Its standard deviation before anything was seen, in its unit: what the capture says, or else what a careful
+// laboratory reaches. 0: what is given is exact. `camera`: an index, -1 for what is not a camera's.
+double prior_deviation(const Capture& capture, int camera, const CorrectedQuantity& quantity);
 
 // free: the recording determines it. prior: it may vary, but the recording says little beyond the given value. held:
 // not varied.
@@ -68,10 +74,10 @@ const Correction* find(const Corrections& corrections, const std::string& subjec
 // The first number of a correction, 0 where there is none.
 double value_of(const Corrections& corrections, const std::string& subject, const std::string& quantity);
 
-// Mends poses and focal lengths of the cameras, the times of cameras and views, the base's motion, and the rope's
-// length and diameter. A base whose samples then end before the last frame (or begin after the first) is continued with
-// its last velocity and acceleration. Views keep their pixels. Cameras without corrections stay as they are, and so do
-// those that are calibrated otherwise than the corrected ones were, which is warned of.
+// Mends poses, focal lengths and colors of the cameras, the times of cameras and views, the base's motion, and the
+// rope's length and diameter. A base whose samples then end before the last frame (or begin after the first) is
+// continued with its last velocity and acceleration. Views keep their pixels. Cameras without corrections stay as they
+// are, and so do those that are calibrated otherwise than the corrected ones were, which is warned of.
 void apply(const Corrections& corrections, Capture& capture);
 // What the base's poses are multiplied by.
 math::Pose grasp_in_base(const Corrections& corrections);

@@ -92,6 +92,9 @@ JointChoice choose_joints(const chain::Chain& chain, const SequenceFit& fit);
 struct CorrectionOptions {
   std::vector<std::string> held;  // groups of corrected_quantities() that are not varied
   int frames = 75;                // at most, spread over the recording
+  // Known mistakes as the corrections that mend them, e.g. half a pixel. Quantities that are not in one of them are
+  // right as given.
+  std::vector<capture::Corrections> mistakes;
 };
 
 // How far the masks' outlines are from the rope's in one camera, px; a positive sign where the mask is wider.
@@ -107,6 +110,7 @@ struct CorrectionFit {
   math::MatrixX covariance;  // of all their numbers, in their order and units; 0 for those that are held
   // By which share the outlines' square residuals would be larger with what was given, whatever of it is wrong.
   double evidence = 0.0;
+  std::vector<double> evidence_after;  // the same with each of the options' mistakes mended, and nothing else
   solve::Summary summary;              // the unknowns relative to their prior deviations, and rad
   std::vector<OutlineMisfit> misfits;  // by camera, after the corrections
   chain::Chain chain;                  // with the corrected length and diameter

@@ -38,6 +38,10 @@ struct ViewSpec {
   std::vector<math::Pose> motions;  // E_j of every link, base link first (mathematics.md 2.2)
 };
 
+// Color from which on a camera records nothing brighter: 1 where its gain and bias were found. Of another camera
+// nothing is known of them, and the Gaussians' colors, which nothing bounds above, take up what it does.
+double recorded_white(const capture::Camera& camera);
+
 // Row-major picture of one view. Colors are premultiplied by alpha, over a black background.
 struct Picture {
   int width = 0, height = 0;

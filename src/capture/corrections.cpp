@@ -27,6 +27,8 @@ const std::vector<CorrectedQuantity>& corrected_quantities() {
       {"camera", "time", "time", "s", 1, 0.001, 0.0, 10.0},
       {"camera", "mask_offset", "masks", "px", 1, 0.3, 0.0, 1e3},
       {"camera", "mask_start", "masks", "m", 1, 0.0005, 0.0, 100.0},
+      {"camera", "gain", "colors", "1", 3, 0.2, 0.0, 10.0},
+      {"camera", "bias", "colors", "1", 3, 0.03, 0.0, 1.0},
       {"base", "time", "time", "s", 1, 0.002, 0.0, 10.0},
       {"grasp", "translation", "grasp", "m", 3, 0.0005, 0.0, 100.0},
       {"grasp", "rotation", "grasp", "rad", 3, 0.005, 0.0, 3.2},
@@ -34,6 +36,25 @@ const std::vector<CorrectedQuantity>& corrected_quantities() {
       {"object", "diameter", "diameter", "m", 1, 0.0, 0.01, 100.0},
   };
   return quantities;
+}
+
+const CorrectedQuantity& corrected_quantity(const std::string& subject, const std::string& name) {
+  const auto& all = corrected_quantities();
+  const auto at =
+      std::find_if(all.begin(), all.end(), [&](const auto& q) { return q.subject == subject && q.name == name; });
+  CHAINSPLAT_CHECK(at != all.end(), "corrected quantity " + name);
+  return *at;
+}
+
+double prior_deviation(const Capture& capture, int camera, const CorrectedQuantity& quantity) {
+  const std::string subject = camera < 0 ? std::string(quantity.subject) : capture.cameras[camera].name;
+  for (const GivenSigma& given : capture.sigma)
+    if (given.subject == subject && given.quantity == quantity.name) return given.deviation;
+  if (quantity.relative == 0.0) return quantity.deviation;
+  const std::string group = quantity.group;
+  return quantity.relative * (group == "length"     ? capture.length
+                              : group == "diameter" ? capture.diameter
+                                                    : capture.cameras[camera].fx);
 }
 
 const char* name(CorrectionState state) {
@@ -82,6 +103,10 @@ Camera corrected(const Corrections& corrections, Camera camera) {
     throw InputError(camera.name, "the twin's correction leaves nothing of its focal length", "train again");
   camera.fx *= scale;
   camera.fy *= scale;
+  if (const Correction* const gain = find(corrections, camera.name, "gain")) camera.gain += gain->value;
+  if (const Correction* const bias = find(corrections, camera.name, "bias")) camera.bias += bias->value;
+  if (!(camera.gain.minCoeff() > kLeastShare))
+    throw InputError(camera.name, "the twin's correction leaves nothing of its colors", "train again");
   return camera;
 }
 

@@ -710,7 +710,8 @@ void read_sigma(const Reader& reader, Capture& capture) {
   cameras.know(names);
   for (const Camera& camera : capture.cameras) {
     const Reader node = cameras.child(camera.name, false, "{ \"rotation\": 0.002 }");
-    if (node.present()) node.know({"rotation", "translation", "focal", "time", "mask_offset", "mask_start"});
+    if (node.present())
+      node.know({"rotation", "translation", "focal", "time", "mask_offset", "mask_start", "gain", "bias"});
     read(node, camera.name, "camera");
   }
   const Reader base = reader.child("base", false, "{ \"time\": 0.002 }");

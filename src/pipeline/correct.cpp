@@ -1,10 +1,12 @@
 // correct.cpp - what a capture was given wrongly by a little, found before the long work, and said in plain words.
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdarg>
 #include <cstdio>
 #include <numbers>
 
+#include "chainsplat/camera_colors.h"
 #include "chainsplat/silhouette.h"
 #include "pipeline/mistakes.h"
 #include "pipeline/stages.h"
@@ -20,6 +22,11 @@ constexpr int kJoints = 16;  // with eight, the clamp's bend is taken for a wron
 // links alone leave up to 0.05 on clean recordings of hanging ropes and 0.5 on a table, a grasp 3 mm off 1.5 and more
 // (design.md, 'Corrections').
 constexpr double kNothingWrong = 1.0;
+// Pixel centers are counted from (0, 0) by most other tools. Taking this back must leave at most this share of the
+// evidence that something is wrong, of which there must be so much at least.
+constexpr std::array kShifts = {0.5, -0.5};  // px
+constexpr double kLeftOfHalfPixel = 0.2;     // share
+constexpr double kLeastForHalfPixel = 0.15;  // as kNothingWrong
 // Standard deviations from which a correction is told (something is wrong, and this may be it), and told as certain.
 constexpr double kPossible = 1.5, kCertain = 3.0;
 constexpr double kMeters = 1e3, kSeconds = 1e3, kDegrees = 180.0 / std::numbers::pi;  // to mm, ms, degrees
@@ -33,6 +40,9 @@ constexpr double kGraspTurn = 0.4;  // degrees
 constexpr double kLength = 0.5;     // %
 constexpr double kDiameter = 3.0;   // %
 constexpr double kFringe = 0.6;     // px
+constexpr double kBrightness = 5.0;  // %
+// From which share of a gain and which bias, of 1, on cameras' colors are mended at all: less is the model's error.
+constexpr double kGain = 0.03, kBias = 0.015;
 // What no correction explains.
 constexpr double kMisfit = 1.5;    // px RMS of a camera's outlines, of which straight links leave 0.3 to 0.4
 constexpr double kForeign = 0.25;  // share of the outline that is not the rope's: blobs, occluders, or a wrong length
@@ -106,6 +116,30 @@ void judge_cameras(const capture::Corrections& found, const capture::Capture& gi
                          camera.name + text("'s masks %s %.1f +- %.1f px %s than the rope on each side",
                                             certain(fringe) ? "are" : "may be", std::abs(fringe.value),
                                             fringe.deviation, fringe.value > 0.0 ? "wider" : "narrower")});
+  }
+}
+
+// Of the colors in the middle of the range: a bias and a gain seldom come alone.
+void judge_colors(const silhouette::CameraColors& colors, const capture::Capture& given,
+                  std::vector<Finding>& verdict) {
+  constexpr double kMiddle = 0.5;
+  for (std::size_t c = 0; c < given.cameras.size(); ++c) {
+    const auto column = static_cast<Eigen::Index>(c);
+    const math::Vector3 brighter =
+        100.0 * (colors.gain.col(column).array() - 1.0 + colors.bias.col(column).array() / kMiddle);
+    const double mean = brighter.mean(), deviation = 100.0 * colors.gain_deviation.col(column).mean();
+    const double cast = brighter.maxCoeff() - brighter.minCoeff();
+    if (std::abs(mean) >= kBrightness && std::abs(mean) > kPossible * deviation)
+      verdict.push_back(
+          {"camera-color", given.cameras[c].name, mean, deviation, "%", true, true, false, -1,
+           given.cameras[c].name + text("'s pictures are %.0f +- %.0f %% %s than all cameras' mean: corrected",
+                                        std::abs(mean), deviation, mean > 0.0 ? "brighter" : "darker")});
+    else if (cast >= kBrightness && cast > kPossible * deviation)
+      verdict.push_back(
+          {"camera-color", given.cameras[c].name, cast, deviation, "%", true, true, false, -1,
+           given.cameras[c].name + text("'s white balance is not the other cameras' (red %+.0f %%, green %+.0f %%, "
+                                        "blue %+.0f %% of their mean): corrected",
+                                        brighter[0], brighter[1], brighter[2])});
   }
 }
 
@@ -196,6 +230,78 @@ void judge_mass(const capture::Capture& given, std::vector<Finding>& verdict) {
             *given.mass, given.length, kMeters * given.diameter, density)});
 }
 
+// Turns of all cameras that shift their images by `shift` px to the right and down, as a larger cx and cy would.
+capture::Corrections shifted_images(const capture::Capture& given, double shift) {
+  capture::Corrections out;
+  for (const capture::Camera& camera : given.cameras) {
+    capture::Correction turn;
+    turn.quantity = &capture::corrected_quantity("camera", "rotation");
+    turn.subject = camera.name;
+    turn.value = math::Vector3(shift / camera.fy, -shift / camera.fx, 0.0);
+    out.push_back(std::move(turn));
+  }
+  return out;
+}
+
+// The corrections that the twin is made with: what was found; what was given where nothing is surely wrong, since it is
+// better known than what was found; or half a pixel where that alone explains what is wrong. Returns true for this one.
+bool decide(silhouette::CorrectionFit& fit, const silhouette::CorrectionOptions& options, Corrected& out) {
+  const auto least = std::min_element(fit.evidence_after.begin(), fit.evidence_after.end());
+  const bool half_pixel = fit.evidence > kLeastForHalfPixel && *least < kLeftOfHalfPixel * fit.evidence;
+  out.corrections = std::move(fit.corrections);
+  if (!half_pixel && fit.evidence >= kNothingWrong) {
+    out.covariance = std::move(fit.covariance);
+    return false;
+  }
+  for (capture::Correction& correction : out.corrections) correction.value.setZero();
+  if (!half_pixel) return false;
+  const std::size_t which = least - fit.evidence_after.begin();
+  for (capture::Correction& correction : out.corrections)
+    if (const auto* const turn = capture::find(options.mistakes[which], correction.subject, correction.quantity->name))
+      correction.value = turn->value;
+  out.verdict.push_back(
+      {"half-pixel", "cameras", kShifts[which], 0.0, "px", true, true, false, -1,
+       text("the cameras' cx and cy are half a pixel too %s%s: corrected", kShifts[which] > 0.0 ? "small" : "large",
+            kShifts[which] > 0.0 ? " (they count pixel centers from 0, 0; here from 0.5, 0.5)" : "")});
+  return true;
+}
+
+// Adds how the cameras' colors differ to the corrections and mends it in `capture`, whose cameras are corrected
+// already.
+void correct_colors(const silhouette::CorrectionFit& fit, const std::vector<std::string>& fixed,
+                    capture::Capture& capture, Corrected& out) {
+  const bool held = std::find(fixed.begin(), fixed.end(), "colors") != fixed.end();
+  const bool varied = capture.cameras.size() > 1 && !held;
+  silhouette::CameraColors colors;
+  if (varied) colors = silhouette::fit_camera_colors(fit.chain, capture, {fit.time, fit.theta, {}, {}});
+  bool differ = false;
+  for (Eigen::Index c = 0; c < colors.gain.cols(); ++c)
+    for (int i = 0; i < 3; ++i) {
+      const double gain = std::abs(colors.gain(i, c) - 1.0), bias = std::abs(colors.bias(i, c));
+      differ = differ || (gain > kGain && gain > kCertain * colors.gain_deviation(i, c)) ||
+               (bias > kBias && bias > kCertain * colors.bias_deviation(i, c));
+    }
+  capture::Corrections found;
+  for (std::size_t c = 0; c < capture.cameras.size(); ++c)
+    for (const char* const name : {"gain", "bias"}) {
+      capture::Correction correction;
+      correction.quantity = &capture::corrected_quantity("camera", name);
+      correction.subject = capture.cameras[c].name;
+      correction.value = correction.deviation = math::Vector3::Zero();
+      correction.calibration = capture::find(out.corrections, correction.subject, "rotation")->calibration;
+      if (varied) {
+        const bool gain = name == std::string("gain");
+        correction.state = capture::CorrectionState::free;
+        correction.deviation = (gain ? colors.gain_deviation : colors.bias_deviation).col(c);
+        if (differ) correction.value = gain ? math::Vector3(colors.gain.col(c).array() - 1.0) : colors.bias.col(c);
+      }
+      found.push_back(std::move(correction));
+    }
+  capture::apply(found, capture);
+  if (differ) judge_colors(colors, capture, out.verdict);
+  out.corrections.insert(out.corrections.end(), found.begin(), found.end());
+}
+
 }  // namespace
 
 Corrected correct(capture::Capture& capture, const std::vector<std::string>& fixed, bool anyway) {
@@ -217,20 +323,17 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   }
   silhouette::CorrectionOptions options;
   options.held = fixed;
+  for (const double shift : kShifts) options.mistakes.push_back(shifted_images(capture, shift));
   silhouette::CorrectionFit fit = silhouette::fit_corrections(chain, capture, sequence, options);
   tell_fit("correct", fit.summary);
-  out.corrections = std::move(fit.corrections);
-  // where nothing is surely wrong, what was given is better known than what was found
-  if (fit.evidence < kNothingWrong)
-    for (capture::Correction& correction : out.corrections) correction.value.setZero();
-  else
-    out.covariance = std::move(fit.covariance);
+  const bool half_pixel = decide(fit, options, out);
   judge_clocks(out.corrections, capture, out.verdict);
-  judge_cameras(out.corrections, capture, out.verdict);
+  if (!half_pixel) judge_cameras(out.corrections, capture, out.verdict);
   judge_rope(out.corrections, capture, out.verdict);
   judge_outlines(fit, capture, out.verdict);
   judge_folds(fit, out.verdict);
   capture::apply(out.corrections, capture);
+  correct_colors(fit, fixed, capture, out);
   return out;
 }
 

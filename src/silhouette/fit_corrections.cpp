@@ -56,17 +56,8 @@ struct Layout {
   int size = 0;     // of those that are not held
 };
 
-// What the capture says of it, or else what a careful laboratory reaches. 0: it is exact.
-double prior_deviation(const capture::CorrectedQuantity& quantity, const capture::Capture& capture, int camera) {
-  const std::string subject = camera < 0 ? std::string(quantity.subject) : capture.cameras[camera].name;
-  for (const capture::GivenSigma& given : capture.sigma)
-    if (given.subject == subject && given.quantity == quantity.name) return given.deviation;
-  if (quantity.relative == 0.0) return quantity.deviation;
-  const std::string group = quantity.group;
-  return quantity.relative * (group == "length"     ? capture.length
-                              : group == "diameter" ? capture.diameter
-                                                    : capture.cameras[camera].fx);
-}
+// Outlines say nothing of these.
+bool of_colors(const capture::CorrectedQuantity& quantity) { return quantity.group == std::string("colors"); }
 
 bool is_held(const capture::CorrectedQuantity& quantity, const capture::Capture& capture, const chain::Chain& chain,
              int camera, const std::vector<std::string>& held) {
@@ -83,13 +74,14 @@ bool is_held(const capture::CorrectedQuantity& quantity, const capture::Capture&
 Layout layout_of(const capture::Capture& capture, const chain::Chain& chain, const CorrectionOptions& options) {
   Layout layout;
   const auto add = [&](const capture::CorrectedQuantity& quantity, int camera) {
-    const double deviation = prior_deviation(quantity, capture, camera);
+    const double deviation = capture::prior_deviation(capture, camera, quantity);
     const bool held = deviation == 0.0 || is_held(quantity, capture, chain, camera, options.held);
     layout.columns.push_back({&quantity, camera, layout.numbers, held ? -1 : layout.size, deviation});
     layout.numbers += quantity.size;
     if (!held) layout.size += quantity.size;
   };
   for (const auto& quantity : capture::corrected_quantities()) {
+    if (of_colors(quantity)) continue;
     if (quantity.subject == std::string("camera")) {
       for (int c = 0; c < static_cast<int>(capture.cameras.size()); ++c) add(quantity, c);
     } else {
@@ -273,41 +265,55 @@ solve::ArrowEquations arrow_of(const std::vector<FrameEquations>& frames, const 
   return arrow;
 }
 
-// The square by which residuals grow where all shared unknowns are 0 but where the masks begin: fingers hide a piece of
-// the rope in many recordings that are right. `information`: of the outlines alone.
-double cost_of_given(const Layout& layout, const MatrixX& information, const VectorX& x) {
+// The square by which residuals grow where the shared unknowns are off by `x`, and where the masks begin is free:
+// fingers hide a piece of the rope in many recordings that are right. `information`: of the outlines alone.
+double cost_of_change(const Layout& layout, const MatrixX& information, const VectorX& x) {
   std::vector<int> starts, others;
   for (const Column& column : layout.columns)
     for (int i = 0; column.first >= 0 && i < column.quantity->size; ++i)
       (is_mask_start(column) ? starts : others).push_back(column.first + i);
-  const VectorX given = x(others), pull = information(starts, others) * given;
-  const double with_starts = given.dot(MatrixX(information(others, others)) * given);
+  const VectorX change = x(others), pull = information(starts, others) * change;
+  const double with_starts = change.dot(MatrixX(information(others, others)) * change);
   if (starts.empty()) return with_starts;
   const MatrixX own = information(starts, starts);
   return with_starts - pull.dot(own.completeOrthogonalDecomposition().solve(pull));
 }
 
+// The shared unknowns as `corrections` have them.
+VectorX shared_of(const Layout& layout, const std::vector<capture::Camera>& cameras,
+                  const capture::Corrections& corrections) {
+  VectorX out = VectorX::Zero(layout.size);
+  for (const Column& column : layout.columns) {
+    const std::string subject = column.camera < 0 ? std::string(column.quantity->subject) : cameras[column.camera].name;
+    const Correction* const found = capture::find(corrections, subject, column.quantity->name);
+    if (found && column.first >= 0) out.segment(column.first, column.quantity->size) = found->value / column.deviation;
+  }
+  return out;
+}
+
+// What the outlines alone say of the shared unknowns, whatever the angles are.
+MatrixX outline_information(const std::vector<FrameEquations>& frames) {
+  MatrixX out = MatrixX::Zero(frames.front().shared.rows(), frames.front().shared.cols());
+  for (const FrameEquations& frame : frames)
+    out += frame.shared - frame.local.coupling.transpose() * frame.local.matrix.ldlt().solve(frame.local.coupling);
+  return out;
+}
+
 // Deviations of the shared unknowns: the larger of what the equations say and of what the scatter of the gradients
 // between stretches of time says (a sandwich estimate), since neighboring frames share the model's error.
-MatrixX shared_covariance(const Layout& layout, const std::vector<FrameEquations>& frames, const MatrixX& known,
-                          const VectorX& x, double& evidence) {
+MatrixX shared_covariance(const std::vector<FrameEquations>& frames, const MatrixX& outlines, const MatrixX& known) {
   const Eigen::Index m = known.rows();
-  MatrixX information = known, scatter = known;
+  const MatrixX information = known + outlines;
+  MatrixX scatter = known;
   const int count = static_cast<int>(frames.size()), stretches = std::min(kStretches, count);
   for (int s = 0; s < stretches; ++s) {
     VectorX gradient = VectorX::Zero(m);
     for (int f = s * count / stretches; f < (s + 1) * count / stretches; ++f) {
       const auto& local = frames[f].local;
-      const Eigen::LDLT<MatrixX> own(local.matrix);
-      information += frames[f].shared - local.coupling.transpose() * own.solve(local.coupling);
-      gradient += frames[f].shared_gradient - local.coupling.transpose() * own.solve(local.gradient);
+      gradient += frames[f].shared_gradient - local.coupling.transpose() * local.matrix.ldlt().solve(local.gradient);
     }
     scatter += gradient * gradient.transpose();
   }
-  double squares = 0.0;
-  for (const FrameEquations& frame : frames)
-    for (const FrameEquations::Sums& sums : frame.sums) squares += sums.second;
-  evidence = squares > 0.0 ? cost_of_given(layout, information - known, x) / squares : 0.0;
   const MatrixX covariance = information.ldlt().solve(MatrixX::Identity(m, m));
   MatrixX robust = covariance * scatter * covariance;
   const VectorX grown = (covariance.diagonal().array() / robust.diagonal().array()).max(1.0).sqrt();
@@ -391,6 +397,13 @@ void set_states(const Layout& layout, const VectorX& prior, const MatrixX& share
   }
 }
 
+double square_residuals(const std::vector<FrameEquations>& frames) {
+  double out = 0.0;
+  for (const FrameEquations& frame : frames)
+    for (const FrameEquations::Sums& sums : frame.sums) out += sums.second;
+  return out;
+}
+
 std::vector<OutlineMisfit> misfits_of(const CorrectionProblem& problem, const std::vector<FrameEquations>& frames) {
   const int cameras = static_cast<int>(problem.cameras.size());
   std::vector<FrameEquations::Sums> sums(cameras);
@@ -471,8 +484,16 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
 
   const std::vector<FrameEquations> frames = all_equations(problem, layout, chain, x);
   const VectorX prior = prior_weights(layout, x.head(m), starts, start_deviations(frames));
-  const MatrixX covariance = shared_covariance(
-      layout, frames, known_at(capture, layout, x.head(m), starts, frames).information, x.head(m), out.evidence);
+  const MatrixX outlines = outline_information(frames);
+  const MatrixX covariance =
+      shared_covariance(frames, outlines, known_at(capture, layout, x.head(m), starts, frames).information);
+  const double squares = square_residuals(frames);
+  const auto evidence_of = [&](const capture::Corrections& mended) {
+    const VectorX change = x.head(m) - shared_of(layout, capture.cameras, mended);
+    return squares > 0.0 ? cost_of_change(layout, outlines, change) / squares : 0.0;
+  };
+  out.evidence = evidence_of({});
+  for (const capture::Corrections& mended : options.mistakes) out.evidence_after.push_back(evidence_of(mended));
   out.corrections = corrections_at(layout, capture.cameras, x.head(m));
   set_states(layout, prior, covariance, out.corrections);
   out.covariance = covariance_of_numbers(layout, covariance);
@@ -497,6 +518,7 @@ std::vector<MatrixX> covariances_by_corrections(const chain::Chain& chain, const
   const int cameras = static_cast<int>(capture.cameras.size()), n = chain.angles();
   Layout layout;
   for (const Correction& c : corrections) {
+    if (of_colors(*c.quantity)) continue;
     int camera = -1;
     for (int i = 0; i < cameras; ++i)
       if (capture.cameras[i].name == c.subject && c.quantity->subject == std::string("camera")) camera = i;

@@ -68,6 +68,8 @@ constexpr TileLanes tile_lanes(std::uint32_t tile, std::uint32_t pixels_per_lane
 struct SceneView {
   double fx = 0, fy = 0, cx = 0, cy = 0;  // px, of the crop
   double limit_x = 0, limit_y = 0;        // bounds of |x/z| and |y/z| in the projection's Jacobian
+  math::Vector3 gain, bias;               // capture::Camera's
+  double white = 0;                       // color at which its pixels are cut off
   int width = 0, height = 0, tiles_x = 0, tiles_y = 0;
   math::Pose camera_from_world;
   std::vector<math::Pose> motions;

@@ -87,6 +87,8 @@ std::vector<SplatView> Engine::State::stage_views(Submission& s, std::span<const
     placed.push_back({.intrinsics = {view.fx, view.fy, view.cx, view.cy},
                       .limits = {view.limit_x, view.limit_y, 0, 0},
                       .moment_point = {base.x(), base.y(), base.z(), 0},
+                      .gain = {view.gain.x(), view.gain.y(), view.gain.z(), view.white},
+                      .bias = {view.bias.x(), view.bias.y(), view.bias.z(), 0},
                       .width = narrow(view.width),
                       .height = narrow(view.height),
                       .tiles_x = narrow(view.tiles_x),

@@ -1,5 +1,6 @@
 // scene.cpp - loads Gaussians and views: decides which tiles are active and which views go into one submission.
 #include <algorithm>
+#include <limits>
 
 #include "chainsplat/image_model.h"
 #include "src/splat/engine.h"
@@ -97,6 +98,11 @@ void Engine::State::load_gaussians(Scene& scene, const Gaussians& gaussians) {
   need(scene.gradient, all.size() * sizeof(float), "gradient");
 }
 
+double recorded_white(const capture::Camera& camera) {
+  constexpr double kNone = std::numeric_limits<float>::max();
+  return camera.gain == math::Vector3::Ones() && camera.bias.isZero(0.0) ? kNone : 1.0;
+}
+
 void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
                                std::span<const std::vector<std::uint8_t>* const> targets, Active active) {
   scene.views.clear();
@@ -113,6 +119,9 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
     view.cy = spec.camera->cy - spec.y0;
     view.limit_x = clamp_margin * 0.5 * spec.camera->width / view.fx;
     view.limit_y = clamp_margin * 0.5 * spec.camera->height / view.fy;
+    view.gain = spec.camera->gain;
+    view.bias = spec.camera->bias;
+    view.white = recorded_white(*spec.camera);
     view.width = spec.width;
     view.height = spec.height;
     view.tiles_x = (spec.width + static_cast<int>(tile_width) - 1) / static_cast<int>(tile_width);

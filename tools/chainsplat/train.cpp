@@ -106,7 +106,7 @@ void add_recognition_options(CLI::App& command, Request& request) {
       ->type_name("MODE");
   command
       .add_option("--fixed", options.fixed,
-                  "Take as given what is else corrected: cameras,focal,time,length,diameter,grasp,masks, or all")
+                  "Take as given what is else corrected: cameras,focal,time,length,diameter,grasp,masks,colors, or all")
       ->delimiter(',')
       ->type_name("LIST");
   command.add_flag("--anyway", options.anyway,

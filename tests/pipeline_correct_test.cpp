@@ -1,0 +1,79 @@
+// Conventions and exposures that a capture was given or recorded wrongly, put into the demo by hand.
+#include <doctest/doctest.h>
+
+#include <algorithm>
+#include <cmath>
+
+#include "pipeline/stages.h"
+
+using namespace chainsplat;
+
+namespace {
+
+capture::Capture demo() {
+  static const capture::Capture capture = capture::load(Path(CHAINSPLAT_SOURCE_DIR) / "assets/demo_free_30");
+  return capture;
+}
+
+const capture::Finding* finding(const std::vector<capture::Finding>& verdict, const std::string& code,
+                                const std::string& subject) {
+  for (const capture::Finding& f : verdict)
+    if (f.code == code && f.subject == subject) return &f;
+  return nullptr;
+}
+
+TEST_CASE("half a pixel is named and taken back, and is not found where there is none") {
+  for (const double shift : {-0.5, 0.5}) {
+    capture::Capture capture = demo();
+    for (capture::Camera& camera : capture.cameras) camera.cx += shift, camera.cy += shift;
+    const pipeline::Corrected found = pipeline::correct(capture, {}, false);
+    const capture::Finding* const said = finding(found.verdict, "half-pixel", "cameras");
+    REQUIRE(said);
+    CHECK(said->value == -shift);
+    CHECK(said->corrected);
+    CHECK(said->trusted);
+    // the middle of the picture is where it was with the right numbers
+    for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
+      const capture::Camera &mended = capture.cameras[c], right = demo().cameras[c];
+      const math::Vector3 seen = right.world_from_camera * math::Vector3(0, 0, 1);
+      const math::Vector2 at = capture::project(mended, mended.world_from_camera.inverse() * seen);
+      CHECK((at - math::Vector2(right.cx, right.cy)).norm() < 1e-3);
+    }
+  }
+  capture::Capture right = demo();
+  const pipeline::Corrected nothing = pipeline::correct(right, {}, false);
+  CHECK(!finding(nothing.verdict, "half-pixel", "cameras"));
+  for (const capture::Camera& camera : right.cameras) {
+    CHECK(camera.gain.isOnes(0.0));
+    CHECK(camera.bias.isZero(0.0));
+  }
+}
+
+TEST_CASE("a darker camera is named, and its pictures stay as they are") {
+  constexpr double kDark = 0.7;
+  capture::Capture capture = demo();
+  for (capture::View& view : capture.views) {
+    if (view.camera != 1) continue;
+    for (std::size_t i = 0; i < view.rgba.size(); i += 4)
+      for (int c = 0; c < 3; ++c)
+        view.rgba[i + c] = static_cast<std::uint8_t>(std::lround(kDark * view.rgba[i + c]));
+  }
+  const std::vector<capture::View> recorded = capture.views;
+  const pipeline::Corrected found = pipeline::correct(capture, {}, false);
+  const capture::Finding* const said = finding(found.verdict, "camera-color", "cam1");
+  REQUIRE(said);
+  CHECK(said->value < -15.0);
+  CHECK(said->corrected);
+  const double others = 0.5 * (capture.cameras[0].gain.mean() + capture.cameras[2].gain.mean());
+  CHECK(capture.cameras[1].gain.mean() / others == doctest::Approx(kDark).epsilon(0.05));
+  CHECK(std::equal(recorded.begin(), recorded.end(), capture.views.begin(),
+                   [](const capture::View& a, const capture::View& b) { return a.rgba == b.rgba; }));
+
+  capture::Capture held = demo();
+  held.views = recorded;
+  const pipeline::Corrected as_given = pipeline::correct(held, {"colors"}, false);
+  CHECK(!finding(as_given.verdict, "camera-color", "cam1"));
+  CHECK(held.cameras[1].gain.isOnes(0.0));
+}
+
+}  // namespace
