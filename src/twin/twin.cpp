@@ -447,7 +447,16 @@ double cylinder_radius(const chain::Chain& chain, const std::vector<double>& mas
   const Vector3& d = chain.direction;
   const double along = d[0] * d[0] * i[0] + d[1] * d[1] * i[1] + d[2] * d[2] * i[2] +
                        2 * (d[0] * d[1] * i[3] + d[0] * d[2] * i[4] + d[1] * d[2] * i[5]);
-  const double radius = masses[0] > 0.0 ? std::sqrt(std::max(0.0, 2.0 * along / masses[0])) : 0.0;
+  double radius = masses[0] > 0.0 ? std::sqrt(std::max(0.0, 2.0 * along / masses[0])) : 0.0;
+  // the last digits are rounding, and would change each time the twin is saved and loaded
+  constexpr double kDigits = 12.0;
+  const double half = 0.5 * chain.diameter;
+  if (std::abs(radius - half) <= kRounding * half) {
+    radius = half;
+  } else if (radius > 0.0) {
+    const double step = std::pow(10.0, std::floor(std::log10(radius)) - kDigits + 1.0);
+    radius = std::round(radius / step) * step;
+  }
   if (!fits(radius, kByHand))
     links[1]["inertia"].fail("is, with the other links', not that of uniform cylinders of one radius",
                              "write m (l^2/12 + r^2/4) across and m r^2/2 along the link");
