@@ -198,15 +198,20 @@ std::optional<FoundPose> find_pose(const Json& entry, const std::string& where, 
   return choose(inside, where, camera);
 }
 
+// A size of an image, px; 0 where it is none.
+int pixels_of(double value) {
+  constexpr int kMost = 1 << 15;
+  return value >= 1 && value <= kMost ? static_cast<int>(value) : 0;
+}
+
 void read_size(const Json& entry, Calibration& calibration) {
   const auto width = number(find(entry, {"image_width", "width", "w", "img_width", "imageWidth"}));
   const auto height = number(find(entry, {"image_height", "height", "h", "img_height", "imageHeight"}));
   const auto both = list(find(entry, {"image_size", "imageSize", "resolution", "img_size", "img_shape", "size"}));
-  const auto set = [](double value) { return value >= 1 && value <= 1 << 15 ? static_cast<int>(value) : 0; };
   if (width && height)
-    calibration.width = set(*width), calibration.height = set(*height);
+    calibration.width = pixels_of(*width), calibration.height = pixels_of(*height);
   else if (both && both->size() == 2)
-    calibration.width = set((*both)[0]), calibration.height = set((*both)[1]);
+    calibration.width = pixels_of((*both)[0]), calibration.height = pixels_of((*both)[1]);
 }
 
 const Json* camera_matrix(const Json& entry) {
@@ -353,6 +358,12 @@ std::optional<Calibration> read_kalibr(const Json& document, const Json& entry, 
   return out;
 }
 
+// As find(): keys in any case. Null where the frame has none.
+Json transform_of(const Json& frame) {
+  const Json* const matrix = find(frame, {"transform_matrix"});
+  return matrix ? *matrix : Json();
+}
+
 // The entry of transforms.json whose file_path is meant.
 const Json& nerfstudio_frame(const Json& frames, const Source& source, const std::string& camera) {
   const std::string wanted = source.key.empty() ? camera : source.key;
@@ -366,7 +377,7 @@ const Json& nerfstudio_frame(const Json& frames, const Source& source, const std
     if (name.find(wanted) != std::string::npos) found.push_back(&frame);
   }
   if (found.size() == 1 || (found.size() > 1 && std::all_of(found.begin(), found.end(), [&](const Json* f) {
-                              return (*f)["transform_matrix"] == (*found[0])["transform_matrix"];
+                              return transform_of(*f) == transform_of(*found[0]);
                             })))
     return *found[0];
   throw wrong(
@@ -387,7 +398,7 @@ std::optional<Calibration> read_nerfstudio(const Json& document, const Source& s
   Calibration out;
   out.format = "nerfstudio transforms.json";
   const auto w = value("w"), h = value("h");
-  if (w && h) out.width = static_cast<int>(*w), out.height = static_cast<int>(*h);
+  if (w && h) out.width = pixels_of(*w), out.height = pixels_of(*h);
   auto fx = value("fl_x"), fy = value("fl_y");
   if (!fx && value("camera_angle_x") && w) fx = 0.5 * *w / std::tan(0.5 * *value("camera_angle_x"));
   if (!fx || !w || !h) throw wrong(source, "has no fl_x, w and h", "write the focal length and size in pixels");
@@ -404,7 +415,7 @@ std::optional<Calibration> read_nerfstudio(const Json& document, const Source& s
   } else {
     throw wrong(source, "its camera model '" + name + "' is not supported", "use OPENCV or OPENCV_FISHEYE");
   }
-  const auto m = matrix(frame["transform_matrix"]);
+  const auto m = matrix(transform_of(frame));
   const auto pose = m ? rigid(*m) : std::nullopt;
   if (!pose) throw wrong(source, "its transform_matrix is no rigid motion", "write 4x4, camera to world");
   out.pose = FoundPose{*pose, Direction::world_from_camera, Axes::opengl, source.file.string() + ": transform_matrix"};

@@ -188,7 +188,7 @@ sys.exit(failures > 0)
 SCRIPT
 
 # the program reads what was written, and finds what is badly wrong
-reads gain 0 "^cam0's pictures are .* brighter than all cameras' mean: corrected"
+reads gain 0 "^found: cam0's pictures are .* darker than all cameras' mean: corrected"
 reads frames 0 '^cam1: .* 57 frames'
 reads motion 0 '^cam2: .* 60 frames'
 reads clock 0 '^cam2: .* 0\.020 to 1\.987 s'
