@@ -21,15 +21,14 @@
 //                   weak* [ { singular_value, direction { name: component } } ]: combinations of parameters that the
 //                   data hardly determine;
 //                   solver* { reason, iterations, initial_cost, final_cost, worst_step }: how the fit ended (solve.h)
-//   properties*     what a rope is known by (properties.h); validity* acceleration, speed, curvature: each { value,
-//   unit },
+//   properties*     what a rope is known by (properties.h); validity* acceleration, speed, curvature: each { value, unit },
 //                   the largest that the dynamics were identified from (validity.h)
 //   corrections     cameras { name { rotation, translation, focal, time, mask_offset, mask_start, gain, bias;
-//                   calibration } }, base { time }, grasp { translation }, object { length, diameter }:
-//                   each { value, sigma, state } (corrections.h); absent where nothing was estimated
-//   verdict, trusted   [ { code, subject, value, sigma, unit, corrected, trusted, frame, text } ]; false: do not trust
-//   it gaussians, states, rollout   file names, each absent until the file exists provenance      version, capture,
-//   capture_hash, options, seed, device, driver, durations { stage: s }
+//                   calibration } }, base { time }, grasp { translation }, object { length, diameter }: each
+//                   { value, sigma, state } (corrections.h); absent where nothing was estimated
+//   verdict, trusted   [ { code, subject, value, sigma, unit, corrected, trusted, frame, text } ]; false: do not trust it
+//   gaussians, states, rollout   file names, each absent until the file exists
+//   provenance      version, capture, capture_hash, options, seed, device, driver, durations { stage: s }
 #pragma once
 #include <map>
 #include <optional>

@@ -13,8 +13,8 @@ struct SplatView {
   vec4 intrinsics;   // fx, fy, cx - x0, cy - y0 (px)
   vec4 limits;       // x, y: largest |x/z|, |y/z| in the projection's Jacobian (mathematics.md 2.5); z, w unused
   vec4 moment_point; // xyz: base origin in the camera frame (m), about which link moments are summed; w unused
-  vec4 gain,
-      bias;  // recorded = gain * color + bias; gain.w: recorded white (what is brighter is cut off); bias.w unused
+  vec4 gain;         // xyz: recorded = gain * color + bias; w: recorded white, what is brighter is cut off
+  vec4 bias;         // xyz; w unused
   uint width, height;            // px of the crop
   uint tiles_x, tiles_y;
   uint tile_map;                 // first entry in the tile map (grid cell -> active tile or kNoTile)

@@ -41,8 +41,6 @@ constexpr double kLength = 0.5;     // %
 constexpr double kDiameter = 3.0;   // %
 constexpr double kFringe = 0.6;     // px
 constexpr double kBrightness = 5.0;  // %
-// From which share of a gain and which bias, of 1, on cameras' colors are mended at all: less is the model's error.
-constexpr double kGain = 0.03, kBias = 0.015;
 // What no correction explains.
 constexpr double kMisfit = 1.5;    // px RMS of a camera's outlines, of which straight links leave 0.3 to 0.4
 constexpr double kForeign = 0.25;  // share of the outline that is not the rope's: blobs, occluders, or a wrong length
@@ -278,8 +276,7 @@ void correct_colors(const silhouette::CorrectionFit& fit, const std::vector<std:
   for (Eigen::Index c = 0; c < colors.gain.cols(); ++c)
     for (int i = 0; i < 3; ++i) {
       const double gain = std::abs(colors.gain(i, c) - 1.0), bias = std::abs(colors.bias(i, c));
-      differ = differ || (gain > kGain && gain > kCertain * colors.gain_deviation(i, c)) ||
-               (bias > kBias && bias > kCertain * colors.bias_deviation(i, c));
+      differ = differ || gain > kCertain * colors.gain_deviation(i, c) || bias > kCertain * colors.bias_deviation(i, c);
     }
   capture::Corrections found;
   for (std::size_t c = 0; c < capture.cameras.size(); ++c)
