@@ -393,6 +393,30 @@ TEST_CASE("on a table friction at rest hides forces, and the interval says how m
   }
 }
 
+TEST_CASE("on a table friction that may as well act the other way is no touch") {
+  const chain::Chain rope =
+      chain::make_chain(0.3, 0.02, Vector3::UnitX(), Vector3::UnitZ(), 8, chain::Bending::planar, false);
+  dynamics::Parameters p = uniform(8, 8, 0.06, 0.012, 1e-3, 0.01);
+  p.table_normal = Vector3::UnitZ();
+  p.coulomb_friction.assign(8, 0.35);
+  const dynamics::Model model = dynamics::make_model(rope, p);
+  const auto base = [](double) { return dynamics::at_rest({}); };
+  // the rope turns about the grasp, and is said to turn the other way; where it does so, its rest angles balance it
+  const VectorX theta = VectorX::Zero(8), thetadot = 0.1 * VectorX::Unit(8, 0);
+  const VectorX off = force::residual_torque(model, base(0.0), theta, thetadot, VectorX::Zero(8));
+  dynamics::Model balanced = model;
+  for (int k = 0; k < 8; ++k) balanced.parameters.rest_angle[k] = off[k] / p.stiffness[k];
+  for (const bool sure : {true, false}) {
+    CAPTURE(sure);
+    force::Motion motion = at_rest(theta, 5);
+    for (VectorX& rates : motion.thetadot) rates = -thetadot;
+    motion.noise = 1e-4 * MatrixX::Identity(8, 8);
+    for (Matrix3& covariance : motion.covariance) covariance = Vector3(1e-4, sure ? 1e-4 : 1e3, 1e-4).asDiagonal();
+    const std::vector<force::Estimate> found = force::estimate(balanced, {}, base, motion, {});
+    CHECK(found[2].touching == sure);
+  }
+}
+
 // A finger that pushes a sliding rope presses it down, and one that brakes it lifts it, because the rolling rope rubs
 // at the finger.
 TEST_CASE("on a table a push is told with what it presses the rope down") {

@@ -17,9 +17,10 @@ namespace {
 
 constexpr double kPushedMass = 0.06;  // kg, of the rope to which Options::force_scale refers
 
-// `touching` means that a contact is more likely than not and its force exceeds this share of the rope's weight, since
-// model errors cause apparent forces below it.
+// `touching` means that a contact is more likely than not, and that its force exceeds this share of the rope's weight,
+// since model errors cause apparent forces below it, and so many of its standard errors.
 constexpr double kTouchingWeight = 0.04;
+constexpr double kTouchingErrors = 2.0;
 
 // Ratio of the times without and with a contact, where contacts are searched for and where the user names one.
 constexpr double kOddsOfNone = 3.0, kOddsWhereNamed = 1.0;
@@ -42,6 +43,7 @@ struct Frame {
   std::vector<Pose> motions;
   std::vector<double> hidden;  // N per link, friction that may balance a force unseen
   std::vector<double> speed;   // m/s per link, of its middle over the table
+  std::vector<double> slow;    // m/s per link, speed below which it is not known which way its friction acts
   std::vector<Vector3> slip;   // per link, direction of that speed; shorter than 1 below the regularization speed
   Contact named;               // the contact that the user names, valid if `is_named`
   bool is_named = false;
@@ -96,6 +98,7 @@ Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> de
   // friction at rest balances any force up to its limit; neighbors are correlated, as they were dragged there together
   out.hidden.assign(chain.links(), 0.0);
   out.speed.assign(chain.links(), 0.0);
+  out.slow.assign(chain.links(), 0.0);
   out.slip.assign(chain.links(), Vector3::Zero());
   if (p.table_normal) {
     const Vector3& normal = *p.table_normal;
@@ -109,10 +112,15 @@ Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> de
       const Vector3 v = across * (jacobian * thetadot + v0 + omega.cross(x - base.pose.translation));
       out.speed[link] = v.norm();
       out.slip[link] = v / std::hypot(v.norm(), p.coulomb_speed);
+      // a link that may as well slide the other way: where the rope turns, the speed's error reverses its friction
+      const MatrixX sliding = across * jacobian;
+      const double speed_variance =
+          0.5 * motion.covariance[f](1, 1) * (sliding * motion.noise * sliding.transpose()).trace();
+      out.slow[link] = std::hypot(p.coulomb_speed, std::sqrt(speed_variance));
       const double limit = p.coulomb_friction[link - 1] * p.link_mass[link - 1] * std::abs(p.gravity.dot(normal));
-      out.hidden[link] = limit * p.coulomb_speed / std::hypot(v.norm(), p.coulomb_speed);
+      out.hidden[link] = limit * out.slow[link] / std::hypot(v.norm(), out.slow[link]);
       const double off = std::hypot(out.hidden[link], options.relative_deviation * limit);
-      friction[link] = off * across * jacobian;
+      friction[link] = off * sliding;
     }
     for (int a = 1; a < chain.links(); ++a)
       for (int b = 1; b < chain.links(); ++b) {
@@ -263,7 +271,8 @@ Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, 
     e.force = believed * force;
     e.sigma = (variance + believed * (1.0 - believed) * force.cwiseProduct(force)).cwiseSqrt();
     e.observed = (Vector3::Ones() - variance.cwiseQuotient(touch.prior.diagonal())).cwiseMax(0.0);
-    e.touching = e.probability > 0.5 && e.force.norm() > kTouchingWeight * dynamics::total_mass(p) * p.gravity.norm();
+    e.touching = e.probability > 0.5 && e.force.norm() > kTouchingWeight * dynamics::total_mass(p) * p.gravity.norm() &&
+                 force.dot(covariance.ldlt().solve(force)) > kTouchingErrors * kTouchingErrors;
     // friction at rest may balance any force up to its limit: bounds around the force if it balanced none
     const Fit sliding = solve(touch.jacobian, frame.residual, frame.sliding_covariance, touch.prior);
     const double limit = std::accumulate(frame.hidden.begin(), frame.hidden.end(), 0.0);
@@ -278,7 +287,7 @@ Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, 
   e.point = frame.motions[e.contact.link] * e.contact.home;
   // friction is known where the links about the contact slide
   for (int link = std::max(1, e.contact.link - 1); link <= std::min(chain.links() - 1, e.contact.link + 1); ++link)
-    if (frame.hidden[link] > 0.0 && frame.speed[link] < kMovingSpeeds * p.coulomb_speed) e.moving = false;
+    if (frame.hidden[link] > 0.0 && frame.speed[link] < kMovingSpeeds * frame.slow[link]) e.moving = false;
   return e;
 }
 
