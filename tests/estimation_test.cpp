@@ -563,13 +563,82 @@ TEST_CASE("a base whose stamps are late is found to be so while it moves") {
   const auto late_base = [](double time) { return moving_base(time - kLate); };
   estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, late_base, 0.0);
   const auto found = follow(filter, shared_views());
-  CHECK(std::abs(filter.base_late - kLate) < 6e-3);  // in a second of motion
-  CHECK(filter.base_late_information > 1.0 / (3e-3 * 3e-3));
+  CHECK(std::abs(filter.setup.mean[0] - kLate) < 6e-3);  // in a second of motion
+  CHECK(filter.setup.information(0, 0) > 1.0 / (3e-3 * 3e-3));
   const std::size_t last = found.size() - 1;
   CHECK(rms(shared_twin().chain, found[last].theta, shared_truth().theta[last]) < 5e-3);
   estimation::Filter right = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
   follow(right, shared_views());
-  CHECK(std::abs(right.base_late) < 3e-3);
+  CHECK(std::abs(right.setup.mean[0]) < 3e-3);
+}
+
+TEST_CASE("a camera that the twin does not know is found to stand where it does") {
+  const capture::Camera right = front_camera();
+  capture::Camera off = right;
+  off.world_from_camera.rotation *= math::exp_so3(Vector3(0.003, 0.005, -0.002));
+  off.world_from_camera.translation += Vector3(0.002, -0.002, -0.003);
+  const chain::Chain& chain = shared_twin().chain;
+  const auto follow_with = [&](const std::vector<char>& unverified) {
+    estimation::Filter filter = estimation::start(shared_twin(), {off}, moving_base, 0.0, {}, unverified);
+    const auto found = follow(filter, shared_views());
+    double error = 0.0;
+    for (std::size_t f = 20; f < found.size(); ++f) error += rms(chain, found[f].theta, shared_truth().theta[f]);
+    return std::tuple{error / static_cast<double>(found.size() - 20), found, filter};
+  };
+  const auto [as_given, trusting, given] = follow_with({});
+  const auto [error, found, filter] = follow_with({1});
+  CHECK(error < 0.5 * as_given);
+  for (std::size_t f = 0; f < found.size(); ++f)
+    CHECK(rms(chain, found[f].theta, shared_truth().theta[f]) < 3.0 * deviation(chain, found[f]));
+  // while it is learned the rope seems to move
+  CHECK(found[0].settling);
+  CHECK_FALSE(found.back().settling);
+  // where the rope is, both cameras now see the same
+  const Vector3 middle = moving_base(1.0).pose.translation - Vector3(0.0, 0.0, 0.15);
+  const auto pixel = [&](const capture::Camera& camera) {
+    return Vector2(capture::project(camera, camera.world_from_camera.inverse() * middle));
+  };
+  const double before = (pixel(off) - pixel(right)).norm(), after = (pixel(filter.cameras[0]) - pixel(right)).norm();
+  CHECK(before > 1.5);
+  CHECK(after < 0.4 * before);
+}
+
+TEST_CASE("a rope on a table lies in its plane, however the gripper's pose is tilted") {
+  twin::Twin twin = shared_twin();
+  twin.chain = chain::make_chain(0.3, 0.02, Vector3::UnitX(), Vector3::UnitZ(), 6, chain::Bending::planar, false);
+  twin.parameters.reset();
+  twin.tabletop = true;
+  trajectory::BaseMotion tilted;
+  tilted.pose.rotation = math::exp_so3(Vector3(0.02, -0.015, 0.3));
+  tilted.velocity << 0.1, 0.2, 0.3, 0.4, 0.5, 0.6;
+  const estimation::Filter filter = estimation::start(
+      twin, {front_camera()}, [&](double) { return tilted; }, 0.0);
+  const trajectory::BaseMotion believed = estimation::base_at(filter, 0.0);
+  CHECK((believed.pose.rotation.col(2) - Vector3::UnitZ()).norm() < 0.001);
+  CHECK((tilted.pose.rotation.col(2) - Vector3::UnitZ()).norm() > 0.02);
+  // the same motion of the gripper, told in the turned frame
+  CHECK(
+      (believed.pose.rotation * believed.velocity.head<3>() - tilted.pose.rotation * tilted.velocity.head<3>()).norm() <
+      1e-12);
+  CHECK(
+      (believed.pose.rotation * believed.velocity.tail<3>() - tilted.pose.rotation * tilted.velocity.tail<3>()).norm() <
+      1e-12);
+}
+
+TEST_CASE("blobs apart from a rope that is seen whole are no reason to doubt it") {
+  std::vector<capture::View> views(shared_views().begin(), shared_views().begin() + 6);
+  estimation::Filter alone = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  const auto expected = follow(alone, views);
+  for (capture::View& view : views)
+    for (int x0 : {10, 260})
+      for (int y = 20; y < 60; ++y)
+        for (int x = x0; x < x0 + 40; ++x) view.rgba[4 * (y * view.width + x) + 3] = 255;
+  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  const auto found = follow(filter, views);
+  for (std::size_t f = 0; f < found.size(); ++f) {
+    CHECK(std::string(estimation::status(found[f])) == "following");
+    CHECK(rms(shared_twin().chain, found[f].theta, expected[f].theta) < 0.5e-3);
+  }
 }
 
 TEST_CASE("a mask elsewhere is not the rope: lost, and the prediction stays") {
@@ -651,6 +720,20 @@ TEST_CASE("the tube covers its own mask, and half of it when the other half is h
         doctest::Approx(whole * kept / mask).epsilon(0.05));
 }
 
+TEST_CASE("what a line says of the base is read back, and refused where it cannot be") {
+  const auto read = [](const char* more) {
+    return estimation::read_estimate_line(std::string(R"({"time": 1.0, "theta": [0.1, 0.2])") + more + "}", "here", 2,
+                                          0.0);
+  };
+  CHECK(read("")->base.late == 0.0);
+  CHECK_FALSE(read(R"(, "settling": true)"));
+  CHECK(read(R"(, "base_late": 0.02)")->base.late == 0.02);
+  CHECK(read(R"(, "grasp_rotation": [0.1, 0, 0.2])")->base.grasp_rotation == Vector3(0.1, 0.0, 0.2));
+  for (const char* wrong : {R"(, "base_late": "x")", R"(, "base_late": 1e9)", R"(, "grasp_rotation": [0.1])",
+                            R"(, "grasp_rotation": [9, 9, 9])"})
+    CHECK_THROWS_AS(read(wrong), InputError);
+}
+
 TEST_CASE("a line of JSON holds what formats.md 3.1 names") {
   estimation::Estimate e;
   e.frame = 12;
@@ -675,6 +758,8 @@ TEST_CASE("a line of JSON holds what formats.md 3.1 names") {
   CHECK(line["latency_ms"].get<double>() == doctest::Approx(7.9));
   e.theta[1] = NAN;  // JSON has no such number
   e.covariance(1, 0) = INFINITY;
+  CHECK(line["base_late"] == 0.0);
+  CHECK(line["grasp_rotation"].size() == 3);
   const auto broken = nlohmann::json::parse(estimation::to_json(e, 0.0079));
   CHECK(broken["theta"][1].is_null());
   CHECK(broken["covariance"][1].is_null());

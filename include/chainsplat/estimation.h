@@ -18,7 +18,9 @@
 #include <vector>
 
 #include "chainsplat/capture.h"
+#include "chainsplat/corrections.h"
 #include "chainsplat/dynamics.h"
+#include "chainsplat/estimate_lines.h"
 #include "chainsplat/silhouette.h"
 #include "chainsplat/splat.h"
 #include "chainsplat/twin.h"
@@ -70,16 +72,36 @@ struct Estimate {
   std::optional<double> likeness;  // correlation of drawn and recorded colors about each channel's mean, the best
                                    // of the views'; none: not compared, or a rope without marks
   double gain = 1.0, bias = 0.0;   // exposure of the last view relative to the twin's colors
+  BaseCorrection base;             // by which the base is believed to be off (base_at())
   double surprise = 0.0;           // squared innovation over its expectation, about 1 as long as the model holds
   bool seen = false;               // whether a mask shows anything
   bool lost = false;               // whether the estimate does not explain the mask, the masks were empty for long,
                                    // or the colors in them have been unlike the twin's for long
   bool doubtful = false;           // not lost, but what is seen may not be the rope, or not all of it: the deviations
                                    // are those of a rope that nobody looks at, and no force should be told from it
+  bool settling = false;           // the rope seems to move since where cameras stand, or the base's clock, is being
+                                   // learned: no force should be told from it, either
 };
 const char* status(const Estimate& estimate);  // "following", "doubtful" or "lost"
 
 constexpr double kNever = -std::numeric_limits<double>::infinity();  // s; before all times, which may be negative
+
+// What is learned of the surroundings while the rope is followed: the base's clock, how the grasp is turned, and the
+// poses of cameras that no training has compared with the rope. Gaussian, of the numbers of silhouette::SetupEquations,
+// which are 0 where all is as given.
+struct Setup {
+  std::vector<capture::Camera> cameras;  // as given
+  std::vector<char> posed;               // by camera: its pose is learned
+  math::VectorX mean;
+  math::MatrixX information;       // of what is known beforehand and of all frames
+  math::VectorX right;             // information times mean
+  math::MatrixX angles;            // rad^2, n x n: what the rest of its uncertainty adds to the last frame's angles
+  math::MatrixX first_information;  // of what is known beforehand alone
+  math::VectorX first_right;
+  int frames = 0;                  // that count
+  double last = kNever;            // s, the last frame
+  double settling_until = kNever;  // s: until then it changes so fast that the rope seems to move by it
+};
 
 // The state of the filter between two frames.
 struct Filter {
@@ -87,11 +109,9 @@ struct Filter {
   bool identified = false;                    // the twin has dynamics; otherwise rates are constant
   bool shifts = false;                        // the unknown force is a part of the state
   std::optional<math::Vector3> table_normal;  // unit, world; on a table the masks' shift is a part of the state too
-  std::vector<capture::Camera> cameras;
-  std::vector<char> unverified;        // by camera: its pose was never compared with the rope; empty: none
-  dynamics::BaseFunction base;         // as given; base_at() is what is believed
-  double base_late = 0.0;              // s, by which its stamps are late, as learned while it moves,
-  double base_late_information = 0.0;  // 1/s^2; 0: not learned
+  std::vector<capture::Camera> cameras;       // as they are believed to be
+  dynamics::BaseFunction base;                // as given; base_at() is what is believed
+  Setup setup;
   Options options;
   CompareColors compare_colors;     // empty: silhouettes alone
   std::optional<Belief> belief;     // none before the first frame
@@ -107,13 +127,18 @@ struct Filter {
   double edge_offset = 0.0, edge_offset_variance = 0.0;  // px, px^2, of the masks' outline outside the tube's
 };
 
-// Starts a filter. `base_start`: the first time at which `base` is valid. Throws InputError where the twin's chain or
-// parameters are unusable.
+// Starts a filter. `base_start`: the first time at which `base` is valid; it is asked up to 0.2 s after a frame's own
+// time, too, where it may be as at rest. `unverified`: by camera whether no training has compared its pose with the
+// rope; empty: none. Throws InputError where the twin's chain or parameters are unusable.
 Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
-             double base_start, const Options& options = {});
+             double base_start, const Options& options = {}, const std::vector<char>& unverified = {});
 
-// The base's motion, its clock mended as far as it is known.
+// The base's motion as it is believed to be: its clock and how it holds the rope mended as far as they are known.
 trajectory::BaseMotion base_at(const Filter& filter, double time);
+
+// What of the setup has turned out to be wrong by more than three deviations, so far: codes "base-time" and
+// "camera-pose".
+std::vector<capture::Finding> findings(const Filter& filter);
 
 // Processes one frame: undistorted crops with their masks, which may be empty, of one camera or of several at nearly
 // the same time (the first view's; View::camera is an index into Filter::cameras). Times must increase. Throws

@@ -68,8 +68,9 @@ struct TrackerOptions {
 // Follows a rope through frames that come from anywhere, one moment after the other. One thread at a time.
 class Tracker {
  public:
-  // `cameras`: as they are believed to be (as_corrected()). `base` is asked at times up to a frame's own, by any
-  // thread; before `start`, s, the rope is taken to rest. `unverified`: by camera, as as_corrected() says; empty: none.
+  // `cameras`: as they are believed to be (as_corrected()). `base` is asked at times up to 0.2 s after a
+  // frame's own, where it may be as at rest, by any thread; before `start`, s, the rope is taken to rest. `unverified`:
+  // by camera, as as_corrected() says; empty: none.
   // Throws InputError for a twin without states or Gaussians that the solver needs, and where there is no such device.
   Tracker(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
           double start, const TrackerOptions& options = {}, const std::vector<char>& unverified = {});
@@ -86,6 +87,8 @@ class Tracker {
 
   const twin::Twin& twin() const;
   const dynamics::Model& model() const;
+  trajectory::BaseMotion base_at(double time) const;  // as it is believed to move
+  std::vector<capture::Finding> findings() const;     // what was given wrongly, as far as it is known by now
   const std::vector<capture::Camera>& cameras() const;
 
  private:
@@ -126,7 +129,9 @@ class Follower {
 
   const twin::Twin& twin() const;
   const dynamics::Model& model() const;
-  const trajectory::Trajectory& base() const;
+  const trajectory::Trajectory& base() const;         // as given
+  trajectory::BaseMotion base_at(double time) const;  // as it is believed to move
+  std::vector<capture::Finding> findings() const;     // what was given wrongly, as far as it is known by now
   const std::vector<capture::Camera>& cameras() const;
 
  private:

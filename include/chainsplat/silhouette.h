@@ -42,6 +42,7 @@ struct FrameFit {
   math::VectorX theta;
   double residual_pixels = 0.0;  // RMS distance of the mask's outline from the tube's, robust, px
   double covered = 0.0;          // share of mask pixels within the tube's half width + 2 px of the projected centerline
+  double foreign = 0.0;          // share of mask pixels in parts of the masks that lie apart from the whole chain
   double inside = 0.0;           // share of the projected centerline that lies in the masks (occluders lower it)
   double edge_offset = 0.0;      // px by which the masks are wider than the tube on each side
   math::VectorX mask_shift;      // px, x and y of each view; empty where the prior says nothing about it
@@ -90,11 +91,11 @@ JointChoice choose_joints(const chain::Chain& chain, const SequenceFit& fit);
 // --- what the recording was given wrongly ----------------------------------------------------------------------------
 
 struct CorrectionOptions {
-  std::vector<std::string> held;  // groups of corrected_quantities() that are not varied
-  int frames = 75;                // at most, spread over the recording
+  std::vector<std::string> held = {};  // groups of corrected_quantities() that are not varied
+  int frames = 75;                     // at most, spread over the recording
   // Known mistakes as the corrections that mend them, e.g. half a pixel. Quantities that are not in one of them are
   // right as given.
-  std::vector<capture::Corrections> mistakes;
+  std::vector<capture::Corrections> mistakes = {};
 };
 
 // How far the masks' outlines are from the rope's in one camera, px; a positive sign where the mask is wider.
@@ -133,14 +134,20 @@ std::vector<math::MatrixX> covariances_by_corrections(const chain::Chain& chain,
                                                       const capture::Corrections& corrections,
                                                       const math::MatrixX& covariance);
 
-// What one frame says of by how much its base is late, its angles being unknown too, with a prior of their own (about
-// theta, the frame's fit): information, 1/s^2, and the cost's gradient, 1/s, with the tempered weights of
-// fit_corrections(). The change that the frame asks for is -gradient / information.
-struct ClockEquation {
-  double information = 0.0, gradient = 0.0;
+// What one frame says of what all frames share: by how much its base is late (s), how the rope is turned in the grasp
+// (rad, rotation vector in the base frame), and then for each camera of `posed`, by camera, how it is turned (rad,
+// rotation vector in its own frame) and where it stands (m, world). The frame's angles are unknown too, with the prior
+// of `options` (about theta, the frame's fit), and so is each camera's edge offset. With the tempered weights of
+// fit_corrections().
+struct SetupEquations {
+  static constexpr int kClock = 0, kGrasp = 1, kCameras = 4, kPerCamera = 6;  // where they stand
+  math::MatrixX information;                                                  // m x m
+  math::VectorX gradient;  // m, of the cost: the change that the frame asks for is -information^-1 gradient
+  math::MatrixX angles;    // n x m, how the frame's angles change with the unknowns
 };
-ClockEquation clock_equation(const chain::Chain& chain, const std::function<trajectory::BaseMotion(double time)>& base,
-                             std::span<const capture::View* const> views, const std::vector<capture::Camera>& cameras,
-                             const math::VectorX& theta, const Prior& prior);
+SetupEquations setup_equations(const chain::Chain& chain,
+                               const std::function<trajectory::BaseMotion(double time)>& base,
+                               std::span<const capture::View* const> views, const std::vector<capture::Camera>& cameras,
+                               const std::vector<char>& posed, const math::VectorX& theta, const Options& options);
 
 }  // namespace chainsplat::silhouette

@@ -99,6 +99,8 @@ std::string states_csv(const chain::States& states);
 chain::States read_states(const Path& file, int angles);
 // Columns 'time,x_0,y_0,z_0,...': chain::nodes at every state, world frame, m.
 std::string centerline_csv(const chain::Chain& chain, const chain::States& states, const trajectory::Trajectory& base);
+// `base`: one pose per state.
+std::string centerline_csv(const chain::Chain& chain, const chain::States& states, std::span<const math::Pose> base);
 // Binary little-endian PLY with the properties of 3DGS, then link_0, link_1, ... (logits). Home configuration, base
 // frame, m.
 std::string gaussians_ply(const splat::Gaussians& gaussians);

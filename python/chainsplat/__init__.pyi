@@ -133,6 +133,7 @@ class Estimate:
     theta: _Numbers
     thetadot: _Numbers
     covariance: _Numbers
+    base_late: float
     centerline_sigma: float
     iou: float
     residual: float

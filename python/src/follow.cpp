@@ -93,6 +93,9 @@ void add_follow(py::module_& m) {
       .def_property_readonly(
           "covariance", [](const Estimate& e) { return array_of(e.covariance); },
           "(2 n, 2 n), of theta and thetadot; (0, 0): unknown")
+      .def_property_readonly(
+          "base_late", [](const Estimate& e) { return e.base.late; },
+          "s, by which the base's stamps are believed to be late")
       .def_readonly("centerline_sigma", &Estimate::centerline_sigma, "m, standard deviation along the rope, RMS")
       .def_readonly("iou", &Estimate::iou, "of the rope's tube and the mask")
       .def_readonly("residual", &Estimate::residual, "px, of the outline")

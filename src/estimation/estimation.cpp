@@ -11,6 +11,7 @@
 #include "chainsplat/dynamics/parametrization.h"
 #include "chainsplat/image_model.h"
 #include "src/estimation/color.h"
+#include "src/estimation/setup.h"
 #include "src/estimation/start.h"
 
 namespace chainsplat::estimation {
@@ -47,14 +48,6 @@ constexpr double kPlaceFloor = 0.005;
 // Ridge, as a share of the torques' mean variance, for torques that a force at few places cannot cause.
 constexpr double kPlaceRidge = 1e-3;
 
-// Deviation of the pose of a camera that no training has compared with the rope: what calibrations by hand reach.
-constexpr double kCameraTurn = 0.0044;  // rad, a quarter of a degree
-constexpr double kCameraShift = 0.003;  // m
-// The base's clock: how late its stamps may be, and the speed from which it is learned.
-constexpr double kClock = 0.01;        // s, standard deviation before anything was seen
-constexpr double kLatestClock = 0.15;  // s
-constexpr double kMoving = 0.03;       // m/s
-
 constexpr double kLongUnseen = 0.5;  // s without a mask, after which the rope counts as lost
 // Standard deviations that are added for the search of a lost rope.
 constexpr double kLostAngle = 0.5;      // rad
@@ -77,6 +70,7 @@ constexpr double kUnlike = 0.5;  // likeness of drawn and recorded colors, below
 // laid double into them, or be turned toward the camera.
 constexpr double kShown = 0.7;
 constexpr double kLongHidden = 2.0;  // s after which a rope that was never seen whole is followed as it is seen
+constexpr int kFirstRounds = 3;      // of masks and setup in turn, in the first frame
 // Share of the masks that the rope covers, below which something else is in them, and the rope is sought elsewhere,
 // too; there it must cover so much more.
 constexpr double kUnexplained = 0.8, kBetter = 0.1;
@@ -392,43 +386,15 @@ double shown_share(const Filter& filter, std::span<const capture::View* const> v
   return most;
 }
 
-// Learns by how much the base's stamps are late, from a frame that is explained, while the base moves.
-void learn_clock(Filter& filter, std::span<const capture::View* const> views, const Belief& predicted,
-                 const VectorX& theta) {
-  const Vector6 velocity = base_at(filter, predicted.time).velocity;
-  // without dynamics nothing tells a rope that follows late from a base that is stamped late
-  if (!filter.identified || velocity.tail<3>().norm() < kMoving) return;
-  const int n = filter.model.chain.angles();
-  const Eigen::LLT<MatrixX> factor(predicted.covariance.topLeftCorner(n, n));
-  if (!math::is_positive(factor)) return;
-  silhouette::Prior prior;
-  prior.mean = predicted.mean.head(n);
-  prior.information = factor.solve(MatrixX::Identity(n, n));
-  const silhouette::ClockEquation clock = silhouette::clock_equation(
-      filter.model.chain, [&](double t) { return base_at(filter, t); }, views, filter.cameras, theta, prior);
-  if (!std::isfinite(clock.gradient) || !(clock.information > 0.0)) return;
-  if (filter.base_late_information == 0.0) filter.base_late_information = 1.0 / (kClock * kClock);
-  filter.base_late_information += clock.information;
-  const double change = -clock.gradient / filter.base_late_information;
-  filter.base_late = std::clamp(filter.base_late + change, -kLatestClock, kLatestClock);
+// The share of the masks that is not the rope's: what lies apart from a rope that is seen nearly whole.
+double foreign_share(const silhouette::FrameFit& fit) { return fit.inside >= kUnexplained ? fit.foreign : 0.0; }
+
+bool explains(const silhouette::FrameFit& fit) {
+  return fit.covered >= kLostShare * (1.0 - foreign_share(fit)) && fit.theta.allFinite();
 }
 
-// Variance, m^2 per coordinate, by which the rope is displaced by the poses of cameras that were never compared with
-// it, and by the base's clock.
-double pose_variance(const Filter& filter, std::span<const capture::View* const> views) {
-  double sum = 0.0;
-  for (const capture::View* const view : views) {
-    if (filter.unverified.empty() || !filter.unverified.at(view->camera)) continue;
-    const Vector3 from_camera =
-        base_at(filter, view->time).pose.translation - filter.cameras.at(view->camera).world_from_camera.translation;
-    sum += kCameraTurn * kCameraTurn * from_camera.squaredNorm() + kCameraShift * kCameraShift;
-  }
-  const double clock = filter.base_late_information > 0.0 ? 1.0 / filter.base_late_information : kClock * kClock;
-  const double speed2 = base_at(filter, views.front()->time).velocity.tail<3>().squaredNorm();
-  return sum / static_cast<double>(views.size() * views.size()) + clock * speed2 / 3.0;
-}
-
-bool explains(const silhouette::FrameFit& fit) { return fit.covered >= kLostShare && fit.theta.allFinite(); }
+// Whether there is something in the masks that cannot be told from the rope.
+bool has_more(const silhouette::FrameFit& fit) { return fit.covered < kUnexplained * (1.0 - foreign_share(fit)); }
 
 }  // namespace
 
@@ -442,7 +408,7 @@ Options options_for_live_masks(bool tabletop) {
 }
 
 Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
-             double base_start, const Options& options) {
+             double base_start, const Options& options, const std::vector<char>& unverified) {
   Filter filter;
   filter.identified = twin.parameters.has_value();
   if (filter.identified) {
@@ -461,6 +427,7 @@ Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras
   filter.options = options;
   if (twin.tabletop) filter.table_normal = twin.table_normal.value_or(Vector3::UnitZ()).normalized();
   filter.edge_offset_variance = kOffsetDeviation * kOffsetDeviation;
+  filter.setup = first_setup(filter, unverified);
   if (twin.tabletop || !filter.identified) {
     filter.rest = twin.initial                ? twin.initial->theta
                   : twin.states.theta.empty() ? VectorX::Zero(twin.chain.angles())
@@ -579,7 +546,9 @@ std::optional<VectorX> expected(const Filter& filter, double time) {
   return move(filter, *filter.belief, time).theta;
 }
 
-trajectory::BaseMotion base_at(const Filter& filter, double time) { return filter.base(time + filter.base_late); }
+trajectory::BaseMotion base_at(const Filter& filter, double time) {
+  return corrected(filter.base, base_correction(filter.setup), time);
+}
 
 namespace {
 
@@ -605,7 +574,7 @@ Attempt measure_frame(Filter& filter, Belief predicted, std::span<const capture:
     if (!in_contact) try_with(Contact::touched);
     if (filter.shifts && surprising(out.measured)) try_with(Contact::struck);
   }
-  if (!explains(out.measured.fit) || out.measured.fit.covered < kUnexplained) {
+  if (!explains(out.measured.fit) || has_more(out.measured.fit)) {
     const int n = filter.model.chain.angles();
     Belief wide = first_belief(filter, time);
     wide.covariance.diagonal().head(n).array() += kLostAngle * kLostAngle;
@@ -630,7 +599,7 @@ bool judge(Filter& filter, std::span<const capture::View* const> views, const At
     filter.whole = shown_share(filter, views, attempt.predicted.mean.head(n), filter.edge_offset) > kShown;
   if (!filter.whole && filter.hidden_since == kNever) filter.hidden_since = out.time;
   const bool hidden = !filter.whole && out.time - filter.hidden_since < kLongHidden;
-  out.doubtful = !filter.whole || folded || fit.covered < kUnexplained;
+  out.doubtful = !filter.whole || folded || has_more(fit);
   const bool believed = !out.lost && !folded && !hidden;
   if (!out.lost && !believed) filter.last_like = filter.last_seen = out.time;  // something of the rope is there
   return believed;
@@ -644,7 +613,7 @@ void learn(Filter& filter, std::span<const capture::View* const> views, const At
   if (filter.compare_colors) look_at_colors(filter, views, *filter.belief, out);
   if (first || out.likeness.value_or(1.0) >= kUnlike) filter.last_like = out.time;
   learn_force(filter, out.time);
-  learn_clock(filter, views, attempt.predicted, attempt.measured.fit.theta);
+  learn_setup(filter, views, attempt.predicted, attempt.measured.fit.theta);
   const double gain = 1.0 / kOffsetFrames;
   filter.edge_offset += gain * (attempt.measured.fit.edge_offset - filter.edge_offset);
   filter.edge_offset_variance =
@@ -654,12 +623,13 @@ void learn(Filter& filter, std::span<const capture::View* const> views, const At
 // What is believed, with the uncertainty of the model's shape.
 void report(const Filter& filter, std::span<const capture::View* const> views, Estimate& out) {
   const int n = filter.model.chain.angles();
+  out.base = base_correction(filter.setup);
   out.theta = filter.belief->mean.head(n);
   out.thetadot = filter.belief->mean.segment(n, n);
   out.covariance = filter.belief->covariance.topLeftCorner(2 * n, 2 * n);
   if (out.doubtful) out.covariance.diagonal().head(n).array() += kDoubtAngle * kDoubtAngle;
   std::vector<double> shape = chain::shape_variances(filter.model.chain, out.theta);
-  for (double& variance : shape) variance += pose_variance(filter, views);
+  out.covariance.topLeftCorner(n, n) += filter.setup.angles;
   out.centerline_sigma = centerline_deviation(filter.model.chain, out.theta, out.covariance.topLeftCorner(n, n), shape);
   out.covariance.topLeftCorner(n, n) += chain::shape_covariance(filter.model.chain, shape, out.theta);
   for (const capture::View* const v : views)
@@ -685,7 +655,17 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
   out.seen = std::any_of(views.begin(), views.end(), [](const capture::View* v) { return has_mask(*v); });
   bool believed = false;
   if (out.seen) {
-    const Attempt attempt = measure_frame(filter, predicted, views);
+    Attempt attempt = measure_frame(filter, predicted, views);
+    // at first masks of cameras that are off bend the rope toward them; where they stand is learned from these, and
+    // counts once
+    for (int round = 0; first && round < kFirstRounds && explains(attempt.measured.fit); ++round) {
+      const Setup before = filter.setup;
+      learn_setup(filter, views, attempt.predicted, attempt.measured.fit.theta);
+      filter.setup.information = before.information;
+      filter.setup.right = before.right;
+      filter.setup.frames = before.frames;
+      attempt = measure_frame(filter, predicted, views);
+    }
     believed = judge(filter, views, attempt, out);
     if (believed) learn(filter, views, attempt, first, out);
     predicted = attempt.predicted;
@@ -698,6 +678,8 @@ Estimate update(Filter& filter, std::span<const capture::View* const> views) {
     out.lost = true;
   }
   out.doubtful = !out.lost && (out.doubtful || out.likeness.value_or(1.0) < kUnlike);
+  out.settling = view.time < filter.setup.settling_until;
+  filter.setup.last = view.time;
   if (out.lost) filter.whole = false, filter.hidden_since = kNever;
   filter.lost = out.lost;
   report(filter, views, out);
@@ -796,6 +778,9 @@ std::string to_json(const Estimate& estimate, double latency, bool rates) {
                   {"covariance", std::move(covariance)},
                   {"lost", estimate.lost},
                   {"status", status(estimate)},
+                  {"base_late", estimate.base.late},
+                  {"grasp_rotation", list(estimate.base.grasp_rotation)},
+                  {"settling", estimate.settling},
                   {"latency_ms", std::round(1e6 * latency) / 1e3}};
   return line.dump();
 }

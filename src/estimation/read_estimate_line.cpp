@@ -17,6 +17,7 @@ using Json = nlohmann::ordered_json;
 // No rope turns so far or so fast, and no clock runs so long: far below, squares and products could overflow.
 constexpr double kMostAngle = 1e6;  // rad, rad/s
 constexpr double kMostTime = 1e12;  // s, thirty thousand years
+constexpr double kLatest = 60.0;    // s, of the base's stamps
 
 [[noreturn]] void refuse(const std::string& where, const char* field, const std::string& what) {
   throw InputError(where + ": " + field, what, "give the output of 'chainsplat estimate'");
@@ -42,6 +43,17 @@ math::VectorX numbers(const Json& object, const std::string& where, const char* 
 
 }  // namespace
 
+trajectory::BaseMotion corrected(const std::function<trajectory::BaseMotion(double time)>& given,
+                                 const BaseCorrection& correction, double time) {
+  trajectory::BaseMotion out = given(time + correction.late);
+  const math::Matrix3 turn = math::exp_so3(correction.grasp_rotation);
+  const math::Pose from_base{turn.transpose(), math::Vector3::Zero()};
+  out.pose.rotation = out.pose.rotation * turn;
+  out.velocity = math::transform_twist(from_base, out.velocity);
+  out.acceleration = math::transform_twist(from_base, out.acceleration);
+  return out;
+}
+
 std::optional<EstimateLine> read_estimate_line(const std::string& line, const std::string& where, int angles,
                                                double before) {
   const Json object = core::parse_json_or_discard(line);
@@ -54,6 +66,10 @@ std::optional<EstimateLine> read_estimate_line(const std::string& line, const st
   if (const auto status = object.find("status"); status != object.end()) {
     if (!status->is_string()) refuse(where, "status", "is no text");
     if (status->get<std::string>() != "following") return {};
+  }
+  if (const auto settling = object.find("settling"); settling != object.end()) {
+    if (!settling->is_boolean()) refuse(where, "settling", "is not true or false");
+    if (settling->get<bool>()) return {};
   }
   for (const char* field : {"time", "theta"})
     if (!object.contains(field)) refuse(where, field, "is missing");
@@ -72,6 +88,12 @@ std::optional<EstimateLine> read_estimate_line(const std::string& line, const st
       throw InputError(where + ": " + field,
                        "has " + std::to_string(values->size()) + " angles, the twin " + std::to_string(angles),
                        "give estimates of this twin");
+  if (const auto late = object.find("base_late"); late != object.end())
+    out.base.late = number(*late, where, "base_late", kLatest);
+  if (const math::VectorX turn = numbers(object, where, "grasp_rotation", M_PI); turn.size() > 0) {
+    if (turn.size() != 3) refuse(where, "grasp_rotation", "is no rotation vector");
+    out.base.grasp_rotation = turn;
+  }
   if ((out.sigma.array() < 0.0).any()) refuse(where, "sigma", "is negative");
 
   const math::VectorX triangle = numbers(object, where, "covariance", kMostAngle * kMostAngle);

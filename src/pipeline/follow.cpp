@@ -122,8 +122,7 @@ Tracker::Implementation::Implementation(const twin::Twin& followed, const std::v
   if (cameras.empty()) throw InputError("`cameras`", "there is none", "give those whose frames will come");
   if (!twin.parameters)
     core::warn("the twin: its dynamics are not identified; angles are assumed to go on at constant rate");
-  filter = estimation::start(twin, cameras, std::move(base), start);
-  filter.unverified = unverified;
+  filter = estimation::start(twin, cameras, std::move(base), start, {}, unverified);
   for (std::size_t c = 0; c < unverified.size(); ++c)
     if (unverified[c])
       core::warn(cameras[c].name + ": the twin was not made with this calibration; deviations allow for its errors");
@@ -233,6 +232,12 @@ capture::View Tracker::mask(const capture::Image8& picture, double time) {
 
 const twin::Twin& Tracker::twin() const { return implementation_->twin; }
 const dynamics::Model& Tracker::model() const { return implementation_->filter.model; }
+trajectory::BaseMotion Tracker::base_at(double time) const {
+  return estimation::base_at(implementation_->filter, time);
+}
+std::vector<capture::Finding> Tracker::findings() const {
+  return implementation_->adam ? std::vector<capture::Finding>{} : estimation::findings(implementation_->filter);
+}
 const std::vector<capture::Camera>& Tracker::cameras() const { return implementation_->filter.cameras; }
 
 void FollowOptions::check() const {
@@ -327,6 +332,8 @@ void Follower::follow(const std::function<void(const Followed&)>& each) {
 const twin::Twin& Follower::twin() const { return implementation_->tracker->twin(); }
 const dynamics::Model& Follower::model() const { return implementation_->tracker->model(); }
 const trajectory::Trajectory& Follower::base() const { return implementation_->base; }
+trajectory::BaseMotion Follower::base_at(double time) const { return implementation_->tracker->base_at(time); }
+std::vector<capture::Finding> Follower::findings() const { return implementation_->tracker->findings(); }
 const std::vector<capture::Camera>& Follower::cameras() const { return implementation_->tracker->cameras(); }
 
 }  // namespace chainsplat::pipeline

@@ -15,7 +15,9 @@ namespace {
 // Gives every line to `filter`, until they end or a stop is requested: what a stream has taught by then counts.
 void follow_lines(adaptation::ParameterFilter& filter, const chain::Chain& chain, const trajectory::Trajectory& base,
                   std::istream& lines, const std::string& name, OnlineResult& result) {
-  const dynamics::BaseFunction base_at = [&](double time) { return base.at(time); };
+  const dynamics::BaseFunction given = [&](double time) { return base.at(time); };
+  estimation::BaseCorrection correction;  // as the lines say
+  const dynamics::BaseFunction base_at = [&](double time) { return estimation::corrected(given, correction, time); };
   std::string line;
   double before = -std::numeric_limits<double>::infinity();
   result.from = result.to = NAN;
@@ -25,6 +27,7 @@ void follow_lines(adaptation::ParameterFilter& filter, const chain::Chain& chain
     const auto read = estimation::read_estimate_line(line, where, chain.angles(), before);
     if (!read) continue;
     before = read->time;
+    correction = read->base;
     try {
       filter.observe({read->time, read->theta, read->thetadot, read->sigma}, base_at);
     } catch (const InputError& error) {

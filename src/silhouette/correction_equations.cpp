@@ -227,27 +227,54 @@ FrameEquations frame_equations(const CorrectionProblem& problem, const Corrected
   return out;
 }
 
-ClockEquation clock_equation(const chain::Chain& chain, const std::function<trajectory::BaseMotion(double time)>& base,
-                             std::span<const capture::View* const> views, const std::vector<capture::Camera>& cameras,
-                             const VectorX& theta, const Prior& prior) {
-  CorrectionProblem problem{{views.begin(), views.end()},  cameras, base,        {},       1, {}, {},
-                            kEvidence * prior.information, {},      kLargestCut, kEndReach};
-  SharedPlaces clock;
-  clock.at.fill(-1);
-  clock.at[kBaseTime] = 0;
-  clock.unit[kBaseTime] = 1.0;
-  problem.places.assign(cameras.size(), clock);
-  for (int k = 0; k < chain.angles(); ++k) problem.held.push_back(chain::is_twist(chain, k));
-  CorrectedFrame frame{views.front()->time, VectorX::Zero(chain.angles()), {}};
+SetupEquations setup_equations(const chain::Chain& chain,
+                               const std::function<trajectory::BaseMotion(double time)>& base,
+                               std::span<const capture::View* const> views, const std::vector<capture::Camera>& cameras,
+                               const std::vector<char>& posed, const VectorX& theta, const Options& options) {
+  const int n = chain.angles();
+  const MatrixX prior = kEvidence * options.prior.information;
+  CorrectionProblem problem{
+      {views.begin(), views.end()}, cameras, base, {}, 0, {}, {}, prior, {}, kLargestCut, kEndReach};
+  SharedPlaces places;
+  places.at.fill(-1);
+  problem.places.assign(cameras.size(), places);
+  const auto vary = [&](SharedPlaces& of, int quantity, int at) {
+    of.at[quantity] = at;
+    of.unit[quantity] = 1.0;
+  };
+  problem.shared = SetupEquations::kCameras;
+  for (std::size_t c = 0; c < cameras.size(); ++c) {
+    vary(problem.places[c], kBaseTime, SetupEquations::kClock);
+    for (int i = 0; i < 3; ++i) vary(problem.places[c], kGraspRotation + i, SetupEquations::kGrasp + i);
+    for (int i = 0; posed[c] && i < 3; ++i) {
+      vary(problem.places[c], kRotation + i, problem.shared + i);
+      vary(problem.places[c], kTranslation + i, problem.shared + 3 + i);
+    }
+    if (posed[c]) problem.shared += SetupEquations::kPerCamera;
+  }
+  const int m = problem.shared, widths = static_cast<int>(cameras.size());  // then each camera's edge offset
+  for (SharedPlaces& of : problem.places) vary(of, kMaskOffset, problem.shared++);
+
+  for (int k = 0; k < n; ++k) problem.held.push_back(chain::is_twist(chain, k));
+  CorrectedFrame frame{views.front()->time, VectorX::Zero(n), {}};
   for (std::size_t v = 0; v < views.size(); ++v) {
     problem.masks.push_back(mask_points(*views[v], cameras.at(views[v]->camera), Options{}.max_pixels));
     frame.views.push_back(static_cast<int>(v));
   }
-  FrameEquations equations = frame_equations(problem, frame, {}, chain, theta);
-  equations.local.gradient -= problem.prior * prior.mean;
-  const VectorX moved = equations.local.matrix.ldlt().solve(equations.local.coupling.col(0));
-  return {equations.shared(0, 0) - moved.dot(equations.local.coupling.col(0)),
-          equations.shared_gradient[0] - moved.dot(equations.local.gradient)};
+  const FrameEquations equations = frame_equations(problem, frame, {}, chain, theta);
+  // what ends with this frame, its angles and the edge offsets, is eliminated
+  const double known = 1.0 / (options.edge_offset_deviation * options.edge_offset_deviation);
+  MatrixX own(n + widths, n + widths), coupling(n + widths, m);
+  own << equations.local.matrix, equations.local.coupling.rightCols(widths),
+      equations.local.coupling.rightCols(widths).transpose(), equations.shared.bottomRightCorner(widths, widths);
+  own.diagonal().tail(widths).array() += known;
+  coupling << equations.local.coupling.leftCols(m), equations.shared.bottomLeftCorner(widths, m);
+  VectorX gradient(n + widths);
+  gradient << equations.local.gradient - prior * options.prior.mean,
+      (equations.shared_gradient.tail(widths).array() - known * options.edge_offset).matrix();
+  const MatrixX moved = own.ldlt().solve(coupling);
+  return {equations.shared.topLeftCorner(m, m) - moved.transpose() * coupling,
+          equations.shared_gradient.head(m) - moved.transpose() * gradient, -moved.topRows(n)};
 }
 
 }  // namespace chainsplat::silhouette

@@ -286,7 +286,7 @@ void judge(const Problem& problem, FrameSolution& out) {
   constexpr double kMargin = 2.0;  // px, of `covered`
   constexpr double kCap = 3.0;     // diameters
   const double radius = 0.5 * problem.chain->diameter;
-  double pixels = 0, covered = 0, samples = 0, inside = 0, cost = 0;
+  double pixels = 0, covered = 0, foreign = 0, samples = 0, inside = 0, cost = 0;
   int seen = 0;
   out.mask_pixels = 0;
   for (const ViewWork& work : problem.views) {
@@ -297,18 +297,21 @@ void judge(const Problem& problem, FrameSolution& out) {
     const double cap = kCap * work.diameter;
     double view_cost = 0;
     const double area = static_cast<double>(mask.area) / mask.pixels.size();  // px a sample stands for
-    for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
-      for (int i = mask.blobs[b].first_pixel; i < mask.blobs[b].last_pixel; ++i) {
+    for (const Blob& blob : mask.blobs) {
+      double here = 0;
+      for (int i = blob.first_pixel; i < blob.last_pixel; ++i) {
         const Nearest at = nearest(work.segments, mask.pixels[i]);
         const Segment& s = work.segments[at.segment];
         const Vector3 x = point_at(s, at.t);
         const double half_width = radius * projected_gradient(*work.view->camera, x, s.normal).norm();
         const double away = std::sqrt(at.distance2) - half_width;
         pixels += area;
-        if (away <= kMargin) covered += area;
+        if (away <= kMargin) here += area;
         const double size = std::clamp(away, 0.0, cap);
         view_cost += size * size / mask.pixels.size();
       }
+      covered += here;
+      if (here == 0) foreign += area * (blob.last_pixel - blob.first_pixel);
     }
     double reverse = 0;
     int count = 0;
@@ -325,6 +328,7 @@ void judge(const Problem& problem, FrameSolution& out) {
     cost += view_cost + (count > 0 ? reverse / count : cap * cap);
   }
   out.fit.covered = pixels > 0 ? covered / pixels : 0.0;
+  out.fit.foreign = pixels > 0 ? foreign / pixels : 0.0;
   out.fit.inside = samples > 0 ? inside / samples : 0.0;
   out.cost = seen > 0 ? cost / seen : 0.0;
 }

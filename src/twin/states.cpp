@@ -67,6 +67,12 @@ chain::States read_states(const Path& file, int angles) {
 }
 
 std::string centerline_csv(const chain::Chain& chain, const chain::States& states, const trajectory::Trajectory& base) {
+  std::vector<math::Pose> poses;
+  for (const double time : states.time) poses.push_back(base.pose(time));
+  return centerline_csv(chain, states, poses);
+}
+
+std::string centerline_csv(const chain::Chain& chain, const chain::States& states, std::span<const math::Pose> base) {
   std::string text = "time";
   for (int i = 0; i <= chain.links(); ++i) {
     const std::string number = std::to_string(i);
@@ -74,8 +80,7 @@ std::string centerline_csv(const chain::Chain& chain, const chain::States& state
   }
   text += '\n';
   for (std::size_t i = 0; i < states.time.size(); ++i) {
-    const math::MatrixX nodes =
-        chain::nodes(chain, chain::link_motions(chain, states.theta[i], base.pose(states.time[i])));
+    const math::MatrixX nodes = chain::nodes(chain, chain::link_motions(chain, states.theta[i], base[i]));
     text += core::exact(states.time[i]);
     for (const double coordinate : nodes.reshaped()) append_number(text, coordinate);
     text += '\n';

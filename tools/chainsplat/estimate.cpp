@@ -130,11 +130,11 @@ class Push {
     live_.emplace();
     live_->model = follower.model();
     live_->deviations = force::deviations(follower.model(), follower.twin().estimates);
-    live_->base = [&follower](double time) { return follower.base().at(time); };
+    live_->base = [&follower](double time) { return follower.base_at(time); };
   }
   // None of a rope that may be somewhere else, and of the first frames.
   std::optional<force::Estimate> update(const estimation::Estimate& e) {
-    if (!live_ || e.lost || e.doubtful) return {};
+    if (!live_ || e.lost || e.doubtful || e.settling) return {};
     const Eigen::Index n = std::min(e.theta.size(), e.covariance.rows());  // 0: no covariance
     return force::update(*live_, e.time, e.theta, e.covariance.topLeftCorner(n, n));
   }
@@ -163,7 +163,7 @@ class Page {
     shown.frame = e.frame, shown.time = e.time, shown.latency = followed.latency;
     shown.iou = e.iou, shown.residual = e.residual, shown.seen = e.seen, shown.status = estimation::status(e);
     shown.line = recorded_line(
-        camera, chain::nodes(twin.chain, chain::link_motions(twin.chain, e.theta, follower_.base().pose(e.time))));
+        camera, chain::nodes(twin.chain, chain::link_motions(twin.chain, e.theta, follower_.base_at(e.time).pose)));
     if (pushed) show_force(*pushed, twin, follower_.model(), camera, shown);
     if (!followed.frame.picture.pixels.empty()) shown.picture = &followed.frame.picture;
     if (!followed.views.empty()) shown.view = &followed.views[0];
@@ -185,7 +185,7 @@ void record(const pipeline::Followed& followed, const pipeline::Follower& follow
             const std::optional<force::Estimate>& pushed, exports::McapRecording& recording) {
   constexpr int kQuality = 80;  // of JPEG
   const estimation::Estimate& e = followed.estimate;
-  recording.pose(e.time, follower.base().pose(e.time), e.theta, e.thetadot);
+  recording.pose(e.time, follower.base_at(e.time).pose, e.theta, e.thetadot);
   recording.status(e.time, estimation::status(e), e.centerline_sigma, followed.latency);
   if (pushed)
     recording.force(pushed->time, pushed->point, pushed->force, pushed->sigma, pushed->touching,
@@ -199,7 +199,8 @@ struct Ending {
   const EstimateRequest& request;
   const pipeline::Follower& follower;
   Tally tally;
-  chain::States states = {};  // of all frames, where a centerline is to be written
+  chain::States states = {};          // of all frames, where a centerline is to be written,
+  std::vector<math::Pose> base = {};  // and the base there, as it was believed to stand
   std::optional<exports::McapRecording> recording = {};
 
   void keep(const pipeline::Followed& followed) {
@@ -207,14 +208,16 @@ struct Ending {
     if (request.centerline.empty()) return;
     states.time.push_back(followed.estimate.time);
     states.theta.push_back(followed.estimate.theta);
+    base.push_back(follower.base_at(followed.estimate.time).pose);
   }
   void write() {
     if (recording) recording->finish();
     recording.reset();
     if (!request.centerline.empty() && !states.time.empty())
-      write_result(request.centerline, twin::centerline_csv(follower.twin().chain, states, follower.base()));
+      write_result(request.centerline, twin::centerline_csv(follower.twin().chain, states, base));
   }
   void summarize() const {
+    for (const capture::Finding& finding : follower.findings()) core::warn(finding.text);
     if (tally.frames > 0)
       say(std::to_string(tally.frames) + " frames" + (tally.lost ? ", lost in " + std::to_string(tally.lost) : "") +
           (tally.doubtful ? ", doubtful in " + std::to_string(tally.doubtful) : "") + "; " + latency_text(tally) + ".");

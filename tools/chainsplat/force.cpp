@@ -7,6 +7,7 @@
 #include <functional>
 #include <iostream>
 #include <limits>
+#include <map>
 #include <memory>
 #include <sstream>
 
@@ -33,6 +34,7 @@ struct State {
   double time = 0.0;
   math::VectorX theta;
   math::MatrixX standing;  // n x n, or empty
+  estimation::BaseCorrection base = {};
 };
 
 // A line of `estimate`; none where it is lost. `before`: time of the state before.
@@ -41,7 +43,7 @@ std::optional<State> read_estimate(const std::string& text, const std::string& w
   const std::optional<estimation::EstimateLine> line =
       estimation::read_estimate_line(text, where, chain.angles(), before);
   if (!line) return {};
-  State out{line->time, line->theta, {}};
+  State out{line->time, line->theta, {}, line->base};
   if (line->sigma.size() == 0) return out;  // as estimate's solver adam writes it
   out.standing =
       line->covariance.size() > 0 ? line->covariance : force::angle_covariance(chain, line->theta, line->sigma);
@@ -144,10 +146,18 @@ void force(const Globals& globals, const ForceRequest& request) {
   const std::string where = !request.hand.empty()                            ? request.hand
                             : request.contact.find(',') != std::string::npos ? "--contact"
                                                                              : request.contact;
+  // what the states say of the base: the last one before a time, or the first
+  std::map<double, estimation::BaseCorrection> corrections;
+  const dynamics::BaseFunction given = [&](double time) { return base.at(time); };
+  const dynamics::BaseFunction base_at = [&](double time) {
+    auto at = corrections.upper_bound(time);
+    if (at != corrections.begin()) --at;
+    return estimation::corrected(given, at == corrections.end() ? estimation::BaseCorrection{} : at->second, time);
+  };
   const double near = kNear * twin.chain.diameter;
   double least = std::numeric_limits<double>::infinity();  // m, of what is said to touch, from the rope
   const auto nearest = [&](double time, const math::VectorX& theta, const math::MatrixX& points) {
-    return force::nearest_contact(twin.chain, twin.gaussians, base.pose(time), theta, points);
+    return force::nearest_contact(twin.chain, twin.gaussians, base_at(time).pose, theta, points);
   };
   // what is far from the rope does not touch it; what always is was meant otherwise
   const auto with_near = [&](const ContactAt& contact) -> ContactAt {
@@ -189,7 +199,6 @@ void force(const Globals& globals, const ForceRequest& request) {
   };
   const std::string few = "has fewer than three states", more = "give more: forces need accelerations";
   const std::vector<dynamics::Model> deviations = force::deviations(model, twin.estimates);
-  const dynamics::BaseFunction base_at = [&](double time) { return base.at(time); };
 
   if (request.live) {
     force::Live live;
@@ -202,6 +211,7 @@ void force(const Globals& globals, const ForceRequest& request) {
       each_state(request, twin.chain, [&](const State& state) {
         first = std::min(first, state.time);
         check_time(first, state.time);
+        corrections = {{state.time, state.base}};  // it goes for the few states before it, too
         if (const auto line = force::update(live, state.time, state.theta, state.standing)) write(*line);
       });
       if (live.taken < 3) throw InputError(source, few, more);
@@ -214,6 +224,7 @@ void force(const Globals& globals, const ForceRequest& request) {
   } else {
     chain::States states;
     each_state(request, twin.chain, [&](const State& state) {
+      corrections[state.time] = state.base;
       states.time.push_back(state.time);
       states.theta.push_back(state.theta);
       if (state.standing.size() > 0) states.covariance.push_back(state.standing);

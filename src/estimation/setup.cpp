@@ -1,0 +1,213 @@
+#include "src/estimation/setup.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <functional>
+#include <numbers>
+
+#include "chainsplat/silhouette.h"
+
+namespace chainsplat::estimation {
+
+using math::MatrixX;
+using math::Pose;
+using math::Vector3;
+using math::VectorX;
+using silhouette::SetupEquations;
+
+namespace {
+
+// Standard deviations before anything was seen.
+constexpr double kClock = 1.0 / 30.0;   // s: stamps are often off by a frame
+constexpr double kCameraTurn = 0.0044;  // rad, a quarter of a degree: what calibrations by hand reach
+constexpr double kCameraShift = 0.003;  // m
+constexpr double kGraspTurn = 0.02;     // rad: how differently a hand lays a rope into a gripper twice
+constexpr double kTableTilt = 0.002;    // rad, of the bending plane from the table's
+
+// Frames that count, as many as are taken of a recording (silhouette::CorrectionOptions): they share the model's
+// errors, and what they say is slowly forgotten for what later ones say.
+constexpr int kFrames = 75;
+constexpr double kWidth = 2.0;         // px, deviation of how wide one camera's masks are from all cameras'
+constexpr double kLatestClock = 0.15;  // s
+constexpr double kMoving = 0.03;       // m/s, speed of the base from which its clock is learned
+// A rope that seems to go faster than this from frame to frame, only because the setup is believed to be another, is
+// not known to move as it is said to for the time that accelerations are told from.
+constexpr double kSettled = 0.01;      // m/s, RMS along the rope
+constexpr double kSettlingTime = 0.1;  // s
+constexpr double kFrame = 1.0 / 30.0;  // s, to the first frame from what was believed before
+
+// Whether the grasp's rotation is a number of its own: the first joint of a chain that bends in space takes it.
+bool bends_in_plane(const chain::Chain& chain) { return chain.angles() < chain.links(); }
+
+// A rope that lies on a table bends in its plane, however the gripper holds it (mathematics.md 6.10).
+void add_table(const Filter& filter, Setup& setup) {
+  if (!filter.table_normal || !bends_in_plane(filter.model.chain)) return;
+  const Vector3 normal = filter.base(filter.base_start).pose.rotation.transpose() * *filter.table_normal;
+  Vector3 axis = filter.model.chain.bending_axis;
+  if (axis.dot(normal) < 0.0) axis = -axis;  // bending axes may also point down
+  const math::Matrix3 slope = math::hat(normal) * math::hat(axis);
+  constexpr double kWeight = 1.0 / (kTableTilt * kTableTilt);
+  setup.information.block<3, 3>(SetupEquations::kGrasp, SetupEquations::kGrasp) += kWeight * slope.transpose() * slope;
+  setup.right.segment<3>(SetupEquations::kGrasp) -= kWeight * slope.transpose() * axis.cross(normal);
+}
+
+// The base's motion, and its velocity over the time in which it may be as its clock is known, if that is larger: a base
+// that rests may have begun to move.
+trajectory::BaseMotion base_as_timed(const Filter& filter, double time) {
+  const double deviation = 1.0 / std::sqrt(filter.setup.information(SetupEquations::kClock, SetupEquations::kClock));
+  trajectory::BaseMotion out = base_at(filter, time);
+  const Pose before = base_at(filter, time - deviation).pose, after = base_at(filter, time + deviation).pose;
+  math::Vector6 mean;
+  mean << math::log_so3(before.rotation.transpose() * after.rotation),
+      out.pose.rotation.transpose() * (after.translation - before.translation);
+  mean /= 2.0 * deviation;
+  if (mean.tail<3>().norm() > out.velocity.tail<3>().norm()) out.velocity = mean;
+  return out;
+}
+
+// m, RMS over the rope, by which a change of the angles moves it.
+double displacement(const chain::Chain& chain, const VectorX& theta, const VectorX& change) {
+  double sum = 0.0;
+  const std::vector<MatrixX> jacobians = chain::link_end_jacobians(chain, theta, Pose{});
+  for (const MatrixX& jacobian : jacobians) sum += (jacobian * change).squaredNorm();
+  return std::sqrt(sum / static_cast<double>(jacobians.size()));
+}
+
+void move_cameras(Filter& filter) {
+  int at = SetupEquations::kCameras;
+  for (std::size_t c = 0; c < filter.cameras.size(); ++c) {
+    if (!filter.setup.posed[c]) continue;
+    Pose pose = filter.setup.cameras[c].world_from_camera;
+    pose.rotation = pose.rotation * math::exp_so3(filter.setup.mean.segment<3>(at));
+    pose.translation += filter.setup.mean.segment<3>(at + 3);
+    filter.cameras[c].world_from_camera = pose;
+    at += SetupEquations::kPerCamera;
+  }
+}
+
+}  // namespace
+
+Setup first_setup(const Filter& filter, const std::vector<char>& unverified) {
+  Setup setup;
+  setup.cameras = filter.cameras;
+  setup.posed = unverified;
+  setup.posed.resize(filter.cameras.size(), 0);
+  const auto size = SetupEquations::kCameras +
+                    SetupEquations::kPerCamera * std::count_if(setup.posed.begin(), setup.posed.end(), std::identity{});
+  VectorX deviation(size);
+  deviation[SetupEquations::kClock] = kClock;
+  deviation.segment<3>(SetupEquations::kGrasp).setConstant(kGraspTurn);
+  for (auto at = SetupEquations::kCameras; at < size; at += SetupEquations::kPerCamera) {
+    deviation.segment<3>(at).setConstant(kCameraTurn);
+    deviation.segment<3>(at + 3).setConstant(kCameraShift);
+  }
+  setup.right = VectorX::Zero(size);
+  setup.information = deviation.cwiseAbs2().cwiseInverse().asDiagonal();
+  add_table(filter, setup);
+  setup.mean = setup.information.ldlt().solve(setup.right);
+  setup.first_information = setup.information;
+  setup.first_right = setup.right;
+  setup.angles = MatrixX::Zero(filter.model.chain.angles(), filter.model.chain.angles());
+  return setup;
+}
+
+BaseCorrection base_correction(const Setup& setup) {
+  if (setup.mean.size() == 0) return {};
+  return {setup.mean[SetupEquations::kClock], setup.mean.segment<3>(SetupEquations::kGrasp)};
+}
+
+std::vector<capture::Finding> findings(const Filter& filter) {
+  constexpr double kSure = 3.0;          // standard deviations
+  constexpr double kLeastClock = 0.002;  // s; less does no harm
+  constexpr double kLeastTurn = 0.001;   // rad
+  constexpr double kLeastShift = 0.001;  // m
+  constexpr double kDegrees = 180.0 / std::numbers::pi;
+  const Setup& setup = filter.setup;
+  const MatrixX covariance = setup.information.ldlt().solve(MatrixX::Identity(setup.mean.size(), setup.mean.size()));
+  std::vector<capture::Finding> out;
+  char text[200];
+  const double late = setup.mean[SetupEquations::kClock];
+  const double clock = std::sqrt(covariance(SetupEquations::kClock, SetupEquations::kClock));
+  if (std::abs(late) > std::max(kLeastClock, kSure * clock)) {
+    std::snprintf(text, sizeof text, "the base's stamps are %.1f +- %.1f ms %s: followed with the time that fits",
+                  1e3 * std::abs(late), 1e3 * clock, late > 0.0 ? "late" : "early");
+    out.push_back({"base-time", "base", 1e3 * late, 1e3 * clock, "ms", true, true, false, -1, text});
+  }
+  int at = SetupEquations::kCameras;
+  for (std::size_t c = 0; c < setup.cameras.size(); ++c) {
+    if (!setup.posed[c]) continue;
+    // of the size of a vector: of its component along itself
+    const auto size = [&](int first, double* deviation) {
+      const Vector3 value = setup.mean.segment<3>(first);
+      const Vector3 along = value.norm() > 0.0 ? value.normalized() : Vector3::UnitX();
+      *deviation = std::sqrt(along.dot(covariance.block<3, 3>(first, first) * along));
+      return value.norm();
+    };
+    double turn_deviation, shift_deviation;
+    const double turn = size(at, &turn_deviation), shift = size(at + 3, &shift_deviation);
+    at += SetupEquations::kPerCamera;
+    if (turn <= std::max(kLeastTurn, kSure * turn_deviation) && shift <= std::max(kLeastShift, kSure * shift_deviation))
+      continue;
+    const std::string& name = setup.cameras[c].name;
+    std::snprintf(text, sizeof text,
+                  "%.2f +- %.2f degrees and %.1f +- %.1f mm from where its calibration puts it: followed as it stands; "
+                  "calibrate it again",
+                  kDegrees * turn, kDegrees * turn_deviation, 1e3 * shift, 1e3 * shift_deviation);
+    out.push_back({"camera-pose", name, kDegrees * turn, kDegrees * turn_deviation, "deg", true, true, false, -1,
+                   name + " stands " + text});
+  }
+  return out;
+}
+
+void learn_setup(Filter& filter, std::span<const capture::View* const> views, const Belief& predicted,
+                 const VectorX& theta) {
+  Setup& setup = filter.setup;
+  const chain::Chain& chain = filter.model.chain;
+  const int n = chain.angles();
+  const Eigen::LLT<MatrixX> factor(predicted.covariance.topLeftCorner(n, n));
+  if (!math::is_positive(factor)) return;
+  silhouette::Options options = filter.options.silhouette;
+  options.prior.mean = predicted.mean.head(n);
+  options.prior.information = factor.solve(MatrixX::Identity(n, n));
+  options.edge_offset = filter.edge_offset;
+  options.edge_offset_deviation = kWidth;
+  SetupEquations frame = silhouette::setup_equations(
+      chain, [&](double time) { return base_as_timed(filter, time); }, views, filter.cameras, setup.posed, theta,
+      options);
+  if (!frame.information.allFinite() || !frame.gradient.allFinite()) return;
+  const auto leave_out = [&](int at, int size) {
+    frame.information.middleRows(at, size).setZero();
+    frame.information.middleCols(at, size).setZero();
+    frame.gradient.segment(at, size).setZero();
+    frame.angles.middleCols(at, size).setZero();
+  };
+  // without dynamics nothing tells a rope that follows late from a base that is stamped late
+  const bool moving = base_as_timed(filter, predicted.time).velocity.tail<3>().norm() >= kMoving;
+  if (!filter.identified || !moving) leave_out(SetupEquations::kClock, 1);
+  if (!bends_in_plane(chain)) leave_out(SetupEquations::kGrasp, 3);
+
+  if (setup.frames < kFrames) {
+    ++setup.frames;
+  } else if (moving) {
+    setup.information -= (setup.information - setup.first_information) / kFrames;
+    setup.right -= (setup.right - setup.first_right) / kFrames;
+  } else {  // what rests says the same again
+    frame.information.setZero();
+    frame.gradient.setZero();
+  }
+  setup.information += frame.information;
+  setup.right += frame.information * setup.mean - frame.gradient;
+  const Eigen::LDLT<MatrixX> solver(setup.information);
+  VectorX mean = solver.solve(setup.right);
+  mean[SetupEquations::kClock] = std::clamp(mean[SetupEquations::kClock], -kLatestClock, kLatestClock);
+  const VectorX change = frame.angles * (mean - setup.mean);
+  setup.mean = std::move(mean);
+  setup.angles = frame.angles * solver.solve(frame.angles.transpose());
+  move_cameras(filter);
+  if (filter.belief) filter.belief->mean.head(n) += change;
+  const double interval = setup.last == kNever ? kFrame : predicted.time - setup.last;
+  if (displacement(chain, theta, change) > kSettled * interval) setup.settling_until = predicted.time + kSettlingTime;
+}
+
+}  // namespace chainsplat::estimation
