@@ -363,13 +363,19 @@ TEST_CASE("pushes on a swinging rope that is finer and more damped than its twin
   }
 }
 
-TEST_CASE("on a table friction at rest hides forces, and the interval says how much") {
-  const chain::Chain rope =
-      chain::make_chain(0.3, 0.02, Vector3::UnitX(), Vector3::UnitZ(), 8, chain::Bending::planar, false);
+// A straight rope of eight planar joints that lies on a table.
+dynamics::Model table_rope(std::vector<double> roll_lever = {}) {
   dynamics::Parameters p = uniform(8, 8, 0.06, 0.012, 1e-3, 0.01);
   p.table_normal = Vector3::UnitZ();
   p.coulomb_friction.assign(8, 0.35);
-  const dynamics::Model model = dynamics::make_model(rope, p);
+  if (!roll_lever.empty()) p.roll_lever = std::move(roll_lever);
+  return dynamics::make_model(
+      chain::make_chain(0.3, 0.02, Vector3::UnitX(), Vector3::UnitZ(), 8, chain::Bending::planar, false), p);
+}
+
+TEST_CASE("on a table friction at rest hides forces, and the interval says how much") {
+  const dynamics::Model model = table_rope();
+  const chain::Chain& rope = model.chain;
   const auto base = [](double) { return dynamics::at_rest({}); };
   const force::Contact contact{chain::link_at(rope, 0.2), 0.2, 0.2 * rope.direction};
   const std::vector<std::optional<force::Contact>> contacts(5, contact);
@@ -394,18 +400,14 @@ TEST_CASE("on a table friction at rest hides forces, and the interval says how m
 }
 
 TEST_CASE("on a table friction that may as well act the other way is no touch") {
-  const chain::Chain rope =
-      chain::make_chain(0.3, 0.02, Vector3::UnitX(), Vector3::UnitZ(), 8, chain::Bending::planar, false);
-  dynamics::Parameters p = uniform(8, 8, 0.06, 0.012, 1e-3, 0.01);
-  p.table_normal = Vector3::UnitZ();
-  p.coulomb_friction.assign(8, 0.35);
-  const dynamics::Model model = dynamics::make_model(rope, p);
+  const dynamics::Model model = table_rope();
+  const chain::Chain& rope = model.chain;
   const auto base = [](double) { return dynamics::at_rest({}); };
   // the rope turns about the grasp, and is said to turn the other way; where it does so, its rest angles balance it
   const VectorX theta = VectorX::Zero(8), thetadot = 0.1 * VectorX::Unit(8, 0);
   const VectorX off = force::residual_torque(model, base(0.0), theta, thetadot, VectorX::Zero(8));
   dynamics::Model balanced = model;
-  for (int k = 0; k < 8; ++k) balanced.parameters.rest_angle[k] = off[k] / p.stiffness[k];
+  for (int k = 0; k < 8; ++k) balanced.parameters.rest_angle[k] = off[k] / model.parameters.stiffness[k];
   for (const bool sure : {true, false}) {
     CAPTURE(sure);
     force::Motion motion = at_rest(theta, 5);
@@ -420,13 +422,8 @@ TEST_CASE("on a table friction that may as well act the other way is no touch") 
 // A finger that pushes a sliding rope presses it down, and one that brakes it lifts it, because the rolling rope rubs
 // at the finger.
 TEST_CASE("on a table a push is told with what it presses the rope down") {
-  const chain::Chain rope =
-      chain::make_chain(0.3, 0.02, Vector3::UnitX(), Vector3::UnitZ(), 8, chain::Bending::planar, false);
-  dynamics::Parameters p = uniform(8, 8, 0.06, 0.012, 1e-3, 0.01);
-  p.table_normal = Vector3::UnitZ();
-  p.coulomb_friction.assign(8, 0.35);
-  p.roll_lever = {0.0, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03};
-  dynamics::Model model = dynamics::make_model(rope, p);
+  dynamics::Model model = table_rope({0.0, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03});
+  const chain::Chain& rope = model.chain;
   const auto base = [](double) { return dynamics::at_rest({}); };
   const VectorX theta = VectorX::LinSpaced(8, 0.25, 0.05), thetadot = VectorX::Constant(8, 0.1);
   const force::Contact contact{chain::link_at(rope, 0.2), 0.2, 0.2 * rope.direction};
@@ -443,12 +440,12 @@ TEST_CASE("on a table a push is told with what it presses the rope down") {
     // the torque by the push, by the friction of what presses the rope down, and by the impeded roll
     VectorX torque = jacobian.transpose() * (force - 0.35 * pressed * slip);
     for (int k = 0; k < 8; ++k)
-      torque[k] -=
-          p.roll_lever[k] * std::min(rope.link_start(rope.child_link[k]), 0.2) / 0.3 * pressed * slip.dot(across);
+      torque[k] -= model.parameters.roll_lever[k] * std::min(rope.link_start(rope.child_link[k]), 0.2) / 0.3 * pressed *
+                   slip.dot(across);
     // the rope's rest angles balance it
     dynamics::Model bent = model;
     const VectorX off = force::residual_torque(model, base(0.0), theta, thetadot, VectorX::Zero(8)) - torque;
-    for (int k = 0; k < 8; ++k) bent.parameters.rest_angle[k] += off[k] / p.stiffness[k];
+    for (int k = 0; k < 8; ++k) bent.parameters.rest_angle[k] += off[k] / model.parameters.stiffness[k];
     force::Motion motion = at_rest(theta, 5);
     for (VectorX& rates : motion.thetadot) rates = thetadot;
     const std::vector<std::optional<force::Contact>> contacts(5, contact);

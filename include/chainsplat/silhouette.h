@@ -134,6 +134,15 @@ std::vector<math::MatrixX> covariances_by_corrections(const chain::Chain& chain,
                                                       const capture::Corrections& corrections,
                                                       const math::MatrixX& covariance);
 
+// What a table says of how the rope is turned in the grasp: a rope that lies there bends in its plane, however the
+// gripper holds it (mathematics.md 6.10). For a small rotation vector of the grasp, rad, base frame, about where it
+// turns the bending axis to `bending_axis`; `normal`: the table's, unit, base frame. Axes may point down, too.
+struct TiltEquations {
+  math::Matrix3 information;
+  math::Vector3 gradient;
+};
+TiltEquations tilt_equations(const math::Vector3& bending_axis, const math::Vector3& normal);
+
 // What one frame says of what all frames share: by how much its base is late (s), how the rope is turned in the grasp
 // (rad, rotation vector in the base frame), and then for each camera of `posed`, by camera, how it is turned (rad,
 // rotation vector in its own frame) and where it stands (m, world). The frame's angles are unknown too, with the prior

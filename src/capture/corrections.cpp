@@ -93,11 +93,16 @@ math::Pose grasp_in_base(const Corrections& corrections) {
   return out;
 }
 
+Pose moved(const Pose& world_from_camera, const Vector3& rotation, const Vector3& translation) {
+  return {world_from_camera.rotation * math::exp_so3(rotation), world_from_camera.translation + translation};
+}
+
 Camera corrected(const Corrections& corrections, Camera camera) {
-  Pose& pose = camera.world_from_camera;
-  if (const Correction* const turn = find(corrections, camera.name, "rotation"))
-    pose.rotation = pose.rotation * math::exp_so3(turn->value);
-  if (const Correction* const shift = find(corrections, camera.name, "translation")) pose.translation += shift->value;
+  const Correction* const turn = find(corrections, camera.name, "rotation");
+  const Correction* const shift = find(corrections, camera.name, "translation");
+  const Vector3 none = Vector3::Zero();
+  camera.world_from_camera =
+      moved(camera.world_from_camera, turn ? Vector3(turn->value) : none, shift ? Vector3(shift->value) : none);
   const double scale = 1.0 + value_of(corrections, camera.name, "focal") / camera.fx;
   if (!(scale > kLeastShare))
     throw InputError(camera.name, "the twin's correction leaves nothing of its focal length", "train again");

@@ -205,6 +205,15 @@ void hold(const std::vector<char>& held, solve::ArrowEquations::Local& local) {
 
 }  // namespace
 
+TiltEquations tilt_equations(const Vector3& bending_axis, const Vector3& normal) {
+  constexpr double kDeviation = 0.002;  // rad, of the bending plane from the table's
+  constexpr double kWeight = 1.0 / (kDeviation * kDeviation);
+  const Vector3 axis = bending_axis.dot(normal) < 0.0 ? Vector3(-bending_axis) : bending_axis;
+  const Vector3 residual = axis.cross(normal);
+  const math::Matrix3 slope = math::hat(normal) * math::hat(axis);  // (w x axis) x normal = [normal] [axis] w
+  return {kWeight * slope.transpose() * slope, kWeight * slope.transpose() * residual};
+}
+
 FrameEquations frame_equations(const CorrectionProblem& problem, const CorrectedFrame& frame,
                                const capture::Corrections& corrections, const chain::Chain& chain,
                                const VectorX& theta) {

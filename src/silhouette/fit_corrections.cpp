@@ -23,7 +23,6 @@ constexpr double kLongestStep = 50.0;     // the same, in one step
 constexpr double kWidestCut = 30.0;       // px
 constexpr double kNarrowing = 0.6;        // of that cut from step to step
 constexpr double kWideEnd = 8.0;          // half widths: the reach of the free end as long as the cut is wide
-constexpr double kTableTilt = 0.002;      // rad, deviation of the bending plane from the table's
 constexpr double kLeastSize = 0.5;        // share of the given length and diameter below which no correction goes
 // The priors' penalty is kTails / 2 ln(1 + |y|^2 / kTails) in units of their deviation: nearly a Gaussian's for what a
 // careful laboratory gets wrong, and for a fault ten times that nearly flat.
@@ -231,7 +230,6 @@ struct Known {
   VectorX gradient;
 };
 
-// A rope that lies on a table bends in its plane, however the gripper holds it.
 void add_table(const capture::Capture& capture, const Layout& layout, const VectorX& x, Known& known) {
   if (!capture.table) return;
   for (const Column& column : layout.columns) {
@@ -239,14 +237,10 @@ void add_table(const capture::Capture& capture, const Layout& layout, const Vect
         column.quantity->name != std::string("rotation"))
       continue;
     const Vector3 normal = capture.base.pose(capture.base.start()).rotation.transpose() * capture.table->normal;
-    Vector3 axis = math::exp_so3(column.deviation * x.segment<3>(column.first)) * capture.bending_axis;
-    if (axis.dot(normal) < 0.0) axis = -axis;  // bending axes may also point down
-    const Vector3 residual = axis.cross(normal);
-    // (w x axis) x normal = [normal] [axis] w
-    const math::Matrix3 slope = column.deviation * math::hat(normal) * math::hat(axis);
-    constexpr double kWeight = 1.0 / (kTableTilt * kTableTilt);
-    known.information.block<3, 3>(column.first, column.first) += kWeight * slope.transpose() * slope;
-    known.gradient.segment<3>(column.first) += kWeight * slope.transpose() * residual;
+    const Vector3 axis = math::exp_so3(column.deviation * x.segment<3>(column.first)) * capture.bending_axis;
+    const TiltEquations tilt = tilt_equations(axis, normal);
+    known.information.block<3, 3>(column.first, column.first) += column.deviation * column.deviation * tilt.information;
+    known.gradient.segment<3>(column.first) += column.deviation * tilt.gradient;
   }
 }
 
