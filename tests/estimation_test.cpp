@@ -725,13 +725,29 @@ TEST_CASE("what a line says of the base is read back, and refused where it canno
     return estimation::read_estimate_line(std::string(R"({"time": 1.0, "theta": [0.1, 0.2])") + more + "}", "here", 2,
                                           0.0);
   };
-  CHECK(read("")->base.late == 0.0);
   CHECK_FALSE(read(R"(, "settling": true)"));
-  CHECK(read(R"(, "base_late": 0.02)")->base.late == 0.02);
-  CHECK(read(R"(, "grasp_rotation": [0.1, 0, 0.2])")->base.grasp_rotation == Vector3(0.1, 0.0, 0.2));
+  CHECK(read(R"(, "base_late": 0.02)")->base->late == 0.02);
+  CHECK_FALSE(read("")->base);
+  const estimation::EstimateLine held = *read(R"(, "grasp_rotation": [0.1, 0, 0.2], "grasp_shift": [0, 0.01, 0])");
+  CHECK((math::log_so3(held.base->grasp.rotation) - Vector3(0.1, 0.0, 0.2)).norm() < 1e-12);
+  CHECK(held.base->grasp.translation == Vector3(0.0, 0.01, 0.0));
   for (const char* wrong : {R"(, "base_late": "x")", R"(, "base_late": 1e9)", R"(, "grasp_rotation": [0.1])",
-                            R"(, "grasp_rotation": [9, 9, 9])"})
+                            R"(, "grasp_rotation": [9, 9, 9])", R"(, "grasp_shift": [0, 0])"})
     CHECK_THROWS_AS(read(wrong), InputError);
+}
+
+TEST_CASE("what a line says of the base goes for a base that the twin has mended, too") {
+  const auto given = [](double time) { return moving_base(time); };
+  const estimation::BaseCorrection known{0.02, {math::exp_so3(Vector3(0.1, 0.2, -0.1)), Vector3(0.003, 0.0, 0.001)}};
+  const estimation::BaseCorrection said{0.05, {math::exp_so3(Vector3(0.0, -0.1, 0.3)), Vector3(0.0, 0.002, 0.004)}};
+  const auto own = [&](double time) { return estimation::corrected(given, known, time); };
+  const trajectory::BaseMotion wanted = estimation::corrected(given, said, 0.4);
+  const trajectory::BaseMotion found = estimation::corrected(own, estimation::remaining(said, known), 0.4);
+  CHECK((found.pose.rotation - wanted.pose.rotation).norm() < 1e-12);
+  CHECK((found.pose.translation - wanted.pose.translation).norm() < 1e-12);
+  CHECK((found.velocity - wanted.velocity).norm() < 1e-12);
+  CHECK((found.acceleration - wanted.acceleration).norm() < 1e-12);
+  CHECK(estimation::remaining({}, known).late == 0.0);  // a line that says nothing
 }
 
 TEST_CASE("a line of JSON holds what formats.md 3.1 names") {

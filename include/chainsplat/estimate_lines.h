@@ -6,15 +6,23 @@
 #include <optional>
 #include <string>
 
+#include "chainsplat/corrections.h"
 #include "chainsplat/trajectory.h"
 
 namespace chainsplat::estimation {
 
 // How a base is believed to be off that a rope is followed with.
 struct BaseCorrection {
-  double late = 0.0;                                     // s, of its stamps
-  math::Vector3 grasp_rotation = math::Vector3::Zero();  // rad, rotation vector of the rope in the base frame
+  double late = 0.0;  // s, of its stamps
+  math::Pose grasp;   // of the rope in the base frame; none where the gripper holds it as it was given
 };
+// What a twin was made with.
+BaseCorrection base_correction(const capture::Corrections& corrections);
+// A base that was mended by the first is mended by the second, too.
+BaseCorrection operator*(const BaseCorrection& first, const BaseCorrection& second);
+BaseCorrection inverse(const BaseCorrection& correction);
+// What is left of a line's correction (EstimateLine::base) for a base that is `known` to have been mended by so much.
+BaseCorrection remaining(const std::optional<BaseCorrection>& said, const BaseCorrection& known);
 // The base's motion at a time, mended. `given`: as it was given.
 trajectory::BaseMotion corrected(const std::function<trajectory::BaseMotion(double time)>& given,
                                  const BaseCorrection& correction, double time);
@@ -24,11 +32,12 @@ struct EstimateLine {
   double time = 0.0;                     // s
   math::VectorX theta, thetadot, sigma;  // rad, rad/s, rad
   math::MatrixX covariance;              // of theta, rad^2
-  BaseCorrection base;
+  // Of the base motion that the frames were given with: a capture's file, not as the twin corrects it.
+  std::optional<BaseCorrection> base;
 };
 
-// None where the frame is lost or doubtful, or settling. `before`: time of the line before. Throws InputError with `where` and the field that is
-// not what a rope with so many angles can have.
+// None where the frame is lost, doubtful or settling. `before`: time of the line before. Throws InputError with `where`
+// and the field that is not what a rope with so many angles can have.
 std::optional<EstimateLine> read_estimate_line(const std::string& line, const std::string& where, int angles,
                                                double before);
 

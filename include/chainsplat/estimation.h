@@ -72,7 +72,7 @@ struct Estimate {
   std::optional<double> likeness;  // correlation of drawn and recorded colors about each channel's mean, the best
                                    // of the views'; none: not compared, or a rope without marks
   double gain = 1.0, bias = 0.0;   // exposure of the last view relative to the twin's colors
-  BaseCorrection base;             // by which the base is believed to be off (base_at())
+  BaseCorrection base;             // of the base motion as it was given (base_at())
   double surprise = 0.0;           // squared innovation over its expectation, about 1 as long as the model holds
   bool seen = false;               // whether a mask shows anything
   bool lost = false;               // whether the estimate does not explain the mask, the masks were empty for long,

@@ -45,7 +45,7 @@ struct SourceOptions {
 struct FrameSource {
   std::vector<capture::Camera> cameras;
   std::vector<char> unverified;                // by camera: the twin was made with another calibration
-  std::optional<trajectory::Trajectory> base;  // a capture's own
+  std::optional<trajectory::Trajectory> base;  // a capture's own, as the twin corrects it
   bool masked = false;                         // the frames have views
   // The next frame; false at the end. Throws InputError or WorkError where the frames end in another way, Interrupted
   // where a stop is requested while it waits.
@@ -129,7 +129,7 @@ class Follower {
 
   const twin::Twin& twin() const;
   const dynamics::Model& model() const;
-  const trajectory::Trajectory& base() const;         // as given
+  const trajectory::Trajectory& base() const;         // a capture's own as the twin corrects it, another as given
   trajectory::BaseMotion base_at(double time) const;  // as it is believed to move
   std::vector<capture::Finding> findings() const;     // what was given wrongly, as far as it is known by now
   const std::vector<capture::Camera>& cameras() const;

@@ -779,7 +779,8 @@ std::string to_json(const Estimate& estimate, double latency, bool rates) {
                   {"lost", estimate.lost},
                   {"status", status(estimate)},
                   {"base_late", estimate.base.late},
-                  {"grasp_rotation", list(estimate.base.grasp_rotation)},
+                  {"grasp_rotation", list(math::log_so3(estimate.base.grasp.rotation))},
+                  {"grasp_shift", list(estimate.base.grasp.translation)},
                   {"settling", estimate.settling},
                   {"latency_ms", std::round(1e6 * latency) / 1e3}};
   return line.dump();

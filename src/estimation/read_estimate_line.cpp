@@ -18,6 +18,7 @@ using Json = nlohmann::ordered_json;
 constexpr double kMostAngle = 1e6;  // rad, rad/s
 constexpr double kMostTime = 1e12;  // s, thirty thousand years
 constexpr double kLatest = 60.0;    // s, of the base's stamps
+constexpr double kLargestShift = 10.0;  // m, of the rope in the grasp
 
 [[noreturn]] void refuse(const std::string& where, const char* field, const std::string& what) {
   throw InputError(where + ": " + field, what, "give the output of 'chainsplat estimate'");
@@ -43,12 +44,25 @@ math::VectorX numbers(const Json& object, const std::string& where, const char* 
 
 }  // namespace
 
+BaseCorrection base_correction(const capture::Corrections& corrections) {
+  return {capture::value_of(corrections, "base", "time"), capture::grasp_in_base(corrections)};
+}
+
+BaseCorrection operator*(const BaseCorrection& first, const BaseCorrection& second) {
+  return {first.late + second.late, first.grasp * second.grasp};
+}
+
+BaseCorrection inverse(const BaseCorrection& correction) { return {-correction.late, correction.grasp.inverse()}; }
+
+BaseCorrection remaining(const std::optional<BaseCorrection>& said, const BaseCorrection& known) {
+  return said ? inverse(known) * *said : BaseCorrection{};
+}
+
 trajectory::BaseMotion corrected(const std::function<trajectory::BaseMotion(double time)>& given,
                                  const BaseCorrection& correction, double time) {
   trajectory::BaseMotion out = given(time + correction.late);
-  const math::Matrix3 turn = math::exp_so3(correction.grasp_rotation);
-  const math::Pose from_base{turn.transpose(), math::Vector3::Zero()};
-  out.pose.rotation = out.pose.rotation * turn;
+  const math::Pose from_base = correction.grasp.inverse();
+  out.pose = out.pose * correction.grasp;
   out.velocity = math::transform_twist(from_base, out.velocity);
   out.acceleration = math::transform_twist(from_base, out.acceleration);
   return out;
@@ -88,11 +102,17 @@ std::optional<EstimateLine> read_estimate_line(const std::string& line, const st
       throw InputError(where + ": " + field,
                        "has " + std::to_string(values->size()) + " angles, the twin " + std::to_string(angles),
                        "give estimates of this twin");
+  for (const char* field : {"base_late", "grasp_rotation", "grasp_shift"})
+    if (object.contains(field)) out.base.emplace();
   if (const auto late = object.find("base_late"); late != object.end())
-    out.base.late = number(*late, where, "base_late", kLatest);
+    out.base->late = number(*late, where, "base_late", kLatest);
   if (const math::VectorX turn = numbers(object, where, "grasp_rotation", M_PI); turn.size() > 0) {
     if (turn.size() != 3) refuse(where, "grasp_rotation", "is no rotation vector");
-    out.base.grasp_rotation = turn;
+    out.base->grasp.rotation = math::exp_so3(turn);
+  }
+  if (const math::VectorX shift = numbers(object, where, "grasp_shift", kLargestShift); shift.size() > 0) {
+    if (shift.size() != 3) refuse(where, "grasp_shift", "is no vector");
+    out.base->grasp.translation = shift;
   }
   if ((out.sigma.array() < 0.0).any()) refuse(where, "sigma", "is negative");
 

@@ -23,7 +23,6 @@ constexpr double kClock = 1.0 / 30.0;   // s: stamps are often off by a frame
 constexpr double kCameraTurn = 0.0044;  // rad, a quarter of a degree: what calibrations by hand reach
 constexpr double kCameraShift = 0.003;  // m
 constexpr double kGraspTurn = 0.02;     // rad: how differently a hand lays a rope into a gripper twice
-constexpr double kTableTilt = 0.002;    // rad, of the bending plane from the table's
 
 // Frames that count, as many as are taken of a recording (silhouette::CorrectionOptions): they share the model's
 // errors, and what they say is slowly forgotten for what later ones say.
@@ -40,16 +39,12 @@ constexpr double kFrame = 1.0 / 30.0;  // s, to the first frame from what was be
 // Whether the grasp's rotation is a number of its own: the first joint of a chain that bends in space takes it.
 bool bends_in_plane(const chain::Chain& chain) { return chain.angles() < chain.links(); }
 
-// A rope that lies on a table bends in its plane, however the gripper holds it (mathematics.md 6.10).
 void add_table(const Filter& filter, Setup& setup) {
   if (!filter.table_normal || !bends_in_plane(filter.model.chain)) return;
   const Vector3 normal = filter.base(filter.base_start).pose.rotation.transpose() * *filter.table_normal;
-  Vector3 axis = filter.model.chain.bending_axis;
-  if (axis.dot(normal) < 0.0) axis = -axis;  // bending axes may also point down
-  const math::Matrix3 slope = math::hat(normal) * math::hat(axis);
-  constexpr double kWeight = 1.0 / (kTableTilt * kTableTilt);
-  setup.information.block<3, 3>(SetupEquations::kGrasp, SetupEquations::kGrasp) += kWeight * slope.transpose() * slope;
-  setup.right.segment<3>(SetupEquations::kGrasp) -= kWeight * slope.transpose() * axis.cross(normal);
+  const silhouette::TiltEquations tilt = silhouette::tilt_equations(filter.model.chain.bending_axis, normal);
+  setup.information.block<3, 3>(SetupEquations::kGrasp, SetupEquations::kGrasp) += tilt.information;
+  setup.right.segment<3>(SetupEquations::kGrasp) -= tilt.gradient;
 }
 
 // The base's motion, and its velocity over the time in which it may be as its clock is known, if that is larger: a base
@@ -68,20 +63,17 @@ trajectory::BaseMotion base_as_timed(const Filter& filter, double time) {
 
 // m, RMS over the rope, by which a change of the angles moves it.
 double displacement(const chain::Chain& chain, const VectorX& theta, const VectorX& change) {
-  double sum = 0.0;
   const std::vector<MatrixX> jacobians = chain::link_end_jacobians(chain, theta, Pose{});
-  for (const MatrixX& jacobian : jacobians) sum += (jacobian * change).squaredNorm();
-  return std::sqrt(sum / static_cast<double>(jacobians.size()));
+  return std::sqrt(change.dot(chain::displacement_metric(jacobians) * change) / static_cast<double>(jacobians.size()));
 }
 
 void move_cameras(Filter& filter) {
   int at = SetupEquations::kCameras;
   for (std::size_t c = 0; c < filter.cameras.size(); ++c) {
     if (!filter.setup.posed[c]) continue;
-    Pose pose = filter.setup.cameras[c].world_from_camera;
-    pose.rotation = pose.rotation * math::exp_so3(filter.setup.mean.segment<3>(at));
-    pose.translation += filter.setup.mean.segment<3>(at + 3);
-    filter.cameras[c].world_from_camera = pose;
+    filter.cameras[c].world_from_camera =
+        capture::moved(filter.setup.cameras[c].world_from_camera, filter.setup.mean.segment<3>(at),
+                       filter.setup.mean.segment<3>(at + 3));
     at += SetupEquations::kPerCamera;
   }
 }
@@ -114,7 +106,8 @@ Setup first_setup(const Filter& filter, const std::vector<char>& unverified) {
 
 BaseCorrection base_correction(const Setup& setup) {
   if (setup.mean.size() == 0) return {};
-  return {setup.mean[SetupEquations::kClock], setup.mean.segment<3>(SetupEquations::kGrasp)};
+  return {setup.mean[SetupEquations::kClock],
+          {math::exp_so3(setup.mean.segment<3>(SetupEquations::kGrasp)), Vector3::Zero()}};
 }
 
 std::vector<capture::Finding> findings(const Filter& filter) {

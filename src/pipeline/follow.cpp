@@ -324,7 +324,9 @@ void Follower::follow(const std::function<void(const Followed&)>& each) {
       made[0].frame = frame.frame;
     }
     const std::vector<capture::View>& views = f.source.masked ? frame.views : made;
-    const estimation::Estimate estimate = f.tracker->update(views);
+    estimation::Estimate estimate = f.tracker->update(views);
+    if (f.options.base.empty() && f.source.base)
+      estimate.base = estimation::base_correction(f.options.source.corrections) * estimate.base;
     each({frame, views, estimate, core::seconds_now() - frame.arrived});
   }
 }

@@ -13,8 +13,10 @@ namespace chainsplat::pipeline {
 namespace {
 
 // Gives every line to `filter`, until they end or a stop is requested: what a stream has taught by then counts.
+// `known`: how `base` was mended before.
 void follow_lines(adaptation::ParameterFilter& filter, const chain::Chain& chain, const trajectory::Trajectory& base,
-                  std::istream& lines, const std::string& name, OnlineResult& result) {
+                  const estimation::BaseCorrection& known, std::istream& lines, const std::string& name,
+                  OnlineResult& result) {
   const dynamics::BaseFunction given = [&](double time) { return base.at(time); };
   estimation::BaseCorrection correction;  // as the lines say
   const dynamics::BaseFunction base_at = [&](double time) { return estimation::corrected(given, correction, time); };
@@ -27,7 +29,7 @@ void follow_lines(adaptation::ParameterFilter& filter, const chain::Chain& chain
     const auto read = estimation::read_estimate_line(line, where, chain.angles(), before);
     if (!read) continue;
     before = read->time;
-    correction = read->base;
+    correction = estimation::remaining(read->base, known);
     try {
       filter.observe({read->time, read->theta, read->thetadot, read->sigma}, base_at);
     } catch (const InputError& error) {
@@ -51,7 +53,9 @@ OnlineResult identify_online(const Path& run, std::istream& lines, const std::st
   adaptation::ParameterFilter filter(twin.chain, *twin.parameters, twin.estimates, settings);
   if (!lines) throw InputError(name, "cannot be read", "give what 'estimate' printed, or - for standard input");
   OnlineResult result;
-  follow_lines(filter, twin.chain, base, lines, name, result);
+  const auto known =
+      options.base.empty() ? estimation::base_correction(twin.corrections) : estimation::BaseCorrection{};
+  follow_lines(filter, twin.chain, base, known, lines, name, result);
   const adaptation::Result learned = filter.result();
   if (learned.used == 0)
     throw InputError(name, "has no two frames in a row that fit the twin",

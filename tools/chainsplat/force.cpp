@@ -34,7 +34,7 @@ struct State {
   double time = 0.0;
   math::VectorX theta;
   math::MatrixX standing;  // n x n, or empty
-  estimation::BaseCorrection base = {};
+  std::optional<estimation::BaseCorrection> base = {};
 };
 
 // A line of `estimate`; none where it is lost. `before`: time of the state before.
@@ -146,6 +146,8 @@ void force(const Globals& globals, const ForceRequest& request) {
   const std::string where = !request.hand.empty()                            ? request.hand
                             : request.contact.find(',') != std::string::npos ? "--contact"
                                                                              : request.contact;
+  const estimation::BaseCorrection known =
+      request.base.empty() ? estimation::base_correction(twin.corrections) : estimation::BaseCorrection{};
   // what the states say of the base: the last one before a time, or the first
   std::map<double, estimation::BaseCorrection> corrections;
   const dynamics::BaseFunction given = [&](double time) { return base.at(time); };
@@ -211,7 +213,8 @@ void force(const Globals& globals, const ForceRequest& request) {
       each_state(request, twin.chain, [&](const State& state) {
         first = std::min(first, state.time);
         check_time(first, state.time);
-        corrections = {{state.time, state.base}};  // it goes for the few states before it, too
+        corrections = {
+            {state.time, estimation::remaining(state.base, known)}};  // it goes for the few states before it, too
         if (const auto line = force::update(live, state.time, state.theta, state.standing)) write(*line);
       });
       if (live.taken < 3) throw InputError(source, few, more);
@@ -224,7 +227,7 @@ void force(const Globals& globals, const ForceRequest& request) {
   } else {
     chain::States states;
     each_state(request, twin.chain, [&](const State& state) {
-      corrections[state.time] = state.base;
+      corrections[state.time] = estimation::remaining(state.base, known);
       states.time.push_back(state.time);
       states.theta.push_back(state.theta);
       if (state.standing.size() > 0) states.covariance.push_back(state.standing);
