@@ -82,6 +82,14 @@ struct Capture {
   bool has_depth = false;
 };
 
+// Frames of several cameras that belong to one moment: of each camera the one that is nearest in time, unless it is
+// more than half the interval between moments away. A frame in the middle between two moments belongs to both.
+double moment_reach(const std::vector<double>& moments);  // s, that half; infinite for a single moment
+// By moment the index of its frame among those at `times`, -1: none. `moments` increase; all in s.
+std::vector<int> frames_at(const std::vector<double>& moments, const std::vector<double>& times, double reach);
+// By moment the indices of its views in Capture::views, camera by camera.
+std::vector<std::vector<int>> views_at(const Capture& capture, const std::vector<double>& moments);
+
 // Bounds of a capture; the reasons are given where they are checked (src/capture/manifest.cpp).
 constexpr double kSlowestRate = 0.1, kFastestRate = 1e6;  // frames per second
 constexpr int kMostFrames = 1000000;                      // per camera

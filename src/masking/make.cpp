@@ -30,7 +30,6 @@ constexpr int kLeastSamples = 4;
 constexpr double kLinkDiameters = 1.5;  // length of a link in diameters, unless the number of joints hits its bounds
 constexpr int kFewestJoints = 8, kMostJoints = 16;
 // chains grown in moments
-constexpr double kSameMoment = 0.02;    // s, largest difference in time between pictures of one moment
 constexpr double kLeastEvidence = 0.1;  // nats per sample in the best moment, below which there is no rope
 constexpr double kTrusted = 0.75;       // share of the best moment's evidence from which on colors are learned,
 constexpr double kUsable = 0.5;         // and from which on a moment's chain is used
@@ -114,22 +113,24 @@ std::vector<Moment> moments_of(const capture::Capture& scene, const std::vector<
                                const std::vector<Samples>& samples) {
   const auto first = std::find_if(samples.begin(), samples.end(), [](const Samples& s) { return !s.frames.empty(); });
   std::vector<Moment> moments;
-  for (const View& one : first->frames) {
-    Moment moment{one.time, {}, {}, {}};
-    for (std::size_t c = 0; c < samples.size(); ++c) {
-      const std::vector<View>& frames = samples[c].frames;
-      const auto nearest = std::min_element(frames.begin(), frames.end(), [&](const View& a, const View& b) {
-        return std::abs(a.time - one.time) < std::abs(b.time - one.time);
-      });
-      if (nearest == frames.end() || std::abs(nearest->time - one.time) > kSameMoment) continue;
-      moment.shots.push_back({picture_of(*nearest),
-                              &cameras[c],
-                              cameras[c].world_from_camera.inverse() * scene.base.pose(nearest->time),
-                              {},
-                              {}});
-      moment.cameras.push_back(static_cast<int>(c));
+  const auto times_of = [](const Samples& some) {
+    std::vector<double> times;
+    for (const View& view : some.frames) times.push_back(view.time);
+    return times;
+  };
+  const std::vector<double> times = times_of(*first);
+  for (const double time : times) moments.push_back({time, {}, {}, {}});
+  // samples are some frames of many; together are those that all the frames' own interval says
+  const double reach = capture::moment_reach(scene.times[first - samples.begin()]);
+  for (std::size_t c = 0; c < samples.size(); ++c) {
+    const std::vector<int> nearest = capture::frames_at(times, times_of(samples[c]), reach);
+    for (std::size_t m = 0; m < times.size(); ++m) {
+      if (nearest[m] < 0) continue;
+      const View& view = samples[c].frames[nearest[m]];
+      moments[m].shots.push_back(
+          {picture_of(view), &cameras[c], cameras[c].world_from_camera.inverse() * scene.base.pose(view.time), {}, {}});
+      moments[m].cameras.push_back(static_cast<int>(c));
     }
-    moments.push_back(std::move(moment));
   }
   return moments;
 }

@@ -19,7 +19,6 @@ namespace {
 constexpr int kBlack = 16;         // brightness up to which a pixel of a masked video is background (lossy coding)
 constexpr int kMargin = 24;        // px about what a frame shows
 constexpr int kMostStale = 30;     // frames of a device in a row whose time stamps do not increase
-constexpr double kTogether = 0.5;  // of a frame's interval: frames of several cameras nearer than that are one moment
 
 // Raw RGB24 from standard input; an incomplete last frame ends the work. Throws Interrupted where it waits.
 bool read_raw(const capture::Camera& camera, capture::Image8& image) {
@@ -84,23 +83,18 @@ FrameSource open_capture(const SourceOptions& options) {
   source.cameras = recorded->cameras;
   source.base = recorded->base;
   source.masked = true;
-  source.next = [recorded, whole, at = std::size_t{0}](LiveFrame& frame) mutable {
-    // the first camera sets the pace, the others' nearest frames join
-    if (at >= recorded->views.size() || recorded->views[at].camera != 0) return false;
+  // the first camera sets the pace, the others' frames of the moment join
+  std::vector<double> moments;
+  for (const capture::View& view : recorded->views)
+    if (view.camera == 0) moments.push_back(view.time);
+  source.next = [recorded, whole, together = capture::views_at(*recorded, moments),
+                 at = std::size_t{0}](LiveFrame& frame) mutable {
+    if (at >= together.size()) return false;
     const capture::View& leader = recorded->views[at];
     frame.frame = leader.frame;
     frame.time = leader.time;
-    frame.views.assign(1, leader);
-    const std::vector<double>& times = recorded->times[0];
-    const double interval = times.size() > 1 ? (times.back() - times.front()) / (times.size() - 1.0) : 0.0;
-    for (int c = 1; c < static_cast<int>(recorded->cameras.size()); ++c) {
-      const capture::View* nearest = nullptr;
-      for (const capture::View& view : recorded->views)
-        if (view.camera == c && std::abs(view.time - leader.time) <= kTogether * interval &&
-            (!nearest || std::abs(view.time - leader.time) < std::abs(nearest->time - leader.time)))
-          nearest = &view;
-      if (nearest) frame.views.push_back(*nearest);
-    }
+    frame.views.clear();
+    for (const int v : together[at]) frame.views.push_back(recorded->views[v]);
     if (whole) frame.picture = capture::rgb(whole->views.at(at));
     ++at;
     frame.arrived = core::seconds_now();

@@ -2,32 +2,17 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 #include <numeric>
 
 namespace chainsplat::recognition {
 
 std::vector<FrameViews> assign_views(const capture::Capture& capture, const std::vector<double>& times) {
+  const std::vector<std::vector<int>> views = capture::views_at(capture, times);
   std::vector<FrameViews> frames(times.size());
-  for (std::size_t k = 0; k < times.size(); ++k) frames[k].time = times[k];
-  const double period = times.size() > 1 ? (times.back() - times.front()) / static_cast<double>(times.size() - 1)
-                                         : std::numeric_limits<double>::infinity();
-  // each frame takes every camera's nearest view
-  for (std::size_t camera = 0; camera < capture.cameras.size(); ++camera) {
-    std::vector<int> nearest(times.size(), -1);
-    for (int v = 0; v < static_cast<int>(capture.views.size()); ++v) {
-      const capture::View& view = capture.views[v];
-      if (view.camera != static_cast<int>(camera) || view.width == 0) continue;
-      const auto above = std::lower_bound(times.begin(), times.end(), view.time);
-      for (auto at = above == times.begin() ? above : above - 1; at != times.end() && at <= above; ++at) {
-        const auto k = static_cast<std::size_t>(at - times.begin());
-        const double away = std::abs(view.time - times[k]);
-        if (away > 0.5 * period * (1.0 + 1e-6)) continue;
-        if (nearest[k] < 0 || away < std::abs(capture.views[nearest[k]].time - times[k])) nearest[k] = v;
-      }
-    }
-    for (std::size_t k = 0; k < times.size(); ++k)
-      if (nearest[k] >= 0) frames[k].views.push_back(nearest[k]);
+  for (std::size_t k = 0; k < times.size(); ++k) {
+    frames[k].time = times[k];
+    for (const int v : views[k])
+      if (capture.views[v].width > 0) frames[k].views.push_back(v);
   }
   return frames;
 }

@@ -9,7 +9,7 @@
 
 namespace chainsplat::recognition {
 
-// One frame time of the first camera and the views that are nearest to it, at most half a frame away.
+// One frame time of the first camera and the views of that moment (capture::views_at()).
 struct FrameViews {
   double time = 0.0;
   std::vector<int> views;  // indices into Capture::views, empty masks left out

@@ -127,22 +127,7 @@ Frames frames_of(const capture::Capture& capture) {
     for (const capture::View& view : views)
       if (view.camera == camera) frames.times.push_back(view.time);
   }
-  const int count = static_cast<int>(frames.times.size());
-  frames.views.resize(count);
-  const double interval = count > 1 ? (frames.times.back() - frames.times.front()) / (count - 1) : 1.0;
-  std::vector<std::vector<int>> chosen(count, std::vector<int>(capture.cameras.size(), -1));
-  for (int v = 0; v < static_cast<int>(views.size()); ++v) {
-    const auto above = std::lower_bound(frames.times.begin(), frames.times.end(), views[v].time);
-    int at = static_cast<int>(above - frames.times.begin());
-    if (at == count || (at > 0 && views[v].time - frames.times[at - 1] < frames.times[at] - views[v].time)) --at;
-    const double distance = std::abs(views[v].time - frames.times[at]);
-    if (distance > 0.5 * interval) continue;
-    int& best = chosen[at][views[v].camera];
-    if (best < 0 || distance < std::abs(views[best].time - frames.times[at])) best = v;
-  }
-  for (int f = 0; f < count; ++f)
-    for (const int v : chosen[f])
-      if (v >= 0) frames.views[f].push_back(v);
+  frames.views = capture::views_at(capture, frames.times);
   return frames;
 }
 
