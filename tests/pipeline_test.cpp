@@ -214,6 +214,14 @@ TEST_CASE("a job file becomes the jobs of a batch") {
   pipeline::save_plan(plan, folder.path);
   CHECK(pipeline::load_plan(folder.path).jobs[3].arguments == plan.jobs[3].arguments);
   CHECK(pipeline::unfinished(plan, folder.path).size() == 4);
+  for (const char* const seed : {"-2.0", "-1", "1.5", "\"1\""}) {
+    CAPTURE(seed);
+    core::write_file(
+        folder.path / "batch.json",
+        std::string(R"({"jobs": [{"name": "a", "capture": "b", "settings": "", "arguments": [], "seed": )") + seed +
+            "}]}");
+    CHECK_THROWS_WITH_AS(pipeline::load_plan(folder.path), doctest::Contains("is damaged"), InputError);
+  }
   core::write_file(folder.path / "jobs.toml", "captures = [\"captures/*\"]\nsettings = { joints = 0 }\n");
   CHECK_THROWS_WITH_AS(pipeline::read_job_file(folder.path / "jobs.toml"),
                        doctest::Contains("`joints` 0 is not from 1"), InputError);

@@ -1,5 +1,6 @@
 // chainsplat/json.h - JSON from outside, read with bounds. Not installed: no header that is names the JSON library.
 #pragma once
+#include <cstdint>
 #include <nlohmann/json_fwd.hpp>
 #include <string_view>
 
@@ -15,5 +16,7 @@ nlohmann::ordered_json parse_json_or_discard(std::string_view text);
 // The value of an integer. The JSON library turns any number into an int, and one that does not fit into an undefined
 // one. Throws nlohmann::json::exception where it is none, or does not fit.
 int whole_number(const nlohmann::ordered_json& value);
+// The same of a whole number from 0 on.
+std::uint64_t unsigned_number(const nlohmann::ordered_json& value);
 
 }  // namespace chainsplat::core

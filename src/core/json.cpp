@@ -9,6 +9,8 @@ namespace chainsplat::core {
 
 namespace {
 
+constexpr int kOtherType = 302;  // the library's own id for a value of another type
+
 // Returns the byte at which the nesting exceeds kDeepestJson, or npos where it never does. Brackets inside strings do
 // not count.
 std::size_t too_deep(std::string_view text) {
@@ -51,11 +53,16 @@ nlohmann::ordered_json parse_json_or_discard(std::string_view text) {
   }
 }
 
+std::uint64_t unsigned_number(const nlohmann::ordered_json& value) {
+  if (!value.is_number_unsigned())
+    throw nlohmann::json::type_error::create(kOtherType, "is no whole number from 0 on", &value);
+  return value.get<std::uint64_t>();
+}
+
 int whole_number(const nlohmann::ordered_json& value) {
   constexpr std::int64_t kMost = std::numeric_limits<int>::max();
   if (!value.is_number_integer() || value > kMost || value < -kMost)
-    // 302 is the library's own id for a value of another type
-    throw nlohmann::json::type_error::create(302, "is no whole number that fits", &value);
+    throw nlohmann::json::type_error::create(kOtherType, "is no whole number that fits", &value);
   return value.get<int>();
 }
 

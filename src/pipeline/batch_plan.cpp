@@ -265,7 +265,8 @@ BatchPlan load_plan(const Path& folder) {
   try {
     const Json document = core::parse_json(core::read_file(file));
     for (const Json& entry : document.at("jobs"))
-      plan.jobs.push_back({entry.at("name"), entry.at("capture"), entry.at("settings"), entry.at("seed"),
+      plan.jobs.push_back({entry.at("name"), entry.at("capture"), entry.at("settings"),
+                           core::unsigned_number(entry.at("seed")),
                            entry.at("arguments").get<std::vector<std::string>>()});
     for (const BatchJob& job : plan.jobs)  // names a folder in this one
       if (job.name.empty() || job.name.find_first_of(std::string_view("/\0", 2)) != std::string::npos ||
