@@ -42,6 +42,8 @@ splat::AdamRates rates(double fraction, double scale) {
 
 namespace {
 
+constexpr int kTotalSteps = kRounds * kSteps + kFinalSteps;
+
 struct TrainingViews {
   std::vector<int> frames;    // that train
   std::vector<int> views;     // capture view of every training view
@@ -85,252 +87,297 @@ double mean(const std::vector<double>& values) {
   return values.empty() ? 0.0 : std::accumulate(values.begin(), values.end(), 0.0) / static_cast<double>(values.size());
 }
 
-}  // namespace
+// What the rounds share.
+struct Job {
+  const capture::Capture& capture;
+  const Options& options;
+  std::string text = job_text(capture, options);  // by which its checkpoints are known
+  Result result = {};                             // the chain, and how it was chosen
+  chain::States states = {};
+  std::vector<math::VectorX> coarse = {};  // by the silhouettes; what later steps correct goes to all frames
+  // What the silhouettes know stays known: appearance alone would pull angles to explain rolling and shading.
+  AnglePrior prior = {};
+  splat::Gaussians gaussians = {};  // at the round's start
+  StepWatch watch = {};
+  int first_round = 0, first_step = 0;    // where a resumed job goes on,
+  splat::Engine::Snapshot snapshot = {};  // and from what, within a round
+  std::vector<FrameViews> frames = {};    // as assigned to states.time
+  TrainingViews training = {};
+  std::vector<double> empty = {};  // empty_losses()
+  double loss = NAN, psnr = NAN;   // last read
+};
 
-Result recognize_fast(gpu::Device& device, const capture::Capture& capture, const Options& options) {
-  Result result;
-  const std::string job = job_text(capture, options);
-  const auto make = [&](chain::Bending bending, int joints) {
-    return chain::make_chain(capture.length, capture.diameter, capture.direction, capture.bending_axis, joints, bending,
-                             options.twist);
-  };
-  const int total_steps = kRounds * kSteps + kFinalSteps;
-  constexpr double kLeastBudget = 300, kMostBudget = 6000;  // of the automatic choice: short stubs and thin cables
-  const double by_size = std::clamp(kGaussiansADiameter * capture.length / capture.diameter, kLeastBudget, kMostBudget);
-  const int budget = options.budget > 0 ? options.budget : static_cast<int>(std::lround(by_size));
-  const int added_a_round = std::max(1, budget / 10);
+int budget_of(const capture::Capture& capture, const Options& options) {
+  constexpr double kLeast = 300, kMost = 6000;  // of the automatic choice: short stubs and thin cables
+  if (options.budget > 0) return options.budget;
+  return static_cast<int>(
+      std::lround(std::clamp(kGaussiansADiameter * capture.length / capture.diameter, kLeast, kMost)));
+}
+
+// The chain that the silhouettes ask for, and the angles that they show.
+void begin(Job& job) {
   constexpr int kFirstJoints = 12;  // which most ropes end with
-  int first_round = 0;
-  StepWatch watch;
-  splat::Gaussians gaussians;
-  chain::States states;
-  AnglePrior prior;
-
-  std::optional<Checkpoint> before;
-  if (options.resume && !options.checkpoint.empty()) before = load_checkpoint(options.checkpoint, job);
-  if (before) {
-    result.bending = {before->spatial ? chain::Bending::spatial : chain::Bending::planar, before->out_of_plane_rms,
-                      before->deviation};
-    const chain::Chain joint = make(result.bending.bending, 1);
-    result.chain = make(result.bending.bending, static_cast<int>(before->states.theta.at(0).size()) / joint.angles());
-    states = before->states;
-    gaussians = before->gaussians;
-    first_round = before->stage;
-    watch = before->watch;
-  } else {
-    // coarse: silhouettes
-    core::report({"recognize", 0, total_steps, NAN, NAN, "silhouettes"});
-    const bool decide = !options.bending && !capture.tabletop;
-    const chain::Bending first =
-        options.bending.value_or(capture.tabletop ? chain::Bending::planar : chain::Bending::spatial);
-    result.bending.bending = first;
-    int joints = options.joints.value_or(kFirstJoints);
-    result.chain = make(first, joints);
-    silhouette::SequenceFit fit = silhouette::fit_sequence(result.chain, capture);
-    if (decide) result.bending = silhouette::choose_bending(result.chain, capture, fit);
-    if (!options.joints) {
-      result.joints = silhouette::choose_joints(result.chain, fit);
-      joints = result.joints.joints;
-    }
-    if (result.bending.bending != first || joints != result.chain.links() - 1) {
-      result.chain = make(result.bending.bending, joints);
-      fit = silhouette::fit_sequence(result.chain, capture);
-    }
-    states = fit.states;
-    // what the silhouettes know stays known: appearance alone would pull angles to explain rolling and shading
-    prior = prior_of(fit);
+  const capture::Capture& capture = job.capture;
+  const Options& options = job.options;
+  Result& result = job.result;
+  core::report({"recognize", 0, kTotalSteps, NAN, NAN, "silhouettes"});
+  const bool decide = !options.bending && !capture.tabletop;
+  const chain::Bending first =
+      options.bending.value_or(capture.tabletop ? chain::Bending::planar : chain::Bending::spatial);
+  result.bending.bending = first;
+  int joints = options.joints.value_or(kFirstJoints);
+  result.chain = chain_of(capture, options, first, joints);
+  silhouette::SequenceFit fit = silhouette::fit_sequence(result.chain, capture);
+  if (decide) result.bending = silhouette::choose_bending(result.chain, capture, fit);
+  if (!options.joints) {
+    result.joints = silhouette::choose_joints(result.chain, fit);
+    joints = result.joints.joints;
   }
-  std::vector<math::VectorX> coarse = states.theta;  // to carry corrections to the frames that do not train
-  if (before) {
-    const Eigen::Index n = result.chain.angles();
-    const double* from = before->extra.data();
-    for (math::VectorX& theta : coarse) {
-      theta = Eigen::Map<const math::VectorX>(from, n);
-      from += n;
-    }
-    for (std::size_t k = 0; k < coarse.size(); ++k, from += n * n)
-      prior.information.push_back(Eigen::Map<const math::MatrixX>(from, n, n));
-    prior.mean = coarse;
+  if (result.bending.bending != first || joints != result.chain.links() - 1) {
+    result.chain = chain_of(capture, options, result.bending.bending, joints);
+    fit = silhouette::fit_sequence(result.chain, capture);
   }
-  const std::vector<FrameViews> frames = assign_views(capture, states.time);
-  const TrainingViews training = training_views(capture, frames, std::max(1, options.every));
-  if (training.views.empty())
-    throw WorkError(capture.name, "no training frame shows the object", "use `every` 1 or check the masks");
-  const chain::Chain& chain = result.chain;
+  job.states = fit.states;
+  job.coarse = job.states.theta;
+  job.prior = prior_of(fit);
+}
 
-  splat::Engine engine(device);
+void resume(Job& job, Checkpoint before) {
+  Result& result = job.result;
+  result.bending = {before.spatial ? chain::Bending::spatial : chain::Bending::planar, before.out_of_plane_rms,
+                    before.deviation};
+  const chain::Chain joint = chain_of(job.capture, job.options, result.bending.bending, 1);
+  const Eigen::Index n = before.states.theta.at(0).size();
+  result.chain = chain_of(job.capture, job.options, result.bending.bending, static_cast<int>(n) / joint.angles());
+  job.states = std::move(before.states);
+  job.gaussians = std::move(before.gaussians);
+  job.first_round = before.stage;
+  job.first_step = before.step;
+  job.snapshot = std::move(before.snapshot);
+  job.watch = before.watch;
+  const double* from = before.extra.data();
+  for (std::size_t k = 0; k < job.states.time.size(); ++k, from += n)
+    job.coarse.emplace_back(Eigen::Map<const math::VectorX>(from, n));
+  for (std::size_t k = 0; k < job.states.time.size(); ++k, from += n * n)
+    job.prior.information.emplace_back(Eigen::Map<const math::MatrixX>(from, n, n));
+  job.prior.mean = job.coarse;
+}
+
+// `step`: Adam's steps done of the round.
+void save(const Job& job, splat::Engine& engine, int round, int step) {
+  if (job.options.checkpoint.empty()) return;
+  Checkpoint c;
+  c.job = job.text;
+  c.stage = round;
+  c.step = step;
+  c.watch = job.watch;
+  c.spatial = job.result.bending.bending == chain::Bending::spatial;
+  c.out_of_plane_rms = job.result.bending.out_of_plane_rms;
+  c.deviation = job.result.bending.deviation;
+  c.states = job.states;
+  c.gaussians = job.gaussians;
+  if (step > 0) c.snapshot = engine.snapshot();
+  for (const math::VectorX& theta : job.coarse)
+    c.extra.insert(c.extra.end(), theta.data(), theta.data() + theta.size());
+  for (const math::MatrixX& m : job.prior.information) c.extra.insert(c.extra.end(), m.data(), m.data() + m.size());
+  save_checkpoint(c, job.options.checkpoint);
+}
+
+// The training views with the links where the states put them.
+std::vector<splat::ViewSpec> posed_views(const Job& job) {
   std::vector<splat::ViewSpec> specs;
-  std::vector<const std::vector<std::uint8_t>*> targets;
-  const auto pose_views = [&] {
-    specs.clear();
-    for (std::size_t i = 0; i < training.views.size(); ++i) {
-      const int k = training.frame_of[i];
-      const capture::View& view = capture.views[training.views[i]];
-      specs.push_back(
-          view_spec(capture, view, view_motions(chain, capture, states, frames[k], k, states.theta[k], view)));
-    }
-  };
-  pose_views();
-  for (const int v : training.views) targets.push_back(&capture.views[v].rgba);
-  engine.set_views(specs, targets);
-  if (!before) {
-    core::Random random(options.seed * 1000003 + 1);
-    gaussians = place_along_chain(chain, capture, states, frames, training.frames,
-                                  static_cast<int>(kFirstShare * budget), random);
+  for (std::size_t i = 0; i < job.training.views.size(); ++i) {
+    const int k = job.training.frame_of[i];
+    const capture::View& view = job.capture.views[job.training.views[i]];
+    specs.push_back(view_spec(
+        job.capture, view,
+        view_motions(job.result.chain, job.capture, job.states, job.frames[k], k, job.states.theta[k], view)));
   }
+  return specs;
+}
 
-  double loss = NAN, psnr = NAN;
-  const auto checkpoint = [&](int round, int step) {
-    if (options.checkpoint.empty()) return;
-    Checkpoint c;
-    c.job = job;
-    c.stage = round;
-    c.step = step;
-    c.watch = watch;
-    c.spatial = result.bending.bending == chain::Bending::spatial;
-    c.out_of_plane_rms = result.bending.out_of_plane_rms;
-    c.deviation = result.bending.deviation;
-    c.states = states;
-    c.gaussians = gaussians;
-    if (step > 0) c.snapshot = engine.snapshot();
-    for (const math::VectorX& theta : coarse) c.extra.insert(c.extra.end(), theta.data(), theta.data() + theta.size());
-    for (const math::MatrixX& m : prior.information) c.extra.insert(c.extra.end(), m.data(), m.data() + m.size());
-    save_checkpoint(c, options.checkpoint);
-  };
-  const std::vector<double> empty = empty_losses(capture, training);
-  // Adam's steps of one round (the last is the polish). Which views make a batch depends on the round alone: a resumed
-  // one draws those of the steps before `first_step` again. False: the optimization ran away.
-  const auto adam = [&](int round, int first_step, core::Random& random) {
-    const std::string note =
-        round < kRounds ? "round " + std::to_string(round + 1) + " of " + std::to_string(kRounds) : "last polish";
-    ViewDeck deck;
-    for (int step = 0; step < (round < kRounds ? kSteps : kFinalSteps); ++step) {
-      const std::vector<int> batch = draw_batch(deck, kBatch, static_cast<int>(training.views.size()), random);
-      if (step < first_step) continue;
-      if (const int signal = core::stop_requested()) {
-        checkpoint(round, step);
-        throw Interrupted(signal);
-      }
-      constexpr int kReadEvery = 10;
-      const bool read = step % kReadEvery == 0;
-      const int done_steps = round * kSteps + step + 1;
-      const splat::LossValues values =
-          engine.step(batch, kLossWeights,
-                      rates(static_cast<double>(done_steps - 1) / total_steps, options.step * step_scale(watch)), read);
-      if (watch_gradients(watch, values.not_finite, done_steps) == Course::diverged) return false;
-      if (read) {
-        loss = values.total / static_cast<double>(batch.size());
-        psnr = mean(values.psnr_object);
-        double nothing = 0.0;
-        for (const int v : batch) nothing += empty[v];
-        // masks of a batch may all be empty
-        if (nothing > 0.0 && watch_loss(watch, values.total / nothing) == Course::diverged) return false;
-        core::report({"recognize", done_steps, total_steps, loss, psnr, note});
-      }
+// Adam's steps of one round, from `first_step`; round kRounds is the last polish. Which views make a batch depends on
+// the round alone: a resumed one draws those of the steps before again. False: the optimization ran away.
+bool train_gaussians(Job& job, splat::Engine& engine, int round, int first_step, core::Random& random) {
+  constexpr int kReadEvery = 10;
+  const std::string note =
+      round < kRounds ? "round " + std::to_string(round + 1) + " of " + std::to_string(kRounds) : "last polish";
+  ViewDeck deck;
+  for (int step = 0; step < (round < kRounds ? kSteps : kFinalSteps); ++step) {
+    const std::vector<int> batch = draw_batch(deck, kBatch, static_cast<int>(job.training.views.size()), random);
+    if (step < first_step) continue;
+    if (const int signal = core::stop_requested()) {
+      save(job, engine, round, step);
+      throw Interrupted(signal);
     }
-    return true;
-  };
-  // what the angles' refinement drew last of every training view: it shows where Gaussians are missing, too
-  struct LastDrawn {
-    std::vector<math::Pose> motions;
-    splat::Picture picture;
-  };
-  std::vector<LastDrawn> last_drawn(training.views.size());
-  const auto draw_training = [&](std::span<const int> views, std::span<const std::vector<math::Pose>> motions,
-                                 bool keep) {
+    const bool read = step % kReadEvery == 0;
+    const int done = round * kSteps + step + 1;
+    const splat::LossValues values =
+        engine.step(batch, kLossWeights,
+                    rates(static_cast<double>(done - 1) / kTotalSteps, job.options.step * step_scale(job.watch)), read);
+    if (watch_gradients(job.watch, values.not_finite, done) == Course::diverged) return false;
+    if (!read) continue;
+    job.loss = values.total / static_cast<double>(batch.size());
+    job.psnr = mean(values.psnr_object);
+    double nothing = 0.0;
+    for (const int v : batch) nothing += job.empty[v];
+    // masks of a batch may all be empty
+    if (nothing > 0.0 && watch_loss(job.watch, values.total / nothing) == Course::diverged) return false;
+    core::report({"recognize", done, kTotalSteps, job.loss, job.psnr, note});
+  }
+  return true;
+}
+
+// A round that ran away is done again from its start, with smaller steps from here on.
+void slow_down(StepWatch& watch, int round) {
+  ++watch.restarts;
+  const std::string trouble = std::string(watch.bad_in_a_row > 0 ? "gradients are not finite" : "the loss runs away") +
+                              " in round " + std::to_string(round + 1);
+  const std::string size = core::exact(step_scale(watch)) + " of the usual ones";
+  if (watch.restarts > kMostRestarts)
+    throw WorkError("recognize", trouble + " at step sizes down to " + size,
+                    "look at the capture with 'chainsplat check'; if it is sound, report it");
+  core::warn("recognize: " + trouble + "; it is repeated from its start with steps of " + size);
+  watch.bad_in_a_row = 0;
+}
+
+// One round of Adam, again where it runs away. Leaves what it began with in job.gaussians, the rest in the engine.
+// Returns the round's random numbers as the steps leave them.
+core::Random train_round(Job& job, splat::Engine& engine, int round) {
+  constexpr int kPolish = 999, kRound = 100;  // seeds of the rounds
+  for (bool resumed = round == job.first_round && job.first_step > 0;; resumed = false) {
+    core::Random random(job.options.seed * 1000003 + (round == kRounds ? kPolish : kRound + round));
+    if (resumed) {
+      engine.restore(job.snapshot);
+    } else {
+      begin_round(job.watch);
+      save(job, engine, round, 0);
+      engine.set_gaussians(job.gaussians);
+    }
+    if (train_gaussians(job, engine, round, resumed ? job.first_step : 0, random)) return random;
+    slow_down(job.watch, round);
+  }
+}
+
+// What the angles' refinement drew last of every training view: it shows where Gaussians are missing, too.
+struct LastDrawn {
+  std::vector<math::Pose> motions;
+  splat::Picture picture;
+};
+
+// Gauss-Newton on the angles of the training frames, with the engine's Gaussians held. Returns what was drawn last, by
+// training view, if `keep`; else steps that cannot go far are trusted, and not drawn.
+std::vector<LastDrawn> refine_training(Job& job, splat::Engine& engine, bool keep) {
+  std::vector<LastDrawn> last(keep ? job.training.views.size() : 0);
+  const Draw draw = [&](std::span<const int> views, std::span<const std::vector<math::Pose>> motions) {
     std::vector<int> batch;
     for (std::size_t v = 0; v < views.size(); ++v) {
-      batch.push_back(training.index_of[views[v]]);
+      batch.push_back(job.training.index_of[views[v]]);
       engine.set_motions(batch.back(), motions[v]);
     }
     std::vector<splat::Picture> pictures = engine.draw_views(batch, true);
     for (std::size_t v = 0; keep && v < views.size(); ++v)
-      last_drawn[batch[v]] = {motions[v], {pictures[v].width, pictures[v].height, pictures[v].rgba, {}}};
+      last[batch[v]] = {motions[v], {pictures[v].width, pictures[v].height, pictures[v].rgba, {}}};
     return pictures;
   };
-  for (int round = first_round; round <= kRounds; ++round) {
-    const bool polish = round == kRounds;
-    core::Random random(options.seed * 1000003 + (polish ? 999 : 100 + round));
-    int first_step = 0;
-    if (before && round == first_round && before->step > 0) {
-      first_step = before->step;
-      engine.restore(before->snapshot);
-    } else {
-      begin_round(watch);
-      checkpoint(round, 0);
-      engine.set_gaussians(gaussians);
-    }
-    if (!adam(round, first_step, random)) {
-      // once more from the round's start, with smaller steps from here on
-      ++watch.restarts;
-      const std::string trouble = watch.bad_in_a_row > 0 ? "gradients are not finite" : "the loss runs away";
-      if (watch.restarts > kMostRestarts)
-        throw WorkError("recognize",
-                        trouble + " in round " + std::to_string(round + 1) + " at step sizes down to " +
-                            core::exact(step_scale(watch)) + " of the usual ones",
-                        "look at the capture with 'chainsplat check'; if it is sound, report it");
-      core::warn("recognize: " + trouble + " in round " + std::to_string(round + 1) +
-                 "; it is repeated from its start with steps of " + core::exact(step_scale(watch)) +
-                 " of the usual ones");
-      watch.bad_in_a_row = 0;
-      before.reset();
-      --round;
-      continue;
-    }
-    if (polish) {
-      gaussians = engine.gaussians();
-      checkpoint(kRounds + 1, 0);
-      break;
-    }
-    RefineOptions refine;
-    refine.iterations = kAngleIterations;
-    refine.mask_weight = kAngleMaskWeight;
-    const bool adding = round + 1 < kRounds;
-    if (!adding) {
-      refine.trusted = kTrustedStep;
-      last_drawn = {};
-    }
-    const Draw draw = [&](std::span<const int> views, std::span<const std::vector<math::Pose>> motions) {
-      return draw_training(views, motions, adding);
-    };
-    refine_angles(chain, capture, frames, training.frames, draw, refine, prior, states);
-    pose_views();
-    for (std::size_t i = 0; i < specs.size(); ++i) engine.set_motions(static_cast<int>(i), specs[i].motions);
-    gaussians = engine.gaussians();
-    if (adding) {
-      std::vector<Drawn> drawn;
-      for (std::size_t i = 0; i < last_drawn.size(); ++i)
-        drawn.push_back({&capture.views[training.views[i]], &last_drawn[i].motions, &last_drawn[i].picture});
-      add_and_prune(gaussians, chain, capture, drawn, budget, added_a_round, random);
-      if (round + 1 == kShRound && gaussians.degree == 0) gaussians.resize(gaussians.count, gaussians.links, 1);
-    } else {
-      std::vector<Viewpoint> viewpoints;
-      for (const splat::ViewSpec& spec : specs)
-        viewpoints.push_back({spec.camera->world_from_camera.translation, spec.motions});
-      const int unseen = finish_unseen(chain, viewpoints, gaussians);
-      core::say_more("recognize: " + std::to_string(unseen) + " of " + std::to_string(gaussians.count) +
-                     " Gaussians lie where no camera saw the rope; their colors are guessed");
-    }
-  }
-  // every frame: start from the silhouettes plus the correction of the training frames around it
-  core::report({"recognize", total_steps, total_steps, loss, psnr, "all frames"});
+  RefineOptions refine;
+  refine.iterations = kAngleIterations;
+  refine.mask_weight = kAngleMaskWeight;
+  if (!keep) refine.trusted = kTrustedStep;
+  refine_angles(job.result.chain, job.capture, job.frames, job.training.frames, draw, refine, job.prior, job.states);
+  return last;
+}
+
+// Gaussians go where the images ask for more of them.
+void add_gaussians(Job& job, const std::vector<LastDrawn>& last, int budget, int round, core::Random& random) {
+  std::vector<Drawn> drawn;
+  for (std::size_t i = 0; i < last.size(); ++i)
+    drawn.push_back({&job.capture.views[job.training.views[i]], &last[i].motions, &last[i].picture});
+  add_and_prune(job.gaussians, job.result.chain, job.capture, drawn, budget, std::max(1, budget / 10), random);
+  if (round + 1 == kShRound && job.gaussians.degree == 0)
+    job.gaussians.resize(job.gaussians.count, job.gaussians.links, 1);
+}
+
+void guess_unseen(Job& job, const std::vector<splat::ViewSpec>& specs) {
+  std::vector<Viewpoint> viewpoints;
+  for (const splat::ViewSpec& spec : specs)
+    viewpoints.push_back({spec.camera->world_from_camera.translation, spec.motions});
+  const int unseen = finish_unseen(job.result.chain, viewpoints, job.gaussians);
+  core::say_more("recognize: " + std::to_string(unseen) + " of " + std::to_string(job.gaussians.count) +
+                 " Gaussians lie where no camera saw the rope; their colors are guessed");
+}
+
+// All frames are refined, from the silhouettes plus the correction of the training frames around each.
+void refine_all_frames(Job& job, splat::Engine& engine) {
+  core::report({"recognize", kTotalSteps, kTotalSteps, job.loss, job.psnr, "all frames"});
+  const std::vector<int>& trained = job.training.frames;
   chain::States correction;
-  for (const int k : training.frames) {
-    correction.time.push_back(states.time[k]);
-    correction.theta.push_back(states.theta[k] - coarse[k]);
+  for (const int k : trained) {
+    correction.time.push_back(job.states.time[k]);
+    correction.theta.push_back(job.states.theta[k] - job.coarse[k]);
   }
-  std::vector<int> all_frames;
-  for (int k = 0; k < static_cast<int>(frames.size()); ++k) {
-    if (frames[k].views.empty()) continue;
-    all_frames.push_back(k);
-    if (std::find(training.frames.begin(), training.frames.end(), k) == training.frames.end())
-      states.theta[k] = coarse[k] + chain::interpolate(correction, states.time[k]);
+  std::vector<int> all;
+  for (int k = 0; k < static_cast<int>(job.frames.size()); ++k) {
+    if (job.frames[k].views.empty()) continue;
+    all.push_back(k);
+    if (std::find(trained.begin(), trained.end(), k) == trained.end())
+      job.states.theta[k] = job.coarse[k] + chain::interpolate(correction, job.states.time[k]);
   }
-  result.summary = refine_all(engine, chain, capture, frames, gaussians, all_frames, kFinalIterations, prior, states);
-  differentiate(states);
-  result.gaussians = std::move(gaussians);
-  result.states = std::move(states);
-  return result;
+  job.result.summary = refine_all(engine, job.result.chain, job.capture, job.frames, job.gaussians, all,
+                                  kFinalIterations, job.prior, job.states);
+  differentiate(job.states);
+}
+
+}  // namespace
+
+Result recognize_fast(gpu::Device& device, const capture::Capture& capture, const Options& options) {
+  Job job{capture, options};
+  std::optional<Checkpoint> before;
+  if (options.resume && !options.checkpoint.empty()) before = load_checkpoint(options.checkpoint, job.text);
+  const bool resumed = before.has_value();
+  if (resumed)
+    resume(job, std::move(*before));
+  else
+    begin(job);
+  job.frames = assign_views(capture, job.states.time);
+  job.training = training_views(capture, job.frames, std::max(1, options.every));
+  if (job.training.views.empty())
+    throw WorkError(capture.name, "no training frame shows the object", "use `every` 1 or check the masks");
+  job.empty = empty_losses(capture, job.training);
+
+  splat::Engine engine(device);
+  std::vector<splat::ViewSpec> specs = posed_views(job);
+  std::vector<const std::vector<std::uint8_t>*> targets;
+  for (const int v : job.training.views) targets.push_back(&capture.views[v].rgba);
+  engine.set_views(specs, targets);
+  const int budget = budget_of(capture, options);
+  if (!resumed) {
+    core::Random random(options.seed * 1000003 + 1);
+    job.gaussians = place_along_chain(job.result.chain, capture, job.states, job.frames, job.training.frames,
+                                      static_cast<int>(kFirstShare * budget), random);
+  }
+
+  for (int round = job.first_round; round < kRounds; ++round) {
+    core::Random random = train_round(job, engine, round);
+    const bool adding = round + 1 < kRounds;
+    const std::vector<LastDrawn> last = refine_training(job, engine, adding);
+    specs = posed_views(job);
+    for (std::size_t i = 0; i < specs.size(); ++i) engine.set_motions(static_cast<int>(i), specs[i].motions);
+    job.gaussians = engine.gaussians();
+    if (adding)
+      add_gaussians(job, last, budget, round, random);
+    else
+      guess_unseen(job, specs);
+  }
+  if (job.first_round <= kRounds) {
+    train_round(job, engine, kRounds);
+    job.gaussians = engine.gaussians();
+    save(job, engine, kRounds + 1, 0);
+  }
+  refine_all_frames(job, engine);
+  job.result.gaussians = std::move(job.gaussians);
+  job.result.states = std::move(job.states);
+  return std::move(job.result);
 }
 
 }  // namespace chainsplat::recognition

@@ -26,6 +26,9 @@ splat::AdamRates rates(double fraction, double scale);
 Result recognize_fast(gpu::Device& device, const capture::Capture& capture, const Options& options);
 Result recognize_paper(gpu::Device& device, const capture::Capture& capture, const Options& options);
 
+// The chain of the capture's rope with so many joints.
+chain::Chain chain_of(const capture::Capture& capture, const Options& options, chain::Bending bending, int joints);
+
 // Everything that the result depends on, to recognize a checkpoint of another job: a line 'NAME VALUE' each.
 std::string job_text(const capture::Capture& capture, const Options& options);
 

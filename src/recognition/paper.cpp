@@ -91,29 +91,14 @@ double scene_extent(const capture::Capture& capture) {
   return 1.1 * std::max(extent, capture.length);
 }
 
-}  // namespace
+// A training view on the union of its camera's crops.
+struct PaperView {
+  capture::View view;
+  int frame = 0;
+};
 
-Result recognize_paper(gpu::Device& device, const capture::Capture& capture, const Options& options) {
-  Result result;
-  const std::string job = job_text(capture, options);
-  result.bending.bending = options.bending.value_or(chain::Bending::planar);
-  result.chain = chain::make_chain(capture.length, capture.diameter, capture.direction, capture.bending_axis,
-                                   options.joints.value_or(kJoints), result.bending.bending, options.twist);
-  const chain::Chain& chain = result.chain;
-  chain::States states;
-  std::vector<double> times;
-  for (const capture::View& view : capture.views)
-    if (view.camera == 0) times.push_back(view.time);
-  states.time = times;
-  states.theta.assign(times.size(), math::VectorX::Zero(chain.angles()));
-  const std::vector<FrameViews> frames = assign_views(capture, times);
-  std::vector<int> training;
-  for (int k = 0; k < static_cast<int>(frames.size()); k += std::max(1, options.every))
-    if (!frames[k].views.empty()) training.push_back(k);
-  if (training.empty())
-    throw WorkError(capture.name, "no training frame shows the object", "use `every` 1 or check the masks");
-
-  // views on the union of their camera's crops
+std::vector<PaperView> views_of(const capture::Capture& capture, const std::vector<FrameViews>& frames,
+                                const std::vector<int>& training) {
   std::vector<int> x0(capture.cameras.size(), 1 << 30), y0 = x0, x1(capture.cameras.size(), 0), y1 = x1;
   for (const capture::View& view : capture.views) {
     if (view.width == 0) continue;
@@ -122,155 +107,217 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
     x1[view.camera] = std::max(x1[view.camera], view.x0 + view.width);
     y1[view.camera] = std::max(y1[view.camera], view.y0 + view.height);
   }
-  std::vector<capture::View> views;
-  std::vector<int> frame_of;
-  for (const int k : training) {
+  std::vector<PaperView> views;
+  for (const int k : training)
     for (const int v : frames[k].views) {
       const int c = capture.views[v].camera;
-      views.push_back(padded(capture.views[v], x0[c], y0[c], x1[c] - x0[c], y1[c] - y0[c]));
-      frame_of.push_back(k);
+      views.push_back({padded(capture.views[v], x0[c], y0[c], x1[c] - x0[c], y1[c] - y0[c]), k});
     }
+  return views;
+}
+
+// What the iterations share.
+struct Job {
+  const capture::Capture& capture;
+  const Options& options;
+  std::string text = job_text(capture, options);  // by which its checkpoints are known
+  Result result = {};
+  chain::States states = {};
+  std::vector<FrameViews> frames = {};         // as assigned to states.time
+  std::vector<int> training = {};              // frames
+  std::vector<PaperView> views = {};           // of these
+  std::vector<solve::AdamState> moments = {};  // of each frame's angles; steps: its visits
+  StepWatch watch = {};
+  int first = 0;  // iteration
+};
+
+std::vector<math::Pose> motions_of(const Job& job, const PaperView& view) {
+  return chain::link_motions(job.result.chain, job.states.theta[view.frame], job.capture.base.pose(view.view.time));
+}
+
+// All angles zero at the times of the first camera's frames.
+void begin(Job& job) {
+  const chain::Bending bending = job.options.bending.value_or(chain::Bending::planar);
+  job.result.bending.bending = bending;
+  job.result.chain = chain_of(job.capture, job.options, bending, job.options.joints.value_or(kJoints));
+  const math::VectorX straight = math::VectorX::Zero(job.result.chain.angles());
+  for (const capture::View& view : job.capture.views)
+    if (view.camera == 0) job.states.time.push_back(view.time);
+  job.states.theta.assign(job.states.time.size(), straight);
+  job.frames = assign_views(job.capture, job.states.time);
+  for (int k = 0; k < static_cast<int>(job.frames.size()); k += std::max(1, job.options.every))
+    if (!job.frames[k].views.empty()) job.training.push_back(k);
+  if (job.training.empty())
+    throw WorkError(job.capture.name, "no training frame shows the object", "use `every` 1 or check the masks");
+  job.views = views_of(job.capture, job.frames, job.training);
+  job.moments.resize(job.frames.size());
+  for (solve::AdamState& m : job.moments) m.first = m.second = straight;
+}
+
+void resume(Job& job, Checkpoint before, splat::Engine& engine) {
+  job.states = std::move(before.states);
+  job.first = before.stage;
+  job.watch = before.watch;
+  engine.restore(before.snapshot);
+  const double* from = before.extra.data();
+  const Eigen::Index n = job.result.chain.angles();
+  for (solve::AdamState& m : job.moments) {
+    m.first = Eigen::Map<const math::VectorX>(from, n);
+    m.second = Eigen::Map<const math::VectorX>(from + n, n);
+    m.steps = static_cast<int>(from[2 * n]);
+    from += 2 * n + 1;
   }
-  const auto motions_of = [&](std::size_t i) {
-    return chain::link_motions(chain, states.theta[frame_of[i]], capture.base.pose(views[i].time));
-  };
+}
+
+void save(const Job& job, splat::Engine& engine, int iteration) {
+  if (job.options.checkpoint.empty()) return;
+  Checkpoint c;
+  c.job = job.text;
+  c.stage = iteration;
+  c.spatial = job.result.bending.bending == chain::Bending::spatial;
+  c.watch = job.watch;
+  c.states = job.states;
+  c.snapshot = engine.snapshot();
+  for (const solve::AdamState& m : job.moments) {
+    c.extra.insert(c.extra.end(), m.first.data(), m.first.data() + m.first.size());
+    c.extra.insert(c.extra.end(), m.second.data(), m.second.data() + m.second.size());
+    c.extra.push_back(m.steps);
+  }
+  save_checkpoint(c, job.options.checkpoint);
+}
+
+// Gaussians anywhere in the bounds of the visual hull.
+splat::Gaussians random_gaussians(const Job& job) {
+  core::Random random(job.options.seed * 1000003 + 7);
+  math::Vector3 low, high;
+  hull_bounds(job.capture, job.frames, job.training, low, high);
+  if ((high - low).minCoeff() <= 0)
+    throw WorkError(job.capture.name, "the cameras' masks have no common volume",
+                    "check the calibration with 'chainsplat check'");
+  splat::Gaussians g;
+  g.resize(job.options.paper_gaussians, job.result.chain.links(), 0);
+  const double spacing = std::cbrt((high - low).prod() / job.options.paper_gaussians);
+  constexpr float kStartOpacityLogit = -2.1972246f;  // opacity 0.1
+  for (int i = 0; i < g.count; ++i) {
+    for (int c = 0; c < 3; ++c) {
+      g.mean[3 * i + c] = static_cast<float>(random.uniform(low[c], high[c]));
+      g.log_scale[3 * i + c] = static_cast<float>(std::log(spacing));
+      g.sh[3 * i + c] = static_cast<float>(random.normal() / 255.0 / image_model::kSh0);
+    }
+    g.opacity_logit[i] = kStartOpacityLogit;
+  }
+  return g;
+}
+
+// One random view without repetition until all were used; a function of the iteration alone, so that a resumed run
+// draws the same ones. `order` is kept between iterations.
+std::size_t draw_view(const Job& job, int iteration, std::vector<int>& order) {
+  const std::size_t count = job.views.size(), place = static_cast<std::size_t>(iteration) % count;
+  if (place == 0 || order.empty()) {
+    core::Random random(job.options.seed * 1000003 + 17 + static_cast<std::uint64_t>(iteration) / count * 7919);
+    order.resize(count);
+    std::iota(order.begin(), order.end(), 0);
+    shuffle(order, random);
+  }
+  return static_cast<std::size_t>(order[place]);
+}
+
+splat::AdamRates rates_of_paper(double extent, double fraction) {
+  splat::AdamRates rates;
+  rates.mean = static_cast<float>(extent * kMeanRateFirst * std::pow(kMeanRateLast / kMeanRateFirst, fraction));
+  rates.rotation = 1e-3f;
+  rates.log_scale = 5e-3f;
+  rates.opacity = 0.025f;
+  rates.sh0 = 2.5e-3f;
+  rates.link_logits = 0.1f;
+  return rates;
+}
+
+// One step of Adam on the Gaussians and on the angles of one view's frame.
+void train_on(Job& job, splat::Engine& engine, std::size_t v, int iteration, const splat::AdamRates& rates) {
+  constexpr int kReadEvery = 50;
+  constexpr splat::LossWeights kWeights{0.8f, 0.2f, 0.0f};
+  const PaperView& view = job.views[v];
+  const bool read = iteration % kReadEvery == 0;
+  engine.set_motions(static_cast<int>(v), motions_of(job, view));
+  const int batch[] = {static_cast<int>(v)};
+  std::vector<math::MatrixX> twists;
+  const splat::LossValues values = engine.step(batch, kWeights, rates, read, &twists);
+  // no restart with smaller steps: the paper's rates are what this mode is for
+  if (watch_gradients(job.watch, values.not_finite, iteration + 1) == Course::diverged ||
+      (read && !std::isfinite(values.total)))
+    throw WorkError("recognize", "losses or gradients are not finite at iteration " + std::to_string(iteration + 1),
+                    "try `mode` fast or another `seed`");
+  if (read)
+    core::report(
+        {"recognize", iteration, job.options.paper_iterations, values.total, values.psnr_object[0], "paper mode"});
+  const chain::Chain& chain = job.result.chain;
+  math::VectorX& theta = job.states.theta[view.frame];
+  const math::VectorX gradient =
+      chain::theta_gradient(chain, chain::world_axes(chain, theta, job.capture.base.pose(view.view.time)), twists[0]);
+  if (gradient.allFinite()) solve::adam_step(job.moments[view.frame], gradient, {.rate = kAngleRate}, theta);
+}
+
+// The frames between: interpolated, then refined with the Gaussians held.
+void refine_others(Job& job, splat::Engine& engine) {
+  constexpr int kIterations = 8;  // Gauss-Newton steps from the interpolated angles
+  core::report({"recognize", job.options.paper_iterations, job.options.paper_iterations, NAN, NAN, "all frames"});
+  chain::States trained;
+  for (const int k : job.training) {
+    trained.time.push_back(job.states.time[k]);
+    trained.theta.push_back(job.states.theta[k]);
+  }
+  std::vector<int> others;
+  for (int k = 0; k < static_cast<int>(job.frames.size()); ++k) {
+    if (std::find(job.training.begin(), job.training.end(), k) != job.training.end()) continue;
+    job.states.theta[k] = chain::interpolate(trained, job.states.time[k]);
+    if (!job.frames[k].views.empty()) others.push_back(k);
+  }
+  job.result.summary = refine_all(engine, job.result.chain, job.capture, job.frames, job.result.gaussians, others,
+                                  kIterations, {}, job.states);
+  job.states.covariance.clear();  // nothing says how sure the training frames are
+  differentiate(job.states);
+}
+
+}  // namespace
+
+Result recognize_paper(gpu::Device& device, const capture::Capture& capture, const Options& options) {
+  constexpr int kCheckpointEvery = 1000;
+  Job job{capture, options};
+  begin(job);
   std::vector<splat::ViewSpec> specs;
   std::vector<const std::vector<std::uint8_t>*> targets;
-  for (std::size_t i = 0; i < views.size(); ++i) {
-    specs.push_back(view_spec(capture, views[i], motions_of(i)));
-    targets.push_back(&views[i].rgba);
+  for (const PaperView& view : job.views) {
+    specs.push_back(view_spec(capture, view.view, motions_of(job, view)));
+    targets.push_back(&view.view.rgba);
   }
   splat::Engine engine(device);
   engine.set_views(specs, targets, true);
-
-  std::vector<solve::AdamState> moments(frames.size());  // of each time step's angles; steps: its visits
-  for (auto& m : moments) m.first = m.second = math::VectorX::Zero(chain.angles());
-  core::Random random(options.seed * 1000003 + 7);
-  int first = 0;
-  StepWatch watch;
   std::optional<Checkpoint> before;
-  if (options.resume && !options.checkpoint.empty()) before = load_checkpoint(options.checkpoint, job);
-  if (before) {
-    states = before->states;
-    first = before->stage;
-    watch = before->watch;
-    engine.restore(before->snapshot);
-    const double* from = before->extra.data();
-    for (auto& m : moments) {
-      m.first = Eigen::Map<const math::VectorX>(from, chain.angles());
-      m.second = Eigen::Map<const math::VectorX>(from + chain.angles(), chain.angles());
-      m.steps = static_cast<int>(from[2 * chain.angles()]);
-      from += 2 * chain.angles() + 1;
-    }
-  } else {
-    math::Vector3 low, high;
-    hull_bounds(capture, frames, training, low, high);
-    if ((high - low).minCoeff() <= 0)
-      throw WorkError(capture.name, "the cameras' masks have no common volume",
-                      "check the calibration with 'chainsplat check'");
-    splat::Gaussians g;
-    g.resize(options.paper_gaussians, chain.links(), 0);
-    const double spacing = std::cbrt((high - low).prod() / options.paper_gaussians);
-    constexpr float kStartOpacityLogit = -2.1972246f;  // opacity 0.1
-    for (int i = 0; i < g.count; ++i) {
-      for (int c = 0; c < 3; ++c) {
-        g.mean[3 * i + c] = static_cast<float>(random.uniform(low[c], high[c]));
-        g.log_scale[3 * i + c] = static_cast<float>(std::log(spacing));
-        g.sh[3 * i + c] = static_cast<float>(random.normal() / 255.0 / image_model::kSh0);
-      }
-      g.opacity_logit[i] = kStartOpacityLogit;
-    }
-    engine.set_gaussians(g);
-  }
+  if (options.resume && !options.checkpoint.empty()) before = load_checkpoint(options.checkpoint, job.text);
+  if (before)
+    resume(job, std::move(*before), engine);
+  else
+    engine.set_gaussians(random_gaussians(job));
 
   const double extent = scene_extent(capture);
-  const splat::LossWeights weights{0.8f, 0.2f, 0.0f};
-  const auto checkpoint = [&](int iteration) {
-    if (options.checkpoint.empty()) return;
-    Checkpoint c;
-    c.job = job;
-    c.stage = iteration;
-    c.spatial = result.bending.bending == chain::Bending::spatial;
-    c.watch = watch;
-    c.states = states;
-    c.snapshot = engine.snapshot();
-    for (const auto& m : moments) {
-      c.extra.insert(c.extra.end(), m.first.data(), m.first.data() + m.first.size());
-      c.extra.insert(c.extra.end(), m.second.data(), m.second.data() + m.second.size());
-      c.extra.push_back(m.steps);
-    }
-    save_checkpoint(c, options.checkpoint);
-  };
   std::vector<int> order;
-  for (int iteration = first; iteration < options.paper_iterations; ++iteration) {
+  for (int iteration = job.first; iteration < options.paper_iterations; ++iteration) {
     if (const int signal = core::stop_requested()) {
-      checkpoint(iteration);
+      save(job, engine, iteration);
       throw Interrupted(signal);
     }
-    // one random view without repetition until all were used; a function of the iteration alone, so that a resumed run
-    // draws the same ones
-    const std::size_t count = views.size(), place = static_cast<std::size_t>(iteration) % count;
-    if (place == 0 || order.empty()) {
-      core::Random random_order(options.seed * 1000003 + 17 + static_cast<std::uint64_t>(iteration) / count * 7919);
-      order.resize(count);
-      std::iota(order.begin(), order.end(), 0);
-      shuffle(order, random_order);
-    }
-    const auto v = static_cast<std::size_t>(order[place]);
     const double fraction = static_cast<double>(iteration) / options.paper_iterations;
-    splat::AdamRates rates;
-    rates.mean = static_cast<float>(extent * kMeanRateFirst * std::pow(kMeanRateLast / kMeanRateFirst, fraction));
-    rates.rotation = 1e-3f;
-    rates.log_scale = 5e-3f;
-    rates.opacity = 0.025f;
-    rates.sh0 = 2.5e-3f;
-    rates.link_logits = 0.1f;
-    constexpr int kReadEvery = 50;
-    const bool read = iteration % kReadEvery == 0;
-    engine.set_motions(static_cast<int>(v), motions_of(v));
-    const int batch[] = {static_cast<int>(v)};
-    std::vector<math::MatrixX> twists;
-    const splat::LossValues values = engine.step(batch, weights, rates, read, &twists);
-    // no restart with smaller steps: the paper's rates are what this mode is for
-    if (watch_gradients(watch, values.not_finite, iteration + 1) == Course::diverged ||
-        (read && !std::isfinite(values.total)))
-      throw WorkError("recognize", "losses or gradients are not finite at iteration " + std::to_string(iteration + 1),
-                      "try `mode` fast or another `seed`");
-    if (read)
-      core::report(
-          {"recognize", iteration, options.paper_iterations, values.total, values.psnr_object[0], "paper mode"});
-    // Adam on this time step's angles
-    const int k = frame_of[v];
-    const math::VectorX gradient = chain::theta_gradient(
-        chain, chain::world_axes(chain, states.theta[k], capture.base.pose(views[v].time)), twists[0]);
-    if (gradient.allFinite()) solve::adam_step(moments[k], gradient, {.rate = kAngleRate}, states.theta[k]);
+    train_on(job, engine, draw_view(job, iteration, order), iteration, rates_of_paper(extent, fraction));
     const int done = iteration + 1;
     if (done % kOpacityReset == 0 && done <= kLastOpacityReset) engine.reset_opacity(kResetOpacity);
     if (std::find(std::begin(kLinkResets), std::end(kLinkResets), done) != std::end(kLinkResets)) engine.reset_links();
-    constexpr int kCheckpointEvery = 1000;
-    if (done % kCheckpointEvery == 0) checkpoint(done);
+    if (done % kCheckpointEvery == 0) save(job, engine, done);
   }
-  result.gaussians = engine.gaussians();
-
-  // the frames between: interpolated, then refined with the Gaussians held
-  core::report({"recognize", options.paper_iterations, options.paper_iterations, NAN, NAN, "all frames"});
-  chain::States trained;
-  for (const int k : training) {
-    trained.time.push_back(states.time[k]);
-    trained.theta.push_back(states.theta[k]);
-  }
-  std::vector<int> others;
-  for (int k = 0; k < static_cast<int>(frames.size()); ++k) {
-    if (std::find(training.begin(), training.end(), k) != training.end()) continue;
-    states.theta[k] = chain::interpolate(trained, states.time[k]);
-    if (!frames[k].views.empty()) others.push_back(k);
-  }
-  constexpr int kIterations = 8;  // Gauss-Newton steps from the interpolated angles
-  result.summary = refine_all(engine, chain, capture, frames, result.gaussians, others, kIterations, {}, states);
-  states.covariance.clear();  // nothing says how sure the training frames are
-  differentiate(states);
-  result.states = std::move(states);
-  return result;
+  job.result.gaussians = engine.gaussians();
+  refine_others(job, engine);
+  job.result.states = std::move(job.states);
+  return std::move(job.result);
 }
 
 }  // namespace chainsplat::recognition

@@ -15,6 +15,11 @@ Result recognize(gpu::Device& device, const capture::Capture& capture, const Opt
                                      : recognize_fast(device, capture, options);
 }
 
+chain::Chain chain_of(const capture::Capture& capture, const Options& options, chain::Bending bending, int joints) {
+  return chain::make_chain(capture.length, capture.diameter, capture.direction, capture.bending_axis, joints, bending,
+                           options.twist);
+}
+
 std::string job_text(const capture::Capture& capture, const Options& options) {
   // what was recorded, view by view, and as it was loaded: masks and frames can be others than of the same capture.json
   const auto hashed = [](const auto& values, std::uint64_t hash) {
