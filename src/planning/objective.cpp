@@ -130,6 +130,159 @@ Soft soft_minimum(const Task& task, const dynamics::Model& model, const Rollout&
   return soft;
 }
 
+// The sum under way.
+struct Terms {
+  const Task& task;
+  const Sharpness& sharpness;
+  bool derivatives;
+  Evaluation sum;
+  double counted = 0.0;  // of the value: what is no violation
+  int stride = 1;        // nodes between tests of limits and obstacles
+};
+
+// A square that counts above zero only, and what a step may do to it: `near` is how far below zero a step may begin.
+// `slope()`: of the residual, where derivatives are asked for.
+template <class Slope>
+void add_one_sided(Terms& t, double weight, double residual, double near, const Slope& slope) {
+  if (residual <= (t.derivatives ? -near : 0.0)) return;
+  if (!t.derivatives) {
+    t.sum.value += weight * residual * residual;
+    return;
+  }
+  VectorX by_unknown = slope();
+  if (residual > 0.0) add(t.sum, weight, residual, by_unknown);
+  for (Eigen::Index i = 0; i < by_unknown.size(); ++i)
+    if (t.task.held[i]) by_unknown[i] = 0.0;
+  t.sum.near.push_back({residual, weight, std::move(by_unknown)});
+}
+
+// The samples' soft minima, averaged, or their soft maximum. Returns each sample's share in it.
+std::vector<double> add_misses(Terms& t, const std::vector<Soft>& soft) {
+  const auto samples = static_cast<int>(soft.size());
+  std::vector<double> share(samples, 1.0 / samples);
+  Evaluation& sum = t.sum;
+  if (t.task.options->worst_case && samples > 1) {
+    double largest = -std::numeric_limits<double>::infinity(), total = 0.0;
+    for (const Soft& s : soft) largest = std::max(largest, s.value);
+    for (int m = 0; m < samples; ++m)
+      total += share[m] = std::exp(t.sharpness.soft_minimum * (soft[m].value - largest));
+    for (double& s : share) s /= total;
+    sum.value = largest + std::log(total) / t.sharpness.soft_minimum;
+    for (const Soft& s : soft) sum.miss = std::max(sum.miss, s.miss);
+  } else {
+    for (const Soft& s : soft) sum.value += s.value / samples, sum.miss += s.miss / samples;
+  }
+  t.counted = sum.value;
+  return share;
+}
+
+// Derivatives of one sample's soft minimum.
+void add_pull(Terms& t, const dynamics::Model& model, const Rollout& rollout, const Soft& soft, double share) {
+  const chain::Chain& chain = model.chain;
+  for (std::size_t i = 0; i < soft.candidates.size(); ++i) {
+    const double weight = share * soft.weights[i];
+    if (weight < kNegligible) continue;
+    const auto& [node, best] = soft.candidates[i];
+    const MatrixX axes = chain::world_axes(chain, rollout.theta[node], pose_at(t.task, rollout, node));
+    const MatrixX slope = point_slope(t.task, chain, rollout, axes, node, best.link, best.point);
+    const Vector3 apart = best.point - t.task.target_at(t.task.grid.time(node));
+    t.sum.gradient += 2.0 * weight * slope.transpose() * apart;
+    t.sum.curvature.selfadjointView<Eigen::Lower>().rankUpdate(slope.transpose(), 2.0 * weight);
+  }
+}
+
+// At rest in the end: the speed that each joint gives to the free end.
+void add_rest(Terms& t, const chain::Chain& chain, const Rollout& rollout) {
+  const double weight = 1.0 / static_cast<double>(t.task.models.size() * chain.angles());
+  for (int k = 0; k < chain.angles(); ++k) {
+    const double arm = kRestTime * (chain.length - chain.link_start(chain.child_link[k]));
+    const double residual = arm * rollout.thetadot.back()[k];
+    if (t.derivatives)
+      add(t.sum, weight, residual, arm * rollout.thetadot_slope.back().row(k).transpose());
+    else
+      t.sum.value += weight * residual * residual;
+  }
+}
+
+void add_obstacles(Terms& t, const chain::Chain& chain, const Rollout& rollout) {
+  const Task& task = t.task;
+  const double weight = task.limit_weight * kClearanceWeight / static_cast<double>(task.models.size());
+  for (int node = 0; node < task.grid.nodes(); node += t.stride) {
+    const math::Pose base = pose_at(task, rollout, node);
+    const auto motions = chain::link_motions(chain, rollout.theta[node], base);
+    MatrixX axes;
+    watch(task, chain, motions, [&](int link, const Vector3& point, double distance, const Vector3& outward) {
+      add_one_sided(t, weight, t.sharpness.clearance - distance, kNear, [&] {
+        if (axes.size() == 0) axes = chain::world_axes(chain, rollout.theta[node], base);
+        return VectorX(-(point_slope(task, chain, rollout, axes, node, link, point).transpose() * outward));
+      });
+    });
+  }
+}
+
+// A limit on a derivative of the base's motion, of its translation or its yaw.
+void add_limit(Terms& t, const Basis& basis, const Coordinates& base, int derivative, double most, bool yaw) {
+  const Task& task = t.task;
+  const double value = yaw ? std::abs(base(3, derivative)) : base.col(derivative).head<3>().norm();
+  add_one_sided(t, task.limit_weight * kLimitWeight, value / most - kLimitMargin, kNearLimit, [&] {
+    VectorX slope = VectorX::Zero(t.sum.gradient.size());
+    for (std::size_t a = 0; a < task.motion.axes.size(); ++a) {
+      const Axis axis = task.motion.axes[a];
+      if ((axis == Axis::yaw) != yaw) continue;
+      const double direction = base(static_cast<int>(axis), derivative) / value;
+      slope.segment(static_cast<Eigen::Index>(a) * kPerAxis, kPerAxis) = direction / most * basis.col(derivative);
+    }
+    return slope;
+  });
+}
+
+void add_limits(Terms& t, const std::vector<Coordinates>& base, const VectorX& unknowns) {
+  const Task& task = t.task;
+  const Limits& limits = task.options->limits;
+  const bool smooth = task.motion.window == Window::smooth;
+  for (int node = 0; node < task.grid.nodes(); node += t.stride) {
+    const Basis& b = task.grid.basis[node];
+    add_limit(t, b, base[node], 1, limits.velocity, false);
+    add_limit(t, b, base[node], 2, limits.acceleration, false);
+    if (smooth) add_limit(t, b, base[node], 3, limits.jerk, false);
+    add_limit(t, b, base[node], 1, limits.yaw_velocity, true);
+    add_limit(t, b, base[node], 2, limits.yaw_acceleration, true);
+    if (smooth) add_limit(t, b, base[node], 3, limits.yaw_jerk, true);
+  }
+  if (!smooth) return;
+  const Coordinates end = moved(task.motion, unknowns, task.grid.end_basis, task.grid.end_fixed);
+  add_limit(t, task.grid.end_basis, end, 3, limits.jerk, false);
+  add_limit(t, task.grid.end_basis, end, 3, limits.yaw_jerk, true);
+}
+
+// Smoothness and stroke along one axis, the a-th of the motion's. `length`: m, of the rope.
+void add_axis(Terms& t, const std::vector<Coordinates>& base, std::size_t a, double length) {
+  const Task& task = t.task;
+  const int row = static_cast<int>(task.motion.axes[a]), nodes = task.grid.nodes();
+  const bool yaw = task.motion.axes[a] == Axis::yaw;
+  const double scale = yaw ? length : 1.0;  // an angular acceleration counts by what it does at the rope's length
+  const double weight = t.sharpness.smoothness * scale * scale / nodes;
+  const auto first = static_cast<Eigen::Index>(a) * kPerAxis;
+  const double origin = yaw ? 0.0 : task.motion.origin.translation[row];
+  const double most = yaw ? task.options->limits.turn : task.options->limits.stroke;
+  for (int node = 0; node < nodes; ++node) {
+    const Basis& b = task.grid.basis[node];
+    const double smoothness = weight * base[node](row, 2) * base[node](row, 2);
+    t.sum.value += smoothness, t.counted += smoothness;
+    if (t.derivatives) {
+      t.sum.gradient.segment(first, kPerAxis) += 2.0 * weight * base[node](row, 2) * b.col(2);
+      t.sum.curvature.block(first, first, kPerAxis, kPerAxis) += 2.0 * weight * b.col(2) * b.col(2).transpose();
+    }
+    if (node % t.stride != 0) continue;
+    const double offset = base[node](row, 0) - origin;
+    add_one_sided(t, task.limit_weight * kLimitWeight, std::abs(offset) / most - kLimitMargin, kNearLimit, [&] {
+      VectorX slope = VectorX::Zero(t.sum.gradient.size());
+      slope.segment(first, kPerAxis) = (offset < 0.0 ? -1.0 : 1.0) / most * b.col(0);
+      return slope;
+    });
+  }
+}
+
 }  // namespace
 
 Part part_of(const Options& options, bool tabletop) { return options.part.value_or(tabletop ? Part::rope : Part::tip); }
@@ -147,13 +300,12 @@ Nearest nearest(const chain::Chain& chain, const std::vector<math::Pose>& motion
 }
 
 Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& sharpness, bool derivatives) {
-  const Eigen::Index size = unknowns.size();
-  const int samples = static_cast<int>(task.models.size()), nodes = task.grid.nodes();
+  const int samples = static_cast<int>(task.models.size());
   const Options& options = *task.options;
-  Evaluation sum;
-  sum.gradient.setZero(size);
-  sum.curvature.setZero(size, size);
-  const int stride = std::max(1, static_cast<int>(std::lround(kLimitInterval / task.grid.step)));
+  Terms t{task, sharpness, derivatives, {}};
+  t.sum.gradient.setZero(unknowns.size());
+  t.sum.curvature.setZero(unknowns.size(), unknowns.size());
+  t.stride = std::max(1, static_cast<int>(std::lround(kLimitInterval / task.grid.step)));
 
   std::vector<Rollout> rollouts(samples);
   std::vector<char> finite(samples);
@@ -161,150 +313,31 @@ Evaluation evaluate(const Task& task, const VectorX& unknowns, const Sharpness& 
     finite[m] =
         roll_out(*task.models[m], task.motion, task.grid, unknowns, task.initial, derivatives, rollouts[m], task.exact);
   });
-  if (std::find(finite.begin(), finite.end(), 0) != finite.end()) return sum;
-  sum.good = true;
+  if (std::find(finite.begin(), finite.end(), 0) != finite.end()) return t.sum;
+  t.sum.good = true;
 
-  // the samples' soft minima, averaged, or their soft maximum
   std::vector<Soft> soft;
-  std::vector<double> share(samples, 1.0 / samples);
   for (int m = 0; m < samples; ++m)
     soft.push_back(soft_minimum(task, *task.models[m], rollouts[m], sharpness.soft_minimum));
-  if (options.worst_case && samples > 1) {
-    double largest = -std::numeric_limits<double>::infinity(), total = 0.0;
-    for (const Soft& s : soft) largest = std::max(largest, s.value);
-    for (int m = 0; m < samples; ++m) total += share[m] = std::exp(sharpness.soft_minimum * (soft[m].value - largest));
-    for (double& s : share) s /= total;
-    sum.value = largest + std::log(total) / sharpness.soft_minimum;
-    for (const Soft& s : soft) sum.miss = std::max(sum.miss, s.miss);
-  } else {
-    for (const Soft& s : soft) sum.value += s.value / samples, sum.miss += s.miss / samples;
-  }
-
-  // a square that counts above zero only, with what a step may do to it
-  const auto add_one_sided = [&](double residual, double weight, VectorX slope) {
-    if (residual > 0.0) add(sum, weight, residual, slope);
-    if (!derivatives) return;
-    for (Eigen::Index i = 0; i < size; ++i)
-      if (task.held[i]) slope[i] = 0.0;
-    sum.near.push_back({residual, weight, std::move(slope)});
-  };
-  double counted = sum.value;  // what is no violation
+  const std::vector<double> share = add_misses(t, soft);
   for (int m = 0; m < samples; ++m) {
-    const dynamics::Model& model = *task.models[m];
-    const chain::Chain& chain = model.chain;
-    const Rollout& rollout = rollouts[m];
-    for (std::size_t i = 0; derivatives && i < soft[m].candidates.size(); ++i) {
-      const double weight = share[m] * soft[m].weights[i];
-      if (weight < kNegligible) continue;
-      const auto& [node, best] = soft[m].candidates[i];
-      const MatrixX axes = chain::world_axes(chain, rollout.theta[node], pose_at(task, rollout, node));
-      const MatrixX slope = point_slope(task, chain, rollout, axes, node, best.link, best.point);
-      const Vector3 apart = best.point - task.target_at(task.grid.time(node));
-      sum.gradient += 2.0 * weight * slope.transpose() * apart;
-      sum.curvature.selfadjointView<Eigen::Lower>().rankUpdate(slope.transpose(), 2.0 * weight);
+    const chain::Chain& chain = task.models[m]->chain;
+    if (derivatives) add_pull(t, *task.models[m], rollouts[m], soft[m], share[m]);
+    if (task.tabletop) add_rest(t, chain, rollouts[m]);
+    if (!options.spheres.empty() || !options.boxes.empty()) add_obstacles(t, chain, rollouts[m]);
+  }
+  // the base's motion is the same for all samples
+  const std::vector<Coordinates>& base = rollouts.front().base;
+  add_limits(t, base, unknowns);
+  for (std::size_t a = 0; a < task.motion.axes.size(); ++a) add_axis(t, base, a, task.models.front()->chain.length);
+  t.sum.violation = t.sum.value - t.counted;
+  t.sum.curvature.triangularView<Eigen::StrictlyUpper>() = t.sum.curvature.transpose();
+  for (Eigen::Index i = 0; derivatives && i < unknowns.size(); ++i)
+    if (task.held[i]) {
+      t.sum.gradient[i] = 0.0;
+      t.sum.curvature.row(i).setZero(), t.sum.curvature.col(i).setZero();
     }
-    // at rest in the end: speed that each joint gives to the free end
-    if (task.tabletop)
-      for (int k = 0; k < chain.angles(); ++k) {
-        const double arm = kRestTime * (chain.length - chain.link_start(chain.child_link[k]));
-        const double residual = arm * rollout.thetadot.back()[k];
-        const double weight = 1.0 / (samples * chain.angles());
-        if (derivatives)
-          add(sum, weight, residual, arm * rollout.thetadot_slope.back().row(k).transpose());
-        else
-          sum.value += weight * residual * residual;
-      }
-    if (!options.spheres.empty() || !options.boxes.empty())
-      for (int node = 0; node < nodes; node += stride) {
-        const math::Pose base = pose_at(task, rollout, node);
-        const auto motions = chain::link_motions(chain, rollout.theta[node], base);
-        MatrixX axes;
-        watch(task, chain, motions, [&](int link, const Vector3& point, double distance, const Vector3& outward) {
-          const double residual = sharpness.clearance - distance;
-          if (residual <= (derivatives ? -kNear : 0.0)) return;
-          const double weight = task.limit_weight * kClearanceWeight / samples;
-          if (!derivatives) {
-            sum.value += weight * residual * residual;
-            return;
-          }
-          if (axes.size() == 0) axes = chain::world_axes(chain, rollout.theta[node], base);
-          add_one_sided(residual, weight,
-                        -(point_slope(task, chain, rollout, axes, node, link, point).transpose() * outward));
-        });
-      }
-  }
-
-  // smoothness and limits of the base, the same for all samples
-  const auto& base = rollouts.front().base;
-  const double length = task.models.front()->chain.length;
-  const auto limit = [&](const Basis& b, const Coordinates& c, int derivative, double most, bool yaw) {
-    const double value = yaw ? std::abs(c(3, derivative)) : c.col(derivative).head<3>().norm();
-    const double residual = value / most - kLimitMargin;
-    if (residual <= (derivatives ? -kNearLimit : 0.0)) return;
-    if (!derivatives) {
-      sum.value += task.limit_weight * kLimitWeight * residual * residual;
-      return;
-    }
-    VectorX slope = VectorX::Zero(size);
-    for (std::size_t a = 0; a < task.motion.axes.size(); ++a) {
-      const Axis axis = task.motion.axes[a];
-      if ((axis == Axis::yaw) != yaw) continue;
-      const double direction = c(static_cast<int>(axis), derivative) / value;
-      slope.segment(static_cast<Eigen::Index>(a) * kPerAxis, kPerAxis) = direction / most * b.col(derivative);
-    }
-    add_one_sided(residual, task.limit_weight * kLimitWeight, std::move(slope));
-  };
-  const Limits& limits = options.limits;
-  const bool smooth = task.motion.window == Window::smooth;
-  for (int node = 0; node < nodes; node += stride) {
-    const Basis& b = task.grid.basis[node];
-    limit(b, base[node], 1, limits.velocity, false);
-    limit(b, base[node], 2, limits.acceleration, false);
-    if (smooth) limit(b, base[node], 3, limits.jerk, false);
-    limit(b, base[node], 1, limits.yaw_velocity, true);
-    limit(b, base[node], 2, limits.yaw_acceleration, true);
-    if (smooth) limit(b, base[node], 3, limits.yaw_jerk, true);
-  }
-  if (smooth) {
-    const Coordinates end = moved(task.motion, unknowns, task.grid.end_basis, task.grid.end_fixed);
-    limit(task.grid.end_basis, end, 3, limits.jerk, false);
-    limit(task.grid.end_basis, end, 3, limits.yaw_jerk, true);
-  }
-  for (std::size_t a = 0; a < task.motion.axes.size(); ++a) {
-    const int row = static_cast<int>(task.motion.axes[a]);
-    const bool yaw = task.motion.axes[a] == Axis::yaw;
-    const double scale = yaw ? length : 1.0;  // an angular acceleration counts by what it does at the rope's length
-    const double weight = sharpness.smoothness * scale * scale / nodes;
-    const auto first = static_cast<Eigen::Index>(a) * kPerAxis;
-    const double origin = yaw ? 0.0 : task.motion.origin.translation[row];
-    const double most = yaw ? limits.turn : limits.stroke;
-    for (int node = 0; node < nodes; ++node) {
-      const Basis& b = task.grid.basis[node];
-      const double smoothness = weight * base[node](row, 2) * base[node](row, 2);
-      sum.value += smoothness, counted += smoothness;
-      if (derivatives) {
-        sum.gradient.segment(first, kPerAxis) += 2.0 * weight * base[node](row, 2) * b.col(2);
-        sum.curvature.block(first, first, kPerAxis, kPerAxis) += 2.0 * weight * b.col(2) * b.col(2).transpose();
-      }
-      if (node % stride != 0) continue;
-      const double offset = base[node](row, 0) - origin;
-      const double residual = std::abs(offset) / most - kLimitMargin;
-      if (residual <= (derivatives ? -kNearLimit : 0.0)) continue;
-      VectorX slope = VectorX::Zero(size);
-      slope.segment(first, kPerAxis) = (offset < 0.0 ? -1.0 : 1.0) / most * b.col(0);
-      add_one_sided(residual, task.limit_weight * kLimitWeight, std::move(slope));
-    }
-  }
-  sum.violation = sum.value - counted;
-  if (derivatives) {
-    sum.curvature.triangularView<Eigen::StrictlyUpper>() = sum.curvature.transpose();
-    for (Eigen::Index i = 0; i < size; ++i)
-      if (task.held[i]) {
-        sum.gradient[i] = 0.0;
-        sum.curvature.row(i).setZero(), sum.curvature.col(i).setZero();
-      }
-  }
-  return sum;
+  return std::move(t.sum);
 }
 
 Hit measure(const Task& task, const dynamics::Model& model, const Rollout& rollout) {
