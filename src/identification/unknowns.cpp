@@ -55,156 +55,202 @@ bool twists_within_links(const chain::Chain& chain, const Options& options) {
          chain.angles() == 2 * (chain.links() - 1);
 }
 
-}  // namespace
+std::vector<double> all(int count, double value) { return std::vector<double>(count, value); }
 
-Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const Start& start, const Extras& extras) {
-  const int n = chain.angles(), links = chain.links() - 1;
-  Unknowns u;
-  u.total_mass = options.mass.value_or(1.0);
-  u.held.emplace_back("total_mass", options.mass ? "given: only ratios to it are observable"
-                                                 : "set to 1 kg: only ratios to it are observable, forces are per kg");
-  u.initial = {0.0, start.theta, start.thetadot};
+// The unknowns in the making.
+struct Draft {
+  const chain::Chain& chain;
+  const Options& options;
+  Unknowns u = {};
+  std::vector<double> means = {}, deviations = {};
+  struct Smooth {  // neighbors are alike
+    int first, count;
+    double deviation;
+  };
+  std::vector<Smooth> smooth = {};
+  int angles = chain.angles(), links = chain.links() - 1;
+  double torque = 0.0;     // N m (or per kg), of the rope's weight at its length
+  double reference = 0.0;  // m, of rope that a joint stands for in the mean
+  bool stiff = options.fit_stiffness && !options.paper;
 
-  dynamics::Parameters& unit = u.reference;
-  const auto all = [](int count, double value) { return std::vector<double>(count, value); };
-  unit.viscous_friction = unit.coulomb_friction = unit.air_linear = unit.air_quadratic = all(links, 0.0);
-  unit.stiffness = unit.rest_angle = unit.damping = all(n, 0.0);
+  void hold(const char* name, const char* reason) { u.held.emplace_back(name, reason); }
+  void add(Quantity quantity, int index, double mean, double deviation) {
+    u.list.push_back({quantity, index});
+    for (const Prior& prior : options.priors)
+      if (prior.unknown == dynamics::Unknown{quantity, index} ||
+          prior.unknown == dynamics::Unknown{quantity, dynamics::kEvery})
+        mean = prior.mean, deviation = prior.deviation;
+    means.push_back(mean), deviations.push_back(deviation);
+  }
+  void add_many(Quantity quantity, int count, double mean, double deviation, double smooth_deviation = 0.0) {
+    if (smooth_deviation > 0.0) smooth.push_back({u.size(), count, smooth_deviation});
+    for (int i = 0; i < count; ++i) add(quantity, i, mean, deviation);
+  }
+};
+
+Draft begin(const chain::Chain& chain, const Options& options, const Start& start) {
+  Draft d{chain, options};
+  d.u.total_mass = options.mass.value_or(1.0);
+  d.hold("total_mass", options.mass ? "given: only ratios to it are observable"
+                                    : "set to 1 kg: only ratios to it are observable, forces are per kg");
+  d.u.initial = {0.0, start.theta, start.thetadot};
+  d.torque = d.u.total_mass * options.gravity.norm() * chain.length;
+  d.reference = (chain.length - chain.joint_arclength[0]) / d.links;
+
+  dynamics::Parameters& unit = d.u.reference;
+  unit.viscous_friction = unit.coulomb_friction = unit.air_linear = unit.air_quadratic = all(d.links, 0.0);
+  unit.stiffness = unit.rest_angle = unit.damping = all(d.angles, 0.0);
   unit.radius = options.paper ? 0.0 : 0.5 * chain.diameter;
   unit.gravity = options.gravity;
   if (options.tabletop) unit.table_normal = options.table_normal.normalized();
   unit.integrator = options.paper ? dynamics::Integrator::implicit_velocity_euler : options.integrator;
   unit.substeps = options.paper ? 1 : options.substeps > 0 ? options.substeps : options.tabletop ? 8 : 4;
-  for (int link = 1; link <= links; ++link) unit.link_mass.push_back(chain.link_end(link) - chain.link_start(link));
-
+  for (int link = 1; link <= d.links; ++link) unit.link_mass.push_back(chain.link_end(link) - chain.link_start(link));
   // a joint is the softer the longer the piece of rope that it stands for
-  const double reference = (chain.length - chain.joint_arclength[0]) / links;
-  for (int k = 0; k < n; ++k)
-    unit.damping[k] = options.paper ? 1.0 : reference / chain::bent_length(chain, chain.child_link[k]);
+  for (int k = 0; k < d.angles; ++k)
+    unit.damping[k] = options.paper ? 1.0 : d.reference / chain::bent_length(chain, chain.child_link[k]);
+  return d;
+}
 
-  std::vector<double> means, sds;
-  struct Smooth {
-    int first, count;
-    double sd;
-  };
-  std::vector<Smooth> smooth;
-  const auto add = [&](Quantity quantity, int index, double mean, double sd) {
-    u.list.push_back({quantity, index});
-    for (const Prior& prior : options.priors)
-      if (prior.unknown == dynamics::Unknown{quantity, index} ||
-          prior.unknown == dynamics::Unknown{quantity, dynamics::kEvery})
-        mean = prior.mean, sd = prior.deviation;
-    means.push_back(mean), sds.push_back(sd);
-  };
-  const auto add_many = [&](Quantity quantity, int count, double mean, double sd, double smooth_sd) {
-    if (smooth_sd > 0.0) smooth.push_back({u.size(), count, smooth_sd});
-    for (int i = 0; i < count; ++i) add(quantity, i, mean, sd);
-  };
-
-  const double torque = u.total_mass * options.gravity.norm() * chain.length;
-  const bool stiff = options.fit_stiffness && !options.paper;
-  if (stiff) {
-    unit.stiffness = unit.damping;
-    add(Quantity::stiffness, 0, std::log(kStiffnessPart * torque), kSharedSd);
-    // two fingers hold a rope more stiffly one way than the other (a foam noodle in a gripper: 1.5)
-    if (options.per_joint && n > 1 && chain.child_link[1] == 1 && !chain::is_twist(chain, 1))
-      add(Quantity::grasp_stiffness, 0, 0.0, kGraspSd);
-    if (chain::has_twist(chain)) add(Quantity::twist_stiffness, 0, 0.0, kTwistSd);
-    if (twists_within_links(chain, options)) {
-      for (int k = 0; k < n; k += 2) unit.torsional_stiffness.push_back(unit.stiffness[k]);
-      add(Quantity::torsional_stiffness, 0, -std::log(1.0 + kPoissonRatio), kTorsionSd);
-    }
-  } else {
-    u.held.emplace_back("stiffness", options.paper ? "0, as in the paper" : "held at 0 on request");
+void add_stiffness(Draft& d) {
+  dynamics::Parameters& unit = d.u.reference;
+  if (!d.stiff) return d.hold("stiffness", d.options.paper ? "0, as in the paper" : "held at 0 on request");
+  unit.stiffness = unit.damping;
+  d.add(Quantity::stiffness, 0, std::log(kStiffnessPart * d.torque), kSharedSd);
+  // two fingers hold a rope more stiffly one way than the other (a foam noodle in a gripper: 1.5)
+  if (d.options.per_joint && d.angles > 1 && d.chain.child_link[1] == 1 && !chain::is_twist(d.chain, 1))
+    d.add(Quantity::grasp_stiffness, 0, 0.0, kGraspSd);
+  if (chain::has_twist(d.chain)) d.add(Quantity::twist_stiffness, 0, 0.0, kTwistSd);
+  if (twists_within_links(d.chain, d.options)) {
+    for (int k = 0; k < d.angles; k += 2) unit.torsional_stiffness.push_back(unit.stiffness[k]);
+    d.add(Quantity::torsional_stiffness, 0, -std::log(1.0 + kPoissonRatio), kTorsionSd);
   }
-  const double damping = stiff ? kRetardation * kStiffnessPart * torque : kDampingPart * torque;
-  if (options.paper) {
-    add_many(Quantity::joint_damping, links, std::log(damping), kViscousSd, 0.0);
-    add_many(Quantity::link_mass, links, 0.0, kPaperMassSd, 0.0);
-    if (options.tabletop) {
-      unit.viscous_friction = all(links, 1.0);
-      add_many(Quantity::viscous_friction, links, std::log(kViscousRate * u.total_mass / links), kViscousSd, 0.0);
-    }
-    u.held.emplace_back("tip_mass", "0, as in the paper");
-    u.held.emplace_back("rest_angle", "0, as in the paper");
-    u.held.emplace_back("initial_state", "the recognized one, as in the paper");
-  } else {
-    add(Quantity::damping, 0, std::log(damping), kSharedSd);
-    if (options.per_joint) {
-      if (stiff) add_many(Quantity::joint_stiffness, links, 0.0, kJointSd, kSmoothSd);
-      add_many(Quantity::joint_damping, links, 0.0, kJointSd, kSmoothSd);
-      add_many(Quantity::link_mass, links, 0.0, kMassSd, kSmoothSd);
-    } else {
-      u.held.emplace_back("link_mass", "uniform along the rope");
-    }
-    if (options.tabletop) {
-      unit.coulomb_friction = all(links, 1.0);
-      add_many(Quantity::coulomb_friction, links, std::log(kCoulombMean), kCoulombSd, 0.0);
-      unit.tip_mass = options.tip_mass.value_or(0.0);
-      u.held.emplace_back("tip_mass", options.tip_mass ? "given" : "0: not observable on a table beside the friction");
-      u.held.emplace_back("drag", "0 on a table");
-    } else {
-      unit.air_quadratic = unit.link_mass;  // by length, too
-      add(Quantity::drag, 0, std::log(kDragPerDiameter * std::max(chain.diameter, 1e-3)), kSharedSd);
-      if (options.tip_mass && *options.tip_mass == 0.0) {
-        u.held.emplace_back("tip_mass", "0: given");
-      } else {
-        const TipPrior prior = tip_prior(options, extras, u.total_mass);
-        unit.tip_mass = 0.5 * u.total_mass;  // where the logit is 0
-        add(Quantity::tip_mass, 0, std::log(prior.part / (1.0 - prior.part)), prior.deviation);
-      }
-    }
-    if (stiff)
-      add_many(Quantity::rest_angle, n, 0.0, kRestSd, 0.0);
-    else
-      u.held.emplace_back("rest_angle", "has no effect without stiffness");
-    // a natural curvature out of the plane of kRestSd a joint, torsion as stiff as bending
-    if (stiff && options.tabletop && n == links) {
-      unit.roll_lever = all(n, 0.0);
-      for (int k = chain.link_start(1) > 0.0 ? 0 : 1; k < n; ++k)  // at the grasp nothing rolls
-        add(Quantity::roll_lever, k, 0.0, kRestSd * 0.5 * chain.diameter * chain.length / reference);
-    }
-    if (!extras.friction) {
-      u.held.emplace_back("bending_friction",
-                          options.tabletop ? "0: not told from the table's friction" : "0: the data do not ask for it");
-    } else {
-      unit.bending_friction = all(n, 1.0);
-      for (int k = 0; k < n; ++k)  // a curvature, alike all along
-        unit.bending_friction_angle.push_back(chain::bent_length(chain, chain.child_link[k]) / reference);
-      add(Quantity::bending_friction, 0, std::log(kBendingFrictionPart * torque), kBendingFrictionSd);
-      add(Quantity::bending_friction_angle, 0, std::log(kBendingFrictionAngle), kBendingFrictionAngleSd);
-    }
-    u.initial = {0.0, VectorX::Zero(n), VectorX::Zero(n)};
-    for (int k = 0; k < n; ++k) add(Quantity::theta, k, start.theta[k], start.theta_sd[k]);
-    for (int k = 0; k < n; ++k) add(Quantity::thetadot, k, start.thetadot[k], start.rate_sd);
-    if (extras.friction) add_many(Quantity::friction_state, n, 0.0, kFrictionStateSd, 0.0);
-  }
+}
 
-  const int size = u.size();
-  u.mean = Eigen::Map<const VectorX>(means.data(), size);
-  u.precision = MatrixX::Zero(size, size);
-  for (int i = 0; i < size; ++i) u.precision(i, i) = 1.0 / (sds[i] * sds[i]);
-  for (const Smooth& s : smooth)
+// Damping of the usual size: a logarithm.
+double usual_damping(const Draft& d) {
+  return std::log((d.stiff ? kRetardation * kStiffnessPart : kDampingPart) * d.torque);
+}
+
+// What the paper fits: a damping and a mass per link, and on a table its viscous friction.
+void add_as_in_paper(Draft& d) {
+  d.add_many(Quantity::joint_damping, d.links, usual_damping(d), kViscousSd);
+  d.add_many(Quantity::link_mass, d.links, 0.0, kPaperMassSd);
+  if (d.options.tabletop) {
+    d.u.reference.viscous_friction = all(d.links, 1.0);
+    d.add_many(Quantity::viscous_friction, d.links, std::log(kViscousRate * d.u.total_mass / d.links), kViscousSd);
+  }
+  d.hold("tip_mass", "0, as in the paper");
+  d.hold("rest_angle", "0, as in the paper");
+  d.hold("initial_state", "the recognized one, as in the paper");
+}
+
+void add_damping_and_masses(Draft& d) {
+  d.add(Quantity::damping, 0, usual_damping(d), kSharedSd);
+  if (!d.options.per_joint) return d.hold("link_mass", "uniform along the rope");
+  if (d.stiff) d.add_many(Quantity::joint_stiffness, d.links, 0.0, kJointSd, kSmoothSd);
+  d.add_many(Quantity::joint_damping, d.links, 0.0, kJointSd, kSmoothSd);
+  d.add_many(Quantity::link_mass, d.links, 0.0, kMassSd, kSmoothSd);
+}
+
+// The table's friction, or the air's drag and the tip's mass.
+void add_surroundings(Draft& d, const Extras& extras) {
+  const Options& options = d.options;
+  dynamics::Parameters& unit = d.u.reference;
+  if (options.tabletop) {
+    unit.coulomb_friction = all(d.links, 1.0);
+    d.add_many(Quantity::coulomb_friction, d.links, std::log(kCoulombMean), kCoulombSd);
+    unit.tip_mass = options.tip_mass.value_or(0.0);
+    d.hold("tip_mass", options.tip_mass ? "given" : "0: not observable on a table beside the friction");
+    d.hold("drag", "0 on a table");
+    return;
+  }
+  unit.air_quadratic = unit.link_mass;  // by length, too
+  d.add(Quantity::drag, 0, std::log(kDragPerDiameter * std::max(d.chain.diameter, 1e-3)), kSharedSd);
+  if (options.tip_mass && *options.tip_mass == 0.0) return d.hold("tip_mass", "0: given");
+  const TipPrior prior = tip_prior(options, extras, d.u.total_mass);
+  unit.tip_mass = 0.5 * d.u.total_mass;  // where the logit is 0
+  d.add(Quantity::tip_mass, 0, std::log(prior.part / (1.0 - prior.part)), prior.deviation);
+}
+
+void add_natural_shape(Draft& d) {
+  if (!d.stiff) return d.hold("rest_angle", "has no effect without stiffness");
+  d.add_many(Quantity::rest_angle, d.angles, 0.0, kRestSd);
+  // a natural curvature out of the plane of kRestSd a joint, torsion as stiff as bending
+  if (!d.options.tabletop || d.angles != d.links) return;
+  d.u.reference.roll_lever = all(d.angles, 0.0);
+  for (int k = d.chain.link_start(1) > 0.0 ? 0 : 1; k < d.angles; ++k)  // at the grasp nothing rolls
+    d.add(Quantity::roll_lever, k, 0.0, kRestSd * 0.5 * d.chain.diameter * d.chain.length / d.reference);
+}
+
+void add_bending_friction(Draft& d, const Extras& extras) {
+  if (!extras.friction)
+    return d.hold("bending_friction",
+                  d.options.tabletop ? "0: not told from the table's friction" : "0: the data do not ask for it");
+  dynamics::Parameters& unit = d.u.reference;
+  unit.bending_friction = all(d.angles, 1.0);
+  for (int k = 0; k < d.angles; ++k)  // a curvature, alike all along
+    unit.bending_friction_angle.push_back(chain::bent_length(d.chain, d.chain.child_link[k]) / d.reference);
+  d.add(Quantity::bending_friction, 0, std::log(kBendingFrictionPart * d.torque), kBendingFrictionSd);
+  d.add(Quantity::bending_friction_angle, 0, std::log(kBendingFrictionAngle), kBendingFrictionAngleSd);
+}
+
+void add_initial_state(Draft& d, const Start& start, const Extras& extras) {
+  const int n = d.angles;
+  d.u.initial = {0.0, VectorX::Zero(n), VectorX::Zero(n)};
+  for (int k = 0; k < n; ++k) d.add(Quantity::theta, k, start.theta[k], start.theta_sd[k]);
+  for (int k = 0; k < n; ++k) d.add(Quantity::thetadot, k, start.thetadot[k], start.rate_sd);
+  if (extras.friction) d.add_many(Quantity::friction_state, n, 0.0, kFrictionStateSd);
+}
+
+// A rope that lies flat presses on the table with its weight: one coefficient, but where the fingers hold.
+MatrixX table_friction_precision(const Draft& d, int first) {
+  MatrixX covariance = MatrixX::Zero(d.links, d.links);
+  const auto by_options = [&](int j) { return d.deviations[first + j] != kCoulombSd; };  // options.priors
+  for (int i = 0; i < d.links; ++i) {
+    const bool held = d.chain.link_start(i + 1) < kHeldDiameters * d.chain.diameter;
+    const double own = !d.options.friction_per_link ? kSameSd : held ? kHeldCoulombSd : kLinkCoulombSd;
+    covariance(i, i) = by_options(i) ? d.deviations[first + i] * d.deviations[first + i] : own * own;
+    for (int j = 0; j < d.links; ++j)
+      if (!by_options(i) && !by_options(j)) covariance(i, j) += kCoulombSd * kCoulombSd;
+  }
+  const Eigen::LDLT<MatrixX> factor(covariance);
+  CHAINSPLAT_CHECK(math::is_positive(factor), std::to_string(d.links));
+  return factor.solve(MatrixX::Identity(d.links, d.links));
+}
+
+Unknowns finish(Draft d) {
+  const int size = d.u.size();
+  d.u.mean = Eigen::Map<const VectorX>(d.means.data(), size);
+  MatrixX& precision = d.u.precision;
+  precision = MatrixX::Zero(size, size);
+  for (int i = 0; i < size; ++i) precision(i, i) = 1.0 / (d.deviations[i] * d.deviations[i]);
+  for (const Draft::Smooth& s : d.smooth)
     for (int i = s.first; i + 1 < s.first + s.count; ++i) {
-      const double weight = 1.0 / (s.sd * s.sd);
-      u.precision(i, i) += weight, u.precision(i + 1, i + 1) += weight;
-      u.precision(i, i + 1) -= weight, u.precision(i + 1, i) -= weight;
+      const double weight = 1.0 / (s.deviation * s.deviation);
+      precision(i, i) += weight, precision(i + 1, i + 1) += weight;
+      precision(i, i + 1) -= weight, precision(i + 1, i) -= weight;
     }
-  if (const int coulomb = u.first(Quantity::coulomb_friction); coulomb >= 0) {
-    // a rope that lies flat presses on the table with its weight: one coefficient, but where the fingers hold
-    MatrixX covariance = MatrixX::Zero(links, links);
-    const auto given = [&](int j) { return sds[coulomb + j] != kCoulombSd; };  // in options.priors
-    for (int i = 0; i < links; ++i) {
-      const bool held = chain.link_start(i + 1) < kHeldDiameters * chain.diameter;
-      const double own = !options.friction_per_link ? kSameSd : held ? kHeldCoulombSd : kLinkCoulombSd;
-      covariance(i, i) = given(i) ? sds[coulomb + i] * sds[coulomb + i] : own * own;
-      for (int j = 0; j < links; ++j)
-        if (!given(i) && !given(j)) covariance(i, j) += kCoulombSd * kCoulombSd;
-    }
-    const Eigen::LDLT<MatrixX> factor(covariance);
-    CHAINSPLAT_CHECK(math::is_positive(factor), std::to_string(links));
-    u.precision.block(coulomb, coulomb, links, links) = factor.solve(MatrixX::Identity(links, links));
+  if (const int coulomb = d.u.first(Quantity::coulomb_friction); coulomb >= 0)
+    precision.block(coulomb, coulomb, d.links, d.links) = table_friction_precision(d, coulomb);
+  return std::move(d.u);
+}
+
+}  // namespace
+
+Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const Start& start, const Extras& extras) {
+  Draft d = begin(chain, options, start);
+  add_stiffness(d);
+  if (options.paper) {
+    add_as_in_paper(d);
+  } else {
+    add_damping_and_masses(d);
+    add_surroundings(d, extras);
+    add_natural_shape(d);
+    add_bending_friction(d, extras);
+    add_initial_state(d, start, extras);
   }
-  return u;
+  return finish(std::move(d));
 }
 
 Unknowns make_state_unknowns(const chain::Chain& chain, const dynamics::Parameters& parameters, const Start& start) {

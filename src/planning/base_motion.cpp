@@ -102,7 +102,7 @@ trajectory::BaseMotion base_at(const Motion& motion, double time) {
 Peaks peaks(const Motion& motion, double from, double to, const Limits& limits, double step) {
   Peaks out;
   const int steps = std::max(1, static_cast<int>(std::ceil((to - from) / step)));
-  const auto look = [&](double time) {
+  const auto include = [&](double time) {
     const Coordinates c = coordinates(motion, time);
     out.velocity = std::max(out.velocity, c.col(1).head<3>().norm());
     out.acceleration = std::max(out.acceleration, c.col(2).head<3>().norm());
@@ -113,13 +113,13 @@ Peaks peaks(const Motion& motion, double from, double to, const Limits& limits, 
     out.yaw_jerk = std::max(out.yaw_jerk, std::abs(c(3, 3)));
     out.turn = std::max(out.turn, std::abs(c(3, 0)));
   };
-  for (int k = 0; k <= steps; ++k) look(from + (to - from) * k / steps);
+  for (int k = 0; k <= steps; ++k) include(from + (to - from) * k / steps);
   // the jerk jumps at both ends of a piece: just before, and after
   constexpr double kBefore = 1e-9;  // s
   for (const Piece& piece : motion.pieces)
     for (const double time : {piece.start, piece.start + piece.duration})
       for (const double side : {time - kBefore, time})
-        if (side >= from && side <= to) look(side);
+        if (side >= from && side <= to) include(side);
   const auto check = [&](double value, double limit, const char* name) {
     if (out.over.empty() && !(value <= limit * (1.0 + kRounding))) out.over = name;
   };

@@ -243,7 +243,7 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
   dynamics::InitialState last_seen = problem.initial;
   last_seen.time = 0.0;
   // the twin's state from the points of the rope that a camera could follow
-  const auto look = [&](double now) {
+  const auto observe = [&](double now) {
     const trajectory::BaseMotion here = base(now);
     const MatrixX points =
         chain::centerline(truth.chain, chain::link_motions(truth.chain, state.theta, here.pose), true_seen);
@@ -257,10 +257,10 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
   for (int k = 0; k < intervals; ++k) {
     const double now = k / loop.rate, next = std::min(end, (k + 1) / loop.rate);
     const double left = (problem.tabletop ? end : hit_time) - now;
-    if (loop.feedback && k == 0) last_seen = look(now);
+    if (loop.feedback && k == 0) last_seen = observe(now);
     if (loop.feedback && k > 0 && left > kShortest) {
       const double begin = core_time();
-      const dynamics::InitialState estimate = look(now);
+      const dynamics::InitialState estimate = observe(now);
       correct(corrected, base, last_seen, estimate, seen);
       last_seen = estimate;
       const double rest = end - now;

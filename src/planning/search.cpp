@@ -160,7 +160,7 @@ solve::Summary minimize(const Task& task, VectorX& unknowns, const Sharpness& sh
 double load(const Task& task, const VectorX& unknowns) {
   const Limits& limits = task.options->limits;
   double most = 0.0;
-  const auto look = [&](const Coordinates& c) {
+  const auto raise = [&](const Coordinates& c) {
     const Vector3 offset = c.col(0).head<3>() - task.motion.origin.translation;
     most = std::max({most, c.col(1).head<3>().norm() / limits.velocity, c.col(2).head<3>().norm() / limits.acceleration,
                      offset.cwiseAbs().maxCoeff() / limits.stroke, std::abs(c(3, 1)) / limits.yaw_velocity,
@@ -169,8 +169,8 @@ double load(const Task& task, const VectorX& unknowns) {
       most = std::max({most, c.col(3).head<3>().norm() / limits.jerk, std::abs(c(3, 3)) / limits.yaw_jerk});
   };
   for (int node = 0; node < task.grid.nodes(); ++node)
-    look(moved(task.motion, unknowns, task.grid.basis[node], task.grid.fixed[node]));
-  look(moved(task.motion, unknowns, task.grid.end_basis, task.grid.end_fixed));
+    raise(moved(task.motion, unknowns, task.grid.basis[node], task.grid.fixed[node]));
+  raise(moved(task.motion, unknowns, task.grid.end_basis, task.grid.end_fixed));
   return most;
 }
 
