@@ -6,6 +6,7 @@
 #include <nlohmann/json.hpp>
 
 #include "dynamics/planar.h"
+#include "dynamics/spatial.h"
 
 using namespace chainsplat;
 using namespace chainsplat::dynamics;
@@ -478,10 +479,10 @@ TEST_CASE("the planar equations agree with the spatial ones, the base moving and
         const trajectory::BaseMotion base = random_base(random);
         const Vector6 jerk = random_vector(random, 6, 5.0);
         const VectorX theta = random_vector(random, 6, 0.5), thetadot = random_vector(random, 6, 2.0);
-        Engine general(model);
+        SpatialEngine general(model);
         PlanarEngine planar(model);
         MatrixX forces(6, 8), planar_forces(6, 8);
-        for (Engine* engine : {&general, static_cast<Engine*>(&planar)}) {
+        for (Engine* engine : {static_cast<Engine*>(&general), static_cast<Engine*>(&planar)}) {
           engine->place(base, theta, thetadot, true);
           REQUIRE(engine->factor_mass());
           engine->accelerate();

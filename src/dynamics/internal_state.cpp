@@ -1,5 +1,7 @@
 #include "internal_state.h"
 
+#include "spatial.h"
+
 namespace chainsplat::dynamics {
 
 InternalState::InternalState(const Model& model)
@@ -79,7 +81,7 @@ std::vector<VectorX> internal_states(const Model& model, const std::vector<Vecto
   if (!internal.present) return {};
   const BendingFriction friction(model);
   const Eigen::Index n = model.chain.angles();
-  Engine engine(model);
+  SpatialEngine engine(model);
   std::vector<VectorX> out;
   VectorX shares = VectorX::Zero(friction.present ? n : 0);
   if (friction.present && before.size() >= n) shares = before.head(n);

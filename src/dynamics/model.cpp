@@ -3,6 +3,7 @@
 
 #include "chainsplat/dynamics/base_wrench.h"
 #include "planar.h"
+#include "spatial.h"
 
 namespace chainsplat::dynamics {
 namespace {
@@ -154,7 +155,7 @@ VectorX inverse_dynamics(const Model& model, const trajectory::BaseMotion& base,
                          const VectorX& thetadot, const VectorX& thetaddot) {
   check_state(model, theta, thetadot);
   check_state(model, thetaddot, thetadot);
-  Engine engine(model);
+  SpatialEngine engine(model);
   engine.place(base, theta, thetadot, false);
   engine.acceleration = thetaddot;
   engine.inverse_torque();
@@ -162,7 +163,7 @@ VectorX inverse_dynamics(const Model& model, const trajectory::BaseMotion& base,
 }
 
 MatrixX mass_matrix(const Model& model, const VectorX& theta) {
-  Engine engine(model);
+  SpatialEngine engine(model);
   engine.place({}, theta, VectorX::Zero(theta.size()), false);
   return engine.mass;
 }
@@ -170,7 +171,7 @@ MatrixX mass_matrix(const Model& model, const VectorX& theta) {
 VectorX forward_dynamics(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                          const VectorX& thetadot) {
   check_state(model, theta, thetadot);
-  Engine engine(model);
+  SpatialEngine engine(model);
   engine.place(base, theta, thetadot, false);
   if (!engine.factor_mass()) throw_singular(model, engine.singular_angle);
   engine.accelerate();
@@ -181,7 +182,7 @@ VectorX forward_dynamics(const Model& model, const trajectory::BaseMotion& base,
 Vector6 base_wrench(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                     const VectorX& thetadot, const VectorX& internal_state) {
   check_state(model, theta, thetadot);
-  Engine engine(model);
+  SpatialEngine engine(model);
   engine.internal_state = internal_state;
   engine.place(base, theta, thetadot, false);
   if (!engine.factor_mass()) throw_singular(model, engine.singular_angle);
@@ -205,14 +206,14 @@ std::vector<Vector6> base_wrenches(const Model& model, const trajectory::Traject
 VectorX forward_dynamics_articulated(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                                      const VectorX& thetadot) {
   check_state(model, theta, thetadot);
-  Engine engine(model);
+  SpatialEngine engine(model);
   engine.place(base, theta, thetadot, false);
   if (!engine.articulated_acceleration()) throw_singular(model, engine.singular_angle);
   return engine.acceleration;
 }
 
 // Engine frames have world axes and the base origin: turn and shift into {i}.
-static MatrixX in_link_frames(const Engine& engine, bool wrenches) {
+static MatrixX in_link_frames(const SpatialEngine& engine, bool wrenches) {
   MatrixX out = MatrixX::Zero(6, engine.angles);
   for (int j = 0; j < engine.link_count; ++j)
     for (int k = engine.links[j].first_angle; k < engine.links[j].end_angle; ++k) {
@@ -231,7 +232,7 @@ static MatrixX in_link_frames(const Engine& engine, bool wrenches) {
 MatrixX external_wrenches(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                           const VectorX& thetadot) {
   check_state(model, theta, thetadot);
-  Engine engine(model);
+  SpatialEngine engine(model);
   engine.place(base, theta, thetadot, false);
   return in_link_frames(engine, true);
 }
@@ -239,7 +240,7 @@ MatrixX external_wrenches(const Model& model, const trajectory::BaseMotion& base
 MatrixX body_twists(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                     const VectorX& thetadot) {
   check_state(model, theta, thetadot);
-  Engine engine(model);
+  SpatialEngine engine(model);
   engine.place(base, theta, thetadot, false);
   return in_link_frames(engine, false);
 }
@@ -247,7 +248,7 @@ MatrixX body_twists(const Model& model, const trajectory::BaseMotion& base, cons
 Linearization linearize(const Model& model, const trajectory::BaseMotion& base, const Vector6& base_jerk,
                         const VectorX& theta, const VectorX& thetadot) {
   check_state(model, theta, thetadot);
-  Engine engine(model);
+  SpatialEngine engine(model);
   engine.place(base, theta, thetadot, true);
   if (!engine.factor_mass()) throw_singular(model, engine.singular_angle);
   engine.accelerate();
@@ -258,7 +259,7 @@ Linearization linearize(const Model& model, const trajectory::BaseMotion& base, 
 BaseSlopes base_slopes(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                        const VectorX& thetadot) {
   check_state(model, theta, thetadot);
-  Engine engine(model);
+  SpatialEngine engine(model);
   engine.place(base, theta, thetadot, true);
   if (!engine.factor_mass()) throw_singular(model, engine.singular_angle);
   engine.accelerate();
@@ -271,7 +272,7 @@ BaseSlopes base_slopes(const Model& model, const trajectory::BaseMotion& base, c
 MatrixX unknown_forces(const Model& model, const trajectory::BaseMotion& base, const VectorX& theta,
                        const VectorX& thetadot, std::span<const Tangent> unknowns) {
   check_state(model, theta, thetadot);
-  Engine engine(model);
+  SpatialEngine engine(model);
   engine.place(base, theta, thetadot, false);
   if (!engine.factor_mass()) throw_singular(model, engine.singular_angle);
   engine.accelerate();
@@ -322,7 +323,7 @@ Equilibrium static_equilibrium(const Model& model, const math::Pose& base, const
     return out;
   }
 
-  Engine engine(model);
+  SpatialEngine engine(model);
   MatrixX hessian;
   const auto evaluate = [&](const VectorX& theta, solve::NormalEquations* equations) {
     if (equations) {

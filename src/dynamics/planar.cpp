@@ -2,19 +2,18 @@
 
 #include <cmath>
 
+#include "spatial.h"
+
 namespace chainsplat::dynamics {
 namespace {
 
 using Planar = PlanarEngine::Planar;
 
-const double kGaussPoint[3] = {0.5 * (1.0 - std::sqrt(0.6)), 0.5, 0.5 * (1.0 + std::sqrt(0.6))};
-constexpr double kGaussWeight[3] = {5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0};
-
 void add(Planar& a, const Planar& b, double scale = 1.0) {
   a.turn += scale * b.turn, a.x += scale * b.x, a.y += scale * b.y;
 }
 double dot(const Planar& a, const Planar& b) { return a.turn * b.turn + a.x * b.x + a.y * b.y; }
-// X x Y and X x* F of engine.h.
+// X x Y and X x* F of spatial.h.
 Planar cross(const Planar& a, const Planar& b) {
   return {0.0, b.turn * a.y - a.turn * b.y, a.turn * b.x - b.turn * a.x};
 }
@@ -35,7 +34,7 @@ bool is_planar(const chain::Chain& chain) {
 
 std::unique_ptr<Engine> make_engine(const Model& model) {
   if (is_planar(model.chain)) return std::make_unique<PlanarEngine>(model);
-  return std::make_unique<Engine>(model);
+  return std::make_unique<SpatialEngine>(model);
 }
 
 PlanarEngine::PlanarEngine(const Model& m) : Engine(m) {
@@ -377,7 +376,7 @@ void PlanarEngine::base_slopes(BaseSlopes& slopes) const {
     const Planar s = axis_at(px_[j], py_[j]), inertia_row = inertia_row_of(j), velocity_row = velocity_row_of(j);
     for (int i = 0; i < 3; ++i) {
       slopes.acceleration(j, kComponent[i]) = dot(inertia_row, in_plane[i]);
-      // see Engine::base_slopes
+      // see SpatialEngine::base_slopes
       double& by_velocity = slopes.velocity(j, kComponent[i]);
       by_velocity = dot(velocity_row, in_plane[i]) + dot(inertia_row, cross(base_v, in_plane[i]));
       for (int link = 0; rolls && link < angles; ++link)

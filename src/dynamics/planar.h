@@ -1,7 +1,7 @@
 // Private to dynamics: the equations of motion of a chain that bends about one direction, several times faster.
 //
 // Everything happens in the base frame, in the plane of bending, about the base origin: x = d, y = a x d, z = a. There
-// the formulas of engine.h hold with twists (turn rate, velocity) and wrenches (moment, force) of three numbers each.
+// the formulas of spatial.h hold with twists (turn rate, velocity) and wrenches (moment, force) of three numbers each.
 // What a base that also moves and turns out of the plane adds are fields that are fixed to the base:
 //   acceleration  o + X r,  o = (w_y v_z, -w_x v_z),  X = [-w_y^2, w_x w_y; w_x w_y, -w_x^2]
 //   velocity      z part v_z + g r,  g = (-w_y, w_x), which friction feels
@@ -9,7 +9,6 @@
 // A unit turn of angle k is seen from the outer links as these fields turned back about joint k. X needs the second
 // moments of the links, not only their inertia about z.
 #pragma once
-#include <memory>
 #include <vector>
 
 #include "engine.h"
@@ -68,8 +67,5 @@ class PlanarEngine : public Engine {
   Planar unit_tip_planar_;
   std::vector<double> lift_;  // a joint: the z velocity's change at the base origin where the fields turn back about it
 };
-
-// The faster one that fits.
-std::unique_ptr<Engine> make_engine(const Model& model);
 
 }  // namespace chainsplat::dynamics

@@ -6,7 +6,6 @@
 
 #include "factor.h"
 #include "internal_state.h"
-#include "planar.h"
 
 namespace chainsplat::dynamics {
 
