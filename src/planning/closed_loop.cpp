@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <optional>
 
 #include "parameter_correction.h"
 #include "search.h"
@@ -195,10 +196,7 @@ class Samples {
   std::vector<Coordinates> at_;
 };
 
-}  // namespace
-
-LoopResult closed_loop(const Problem& problem, const Options& options, const Plan& plan, const dynamics::Model& truth,
-                       const LoopOptions& loop) {
+void check(const Problem& problem, const Plan& plan, const dynamics::Model& truth, const LoopOptions& loop) {
   if (plan.hits.size() != 1) throw InputError("`targets`", "feedback is for one of them", "give one target");
   if (!(loop.rate > 0.0) || !std::isfinite(loop.rate))
     throw InputError("`loop.rate`", "must be above 0", "give replans a second, for example 10");
@@ -206,174 +204,239 @@ LoopResult closed_loop(const Problem& problem, const Options& options, const Pla
     throw InputError("`loop.target_velocity`", "is not finite", "give VX,VY,VZ in m/s");
   if (truth.chain.direction != problem.model.chain.direction)
     throw InputError("`truth`", "the chain leaves the gripper in another direction", "give one of the same grasp");
-  const chain::Chain& chain = problem.model.chain;
-  const std::vector<double> seen = chain::equal_arclengths(chain, kSeenPoints);
-  std::vector<double> true_seen = seen;  // the same parts of a rope of another length
-  for (double& s : true_seen) s *= truth.chain.length / chain.length;
-  LoopResult out;
-  std::vector<solve::Summary> summaries;
-  out.motion = plan.motion;
-  const double end = out.motion.end();
-  const auto base = [&](double time) { return base_at(out.motion, time); };
-  const auto target_at = [&](double time) {
-    return Vector3(at_rope_height(problem, problem.targets.front()) + time * loop.target_velocity);
-  };
+}
 
-  dynamics::InitialState state;
+// The play of a plan on the true rope, as far as it has come.
+struct Play {
+  const Problem& problem;
+  const Options& options;
+  const dynamics::Model& truth;
+  const LoopOptions& loop;
+  const chain::Chain& chain = problem.model.chain;                         // the twin's
+  std::vector<double> seen = chain::equal_arclengths(chain, kSeenPoints);  // arc lengths that a camera follows
+  std::vector<double> true_seen = seen;                                    // the same parts of the true rope
+  LoopResult out = {};
+  dynamics::InitialState state = {};      // of the true rope
+  dynamics::InitialState last_seen = {};  // of the twin
+  Samples samples;                        // of the base's motion
+  double end;                             // s, of the plan
+  double hit_time;                        // s, as planned last
+  core::Random random{options.seed + 3};
+  double foretold = std::numeric_limits<double>::infinity();  // m, miss by the last replan
+  bool elsewhere = false;                                     // the next replan looks elsewhere, too
+  ParameterCorrection corrected = start_correction(problem.model);
+  std::vector<solve::Summary> summaries = {};
+
+  trajectory::BaseMotion base(double time) const { return base_at(out.motion, time); }
+  Vector3 target_at(double time) const {
+    return at_rope_height(problem, problem.targets.front()) + time * loop.target_velocity;
+  }
+};
+
+Play begin(const Problem& problem, const Options& options, const Plan& plan, const dynamics::Model& truth,
+           const LoopOptions& loop) {
+  Play play{.problem = problem,
+            .options = options,
+            .truth = truth,
+            .loop = loop,
+            .samples = Samples(plan.motion),
+            .end = plan.motion.end(),
+            .hit_time = plan.hits.front().time};
+  for (double& s : play.true_seen) s *= truth.chain.length / play.chain.length;
+  play.out.motion = plan.motion;
+  play.last_seen = problem.initial;
+  play.last_seen.time = 0.0;
+
+  dynamics::InitialState& state = play.state;
   state.time = 0.0;
   if (problem.tabletop) {
     const MatrixX shape =
-        chain::centerline(chain, chain::link_motions(chain, problem.initial.theta, problem.base), seen);
-    state = fit_state(truth.chain, dynamics::at_rest(problem.base), true_seen, shape, {},
+        chain::centerline(play.chain, chain::link_motions(play.chain, problem.initial.theta, problem.base), play.seen);
+    state = fit_state(truth.chain, dynamics::at_rest(problem.base), play.true_seen, shape, {},
                       VectorX::Zero(truth.chain.angles()))
                 .state;
   } else {
     state.theta = dynamics::static_equilibrium(truth, problem.base).theta;
   }
   state.thetadot = VectorX::Zero(truth.chain.angles());
-  out.states.time.push_back(0.0), out.states.theta.push_back(state.theta),
-      out.states.thetadot.push_back(state.thetadot);
+  chain::States& states = play.out.states;
+  states.time.push_back(0.0), states.theta.push_back(state.theta), states.thetadot.push_back(state.thetadot);
+  return play;
+}
 
-  double hit_time = plan.hits.front().time;
-  Samples samples(out.motion);
-  core::Random random(options.seed + 3);
-  double foretold = std::numeric_limits<double>::infinity();  // miss, by the last replan
-  bool elsewhere = false;
-  ParameterCorrection corrected = start_correction(problem.model);
-  dynamics::InitialState last_seen = problem.initial;
-  last_seen.time = 0.0;
-  // the twin's state from the points of the rope that a camera could follow
-  const auto observe = [&](double now) {
-    const trajectory::BaseMotion here = base(now);
-    const MatrixX points =
-        chain::centerline(truth.chain, chain::link_motions(truth.chain, state.theta, here.pose), true_seen);
-    const MatrixX speeds = centerline_velocity(truth.chain, state.theta, state.thetadot, here, true_seen);
-    dynamics::InitialState found = fit_state(chain, here, seen, points, speeds, last_seen.theta).state;
-    found.time = now;
-    found.internal_state = dynamics::internal_state_in_motion(problem.model, found.theta, found.thetadot);
-    return found;
-  };
-  const int intervals = std::max(1, static_cast<int>(std::ceil(end * loop.rate - 1e-9)));
-  for (int k = 0; k < intervals; ++k) {
-    const double now = k / loop.rate, next = std::min(end, (k + 1) / loop.rate);
-    const double left = (problem.tabletop ? end : hit_time) - now;
-    if (loop.feedback && k == 0) last_seen = observe(now);
-    if (loop.feedback && k > 0 && left > kShortest) {
-      const double begin = core_time();
-      const dynamics::InitialState estimate = observe(now);
-      correct(corrected, base, last_seen, estimate, seen);
-      last_seen = estimate;
-      const double rest = end - now;
-      const double length = problem.tabletop ? rest : std::min(rest, std::max(kLeastPiece, kPieceMargin * left));
-      Motion motion = out.motion;
-      append_piece(motion, now, length);
-      const int full = problem.model.parameters.substeps;
-      const int substeps = std::clamp(static_cast<int>(kReplanNodes / (30.0 * length)), full > 4 ? 2 : 1, full);
-      Task task = make_task(problem, options, {&corrected.model}, motion, estimate, problem.targets.front(), substeps);
-      task.exact = false;
-      task.target = target_at(now);
-      task.target_velocity = loop.target_velocity;
-      task.target_time = now;
-      if (options.terminal)
-        for (std::size_t a = 0; a < motion.axes.size(); ++a) task.held[a * kPerAxis + kBasisCount] = true;
-      struct Correction {
-        Motion motion;
-        Samples samples;
-        double miss, time;
-        solve::Summary summary;
-      };
-      const auto correction = [&](VectorX q, const Effort& effort) {
-        Correction c{motion, samples, std::numeric_limits<double>::infinity(), hit_time, {}};
-        if (effort.steps > 0) c.summary = minimize(task, q, {kReplanSharpness, kReplanSmoothness}, effort);
-        set_unknowns(c.motion, q);
-        // what asks too much of the arm is taken in part
-        c.samples.take_within(c.motion, options.limits);
-        Rollout rollout;
-        if (roll_out(corrected.model, task.motion, task.grid, unknowns_of(c.motion), estimate, false, rollout)) {
-          const Hit hit = measure(task, corrected.model, rollout);
-          c.miss = hit.miss, c.time = hit.time;
-        }
-        return c;
-      };
-      Correction best =
-          correction(VectorX::Zero(static_cast<Eigen::Index>(motion.axes.size()) * kPerAxis), kReplanEffort);
-      if (elsewhere) {
-        Task other = task;
-        if (other.part == Part::rope && problem.tabletop && k % 2 == 0) other.first_link = chain.links() - 1;
-        std::vector<VectorX> starts = carried(other);
-        while (starts.size() < kOthers)
-          starts.push_back(random_unknowns(other, random, random.uniform(kLeastLoad, kMostLoad)));
-        const Sharpness soft{kOtherSharpness, kOtherSmoothness};
-        double least = std::numeric_limits<double>::infinity();
-        VectorX q;
-        for (const VectorX& start : starts)
-          if (const Evaluation e = evaluate(other, start, soft, false); e.good && e.value < least)
-            least = e.value, q = start;
-        if (q.size() > 0) {
-          const solve::Summary summary = minimize(other, q, soft, kOtherEffort);
-          Correction c = correction(std::move(q), {.steps = 0});
-          c.summary = summary;
-          if (c.miss < kClearlyBetter * best.miss) best = std::move(c);
-        }
-      }
-      out.motion = std::move(best.motion);
-      samples = std::move(best.samples);
-      hit_time = best.time;
-      summaries.push_back(best.summary);
-      // the next one looks elsewhere where this one, with all its steps, did not help
-      elsewhere = best.miss > kStuck && best.miss > kProgress * foretold && left > kLeastOther;
-      foretold = best.miss;
-      const double seconds = core_time() - begin;
-      ++out.replans;
-      out.longest_replan = std::max(out.longest_replan, seconds);
-      out.mean_replan += (seconds - out.mean_replan) / out.replans;
-    }
-    std::vector<double> times;
-    const int steps = std::max(1, static_cast<int>(std::ceil((next - now) / kTruthStep - 1e-9)));
-    for (int i = 1; i <= steps; ++i) times.push_back(i == steps ? next : now + (next - now) * i / steps);
-    state.time = now;
-    const chain::States states = dynamics::rollout(truth, base, state, times);
-    for (std::size_t i = 0; i < states.time.size(); ++i) {
-      out.states.time.push_back(states.time[i]);
-      out.states.theta.push_back(states.theta[i]);
-      out.states.thetadot.push_back(states.thetadot[i]);
-    }
-    state.theta = states.theta.back(), state.thetadot = states.thetadot.back();
-    if (!states.internal_state.empty()) state.internal_state = states.internal_state.back();
+// The twin's state from the points of the true rope that a camera could follow.
+dynamics::InitialState observe(const Play& play, double now) {
+  const chain::Chain& rope = play.truth.chain;
+  const trajectory::BaseMotion here = play.base(now);
+  const MatrixX points =
+      chain::centerline(rope, chain::link_motions(rope, play.state.theta, here.pose), play.true_seen);
+  const MatrixX speeds = centerline_velocity(rope, play.state.theta, play.state.thetadot, here, play.true_seen);
+  dynamics::InitialState found = fit_state(play.chain, here, play.seen, points, speeds, play.last_seen.theta).state;
+  found.time = now;
+  found.internal_state = dynamics::internal_state_in_motion(play.problem.model, found.theta, found.thetadot);
+  return found;
+}
+
+// The rest of the motion with one more piece, of `length` s, that is to be found.
+Task task_of_piece(const Play& play, const dynamics::InitialState& estimate, double now, double length) {
+  Motion motion = play.out.motion;
+  append_piece(motion, now, length);
+  const int full = play.problem.model.parameters.substeps;
+  const int substeps = std::clamp(static_cast<int>(kReplanNodes / (30.0 * length)), full > 4 ? 2 : 1, full);
+  Task task = make_task(play.problem, play.options, {&play.corrected.model}, motion, estimate,
+                        play.problem.targets.front(), substeps);
+  task.exact = false;
+  task.target = play.target_at(now);
+  task.target_velocity = play.loop.target_velocity;
+  task.target_time = now;
+  if (play.options.terminal)
+    for (std::size_t a = 0; a < motion.axes.size(); ++a) task.held[a * kPerAxis + kBasisCount] = true;
+  return task;
+}
+
+struct Correction {
+  Motion motion;
+  Samples samples;
+  double miss, time;
+  solve::Summary summary;
+};
+
+// From these unknowns of the piece, by so much effort.
+Correction correction_from(const Play& play, const Task& task, const dynamics::InitialState& estimate, VectorX unknowns,
+                           const Effort& effort) {
+  Correction c{task.motion, play.samples, std::numeric_limits<double>::infinity(), play.hit_time, {}};
+  if (effort.steps > 0) c.summary = minimize(task, unknowns, {kReplanSharpness, kReplanSmoothness}, effort);
+  set_unknowns(c.motion, unknowns);
+  // what asks too much of the arm is taken in part
+  c.samples.take_within(c.motion, play.options.limits);
+  Rollout rollout;
+  if (roll_out(play.corrected.model, task.motion, task.grid, unknowns_of(c.motion), estimate, false, rollout)) {
+    const Hit hit = measure(task, play.corrected.model, rollout);
+    c.miss = hit.miss, c.time = hit.time;
   }
+  return c;
+}
 
-  // the same part of the true rope that counts for the twin
-  std::vector<double> counts;
-  const Part part = part_of(options, problem.tabletop);
+// From the best of other starts; none where all of them run away. `k`: of the replan.
+std::optional<Correction> correction_elsewhere(Play& play, Task task, const dynamics::InitialState& estimate, int k) {
+  if (task.part == Part::rope && play.problem.tabletop && k % 2 == 0) task.first_link = play.chain.links() - 1;
+  std::vector<VectorX> starts = carried(task);
+  while (starts.size() < kOthers)
+    starts.push_back(random_unknowns(task, play.random, play.random.uniform(kLeastLoad, kMostLoad)));
+  const Sharpness soft{kOtherSharpness, kOtherSmoothness};
+  double least = std::numeric_limits<double>::infinity();
+  VectorX best;
+  for (const VectorX& start : starts)
+    if (const Evaluation e = evaluate(task, start, soft, false); e.good && e.value < least)
+      least = e.value, best = start;
+  if (best.size() == 0) return std::nullopt;
+  const solve::Summary summary = minimize(task, best, soft, kOtherEffort);
+  Correction c = correction_from(play, task, estimate, std::move(best), {.steps = 0});
+  c.summary = summary;
+  return c;
+}
+
+// Looks at the rope, corrects the model by what it did since the last look, and plans the rest anew. `left`: s, to the
+// hit. `k`: of the replan.
+void replan(Play& play, double now, double left, int k) {
+  const double begun = core_time();
+  const dynamics::InitialState estimate = observe(play, now);
+  correct(
+      play.corrected, [&](double time) { return play.base(time); }, play.last_seen, estimate, play.seen);
+  play.last_seen = estimate;
+  const double rest = play.end - now;
+  const double length = play.problem.tabletop ? rest : std::min(rest, std::max(kLeastPiece, kPieceMargin * left));
+  const Task task = task_of_piece(play, estimate, now, length);
+  const auto size = static_cast<Eigen::Index>(task.motion.axes.size()) * kPerAxis;
+  Correction best = correction_from(play, task, estimate, VectorX::Zero(size), kReplanEffort);
+  if (play.elsewhere)
+    if (auto other = correction_elsewhere(play, task, estimate, k); other && other->miss < kClearlyBetter * best.miss)
+      best = std::move(*other);
+  play.out.motion = std::move(best.motion);
+  play.samples = std::move(best.samples);
+  play.hit_time = best.time;
+  play.summaries.push_back(best.summary);
+  // the next one looks elsewhere where this one, with all its steps, did not help
+  play.elsewhere = best.miss > kStuck && best.miss > kProgress * play.foretold && left > kLeastOther;
+  play.foretold = best.miss;
+  const double seconds = core_time() - begun;
+  LoopResult& out = play.out;
+  ++out.replans;
+  out.longest_replan = std::max(out.longest_replan, seconds);
+  out.mean_replan += (seconds - out.mean_replan) / out.replans;
+}
+
+// The true rope moves on.
+void advance(Play& play, double now, double next) {
+  std::vector<double> times;
+  const int steps = std::max(1, static_cast<int>(std::ceil((next - now) / kTruthStep - 1e-9)));
+  for (int i = 1; i <= steps; ++i) times.push_back(i == steps ? next : now + (next - now) * i / steps);
+  dynamics::InitialState& state = play.state;
+  state.time = now;
+  const chain::States states = dynamics::rollout(
+      play.truth, [&](double time) { return play.base(time); }, state, times);
+  for (std::size_t i = 0; i < states.time.size(); ++i) {
+    play.out.states.time.push_back(states.time[i]);
+    play.out.states.theta.push_back(states.theta[i]);
+    play.out.states.thetadot.push_back(states.thetadot[i]);
+  }
+  state.theta = states.theta.back(), state.thetadot = states.thetadot.back();
+  if (!states.internal_state.empty()) state.internal_state = states.internal_state.back();
+}
+
+// What the true rope came to: its nearest point, of the same part that counts for the twin.
+Hit hit_of(const Play& play) {
+  constexpr int kCounted = 65, kBetween = 4;  // points of the rope; parts of a step
+  const chain::Chain& rope = play.truth.chain;
+  const bool tabletop = play.problem.tabletop;
+  const Part part = part_of(play.options, tabletop);
   const double first = part == Part::rope        ? 0.0
-                       : part == Part::last_link ? chain.link_start(chain.links() - 1) / chain.length
+                       : part == Part::last_link ? play.chain.link_start(play.chain.links() - 1) / play.chain.length
                                                  : 1.0;
-  constexpr int kCounted = 65;
+  std::vector<double> counts;
   for (int i = part == Part::tip ? kCounted - 1 : 0; i < kCounted; ++i)
-    counts.push_back(truth.chain.length * std::min(1.0, first + (1.0 - first) * i / (kCounted - 1)));
-  out.hit.miss = std::numeric_limits<double>::infinity();
-  constexpr int kBetween = 4;  // parts of a step
-  const std::size_t count = out.states.time.size();
-  for (std::size_t k = problem.tabletop ? count - 1 : 0; k < count; ++k)
+    counts.push_back(rope.length * std::min(1.0, first + (1.0 - first) * i / (kCounted - 1)));
+  Hit hit;
+  hit.miss = std::numeric_limits<double>::infinity();
+  const chain::States& states = play.out.states;
+  const std::size_t count = states.time.size();
+  for (std::size_t k = tabletop ? count - 1 : 0; k < count; ++k)
     for (int i = 0; i < (k + 1 < count ? kBetween : 1); ++i) {
       const double time =
-          i == 0 ? out.states.time[k]
-                 : out.states.time[k] + (out.states.time[k + 1] - out.states.time[k]) * i / double(kBetween);
-      const VectorX theta = i == 0 ? out.states.theta[k] : chain::interpolate(out.states, time);
-      const MatrixX points =
-          chain::centerline(truth.chain, chain::link_motions(truth.chain, theta, base(time).pose), counts);
+          i == 0 ? states.time[k] : states.time[k] + (states.time[k + 1] - states.time[k]) * i / double(kBetween);
+      const VectorX theta = i == 0 ? states.theta[k] : chain::interpolate(states, time);
+      const MatrixX points = chain::centerline(rope, chain::link_motions(rope, theta, play.base(time).pose), counts);
       Vector3 nearest = Vector3::Zero();
-      const double miss = distance_to(points, target_at(time), nearest);
-      if (miss < out.hit.miss) out.hit.miss = miss, out.hit.time = time, out.hit.point = nearest;
+      const double miss = distance_to(points, play.target_at(time), nearest);
+      if (miss < hit.miss) hit.miss = miss, hit.time = time, hit.point = nearest;
     }
-  out.hit.mean_miss = out.hit.worst_miss = out.hit.miss;
-  out.foretold = out.replans > 0 ? foretold : plan.hits.front().miss;
+  hit.mean_miss = hit.worst_miss = hit.miss;
+  return hit;
+}
+
+}  // namespace
+
+LoopResult closed_loop(const Problem& problem, const Options& options, const Plan& plan, const dynamics::Model& truth,
+                       const LoopOptions& loop) {
+  check(problem, plan, truth, loop);
+  Play play = begin(problem, options, plan, truth, loop);
+  const double end = play.end;
+  const int intervals = std::max(1, static_cast<int>(std::ceil(end * loop.rate - 1e-9)));
+  for (int k = 0; k < intervals; ++k) {
+    const double now = k / loop.rate, left = (problem.tabletop ? end : play.hit_time) - now;
+    if (loop.feedback && k == 0) play.last_seen = observe(play, now);
+    if (loop.feedback && k > 0 && left > kShortest) replan(play, now, left, k);
+    advance(play, now, std::min(end, (k + 1) / loop.rate));
+  }
+  LoopResult& out = play.out;
+  out.hit = hit_of(play);
+  out.foretold = out.replans > 0 ? play.foretold : plan.hits.front().miss;
   out.out_of_reach = std::numeric_limits<double>::infinity();
   for (double share = problem.tabletop ? 1.0 : 0.0; share <= 1.0; share += 0.01)
-    out.out_of_reach = std::min(out.out_of_reach, unreachable_distance(problem, options, target_at(share * end)));
+    out.out_of_reach = std::min(out.out_of_reach, unreachable_distance(problem, options, play.target_at(share * end)));
   out.peaks = peaks(out.motion, 0.0, end, options.limits);
-  out.summary = solve::together(summaries);
-  return out;
+  out.summary = solve::together(play.summaries);
+  return std::move(out);
 }
 
 }  // namespace chainsplat::planning
