@@ -23,6 +23,12 @@ struct LinkConstants {
   int first_angle, end_angle;
 };
 
+// Whether a tangent changes the wrenches of links, not only the joint law.
+inline bool moves_links(const Tangent& d) {
+  return d.tip_mass != 0.0 || !d.link_mass.empty() || !d.viscous_friction.empty() || !d.coulomb_friction.empty() ||
+         !d.air_linear.empty() || !d.air_quadratic.empty();
+}
+
 class Engine {
  public:
   virtual ~Engine() = default;

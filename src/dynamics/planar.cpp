@@ -454,12 +454,9 @@ void PlanarEngine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& fo
     const Tangent& d = unknowns[q];
     auto column = forces.col(static_cast<Eigen::Index>(q));
     joint_forces(d, column);
-    const bool tip = d.tip_mass != 0.0;
-    if (d.link_mass.empty() && d.viscous_friction.empty() && d.coulomb_friction.empty() && d.air_linear.empty() &&
-        d.air_quadratic.empty() && !tip)
-      continue;
+    if (!moves_links(d)) continue;
     Planar sum;
-    if (tip) add(sum, unit_tip_planar_, d.tip_mass);
+    if (d.tip_mass != 0.0) add(sum, unit_tip_planar_, d.tip_mass);
     for (int j = angles - 1; j >= 0; --j) {
       if (!d.link_mass.empty()) add(sum, units_[j].mass, d.link_mass[j]);
       if (!d.viscous_friction.empty()) add(sum, units_[j].viscous, d.viscous_friction[j]);

@@ -328,11 +328,8 @@ void SpatialEngine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& f
     const Tangent& d = unknowns[p];
     auto column = forces.col(static_cast<Eigen::Index>(p));
     joint_forces(d, column);
-    const bool tip = d.tip_mass != 0.0;
-    if (d.link_mass.empty() && d.viscous_friction.empty() && d.coulomb_friction.empty() && d.air_linear.empty() &&
-        d.air_quadratic.empty() && !tip)
-      continue;
-    Vector6 sum = tip ? Vector6(d.tip_mass * unit_tip_) : Vector6::Zero().eval();
+    if (!moves_links(d)) continue;
+    Vector6 sum = d.tip_mass != 0.0 ? Vector6(d.tip_mass * unit_tip_) : Vector6::Zero().eval();
     for (int j = link_count - 1; j >= 0; --j) {
       if (!d.link_mass.empty()) sum += d.link_mass[j] * unit_[j].mass;
       if (!d.viscous_friction.empty()) sum += d.viscous_friction[j] * unit_[j].viscous;
