@@ -2,6 +2,8 @@
 
 #include <doctest/doctest.h>
 #include <cmath>
+#include <functional>
+#include <string>
 
 #include "chainsplat/identification.h"
 
@@ -123,10 +125,19 @@ TEST_CASE("requests that cannot be met are refused") {
   CHECK_THROWS_AS(excitation::excite(problem, {}), InputError);  // nothing known
   problem.estimates.names = {"log_stiffness"};
   problem.estimates.covariance = math::MatrixX::Identity(1, 1);
-  excitation::Options options;
-  options.duration = -1.0;
-  CHECK_THROWS_AS(excitation::excite(problem, options), InputError);
-  options = {};
-  options.limits.velocity = 0.0;
-  CHECK_THROWS_AS(excitation::excite(problem, options), InputError);
+  const auto refused = [&](const std::string& field, const std::function<void(excitation::Options&)>& change) {
+    excitation::Options options;
+    change(options);
+    try {
+      excitation::excite(problem, options);
+      FAIL("not refused: ", field);
+    } catch (const InputError& error) {
+      CHECK(error.where == field);
+    }
+  };
+  refused("`duration`", [](excitation::Options& o) { o.duration = -1.0; });
+  refused("`noise`", [](excitation::Options& o) { o.noise = NAN; });
+  refused("`frame_rate`", [](excitation::Options& o) { o.frame_rate = 1e9; });
+  refused("`velocity`", [](excitation::Options& o) { o.limits.velocity = 0.0; });
+  refused("`yaw_jerk`", [](excitation::Options& o) { o.limits.yaw_jerk = -1.0; });
 }

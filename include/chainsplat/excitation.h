@@ -29,6 +29,8 @@ struct Options {
   int starts = 24;                   // random motions, of which the best is refined
   int generations = 24;              // of eight changes of it each
   std::uint64_t seed = 0;
+
+  void check() const;  // throws InputError whose `where` names the wrong field
 };
 
 struct Problem {
@@ -58,8 +60,8 @@ struct Result {
   Prediction prediction;
 };
 
-// Same seed, same motion. Throws InputError where the twin knows no covariance or limits allow no motion, WorkError
-// where no motion keeps the rope within `max_bend`.
+// Same seed, same motion. Throws InputError as Options::check() and where the twin knows no covariance, WorkError where
+// no motion keeps the rope within `max_bend`.
 Result excite(const Problem& problem, const Options& options);
 
 // Information about `names` (initial states left out of the sum) in a recording under `base` at `times`, with noise of

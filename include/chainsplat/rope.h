@@ -2,7 +2,7 @@
 //
 // What a planner, a controller or a learner needs beside the modules: the rope with all that a call on it starts from,
 // a rollout that starts at rest, many rollouts at once, derivatives, the base's motion as its poses come, and whole
-// problems for planning and forces. A Rope that nobody changes may be used by several threads.
+// problems for planning, excitation and forces. A Rope that nobody changes may be used by several threads.
 #pragma once
 #include <functional>
 #include <optional>
@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "chainsplat/dynamics/parametrization.h"
+#include "chainsplat/excitation.h"
 #include "chainsplat/force.h"
 #include "chainsplat/planning.h"
 #include "chainsplat/twin.h"
@@ -90,6 +91,13 @@ class LiveBase {
 // Where a plan for this rope starts: at rest where its recording began, without targets. Of a rope without dynamics the
 // usual are assumed, and a warning says so.
 planning::Problem planning_problem(const Rope& rope);
+
+// What to record next (excitation.h): a motion from rest where this rope's recording began, compared with one more
+// recording of the old motion. Throws InputError before identification.
+excitation::Problem excitation_problem(const Rope& rope);
+// By how much points of the recorded rope are off the rolled-out one, m, RMS of one coordinate: the noise of a
+// recording to come. 2 mm where there is nothing to compare, at least 0.5 mm.
+double recorded_noise(const Rope& rope);
 
 // The force from outside along `states` under `base`, one a time: where it acts is found, or it acts at what is nearest
 // to `contact`, m, world. Throws InputError for fewer than three states, and for times that the base does not cover.

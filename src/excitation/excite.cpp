@@ -11,14 +11,16 @@ namespace {
 
 using planning::Axis;
 
-constexpr double kPiece = 2.0;        // s, of one stretch of basis functions: up to about 2 Hz
-constexpr double kOverlap = 0.5;      // of a stretch with the next: no rest between them
-constexpr int kChanges = 8;           // a generation
-constexpr double kFirstChange = 0.5;  // of a weight's spread
-constexpr double kMargin = 0.998;     // of a limit: peaks lie between the points of the grid
-constexpr double kGrid = 2e-3;        // s, of that grid
-constexpr int kMaxSofter = 12;        // times that a motion which bends the rope too far is made smaller
+constexpr double kPiece = 2.0;          // s, of one stretch of basis functions: up to about 2 Hz
+constexpr double kOverlap = 0.5;        // of a stretch with the next: no rest between them
+constexpr int kChanges = 8;             // a generation
+constexpr double kFirstChange = 0.5;    // of a weight's spread
+constexpr double kSmallerChange = 0.7;  // by which it shrinks after a generation without a better motion
+constexpr double kMargin = 0.998;       // of a limit: peaks lie between the points of the grid
+constexpr double kGrid = 2e-3;          // s, of that grid
+constexpr int kMaxSofter = 12;          // times that a motion which bends the rope too far is made smaller
 constexpr double kSofter = 0.8;
+constexpr int kMostFrames = 100000;  // each has the derivatives of all angles by all parameters: some 10 kB
 
 struct Candidate {
   planning::Motion motion;
@@ -88,131 +90,199 @@ Known known_parameters(const Problem& problem) {
   return known;
 }
 
-}  // namespace
+// All that stays the same during the search.
+struct Search {
+  const Problem& problem;
+  const Options& options;
+  std::vector<Axis> axes;
+  Known known;
+  double known_log_det = 0.0;
+  std::vector<double> times;  // s, of the frames
+  dynamics::InitialState initial;
+};
 
-Result excite(const Problem& problem, const Options& options) {
-  if (!(options.duration >= 0.5 && options.duration <= 120.0))
-    throw InputError("`duration`", "is " + core::exact(options.duration) + " s", "give 0.5 to 120 s");
-  if (!(options.noise > 0.0) || !(options.frame_rate > 0.0) || !(options.max_bend > 0.0))
-    throw InputError("excite", "noise, frame rate or largest bend is not above 0", "give numbers above 0");
-  const planning::Limits& l = options.limits;
-  for (double limit :
-       {l.velocity, l.acceleration, l.jerk, l.stroke, l.yaw_velocity, l.yaw_acceleration, l.yaw_jerk, l.turn})
-    if (!(limit > 0.0)) throw InputError("excite", "a limit is not above 0", "give limits that allow a motion");
-  const Known known = known_parameters(problem);
-  const auto axes = options.axes.empty() ? default_axes(problem) : options.axes;
-  const double known_log_det = log_det(known.information);
+Search make_search(const Problem& problem, const Options& options) {
+  if (const double seconds = std::max(options.duration, problem.recorded_end - problem.recorded_start);
+      options.frame_rate * seconds > kMostFrames)
+    throw InputError("`frame_rate`",
+                     core::exact(options.frame_rate) + " frames a second for " + core::exact(seconds) +
+                         " s are more than the " + std::to_string(kMostFrames) + " frames that fit into memory",
+                     "give those of the camera, for example 30");
+  Search search{problem,
+                options,
+                options.axes.empty() ? default_axes(problem) : options.axes,
+                known_parameters(problem),
+                0.0,
+                {},
+                problem.initial};
+  search.known_log_det = log_det(search.known.information);
+  for (int k = 0; k / options.frame_rate <= options.duration + 1e-9; ++k)
+    search.times.push_back(k / options.frame_rate);
+  search.initial.time = 0.0;
+  return search;
+}
 
-  std::vector<double> times;
-  for (int k = 0; k / options.frame_rate <= options.duration + 1e-9; ++k) times.push_back(k / options.frame_rate);
-  dynamics::InitialState initial = problem.initial;
-  initial.time = 0.0;
+// Whether the rope follows the motion without a joint that bends beyond `max_bend`.
+bool stays_within_bend(const Search& search, const planning::Motion& motion) {
+  const dynamics::Model& model = search.problem.model;
+  const auto grid = dynamics::sample_base([&](double t) { return planning::base_at(motion, t); }, 0.0, search.times,
+                                          model.parameters.substeps);
+  chain::States states;
+  if (!dynamics::simulate(model, grid, search.initial, states)) return false;
+  return std::all_of(states.theta.begin(), states.theta.end(), [&](const VectorX& theta) {
+    return (theta - search.initial.theta).cwiseAbs().maxCoeff() <= search.options.max_bend;
+  });
+}
 
-  const auto simulate = [&](const planning::Motion& motion, chain::States& states) {
-    const auto grid = dynamics::sample_base([&](double t) { return planning::base_at(motion, t); }, 0.0, times,
-                                            problem.model.parameters.substeps);
-    if (!dynamics::simulate(problem.model, grid, initial, states)) return false;
-    for (const VectorX& theta : states.theta)
-      if (!((theta - initial.theta).cwiseAbs().maxCoeff() <= options.max_bend)) return false;
-    return true;
-  };
-  const auto evaluate = [&](Candidate& c) {
-    scale_to_limits(c.motion, options);
-    chain::States states;
-    int softer = 0;
-    for (; softer < kMaxSofter && !simulate(c.motion, states); ++softer) scale(c.motion, kSofter, kSofter);
-    if (softer == kMaxSofter) return;
-    const MatrixX told = information(
-        problem.model, known.unknowns, [&](double t) { return planning::base_at(c.motion, t); }, initial, times,
-        options.noise);
-    if (told.size()) c.value = log_det(known.information + told);
-  };
-  const auto best_of = [](std::vector<Candidate>& candidates) {
-    return *std::max_element(candidates.begin(), candidates.end(),
-                             [](const Candidate& a, const Candidate& b) { return a.value < b.value; });
-  };
+// What a recording of the motion tells; empty where the rollout diverges. `states`: filled where given.
+MatrixX told_by(const Search& search, const planning::Motion& motion, chain::States* states = nullptr) {
+  return information(
+      search.problem.model, search.known.unknowns, [&](double t) { return planning::base_at(motion, t); },
+      search.initial, search.times, search.options.noise, states);
+}
 
-  core::Random random(options.seed * 1000003u + 17u);
+// Makes the motion as large as limits and rope allow, and values it.
+void evaluate(const Search& search, Candidate& candidate) {
+  scale_to_limits(candidate.motion, search.options);
+  int softer = 0;
+  for (; softer < kMaxSofter && !stays_within_bend(search, candidate.motion); ++softer)
+    scale(candidate.motion, kSofter, kSofter);
+  if (softer == kMaxSofter) return;
+  const MatrixX told = told_by(search, candidate.motion);
+  if (told.size()) candidate.value = log_det(search.known.information + told);
+}
+
+// Values all of them; returns the best.
+Candidate best_of(const Search& search, std::vector<Candidate>& candidates) {
+  core::parallel_for(static_cast<std::int64_t>(candidates.size()),
+                     [&](std::int64_t i) { evaluate(search, candidates[i]); });
+  return *std::max_element(candidates.begin(), candidates.end(),
+                           [](const Candidate& a, const Candidate& b) { return a.value < b.value; });
+}
+
+MatrixX random_weights(const Search& search, core::Random& random) {
+  MatrixX weights(planning::kBasisCount, static_cast<Eigen::Index>(search.axes.size()));
+  for (double& w : weights.reshaped()) w = random.normal();
+  return weights;
+}
+
+// Stretches of basis functions that overlap, with random weights.
+std::vector<Candidate> random_motions(const Search& search, core::Random& random) {
+  const Options& options = search.options;
   const int pieces =
       std::max(1, static_cast<int>(std::floor((options.duration - kPiece) / (kOverlap * kPiece) + 1e-9)) + 1);
   const double piece = std::min(kPiece, options.duration);
   const double shift = pieces > 1 ? (options.duration - piece) / (pieces - 1) : 0.0;
-  const auto random_weights = [&] {
-    MatrixX weights(planning::kBasisCount, static_cast<Eigen::Index>(axes.size()));
-    for (double& w : weights.reshaped()) w = random.normal();
-    return weights;
-  };
   std::vector<Candidate> candidates(std::max(1, options.starts));
   for (Candidate& c : candidates) {
-    c.motion.origin = problem.base;
-    c.motion.up = -problem.model.parameters.gravity.normalized();
+    c.motion.origin = search.problem.base;
+    c.motion.up = -search.problem.model.parameters.gravity.normalized();
     if (!c.motion.up.allFinite()) c.motion.up = math::Vector3::UnitZ();
-    c.motion.axes = axes;
+    c.motion.axes = search.axes;
     for (int i = 0; i < pieces; ++i)
-      c.motion.pieces.push_back(
-          {i * shift, piece, random_weights(), VectorX::Zero(static_cast<Eigen::Index>(axes.size()))});
+      c.motion.pieces.push_back({i * shift, piece, random_weights(search, random),
+                                 VectorX::Zero(static_cast<Eigen::Index>(search.axes.size()))});
   }
-  const auto evaluate_all = [&] {
-    core::parallel_for(static_cast<std::int64_t>(candidates.size()), [&](std::int64_t i) { evaluate(candidates[i]); });
-  };
-  evaluate_all();
-  Candidate best = best_of(candidates);
-  if (!std::isfinite(best.value))
-    throw WorkError("excite", "no motion keeps every joint within " + core::exact(options.max_bend) + " rad",
-                    "raise `max_bend` or lower `acceleration`");
+  return candidates;
+}
+
+// Random changes of the best motion, smaller where none was better.
+Candidate refine(const Search& search, Candidate best, core::Random& random) {
   double change = kFirstChange;
-  for (int generation = 0; generation < options.generations; ++generation) {
+  for (int generation = 0; generation < search.options.generations; ++generation) {
     if (core::stop_requested()) throw Interrupted(core::stop_requested());
     double spread = 0.0, count = 0.0;
     for (const auto& p : best.motion.pieces)
       spread += p.weights.squaredNorm(), count += static_cast<double>(p.weights.size());
     spread = std::sqrt(spread / count);
-    candidates.assign(kChanges, best);
+    std::vector<Candidate> candidates(kChanges, best);
     for (Candidate& c : candidates) {
       c.value = -std::numeric_limits<double>::infinity();
-      for (auto& p : c.motion.pieces) p.weights += change * spread * random_weights();
+      for (auto& p : c.motion.pieces) p.weights += change * spread * random_weights(search, random);
     }
-    evaluate_all();
-    const Candidate other = best_of(candidates);
+    const Candidate other = best_of(search, candidates);
     if (other.value > best.value)
       best = other;
     else
-      change *= 0.7;
-    core::report({"excite", generation + 1, options.generations, -best.value, NAN, "refining the motion"});
+      change *= kSmallerChange;
+    core::report({"excite", generation + 1, search.options.generations, -best.value, NAN, "refining the motion"});
   }
+  return best;
+}
+
+// What one more recording of the old motion would tell; empty where there is none.
+MatrixX told_by_repetition(const Search& search) {
+  const Problem& problem = search.problem;
+  if (!problem.recorded) return {};
+  std::vector<double> times;
+  for (int k = 0; problem.recorded_start + k / search.options.frame_rate <= problem.recorded_end + 1e-9; ++k)
+    times.push_back(problem.recorded_start + k / search.options.frame_rate);
+  if (times.size() < 2) return {};
+  dynamics::InitialState initial = search.initial;
+  initial.time = problem.recorded_start;
+  return information(problem.model, search.known.unknowns, problem.recorded, initial, times, search.options.noise);
+}
+
+std::vector<double> standard_errors(const MatrixX& information) {
+  const MatrixX covariance = information.ldlt().solve(MatrixX::Identity(information.rows(), information.cols()));
+  std::vector<double> out;
+  for (Eigen::Index i = 0; i < covariance.rows(); ++i) out.push_back(std::sqrt(covariance(i, i)));
+  return out;
+}
+
+Prediction predict(const Search& search, const Candidate& best, const MatrixX& told) {
+  const Known& known = search.known;
+  const auto size = static_cast<double>(known.unknowns.size());
+  Prediction out;
+  for (const dynamics::Unknown& unknown : known.unknowns) out.names.push_back(dynamics::name_of(unknown));
+  out.now = standard_errors(known.information);
+  out.excited = standard_errors(known.information + told);
+  out.gain = (best.value - search.known_log_det) / size;
+  if (const MatrixX again = told_by_repetition(search); again.size()) {
+    out.repeated = standard_errors(known.information + again);
+    out.repeated_gain = (log_det(known.information + again) - search.known_log_det) / size;
+  }
+  return out;
+}
+
+}  // namespace
+
+void Options::check() const {
+  constexpr double kShortest = 0.5, kLongest = 120.0;  // s
+  if (!(duration >= kShortest && duration <= kLongest))
+    throw InputError("`duration`", "is " + core::exact(duration) + " s",
+                     "give " + core::exact(kShortest) + " to " + core::exact(kLongest) + " s");
+  const std::pair<const char*, double> positive[] = {{"`noise`", noise},
+                                                     {"`frame_rate`", frame_rate},
+                                                     {"`max_bend`", max_bend},
+                                                     {"`velocity`", limits.velocity},
+                                                     {"`acceleration`", limits.acceleration},
+                                                     {"`jerk`", limits.jerk},
+                                                     {"`stroke`", limits.stroke},
+                                                     {"`yaw_velocity`", limits.yaw_velocity},
+                                                     {"`yaw_acceleration`", limits.yaw_acceleration},
+                                                     {"`yaw_jerk`", limits.yaw_jerk},
+                                                     {"`turn`", limits.turn}};
+  for (const auto& [name, value] : positive)
+    if (!(value > 0.0)) throw InputError(name, "is " + core::exact(value), "give a number above 0");
+}
+
+Result excite(const Problem& problem, const Options& options) {
+  options.check();
+  const Search search = make_search(problem, options);
+  core::Random random(options.seed * 1000003u + 17u);
+  std::vector<Candidate> candidates = random_motions(search, random);
+  Candidate best = best_of(search, candidates);
+  if (!std::isfinite(best.value))
+    throw WorkError("excite", "no motion keeps every joint within " + core::exact(options.max_bend) + " rad",
+                    "raise `max_bend` or lower `acceleration`");
+  best = refine(search, best, random);
 
   Result result;
   result.motion = best.motion;
   result.peaks = planning::peaks(best.motion, 0.0, options.duration, options.limits);
-  const auto size = static_cast<double>(known.unknowns.size());
-  const auto errors = [](const MatrixX& information) {
-    const MatrixX covariance = information.ldlt().solve(MatrixX::Identity(information.rows(), information.cols()));
-    std::vector<double> out;
-    for (Eigen::Index i = 0; i < covariance.rows(); ++i) out.push_back(std::sqrt(covariance(i, i)));
-    return out;
-  };
-  Prediction& p = result.prediction;
-  for (const dynamics::Unknown& unknown : known.unknowns) p.names.push_back(dynamics::name_of(unknown));
-  p.now = errors(known.information);
-  const MatrixX told = information(
-      problem.model, known.unknowns, [&](double t) { return planning::base_at(best.motion, t); }, initial, times,
-      options.noise, &result.states);
-  p.excited = errors(known.information + told);
-  p.gain = (best.value - known_log_det) / size;
-  if (problem.recorded) {
-    std::vector<double> old;
-    for (int k = 0; problem.recorded_start + k / options.frame_rate <= problem.recorded_end + 1e-9; ++k)
-      old.push_back(problem.recorded_start + k / options.frame_rate);
-    initial.time = problem.recorded_start;
-    const MatrixX again = old.size() < 2
-                              ? MatrixX()
-                              : information(problem.model, known.unknowns, problem.recorded, initial, old,
-                                            options.noise);
-    if (again.size()) {
-      p.repeated = errors(known.information + again);
-      p.repeated_gain = (log_det(known.information + again) - known_log_det) / size;
-    }
-  }
+  const MatrixX told = told_by(search, best.motion, &result.states);
+  result.prediction = predict(search, best, told);
   return result;
 }
 

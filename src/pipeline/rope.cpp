@@ -225,6 +225,37 @@ planning::Problem planning_problem(const Rope& rope) {
   return problem;
 }
 
+excitation::Problem excitation_problem(const Rope& rope) {
+  excitation::Problem problem;
+  problem.model = model_of(rope);
+  problem.tabletop = rope.twin.tabletop;
+  problem.base = rope.base.pose(rope.base.start());
+  problem.estimates = rope.twin.estimates;
+  problem.initial = at_rest(rope, problem.model, problem.base, 0.0);
+  problem.recorded = [base = rope.base](double time) { return base.at(time); };
+  problem.recorded_start = rope.twin.states.time.front();
+  problem.recorded_end = rope.twin.states.time.back();
+  return problem;
+}
+
+double recorded_noise(const Rope& rope) {
+  constexpr double kLeast = 0.5e-3, kUnknown = 2e-3;  // m
+  const twin::Twin& twin = rope.twin;
+  double sum = 0.0;
+  std::size_t count = 0;
+  for (std::size_t k = 0; k < std::min(twin.states.time.size(), twin.rollout.time.size()); ++k) {
+    if (twin.states.time[k] != twin.rollout.time[k]) return kUnknown;
+    const math::Pose pose = rope.base.pose(twin.states.time[k]);
+    const auto place = [&](const math::VectorX& theta) {
+      return chain::nodes(twin.chain, chain::link_motions(twin.chain, theta, pose));
+    };
+    const math::MatrixX off = place(twin.states.theta[k]) - place(twin.rollout.theta[k]);
+    sum += off.rightCols(twin.chain.links() - 1).squaredNorm();
+    count += 3 * (twin.chain.links() - 1);
+  }
+  return count == 0 ? kUnknown : std::max(kLeast, std::sqrt(sum / static_cast<double>(count)));
+}
+
 std::vector<force::Estimate> forces(const Rope& rope, const chain::States& states, const trajectory::Trajectory& base,
                                     const std::optional<math::Vector3>& contact) {
   const dynamics::Model& model = model_of(rope);

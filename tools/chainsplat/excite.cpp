@@ -1,6 +1,5 @@
 // excite.cpp - excite: the base motion that is to be recorded next.
 #include <CLI/CLI.hpp>
-#include <algorithm>
 #include <cmath>
 #include <cstdio>
 #include <iostream>
@@ -9,6 +8,7 @@
 
 #include "chainsplat/excitation.h"
 #include "chainsplat/motion_files.h"
+#include "chainsplat/rope.h"
 #include "chainsplat/run_folder.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
@@ -26,23 +26,8 @@ struct Request {
   excitation::Options options;
 };
 
-// What the identified rollout leaves of the recording, as the sd of one coordinate of a point, m.
-double noise_of(const twin::Twin& twin, const trajectory::Trajectory& base) {
-  constexpr double kLeast = 0.5e-3, kUnknown = 2e-3;  // m
-  double sum = 0.0;
-  std::size_t count = 0;
-  for (std::size_t k = 0; k < std::min(twin.states.time.size(), twin.rollout.time.size()); ++k) {
-    if (twin.states.time[k] != twin.rollout.time[k]) return kUnknown;
-    const math::Pose pose = base.pose(twin.states.time[k]);
-    const auto place = [&](const math::VectorX& theta) {
-      return chain::nodes(twin.chain, chain::link_motions(twin.chain, theta, pose));
-    };
-    const math::MatrixX off = place(twin.states.theta[k]) - place(twin.rollout.theta[k]);
-    sum += off.rightCols(twin.chain.links() - 1).squaredNorm();
-    count += 3 * (twin.chain.links() - 1);
-  }
-  return count == 0 ? kUnknown : std::max(kLeast, std::sqrt(sum / static_cast<double>(count)));
-}
+// One file for the base's motion, and its table beside it.
+bool is_single(const Request& request) { return Path(request.out).extension() == ".tum"; }
 
 Json document_of(const excitation::Result& result, const Request& request) {
   const excitation::Prediction& p = result.prediction;
@@ -77,61 +62,23 @@ Json document_of(const excitation::Result& result, const Request& request) {
   return out;
 }
 
-void excite(const Globals& globals, Request& request) {
-  watch_signals();
-  excitation::Options& options = request.options;
-  planning::check_rate(request.rate, options.duration, "give rows a second, for example 100");
-  options.seed = globals.seed;
-  if (!request.axes.empty()) options.axes = planning::parse_axes(request.axes);
+// Writes the motion, and into a folder also the states that it predicts and `document`.
+void write_files(const Request& request, const excitation::Result& result, const Json& document) {
   const Path out = request.out;
-  const bool single = out.extension() == ".tum";
-  if (single)
-    pipeline::check_output_file(request.out);
-  else
-    pipeline::check_output_folder(request.out, request.force, "name another folder or give --force to write into it");
-
-  const twin::Twin twin = pipeline::load_twin(request.run);
-  const trajectory::Trajectory base = pipeline::own_base(request.run);
-  excitation::Problem problem;
-  problem.model = pipeline::model_of(twin, request.run);
-  problem.tabletop = twin.tabletop;
-  problem.base = base.pose(base.start());
-  problem.estimates = twin.estimates;
-  problem.initial.thetadot = math::VectorX::Zero(twin.chain.angles());
-  if (twin.tabletop)
-    problem.initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
-  else
-    problem.initial.theta = dynamics::static_equilibrium(problem.model, problem.base).theta;
-  problem.recorded = [&](double t) { return base.at(t); };
-  problem.recorded_start = twin.states.time.front();
-  problem.recorded_end = twin.states.time.back();
-  constexpr int kMostFrames = 100000;  // each has the derivatives of all angles by all parameters: some 10 kB
-  if (const double seconds = std::max(options.duration, problem.recorded_end - problem.recorded_start);
-      options.frame_rate * seconds > kMostFrames)
-    throw InputError("--frame-rate",
-                     core::exact(options.frame_rate) + " frames a second for " + core::exact(seconds) +
-                         " s are more than the " + std::to_string(kMostFrames) + " frames that fit into memory",
-                     "give those of the camera, for example 30");
-  options.noise = request.noise > 0.0 ? 1e-3 * request.noise : noise_of(twin, base);
-
-  const excitation::Result result = excitation::excite(problem, options);
-  end_progress();
-  const std::vector<double> times = planning::row_times(options.duration, request.rate);
-  const Json document = document_of(result, request);
+  const bool single = is_single(request);
   const auto beside = [&](const char* name, const char* extension) {
     return single ? Path(out).replace_extension(extension) : out / name;
   };
   if (!single) core::make_folder(out);
+  const std::vector<double> times = planning::row_times(request.options.duration, request.rate);
   core::write_file(beside("base.tum", ".tum"), planning::motion_tum(result.motion, times));
   core::write_file(beside("base.csv", ".csv"), planning::motion_csv(result.motion, times));
-  if (!single) {
-    core::write_file(out / "states.csv", twin::states_csv(result.states));
-    core::write_file(out / "excite.json", document.dump(1) + "\n");
-  }
-  if (globals.json) {
-    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
-    return;
-  }
+  if (single) return;
+  core::write_file(out / "states.csv", twin::states_csv(result.states));
+  core::write_file(out / "excite.json", document.dump(1) + "\n");
+}
+
+void print(const Request& request, const excitation::Result& result) {
   const excitation::Prediction& p = result.prediction;
   const bool compare = !p.repeated.empty();
   std::cout << "parameter                    standard error   after excitation"
@@ -158,6 +105,31 @@ void excite(const Globals& globals, Request& request) {
                 "\npeaks: %.2f m/s, %.1f m/s^2, %.0f m/s^3, %.2f m from the start; motion: ", result.peaks.velocity,
                 result.peaks.acceleration, result.peaks.jerk, result.peaks.stroke);
   std::cout << line << request.out << "\n";
+}
+
+void excite(const Globals& globals, Request& request) {
+  watch_signals();
+  excitation::Options& options = request.options;
+  planning::check_rate(request.rate, options.duration, "give rows a second, for example 100");
+  options.seed = globals.seed;
+  if (!request.axes.empty()) options.axes = planning::parse_axes(request.axes);
+  if (is_single(request))
+    pipeline::check_output_file(request.out);
+  else
+    pipeline::check_output_folder(request.out, request.force, "name another folder or give --force to write into it");
+
+  const pipeline::Rope rope = pipeline::load_rope(request.run);
+  const excitation::Problem problem = pipeline::excitation_problem(rope);
+  options.noise = request.noise > 0.0 ? 1e-3 * request.noise : pipeline::recorded_noise(rope);
+  const excitation::Result result = excitation::excite(problem, options);
+  end_progress();
+
+  const Json document = document_of(result, request);
+  write_files(request, result, document);
+  if (globals.json)
+    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+  else
+    print(request, result);
 }
 
 }  // namespace
