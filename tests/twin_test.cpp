@@ -178,6 +178,31 @@ TEST_CASE("torsion, friction in bending and a payload read back, in a file that 
   CHECK(properties["first_frequency"]["value"] > 0.5);
 }
 
+TEST_CASE("a chain alone is read from a whole file or from its part, held as another rope") {
+  const test::TemporaryFolder folder("chain");
+  const twin::Twin twin = full_twin();
+  twin::save(twin, folder.path);
+  const Path whole = folder.path / "twin.json", part = folder.path / "chain.json", bare = folder.path / "bare.json";
+  Json chain = Json::parse(core::read_file(whole))["chain"];
+  core::write_file(part, chain.dump());
+  for (const Path& file : {whole, part}) {
+    const twin::Twin read = twin::load_chain(file, twin.chain);
+    CHECK(read.chain.joint_arclength == twin.chain.joint_arclength);
+    CHECK(read.parameters->stiffness == twin.parameters->stiffness);
+    CHECK(read.parameters->radius == twin.parameters->radius);
+    CHECK(read.gaussians.count == 0);
+  }
+  chain["joints"][1]["damping"] = -1.0;
+  core::write_file(part, chain.dump());
+  CHECK(contains(error_of([&] { twin::load_chain(part, twin.chain); }), "chain.json: chain.joints[1].damping"));
+  for (Json& link : chain["links"]) link.erase("mass");
+  core::write_file(bare, chain.dump());
+  CHECK_FALSE(twin::load_chain(bare, twin.chain).parameters.has_value());
+  chain::Chain other = twin.chain;  // its axes do not pass through a rope that goes another way
+  other.direction = -other.direction;
+  CHECK(contains(error_of([&] { twin::load_chain(bare, other); }), "does not pass through its joint"));
+}
+
 TEST_CASE("tabletop twins keep their table, thin links and paper's integrator") {
   const test::TemporaryFolder folder("table");
   twin::Twin twin = full_twin();

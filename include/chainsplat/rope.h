@@ -91,6 +91,14 @@ class LiveBase {
 // Where a plan for this rope starts: at rest where its recording began, without targets. Of a rope without dynamics the
 // usual are assumed, and a warning says so.
 planning::Problem planning_problem(const Rope& rope);
+// Lets the problem start as one camera of a capture shows the rope in its first frame, with the base where it is then,
+// at rest, since one image shows no speed. Returns by which camera, and how well that explains it: the overlap of mask
+// and rope, and the outline's RMS distance, px. Throws InputError where the camera does not surely show the rope.
+struct FirstSight {
+  std::string camera;
+  double iou = 0.0, residual = 0.0;
+};
+FirstSight start_as_seen(const Rope& rope, const Path& capture, const std::string& camera, planning::Problem& problem);
 
 // What to record next (excitation.h): a motion from rest where this rope's recording began, compared with one more
 // recording of the old motion. Throws InputError before identification.

@@ -91,6 +91,10 @@ struct Twin {
 void save(const Twin& twin, const Path& run);
 // Throws InputError that names file and key.
 Twin load(const Path& run);
+// The rope that a file describes, without the rest of a twin: a twin.json or its "chain" object alone, whose rope is
+// held as `held` is (direction and bending axis). No parameters where it has none. Throws InputError that names file
+// and key.
+Twin load_chain(const Path& file, const chain::Chain& held);
 
 // Columns 'time,theta_1,...,theta_n,thetadot_1,...,thetadot_n', without the rates if `thetadot` is empty.
 std::string states_csv(const chain::States& states);

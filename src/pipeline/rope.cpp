@@ -4,6 +4,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "chainsplat/corrections.h"
+#include "chainsplat/estimation.h"
 #include "chainsplat/identification.h"
 #include "chainsplat/motion_files.h"
 #include "chainsplat/run_folder.h"
@@ -223,6 +225,30 @@ planning::Problem planning_problem(const Rope& rope) {
   problem.estimates = rope.twin.estimates;
   problem.initial = at_rest(rope, problem.model, problem.base, 0.0);
   return problem;
+}
+
+FirstSight start_as_seen(const Rope& rope, const Path& capture, const std::string& camera, planning::Problem& problem) {
+  capture::LoadOptions load;
+  load.camera = camera;
+  load.last = 1;
+  capture::Capture seen = capture::load(capture, load);
+  capture::apply(rope.twin.corrections, seen);
+  const std::string source = "'" + capture.string() + (camera.empty() ? "'" : ":" + camera + "'");
+  if (seen.cameras.size() != 1)
+    throw InputError("`state_from`", source + " names no single camera", "give CAPTURE:NAME, for example CAPTURE:cam0");
+  if (seen.views.empty() || seen.views[0].width == 0)
+    throw InputError("`state_from`", "the first frame of " + source + " does not show the rope", "name another camera");
+  const capture::View& view = seen.views[0];
+  problem.base = seen.base.pose(view.time);
+  estimation::Filter filter = estimation::start(
+      rope.twin, seen.cameras, [&](double) { return dynamics::at_rest(problem.base); }, view.time);
+  const capture::View* const views[] = {&view};
+  const estimation::Estimate found = estimation::update(filter, views);
+  if (!found.seen || found.lost || found.doubtful)
+    throw InputError("`state_from`", "the rope was not surely recognized in the first frame of " + source,
+                     "name another camera, or give the state with `initial`");
+  problem.initial.theta = found.theta;
+  return {seen.cameras[0].name, found.iou, found.residual};
 }
 
 excitation::Problem excitation_problem(const Rope& rope) {

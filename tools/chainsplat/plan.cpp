@@ -1,17 +1,9 @@
 // plan.cpp - a base motion that makes the rope hit a target.
-#include <unistd.h>
-
 #include <CLI/CLI.hpp>
-#include <algorithm>
-#include <cmath>
 #include <cstdlib>
 #include <iostream>
 #include <memory>
-#include <nlohmann/json.hpp>
 
-#include "chainsplat/capture.h"
-#include "chainsplat/estimation.h"
-#include "chainsplat/json.h"
 #include "chainsplat/motion_files.h"
 #include "chainsplat/planning.h"
 #include "chainsplat/rope.h"
@@ -23,8 +15,6 @@ namespace chainsplat::tools {
 
 namespace {
 
-using Json = nlohmann::ordered_json;
-
 struct PlanRequest {
   std::string run, out, axes, initial, state_from, terminal, hit, horizon = "3", window = "smooth";
   std::vector<std::string> targets, spheres, boxes;
@@ -35,87 +25,15 @@ struct PlanRequest {
   planning::Options options;
 };
 
-// The rope as one camera sees it in its first frame, and the base where it is then; taken to be at rest, since one
-// image shows no speed.
-void start_from_image(const std::string& source, const twin::Twin& twin, planning::Problem& problem) {
-  const auto [folder, name] = split_camera(source);
-  capture::LoadOptions load;
-  load.camera = name;
-  load.last = 1;
-  capture::Capture seen = capture::load(folder, load);
-  capture::apply(twin.corrections, seen);
-  if (seen.cameras.size() != 1)
-    throw InputError("--state-from", "'" + source + "' names no single camera",
-                     "give CAPTURE:NAME, for example CAPTURE:cam0");
-  if (seen.views.empty() || seen.views[0].width == 0)
-    throw InputError("--state-from", "the first frame of '" + source + "' does not show the rope",
-                     "name another camera");
-  const capture::View& view = seen.views[0];
-  problem.base = seen.base.pose(view.time);
-  estimation::Filter filter = estimation::start(
-      twin, seen.cameras, [&](double) { return dynamics::at_rest(problem.base); }, view.time);
-  const capture::View* const views[] = {&view};
-  const estimation::Estimate found = estimation::update(filter, views);
-  if (!found.seen || found.lost || found.doubtful) {
-    std::string what = "the rope was not surely recognized in the first frame of '";
-    what += source + "'";
-    throw InputError("--state-from", what, "name another camera, or give the state with --initial");
-  }
-  problem.initial.theta = found.theta;
-  char text[160];
-  std::snprintf(text, sizeof text, "the rope starts as %s sees it: overlap %.3f, outline within %.2f px",
-                seen.cameras[0].name.c_str(), found.iou, found.residual);
-  say(text);
+// The true rope, held as the twin's is.
+dynamics::Model read_truth(const std::string& file, const twin::Twin& twin) {
+  const twin::Twin truth = twin::load_chain(input_path(file), twin.chain);
+  if (!truth.parameters) throw InputError(file, "has no masses, stiffness and damping", "give an identified chain");
+  return dynamics::make_model(truth.chain, *truth.parameters);
 }
 
-planning::Problem make_problem(const PlanRequest& request, const pipeline::Rope& rope) {
-  planning::Problem problem = pipeline::planning_problem(rope);
-  if (!request.initial.empty()) {
-    const chain::States given = twin::read_states(input_path(request.initial), rope.twin.chain.angles());
-    if (given.time.empty()) throw InputError(request.initial, "has no rows", "give at least one");
-    problem.initial.theta = given.theta[0];
-    if (!given.thetadot.empty()) problem.initial.thetadot = given.thetadot[0];
-  } else if (!request.state_from.empty()) {
-    start_from_image(request.state_from, rope.twin, problem);
-  }
-  return problem;
-}
-
-// CHAIN.json is the chain object of a twin.json (formats.md 2.10), held as `twin`'s rope is: read as a twin of its own.
-dynamics::Model read_truth(const std::string& file, const Path& run) {
-  Json chain;
-  try {
-    chain = core::parse_json(core::read_file(input_path(file)));
-  } catch (const Json::exception&) {
-    throw InputError(file, "is not JSON", "give the 'chain' object of a twin.json");
-  }
-  if (chain.is_object() && chain.contains("chain")) chain = chain["chain"];  // a whole twin.json does too
-  Json document = core::parse_json(core::read_file(run / "twin.json"));
-  document["chain"] = std::move(chain);
-  for (const char* key : {"gaussians", "states", "rollout"}) document.erase(key);
-  const Path folder = std::filesystem::temp_directory_path() / ("chainsplat_simulate_" + std::to_string(::getpid()));
-  core::make_folder(folder);
-  struct Remove {
-    Path path;
-    ~Remove() {
-      std::error_code error;
-      std::filesystem::remove_all(path, error);
-    }
-  } remove{folder};
-  core::write_file(folder / "twin.json", document.dump());
-  try {
-    const twin::Twin truth = twin::load(folder);
-    if (!truth.parameters) throw InputError(file, "has no masses, stiffness and damping", "give an identified chain");
-    return dynamics::make_model(truth.chain, *truth.parameters);
-  } catch (const InputError& error) {
-    // name the file that the user knows, not the copy
-    const std::string copy = (folder / "twin.json").string();
-    if (!error.where.starts_with(copy)) throw;
-    throw InputError(file + error.where.substr(copy.size()), error.problem, error.mend);
-  }
-}
-
-void plan(const Globals& globals, PlanRequest& request) {
+// Fields of the options that are texts on the command line.
+void read_options(const Globals& globals, PlanRequest& request) {
   planning::Options& options = request.options;
   options.seed = globals.seed;
   if (!request.axes.empty()) options.axes = planning::parse_axes(request.axes);
@@ -124,25 +42,8 @@ void plan(const Globals& globals, PlanRequest& request) {
   if (request.hit == "last-link") options.part = planning::Part::last_link;
   if (request.hit == "rope") options.part = planning::Part::rope;
   constexpr double kLongestFree = 4.0;  // s, of a free horizon
-  if (request.horizon == "free") {
-    options.free_horizon = true;
-    options.horizon = kLongestFree;
-  } else {
-    options.horizon = numbers(request.horizon, "--horizon", 1)[0];
-  }
-  constexpr double kLongest = 120.0, kMostReplans = 1000.0;  // s; a second
-  if (options.horizon > kLongest)
-    throw InputError("--horizon",
-                     core::exact(options.horizon) + " s are more than " + core::exact(kLongest) +
-                         " s, and the motion is computed in steps of milliseconds, many times",
-                     "give seconds, for example 3");
-  if (request.loop.rate > kMostReplans)
-    throw InputError("--mpc-rate",
-                     core::exact(request.loop.rate) + " replans a second are more than " + core::exact(kMostReplans) +
-                         ", and each is an optimization",
-                     "give for example 10");
-  planning::check_rate(request.rate, options.horizon * static_cast<double>(request.targets.size()),
-                       "give rows a second, for example 100");
+  options.free_horizon = request.horizon == "free";
+  options.horizon = options.free_horizon ? kLongestFree : numbers(request.horizon, "--horizon", 1)[0];
   if (!request.terminal.empty()) {
     const std::vector<double> values = numbers(request.terminal, "--terminal", 0);
     options.terminal = Eigen::Map<const math::VectorX>(values.data(), static_cast<Eigen::Index>(values.size()));
@@ -155,77 +56,108 @@ void plan(const Globals& globals, PlanRequest& request) {
     const auto v = numbers(text, "--keep-out-box", 6);
     options.boxes.push_back({{v[0], v[1], v[2]}, {v[3], v[4], v[5]}});
   }
-  const std::string mend = "name another folder or give --force to write into it";
-  pipeline::check_output_folder(request.out, request.force, mend);
-  const pipeline::Rope rope = pipeline::load_rope(request.run);
-  planning::Problem problem = make_problem(request, rope);
-  for (const std::string& text : request.targets) {
-    const std::string random = "random:";
-    if (text.rfind(random, 0) == 0) {
-      char* end = nullptr;
-      const std::uint64_t seed = std::strtoull(text.c_str() + random.size(), &end, 10);
-      if (*end != '\0' || end == text.c_str() + random.size())
-        throw InputError("--target", "'" + text + "' has no seed", "give for example random:1");
-      problem.targets.push_back(planning::random_target(problem, options, seed));
-    } else {
-      const auto v = numbers(text, "--target", 3);
-      problem.targets.push_back({v[0], v[1], v[2]});
-    }
+  if (!request.target_velocity.empty()) {
+    const auto v = numbers(request.target_velocity, "--target-velocity", 3);
+    request.loop.target_velocity = {v[0], v[1], v[2]};
   }
+}
+
+// Requests that would take hours or no memory holds, and what does not go together.
+void check(const PlanRequest& request) {
+  constexpr double kLongest = 120.0, kMostReplans = 1000.0;  // s; a second
+  const planning::Options& options = request.options;
+  if (options.horizon > kLongest)
+    throw InputError("--horizon",
+                     core::exact(options.horizon) + " s are more than " + core::exact(kLongest) +
+                         " s, and the motion is computed in steps of milliseconds, many times",
+                     "give seconds, for example 3");
+  if (request.loop.rate > kMostReplans)
+    throw InputError("--mpc-rate",
+                     core::exact(request.loop.rate) + " replans a second are more than " + core::exact(kMostReplans) +
+                         ", and each is an optimization",
+                     "give for example 10");
+  planning::check_rate(request.rate, options.horizon * static_cast<double>(request.targets.size()),
+                       "give rows a second, for example 100");
+  if (request.simulate.empty() && (request.mpc || !request.target_velocity.empty()))
+    throw InputError("--mpc", "feedback needs a rope to see", "give --simulate CHAIN.json as the true one");
+  pipeline::check_output_folder(request.out, request.force, "name another folder or give --force to write into it");
+}
+
+math::Vector3 read_target(const std::string& text, const planning::Problem& problem, const planning::Options& options) {
+  const std::string random = "random:";
+  if (!text.starts_with(random)) {
+    const auto v = numbers(text, "--target", 3);
+    return {v[0], v[1], v[2]};
+  }
+  char* end = nullptr;
+  const std::uint64_t seed = std::strtoull(text.c_str() + random.size(), &end, 10);
+  if (*end != '\0' || end == text.c_str() + random.size())
+    throw InputError("--target", "'" + text + "' has no seed", "give for example random:1");
+  return planning::random_target(problem, options, seed);
+}
+
+planning::Problem make_problem(const PlanRequest& request, const pipeline::Rope& rope) {
+  planning::Problem problem = pipeline::planning_problem(rope);
+  char text[160];
+  if (!request.initial.empty()) {
+    const chain::States given = twin::read_states(input_path(request.initial), rope.twin.chain.angles());
+    if (given.time.empty()) throw InputError(request.initial, "has no rows", "give at least one");
+    problem.initial.theta = given.theta[0];
+    if (!given.thetadot.empty()) problem.initial.thetadot = given.thetadot[0];
+  } else if (!request.state_from.empty()) {
+    const auto [folder, name] = split_camera(request.state_from);
+    const pipeline::FirstSight seen = pipeline::start_as_seen(rope, folder, name, problem);
+    std::snprintf(text, sizeof text, "the rope starts as %s sees it: overlap %.3f, outline within %.2f px",
+                  seen.camera.c_str(), seen.iou, seen.residual);
+    say(text);
+  }
+  for (const std::string& target : request.targets)
+    problem.targets.push_back(read_target(target, problem, request.options));
   for (const math::Vector3& target : problem.targets) {
-    const double bound = planning::unreachable_distance(problem, options, target);
-    if (!(bound > options.tolerance)) continue;
-    char text[160];
+    const double bound = planning::unreachable_distance(problem, request.options, target);
+    if (!(bound > request.options.tolerance)) continue;
     std::snprintf(
         text, sizeof text,
         "--target: at least %.1f mm beyond what rope length, stroke and axes allow; the nearest motion is planned",
         1e3 * bound);
     core::warn(text);
   }
-  if (request.simulate.empty() && (request.mpc || !request.target_velocity.empty()))
-    throw InputError("--mpc", "feedback needs a rope to see", "give --simulate CHAIN.json as the true one");
-  std::optional<dynamics::Model> truth;
-  if (!request.simulate.empty()) truth = read_truth(request.simulate, request.run);
-  if (!request.target_velocity.empty()) {
-    const auto v = numbers(request.target_velocity, "--target-velocity", 3);
-    request.loop.target_velocity = {v[0], v[1], v[2]};
-  }
-  const planning::Plan plan = planning::plan(problem, options);
-  planning::Motion played = plan.motion;
-  std::vector<planning::Simulated> simulated;
+  return problem;
+}
+
+// The plan played on the true rope, without feedback and, where it is asked for, with it.
+std::vector<planning::Simulated> simulate(PlanRequest& request, const planning::Problem& problem,
+                                          const planning::Plan& plan, const dynamics::Model& truth) {
+  std::vector<planning::Simulated> out;
   const auto play = [&](const char* name, bool feedback) {
     request.loop.feedback = feedback;
-    simulated.push_back({name, planning::closed_loop(problem, options, plan, *truth, request.loop)});
+    out.push_back({name, planning::closed_loop(problem, request.options, plan, truth, request.loop)});
   };
-  if (truth) play("without_feedback", false);
-  if (truth && request.mpc) {
-    play("with_feedback", true);
-    played = simulated.back().loop.motion;
-  }
+  play("without_feedback", false);
+  if (request.mpc) play("with_feedback", true);
+  return out;
+}
+
+// Returns the document of plan.json.
+std::string write_files(const PlanRequest& request, const twin::Twin& twin, const planning::Problem& problem,
+                        const planning::Plan& plan, const std::vector<planning::Simulated>& simulated) {
+  const planning::Motion& played = request.mpc ? simulated.back().loop.motion : plan.motion;
   const Path out = request.out;
   core::make_folder(out);
   const std::vector<double> times = planning::row_times(plan.motion.end(), request.rate);
+  const chain::States predicted = planning::predict(problem, played, times);
   core::write_file(out / "base.tum", planning::motion_tum(played, times));
   core::write_file(out / "base.csv", planning::motion_csv(played, times));
-  const chain::States predicted = planning::predict(problem, played, times);
   core::write_file(out / "states.csv", twin::states_csv(predicted));
-  twin::warn_beyond(rope.twin.validity,
-                    twin::validity_of(problem.model.chain,
-                                      trajectory::fit(trajectory::read_tum(out / "base.tum"), request.out), predicted),
-                    request.out);
-  core::write_file(out / "picture.svg", planning::picture_svg(problem, options, plan));
-  const std::string document = planning::plan_json(problem, options, plan, request.horizon, simulated);
+  const trajectory::Trajectory written = trajectory::fit(trajectory::read_tum(out / "base.tum"), request.out);
+  twin::warn_beyond(twin.validity, twin::validity_of(problem.model.chain, written, predicted), request.out);
+  core::write_file(out / "picture.svg", planning::picture_svg(problem, request.options, plan));
+  std::string document = planning::plan_json(problem, request.options, plan, request.horizon, simulated);
   core::write_file(out / "plan.json", document);
-  const auto end = [&] {
-    if (plan.reached) return;
-    std::cout.flush();
-    throw WorkError("--target", "cannot be reached: " + plan.reason,
-                    "give other axes, limits or a longer horizon; the nearest motion is in " + request.out);
-  };
-  if (globals.json) {
-    std::cout << document;
-    return end();
-  }
+  return document;
+}
+
+void print(const PlanRequest& request, const planning::Plan& plan, const std::vector<planning::Simulated>& simulated) {
   char text[256];
   const planning::Hit& worst = planning::worst_hit(plan);
   std::snprintf(
@@ -238,12 +170,31 @@ void plan(const Globals& globals, PlanRequest& request) {
   for (const auto& [name, loop] : simulated) {
     std::snprintf(text, sizeof text, "%s: miss %.2f mm", name.c_str(), 1e3 * loop.hit.miss);
     say(text);
-    if (!(loop.out_of_reach > options.tolerance)) continue;
+    if (!(loop.out_of_reach > request.options.tolerance)) continue;
     std::snprintf(text, sizeof text, "%s: the target moves at least %.1f mm out of reach", name.c_str(),
                   1e3 * loop.out_of_reach);
     say(text);
   }
-  end();
+}
+
+void plan(const Globals& globals, PlanRequest& request) {
+  read_options(globals, request);
+  check(request);
+  const pipeline::Rope rope = pipeline::load_rope(request.run);
+  const planning::Problem problem = make_problem(request, rope);
+  std::optional<dynamics::Model> truth;
+  if (!request.simulate.empty()) truth = read_truth(request.simulate, rope.twin);
+  const planning::Plan plan = planning::plan(problem, request.options);
+  std::vector<planning::Simulated> simulated;
+  if (truth) simulated = simulate(request, problem, plan, *truth);
+  const std::string document = write_files(request, rope.twin, problem, plan, simulated);
+  if (globals.json)
+    std::cout << document << std::flush;
+  else
+    print(request, plan, simulated);
+  if (!plan.reached)
+    throw WorkError("--target", "cannot be reached: " + plan.reason,
+                    "give other axes, limits or a longer horizon; the nearest motion is in " + request.out);
 }
 
 }  // namespace
