@@ -164,130 +164,171 @@ void check_base(const Manifest& manifest, CheckReport& report) {
   }
 }
 
-// Checks the reprojection of the grasp, exposure, image borders, clock and depth of one camera. `views` are all its
-// views, undistorted.
-void check_camera(const Manifest& manifest, const CameraSource& source, const View* views, int count,
-                  CheckReport& report) {
-  // statistics over the frames; `shifted` holds the grasp's distance from the mask per delay of the base
+// What the frames of one camera show.
+struct CameraStatistics {
+  int frames = 0, visible = 0, border = 0;  // numbers of frames: all, with a mask, with a mask at the image's border
+  int behind = 0;                           // with the grasp behind the camera
+  double pixels = 0.0, saturated = 0.0;     // of the masks of all frames
+  std::vector<double> brightness;           // by visible frame, 0..255
+  std::vector<double> distance;             // px, of the projected grasp from the mask
+  std::vector<double> wrong_side;           // share of the mask behind the grasp
+  std::vector<double> grasp_depth, object_depth;  // m
+  std::vector<std::vector<double>> shifted;       // px, the grasp's distance from the mask per delay of the base
+};
+
+CameraStatistics statistics_of(const Manifest& manifest, const CameraSource& source, const View* views, int count) {
   const Camera& camera = source.camera;
   const trajectory::Trajectory& base = manifest.capture.base;
   const Pose camera_from_world = camera.world_from_camera.inverse();
-  const std::string name = camera.name;
-  int visible = 0, border = 0, behind = 0;
-  double pixels = 0.0, saturated = 0.0;
-  std::vector<double> brightness, distance, wrong_side, grasp_depth, object_depth;
-  std::vector<std::vector<double>> shifted(2 * kMostLag + 1);
+  CameraStatistics out;
+  out.frames = count;
+  out.shifted.resize(2 * kMostLag + 1);
   for (int k = 0; k < count; ++k) {
     const View& view = views[k];
     const ViewFacts facts = facts_of(view, camera);
     if (facts.pixels == 0) continue;
-    ++visible;
-    pixels += facts.pixels;
-    saturated += facts.saturated;
-    border += facts.at_border;
-    brightness.push_back(facts.brightness);
-    if (std::isfinite(facts.depth)) object_depth.push_back(facts.depth);
+    ++out.visible;
+    out.pixels += facts.pixels;
+    out.saturated += facts.saturated;
+    out.border += facts.at_border;
+    out.brightness.push_back(facts.brightness);
+    if (std::isfinite(facts.depth)) out.object_depth.push_back(facts.depth);
     const Pose pose = base.pose(view.time);
     const Vector3 grasp = camera_from_world * pose.translation;
     if (grasp.z() <= 0) {
-      ++behind;
+      ++out.behind;
       continue;
     }
-    grasp_depth.push_back(grasp.z());
-    distance.push_back(mask_distance(view, project(camera, grasp)));
+    out.grasp_depth.push_back(grasp.z());
+    out.distance.push_back(mask_distance(view, project(camera, grasp)));
     const double side =
         share_behind(view, camera, grasp, camera_from_world.rotation * pose.rotation * manifest.capture.direction,
                      manifest.capture.length);
-    if (std::isfinite(side)) wrong_side.push_back(side);
+    if (std::isfinite(side)) out.wrong_side.push_back(side);
     if (k % std::max(1, count / kLagFrames) != 0) continue;
     for (int lag = -kMostLag; lag <= kMostLag; ++lag) {
       const Vector3 moved = camera_from_world * base.pose(view.time + lag * source.interval).translation;
-      shifted[lag + kMostLag].push_back(moved.z() > 0 ? mask_distance(view, project(camera, moved)) : kFarPixels);
+      out.shifted[lag + kMostLag].push_back(moved.z() > 0 ? mask_distance(view, project(camera, moved)) : kFarPixels);
     }
   }
-  // the facts
-  const double z = median(grasp_depth), miss = median(distance), bright = median(brightness);
-  const double across = manifest.capture.diameter * camera.fx / z;
+  return out;
+}
+
+std::string facts_line(const Manifest& manifest, const CameraSource& source, const CameraStatistics& s) {
+  const Camera& camera = source.camera;
+  const double z = median(s.grasp_depth);
   std::string line =
       text("%s: %dx%d, %d frames, %.3f to %.3f s, %s; sees the object in %d, %.0f px in the mean (%.2f %%)",
-           name.c_str(), camera.width, camera.height, count, source.times.front(), source.times.back(),
-           camera.distorted() ? "lens distortion is taken out" : "no lens distortion", visible,
-           visible ? pixels / visible : 0.0, visible ? 100.0 * pixels / visible / camera.width / camera.height : 0.0);
-  if (visible > 0) line += text("; brightness %.0f of 255", bright);
+           camera.name.c_str(), camera.width, camera.height, s.frames, source.times.front(), source.times.back(),
+           camera.distorted() ? "lens distortion is taken out" : "no lens distortion", s.visible,
+           s.visible ? s.pixels / s.visible : 0.0,
+           s.visible ? 100.0 * s.pixels / s.visible / camera.width / camera.height : 0.0);
+  if (s.visible > 0) line += text("; brightness %.0f of 255", median(s.brightness));
   if (std::isfinite(z))
-    line +=
-        text("; grasp %.2f m away, the rope about %.1f px across, the grasp %.1f px from the mask", z, across, miss);
-  report.facts.push_back(line);
+    line += text("; grasp %.2f m away, the rope about %.1f px across, the grasp %.1f px from the mask", z,
+                 manifest.capture.diameter * camera.fx / z, median(s.distance));
+  return line;
+}
 
-  // rate, masks and exposure
-  if (source.video_rate > 0 && source.interval > 0 &&
-      std::abs(source.video_rate * source.interval - 1.0) > kRateTolerance)
-    report.doubts.push_back(text("%s: the video says %.4g frames a second, the capture %.4g", name.c_str(),
-                                 source.video_rate, 1.0 / source.interval));
-  if (visible == 0) return;  // load_views() has reported a problem already
-  if (visible < count)
-    report.doubts.push_back(text("%s: the mask is empty in %d of %d frames", name.c_str(), count - visible, count));
-  if (border > 0)
+// Masks that are missing or cut off, and exposure.
+void check_pictures(const Manifest& manifest, const CameraSource& source, const CameraStatistics& s,
+                    CheckReport& report) {
+  const std::string& name = source.camera.name;
+  const double bright = median(s.brightness);
+  if (s.visible < s.frames)
+    report.doubts.push_back(
+        text("%s: the mask is empty in %d of %d frames", name.c_str(), s.frames - s.visible, s.frames));
+  if (s.border > 0)
     report.doubts.push_back(
         text("%s: the mask touches the image's border in %d of %d frames: part of the rope may be out of sight",
-             name.c_str(), border, count));
-  if (saturated > kMostSaturated * pixels)
+             name.c_str(), s.border, s.frames));
+  if (s.saturated > kMostSaturated * s.pixels)
     report.doubts.push_back(
-        text("%s: %.0f %% of the object's pixels are overexposed", name.c_str(), 100.0 * saturated / pixels));
+        text("%s: %.0f %% of the object's pixels are overexposed", name.c_str(), 100.0 * s.saturated / s.pixels));
   if (bright < kDark)
     report.doubts.push_back(text("%s: the object is very dark (%.0f of 255 in the mean)", name.c_str(), bright));
-  const auto [darkest, brightest] = std::minmax_element(brightness.begin(), brightness.end());
-  std::vector<double> jumps;
-  for (std::size_t k = 1; k < brightness.size(); ++k) jumps.push_back(std::abs(brightness[k] - brightness[k - 1]));
-  if (!jumps.empty() && bright > 0 && *std::max_element(jumps.begin(), jumps.end()) > kFlicker * bright)
+  const auto [darkest, brightest] = std::minmax_element(s.brightness.begin(), s.brightness.end());
+  double jump = 0.0;
+  for (std::size_t k = 1; k < s.brightness.size(); ++k)
+    jump = std::max(jump, std::abs(s.brightness[k] - s.brightness[k - 1]));
+  if (bright > 0 && jump > kFlicker * bright)
     report.doubts.push_back(
         text("%s: the object's brightness jumps between frames (%.0f to %.0f of 255): is the exposure fixed?",
              name.c_str(), *darkest, *brightest));
+  const double across = manifest.capture.diameter * source.camera.fx / median(s.grasp_depth);
   if (std::isfinite(across) && across < kThinRope)
     report.doubts.push_back(text("%s: the rope is only %.1f px across", name.c_str(), across));
-  // where the grasp projects to
+}
+
+// Whether the grasp projects to where the masks begin.
+void check_grasp(const CameraSource& source, const CameraStatistics& s, CheckReport& report) {
+  const std::string& name = source.camera.name;
+  const double miss = median(s.distance), side = median(s.wrong_side);
+  const double allowed = kGripperReach * source.camera.fx / median(s.grasp_depth) + kPoseSlack;
   const std::size_t before = report.doubts.size();
-  if (behind > 0)
+  if (s.behind > 0)
     report.doubts.push_back(
         text("%s: the grasp is behind the camera in %d frames: does world_from_camera use OpenCV's axes (z forward)?",
-             name.c_str(), behind));
-  const double allowed = kGripperReach * camera.fx / z + kPoseSlack;
+             name.c_str(), s.behind));
   if (miss > allowed)
     report.doubts.push_back(
         text("%s: the grasp projects %.0f px from the mask (at most %.0f expected): check the camera's pose, the base "
              "trajectory and their times",
              name.c_str(), miss, allowed));
-  else if (median(wrong_side) > kBehind)
+  else if (side > kBehind)
     report.doubts.push_back(text(
         "%s: %.0f %% of the mask lies behind the grasp, against grasp.direction: check the camera's pose, the base "
         "trajectory and the direction",
-        name.c_str(), 100.0 * median(wrong_side)));
+        name.c_str(), 100.0 * side));
   report.poses_doubted = report.poses_doubted || report.doubts.size() > before;
-  // a wrong clock shows as a distance that shrinks when the base is moved in time; the RMS over all frames is compared,
-  // because frames at rest carry no information and would decide a median
-  const auto rms = [](const std::vector<double>& values) {
+}
+
+// A wrong clock shows as a distance that shrinks when the base is moved in time. The RMS over all frames is compared,
+// because frames at rest carry no information and would decide a median.
+void check_clock(const CameraSource& source, const CameraStatistics& s, CheckReport& report) {
+  const auto rms = [&](int lag) {
+    const std::vector<double>& values = s.shifted[lag + kMostLag];
     double sum = 0.0;
     for (const double v : values) sum += v * v;
     return values.empty() ? 0.0 : std::sqrt(sum / static_cast<double>(values.size()));
   };
   int best = 0;
   for (int lag = -kMostLag; lag <= kMostLag; ++lag)
-    if (!shifted[lag + kMostLag].empty() && rms(shifted[lag + kMostLag]) < rms(shifted[best + kMostLag])) best = lag;
-  const double now = rms(shifted[kMostLag]), then = rms(shifted[best + kMostLag]);
+    if (!s.shifted[lag + kMostLag].empty() && rms(lag) < rms(best)) best = lag;
+  const double now = rms(0), then = rms(best);
   if (best != 0 && then < kLagGain * now && now - then > kLagPixels)
     report.doubts.push_back(text(
         "%s: the images fit the base better %d frames %s (%.1f px instead of %.1f): are start and the base's times "
         "on one clock?",
-        name.c_str(), std::abs(best), best > 0 ? "later" : "earlier", then, now));
-  // depth against the distance of the grasp
-  if (source.depth) {
-    const double depth = median(object_depth);
-    if (!std::isfinite(depth))
-      report.doubts.push_back(name + ": no depth inside the masks");
-    else if (std::isfinite(z) && std::abs(depth - z) > manifest.capture.length + kGripperReach)
-      report.doubts.push_back(
-          text("%s: the depth images say %.2f m, the grasp is %.2f m away: check depth_scale", name.c_str(), depth, z));
-  }
+        source.camera.name.c_str(), std::abs(best), best > 0 ? "later" : "earlier", then, now));
+}
+
+// Depth against the distance of the grasp.
+void check_depth(const Manifest& manifest, const CameraSource& source, const CameraStatistics& s, CheckReport& report) {
+  if (!source.depth) return;
+  const std::string& name = source.camera.name;
+  const double depth = median(s.object_depth), z = median(s.grasp_depth);
+  if (!std::isfinite(depth))
+    report.doubts.push_back(name + ": no depth inside the masks");
+  else if (std::isfinite(z) && std::abs(depth - z) > manifest.capture.length + kGripperReach)
+    report.doubts.push_back(
+        text("%s: the depth images say %.2f m, the grasp is %.2f m away: check depth_scale", name.c_str(), depth, z));
+}
+
+// `views` are all of the camera's, undistorted.
+void check_camera(const Manifest& manifest, const CameraSource& source, const View* views, int count,
+                  CheckReport& report) {
+  const CameraStatistics statistics = statistics_of(manifest, source, views, count);
+  report.facts.push_back(facts_line(manifest, source, statistics));
+  if (source.video_rate > 0 && source.interval > 0 &&
+      std::abs(source.video_rate * source.interval - 1.0) > kRateTolerance)
+    report.doubts.push_back(text("%s: the video says %.4g frames a second, the capture %.4g",
+                                 source.camera.name.c_str(), source.video_rate, 1.0 / source.interval));
+  if (statistics.visible == 0) return;  // load_views() has reported a problem already
+  check_pictures(manifest, source, statistics, report);
+  check_grasp(source, statistics, report);
+  check_clock(source, statistics, report);
+  check_depth(manifest, source, statistics, report);
 }
 
 void check_truth(const Manifest& manifest, CheckReport& report) {

@@ -252,20 +252,16 @@ bool lossless(const ImageSource& images) {
          images.suffix.ends_with(".tif") || images.suffix.ends_with(".tiff");
 }
 
-}  // namespace
+// Frames [first, last) of a camera; their views begin at `offset`.
+struct Range {
+  int first = 0, last = 0;
+  std::size_t offset = 0;
+  bool undistorting = false;
+};
 
-void load_views(const Manifest& manifest, const LoadOptions& options, Findings& findings, std::vector<View>& views) {
-  // list the frames of every camera and make their views
-  struct Range {
-    int first = 0, last = 0;
-    std::size_t offset = 0;
-    bool undistorting = false;
-  };
+// The frames of all cameras that are asked for, with their views, which are whole and white where masks do not count.
+std::vector<Range> make_views(const Manifest& manifest, const LoadOptions& options, std::vector<View>& views) {
   std::vector<Range> ranges;
-  struct Frame {
-    int camera, frame;
-  };
-  std::vector<Frame> frames;
   views.clear();
   for (int c = 0; c < static_cast<int>(manifest.cameras.size()); ++c) {
     const CameraSource& source = manifest.cameras[c];
@@ -276,7 +272,6 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
     range.undistorting = options.undistort && source.camera.distorted();
     ranges.push_back(range);
     for (int k = range.first; k < range.last; ++k) {
-      frames.push_back({c, k});
       View view;
       view.camera = c;
       view.frame = k;
@@ -288,21 +283,71 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
       }
       views.push_back(std::move(view));
     }
-    if (options.masked && !source.masks)
-      findings.doubts.push_back(source.where +
-                                ".masks: is missing; the images are taken as masked already (black background)");
   }
-  const auto total = static_cast<std::int64_t>(frames.size());
-  const auto view_of = [&](const Frame& f) -> View& {
-    return views[ranges[f.camera].offset + f.frame - ranges[f.camera].first];
-  };
+  return ranges;
+}
+
+// Color, and the mask of images that are masked already, and depth of one view, as far as they are image files.
+void load_frame_files(const CameraSource& source, const LoadOptions& options, bool undistorting, View& view) {
+  if (!source.images.video) {
+    const Pixels rgb = read_rgb(source.images.frame_file(view.frame), source.camera.width, source.camera.height);
+    if (options.masked && !source.masks)
+      cut_mask(view, source.camera, bright(rgb, lossless(source.images) ? kBlackLossless : kBlackLossy), undistorting,
+               options.margin);
+    fill_color(view, source.camera, rgb, undistorting);
+  }
+  if (options.depth && source.depth)
+    fill_depth(
+        view, source.camera,
+        read_depth(source.depth->frame_file(view.frame), source.camera.width, source.camera.height, source.depth_scale),
+        undistorting);
+}
+
+// Masks must neither be full nor all empty.
+void check_masks(const Manifest& manifest, const CameraSource& source, const Range& range,
+                 const std::vector<View>& views, Findings& findings) {
+  if (range.first == range.last) return;
+  int visible = 0;
+  double covered = 0.0;
+  for (int k = range.first; k < range.last; ++k) {
+    const View& view = views[range.offset + k - range.first];
+    visible += view.width > 0;
+    for (std::size_t i = 3; i < view.rgba.size(); i += 4) covered += view.rgba[i] != 0;
+  }
+  covered /= static_cast<double>(range.last - range.first) * source.camera.width * source.camera.height;
+  if (covered > kMostCovered)
+    findings.problems.push_back({source.where + ".masks",
+                                 source.masks ? "the masks cover more than half of the image"
+                                              : "is missing and the background of the images is not black",
+                                 source.masks ? std::string("the object must be 255 and the rest 0")
+                                              : "make them: chainsplat mask " + manifest.capture.folder.string()});
+  if (visible == 0) {
+    const std::string what = source.camera.name + " never sees the object: every mask is empty";
+    if (range.first == 0 && range.last == source.images.frames)
+      findings.problems.push_back({source.where + ".masks", what, "mend the masks or remove the camera"});
+    else
+      findings.doubts.push_back(source.where + ".masks: " + what + " in the frames asked for");
+  }
+}
+
+}  // namespace
+
+void load_views(const Manifest& manifest, const LoadOptions& options, Findings& findings, std::vector<View>& views) {
+  const std::vector<Range> ranges = make_views(manifest, options, views);
+  const auto total = static_cast<std::int64_t>(views.size());
+  if (options.masked)
+    for (const CameraSource& source : manifest.cameras)
+      if (!source.masks)
+        findings.doubts.push_back(source.where +
+                                  ".masks: is missing; the images are taken as masked already (black background)");
 
   // masks from image files come first, because they decide which part of an image is kept
   for_each_in_parallel(total, [&](std::int64_t i) {
-    const CameraSource& source = manifest.cameras[frames[i].camera];
+    View& view = views[i];
+    const CameraSource& source = manifest.cameras[view.camera];
     if (!options.masked || !source.masks || source.masks->video) return;
-    const Pixels mask = read_mask(source.masks->frame_file(frames[i].frame), source.camera.width, source.camera.height);
-    cut_mask(view_of(frames[i]), source.camera, mask, ranges[frames[i].camera].undistorting, options.margin);
+    const Pixels mask = read_mask(source.masks->frame_file(view.frame), source.camera.width, source.camera.height);
+    cut_mask(view, source.camera, mask, ranges[view.camera].undistorting, options.margin);
   });
   // videos, with one task per camera; where the cameras do not fill the threads evenly, the decoders use more threads
   // (their output does not depend on the number)
@@ -319,53 +364,12 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
     else if (options.masked && source.masks && source.masks->video)
       load_mask_video(source, options, range.first, range.last, range.undistorting, decoder_threads, mine);
   });
-  // images and depth from image files
   for_each_in_parallel(total, [&](std::int64_t i) {
-    const CameraSource& source = manifest.cameras[frames[i].camera];
-    const bool undistorting = ranges[frames[i].camera].undistorting;
-    View& view = view_of(frames[i]);
-    if (!source.images.video) {
-      const Pixels rgb = read_rgb(source.images.frame_file(frames[i].frame), source.camera.width, source.camera.height);
-      if (options.masked && !source.masks)
-        cut_mask(view, source.camera, bright(rgb, lossless(source.images) ? kBlackLossless : kBlackLossy), undistorting,
-                 options.margin);
-      fill_color(view, source.camera, rgb, undistorting);
-    }
-    if (options.depth && source.depth)
-      fill_depth(view, source.camera,
-                 read_depth(source.depth->frame_file(frames[i].frame), source.camera.width, source.camera.height,
-                            source.depth_scale),
-                 undistorting);
+    View& view = views[i];
+    load_frame_files(manifest.cameras[view.camera], options, ranges[view.camera].undistorting, view);
   });
-
-  // check that the masks are neither full nor all empty
-  if (!options.masked) return;
-  for (int c = 0; c < cameras; ++c) {
-    const CameraSource& source = manifest.cameras[c];
-    const Range& range = ranges[c];
-    if (range.first == range.last) continue;
-    int visible = 0;
-    double covered = 0.0;
-    for (int k = range.first; k < range.last; ++k) {
-      const View& view = views[range.offset + k - range.first];
-      visible += view.width > 0;
-      for (std::size_t i = 3; i < view.rgba.size(); i += 4) covered += view.rgba[i] != 0;
-    }
-    covered /= static_cast<double>(range.last - range.first) * source.camera.width * source.camera.height;
-    if (covered > kMostCovered)
-      findings.problems.push_back({source.where + ".masks",
-                                   source.masks ? "the masks cover more than half of the image"
-                                                : "is missing and the background of the images is not black",
-                                   source.masks ? std::string("the object must be 255 and the rest 0")
-                                                : "make them: chainsplat mask " + manifest.capture.folder.string()});
-    if (visible == 0) {
-      const std::string what = source.camera.name + " never sees the object: every mask is empty";
-      if (range.first == 0 && range.last == source.images.frames)
-        findings.problems.push_back({source.where + ".masks", what, "mend the masks or remove the camera"});
-      else
-        findings.doubts.push_back(source.where + ".masks: " + what + " in the frames asked for");
-    }
-  }
+  for (int c = 0; options.masked && c < cameras; ++c)
+    check_masks(manifest, manifest.cameras[c], ranges[c], views, findings);
 }
 
 void add_depth(const Manifest& manifest, std::vector<View>& views) {
@@ -374,10 +378,10 @@ void add_depth(const Manifest& manifest, std::vector<View>& views) {
     const CameraSource& source = manifest.cameras[view.camera];
     if (!source.depth || !view.depth.empty()) return;
     constexpr bool kUndistorting = false;
-    fill_depth(view, source.camera,
-               read_depth(source.depth->frame_file(view.frame), source.camera.width, source.camera.height,
-                          source.depth_scale),
-               kUndistorting);
+    fill_depth(
+        view, source.camera,
+        read_depth(source.depth->frame_file(view.frame), source.camera.width, source.camera.height, source.depth_scale),
+        kUndistorting);
   });
 }
 
