@@ -35,9 +35,9 @@ constexpr double kJointSize = 1.5;        // of an angle
 constexpr double kWarmChange = 0.2;       // from the frame before: 6 rad/s at 30 Hz
 constexpr double kTwist = 0.5;            // unseen by silhouettes, held
 
-// An outline point counts as one observation with this deviation: noise of 0.3 px, correlated over some ten pixels, and
-// what straight links cannot follow. Chosen so that three deviations hold on captures with truth.
-constexpr double kEdgeDeviation = 1.0;  // px
+// px^2, an outline point counts as one observation of this variance: noise of 0.3 px, correlated over some ten pixels,
+// and what straight links cannot follow. Chosen so that three deviations hold on captures with truth.
+constexpr double kFineVariance = 1.0;
 
 // cold start
 constexpr double kStartBend = 1.5;                  // rad, whole bend of the extra starts
@@ -167,13 +167,27 @@ MatrixX joint_prior(const chain::Chain& chain, const Options& options) {
   return information;
 }
 
-FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView>& views, const VectorX& start,
-                          bool warm, const Options& options) {
-  const int n = chain.angles();
+namespace {
+
+// One frame being fitted.
+struct Work {
+  const Options& options;
+  Problem problem;
+  Belief belief = {};
+  OffsetBelief offset = {};
+  VectorX unknowns = {};  // angles, masks' shifts where they are unknown, edge offset
+  FineSums total = {};    // of the last fine equations
+  FrameSolution out = {};
+
+  int angles() const { return problem.chain->angles(); }
+  int last() const { return problem.unknowns() - 1; }  // index of the edge offset
+};
+
+Problem make_problem(const chain::Chain& chain, const std::vector<FrameView>& views, const Options& options) {
   Problem problem;
   problem.chain = &chain;
-  problem.held.assign(n, 0);
-  for (int k = 0; k < n; ++k) problem.held[k] = chain::is_twist(chain, k);
+  problem.held.assign(chain.angles(), 0);
+  for (int k = 0; k < chain.angles(); ++k) problem.held[k] = chain::is_twist(chain, k);
   for (const FrameView& view : views) {
     ViewWork work;
     work.view = &view;
@@ -185,112 +199,161 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
     work.active.assign(view.mask->blobs.size(), 0);
     problem.views.push_back(std::move(work));
   }
+  problem.shifts = options.prior.mean.size() == chain.angles() + 2 * static_cast<int>(views.size());
+  return problem;
+}
 
-  const int with_shifts = n + 2 * static_cast<int>(views.size());
-  problem.shifts = options.prior.mean.size() == with_shifts;
-  const int last = problem.unknowns() - 1;  // the edge offset's
-  const bool given_prior = options.prior.mean.size() == last && options.prior.information.rows() == last;
+bool has_prior(const Work& work) {
+  return work.options.prior.mean.size() == work.last() && work.options.prior.information.rows() == work.last();
+}
+
+// The joints' own prior, and what is known of this frame: the given prior, or, where `warm`, that it is near `start`.
+Belief make_belief(const Work& work, const VectorX& start, bool warm) {
+  const int n = work.angles(), last = work.last();
   Belief belief;
   belief.joints = MatrixX::Zero(last, last);
-  belief.joints.topLeftCorner(n, n) = joint_prior(chain, options);
+  belief.joints.topLeftCorner(n, n) = joint_prior(*work.problem.chain, work.options);
   belief.all = belief.joints;
   belief.weighted_mean = VectorX::Zero(last);
-  if (given_prior) {
-    belief.all += options.prior.information;
-    belief.weighted_mean += options.prior.information * options.prior.mean;
+  if (has_prior(work)) {
+    belief.all += work.options.prior.information;
+    belief.weighted_mean += work.options.prior.information * work.options.prior.mean;
   } else if (warm) {
     const double weight = 1.0 / (kWarmChange * kWarmChange);
     belief.all.diagonal().head(n).array() += weight;
     belief.weighted_mean.head(n) += weight * start;
   }
+  return belief;
+}
 
-  const OffsetBelief offset{options.edge_offset, 1.0 / (options.edge_offset_deviation * options.edge_offset_deviation)};
-  const double variance = kEdgeDeviation * kEdgeDeviation;
-  FineSums total;
-  // tells apart fits that cover the masks alike
-  const auto edge_cost = [&] { return total.length > 0 ? total.capped_square / total.length : 0.0; };
-  FrameSolution out;
-  VectorX unknowns = VectorX::Zero(problem.unknowns());
-  if (problem.shifts) unknowns.segment(n, last - n) = options.prior.mean.tail(last - n);
-  const auto fine_stage = [&](const VectorX& theta) {  // leaves the equations at its result in `problem`
-    unknowns.head(n) = theta;
-    if (problem.shifts) unknowns.segment(n, last - n) = options.prior.mean.tail(last - n);
-    unknowns[last] = offset.mean;
-    place(problem, unknowns);
-    choose_blobs(problem, kLastReach);
-    double cut = kFirstCut;
-    const auto equations = [&](const VectorX& at) {
-      place(problem, at);
-      total = fine_equations(problem, at[last], cut);
-      cut = next_cut(problem, cut);
-      add_priors(problem, belief, variance, offset, at);
-      return edge_cost();
-    };
-    out.fit.summary =
-        gauss_newton(problem, std::max(1, options.iterations - options.iterations / 2), kFineStep, equations, unknowns);
-    place(problem, unknowns);
-    total = fine_equations(problem, unknowns[last], cut);
-    out.fit.summary.final_cost = edge_cost();
+// Tells apart fits that cover the masks alike.
+double edge_cost(const FineSums& total) { return total.length > 0 ? total.capped_square / total.length : 0.0; }
+
+// Masks' shifts as the prior expects them.
+void reset_shifts(Work& work) {
+  if (work.problem.shifts)
+    work.unknowns.segment(work.angles(), work.last() - work.angles()) =
+        work.options.prior.mean.tail(work.last() - work.angles());
+}
+
+// Fits the masks' outlines from `theta`; leaves the equations at its result in `work.problem`.
+void fine_stage(Work& work, const VectorX& theta) {
+  Problem& problem = work.problem;
+  const int last = work.last();
+  work.unknowns.head(work.angles()) = theta;
+  reset_shifts(work);
+  work.unknowns[last] = work.offset.mean;
+  place(problem, work.unknowns);
+  choose_blobs(problem, kLastReach);
+  double cut = kFirstCut;
+  const auto equations = [&](const VectorX& at) {
+    place(problem, at);
+    work.total = fine_equations(problem, at[last], cut);
+    cut = next_cut(problem, cut);
+    add_priors(problem, work.belief, kFineVariance, work.offset, at);
+    return edge_cost(work.total);
   };
+  const int steps = std::max(1, work.options.iterations - work.options.iterations / 2);
+  work.out.fit.summary = gauss_newton(problem, steps, kFineStep, equations, work.unknowns);
+  place(problem, work.unknowns);
+  work.total = fine_equations(problem, work.unknowns[last], cut);
+  work.out.fit.summary.final_cost = edge_cost(work.total);
+}
 
+// The angles from which the fine stage starts where the frame before is known.
+VectorX warm_angles(Work& work, const VectorX& start) {
+  work.unknowns.head(work.angles()) = start;
+  coarse_stage(work.problem, work.belief, std::max(1, work.options.iterations / 2), true, work.options, work.unknowns);
+  return work.unknowns.head(work.angles());
+}
+
+// The same where nothing is known: of the fits from bends to every side that cover the masks about as well as the best
+// one, the one whose outlines fit best.
+VectorX cold_angles(Work& work, const VectorX& start) {
+  Problem& problem = work.problem;
+  const Options& options = work.options;
+  std::vector<VectorX> found;
+  std::vector<double> costs;
+  for (const VectorX& cold : cold_starts(*problem.chain, start)) {
+    // first what hangs together with the grasp, whatever its distance; then what lies near the rope found
+    work.unknowns.head(work.angles()) = cold;
+    place(problem, work.unknowns);
+    choose_blobs(problem, 0.0);
+    coarse_stage(problem, work.belief, options.first_iterations, false, options, work.unknowns);
+    coarse_stage(problem, work.belief, std::max(1, options.iterations / 2), true, options, work.unknowns);
+    place(problem, work.unknowns);
+    judge(problem, work.out);
+    found.push_back(work.unknowns.head(work.angles()));
+    costs.push_back(work.out.cost);
+  }
+  const double best = *std::min_element(costs.begin(), costs.end());
+  double best_edge_cost = std::numeric_limits<double>::infinity();
   VectorX theta = start;
-  if (warm) {
-    unknowns.head(n) = start;
-    coarse_stage(problem, belief, std::max(1, options.iterations / 2), true, options, unknowns);
-    theta = unknowns.head(n);
-  } else {
-    std::vector<VectorX> found;
-    std::vector<double> costs;
-    for (const VectorX& cold : cold_starts(chain, start)) {
-      // first what hangs together with the grasp, whatever its distance; then what lies near the rope found
-      unknowns.head(n) = cold;
-      place(problem, unknowns);
-      choose_blobs(problem, 0.0);
-      coarse_stage(problem, belief, options.first_iterations, false, options, unknowns);
-      coarse_stage(problem, belief, std::max(1, options.iterations / 2), true, options, unknowns);
-      place(problem, unknowns);
-      judge(problem, out);
-      found.push_back(unknowns.head(n));
-      costs.push_back(out.cost);
-    }
-    const double best = *std::min_element(costs.begin(), costs.end());
-    double best_edge_cost = 1e300;
-    for (std::size_t i = 0; i < found.size(); ++i) {
-      if (costs[i] > kAlike * best + kAlikePixels) continue;
-      fine_stage(found[i]);
-      if (edge_cost() < best_edge_cost) {
-        best_edge_cost = edge_cost();
-        theta = unknowns.head(n);
-      }
+  for (std::size_t i = 0; i < found.size(); ++i) {
+    if (costs[i] > kAlike * best + kAlikePixels) continue;
+    fine_stage(work, found[i]);
+    if (edge_cost(work.total) < best_edge_cost) {
+      best_edge_cost = edge_cost(work.total);
+      theta = work.unknowns.head(work.angles());
     }
   }
-  fine_stage(theta);
+  return theta;
+}
 
-  const double offset_normal = problem.normal(last, last) + offset.weight;
-  const double offset_right = problem.right[last] + offset.weight * (offset.mean - unknowns[last]);
+// Information and gradient of the angles (and shifts) without the edge offset, which is marginalized; held angles have
+// none. The joints' prior is in them, the given one is not.
+void take_information(Work& work) {
+  const Problem& problem = work.problem;
+  const int last = work.last();
+  FrameSolution& out = work.out;
+  const double offset_normal = problem.normal(last, last) + work.offset.weight;
+  const double offset_right = problem.right[last] + work.offset.weight * (work.offset.mean - work.unknowns[last]);
   const VectorX coupling = problem.normal.col(last).head(last);
   out.information =
-      (problem.normal.topLeftCorner(last, last) - coupling * coupling.transpose() / offset_normal) / variance;
-  out.gradient = (problem.right.head(last) - coupling * (offset_right / offset_normal)) / variance;
-  for (int k = 0; k < n; ++k) {
+      (problem.normal.topLeftCorner(last, last) - coupling * coupling.transpose() / offset_normal) / kFineVariance;
+  out.gradient = (problem.right.head(last) - coupling * (offset_right / offset_normal)) / kFineVariance;
+  for (int k = 0; k < work.angles(); ++k) {
     if (!problem.held[k]) continue;
     out.information.row(k).setZero();
     out.information.col(k).setZero();
     out.gradient[k] = 0.0;
   }
-  out.information += belief.joints;
-  out.gradient -= belief.joints * VectorX(unknowns.head(last));
-  MatrixX posterior = out.information;
-  for (int k = 0; k < n; ++k)
-    if (problem.held[k]) posterior(k, k) += 1.0 / (kTwist * kTwist);
-  if (given_prior) posterior += options.prior.information;
-  out.fit.theta = unknowns.head(n);
-  if (problem.shifts) out.fit.mask_shift = unknowns.segment(n, last - n);
-  out.fit.covariance = posterior.ldlt().solve(MatrixX::Identity(last, last));
-  out.fit.edge_offset = unknowns[last];
-  out.fit.residual_pixels = total.weight > 0 ? std::sqrt(total.weighted_square / total.weight) : 0.0;
-  judge(problem, out);
-  return out;
+  out.information += work.belief.joints;
+  out.gradient -= work.belief.joints * VectorX(work.unknowns.head(last));
+}
+
+// The posterior covariance, the given prior included.
+MatrixX covariance_of(const Work& work) {
+  const int last = work.last();
+  MatrixX posterior = work.out.information;
+  for (int k = 0; k < work.angles(); ++k)
+    if (work.problem.held[k]) posterior(k, k) += 1.0 / (kTwist * kTwist);
+  if (has_prior(work)) posterior += work.options.prior.information;
+  return posterior.ldlt().solve(MatrixX::Identity(last, last));
+}
+
+}  // namespace
+
+FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView>& views, const VectorX& start,
+                          bool warm, const Options& options) {
+  Work work{options, make_problem(chain, views, options)};
+  work.offset = {options.edge_offset, 1.0 / (options.edge_offset_deviation * options.edge_offset_deviation)};
+  work.belief = make_belief(work, start, warm);
+  work.unknowns = VectorX::Zero(work.problem.unknowns());
+  reset_shifts(work);
+
+  fine_stage(work, warm ? warm_angles(work, start) : cold_angles(work, start));
+
+  take_information(work);
+  FrameFit& fit = work.out.fit;
+  const int n = work.angles();
+  fit.theta = work.unknowns.head(n);
+  if (work.problem.shifts) fit.mask_shift = work.unknowns.segment(n, work.last() - n);
+  fit.covariance = covariance_of(work);
+  fit.edge_offset = work.unknowns[work.last()];
+  fit.residual_pixels = work.total.weight > 0 ? std::sqrt(work.total.weighted_square / work.total.weight) : 0.0;
+  judge(work.problem, work.out);
+  return std::move(work.out);
 }
 
 FrameFit fit_frame(const chain::Chain& chain, const Pose& base, std::span<const capture::View* const> views,
