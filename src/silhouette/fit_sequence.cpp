@@ -131,107 +131,142 @@ Frames frames_of(const capture::Capture& capture) {
   return frames;
 }
 
-SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capture, const Options& options) {
-  SequenceFit out;
-  const Frames frames = frames_of(capture);
-  const int count = static_cast<int>(frames.times.size()), n = chain.angles();
-  if (count == 0) throw InputError(capture.name, "no images are loaded", "check the frames asked for");
+namespace {
 
-  std::vector<MaskPoints> masks(capture.views.size());
-  core::parallel_for(static_cast<std::int64_t>(masks.size()), [&](std::int64_t v) {
+// The frames of a recording while they are fitted.
+struct Sequence {
+  const chain::Chain& chain;
+  std::vector<double> times;
+  std::vector<MaskPoints> masks;              // by view of the capture
+  std::vector<std::vector<FrameView>> views;  // by frame
+  std::vector<char> seen;                     // by frame: a mask shows something
+  std::vector<FrameSolution> solutions;       // by frame
+  Options each;                               // for one frame
+
+  int count() const { return static_cast<int>(times.size()); }
+  VectorX straight() const { return VectorX::Zero(chain.angles()); }
+};
+
+Sequence make_sequence(const chain::Chain& chain, const capture::Capture& capture, const Options& options) {
+  Frames frames = frames_of(capture);
+  if (frames.times.empty()) throw InputError(capture.name, "no images are loaded", "check the frames asked for");
+  const std::size_t count = frames.times.size();
+  Sequence s{chain, std::move(frames.times), {}, {}, {}, {}, options};
+  s.each.prior = {};
+  s.masks.resize(capture.views.size());
+  core::parallel_for(static_cast<std::int64_t>(s.masks.size()), [&](std::int64_t v) {
     const capture::View& view = capture.views[v];
-    masks[v] = mask_points(view, capture.cameras[view.camera], options.max_pixels);
+    s.masks[v] = mask_points(view, capture.cameras[view.camera], options.max_pixels);
   });
-  std::vector<std::vector<FrameView>> views(count);
-  std::vector<char> seen(count, 0);
-  for (int f = 0; f < count; ++f) {
+  s.views.resize(count);
+  s.seen.assign(count, 0);
+  s.solutions.resize(count);
+  for (std::size_t f = 0; f < count; ++f)
     for (const int v : frames.views[f]) {
       const capture::View& view = capture.views[v];
-      views[f].push_back({&masks[v], &capture.cameras[view.camera], capture.base.pose(view.time)});
-      seen[f] = seen[f] || masks[v].area > 0;
+      s.views[f].push_back({&s.masks[v], &capture.cameras[view.camera], capture.base.pose(view.time)});
+      s.seen[f] = s.seen[f] || s.masks[v].area > 0;
     }
-  }
-  if (std::find(seen.begin(), seen.end(), 1) == seen.end())
+  if (std::find(s.seen.begin(), s.seen.end(), 1) == s.seen.end())
     throw InputError(capture.name, "no mask shows the object in any frame",
                      "check the masks, or make them with `chainsplat mask`");
-  const int first = static_cast<int>(std::find(seen.begin(), seen.end(), 1) - seen.begin());
-  Options each = options;
-  each.prior = {};
+  return s;
+}
 
-  // forward
-  std::vector<FrameSolution> solutions(count);
-  std::vector<int> unseen;
-  const auto try_again = [&](int f, const VectorX& from, bool warm) {
-    FrameSolution again = solve_frame(chain, views[f], from, warm, each);
-    if (again.cost < kBetter * solutions[f].cost) solutions[f] = std::move(again);
-  };
-  VectorX start = VectorX::Zero(n);
-  for (int f = 0; f < count; ++f) {
-    if (!seen[f]) unseen.push_back(f);
-    solutions[f] = solve_frame(chain, views[f], start, f > first, each);
-    if (f > first && seen[f] && (solutions[f].fit.covered < kLost || solutions[f].fit.inside < kLost))
-      try_again(f, VectorX::Zero(n), false);
-    if (seen[f]) start = solutions[f].fit.theta;
+// Fits a frame once more, and keeps what is clearly better.
+void try_again(Sequence& s, int f, const VectorX& from, bool warm) {
+  FrameSolution again = solve_frame(s.chain, s.views[f], from, warm, s.each);
+  if (again.cost < kBetter * s.solutions[f].cost) s.solutions[f] = std::move(again);
+}
+
+// Frame after frame, each from the one before; from scratch at first and where the rope is lost.
+void fit_forward(Sequence& s) {
+  const int first = static_cast<int>(std::find(s.seen.begin(), s.seen.end(), 1) - s.seen.begin());
+  VectorX start = s.straight();
+  for (int f = 0; f < s.count(); ++f) {
+    s.solutions[f] = solve_frame(s.chain, s.views[f], start, f > first, s.each);
+    const FrameFit& fit = s.solutions[f].fit;
+    if (f > first && s.seen[f] && (fit.covered < kLost || fit.inside < kLost)) try_again(s, f, s.straight(), false);
+    if (s.seen[f]) start = s.solutions[f].fit.theta;
   }
+}
 
-  // repair: runs of bad frames, once backward from the good frame after them, and from scratch
+// Runs of bad frames once more: backward from the good frame after them, from scratch, and forward.
+void repair(Sequence& s) {
   std::vector<double> covered, inside, residual;
-  for (int f = 0; f < count; ++f) {
-    if (!seen[f]) continue;
-    covered.push_back(solutions[f].fit.covered);
-    inside.push_back(solutions[f].fit.inside);
-    residual.push_back(solutions[f].fit.residual_pixels);
+  for (int f = 0; f < s.count(); ++f) {
+    if (!s.seen[f]) continue;
+    covered.push_back(s.solutions[f].fit.covered);
+    inside.push_back(s.solutions[f].fit.inside);
+    residual.push_back(s.solutions[f].fit.residual_pixels);
   }
   const double usual_covered = math::median(covered), usual_inside = math::median(inside),
                usual_residual = math::median(residual);
   const auto bad = [&](int f) {
-    const FrameFit& fit = solutions[f].fit;
-    return seen[f] && (fit.covered < usual_covered - kLessCovered || fit.inside < usual_inside - kLessInside ||
-                       fit.residual_pixels > kMoreResidual * usual_residual + kMoreResidualPixels);
+    const FrameFit& fit = s.solutions[f].fit;
+    return s.seen[f] && (fit.covered < usual_covered - kLessCovered || fit.inside < usual_inside - kLessInside ||
+                         fit.residual_pixels > kMoreResidual * usual_residual + kMoreResidualPixels);
   };
-  for (int f = count - 1; f >= 0; --f) {
+  for (int f = s.count() - 1; f >= 0; --f) {
     if (!bad(f)) continue;
-    if (f + 1 < count) try_again(f, solutions[f + 1].fit.theta, true);
-    if (bad(f)) try_again(f, VectorX::Zero(n), false);
+    if (f + 1 < s.count()) try_again(s, f, s.solutions[f + 1].fit.theta, true);
+    if (bad(f)) try_again(s, f, s.straight(), false);
   }
-  for (int f = 1; f < count; ++f)
-    if (bad(f)) try_again(f, solutions[f - 1].fit.theta, true);
+  for (int f = 1; f < s.count(); ++f)
+    if (bad(f)) try_again(s, f, s.solutions[f - 1].fit.theta, true);
+}
 
-  // One camera tells depth by the width of the mask: how much wider than the rope masks are is learned from all frames.
+// One camera tells depth by the width of the mask: how much wider than the rope masks are is learned from all frames,
+// which are then fitted with that.
+void share_edge_offset(Sequence& s) {
   std::vector<double> offsets;
   double views_a_frame = 0.0;
-  for (int f = 0; f < count; ++f) {
-    if (!seen[f]) continue;
-    offsets.push_back(solutions[f].fit.edge_offset);
-    views_a_frame += views[f].size();
+  for (int f = 0; f < s.count(); ++f) {
+    if (!s.seen[f]) continue;
+    offsets.push_back(s.solutions[f].fit.edge_offset);
+    views_a_frame += s.views[f].size();
   }
-  if (offsets.size() > 1 && views_a_frame < kFewViews * offsets.size()) {
-    each.edge_offset = math::median(offsets);
-    each.edge_offset_deviation = kCommonOffsetDeviation;
-    const std::vector<VectorX> near = smoothed(frames.times, solutions, seen);
-    for (int f = 0; f < count; ++f)
-      if (seen[f]) solutions[f] = solve_frame(chain, views[f], near[f], true, each);
-  }
+  if (offsets.size() <= 1 || views_a_frame >= kFewViews * offsets.size()) return;
+  s.each.edge_offset = math::median(offsets);
+  s.each.edge_offset_deviation = kCommonOffsetDeviation;
+  const std::vector<VectorX> near = smoothed(s.times, s.solutions, s.seen);
+  for (int f = 0; f < s.count(); ++f)
+    if (s.seen[f]) s.solutions[f] = solve_frame(s.chain, s.views[f], near[f], true, s.each);
+}
 
-  out.states.time = frames.times;
+void warn_of_unseen(const Sequence& s, const std::string& name) {
+  const auto unseen = std::count(s.seen.begin(), s.seen.end(), 0);
+  if (unseen == 0) return;
+  const auto first = std::find(s.seen.begin(), s.seen.end(), 0) - s.seen.begin();
+  const auto last = s.seen.rend() - std::find(s.seen.rbegin(), s.seen.rend(), 0) - 1;
+  core::warn(name + ": " + std::to_string(unseen) + " of " + std::to_string(s.count()) +
+             " frames have no mask pixel in any camera (first " + std::to_string(first) + ", last " +
+             std::to_string(last) + "); their angles follow from the frames around them");
+}
+
+}  // namespace
+
+SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capture, const Options& options) {
+  Sequence s = make_sequence(chain, capture, options);
+  fit_forward(s);
+  repair(s);
+  share_edge_offset(s);
+  warn_of_unseen(s, capture.name);
+
+  SequenceFit out;
   std::vector<solve::Summary> summaries;
-  for (int f = 0; f < count; ++f) {
-    out.frames.push_back(solutions[f].fit);
-    if (seen[f]) summaries.push_back(solutions[f].fit.summary);
+  for (int f = 0; f < s.count(); ++f) {
+    out.frames.push_back(s.solutions[f].fit);
+    if (s.seen[f]) summaries.push_back(s.solutions[f].fit.summary);
   }
   out.summary = solve::together(summaries);
-  if (!unseen.empty()) {
-    const int last = unseen.back();
-    core::warn(capture.name + ": " + std::to_string(unseen.size()) + " of " + std::to_string(count) +
-               " frames have no mask pixel in any camera (first " + std::to_string(unseen.front()) + ", last " +
-               std::to_string(last) + "); their angles follow from the frames around them");
-  }
+  out.states.time = s.times;
   if (options.smooth_in_time) {
-    out.states.theta = smoothed(frames.times, solutions, seen);
+    out.states.theta = smoothed(s.times, s.solutions, s.seen);
   } else {
     for (const FrameFit& fit : out.frames) out.states.theta.push_back(fit.theta);
   }
-  out.states.thetadot = derivative(frames.times, out.states.theta);
+  out.states.thetadot = derivative(s.times, out.states.theta);
   return out;
 }
 
