@@ -134,6 +134,8 @@ class Estimate:
     thetadot: _Numbers
     covariance: _Numbers
     base_late: float
+    grasp: _Numbers
+    settling: bool
     centerline_sigma: float
     iou: float
     residual: float
@@ -160,6 +162,14 @@ class Plan:
     def states(self, rate: float = ...) -> States: ...
     def json(self) -> str: ...
 
+class Excitation:
+    duration: float
+    states: States
+    parameters: Dict[str, Dict[str, float]]
+    gain: float
+    repeated_gain: float
+    def base(self, rate: float = ...) -> Trajectory: ...
+
 def train(capture: _Path, run: _Path, progress: Optional[_Progress] = ..., resume: bool = ..., force: bool = ...,
           picture: _Path = ..., anyway: bool = ..., seed: int = ..., device: str = ..., **options: object) -> Twin: ...
 def identify(runs: Sequence[_Path], joint: bool = ..., markers: Sequence[_Path] = ...,
@@ -167,6 +177,9 @@ def identify(runs: Sequence[_Path], joint: bool = ..., markers: Sequence[_Path] 
 def evaluate(run: _Path, capture: _Path, picture: _Path = ..., device: str = ...) -> Dict[str, Dict[str, float]]: ...
 def plan(twin: Twin, targets: ArrayLike, axes: str = ..., horizon: float = ..., free_horizon: bool = ..., hit: str = ...,
          terminal: Optional[ArrayLike] = ..., samples: int = ..., initial: Optional[_State] = ..., seed: int = ...) -> Plan: ...
+def excite(twin: Twin, duration: float = ..., axes: str = ..., stroke: float = ..., velocity: float = ...,
+           acceleration: float = ..., jerk: float = ..., noise: Optional[float] = ..., frame_rate: float = ...,
+           max_bend: float = ..., seed: int = ...) -> Excitation: ...
 def set_threads(threads: int) -> None: ...
 def write_png(file: _Path, image: ArrayLike) -> None: ...
 def write_capture(folder: _Path, *, cameras: Sequence[Camera], images: Sequence[ArrayLike], masks: Sequence[ArrayLike],

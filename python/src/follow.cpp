@@ -96,6 +96,11 @@ void add_follow(py::module_& m) {
       .def_property_readonly(
           "base_late", [](const Estimate& e) { return e.base.late; },
           "s, by which the base's stamps are believed to be late")
+      .def_property_readonly(
+          "grasp", [](const Estimate& e) { return array_of(e.base.grasp); },
+          "(4, 4): how the rope is believed to be held, base from grasp; the identity where it is as given")
+      .def_readonly("settling", &Estimate::settling,
+                    "True while cameras or clock are being learned: no force should be told from it")
       .def_readonly("centerline_sigma", &Estimate::centerline_sigma, "m, standard deviation along the rope, RMS")
       .def_readonly("iou", &Estimate::iou, "of the rope's tube and the mask")
       .def_readonly("residual", &Estimate::residual, "px, of the outline")

@@ -1,4 +1,4 @@
-// Long work: train, identify, evaluate, plan.
+// Long work: train, identify, evaluate, plan, excite.
 #include <cmath>
 
 #include "chainsplat/motion_files.h"
@@ -114,13 +114,44 @@ Planned plan(const Twin& twin, const Numbers& targets, const std::string& axes, 
   });
 }
 
-trajectory::Trajectory base_of(const Planned& planned, double rate) {
-  const double end = planned.plan.motion.end();
+trajectory::Trajectory base_of(const planning::Motion& motion, double end, double rate) {
   planning::check_rate(rate, end, "give rows a second, for example 100");
   std::vector<trajectory::Sample> samples;
   for (const double time : planning::row_times(end, rate))
-    samples.push_back({time, planning::base_at(planned.plan.motion, time).pose});
-  return trajectory::fit(std::move(samples), "the plan");
+    samples.push_back({time, planning::base_at(motion, time).pose});
+  return trajectory::fit(std::move(samples), "the motion");
+}
+
+// A motion to record, and how long it is.
+struct Excited {
+  excitation::Result result;
+  double duration = 0.0;  // s
+};
+
+Excited excite(const Twin& twin, double duration, const std::string& axes, double stroke, double velocity,
+               double acceleration, double jerk, const std::optional<double>& noise, double frame_rate, double max_bend,
+               std::uint64_t seed) {
+  excitation::Options options;
+  if (!axes.empty()) options.axes = planning::parse_axes(axes);
+  options.duration = duration, options.frame_rate = frame_rate, options.max_bend = max_bend, options.seed = seed;
+  options.limits.stroke = stroke, options.limits.velocity = velocity;
+  options.limits.acceleration = acceleration, options.limits.jerk = jerk;
+  return unlocked([&] {
+    options.noise = noise ? *noise : pipeline::recorded_noise(twin.rope);
+    return Excited{excitation::excite(pipeline::excitation_problem(twin.rope), options), duration};
+  });
+}
+
+// By name: the standard error now, after the motion, and after one more recording of the old motion.
+py::dict errors_of(const excitation::Prediction& p) {
+  py::dict out;
+  for (std::size_t i = 0; i < p.names.size(); ++i) {
+    py::dict row;
+    row["now"] = p.now[i], row["excited"] = p.excited[i];
+    if (!p.repeated.empty()) row["repeated"] = p.repeated[i];
+    out[py::str(p.names[i])] = row;
+  }
+  return out;
 }
 
 }  // namespace
@@ -174,7 +205,9 @@ void add_work(py::module_& m) {
           "(targets, 3), m: where the rope is then")
       .def_property_readonly(
           "duration", [](const Planned& p) { return p.plan.motion.end(); }, "s")
-      .def("base", &base_of, arg("rate") = 100.0, "The base's motion, with samples at `rate` a second.")
+      .def(
+          "base", [](const Planned& p, double rate) { return base_of(p.plan.motion, p.plan.motion.end(), rate); },
+          arg("rate") = 100.0, "The base's motion, with samples at `rate` a second.")
       .def(
           "states",
           [](const Planned& p, double rate) {
@@ -186,6 +219,30 @@ void add_work(py::module_& m) {
           arg("rate") = 100.0, "The rope's predicted states.")
       .def(
           "json", [](const Planned& p) { return planning::plan_json(p.problem, {}, p.plan, ""); }, "As plan.json.");
+  py::class_<Excited>(m, "Excitation", "The base motion that is to be recorded next, and what it will tell.")
+      .def_readonly("duration", &Excited::duration, "s")
+      .def_property_readonly(
+          "states", [](const Excited& e) { return e.result.states; }, "The rope's predicted states.")
+      .def_property_readonly(
+          "parameters", [](const Excited& e) { return errors_of(e.result.prediction); },
+          "By name the standard error 'now', 'excited' (after a recording of the motion) and 'repeated' (after one "
+          "more "
+          "of the old motion).")
+      .def_property_readonly(
+          "gain", [](const Excited& e) { return e.result.prediction.gain; },
+          "Decrease of the log of the uncertain volume per parameter.")
+      .def_property_readonly(
+          "repeated_gain", [](const Excited& e) { return e.result.prediction.repeated_gain; },
+          "The same by the old motion again.")
+      .def(
+          "base", [](const Excited& e, double rate) { return base_of(e.result.motion, e.duration, rate); },
+          arg("rate") = 100.0, "The base's motion, with samples at `rate` a second.");
+  m.def("excite", &excite, arg("twin"), arg("duration") = 5.0, arg("axes") = "", arg("stroke") = 0.2,
+        arg("velocity") = 1.5, arg("acceleration") = 10.0, arg("jerk") = 200.0, arg("noise") = py::none(),
+        arg("frame_rate") = 30.0, arg("max_bend") = 1.2, arg("seed") = 0,
+        "The base motion to record next, after which the parameters' errors shrink most. duration: s. axes: 'x', "
+        "'x,y,yaw', ...; '': x, of a spatial chain x and y, on a table x, y and yaw. Limits in m, m/s, m/s^2, m/s^3. "
+        "noise: m, by which a recorded point is off the model; None: as in the twin's own recording. max_bend: rad.");
   m.def(
       "plan", &plan, arg("twin"), arg("targets"), arg("axes") = "", arg("horizon") = 3.0, arg("free_horizon") = false,
       arg("hit") = "", arg("terminal") = py::none(), arg("samples") = 0, arg("initial") = py::none(), arg("seed") = 0,

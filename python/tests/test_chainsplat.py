@@ -214,6 +214,7 @@ class Module(unittest.TestCase):
                 found = follower.update_all([capture.image(c, k) for c in range(3)], [capture.mask(c, k) for c in range(3)],
                                             moment)
                 self.assertEqual(found.status, "following")
+                self.assertEqual(found.grasp.shape, (4, 4))
                 pose = self.twin.base.pose(moment)
                 errors.append(self.twin.centerline(found.theta, pose) -
                               self.twin.centerline(self.twin.states.theta[k], pose))
@@ -240,6 +241,22 @@ class Module(unittest.TestCase):
         states = self.twin.rollout(motion, times=np.linspace(0.0, plan.duration, 301))
         reached = [self.twin.centerline(theta, motion.pose(t))[-1] for t, theta in zip(states.time, states.theta)]
         self.assertLess(np.min(np.linalg.norm(np.array(reached) - tip - [0.08, 0.0, 0.02], axis=1)), 0.004)
+
+    def test_a_proposed_motion_tells_more_and_keeps_its_limits(self):
+        motion = cs.excite(self.twin, duration=2.0, stroke=0.1, velocity=1.0)
+        base = motion.base(200)
+        places = np.array([base.pose(t)[:3, 3] for t in np.linspace(0.0, motion.duration, 401)])
+        self.assertLess(np.max(np.linalg.norm(places - places[0], axis=1)), 0.1001)  # m
+        speed = np.linalg.norm(np.diff(places, axis=0), axis=1) / (motion.duration / 400)
+        self.assertLess(np.max(speed), 1.01)
+        for errors in motion.parameters.values():
+            self.assertLessEqual(errors["excited"], errors["now"] * (1.0 + 1e-9))
+        self.assertGreater(motion.gain, 0.0)
+        np.testing.assert_array_equal(base.pose(0.7), cs.excite(self.twin, duration=2.0, stroke=0.1, velocity=1.0)
+                                      .base(200).pose(0.7))  # the same request, the same motion
+        with self.assertRaises(cs.InputError) as refused:
+            cs.excite(self.twin, duration=-1.0)
+        self.assertIn("duration", refused.exception.where)
 
     def test_forces_of_a_free_rope_are_small(self):
         found = self.twin.forces(self.twin.rollout())
