@@ -15,6 +15,13 @@ prefix=$work/prefix
 cmake --install "$build" --prefix "$prefix" >"$work/install.txt" || fail "cmake --install: $(tail -3 "$work/install.txt")"
 library=$(dirname "$(find "$prefix" -name 'libchainsplat.so')")
 
+# the manual page names every command, and the shell can read what completes them
+page=$(zcat "$prefix/share/man/man1/chainsplat.1.gz") || fail 'no manual page'
+for command in $("$prefix/bin/chainsplat" --help | sed -nE '/^Subcommands:/,$ s/^  ([a-z]+) .*/\1/p'); do
+  grep -q "fB$command" <<<"$page" || fail "the manual page has no $command"
+done
+bash -n "$prefix/share/bash-completion/completions/chainsplat" || fail 'completions of bash'
+
 # nothing but Eigen and the standard library is named by the headers
 foreign=$(grep -rhoE '#include <[a-zA-Z_]+/[^>]*>' "$prefix/include" | grep -v '<Eigen/' | sort -u || true)
 [ -z "$foreign" ] || fail "installed headers include $foreign"
