@@ -7,6 +7,7 @@
 #include <cmath>
 
 #include "chainsplat/silhouette.h"
+#include "src/masking/cut.h"
 #include "src/masking/grow.h"
 #include "src/masking/look.h"
 #include "src/masking/ribbon.h"
@@ -332,7 +333,7 @@ TEST_CASE("live masks of one camera") {
   for (std::size_t i = 0; i + 3 < masked.views[0].rgba.size(); i += 4)
     if (masked.views[0].rgba[i + 3])
       colors.insert(colors.end(), &masked.views[0].rgba[i], &masked.views[0].rgba[i + 3]);
-  masking::Live live = masking::start(masked.cameras[0], rope, colors);
+  masking::LiveMasks live(masked.cameras[0], rope, colors);
   capture::VideoReader video(kDemo / "cam0.mp4");
   capture::Image8 picture;
   double sum = 0.0;
@@ -342,7 +343,7 @@ TEST_CASE("live masks of one camera") {
     // extrapolate the last two frames at constant velocity, a prediction without dynamics
     const VectorX last = chain::interpolate(fit.states, masked.times[0][std::max(0, k - 1)]);
     const VectorX expected = 2.0 * last - chain::interpolate(fit.states, masked.times[0][std::max(0, k - 2)]);
-    const capture::View view = masking::mask(live, picture, masked.base.pose(time), expected);
+    const capture::View view = live.mask(picture, masked.base.pose(time), expected);
     capture::Image8 whole{320, 240, 1, std::vector<std::uint8_t>(320 * 240, 0)};
     for (int y = 0; y < view.height; ++y)
       for (int x = 0; x < view.width; ++x)

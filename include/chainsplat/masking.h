@@ -14,6 +14,7 @@
 // Pictures are in undistorted pixels unless a function says otherwise. Results do not depend on time or threads.
 #pragma once
 #include <functional>
+#include <memory>
 #include <optional>
 #include <vector>
 
@@ -21,50 +22,6 @@
 #include "chainsplat/chain.h"
 
 namespace chainsplat::masking {
-
-// Natural log odds of a color for the rope against its surroundings, on a grid of 32 steps per channel with index
-// (r, g, b) / 8.
-struct Colors {
-  std::vector<double> object, surroundings;  // numbers of pixels, 32^3; empty: nothing known
-  std::vector<float> log_odds;               // 32^3, computed from the counts by settle()
-  double usual = 0.0, separation = 0.0;      // mean log odds of the object's pixels; that minus the surroundings' mean
-};
-// Computes log_odds from the counts, smoothed over neighboring colors.
-void settle(Colors& colors);
-
-// The picture of one camera without the rope.
-struct Background {
-  std::vector<std::uint8_t> rgb;    // 3 * width * height
-  std::vector<std::uint8_t> noise;  // width * height, standard deviation in gray levels; 0: background unknown here
-};
-
-// The rope's colors along and across as one camera sees it. While the rope does not turn about itself, every mark stays
-// at its arclength and side.
-struct Marks {
-  int along = 0, across = 0;      // numbers of cells; 0: nothing known
-  double step = 0.0;              // m, length of a cell along the rope
-  std::vector<std::uint8_t> rgb;  // 3 * along * across
-  std::vector<char> known;        // along * across
-};
-
-// What distinguishes the rope from everything else for one camera.
-struct Look {
-  Colors near, far;  // of the rope's half at the grasp and of that at the free end, whose tip may differ in color
-  Background background;
-  Marks marks;
-};
-
-// An image of the camera's size, RGB or RGBA, row-major; the pixels are not owned.
-struct Picture {
-  const std::uint8_t* pixels = nullptr;
-  int width = 0, height = 0, channels = 3;
-};
-// Returns the mask of one picture, 0 or 255, as a crop with the picture's RGB inside the mask; an empty view (width 0)
-// when nothing is found. With `theta` the chain is expected there to within about half a diameter; without it, colors
-// and background alone decide, as far as the rope can reach. `doubt` multiplies the usual uncertainty of the place.
-capture::View cut(const Look& appearance, const Picture& picture, const capture::Camera& camera,
-                  const chain::Chain& chain, const math::Pose& base, const std::optional<math::VectorX>& theta,
-                  double doubt = 1.0);
 
 // Help by the user, in recorded pixels of one frame, or of all frames of the camera.
 struct PointHint {
@@ -114,30 +71,27 @@ struct PreviewTile {
 // Returns the pictures side by side, each at most 640 px wide, with the mask's outline and the score.
 capture::Image8 contact_sheet(const std::vector<PreviewTile>& tiles);
 
-// The state of live masking, while the rope is followed. It learns the background where the rope is not, and the colors
-// of what is masked.
-struct Live {
-  capture::Camera camera;  // as recorded, with its lens distortion
-  chain::Chain chain;
-  Look look;
-  std::vector<float> mean, variance;   // of the background, per channel and per pixel
-  std::vector<std::uint16_t> seen;     // number of frames in which the background was visible, per pixel
-  std::vector<double> given;           // counts of the colors passed to start()
-  std::vector<std::uint8_t> straight;  // work space: the frame without its lens distortion
-  std::vector<std::int16_t> from;      // its source for cv::remap, per pixel: column and row of the recorded frame,
-  std::vector<std::uint16_t> part;     // and the interpolation's index into OpenCV's table of weights
-  int frames = 0;
-};
+// Masks of one camera's frames as they come, while the rope is followed. It learns the background where the rope is
+// not, and the colors of what is masked.
+class LiveMasks {
+ public:
+  // `camera`: as recorded, with its lens distortion. `object_rgb`: colors of the rope, 0..255, three numbers per sample
+  // (those of a twin's Gaussians, or of a capture's masks).
+  LiveMasks(const capture::Camera& camera, const chain::Chain& chain, const std::vector<std::uint8_t>& object_rgb);
+  ~LiveMasks();
+  // Learns the rope's marks, which nothing that hides it has, from a drawn picture of the rope at these angles (an
+  // undistorted crop with its coverage as alpha). `base`: world_from_base.
+  void learn_marks(const capture::View& drawn, const math::Pose& base, const math::VectorX& theta);
+  // Returns the undistorted crop of a recorded frame (RGB, of the camera's size) with its mask; an empty view (width 0)
+  // where nothing is found. `theta`: the expected angles; none where they are unknown (in the first frame, or when the
+  // rope is lost).
+  capture::View mask(const capture::Image8& recorded, const math::Pose& base,
+                     const std::optional<math::VectorX>& theta);
+  int frames() const;  // that were masked
 
-// Starts live masking. `object_rgb`: colors of the rope, 0..255, three numbers per sample (those of a twin's Gaussians,
-// or of a capture's masks).
-Live start(const capture::Camera& camera, const chain::Chain& chain, const std::vector<std::uint8_t>& object_rgb);
-// Learns the rope's marks, which nothing that hides it has, from a drawn picture of the rope at these angles (an
-// undistorted crop with its coverage as alpha).
-void learn_marks(Live& live, const capture::View& drawn, const math::Pose& base, const math::VectorX& theta);
-// Returns the undistorted crop of a recorded frame with its mask. `theta`: the expected angles; none where they are
-// unknown (in the first frame, or when the rope is lost).
-capture::View mask(Live& live, const capture::Image8& recorded_rgb, const math::Pose& base,
-                   const std::optional<math::VectorX>& theta);
+ private:
+  struct State;
+  std::unique_ptr<State> state_;
+};
 
 }  // namespace chainsplat::masking

@@ -1,11 +1,11 @@
 // The mask of one picture: log odds per pixel, then a graph cut that puts contours where the picture has edges.
+#include "src/masking/cut.h"
+
 #include <algorithm>
 #include <cmath>
 #include <opencv2/core.hpp>
 #include <opencv2/imgproc.hpp>
 #include <opencv2/imgproc/detail/gcgraph.hpp>
-
-#include "src/masking/look.h"
 
 namespace chainsplat::masking {
 

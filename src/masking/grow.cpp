@@ -6,7 +6,6 @@
 #include <cmath>
 
 #include "chainsplat/image_model.h"
-#include "src/masking/look.h"
 
 namespace chainsplat::masking {
 

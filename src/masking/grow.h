@@ -9,10 +9,10 @@
 // a camera there is only one population, which adds no evidence. What is known besides (gravity, by how much the grasp
 // may be off, a point on the rope) joins as a prior.
 #pragma once
+#include <optional>
 #include <span>
 
-#include "chainsplat/masking.h"
-#include "src/masking/tube.h"
+#include "src/masking/look.h"
 
 namespace chainsplat::masking {
 

@@ -4,8 +4,9 @@
 #include <opencv2/core.hpp>
 #include <opencv2/imgproc.hpp>
 
+#include "chainsplat/masking.h"
+#include "src/masking/cut.h"
 #include "src/masking/grow.h"
-#include "src/masking/look.h"
 
 namespace chainsplat::masking {
 
@@ -14,7 +15,7 @@ namespace {
 constexpr double kForget = 0.02;          // share of the background forgotten per frame: some two seconds at 30 Hz
 constexpr int kLeastSeen = 8;             // number of frames before a background pixel is believed
 constexpr double kFirstNoise = 4.0;       // gray levels, assumed in the first frame
-constexpr double kGivenPixels = 3e4;      // weight of the colors passed to start(): the pixels of some ten frames
+constexpr double kGivenPixels = 3e4;      // weight of the colors that are given: the pixels of some ten frames
 constexpr double kLeastGiven = 0.1;       // share of that weight that is never forgotten
 constexpr double kAboutPixels = 24.0;     // px around the tube whose colors count as the rope's surroundings
 constexpr double kDoubt = 2.0;            // for a prediction; with less, masks followed wrong ones of pushed ropes
@@ -23,132 +24,159 @@ constexpr double kPredictedMargin = 0.7;  // px, by which the tube at a predicti
 constexpr int kColorEvery = 5;            // frames between two updates of the colors
 constexpr double kForgetColors = 0.1;     // share of the counted colors forgotten per update
 
+}  // namespace
+
+struct LiveMasks::State {
+  State(const capture::Camera& recorded, const chain::Chain& rope, const std::vector<std::uint8_t>& object_rgb);
+
+  capture::Camera camera;   // as recorded, with its lens distortion
+  capture::Camera pinhole;  // the same without it, of undistorted pixels
+  chain::Chain chain;
+  Look look;
+  std::vector<float> mean, variance;   // of the background, per channel and per pixel
+  std::vector<std::uint16_t> seen;     // number of frames in which the background was visible, per pixel
+  std::vector<double> given;           // counts of the rope's colors that were given
+  std::vector<std::uint8_t> straight;  // work space: the frame without its lens distortion
+  std::vector<std::int16_t> from;      // its source for cv::remap, per pixel: column and row of the recorded frame,
+  std::vector<std::uint16_t> part;     // and the interpolation's index into OpenCV's table of weights
+  int frames = 0;
+
+  void map_straight();
+  Picture straightened(const capture::Image8& recorded, const Box& box);
+  void learn_first_frame(const Picture& picture, const Box& box);
+  std::optional<math::VectorX> grown_in(const Picture& picture, const math::Pose& base) const;
+  void learn_background(const Picture& picture, const Box& box, const Tube& around);
+  void learn_colors(const Picture& picture, const Reach& where, const Tube& around, const capture::View& mask);
+};
+
+LiveMasks::State::State(const capture::Camera& recorded, const chain::Chain& rope,
+                        const std::vector<std::uint8_t>& object_rgb)
+    : camera(recorded), pinhole(recorded), chain(rope) {
+  pinhole.distortion = {};
+  given.assign(kColorBins, 0.0);
+  const std::size_t samples = object_rgb.size() / 3;
+  for (std::size_t i = 0; i + 2 < object_rgb.size(); i += 3) given[color_bin(&object_rgb[i])] += kGivenPixels / samples;
+  for (Colors* const colors : {&look.near, &look.far}) {
+    colors->object = given;
+    colors->surroundings.assign(kColorBins, 0.0);
+  }
+  const std::size_t pixels = static_cast<std::size_t>(camera.width) * camera.height;
+  look.background.rgb.assign(3 * pixels, 0);
+  look.background.noise.assign(pixels, 0);
+  mean.assign(3 * pixels, 0.0f);
+  variance.assign(pixels, 0.0f);
+  seen.assign(pixels, 0);
+  if (camera.distorted()) map_straight();
+}
+
 // Computes once, for cv::remap, from where every pixel without lens distortion comes.
-void map_straight(Live& live) {
-  const capture::Camera& camera = live.camera;
+void LiveMasks::State::map_straight() {
   cv::Mat wanted(camera.height, camera.width, CV_32FC2);
   for (int y = 0; y < camera.height; ++y)
     for (int x = 0; x < camera.width; ++x) {
       const math::Vector2 p = capture::distort(camera, math::Vector2(x + 0.5, y + 0.5)) - math::Vector2(0.5, 0.5);
       wanted.at<cv::Vec2f>(y, x) = {static_cast<float>(p.x()), static_cast<float>(p.y())};
     }
-  const std::size_t pixels = static_cast<std::size_t>(camera.width) * camera.height;
-  live.from.resize(2 * pixels);
-  live.part.resize(pixels);
-  cv::Mat from(camera.height, camera.width, CV_16SC2, live.from.data());
-  cv::Mat part(camera.height, camera.width, CV_16UC1, live.part.data());
-  cv::convertMaps(wanted, cv::noArray(), from, part, CV_16SC2);
+  from.resize(2 * seen.size());
+  part.resize(seen.size());
+  cv::Mat whole(camera.height, camera.width, CV_16SC2, from.data());
+  cv::Mat rest(camera.height, camera.width, CV_16UC1, part.data());
+  cv::convertMaps(wanted, cv::noArray(), whole, rest, CV_16SC2);
 }
 
-// Removes the lens distortion of a recorded frame inside the box.
-void straighten(const capture::Image8& image, const Box& box, Live& live) {
-  live.straight.resize(image.pixels.size());
+// The frame without its lens distortion, inside the box. It is seen as long as `recorded` and the work space are.
+Picture LiveMasks::State::straightened(const capture::Image8& recorded, const Box& box) {
+  const int width = camera.width, height = camera.height;
+  if (!camera.distorted()) return {recorded.pixels.data(), width, height, 3};
+  straight.resize(recorded.pixels.size());
   const cv::Rect rect(box.x0, box.y0, box.width(), box.height());
-  const int width = live.camera.width, height = live.camera.height;
-  const cv::Mat recorded(height, width, CV_8UC3, const_cast<std::uint8_t*>(image.pixels.data()));
-  cv::Mat out(height, width, CV_8UC3, live.straight.data());
-  const cv::Mat from(height, width, CV_16SC2, live.from.data()), part(height, width, CV_16UC1, live.part.data());
+  const cv::Mat image(height, width, CV_8UC3, const_cast<std::uint8_t*>(recorded.pixels.data()));
+  cv::Mat out(height, width, CV_8UC3, straight.data());
+  const cv::Mat whole(height, width, CV_16SC2, from.data()), rest(height, width, CV_16UC1, part.data());
   cv::Mat in_box = out(rect);
-  cv::remap(recorded, in_box, from(rect), part(rect), cv::INTER_LINEAR, cv::BORDER_REPLICATE);
+  cv::remap(image, in_box, whole(rect), rest(rect), cv::INTER_LINEAR, cv::BORDER_REPLICATE);
+  return {straight.data(), width, height, 3};
 }
 
-}  // namespace
-
-Live start(const capture::Camera& camera, const chain::Chain& chain, const std::vector<std::uint8_t>& object_rgb) {
-  Live live;
-  live.camera = camera;
-  live.chain = chain;
-  live.given.assign(kColorBins, 0.0);
-  const std::size_t samples = object_rgb.size() / 3;
-  for (std::size_t i = 0; i + 2 < object_rgb.size(); i += 3)
-    live.given[color_bin(&object_rgb[i])] += kGivenPixels / samples;
-  for (Colors* const colors : {&live.look.near, &live.look.far}) {
-    colors->object = live.given;
-    colors->surroundings.assign(kColorBins, 0.0);
-  }
-  const std::size_t pixels = static_cast<std::size_t>(camera.width) * camera.height;
-  live.look.background.rgb.assign(3 * pixels, 0);
-  live.look.background.noise.assign(pixels, 0);
-  live.mean.assign(3 * pixels, 0.0f);
-  live.variance.assign(pixels, 0.0f);
-  live.seen.assign(pixels, 0);
-  if (camera.distorted()) map_straight(live);
-  return live;
+// The first frame's colors count as surroundings, since the rope covers little of them.
+void LiveMasks::State::learn_first_frame(const Picture& picture, const Box& box) {
+  for (int y = box.y0; y < box.y1; ++y)
+    for (int x = box.x0; x < box.x1; ++x) look.near.surroundings[color_bin(pixel(picture, x, y))] += 1.0;
+  look.far.surroundings = look.near.surroundings;
+  settle(look);
 }
 
-void learn_marks(Live& live, const capture::View& drawn, const math::Pose& base, const math::VectorX& theta) {
-  capture::Camera camera = live.camera;
-  camera.distortion = {};
-  const Tube place = tube(live.chain, base, theta, camera, 0.0, live.chain.length, 0.0);
-  live.look.marks = marks(drawn, place, live.chain);
+// The angles of a chain grown in this picture; none where nothing is a rope, and for chains with twist joints.
+std::optional<math::VectorX> LiveMasks::State::grown_in(const Picture& picture, const math::Pose& base) const {
+  const int joints = chain.links() - 1;
+  if (chain.angles() != joints && chain.angles() != 2 * joints) return {};
+  const Shot shot{picture, &pinhole, pinhole.world_from_camera.inverse() * base, {}, {}};
+  const Grown grown = grow(chain, {&shot, 1}, {});
+  return grown.evidence > kLeastEvidence ? std::optional(grown.theta) : std::nullopt;
 }
 
-capture::View mask(Live& live, const capture::Image8& recorded, const math::Pose& base,
-                   const std::optional<math::VectorX>& theta) {
-  // the undistorted picture, as far as the rope can reach
-  capture::Camera camera = live.camera;
-  camera.distortion = {};
-  const Reach where = reach(live.chain, base, camera);
-  if (where.box.empty()) return {};
-  const std::vector<std::uint8_t>* pixels = &recorded.pixels;
-  if (live.camera.distorted()) {
-    straighten(recorded, where.box, live);
-    pixels = &live.straight;
-  }
-  const Picture picture{pixels->data(), camera.width, camera.height, 3};
-  if (live.frames == 0) {  // the first frame's colors count as surroundings, since the rope covers little of them
-    for (int y = where.box.y0; y < where.box.y1; ++y)
-      for (int x = where.box.x0; x < where.box.x1; ++x)
-        live.look.near.surroundings[color_bin(pixel(picture, x, y))] += 1.0;
-    live.look.far.surroundings = live.look.near.surroundings;
-    settle(live.look);
-  }
-  // where the rope is expected, or else where a chain grown in this picture lies
-  std::optional<math::VectorX> place = theta;
-  const int joints = live.chain.links() - 1;
-  if (!theta && (live.chain.angles() == joints || live.chain.angles() == 2 * joints)) {  // without twist joints
-    const Shot shot{picture, &camera, camera.world_from_camera.inverse() * base, {}, {}};
-    const Grown grown = grow(live.chain, {&shot, 1}, {});
-    if (grown.evidence > kLeastEvidence) place = grown.theta;
-  }
-  capture::View view = cut(live.look, picture, camera, live.chain, base, place, kDoubt);
-  ++live.frames;
-  if (!theta) return view;
-
-  // learn the background where the tube is not
-  const Tube around = tube(live.chain, base, *theta, camera, 0.0, live.chain.length, kAboutPixels);
-  Background& background = live.look.background;
-  for (int y = where.box.y0; y < where.box.y1; ++y)
-    for (int x = where.box.x0; x < where.box.x1; ++x) {
+// Learns the background in the box where the tube is not.
+void LiveMasks::State::learn_background(const Picture& picture, const Box& box, const Tube& around) {
+  Background& background = look.background;
+  for (int y = box.y0; y < box.y1; ++y)
+    for (int x = box.x0; x < box.x1; ++x) {
       if (around.at(x, y) < around.radius) continue;
-      const std::size_t at = static_cast<std::size_t>(y) * camera.width + x;
-      std::uint16_t& times_visible = live.seen[at];
-      if (times_visible < UINT16_MAX) ++times_visible;
-      const float share = static_cast<float>(std::max(kForget, 1.0 / times_visible));
+      const std::size_t at = static_cast<std::size_t>(y) * picture.width + x;
+      if (seen[at] < UINT16_MAX) ++seen[at];
+      const float share = static_cast<float>(std::max(kForget, 1.0 / seen[at]));
       float square = 0.0f;
       for (int c = 0; c < 3; ++c) {
-        float& mean = live.mean[3 * at + c];
-        const float d = pixel(picture, x, y)[c] - mean;
-        mean += share * d;
+        float& channel = mean[3 * at + c];
+        const float d = pixel(picture, x, y)[c] - channel;
+        channel += share * d;
         square += d * d / 3.0f;
-        background.rgb[3 * at + c] = static_cast<std::uint8_t>(mean + 0.5f);
+        background.rgb[3 * at + c] = static_cast<std::uint8_t>(channel + 0.5f);
       }
-      float& variance = live.variance[at];
-      if (times_visible == 1) square = static_cast<float>(kFirstNoise * kFirstNoise);
-      variance += share * (square - variance);
-      if (times_visible >= kLeastSeen) background.noise[at] = noise_level(std::sqrt(variance));
+      if (seen[at] == 1) square = static_cast<float>(kFirstNoise * kFirstNoise);
+      variance[at] += share * (square - variance[at]);
+      if (seen[at] >= kLeastSeen) background.noise[at] = noise_level(std::sqrt(variance[at]));
     }
-  // learn the colors on either side of the tube's outline
-  if (live.frames % kColorEvery == 1) {
-    for (Colors* const colors : {&live.look.near, &live.look.far})
-      for (int i = 0; i < kColorBins; ++i) {
-        colors->object[i] = std::max((1.0 - kForgetColors) * colors->object[i], kLeastGiven * live.given[i]);
-        colors->surroundings[i] *= 1.0 - kForgetColors;
-      }
-    count_colors(live.look, picture, around, where, live.chain, kPredictedMargin, &view);
-    settle(live.look);
-  }
+}
+
+// Learns the colors on either side of the tube's outline.
+void LiveMasks::State::learn_colors(const Picture& picture, const Reach& where, const Tube& around,
+                                    const capture::View& mask) {
+  for (Colors* const colors : {&look.near, &look.far})
+    for (int i = 0; i < kColorBins; ++i) {
+      colors->object[i] = std::max((1.0 - kForgetColors) * colors->object[i], kLeastGiven * given[i]);
+      colors->surroundings[i] *= 1.0 - kForgetColors;
+    }
+  count_colors(look, picture, around, where, chain, kPredictedMargin, &mask);
+  settle(look);
+}
+
+LiveMasks::LiveMasks(const capture::Camera& camera, const chain::Chain& chain,
+                     const std::vector<std::uint8_t>& object_rgb)
+    : state_(std::make_unique<State>(camera, chain, object_rgb)) {}
+LiveMasks::~LiveMasks() = default;
+
+void LiveMasks::learn_marks(const capture::View& drawn, const math::Pose& base, const math::VectorX& theta) {
+  State& s = *state_;
+  s.look.marks = marks(drawn, tube(s.chain, base, theta, s.pinhole, 0.0, s.chain.length, 0.0), s.chain);
+}
+
+capture::View LiveMasks::mask(const capture::Image8& recorded, const math::Pose& base,
+                              const std::optional<math::VectorX>& theta) {
+  State& s = *state_;
+  const Reach where = reach(s.chain, base, s.pinhole);
+  if (where.box.empty()) return {};
+  const Picture picture = s.straightened(recorded, where.box);
+  if (s.frames == 0) s.learn_first_frame(picture, where.box);
+  const std::optional<math::VectorX> place = theta ? theta : s.grown_in(picture, base);
+  capture::View view = cut(s.look, picture, s.pinhole, s.chain, base, place, kDoubt);
+  ++s.frames;
+  if (!theta) return view;
+  const Tube around = tube(s.chain, base, *theta, s.pinhole, 0.0, s.chain.length, kAboutPixels);
+  s.learn_background(picture, where.box, around);
+  if (s.frames % kColorEvery == 1) s.learn_colors(picture, where, around, view);
   return view;
 }
+
+int LiveMasks::frames() const { return state_->frames; }
 
 }  // namespace chainsplat::masking

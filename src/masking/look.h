@@ -2,10 +2,47 @@
 #pragma once
 #include <span>
 
-#include "chainsplat/masking.h"
+#include "chainsplat/capture.h"
+#include "chainsplat/chain.h"
 #include "src/masking/tube.h"
 
 namespace chainsplat::masking {
+
+// An image of the camera's size, RGB or RGBA, row-major; the pixels are not owned.
+struct Picture {
+  const std::uint8_t* pixels = nullptr;
+  int width = 0, height = 0, channels = 3;
+};
+
+// Natural log odds of a color for the rope against its surroundings, on a grid of 32 steps per channel with index
+// (r, g, b) / 8.
+struct Colors {
+  std::vector<double> object, surroundings;  // numbers of pixels, 32^3; empty: nothing known
+  std::vector<float> log_odds;               // 32^3, computed from the counts by settle()
+  double usual = 0.0, separation = 0.0;      // mean log odds of the object's pixels; that minus the surroundings' mean
+};
+
+// The picture of one camera without the rope.
+struct Background {
+  std::vector<std::uint8_t> rgb;    // 3 * width * height
+  std::vector<std::uint8_t> noise;  // width * height, standard deviation in gray levels; 0: background unknown here
+};
+
+// The rope's colors along and across as one camera sees it. While the rope does not turn about itself, every mark stays
+// at its arclength and side.
+struct Marks {
+  int along = 0, across = 0;      // numbers of cells; 0: nothing known
+  double step = 0.0;              // m, length of a cell along the rope
+  std::vector<std::uint8_t> rgb;  // 3 * along * across
+  std::vector<char> known;        // along * across
+};
+
+// What distinguishes the rope from everything else for one camera.
+struct Look {
+  Colors near, far;  // of the rope's half at the grasp and of that at the free end, whose tip may differ in color
+  Background background;
+  Marks marks;
+};
 
 constexpr int kColorBins = 32 * 32 * 32;
 inline int color_bin(const std::uint8_t* rgb) { return (rgb[0] >> 3) << 10 | (rgb[1] >> 3) << 5 | rgb[2] >> 3; }
@@ -60,6 +97,8 @@ std::uint8_t noise_level(double deviation);
 // Returns a pixel's log odds for the rope from its difference from the background; 0 where the background is unknown.
 double difference_odds(const Background& background, const Picture& picture, int x, int y);
 double color_odds(const Colors& colors, const std::uint8_t* rgb);
+// Computes log_odds from the counts, smoothed over neighboring colors.
+void settle(Colors& colors);
 void settle(Look& appearance);
 
 }  // namespace chainsplat::masking

@@ -4,9 +4,10 @@
 #include <atomic>
 #include <cmath>
 
+#include "chainsplat/masking.h"
 #include "chainsplat/silhouette.h"
+#include "src/masking/cut.h"
 #include "src/masking/grow.h"
-#include "src/masking/look.h"
 #include "src/masking/ribbon.h"
 
 namespace chainsplat::masking {

@@ -99,7 +99,7 @@ struct Tracker::Implementation {
   std::optional<splat::Engine> engine;  // none: outlines alone
   std::optional<estimation::AdamFollower> adam;
   std::optional<bool> masked_before;                       // by the first picture
-  std::optional<masking::Live> live;                       // masks made here
+  std::optional<masking::LiveMasks> live;                  // masks made here
   std::array<int, 4> masked = {0, 0, 0, 0};                // crop of the last mask: x0, y0, width, height
   double last = -std::numeric_limits<double>::infinity();  // s, of the last frame
 
@@ -184,7 +184,7 @@ void Tracker::Implementation::look_at_first_picture(const capture::Image8& pictu
     core::warn(options.name + ": is not masked, and the twin has no colors to find the rope by; what is " +
                "not black is taken for the rope");
   else
-    live = masking::start(filter.cameras[0], twin.chain, colors);
+    live.emplace(filter.cameras[0], twin.chain, colors);
 }
 
 Tracker::Tracker(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
@@ -221,11 +221,11 @@ capture::View Tracker::mask(const capture::Image8& picture, double time) {
   const math::Pose pose = t.filter.base(time).pose;
   const std::optional<math::VectorX> theta = t.expected(time);
   constexpr int kMarksEvery = 10;  // frames; the rope shows nearly the same side
-  if (t.engine && t.live->frames % kMarksEvery == 0) {
+  if (t.engine && t.live->frames() % kMarksEvery == 0) {
     const math::VectorX near = theta.value_or(t.filter.rest);  // marks stay on the rope wherever it lies
-    masking::learn_marks(*t.live, drawn_view(*t.engine, t.twin, camera, pose, near, t.masked), pose, near);
+    t.live->learn_marks(drawn_view(*t.engine, t.twin, camera, pose, near, t.masked), pose, near);
   }
-  capture::View view = masking::mask(*t.live, picture, pose, theta);
+  capture::View view = t.live->mask(picture, pose, theta);
   t.masked = {view.x0, view.y0, view.width, view.height};
   return marked(std::move(view));
 }
