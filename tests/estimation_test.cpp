@@ -5,10 +5,12 @@
 #include <doctest/doctest.h>
 
 #include <cmath>
+#include <functional>
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/gpu.h"
 #include "reference_colors.h"
+#include "src/estimation/predict.h"
 
 namespace {
 
@@ -127,13 +129,25 @@ double deviation(const chain::Chain& chain, const estimation::Estimate& e) {
   return std::sqrt(variance);
 }
 
-std::vector<estimation::Estimate> follow(estimation::Filter& filter, const std::vector<capture::View>& views) {
+using Views = std::span<const capture::View* const>;
+
+std::vector<estimation::Estimate> follow(const std::function<estimation::Estimate(Views)>& update,
+                                         const std::vector<capture::View>& views) {
   std::vector<estimation::Estimate> out;
   for (const capture::View& view : views) {
     const capture::View* const one[] = {&view};
-    out.push_back(estimation::update(filter, one));
+    out.push_back(update(one));
   }
   return out;
+}
+
+std::vector<estimation::Estimate> follow(estimation::Filter& filter, const std::vector<capture::View>& views) {
+  return follow([&](Views moment) { return filter.update(moment); }, views);
+}
+
+// The same with the filter's inside in sight.
+std::vector<estimation::Estimate> follow(estimation::State& state, const std::vector<capture::View>& views) {
+  return follow([&](Views moment) { return estimation::update(state, moment); }, views);
 }
 
 const twin::Twin& shared_twin() {
@@ -158,7 +172,7 @@ TEST_CASE("one camera and the dynamics follow a rope in space, with honest devia
   const twin::Twin& twin = shared_twin();
   for (const int drop : {1, 2}) {
     CAPTURE(drop);
-    estimation::Filter filter = estimation::start(twin, {front_camera()}, moving_base, 0.0);
+    estimation::Filter filter(twin, {front_camera()}, moving_base, 0.0);
     std::vector<capture::View> views;
     for (std::size_t f = 0; f < shared_views().size(); f += drop) views.push_back(shared_views()[f]);
     double square = 0.0;
@@ -236,8 +250,9 @@ std::vector<capture::View> painted_views() {
 
 // Compares colors as a device would, with the painted rope as the twin.
 std::vector<splat::ColorSums> compare_painted(std::span<const capture::View* const> views,
+                                              std::span<const capture::Camera> cameras,
                                               std::span<const std::vector<Pose>> motions) {
-  const capture::Camera camera = front_camera();
+  const capture::Camera& camera = cameras[0];
   const chain::Chain& chain = shared_twin().chain;
   std::vector<splat::ColorSums> out;
   for (std::size_t v = 0; v < views.size(); ++v) {
@@ -250,9 +265,8 @@ std::vector<splat::ColorSums> compare_painted(std::span<const capture::View* con
 
 TEST_CASE("marks on the rope tell its slope in depth, and the exposure is found") {
   const std::vector<capture::View> views = painted_views();
-  estimation::Filter outlines = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
-  estimation::Filter colors = outlines;
-  colors.compare_colors = compare_painted;
+  estimation::Filter outlines(shared_twin(), {front_camera()}, moving_base, 0.0);
+  estimation::Filter colors(shared_twin(), {front_camera()}, moving_base, 0.0, {}, {}, compare_painted);
   const auto a = follow(outlines, views), b = follow(colors, views);
   double without = 0.0, with = 0.0;
   int honest = 0;
@@ -276,8 +290,7 @@ TEST_CASE("what has the rope's outline and not its marks is not the rope: lost i
   for (int f = 8; f < 24; ++f)
     for (std::size_t k = 0; k < views[f].rgba.size(); ++k)
       if (k % 4 != 3) views[f].rgba[k] = k / 4 % 7 < 3 ? 150 : 120;  // stripes of its own
-  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
-  filter.compare_colors = compare_painted;
+  estimation::Filter filter(shared_twin(), {front_camera()}, moving_base, 0.0, {}, {}, compare_painted);
   const auto found = follow(filter, views);
   for (int f = 0; f < 12; ++f) CHECK_FALSE(found[f].lost);  // for some frames it may be a glint
   for (int f = 16; f < 24; ++f) CHECK(found[f].lost);
@@ -321,28 +334,30 @@ TEST_CASE("Adam on the rendering loss finds the rope from near, and says nothing
                             ? (picture.rgba[k] >= 0.5f ? 255 : 0)
                             : static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(picture.rgba[k], 0.0f, 1.0f))));
 
-  const estimation::Filter filter = estimation::start(shared_twin(), {camera}, moving_base, 0.0);
+  twin::Twin near = shared_twin();  // without dynamics, so that it begins at its first angles
+  near.parameters.reset();
+  near.initial.emplace().theta = truth;
+  for (int k = 0; k < 12; k += 2) near.initial->theta[k] += 0.03;  // bends in the image plane
   int asked = 0;
-  estimation::AdamFollower adam =
-      estimation::start_adam(filter, [&](const capture::View& target, const std::vector<Pose>& motions) {
-        ++asked;
-        const splat::ViewSpec drawn = spec(motions);
-        const std::vector<std::uint8_t>* const pixels = &target.rgba;
-        splat::Gradients gradients;
-        engine.loss(gaussians, {&drawn, 1}, {&pixels, 1}, {}, 0.0, &gradients);
-        return gradients.link_twists.front();
-      });
-  adam.theta = truth;
-  for (int k = 0; k < 12; k += 2) adam.theta[k] += 0.03;  // bends in the image plane
-  adam.time = -kInterval;
-  std::vector<double> errors{rms(chain, adam.theta, truth)};
+  const auto gradient = [&](const capture::View& target, const capture::Camera&, const std::vector<Pose>& motions) {
+    ++asked;
+    const splat::ViewSpec drawn = spec(motions);
+    const std::vector<std::uint8_t>* const pixels = &target.rgba;
+    splat::Gradients gradients;
+    engine.loss(gaussians, {&drawn, 1}, {&pixels, 1}, {}, 0.0, &gradients);
+    return gradients.link_twists.front();
+  };
+  estimation::AdamFollower adam(near, {camera}, moving_base, 0.0, gradient, {.first_steps = 10});
+  CHECK_FALSE(adam.expected(0.0));
+  std::vector<double> errors{rms(chain, near.initial->theta, truth)};
   for (int frame = 0; frame < 5; ++frame) {
     view.time = frame * kInterval * 1e-6;  // so short that the base stays
     const capture::View* const one[] = {&view};
-    const estimation::Estimate e = estimation::update(adam, one);
+    const estimation::Estimate e = adam.update(one);
     CHECK(asked == 10 * (frame + 1));
     CHECK_FALSE(e.lost);
     CHECK(e.covariance.size() == 0);
+    CHECK(*adam.expected(1.0) == e.theta);
     errors.push_back(rms(chain, e.theta, truth));
     CHECK(nlohmann::json::parse(estimation::to_json(e, 0.0))["sigma"].empty());
   }
@@ -359,15 +374,15 @@ TEST_CASE("a clock whose zero is elsewhere changes nothing: frames may have nega
       if (k % 4 != 3) views[f].rgba[k] = k / 4 % 7 < 3 ? 150 : 120;  // something else
   views.resize(30);
   const auto followed = [&](double zero) {
-    estimation::Filter filter = estimation::start(
-        shared_twin(), {front_camera()}, [=](double time) { return moving_base(time - zero); }, zero);
-    filter.compare_colors = compare_painted;
+    estimation::State state = estimation::start(
+        shared_twin(), {front_camera()}, [=](double time) { return moving_base(time - zero); }, zero, {}, {},
+        compare_painted);
     std::vector<std::pair<estimation::Estimate, bool>> out;  // with whether a contact is assumed
     for (capture::View view : views) {
       view.time += zero;
       const capture::View* const one[] = {&view};
-      const estimation::Estimate e = estimation::update(filter, one);
-      out.emplace_back(e, filter.contact_until >= e.time);
+      const estimation::Estimate e = estimation::update(state, one);
+      out.emplace_back(e, state.contact_until >= e.time);
     }
     return out;
   };
@@ -391,7 +406,7 @@ TEST_CASE("what hides a part of the rope is not 'no rope'") {
   for (int f = 12; f < 40; ++f)  // a hand in front of the middle of the rope
     for (int y = 105; y < 150; ++y)
       for (int x = 0; x < views[f].width; ++x) views[f].rgba[4 * (y * views[f].width + x) + 3] = 0;
-  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  estimation::Filter filter(shared_twin(), {front_camera()}, moving_base, 0.0);
   int honest = 0;
   for (const estimation::Estimate& e : follow(filter, views)) {
     CHECK_FALSE(e.lost);
@@ -413,7 +428,7 @@ TEST_CASE("a rope whose lower part leaves the image is followed by the rest") {
     for (int x = 0; x < view.width; ++x) shown += view.rgba[4 * ((view.height - 1) * view.width + x) + 3] != 0;
   }
   REQUIRE(shown > 0);
-  estimation::Filter filter = estimation::start(shared_twin(), {camera}, moving_base, 0.0);
+  estimation::Filter filter(shared_twin(), {camera}, moving_base, 0.0);
   int honest = 0;
   for (const estimation::Estimate& e : follow(filter, views)) {
     CHECK_FALSE(e.lost);
@@ -432,7 +447,7 @@ TEST_CASE("a rope that is elsewhere at once is found again") {
     views[f] = draw(shared_twin().chain, thrown, f * kInterval, f, front_camera());
   }
   views.resize(30);
-  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  estimation::Filter filter(shared_twin(), {front_camera()}, moving_base, 0.0);
   const auto found = follow(filter, views);
   CHECK(rms(shared_twin().chain, found[19].theta, thrown) > 50e-3);
   CHECK_FALSE(found[29].lost);
@@ -484,7 +499,7 @@ TEST_CASE("a rope that swung into something is found where one camera does not s
     CAPTURE(link);
     dynamics::InitialState state{0.4, VectorX::Zero(n), VectorX::Zero(n)};
     for (int k = 0; k < n; k += 2) state.thetadot[k] = -1.0;
-    estimation::Filter filter = estimation::start(twin, {front_camera()}, moving_base, 0.0);
+    const estimation::State before = estimation::start(twin, {front_camera()}, moving_base, 0.0);
     estimation::Belief belief{state.time, VectorX::Zero(3 * n), 1e-4 * MatrixX::Identity(3 * n, 3 * n)};
     belief.mean.segment(n, n) = state.thetadot;
     strike(model, moving_base(state.time), link, state);
@@ -492,8 +507,8 @@ TEST_CASE("a rope that swung into something is found where one camera does not s
     const VectorX truth = dynamics::rollout(model, moving_base, state, {time}).theta[0];
     const Pose base = moving_base(time).pose;
     const MatrixX true_nodes = chain::nodes(twin.chain, chain::link_motions(twin.chain, truth, base));
-    const estimation::Belief touched = estimation::predict(filter, belief, time, estimation::Contact::touched);
-    const estimation::Belief struck = estimation::predict(filter, belief, time, estimation::Contact::struck);
+    const estimation::Belief touched = estimation::predict(before, belief, time, estimation::Contact::touched);
+    const estimation::Belief struck = estimation::predict(before, belief, time, estimation::Contact::struck);
     const auto surprise = [&](const estimation::Belief& predicted) {  // the squared Mahalanobis distance
       const VectorX off = truth - predicted.mean.head(n);
       return off.dot(VectorX(predicted.covariance.topLeftCorner(n, n).llt().solve(off)));
@@ -510,8 +525,8 @@ TEST_CASE("a rope that swung into something is found where one camera does not s
 TEST_CASE("depth comes from the dynamics: without them it is worse, and said to be less sure") {
   twin::Twin still = shared_twin();
   still.parameters.reset();
-  estimation::Filter with = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
-  estimation::Filter without = estimation::start(still, {front_camera()}, moving_base, 0.0);
+  estimation::Filter with(shared_twin(), {front_camera()}, moving_base, 0.0);
+  estimation::Filter without(still, {front_camera()}, moving_base, 0.0);
   const auto a = follow(with, shared_views()), b = follow(without, shared_views());
   CHECK(deviation(still.chain, b.back()) > 2.0 * deviation(still.chain, a.back()));
   double error_with = 0.0, error_without = 0.0;
@@ -525,7 +540,7 @@ TEST_CASE("depth comes from the dynamics: without them it is worse, and said to 
 TEST_CASE("a rope out of sight is predicted, counts as lost in time, and is found again") {
   std::vector<capture::View> views = shared_views();
   for (int f = 10; f < 32; ++f) std::fill(views[f].rgba.begin(), views[f].rgba.end(), std::uint8_t{0});
-  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  estimation::Filter filter(shared_twin(), {front_camera()}, moving_base, 0.0);
   const auto found = follow(filter, views);
   CHECK_FALSE(found[12].seen);
   CHECK_FALSE(found[12].lost);
@@ -547,7 +562,7 @@ TEST_CASE("first masks that end half-way down the rope are not believed, and sai
         if (row(y)[4 * x + 3] != 0) top = std::min(top, y), bottom = y;
     std::fill(row((top + bottom) / 2), view.rgba.end(), std::uint8_t{0});
   }
-  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  estimation::Filter filter(shared_twin(), {front_camera()}, moving_base, 0.0);
   const auto found = follow(filter, views);
   const chain::Chain& chain = shared_twin().chain;
   for (int f = 0; f < 10; ++f) {
@@ -561,13 +576,13 @@ TEST_CASE("first masks that end half-way down the rope are not believed, and sai
 TEST_CASE("a base whose stamps are late is found to be so while it moves") {
   constexpr double kLate = 0.02;
   const auto late_base = [](double time) { return moving_base(time - kLate); };
-  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, late_base, 0.0);
-  const auto found = follow(filter, shared_views());
-  CHECK(std::abs(filter.setup.mean[0] - kLate) < 6e-3);  // in a second of motion
-  CHECK(filter.setup.information(0, 0) > 1.0 / (3e-3 * 3e-3));
+  estimation::State state = estimation::start(shared_twin(), {front_camera()}, late_base, 0.0);
+  const auto found = follow(state, shared_views());
+  CHECK(std::abs(state.setup.mean[0] - kLate) < 6e-3);  // in a second of motion
+  CHECK(state.setup.information(0, 0) > 1.0 / (3e-3 * 3e-3));
   const std::size_t last = found.size() - 1;
   CHECK(rms(shared_twin().chain, found[last].theta, shared_truth().theta[last]) < 5e-3);
-  estimation::Filter right = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  estimation::State right = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
   follow(right, shared_views());
   CHECK(std::abs(right.setup.mean[0]) < 3e-3);
 }
@@ -579,14 +594,14 @@ TEST_CASE("a camera that the twin does not know is found to stand where it does"
   off.world_from_camera.translation += Vector3(0.002, -0.002, -0.003);
   const chain::Chain& chain = shared_twin().chain;
   const auto follow_with = [&](const std::vector<char>& unverified) {
-    estimation::Filter filter = estimation::start(shared_twin(), {off}, moving_base, 0.0, {}, unverified);
+    estimation::Filter filter(shared_twin(), {off}, moving_base, 0.0, {}, unverified);
     const auto found = follow(filter, shared_views());
     double error = 0.0;
     for (std::size_t f = 20; f < found.size(); ++f) error += rms(chain, found[f].theta, shared_truth().theta[f]);
-    return std::tuple{error / static_cast<double>(found.size() - 20), found, filter};
+    return std::tuple{error / static_cast<double>(found.size() - 20), found, filter.cameras()[0]};
   };
   const auto [as_given, trusting, given] = follow_with({});
-  const auto [error, found, filter] = follow_with({1});
+  const auto [error, found, believed] = follow_with({1});
   CHECK(error < 0.5 * as_given);
   for (std::size_t f = 0; f < found.size(); ++f)
     CHECK(rms(chain, found[f].theta, shared_truth().theta[f]) < 3.0 * deviation(chain, found[f]));
@@ -598,7 +613,7 @@ TEST_CASE("a camera that the twin does not know is found to stand where it does"
   const auto pixel = [&](const capture::Camera& camera) {
     return Vector2(capture::project(camera, camera.world_from_camera.inverse() * middle));
   };
-  const double before = (pixel(off) - pixel(right)).norm(), after = (pixel(filter.cameras[0]) - pixel(right)).norm();
+  const double before = (pixel(off) - pixel(right)).norm(), after = (pixel(believed) - pixel(right)).norm();
   CHECK(before > 1.5);
   CHECK(after < 0.4 * before);
 }
@@ -611,9 +626,9 @@ TEST_CASE("a rope on a table lies in its plane, however the gripper's pose is ti
   trajectory::BaseMotion tilted;
   tilted.pose.rotation = math::exp_so3(Vector3(0.02, -0.015, 0.3));
   tilted.velocity << 0.1, 0.2, 0.3, 0.4, 0.5, 0.6;
-  const estimation::Filter filter = estimation::start(
+  const estimation::Filter filter(
       twin, {front_camera()}, [&](double) { return tilted; }, 0.0);
-  const trajectory::BaseMotion believed = estimation::base_at(filter, 0.0);
+  const trajectory::BaseMotion believed = filter.base_at(0.0);
   CHECK((believed.pose.rotation.col(2) - Vector3::UnitZ()).norm() < 0.001);
   CHECK((tilted.pose.rotation.col(2) - Vector3::UnitZ()).norm() > 0.02);
   // the same motion of the gripper, told in the turned frame
@@ -627,13 +642,13 @@ TEST_CASE("a rope on a table lies in its plane, however the gripper's pose is ti
 
 TEST_CASE("blobs apart from a rope that is seen whole are no reason to doubt it") {
   std::vector<capture::View> views(shared_views().begin(), shared_views().begin() + 6);
-  estimation::Filter alone = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  estimation::Filter alone(shared_twin(), {front_camera()}, moving_base, 0.0);
   const auto expected = follow(alone, views);
   for (capture::View& view : views)
     for (int x0 : {10, 260})
       for (int y = 20; y < 60; ++y)
         for (int x = x0; x < x0 + 40; ++x) view.rgba[4 * (y * view.width + x) + 3] = 255;
-  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  estimation::Filter filter(shared_twin(), {front_camera()}, moving_base, 0.0);
   const auto found = follow(filter, views);
   for (std::size_t f = 0; f < found.size(); ++f) {
     CHECK(std::string(estimation::status(found[f])) == "following");
@@ -648,7 +663,7 @@ TEST_CASE("a mask elsewhere is not the rope: lost, and the prediction stays") {
     for (int y = 5; y < 25; ++y)
       for (int x = 270; x < 310; ++x) views[f].rgba[4 * (y * views[f].width + x) + 3] = 255;
   }
-  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  estimation::Filter filter(shared_twin(), {front_camera()}, moving_base, 0.0);
   const auto found = follow(filter, views);
   for (int f = 8; f < 11; ++f) {
     CHECK(found[f].lost);
@@ -667,12 +682,12 @@ TEST_CASE("a mask that is too wide on a table is thought to be so on the rope's 
   const double half = std::sqrt(0.5);
   camera.world_from_camera.rotation << 1, 0, 0, 0, -half, half, 0, -half, -half;
   camera.world_from_camera.translation = -0.7 * camera.world_from_camera.rotation.col(2);
-  estimation::Filter filter = estimation::start(
+  estimation::State state = estimation::start(
       twin, {camera}, [](double) { return trajectory::BaseMotion{}; }, 0.0);
-  filter.edge_offset = 0.5;
+  state.edge_offset = 0.5;
   estimation::Belief belief{0.0, VectorX::Zero(3 * n + 2), 1e-4 * MatrixX::Identity(3 * n + 2, 3 * n + 2)};
   belief.mean.tail(2) << 1.0, -1.0;  // forgotten by the time of the prediction
-  const VectorX shift = estimation::predict(filter, belief, 100.0, estimation::Contact::none).mean.tail(2);
+  const VectorX shift = estimation::predict(state, belief, 100.0, estimation::Contact::none).mean.tail(2);
   CHECK(shift[0] == doctest::Approx(0.0).epsilon(1e-6));
   CHECK(shift[1] > 0.3);  // downward, as image rows count
   CHECK(shift[1] <= 0.5);
@@ -680,7 +695,7 @@ TEST_CASE("a mask that is too wide on a table is thought to be so on the rope's 
 
 TEST_CASE("the predicted covariance is that of the predicted mean's derivative") {
   const int n = 12;
-  estimation::Filter filter = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
+  const estimation::State state = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
   estimation::Belief belief;
   belief.time = 0.3;
   belief.mean = VectorX::Zero(3 * n);
@@ -689,13 +704,13 @@ TEST_CASE("the predicted covariance is that of the predicted mean's derivative")
   for (int k = 0; k < 3 * n; ++k) direction[k] = 1.0 + 0.3 * std::cos(0.2 * k);
   const double size = 1e4;  // so large that the process noise is negligible
   belief.covariance = size * size * direction * direction.transpose();
-  const estimation::Belief moved = estimation::predict(filter, belief, 0.3 + kInterval, estimation::Contact::none);
+  const estimation::Belief moved = estimation::predict(state, belief, 0.3 + kInterval, estimation::Contact::none);
   const double step = 1e-5;
   estimation::Belief a = belief, b = belief;
   a.mean += step * direction;
   b.mean -= step * direction;
-  const VectorX slope = (estimation::predict(filter, a, 0.3 + kInterval, estimation::Contact::none).mean -
-                         estimation::predict(filter, b, 0.3 + kInterval, estimation::Contact::none).mean) /
+  const VectorX slope = (estimation::predict(state, a, 0.3 + kInterval, estimation::Contact::none).mean -
+                         estimation::predict(state, b, 0.3 + kInterval, estimation::Contact::none).mean) /
                         (2.0 * step);
   const VectorX expected = size * slope.cwiseAbs(), got = moved.covariance.diagonal().cwiseSqrt();
   CHECK((got - expected).norm() <= 0.05 * expected.norm());

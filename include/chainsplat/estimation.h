@@ -11,7 +11,7 @@
 // Angles are in rad, rates in rad/s, times in s, positions in the world frame in m.
 #pragma once
 #include <functional>
-#include <limits>
+#include <memory>
 #include <optional>
 #include <span>
 #include <string>
@@ -26,6 +26,8 @@
 #include "chainsplat/twin.h"
 
 namespace chainsplat::estimation {
+
+struct State;  // of the filter between two frames
 
 // The filter's noise model. Unknown forces are per kilogram of rope. The values were chosen on captures with truth.
 struct Options {
@@ -47,17 +49,10 @@ struct Options {
 // more. On a table the persistent part, the masks' shift, is in the belief instead.
 Options options_for_live_masks(bool tabletop);
 
-// A Gaussian belief about (theta, thetadot, shift of the rest angles), 3 n numbers in rad and rad/s. On a table, where
-// ropes have contact shadows, it also holds the shift of each camera's masks (silhouette::Prior), px in x and y.
-struct Belief {
-  double time = 0.0;  // s
-  math::VectorX mean;
-  math::MatrixX covariance;
-};
-
-// Compares the twin, with its links at `motions`, with the colors inside the views' masks. Returns one result per view.
-// Throws WorkError.
+// Compares the twin, with its links at `motions` (one list per view), with the colors inside the views' masks.
+// `cameras`: all of them as they are believed to stand, by View::camera. Returns one result per view. Throws WorkError.
 using CompareColors = std::function<std::vector<splat::ColorSums>(std::span<const capture::View* const> views,
+                                                                  std::span<const capture::Camera> cameras,
                                                                   std::span<const std::vector<math::Pose>> motions)>;
 
 struct Estimate {
@@ -72,7 +67,7 @@ struct Estimate {
   std::optional<double> likeness;  // correlation of drawn and recorded colors about each channel's mean, the best
                                    // of the views'; none: not compared, or a rope without marks
   double gain = 1.0, bias = 0.0;   // exposure of the last view relative to the twin's colors
-  BaseCorrection base;             // of the base motion as it was given (base_at())
+  BaseCorrection base;             // of the base motion as it was given (Filter::base_at())
   double surprise = 0.0;           // squared innovation over its expectation, about 1 as long as the model holds
   bool seen = false;               // whether a mask shows anything
   bool lost = false;               // whether the estimate does not explain the mask, the masks were empty for long,
@@ -84,77 +79,41 @@ struct Estimate {
 };
 const char* status(const Estimate& estimate);  // "following", "doubtful" or "lost"
 
-constexpr double kNever = -std::numeric_limits<double>::infinity();  // s; before all times, which may be negative
+// Follows a rope from frame to frame. One thread at a time.
+class Filter {
+ public:
+  // `base`: as given, valid from `base_start` on, s; it is asked up to 0.2 s after a frame's own time, too, where it
+  // may be as at rest. `unverified`: by camera whether no training has compared its pose with the rope; empty: none.
+  // `compare_colors`: empty: outlines alone. Throws InputError where the twin's chain or parameters are unusable.
+  Filter(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
+         double base_start, const Options& options = {}, const std::vector<char>& unverified = {},
+         CompareColors compare_colors = {});
+  ~Filter();
+  Filter(Filter&&) noexcept;
+  Filter& operator=(Filter&&) noexcept;
 
-// What is learned of the surroundings while the rope is followed: the base's clock, how the grasp is turned, and the
-// poses of cameras that no training has compared with the rope. Gaussian, of the numbers of silhouette::SetupEquations,
-// which are 0 where all is as given.
-struct Setup {
-  std::vector<capture::Camera> cameras;  // as given
-  std::vector<char> posed;               // by camera: its pose is learned
-  math::VectorX mean;
-  math::MatrixX information;       // of what is known beforehand and of all frames
-  math::VectorX right;             // information times mean
-  math::MatrixX angles;            // rad^2, n x n: what the rest of its uncertainty adds to the last frame's angles
-  math::MatrixX first_information;  // of what is known beforehand alone
-  math::VectorX first_right;
-  int frames = 0;                  // that count
-  double last = kNever;            // s, the last frame
-  double settling_until = kNever;  // s: until then it changes so fast that the rope seems to move by it
+  // Processes one frame: undistorted crops with their masks, which may be empty, of one camera or of several at nearly
+  // the same time (the first view's; View::camera is an index into cameras()). Times must increase. Throws WorkError.
+  Estimate update(std::span<const capture::View* const> views);
+  // Other options from the next frame on, where only the frames themselves show what they are.
+  void set_options(const Options& options);
+
+  // The predicted angles at `time`, where the masks should be searched for; none before the first frame and while the
+  // rope is lost.
+  std::optional<math::VectorX> expected(double time) const;
+  // The base's motion as it is believed to be: its clock and how it holds the rope mended as far as they are known.
+  trajectory::BaseMotion base_at(double time) const;
+  // What of the setup has turned out to be wrong by more than three deviations, so far: codes "base-time" and
+  // "camera-pose".
+  std::vector<capture::Finding> findings() const;
+
+  const dynamics::Model& model() const;                 // without parameters where the twin has no dynamics
+  const std::vector<capture::Camera>& cameras() const;  // as they are believed to be
+  const math::VectorX& rest() const;                    // rad, angles of the rope at rest at `base_start`
+
+ private:
+  std::unique_ptr<State> state_;
 };
-
-// The state of the filter between two frames.
-struct Filter {
-  dynamics::Model model;
-  bool identified = false;                    // the twin has dynamics; otherwise rates are constant
-  bool shifts = false;                        // the unknown force is a part of the state
-  std::optional<math::Vector3> table_normal;  // unit, world; on a table the masks' shift is a part of the state too
-  std::vector<capture::Camera> cameras;       // as they are believed to be
-  dynamics::BaseFunction base;                // as given; base_at() is what is believed
-  Setup setup;
-  Options options;
-  CompareColors compare_colors;     // empty: silhouettes alone
-  std::optional<Belief> belief;     // none before the first frame
-  double base_start = 0.0;          // s, where the base's motion begins to be known; the rope is assumed at rest there
-  math::VectorX rest;               // rad, angles of the rope at rest at that time
-  double contact_until = kNever;    // s, end of the time in which the motion is assumed to depart from the model
-  math::VectorX everywhere, place;  // shares of the links' ends in the unknown force: even, and as learned in contact
-  double last_seen = kNever;        // s, last frame in which the masks showed the rope
-  double last_like = kNever;        // s, last frame in which the colors in the masks were like the twin's
-  bool lost = false;                // in the last frame
-  bool whole = false;               // the masks have shown the whole rope since it was found
-  double hidden_since = kNever;     // s, first frame since it was found
-  double edge_offset = 0.0, edge_offset_variance = 0.0;  // px, px^2, of the masks' outline outside the tube's
-};
-
-// Starts a filter. `base_start`: the first time at which `base` is valid; it is asked up to 0.2 s after a frame's own
-// time, too, where it may be as at rest. `unverified`: by camera whether no training has compared its pose with the
-// rope; empty: none. Throws InputError where the twin's chain or parameters are unusable.
-Filter start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
-             double base_start, const Options& options = {}, const std::vector<char>& unverified = {});
-
-// The base's motion as it is believed to be: its clock and how it holds the rope mended as far as they are known.
-trajectory::BaseMotion base_at(const Filter& filter, double time);
-
-// What of the setup has turned out to be wrong by more than three deviations, so far: codes "base-time" and
-// "camera-pose".
-std::vector<capture::Finding> findings(const Filter& filter);
-
-// Processes one frame: undistorted crops with their masks, which may be empty, of one camera or of several at nearly
-// the same time (the first view's; View::camera is an index into Filter::cameras). Times must increase. Throws
-// WorkError.
-Estimate update(Filter& filter, std::span<const capture::View* const> views);
-
-// What may have happened to the rope in a step: nothing beyond the model, a force that changes as under a hand, or also
-// a blow, when the rope runs into something or is released.
-enum class Contact { none, touched, struck };
-
-// Returns the belief at a later time, without a measurement.
-Belief predict(const Filter& filter, const Belief& belief, double time, Contact contact);
-
-// Returns the predicted angles at `time`, where the masks should be searched for; none before the first frame and while
-// the rope is lost.
-std::optional<math::VectorX> expected(const Filter& filter, double time);
 
 // The paper's method ("State Estimation"), for comparison: a few Adam steps on the rendering loss of every frame, from
 // the previous frame's angles. It has no motion model and no covariance; rates are differences of the angles.
@@ -165,20 +124,30 @@ struct AdamOptions {
 };
 
 // The gradient of the rendering loss with respect to the links' motions: world twists, 6 x links (mathematics.md 2.8).
-using LinkGradient = std::function<math::MatrixX(const capture::View& view, const std::vector<math::Pose>& motions)>;
+// `camera`: the view's.
+using LinkGradient = std::function<math::MatrixX(const capture::View& view, const capture::Camera& camera,
+                                                 const std::vector<math::Pose>& motions)>;
 
-struct AdamFollower {
-  Filter filter;  // supplies the twin, the cameras and the base; its belief is unused
-  LinkGradient gradient;
-  AdamOptions options;
-  math::VectorX theta;  // of the last frame; empty before the first
-  double time = 0.0;    // s, of the last frame
+class AdamFollower {
+ public:
+  // As the filter; the base is mended by what the table tells alone, and the cameras stand as given.
+  AdamFollower(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
+               double base_start, LinkGradient gradient, const AdamOptions& options = {});
+  ~AdamFollower();
+  AdamFollower(AdamFollower&&) noexcept;
+  AdamFollower& operator=(AdamFollower&&) noexcept;
+
+  Estimate update(std::span<const capture::View* const> views);  // as the filter's, with an empty covariance
+  std::optional<math::VectorX> expected(double time) const;      // the last frame's, whatever the time
+  trajectory::BaseMotion base_at(double time) const;
+  const dynamics::Model& model() const;
+  const std::vector<capture::Camera>& cameras() const;
+  const math::VectorX& rest() const;
+
+ private:
+  struct State;
+  std::unique_ptr<State> state_;
 };
-
-AdamFollower start_adam(const Filter& filter, LinkGradient gradient, const AdamOptions& options = {});
-
-// As the filter's update(), with an empty covariance.
-Estimate update(AdamFollower& follower, std::span<const capture::View* const> views);
 
 // Returns whether any pixel of the view is in the mask.
 bool has_mask(const capture::View& view);

@@ -2,18 +2,22 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 
 #include "shaders/shared/color.h"
 
 namespace chainsplat::estimation {
 
 using math::MatrixX;
+using math::Pose;
 using math::VectorX;
 
 namespace {
 
 constexpr int kLeastPixels = 100;        // fewer pixels are not compared,
 constexpr double kLeastContrast = 0.06;  // nor a rope with less contrast, the standard deviation of the drawn colors
+
+constexpr double kLeastColorWeight = 100;  // pixels times channels; fewer carry too little information
 
 // Returns the correlation of the drawn and the recorded colors about each channel's mean. Whatever the exposure, an
 // object without marks where the twin has them is not the rope.
@@ -56,6 +60,47 @@ ColorEquations color_equations(const chain::Chain& chain, const math::Pose& base
   out.normal = full.topLeftCorner(n, n) - coupling * exposure * coupling.transpose();
   out.right = pull.head(n) - coupling * (exposure * pull.tail<2>());
   return out;
+}
+
+void look_at_colors(const State& state, std::span<const capture::View* const> views, Belief& belief, Estimate& out) {
+  const chain::Chain& chain = state.given.model.chain;
+  const int n = chain.angles();
+  const Belief before = belief;
+  const MatrixX by_angles = before.covariance.leftCols(n);
+  std::vector<const capture::View*> shown;
+  std::copy_if(views.begin(), views.end(), std::back_inserter(shown),
+               [](const capture::View* view) { return view->width > 0 && view->height > 0; });
+  // Gauss-Newton steps on the sum of the views' normal equations and the belief as prior
+  for (int step = 0; step < state.options.color_steps; ++step) {
+    const VectorX theta = belief.mean.head(n);
+    MatrixX information = MatrixX::Zero(n, n);
+    VectorX right = VectorX::Zero(n);
+    double weight = 0.0, square = 0.0;
+    std::vector<std::vector<Pose>> motions;
+    for (const capture::View* const view : shown)
+      motions.push_back(chain::link_motions(chain, theta, base_at(state, view->time).pose));
+    const std::vector<splat::ColorSums> sums = state.compare_colors(shown, state.cameras, motions);
+    for (std::size_t v = 0; v < shown.size(); ++v) {
+      const ColorEquations e = color_equations(chain, base_at(state, shown[v]->time).pose, theta, sums[v]);
+      if (e.weight < kLeastColorWeight || !(e.square > 0.0)) continue;
+      const double scale = state.options.color_share * e.weight / e.square;  // over this view's residual variance
+      information += scale * e.normal;
+      right += scale * e.right;
+      if (e.likeness) out.likeness = std::max(out.likeness.value_or(-1.0), *e.likeness);
+      weight += e.weight;
+      square += e.square;
+      out.gain = e.gain;
+      out.bias = e.bias;
+    }
+    if (weight == 0.0) return;
+    out.color_residual = std::sqrt(square / weight);
+    right += information * (before.mean.head(n) - theta);  // linearized at theta, relative to the prior mean
+    const MatrixX inverse = (MatrixX::Identity(n, n) + information * before.covariance.topLeftCorner(n, n)).inverse();
+    belief.mean = before.mean - by_angles * (inverse * right);
+    belief.covariance = before.covariance - by_angles * (inverse * information) * by_angles.transpose();
+    symmetrize(belief.covariance);
+    belief.covariance.diagonal().array() += kLeastVariance;
+  }
 }
 
 }  // namespace chainsplat::estimation

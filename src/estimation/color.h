@@ -4,7 +4,7 @@
 // measurement, and what hides the rope is not in the mask. The frame's exposure, a gain and a bias, is solved for and
 // eliminated (design.md, 'Recognition').
 #pragma once
-#include "chainsplat/estimation.h"
+#include "src/estimation/state.h"
 
 namespace chainsplat::estimation {
 
@@ -20,5 +20,9 @@ struct ColorEquations {  // of one view, for the residual r = gain * drawn + bia
 // Returns the normal equations of one view. `sums`: of that view, with the twin drawn at theta.
 ColorEquations color_equations(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta,
                                const splat::ColorSums& sums);
+
+// Updates the belief with the colors inside the masks, and tells in `out` how they fit. The drawn rope must be within a
+// stripe's width of the real one.
+void look_at_colors(const State& state, std::span<const capture::View* const> views, Belief& belief, Estimate& out);
 
 }  // namespace chainsplat::estimation

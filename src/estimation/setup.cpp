@@ -39,20 +39,20 @@ constexpr double kFrame = 1.0 / 30.0;  // s, to the first frame from what was be
 // Whether the grasp's rotation is a number of its own: the first joint of a chain that bends in space takes it.
 bool bends_in_plane(const chain::Chain& chain) { return chain.angles() < chain.links(); }
 
-void add_table(const Filter& filter, Setup& setup) {
-  if (!filter.table_normal || !bends_in_plane(filter.model.chain)) return;
-  const Vector3 normal = filter.base(filter.base_start).pose.rotation.transpose() * *filter.table_normal;
-  const silhouette::TiltEquations tilt = silhouette::tilt_equations(filter.model.chain.bending_axis, normal);
+void add_table(const Given& given, Setup& setup) {
+  if (!given.table_normal || !bends_in_plane(given.model.chain)) return;
+  const Vector3 normal = given.base(given.base_start).pose.rotation.transpose() * *given.table_normal;
+  const silhouette::TiltEquations tilt = silhouette::tilt_equations(given.model.chain.bending_axis, normal);
   setup.information.block<3, 3>(SetupEquations::kGrasp, SetupEquations::kGrasp) += tilt.information;
   setup.right.segment<3>(SetupEquations::kGrasp) -= tilt.gradient;
 }
 
 // The base's motion, and its velocity over the time in which it may be as its clock is known, if that is larger: a base
 // that rests may have begun to move.
-trajectory::BaseMotion base_as_timed(const Filter& filter, double time) {
-  const double deviation = 1.0 / std::sqrt(filter.setup.information(SetupEquations::kClock, SetupEquations::kClock));
-  trajectory::BaseMotion out = base_at(filter, time);
-  const Pose before = base_at(filter, time - deviation).pose, after = base_at(filter, time + deviation).pose;
+trajectory::BaseMotion base_as_timed(const State& state, double time) {
+  const double deviation = 1.0 / std::sqrt(state.setup.information(SetupEquations::kClock, SetupEquations::kClock));
+  trajectory::BaseMotion out = base_at(state, time);
+  const Pose before = base_at(state, time - deviation).pose, after = base_at(state, time + deviation).pose;
   math::Vector6 mean;
   mean << math::log_so3(before.rotation.transpose() * after.rotation),
       out.pose.rotation.transpose() * (after.translation - before.translation);
@@ -67,24 +67,22 @@ double displacement(const chain::Chain& chain, const VectorX& theta, const Vecto
   return std::sqrt(change.dot(chain::displacement_metric(jacobians) * change) / static_cast<double>(jacobians.size()));
 }
 
-void move_cameras(Filter& filter) {
+void move_cameras(State& state) {
   int at = SetupEquations::kCameras;
-  for (std::size_t c = 0; c < filter.cameras.size(); ++c) {
-    if (!filter.setup.posed[c]) continue;
-    filter.cameras[c].world_from_camera =
-        capture::moved(filter.setup.cameras[c].world_from_camera, filter.setup.mean.segment<3>(at),
-                       filter.setup.mean.segment<3>(at + 3));
+  for (std::size_t c = 0; c < state.cameras.size(); ++c) {
+    if (!state.setup.posed[c]) continue;
+    state.cameras[c].world_from_camera = capture::moved(
+        state.given.cameras[c].world_from_camera, state.setup.mean.segment<3>(at), state.setup.mean.segment<3>(at + 3));
     at += SetupEquations::kPerCamera;
   }
 }
 
 }  // namespace
 
-Setup first_setup(const Filter& filter, const std::vector<char>& unverified) {
+Setup first_setup(const Given& given, const std::vector<char>& unverified) {
   Setup setup;
-  setup.cameras = filter.cameras;
   setup.posed = unverified;
-  setup.posed.resize(filter.cameras.size(), 0);
+  setup.posed.resize(given.cameras.size(), 0);
   const auto size = SetupEquations::kCameras +
                     SetupEquations::kPerCamera * std::count_if(setup.posed.begin(), setup.posed.end(), std::identity{});
   VectorX deviation(size);
@@ -96,27 +94,26 @@ Setup first_setup(const Filter& filter, const std::vector<char>& unverified) {
   }
   setup.right = VectorX::Zero(size);
   setup.information = deviation.cwiseAbs2().cwiseInverse().asDiagonal();
-  add_table(filter, setup);
+  add_table(given, setup);
   setup.mean = setup.information.ldlt().solve(setup.right);
   setup.first_information = setup.information;
   setup.first_right = setup.right;
-  setup.angles = MatrixX::Zero(filter.model.chain.angles(), filter.model.chain.angles());
+  setup.angles = MatrixX::Zero(given.model.chain.angles(), given.model.chain.angles());
   return setup;
 }
 
 BaseCorrection base_correction(const Setup& setup) {
-  if (setup.mean.size() == 0) return {};
   return {setup.mean[SetupEquations::kClock],
           {math::exp_so3(setup.mean.segment<3>(SetupEquations::kGrasp)), Vector3::Zero()}};
 }
 
-std::vector<capture::Finding> findings(const Filter& filter) {
+std::vector<capture::Finding> findings(const State& state) {
   constexpr double kSure = 3.0;          // standard deviations
   constexpr double kLeastClock = 0.002;  // s; less does no harm
   constexpr double kLeastTurn = 0.001;   // rad
   constexpr double kLeastShift = 0.001;  // m
   constexpr double kDegrees = 180.0 / std::numbers::pi;
-  const Setup& setup = filter.setup;
+  const Setup& setup = state.setup;
   const MatrixX covariance = setup.information.ldlt().solve(MatrixX::Identity(setup.mean.size(), setup.mean.size()));
   std::vector<capture::Finding> out;
   char text[200];
@@ -128,7 +125,7 @@ std::vector<capture::Finding> findings(const Filter& filter) {
     out.push_back({"base-time", "base", 1e3 * late, 1e3 * clock, "ms", true, true, false, -1, text});
   }
   int at = SetupEquations::kCameras;
-  for (std::size_t c = 0; c < setup.cameras.size(); ++c) {
+  for (std::size_t c = 0; c < state.given.cameras.size(); ++c) {
     if (!setup.posed[c]) continue;
     // of the size of a vector: of its component along itself
     const auto size = [&](int first, double* deviation) {
@@ -142,7 +139,7 @@ std::vector<capture::Finding> findings(const Filter& filter) {
     at += SetupEquations::kPerCamera;
     if (turn <= std::max(kLeastTurn, kSure * turn_deviation) && shift <= std::max(kLeastShift, kSure * shift_deviation))
       continue;
-    const std::string& name = setup.cameras[c].name;
+    const std::string& name = state.given.cameras[c].name;
     std::snprintf(text, sizeof text,
                   "%.2f +- %.2f degrees and %.1f +- %.1f mm from where its calibration puts it: followed as it stands; "
                   "calibrate it again",
@@ -153,20 +150,20 @@ std::vector<capture::Finding> findings(const Filter& filter) {
   return out;
 }
 
-void learn_setup(Filter& filter, std::span<const capture::View* const> views, const Belief& predicted,
+void learn_setup(State& state, std::span<const capture::View* const> views, const Belief& predicted,
                  const VectorX& theta) {
-  Setup& setup = filter.setup;
-  const chain::Chain& chain = filter.model.chain;
+  Setup& setup = state.setup;
+  const chain::Chain& chain = state.given.model.chain;
   const int n = chain.angles();
   const Eigen::LLT<MatrixX> factor(predicted.covariance.topLeftCorner(n, n));
   if (!math::is_positive(factor)) return;
-  silhouette::Options options = filter.options.silhouette;
+  silhouette::Options options = state.options.silhouette;
   options.prior.mean = predicted.mean.head(n);
   options.prior.information = factor.solve(MatrixX::Identity(n, n));
-  options.edge_offset = filter.edge_offset;
+  options.edge_offset = state.edge_offset;
   options.edge_offset_deviation = kWidth;
   SetupEquations frame = silhouette::setup_equations(
-      chain, [&](double time) { return base_as_timed(filter, time); }, views, filter.cameras, setup.posed, theta,
+      chain, [&](double time) { return base_as_timed(state, time); }, views, state.cameras, setup.posed, theta,
       options);
   if (!frame.information.allFinite() || !frame.gradient.allFinite()) return;
   const auto leave_out = [&](int at, int size) {
@@ -176,8 +173,8 @@ void learn_setup(Filter& filter, std::span<const capture::View* const> views, co
     frame.angles.middleCols(at, size).setZero();
   };
   // without dynamics nothing tells a rope that follows late from a base that is stamped late
-  const bool moving = base_as_timed(filter, predicted.time).velocity.tail<3>().norm() >= kMoving;
-  if (!filter.identified || !moving) leave_out(SetupEquations::kClock, 1);
+  const bool moving = base_as_timed(state, predicted.time).velocity.tail<3>().norm() >= kMoving;
+  if (!state.given.identified || !moving) leave_out(SetupEquations::kClock, 1);
   if (!bends_in_plane(chain)) leave_out(SetupEquations::kGrasp, 3);
 
   if (setup.frames < kFrames) {
@@ -197,8 +194,8 @@ void learn_setup(Filter& filter, std::span<const capture::View* const> views, co
   const VectorX change = frame.angles * (mean - setup.mean);
   setup.mean = std::move(mean);
   setup.angles = frame.angles * solver.solve(frame.angles.transpose());
-  move_cameras(filter);
-  if (filter.belief) filter.belief->mean.head(n) += change;
+  move_cameras(state);
+  if (state.belief) state.belief->mean.head(n) += change;
   const double interval = setup.last == kNever ? kFrame : predicted.time - setup.last;
   if (displacement(chain, theta, change) > kSettled * interval) setup.settling_until = predicted.time + kSettlingTime;
 }

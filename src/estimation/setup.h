@@ -1,20 +1,23 @@
 // setup.h - what is learned of the base's clock, the grasp and the cameras while a rope is followed
 // (mathematics.md 6.8).
 #pragma once
-#include "chainsplat/estimation.h"
+#include "src/estimation/state.h"
 
 namespace chainsplat::estimation {
 
-// What is known before the first frame. `filter`: with its model, cameras, base and table. `unverified`: by camera
+// What is known before the first frame. `given`: with its model, cameras, base and table. `unverified`: by camera
 // whether no training has compared its pose with the rope; empty: none.
-Setup first_setup(const Filter& filter, const std::vector<char>& unverified);
+Setup first_setup(const Given& given, const std::vector<char>& unverified);
 
-// What of it the base is mended by: nothing before the setup is made.
+// What of it the base is mended by.
 BaseCorrection base_correction(const Setup& setup);
 
 // Takes what a frame that is explained says of the setup. The belief before it was `predicted`, and its masks found the
-// angles `theta`. The filter's cameras and its belief, if it has one, move with the setup.
-void learn_setup(Filter& filter, std::span<const capture::View* const> views, const Belief& predicted,
+// angles `theta`. The state's cameras and its belief, if it has one, move with the setup.
+void learn_setup(State& state, std::span<const capture::View* const> views, const Belief& predicted,
                  const math::VectorX& theta);
+
+// As Filter::findings().
+std::vector<capture::Finding> findings(const State& state);
 
 }  // namespace chainsplat::estimation

@@ -6,6 +6,7 @@
 #include <cmath>
 #include <limits>
 #include <span>
+#include <variant>
 
 #include "chainsplat/estimation.h"
 #include "chainsplat/gpu.h"
@@ -59,14 +60,15 @@ bool black_about(const capture::Image8& picture) {
 }
 
 // The device's kernels are made at their first use, and its buffers grow, which no frame shall wait for: it is shown
-// masks that fill the pictures, which no frame does, and masks of a size that a rope's may have.
-void warm_up(const estimation::Filter& filter, double start) {
+// masks that fill the pictures, which no frame does, and masks of a size that a rope's may have. `motions`: of the
+// links at rest.
+void warm_up(const estimation::CompareColors& compare_colors, const std::vector<capture::Camera>& cameras,
+             const std::vector<math::Pose>& motions) {
   constexpr int kMostWidth = 2048, kMostHeight = 1536;  // px; larger masks can be more than the device takes at once
-  const std::vector<math::Pose> rest = chain::link_motions(filter.model.chain, filter.rest, filter.base(start).pose);
   for (const int share : {1, 4}) {
     std::vector<capture::View> views;
     std::vector<const capture::View*> pointers;
-    for (const capture::Camera& camera : filter.cameras) {
+    for (const capture::Camera& camera : cameras) {
       capture::View& view = views.emplace_back();
       view.camera = static_cast<int>(views.size()) - 1;
       view.width = std::min(camera.width, kMostWidth);
@@ -77,7 +79,7 @@ void warm_up(const estimation::Filter& filter, double start) {
         std::fill_n(&view.rgba[4 * (static_cast<std::size_t>(y) * view.width + left)], 4 * wide, std::uint8_t{255});
     }
     for (const capture::View& view : views) pointers.push_back(&view);
-    filter.compare_colors(pointers, std::vector<std::vector<math::Pose>>(views.size(), rest));
+    compare_colors(pointers, cameras, std::vector<std::vector<math::Pose>>(views.size(), motions));
   }
 }
 
@@ -92,45 +94,57 @@ struct Tracker::Implementation {
                  const std::vector<char>& unverified, dynamics::BaseFunction base, double start,
                  const TrackerOptions& options);
 
+  using Kinds = std::variant<estimation::Filter, estimation::AdamFollower>;
+
   TrackerOptions options;
   twin::Twin twin;
-  estimation::Filter filter;
+  dynamics::BaseFunction base;  // as given
   gpu::DevicePtr device;
   std::optional<splat::Engine> engine;  // none: outlines alone
-  std::optional<estimation::AdamFollower> adam;
+  Kinds follower;
   std::optional<bool> masked_before;                       // by the first picture
   std::optional<masking::LiveMasks> live;                  // masks made here
   std::array<int, 4> masked = {0, 0, 0, 0};                // crop of the last mask: x0, y0, width, height
   double last = -std::numeric_limits<double>::infinity();  // s, of the last frame
 
   void open_engine();
-  void look_at_colors(double start);
-  void start_adam();
+  Kinds make_follower(const std::vector<capture::Camera>& cameras, const std::vector<char>& unverified, double start);
+  estimation::CompareColors color_comparison();
+  estimation::LinkGradient link_gradient();
   void look_at_first_picture(const capture::Image8& picture);
 
-  // Where the rope is expected at `time`; none where that is not known.
+  // What both kinds of followers tell.
   std::optional<math::VectorX> expected(double time) const {
-    if (!adam) return estimation::expected(filter, time);
-    return adam->theta.size() > 0 ? std::optional<math::VectorX>(adam->theta) : std::nullopt;
+    return std::visit([&](const auto& f) { return f.expected(time); }, follower);
+  }
+  const std::vector<capture::Camera>& cameras() const {
+    return std::visit([](const auto& f) -> const std::vector<capture::Camera>& { return f.cameras(); }, follower);
+  }
+  const math::VectorX& rest() const {
+    return std::visit([](const auto& f) -> const math::VectorX& { return f.rest(); }, follower);
   }
 };
 
 Tracker::Implementation::Implementation(const twin::Twin& followed, const std::vector<capture::Camera>& cameras,
-                                        const std::vector<char>& unverified, dynamics::BaseFunction base, double start,
+                                        const std::vector<char>& unverified, dynamics::BaseFunction given, double start,
                                         const TrackerOptions& wanted)
-    : options(wanted), twin(followed) {
+    : options(wanted), twin(followed), base(std::move(given)), follower(make_follower(cameras, unverified, start)) {}
+
+Tracker::Implementation::Kinds Tracker::Implementation::make_follower(const std::vector<capture::Camera>& cameras,
+                                                                      const std::vector<char>& unverified,
+                                                                      double start) {
   if (cameras.empty()) throw InputError("`cameras`", "there is none", "give those whose frames will come");
   if (!twin.parameters)
     core::warn("the twin: its dynamics are not identified; angles are assumed to go on at constant rate");
-  filter = estimation::start(twin, cameras, std::move(base), start, {}, unverified);
   for (std::size_t c = 0; c < unverified.size(); ++c)
     if (unverified[c])
       core::warn(cameras[c].name + ": the twin was not made with this calibration; deviations allow for its errors");
   open_engine();
-  if (options.solver == Solver::adam)
-    start_adam();
-  else if (engine)
-    look_at_colors(start);
+  if (options.solver == Solver::adam) return estimation::AdamFollower(twin, cameras, base, start, link_gradient());
+  const estimation::CompareColors compare = engine ? color_comparison() : nullptr;
+  estimation::Filter filter(twin, cameras, base, start, {}, unverified, compare);
+  if (compare) warm_up(compare, cameras, chain::link_motions(twin.chain, filter.rest(), base(start).pose));
+  return filter;
 }
 
 void Tracker::Implementation::open_engine() {
@@ -147,44 +161,44 @@ void Tracker::Implementation::open_engine() {
     throw InputError("`solver`", "adam draws the twin, and it has no Gaussians", "train it first");
 }
 
-void Tracker::Implementation::look_at_colors(double start) {
+estimation::CompareColors Tracker::Implementation::color_comparison() {
   engine->set_gaussians(twin.gaussians);
-  filter.compare_colors = [this](Views views, std::span<const std::vector<math::Pose>> motions) {
-    std::vector<splat::ViewSpec> specs;
-    std::vector<const std::vector<std::uint8_t>*> pixels;
-    for (std::size_t v = 0; v < views.size(); ++v) {
-      const capture::View& view = *views[v];
-      specs.push_back({&filter.cameras.at(view.camera), view.x0, view.y0, view.width, view.height, motions[v]});
-      pixels.push_back(&view.rgba);
-    }
-    return engine->color_sums(twin.chain, specs, pixels);
-  };
-  warm_up(filter, start);
+  return
+      [this](Views views, std::span<const capture::Camera> cameras, std::span<const std::vector<math::Pose>> motions) {
+        std::vector<splat::ViewSpec> specs;
+        std::vector<const std::vector<std::uint8_t>*> pixels;
+        for (std::size_t v = 0; v < views.size(); ++v) {
+          const capture::View& view = *views[v];
+          specs.push_back({&cameras[view.camera], view.x0, view.y0, view.width, view.height, motions[v]});
+          pixels.push_back(&view.rgba);
+        }
+        return engine->color_sums(twin.chain, specs, pixels);
+      };
 }
 
-void Tracker::Implementation::start_adam() {
-  adam = estimation::start_adam(filter, [this](const capture::View& view, const std::vector<math::Pose>& motions) {
-    const capture::Camera& camera = filter.cameras.at(view.camera);
+estimation::LinkGradient Tracker::Implementation::link_gradient() {
+  return [this](const capture::View& view, const capture::Camera& camera, const std::vector<math::Pose>& motions) {
     const splat::ViewSpec spec{&camera, view.x0, view.y0, view.width, view.height, motions};
     const std::vector<std::uint8_t>* const target = &view.rgba;
     splat::Gradients gradients;
     engine->loss(twin.gaussians, {&spec, 1}, {&target, 1}, {}, static_cast<double>(camera.width) * camera.height,
                  &gradients);
     return std::move(gradients.link_twists.front());
-  });
+  };
 }
 
 // The first picture shows whether masks have to be made.
 void Tracker::Implementation::look_at_first_picture(const capture::Image8& picture) {
   masked_before = black_about(picture);
   if (*masked_before) return;
-  filter.options = estimation::options_for_live_masks(twin.tabletop);
+  if (auto* filter = std::get_if<estimation::Filter>(&follower))
+    filter->set_options(estimation::options_for_live_masks(twin.tabletop));
   const std::vector<std::uint8_t> colors = twin_colors(twin);
   if (colors.empty())
     core::warn(options.name + ": is not masked, and the twin has no colors to find the rope by; what is " +
                "not black is taken for the rope");
   else
-    live.emplace(filter.cameras[0], twin.chain, colors);
+    live.emplace(cameras()[0], twin.chain, colors);
 }
 
 Tracker::Tracker(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
@@ -198,7 +212,7 @@ estimation::Estimate Tracker::update(std::span<const capture::View> views) {
   Implementation& t = *implementation_;
   if (views.empty()) throw InputError(t.options.name, "the moment has no view", "give one, which may be empty");
   for (const capture::View& view : views)
-    if (view.camera < 0 || view.camera >= static_cast<int>(t.filter.cameras.size()))
+    if (view.camera < 0 || view.camera >= static_cast<int>(t.cameras().size()))
       throw InputError(t.options.name, "there is no camera " + std::to_string(view.camera), "count them from 0");
   if (!(views[0].time > t.last))
     throw InputError(t.options.name, core::exact(views[0].time) + " s is not after the frame before",
@@ -206,23 +220,23 @@ estimation::Estimate Tracker::update(std::span<const capture::View> views) {
   t.last = views[0].time;
   std::vector<const capture::View*> pointers;
   for (const capture::View& view : views) pointers.push_back(&view);
-  return t.adam ? estimation::update(*t.adam, pointers) : estimation::update(t.filter, pointers);
+  return std::visit([&](auto& f) { return f.update(pointers); }, t.follower);
 }
 
 capture::View Tracker::mask(const capture::Image8& picture, double time) {
   Implementation& t = *implementation_;
-  const capture::Camera& camera = t.filter.cameras[0];
+  const capture::Camera& camera = t.cameras()[0];
   if (!t.masked_before) t.look_at_first_picture(picture);
   const auto marked = [&](capture::View view) {
     view.time = time;
     return view;
   };
   if (!t.live) return marked(bright_view(picture, camera));
-  const math::Pose pose = t.filter.base(time).pose;
+  const math::Pose pose = t.base(time).pose;
   const std::optional<math::VectorX> theta = t.expected(time);
   constexpr int kMarksEvery = 10;  // frames; the rope shows nearly the same side
   if (t.engine && t.live->frames() % kMarksEvery == 0) {
-    const math::VectorX near = theta.value_or(t.filter.rest);  // marks stay on the rope wherever it lies
+    const math::VectorX near = theta.value_or(t.rest());  // marks stay on the rope wherever it lies
     t.live->learn_marks(drawn_view(*t.engine, t.twin, camera, pose, near, t.masked), pose, near);
   }
   capture::View view = t.live->mask(picture, pose, theta);
@@ -231,14 +245,17 @@ capture::View Tracker::mask(const capture::Image8& picture, double time) {
 }
 
 const twin::Twin& Tracker::twin() const { return implementation_->twin; }
-const dynamics::Model& Tracker::model() const { return implementation_->filter.model; }
+const dynamics::Model& Tracker::model() const {
+  return std::visit([](const auto& f) -> const dynamics::Model& { return f.model(); }, implementation_->follower);
+}
 trajectory::BaseMotion Tracker::base_at(double time) const {
-  return estimation::base_at(implementation_->filter, time);
+  return std::visit([&](const auto& f) { return f.base_at(time); }, implementation_->follower);
 }
 std::vector<capture::Finding> Tracker::findings() const {
-  return implementation_->adam ? std::vector<capture::Finding>{} : estimation::findings(implementation_->filter);
+  const auto* const filter = std::get_if<estimation::Filter>(&implementation_->follower);
+  return filter ? filter->findings() : std::vector<capture::Finding>{};
 }
-const std::vector<capture::Camera>& Tracker::cameras() const { return implementation_->filter.cameras; }
+const std::vector<capture::Camera>& Tracker::cameras() const { return implementation_->cameras(); }
 
 void FollowOptions::check() const {
   if (drop < 1) throw InputError("`drop`", "must be 1 or more", "give 2 for every second frame");

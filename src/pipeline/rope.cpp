@@ -240,10 +240,10 @@ FirstSight start_as_seen(const Rope& rope, const Path& capture, const std::strin
     throw InputError("`state_from`", "the first frame of " + source + " does not show the rope", "name another camera");
   const capture::View& view = seen.views[0];
   problem.base = seen.base.pose(view.time);
-  estimation::Filter filter = estimation::start(
+  estimation::Filter filter(
       rope.twin, seen.cameras, [&](double) { return dynamics::at_rest(problem.base); }, view.time);
   const capture::View* const views[] = {&view};
-  const estimation::Estimate found = estimation::update(filter, views);
+  const estimation::Estimate found = filter.update(views);
   if (!found.seen || found.lost || found.doubtful)
     throw InputError("`state_from`", "the rope was not surely recognized in the first frame of " + source,
                      "name another camera, or give the state with `initial`");

@@ -328,14 +328,14 @@ Json bench_capture(gpu::Device& device, const Path& folder, std::uint64_t seed) 
                         [&](std::vector<render::Frame>& batch) { drawn += batch.size(); });
   lap("render");
   entry["frames_drawn"] = drawn;
-  estimation::Filter filter = estimation::start(
+  estimation::Filter filter(
       twin, {capture.cameras.front()}, [&](double time) { return capture.base.at(time); }, capture.base.start());
   std::vector<double> latency;
   for (const capture::View& view : capture.views) {
     if (view.camera != 0) continue;
     const std::array<const capture::View*, 1> one = {&view};
     const double begun = core::seconds_now();
-    estimation::update(filter, one);
+    filter.update(one);
     latency.push_back(1e3 * (core::seconds_now() - begun));
   }
   std::sort(latency.begin(), latency.end());

@@ -1,0 +1,27 @@
+// predict.h - the belief in a rope that nobody looks at, moved by the twin's dynamics (mathematics.md 6.3).
+#pragma once
+#include <utility>
+
+#include "src/estimation/state.h"
+
+namespace chainsplat::estimation {
+
+// The angles and rates that the twin predicts for a rope that was at rest when the base's motion began; at rest still
+// where its dynamics are not known. `base`: as it is believed to move.
+std::pair<math::VectorX, math::VectorX> motion_from_rest(const Given& given, const dynamics::BaseFunction& base,
+                                                         double time);
+
+// Returns a wide belief around that motion.
+Belief first_belief(const State& state, double time);
+
+// What may have happened to the rope in a step: nothing beyond the model, a force that changes as under a hand, or also
+// a blow, when the rope runs into something or is released.
+enum class Contact { none, touched, struck };
+
+// Returns the belief at a later time, without a measurement.
+Belief predict(const State& state, const Belief& belief, double time, Contact contact);
+
+// As Filter::expected().
+std::optional<math::VectorX> expected(const State& state, double time);
+
+}  // namespace chainsplat::estimation
