@@ -332,14 +332,11 @@ TEST_CASE("pushes on a swinging rope that is finer and more damped than its twin
     CAPTURE(live);
     std::vector<force::Estimate> found;
     if (live) {
-      force::Live follower;
-      follower.model = model;
-      follower.deviations = deviations;
-      follower.base = base;
+      force::LiveForce follower(model, deviations, base);
       for (std::size_t f = 0; f < pushed.observed.time.size(); ++f)
-        if (const auto line = force::update(follower, pushed.observed.time[f], pushed.observed.theta[f], {}))
+        if (const auto line = follower.update(pushed.observed.time[f], pushed.observed.theta[f], {}))
           found.push_back(*line);
-      for (const force::Estimate& line : force::finish(follower)) found.push_back(line);
+      for (const force::Estimate& line : follower.finish()) found.push_back(line);
     } else {
       found = force::estimate(model, deviations, base, force::smooth(pushed.observed), {});
     }

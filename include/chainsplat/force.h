@@ -7,6 +7,7 @@
 // the standard error is large. Forces are in N and points in m, both in the world frame.
 #pragma once
 #include <functional>
+#include <memory>
 #include <optional>
 #include <span>
 #include <string>
@@ -115,25 +116,33 @@ std::vector<Estimate> estimate(const dynamics::Model& model, std::span<const dyn
                                const dynamics::BaseFunction& base, const Motion& motion,
                                std::span<const std::optional<Contact>> contacts, const Options& options = {});
 
-// The same while states arrive: each estimate comes kLiveLag states after its own state, and uses these and earlier
-// ones. The later states determine the acceleration; without any, a push can hardly be distinguished from a swing.
+// What touches the rope at a time, with the angles then; none where nothing does. An empty function: automatic.
+using ContactAt = std::function<std::optional<Contact>(double time, const VectorX& theta)>;
+
+// The same as estimate() while states arrive: each estimate comes kLiveLag states after its own state, and uses these
+// and earlier ones. The later states determine the acceleration; without any, a push can hardly be distinguished from a
+// swing. One thread at a time.
 inline constexpr std::size_t kLiveLag = 2;
-struct Live {
-  dynamics::Model model;
-  std::vector<dynamics::Model> deviations;
-  dynamics::BaseFunction base;
-  // returns the contact at a time with the angles then; empty: automatic
-  std::function<std::optional<Contact>(double time, const VectorX& theta)> contact;
-  Options options;
-  chain::States states;              // of the last seconds
-  VectorX belief;                    // about the contact's place at the last estimate's time; empty before the first
-  std::size_t lines = 0, taken = 0;  // numbers of estimates returned and of states received
+class LiveForce {
+ public:
+  // Arguments as those of estimate().
+  LiveForce(dynamics::Model model, std::vector<dynamics::Model> deviations, dynamics::BaseFunction base,
+            ContactAt contact = {}, const Options& options = {});
+  ~LiveForce();
+  LiveForce(LiveForce&&) noexcept;
+  LiveForce& operator=(LiveForce&&) noexcept;
+
+  // Adds a state. `standing`: n x n, or empty at all times; times must increase. Returns none for the first kLiveLag
+  // states.
+  std::optional<Estimate> update(double time, const VectorX& theta, const MatrixX& standing);
+  // Returns the estimates that are due after the last state; none for fewer than three states.
+  std::vector<Estimate> finish();
+  std::size_t taken() const;  // number of states received
+
+ private:
+  struct State;
+  std::unique_ptr<State> state_;
 };
-// Adds a state. `standing`: n x n, or empty at all times; times must increase. Returns none for the first kLiveLag
-// states.
-std::optional<Estimate> update(Live& live, double time, const VectorX& theta, const MatrixX& standing);
-// Returns the estimates that are due after the last state; none for fewer than three states.
-std::vector<Estimate> finish(Live& live);
 
 // Returns false where too large numbers or a twin without mass leave no finite force.
 bool is_finite(const Estimate& estimate);

@@ -321,25 +321,6 @@ std::optional<Uncertainty> known_uncertainty(const dynamics::Model& model, const
   return out;
 }
 
-// Returns the estimate of state `at` of a live window, which ends with the newest state.
-Estimate live_line(Live& live, std::size_t at) {
-  const bool automatic = !live.contact;
-  const Motion motion = smooth(live.states);
-  const double time = motion.time[at];
-  Frame frame = frame_of(live.model, live.deviations, live.base(time), motion, at, live.options);
-  if (!automatic)
-    if (const std::optional<Contact> contact = live.contact(time, motion.theta[at]))
-      frame.named = *contact, frame.is_named = true;
-  const Track track = track_of(live.model.chain, automatic, live.options);
-  const std::vector<Fit> fits = fits_at(live.model, frame, track, automatic);
-  const double interval = at > 0 ? time - motion.time[at - 1] : motion.time[at + 1] - time;
-  const VectorX before =
-      live.belief.size() == 0 ? first_belief(track) : VectorX(transition(track, interval) * live.belief);
-  live.belief = posterior(before, likelihood(track, evidence_of(fits), interval));
-  ++live.lines;
-  return line_of(live.model, time, frame, fits, live.belief, track, automatic);
-}
-
 }  // namespace
 
 MatrixX angle_covariance(const chain::Chain& chain, const VectorX& theta, const VectorX& sigma) {
@@ -469,7 +450,46 @@ std::vector<Estimate> estimate(const dynamics::Model& model, std::span<const dyn
   return out;
 }
 
-std::optional<Estimate> update(Live& live, double time, const VectorX& theta, const MatrixX& standing) {
+struct LiveForce::State {
+  dynamics::Model model;
+  std::vector<dynamics::Model> deviations;
+  dynamics::BaseFunction base;
+  ContactAt contact;
+  Options options;
+  chain::States states = {};         // of the last seconds
+  VectorX belief = {};               // about the contact's place at the last estimate's time; empty before the first
+  std::size_t lines = 0, taken = 0;  // numbers of estimates returned and of states received
+
+  // Returns the estimate of state `at` of the window, which ends with the newest state.
+  Estimate line(std::size_t at) {
+    const bool automatic = !contact;
+    const Motion motion = smooth(states);
+    const double time = motion.time[at];
+    Frame frame = frame_of(model, deviations, base(time), motion, at, options);
+    if (!automatic)
+      if (const std::optional<Contact> touched = contact(time, motion.theta[at]))
+        frame.named = *touched, frame.is_named = true;
+    const Track track = track_of(model.chain, automatic, options);
+    const std::vector<Fit> fits = fits_at(model, frame, track, automatic);
+    const double interval = at > 0 ? time - motion.time[at - 1] : motion.time[at + 1] - time;
+    const VectorX before = belief.size() == 0 ? first_belief(track) : VectorX(transition(track, interval) * belief);
+    belief = posterior(before, likelihood(track, evidence_of(fits), interval));
+    ++lines;
+    return line_of(model, time, frame, fits, belief, track, automatic);
+  }
+};
+
+LiveForce::LiveForce(dynamics::Model model, std::vector<dynamics::Model> deviations, dynamics::BaseFunction base,
+                     ContactAt contact, const Options& options)
+    : state_(std::make_unique<State>(
+          State{std::move(model), std::move(deviations), std::move(base), std::move(contact), options})) {}
+
+LiveForce::~LiveForce() = default;
+LiveForce::LiveForce(LiveForce&&) noexcept = default;
+LiveForce& LiveForce::operator=(LiveForce&&) noexcept = default;
+
+std::optional<Estimate> LiveForce::update(double time, const VectorX& theta, const MatrixX& standing) {
+  State& live = *state_;
   live.states.time.push_back(time);
   live.states.theta.push_back(theta);
   if (standing.size() > 0) live.states.covariance.push_back(standing);
@@ -482,15 +502,18 @@ std::optional<Estimate> update(Live& live, double time, const VectorX& theta, co
   if (!live.states.covariance.empty())
     live.states.covariance.erase(live.states.covariance.begin(), live.states.covariance.begin() + old);
   if (live.taken <= kLiveLag) return {};
-  return live_line(live, live.states.time.size() - 1 - kLiveLag);
+  return live.line(live.states.time.size() - 1 - kLiveLag);
 }
 
-std::vector<Estimate> finish(Live& live) {
+std::vector<Estimate> LiveForce::finish() {
+  State& live = *state_;
   std::vector<Estimate> out;
   if (live.taken < 3) return out;
-  while (live.lines < live.taken) out.push_back(live_line(live, live.states.time.size() - (live.taken - live.lines)));
+  while (live.lines < live.taken) out.push_back(live.line(live.states.time.size() - (live.taken - live.lines)));
   return out;
 }
+
+std::size_t LiveForce::taken() const { return state_->taken; }
 
 bool is_finite(const Estimate& e) {
   for (const Vector3& v : {e.point, e.force, e.sigma, e.low, e.high, e.observed})

@@ -127,20 +127,18 @@ class Push {
  public:
   explicit Push(const pipeline::Follower& follower) {
     if (!follower.twin().parameters) return;
-    live_.emplace();
-    live_->model = follower.model();
-    live_->deviations = force::deviations(follower.model(), follower.twin().estimates);
-    live_->base = [&follower](double time) { return follower.base_at(time); };
+    live_.emplace(follower.model(), force::deviations(follower.model(), follower.twin().estimates),
+                  [&follower](double time) { return follower.base_at(time); });
   }
   // None of a rope that may be somewhere else, and of the first frames.
   std::optional<force::Estimate> update(const estimation::Estimate& e) {
     if (!live_ || e.lost || e.doubtful || e.settling) return {};
     const Eigen::Index n = std::min(e.theta.size(), e.covariance.rows());  // 0: no covariance
-    return force::update(*live_, e.time, e.theta, e.covariance.topLeftCorner(n, n));
+    return live_->update(e.time, e.theta, e.covariance.topLeftCorner(n, n));
   }
 
  private:
-  std::optional<force::Live> live_;
+  std::optional<force::LiveForce> live_;
 };
 
 // The live window.

@@ -101,13 +101,11 @@ std::vector<ContactPoint> read_contacts(const std::string& name) {
   return out;
 }
 
-// What is said to touch, at a time and with the angles then; empty for 'auto'.
-using ContactAt = std::function<std::optional<force::Contact>(double time, const math::VectorX& theta)>;
-
+// What is said to touch; empty for 'auto'.
 // `nearest`: of points (world, columns) at a time. `apart`: s, how far from a time a line of a file may be.
-ContactAt contact_of(const ForceRequest& request,
-                     const std::function<force::Contact(double, const math::VectorX&, const math::MatrixX&)>& nearest,
-                     double apart) {
+force::ContactAt contact_of(
+    const ForceRequest& request,
+    const std::function<force::Contact(double, const math::VectorX&, const math::MatrixX&)>& nearest, double apart) {
   if (!request.hand.empty()) {
     const math::MatrixX points = twin::read_points(request.hand);
     if (points.cols() == 0) throw InputError(request.hand, "has no point", "give a point cloud of the hand");
@@ -162,7 +160,7 @@ void force(const Globals& globals, const ForceRequest& request) {
     return force::nearest_contact(twin.chain, twin.gaussians, base_at(time).pose, theta, points);
   };
   // what is far from the rope does not touch it; what always is was meant otherwise
-  const auto with_near = [&](const ContactAt& contact) -> ContactAt {
+  const auto with_near = [&](const force::ContactAt& contact) -> force::ContactAt {
     if (!contact) return {};
     return [&least, near, contact](double time, const math::VectorX& theta) {
       std::optional<force::Contact> out = contact(time, theta);
@@ -203,11 +201,8 @@ void force(const Globals& globals, const ForceRequest& request) {
   const std::vector<dynamics::Model> deviations = force::deviations(model, twin.estimates);
 
   if (request.live) {
-    force::Live live;
-    live.model = model;
-    live.deviations = deviations;
-    live.base = base_at;
-    live.contact = with_near(contact_of(request, nearest, kLiveApart));
+    const force::ContactAt contact = with_near(contact_of(request, nearest, kLiveApart));
+    force::LiveForce live(model, deviations, base_at, contact);
     double first = std::numeric_limits<double>::infinity();
     try {
       each_state(request, twin.chain, [&](const State& state) {
@@ -215,15 +210,15 @@ void force(const Globals& globals, const ForceRequest& request) {
         check_time(first, state.time);
         corrections = {
             {state.time, estimation::remaining(state.base, known)}};  // it goes for the few states before it, too
-        if (const auto line = force::update(live, state.time, state.theta, state.standing)) write(*line);
+        if (const auto line = live.update(state.time, state.theta, state.standing)) write(*line);
       });
-      if (live.taken < 3) throw InputError(source, few, more);
-      for (const force::Estimate& line : force::finish(live)) write(line);
+      if (live.taken() < 3) throw InputError(source, few, more);
+      for (const force::Estimate& line : live.finish()) write(line);
     } catch (const InputError& error) {
       if (lines == 0) throw;
       throw pipeline::broken_off(error, "the lines so far are kept");
     }
-    if (live.contact) check_near();
+    if (contact) check_near();
   } else {
     chain::States states;
     each_state(request, twin.chain, [&](const State& state) {
@@ -237,7 +232,7 @@ void force(const Globals& globals, const ForceRequest& request) {
     check_time(states.time.front(), states.time.back());
     twin::warn_beyond(twin.validity, twin::validity_of(twin.chain, base, states), source);
     const force::Motion motion = force::smooth(states);
-    const ContactAt contact =
+    const force::ContactAt contact =
         with_near(contact_of(request, nearest, (states.time.back() - states.time.front()) / (count - 1.0)));
     std::vector<std::optional<force::Contact>> contacts;
     for (std::size_t f = 0; f < count && contact; ++f) contacts.push_back(contact(motion.time[f], motion.theta[f]));
