@@ -377,11 +377,12 @@ CheckReport check(const Path& path) {
   for (std::size_t c = 0; c < manifest.cameras.size(); ++c) {
     const CameraSource& source = manifest.cameras[c];
     const auto of_this_camera = [&](const Problem& problem) {
+      const auto among = [&](const ImageSource& files) {
+        return !files.names.before.empty() && problem.where.starts_with(files.names.before);
+      };
       return problem.where.starts_with(source.where) ||
-             (source.images.video && problem.where.starts_with(source.images.file.string())) ||
-             (!source.images.prefix.empty() && problem.where.starts_with(source.images.prefix)) ||
-             (source.masks && !source.masks->prefix.empty() && problem.where.starts_with(source.masks->prefix)) ||
-             (source.depth && !source.depth->prefix.empty() && problem.where.starts_with(source.depth->prefix)) ||
+             (source.images.video && problem.where.starts_with(source.images.file.string())) || among(source.images) ||
+             (source.masks && among(*source.masks)) || (source.depth && among(*source.depth)) ||
              (source.timestamps && problem.where.starts_with(source.timestamps->string()));
     };
     if (source.times.empty() || capture.base.samples().empty() ||

@@ -8,12 +8,6 @@
 
 namespace chainsplat::capture {
 
-Path ImageSource::frame_file(int frame) const {
-  std::string number = std::to_string(frame);
-  if (static_cast<int>(number.size()) < digits) number.insert(0, digits - number.size(), '0');
-  return prefix + number + suffix;
-}
-
 namespace {
 
 constexpr double kLongestRecording = 3600.0;  // s; the dynamics are integrated over it in millisecond steps
@@ -159,24 +153,18 @@ std::optional<ImageSource> image_source(const ObjectReader& reader, const std::s
   const auto text = reader.path(key, required, "a video like cam0.mp4 or a pattern like cam0/%06d.png");
   if (!text) return std::nullopt;
   ImageSource source;
-  const std::size_t percent = text->find('%');
-  if (percent == std::string::npos) {
+  if (text->find('%') == std::string::npos) {
     source.video = true;
     source.file = folder / *text;
     return source;
   }
-  std::size_t end = percent + 1;
-  while (end < text->size() && std::isdigit(static_cast<unsigned char>((*text)[end]))) ++end;
-  const std::string width = text->substr(percent + 1, end - percent - 1);
-  const bool valid = end < text->size() && (*text)[end] == 'd' && width.size() <= 3 &&
-                     (width.empty() || width[0] == '0') && text->find('%', end) == std::string::npos;
-  if (!valid) {
+  const std::optional<FramePattern> names = read_frame_pattern(*text);
+  if (!names) {
     reader.problem(key, in_quotes(*text) + " is not a frame pattern", "write the number once, as %d or %06d");
     return std::nullopt;
   }
-  source.prefix = (folder / text->substr(0, percent)).string();
-  source.suffix = text->substr(end + 1);
-  if (!width.empty()) std::from_chars(width.data(), width.data() + width.size(), source.digits);
+  source.names = *names;
+  source.names.before = (folder / names->before).string();
   return source;
 }
 
@@ -205,7 +193,7 @@ void survey_frames(Manifest& manifest, bool masked, Findings& findings) {
   core::parallel_for(static_cast<std::int64_t>(manifest.cameras.size()), [&](std::int64_t c) {
     CameraSource& source = manifest.cameras[c];
     Findings& mine = found[c];
-    if (source.images.file.empty() && source.images.prefix.empty()) return;
+    if (source.images.file.empty() && source.images.names.before.empty()) return;
     const Path& folder = manifest.capture.folder;
     if (!count_frames(source.images, folder, source.where + ".images", &source.video_rate, &source.camera, mine))
       return;

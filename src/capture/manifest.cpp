@@ -18,6 +18,7 @@ namespace {
 
 // Bounds of what a file may request. Each is far beyond any recording of a rope. They exist because memory and time
 // grow with these numbers, so that a typing error or a hostile file ends in a message and not in exhausted memory.
+// Others of them are in object_reader.cpp, camera_reader.cpp and frame_files.cpp.
 constexpr std::size_t kMostCameras = 512;  // because the frames of all are in memory at once
 constexpr double kLongestRope = 100.0;     // m
 constexpr double kThinnest = 1e-4;         // of the length, because masks are made in steps of a diameter

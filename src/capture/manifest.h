@@ -5,6 +5,7 @@
 #include <string>
 #include <vector>
 #include "chainsplat/capture.h"
+#include "chainsplat/frame_pattern.h"
 
 namespace chainsplat::capture {
 
@@ -22,11 +23,10 @@ struct Findings {
 // A video, or one image file per frame by a printf pattern.
 struct ImageSource {
   bool video = false;
-  Path file;                   // the video
-  std::string prefix, suffix;  // of an image's path, around the frame number
-  int digits = 0;              // the least number of digits, filled with leading zeros
+  Path file;           // the video
+  FramePattern names;  // paths of the image files
   int frames = 0;
-  Path frame_file(int frame) const;  // the image file of a pattern
+  Path frame_file(int frame) const { return names.file(frame); }  // the image file of a pattern
 };
 
 struct CameraSource {

@@ -248,8 +248,9 @@ void for_each_in_parallel(std::int64_t count, const std::function<void(std::int6
 }
 
 bool lossless(const ImageSource& images) {
-  return images.suffix.ends_with(".png") || images.suffix.ends_with(".PNG") || images.suffix.ends_with(".bmp") ||
-         images.suffix.ends_with(".tif") || images.suffix.ends_with(".tiff");
+  const std::string& ending = images.names.after;
+  return ending.ends_with(".png") || ending.ends_with(".PNG") || ending.ends_with(".bmp") || ending.ends_with(".tif") ||
+         ending.ends_with(".tiff");
 }
 
 // Frames [first, last) of a camera; their views begin at `offset`.

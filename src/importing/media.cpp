@@ -5,6 +5,7 @@
 #include <cctype>
 #include <cstdio>
 
+#include "chainsplat/frame_pattern.h"
 #include "chainsplat/image_model.h"
 #include "document.h"
 
@@ -55,14 +56,13 @@ std::vector<Path> by_pattern(const Path& path) {
   const std::string width = d == std::string::npos ? "x" : text.substr(percent + 1, d - percent - 1);
   if (d == std::string::npos || width.size() > 3 || width.find_first_not_of("0123456789") != std::string::npos)
     throw InputError(text, "is no pattern of images", "write the number once, as %d or %06d");
-  const int digits = width.empty() ? 0 : std::atoi(width.c_str());
+  const capture::FramePattern names{text.substr(0, percent), text.substr(d + 1),
+                                    width.empty() ? 0 : std::atoi(width.c_str())};
   std::vector<Path> files;
   std::error_code error;
   for (int begin : {0, 1}) {
     for (int frame = begin; frame <= capture::kMostFrames; ++frame) {
-      std::string number = std::to_string(frame);
-      if (static_cast<int>(number.size()) < digits) number.insert(0, digits - number.size(), '0');
-      Path file = text.substr(0, percent) + number + text.substr(d + 1);
+      Path file = names.file(frame);
       if (!fs::is_regular_file(file, error)) break;
       files.push_back(std::move(file));
     }
