@@ -142,7 +142,7 @@ TEST_CASE("masks of the demo capture without a prompt") {
   double sum = 0.0, least = 1.0;
   int frames = 0, poor = 0;
   const masking::Summary summary =
-      masking::make(kDemo, {}, [&](int camera, int frame, const capture::Image8& mask, double score) {
+      masking::make(kDemo, {}, {}, [&](int camera, int frame, const capture::Image8& mask, double score) {
         CHECK(mask.channels == 1);
         poor += score < masking::kDoubtful;
         const double one = iou(mask, given_mask(camera, frame));
@@ -163,9 +163,9 @@ TEST_CASE("masks of the demo capture without a prompt") {
 
 TEST_CASE("masks while the base rests: nothing that moves is needed") {
   double sum = 0.0;
-  const masking::Options pause{.first = 22, .last = 28};  // the gripper turns around
+  const capture::FrameRange pause{22, 28};  // the gripper turns around
   const masking::Summary summary = masking::make(
-      kDemo, pause,
+      kDemo, pause, {},
       [&](int camera, int frame, const capture::Image8& mask, double) { sum += iou(mask, given_mask(camera, frame)); });
   CHECK(summary.frames == 18);
   CHECK(summary.inside > 0.9);
@@ -355,9 +355,8 @@ TEST_CASE("live masks of one camera") {
 }
 
 TEST_CASE("what cannot be masked is said") {
-  CHECK_THROWS_WITH_AS(
-      masking::make(kDemo, {.first = 500, .last = 510}, [](int, int, const capture::Image8&, double) {}),
-      doctest::Contains("no frame"), InputError);
+  CHECK_THROWS_WITH_AS(masking::make(kDemo, {500, 510}, {}, [](int, int, const capture::Image8&, double) {}),
+                       doctest::Contains("no frame"), InputError);
 }
 
 }  // namespace

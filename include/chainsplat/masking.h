@@ -23,23 +23,29 @@
 
 namespace chainsplat::masking {
 
-// Help by the user, in recorded pixels of one frame, or of all frames of the camera.
+// Help by the user: cameras by name, places in recorded pixels.
 struct PointHint {
-  int camera = 0, frame = 0;
-  double x = 0.0, y = 0.0;  // lies on the rope
+  std::string camera;
+  std::optional<int> frame;  // none: the first that a mask is made of
+  double x = 0.0, y = 0.0;   // lies on the rope
 };
 struct BoxHint {
-  int camera = 0;
+  std::string camera;
   std::optional<int> frame;                       // none: all
-  double x0 = 0.0, y0 = 0.0, x1 = 0.0, y1 = 0.0;  // the rope lies in here
+  double x0 = 0.0, y0 = 0.0, x1 = 0.0, y1 = 0.0;  // opposite corners, finite; the rope lies between them
+};
+struct EmptyScene {
+  std::string camera;
+  Path picture;  // as recorded, without the rope; its exposure may be another one
 };
 
-struct Options {
-  int first = 0, last = -1;  // frames [first, last) of each camera; last < 0: to the end
+// What does not fit the capture is an InputError: it names the hint as `point`, `box` or `empty`, or the picture's
+// file.
+struct Hints {
   std::vector<PointHint> points = {};
   std::vector<BoxHint> boxes = {};
-  std::vector<std::optional<capture::Image8>> empty =
-      {};  // by camera: a recorded picture of the scene without the rope
+  std::vector<EmptyScene> empty = {};
+  bool any() const { return !(points.empty() && boxes.empty() && empty.empty()); }
 };
 
 // Receives the mask of one frame in recorded pixels, one channel, 0 or 255, and its score, 0 to 1: how much the picture
@@ -55,11 +61,11 @@ struct Summary {
   math::Vector3 grasp = math::Vector3::Zero();  // m, base frame: by how much the grasp is off, at most; stills only
 };
 
-// Makes the masks of a whole capture, by camera, then by frame; masks that the capture has are ignored. At most eight
+// Makes the masks of these frames of a capture, by camera, then by frame; masks that it has are ignored. At most eight
 // frames a camera are stills: they have no background to learn and no motion to smooth. Each is judged by itself, from
 // its outlines too, the grasp may be off by 1 cm, and the rope hangs at rest.
 // Throws InputError when the capture is unusable, has no frames, or shows nothing like the rope at the grasp.
-Summary make(const Path& capture, const Options& options, const Sink& sink);
+Summary make(const Path& capture, const capture::FrameRange& frames, const Hints& hints, const Sink& sink);
 
 // One picture of a contact sheet: as recorded, RGB, with its mask.
 struct PreviewTile {

@@ -8,6 +8,7 @@
 #include "chainsplat/silhouette.h"
 #include "src/masking/cut.h"
 #include "src/masking/grow.h"
+#include "src/masking/hints.h"
 #include "src/masking/ribbon.h"
 
 namespace chainsplat::masking {
@@ -248,44 +249,28 @@ chain::Chain chain_for(const capture::Capture& scene) {
                            scene.tabletop || one ? chain::Bending::planar : chain::Bending::spatial, false);
 }
 
-const Image8* empty_of(const Options& options, int camera) {
-  return camera < static_cast<int>(options.empty.size()) && options.empty[camera] ? &*options.empty[camera] : nullptr;
-}
-
-bool pointed_at(const Options& options, int camera, int frame) {
-  return std::any_of(options.points.begin(), options.points.end(),
-                     [&](const PointHint& hint) { return hint.camera == camera && hint.frame == frame; });
-}
-
 // Where the scene without the rope is known, a moment's shots show what differs from it.
-void take_away_scene(const Options& options, Moment& moment) {
+void take_away_scene(const Help& help, Moment& moment) {
   moment.differences.reserve(moment.shots.size());
   for (std::size_t k = 0; k < moment.shots.size(); ++k)
-    if (const Image8* const empty = empty_of(options, moment.cameras[k])) {
+    if (const Image8* const empty = help.empty_of(moment.cameras[k])) {
       const Image8& shown = moment.differences.emplace_back(difference(*empty, moment.shots[k].picture));
       moment.shots[k].picture = {shown.pixels.data(), shown.width, shown.height, 3};
     }
 }
 
 // Adds the user's help to a moment's shots.
-void add_hints(const Options& options, const std::vector<capture::Camera>& recorded,
-               const std::vector<Samples>& samples, Moment& moment) {
-  take_away_scene(options, moment);
+void add_help(const Help& help, const std::vector<Samples>& samples, Moment& moment) {
+  take_away_scene(help, moment);
   for (std::size_t k = 0; k < moment.shots.size(); ++k) {
     const int c = moment.cameras[k];
     int frame = 0;
     for (const View& view : samples[c].frames)
       if (picture_of(view).pixels == moment.shots[k].picture.pixels) frame = view.frame;
-    for (const PointHint& hint : options.points)
-      if (hint.camera == c && hint.frame == frame)
-        moment.shots[k].on_rope.push_back(capture::undistort(recorded[c], Vector2(hint.x, hint.y)));
-    for (const BoxHint& hint : options.boxes)
-      if (hint.camera == c && hint.frame.value_or(frame) == frame) {
-        const Vector2 a = capture::undistort(recorded[c], Vector2(hint.x0, hint.y0)),
-                      b = capture::undistort(recorded[c], Vector2(hint.x1, hint.y1));
-        moment.shots[k].bounds = Box{static_cast<int>(std::floor(a.x())), static_cast<int>(std::floor(a.y())),
-                                     static_cast<int>(std::ceil(b.x())), static_cast<int>(std::ceil(b.y()))};
-      }
+    for (const Help::Point& point : help.points)
+      if (point.camera == c && point.frame == frame) moment.shots[k].on_rope.push_back(point.at);
+    for (const Help::Region& region : help.boxes)
+      if (region.camera == c && region.frame.value_or(frame) == frame) moment.shots[k].bounds = region.box;
   }
 }
 
@@ -307,13 +292,13 @@ View inside_of(const Tube& tube, const View& picture) {
 }
 
 // The masks of a few stills, each by itself: ribbons about chains that are grown in every moment.
-Summary make_stills(const Recording& recording, const Options& options, const chain::Chain& given,
+Summary make_stills(const Recording& recording, const Help& help, const chain::Chain& given,
                     const std::vector<capture::Camera>& pinholes, const std::vector<Samples>& samples,
                     const Sink& sink) {
   const capture::Capture& scene = recording.capture;
   const int cameras = static_cast<int>(scene.cameras.size());
   std::vector<Moment> moments = moments_of(scene, pinholes, samples);
-  for (Moment& moment : moments) add_hints(options, scene.cameras, samples, moment);
+  for (Moment& moment : moments) add_help(help, samples, moment);
   chain::Chain chain = given;
   // grow: first each moment by itself, then with the grasp and the colors that the moments agree upon
   std::vector<Grown> grown(moments.size());
@@ -374,8 +359,8 @@ Summary make_stills(const Recording& recording, const Options& options, const ch
     std::vector<double> widths;
     for (int c = 0; c < cameras; ++c) {
       looks[c] = {};
-      if (empty_of(options, c) && !stills[c].empty())
-        looks[c].background = empty_scene(*empty_of(options, c), picture_of(*stills[c].front().view));
+      if (help.empty_of(c) && !stills[c].empty())
+        looks[c].background = empty_scene(*help.empty_of(c), picture_of(*stills[c].front().view));
       for (Still& still : stills[c]) {
         const View& view = *still.view;
         const bool by_ribbon = round && still.ribbon.axis.points.size() > 1;
@@ -421,12 +406,13 @@ Summary make_stills(const Recording& recording, const Options& options, const ch
 
 }  // namespace
 
-Summary make(const Path& path, const Options& options, const Sink& sink) {
+Summary make(const Path& path, const capture::FrameRange& frames, const Hints& hints, const Sink& sink) {
   // the frames and the chain
   capture::LoadOptions headers;
   headers.images = false;
   capture::Capture scene = capture::load(path, headers);
-  const Recording recording{path, scene, options.first, options.last};
+  const Recording recording{path, scene, frames.first, frames.last};
+  const Help help = help_of(hints, scene, frames.first);
   const int cameras = static_cast<int>(scene.cameras.size());
   int total = 0;
   for (int c = 0; c < cameras; ++c) total += frames_of(recording, c);
@@ -440,8 +426,8 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
   std::vector<Samples> samples(cameras);
   const std::int64_t work = static_cast<std::int64_t>(total) * (kRounds + 2);
   std::atomic<std::int64_t> done{0};
-  const auto tell = [&](const char* note, std::size_t frames) {
-    const std::int64_t now = done += static_cast<std::int64_t>(frames);
+  const auto tell = [&](const char* note, std::size_t count) {
+    const std::int64_t now = done += static_cast<std::int64_t>(count);
     core::report({"mask", now, work, std::nan(""), std::nan(""), note});
   };
   for (int c = 0; c < cameras; ++c) {
@@ -450,14 +436,14 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
         std::max(1, frames_of(recording, c) / static_cast<int>(std::clamp<double>(room, kLeastSamples, kSamples)));
     each_block(recording, c, [&](std::vector<View>& views) {
       for (View& view : views)
-        if ((view.frame - recording.first) % stride == 0 || pointed_at(options, c, view.frame))
+        if ((view.frame - recording.first) % stride == 0 || help.points_at(c, view.frame))
           samples[c].frames.push_back(std::move(view));
       tell("samples", views.size());
     });
   }
   int longest = 0;
   for (int c = 0; c < cameras; ++c) longest = std::max(longest, frames_of(recording, c));
-  if (longest <= kStills) return make_stills(recording, options, chain, pinholes, samples, sink);
+  if (longest <= kStills) return make_stills(recording, help, chain, pinholes, samples, sink);
 
   // learns every camera's appearance from its samples, with a chain for each and, if there are any, their masks
   std::vector<Look> looks(cameras);
@@ -481,15 +467,15 @@ Summary make(const Path& path, const Options& options, const Sink& sink) {
       }
       settle(looks[c]);
       looks[c].background =
-          empty_of(options, c) && !pictures.empty()
-              ? empty_scene(*empty_of(options, c), pictures.front())
+          help.empty_of(c) && !pictures.empty()
+              ? empty_scene(*help.empty_of(c), pictures.front())
               : median_background(pictures, tubes,
                                   std::max(kLeastSamples, static_cast<int>(kLeastUncovered * tubes.size())));
     }
   };
   Summary summary;
   std::vector<Moment> moments = moments_of(scene, pinholes, samples);
-  for (Moment& moment : moments) add_hints(options, scene.cameras, samples, moment);
+  for (Moment& moment : moments) add_help(help, samples, moment);
   chain::States states = grow_moments(recording, chain, moments);
   learn(states, nullptr);
   // cuts the masks of all frames about the chains and passes them to `consume` block by block

@@ -12,8 +12,13 @@ namespace {
 
 // Fields that are not named as their options are: target_velocity is --target-velocity without a line here.
 const std::map<std::string, std::string> kOtherNames = {
-    {"boxes", "--keep-out-box"},      {"loop.rate", "--mpc-rate"}, {"loop.target_velocity", "--target-velocity"},
-    {"spheres", "--keep-out-sphere"}, {"targets", "--target"},     {"truth", "--simulate"},
+    {"boxes", "--keep-out-box"},
+    {"loop.rate", "--mpc-rate"},
+    {"loop.target_velocity", "--target-velocity"},
+    {"output", "-o"},
+    {"spheres", "--keep-out-sphere"},
+    {"targets", "--target"},
+    {"truth", "--simulate"},
 };
 
 std::string option_of(const std::string& field) {

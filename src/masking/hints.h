@@ -1,0 +1,32 @@
+// The user's help, checked against the capture: cameras by number, places in undistorted pixels.
+#pragma once
+#include <optional>
+#include <vector>
+
+#include "chainsplat/masking.h"
+#include "src/masking/tube.h"
+
+namespace chainsplat::masking {
+
+struct Help {
+  struct Point {
+    int camera, frame;
+    math::Vector2 at;
+  };
+  struct Region {
+    int camera;
+    std::optional<int> frame;  // none: all
+    Box box;
+  };
+  std::vector<Point> points;
+  std::vector<Region> boxes;
+  std::vector<std::optional<capture::Image8>> empty;  // by camera
+
+  bool points_at(int camera, int frame) const;
+  const capture::Image8* empty_of(int camera) const { return empty[camera] ? &*empty[camera] : nullptr; }
+};
+
+// `first`: the frame that a point without one is in. Throws InputError as masking.h says of Hints.
+Help help_of(const Hints& hints, const capture::Capture& scene, int first);
+
+}  // namespace chainsplat::masking
