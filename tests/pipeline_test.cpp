@@ -9,6 +9,8 @@
 #include "chainsplat/batch.h"
 #include "chainsplat/estimation.h"
 #include "chainsplat/follow.h"
+#include "chainsplat/force.h"
+#include "chainsplat/rope.h"
 #include "chainsplat/run_folder.h"
 #include "small_twin.h"
 
@@ -64,6 +66,14 @@ TEST_CASE("check() names the wrong field") {
   pipeline::FollowOptions follow;
   follow.drop = 0;
   CHECK(wrong_field(follow) == "`drop`");
+  pipeline::ForceOptions force;
+  CHECK(wrong_field(force) == "`states`, `estimate`");
+  force.states = "states.csv", force.hand = "hand.ply";
+  CHECK(wrong_field(force) == "");
+  force.contact.emplace(0.0, 0.0, NAN);
+  CHECK(wrong_field(force) == "`contact`, `contacts`, `hand`");
+  force.hand.clear();
+  CHECK(wrong_field(force) == "`contact`");
 }
 
 TEST_CASE("settings are read from texts, and refused by the name of where they stand") {
@@ -175,6 +185,28 @@ TEST_CASE("train by a call, stopped by the listener and gone on with, then evalu
     ++frames;
   });
   CHECK(frames == 8);
+
+  // forces of the files are those of the values; live, each comes two states after its own
+  const pipeline::Rope rope = pipeline::load_rope(whole);
+  const std::vector<force::Estimate> known = pipeline::forces(rope, rope.twin.states, rope.base);
+  pipeline::ForceOptions forces;
+  forces.states = whole / "states.csv";
+  for (const bool live : {false, true}) {
+    forces.live = live;
+    std::vector<force::Estimate> found;
+    const pipeline::ForceResult summary =
+        pipeline::forces(whole, forces, [&](const force::Estimate& estimate, bool) { found.push_back(estimate); });
+    REQUIRE(found.size() == 8);
+    CHECK(summary.states == 8);
+    CHECK(summary.known_mass);
+    for (std::size_t f = 0; f < 8; ++f) {
+      CHECK(found[f].time == known[f].time);
+      if (!live) CHECK((found[f].force - known[f].force).norm() < 1e-9);
+    }
+  }
+  forces.contact.emplace(100.0, 0.0, 0.0);
+  CHECK_THROWS_WITH_AS(pipeline::forces(whole, forces, [](const force::Estimate&, bool) {}),
+                       doctest::Contains("`contact`: never comes nearer"), InputError);
 }
 
 TEST_CASE("a log has a record for every stage, and the lock is one process's") {

@@ -6,6 +6,7 @@
 // WorkError where the work failed, and then what exists is kept; Interrupted where it was stopped. Files: run_folder.h.
 #pragma once
 #include <cstdint>
+#include <functional>
 #include <iosfwd>
 #include <optional>
 #include <string>
@@ -15,6 +16,10 @@
 #include "chainsplat/eval.h"
 #include "chainsplat/solve.h"
 #include "chainsplat/twin.h"
+
+namespace chainsplat::force {
+struct Estimate;
+}
 
 namespace chainsplat::pipeline {
 
@@ -150,6 +155,32 @@ struct Evaluation {
 // How well the twin explains a capture: its own, or another one of the same rope (the rollout only, from rest).
 Evaluation evaluate(const Path& run, const Path& capture, const EvaluateOptions& options,
                     const core::Listener& listener = {});
+
+// --- force -----------------------------------------------------------------------------------------------------------
+
+struct ForceOptions {
+  // The angles over time, one of the two; "-" is standard input, here and below.
+  Path states;    // states.csv
+  Path estimate;  // lines of estimates (estimate_lines.h), which also tell how the base is off
+  Path base;      // base motion, TUM; empty: the capture's own
+  // What touches the rope, at most one of these; none: where it is touched is found. What is farther from the rope than
+  // three diameters does not touch it.
+  std::optional<math::Vector3> contact;  // m, world, at all times
+  Path contacts;                         // 'time,x,y,z' a line below a head line; x, y, z empty: nothing touches
+  Path hand;                             // point cloud (PLY), m, world, at all times
+  bool live = false;  // while states come in: an estimate is told two states after its own, from these and earlier ones
+
+  void check() const;
+};
+struct ForceResult {
+  std::int64_t states = 0, touching = 0;  // that were told, and those among them in which something touches
+  bool known_mass = true;                 // false: forces are per kilogram of rope
+};
+using EachForce = std::function<void(const force::Estimate& estimate, bool known_mass)>;
+// The force from outside, told to `each` for every state in order: live as soon as it is known, else when all are. The
+// end of a live stream in an error is a WorkError once something has been told.
+ForceResult forces(const Path& run, const ForceOptions& options, const EachForce& each,
+                   const core::Listener& listener = {});
 
 // --- report ----------------------------------------------------------------------------------------------------------
 

@@ -282,26 +282,4 @@ double recorded_noise(const Rope& rope) {
   return count == 0 ? kUnknown : std::max(kLeast, std::sqrt(sum / static_cast<double>(count)));
 }
 
-std::vector<force::Estimate> forces(const Rope& rope, const chain::States& states, const trajectory::Trajectory& base,
-                                    const std::optional<math::Vector3>& contact) {
-  const dynamics::Model& model = model_of(rope);
-  constexpr double kSlack = 1.0 / 30.0;  // s, a frame beyond the last sample
-  if (states.time.size() < 3)
-    throw InputError("`states`", "has fewer than three", "give more: forces need accelerations");
-  if (base.samples().size() > 1 &&
-      (states.time.front() < base.start() - kSlack || states.time.back() > base.end() + kSlack))
-    throw InputError("`base`",
-                     "covers " + core::exact(base.start()) + " to " + core::exact(base.end()) + " s, the states " +
-                         core::exact(states.time.front()) + " to " + core::exact(states.time.back()) + " s",
-                     "give the base motion of these states");
-  const force::Motion motion = force::smooth(states);
-  std::vector<std::optional<force::Contact>> contacts;
-  for (std::size_t k = 0; contact && k < motion.time.size(); ++k)
-    contacts.push_back(force::nearest_contact(rope.twin.chain, rope.twin.gaussians, base.pose(motion.time[k]),
-                                              motion.theta[k], *contact));
-  return force::estimate(
-      model, force::deviations(model, rope.twin.estimates), [&base](double time) { return base.at(time); }, motion,
-      contacts);
-}
-
 }  // namespace chainsplat::pipeline

@@ -1,6 +1,10 @@
 // Fuzzes the input of `force`: the lines of `estimate`, and points of contact.
+#include <limits>
+#include <sstream>
+
+#include "chainsplat/estimate_lines.h"
 #include "readers.h"
-#include "tools/chainsplat/force.cpp"
+#include "src/pipeline/contact_file.h"
 
 namespace chainsplat::fuzz {
 
@@ -18,7 +22,7 @@ void estimates(std::string_view bytes) {
 void contacts(std::string_view bytes) {
   static const Path file = folder() / "contacts.csv";
   put(file, bytes);
-  tools::read_contacts(file.string());
+  pipeline::read_contacts(file);
 }
 
 }  // namespace chainsplat::fuzz

@@ -13,6 +13,7 @@ namespace {
 // Fields that are not named as their options are: target_velocity is --target-velocity without a line here.
 const std::map<std::string, std::string> kOtherNames = {
     {"boxes", "--keep-out-box"},
+    {"contacts", "--contact"},
     {"loop.rate", "--mpc-rate"},
     {"loop.target_velocity", "--target-velocity"},
     {"output", "-o"},
