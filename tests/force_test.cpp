@@ -398,7 +398,6 @@ TEST_CASE("on a table friction at rest hides forces, and the interval says how m
 
 TEST_CASE("on a table friction that may as well act the other way is no touch") {
   const dynamics::Model model = table_rope();
-  const chain::Chain& rope = model.chain;
   const auto base = [](double) { return dynamics::at_rest({}); };
   // the rope turns about the grasp, and is said to turn the other way; where it does so, its rest angles balance it
   const VectorX theta = VectorX::Zero(8), thetadot = 0.1 * VectorX::Unit(8, 0);
