@@ -1,19 +1,12 @@
 // motion.cpp - rollout and render: a twin set in motion, and drawn.
 #include <CLI/CLI.hpp>
-#include <algorithm>
-#include <cmath>
-#include <cstdio>
 #include <iostream>
 #include <memory>
 #include <nlohmann/json.hpp>
-#include <optional>
 
-#include "chainsplat/capture.h"
+#include "chainsplat/draw.h"
 #include "chainsplat/dynamics/base_wrench.h"
-#include "chainsplat/encode.h"
-#include "chainsplat/layout.h"
 #include "chainsplat/pipeline.h"
-#include "chainsplat/render.h"
 #include "chainsplat/run_folder.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
@@ -90,153 +83,27 @@ struct RenderRequest {
   bool mask = false, depth = false, undistorted = false, force = false;
 };
 
-std::string frame_name(int frame, const char* ending) {
-  char text[64];
-  std::snprintf(text, sizeof text, "%06d%s", frame, ending);
-  return text;
-}
-
-// The camera's times and, as a motion of its own may be longer than the recording, as many more at its rate. A motion
-// at quite other times is drawn from its beginning on.
-std::vector<double> frame_times(const std::vector<double>& recorded, const chain::States& states) {
-  constexpr double kRate = 30.0;  // frames per second, for a camera of one frame
-  const double known = render::median_interval(recorded), interval = known > 0.0 ? known : 1.0 / kRate;
-  const bool any = std::any_of(recorded.begin(), recorded.end(),
-                               [&](double time) { return render::covered(states, time, interval); });
-  std::vector<double> times = any ? recorded : std::vector<double>{states.time.front()};
-  const double last = times.back();
-  for (int k = 1; static_cast<int>(times.size()) < capture::kMostFrames; ++k) {
-    const double time = last + k * interval;
-    if (time > states.time.back() + 1e-9) break;
-    times.push_back(time);
-  }
-  return times;
-}
-
-// What a camera recorded, read in parts, so that a recording may be long.
-class Recorded {
- public:
-  // `frames`: that may be asked for, from the first on.
-  Recorded(Path capture, const capture::Camera& camera, std::size_t frames)
-      : capture_(std::move(capture)), frames_(static_cast<int>(frames)), at_once_(capture::frames_at_once({camera})) {
-    load_.undistort = false, load_.masked = false, load_.camera = camera.name;
-  }
-  // RGB; empty where there is none. Frames are asked for in order.
-  capture::Image8 at(int frame) {
-    if (frame >= frames_) return {};
-    if (views_.empty() || frame >= load_.last) {
-      load_.first = frame, load_.last = std::min(frames_, frame + at_once_);
-      views_.clear();
-      views_ = capture::load(capture_, load_).views;
-    }
-    return capture::rgb(views_[frame - load_.first]);
-  }
-
- private:
-  Path capture_;
-  capture::LoadOptions load_;
-  std::vector<capture::View> views_;
-  int frames_, at_once_;
-};
-
 void render(const Globals& globals, const RenderRequest& request) {
-  const Path out = request.out;
-  const bool video = out.extension() == ".mp4";
-  const render::Layout layout = render::read_layout(request.layout);
-  if (layout != render::Layout::drawn && request.undistorted)
-    throw InputError("--undistorted", "what was recorded has the lens distortion", "leave it or --layout out");
-  const auto [folder, camera_name] = split_camera(request.camera);
-  if (video) {
-    pipeline::check_output_file(request.out);
-    if (request.mask || request.depth)
-      throw InputError("--mask, --depth", "go with a folder of frames, not with a video",
-                       "let -o end in another way than .mp4");
-  } else {
-    pipeline::check_output_folder(out, request.force, "name another folder or give --force to write into it");
-  }
-  const twin::Twin twin = pipeline::load_twin(request.run);
-  pipeline::check_drawable(twin, request.run);
-  const chain::States states =
-      request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
-  capture::LoadOptions load;
-  load.images = false;
-  load.camera = camera_name;
-  capture::Capture capture = capture::load(folder, load);
-  capture::apply(twin.corrections, capture);
-  // states of a motion of their own bring its base with them
-  const Path beside = base_beside(request.states);
-  const bool own_base = !request.base.empty() || !beside.empty();
-  const trajectory::Trajectory base = !request.base.empty() ? pipeline::read_base(input_path(request.base))
-                                      : !beside.empty()     ? pipeline::read_base(beside)
-                                                            : capture.base;
-  if (!request.states.empty() && !own_base)
-    core::warn(request.states + ": no base motion lies beside it; that of " + folder + " is taken");
-  std::vector<std::size_t> recorded;  // how many of a camera's times are those of its frames
-  for (std::vector<double>& times : capture.times) {
-    const std::vector<double> own = times;
-    if (own_base) times = frame_times(own, states);
-    recorded.push_back(times.front() == own.front() ? own.size() : 0);
-  }
-  if (video && capture.cameras.size() != 1)
-    throw InputError(request.camera, "has " + std::to_string(capture.cameras.size()) + " cameras and a video shows one",
-                     "name it, for example " + folder + ":" + capture.cameras.front().name);
-  if (!video) {
-    pipeline::check_not_capture(out, capture.folder);
-    for (const capture::Camera& camera : capture.cameras)
-      pipeline::check_output_folder(out / camera.name, true, "");  // may be a file
-  }
-  // before the first camera's frames are written
-  for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
-    const double interval = render::median_interval(capture.times[c]);
-    if (std::none_of(capture.times[c].begin(), capture.times[c].end(),
-                     [&](double time) { return render::covered(states, time, interval); }))
-      throw InputError(request.states.empty() ? request.run : request.states,
-                       "covers none of the times of " + capture.cameras[c].name, "give states at the camera's times");
-  }
-  const gpu::DevicePtr device = gpu::open_device({.selector = globals.device});
-  splat::Engine engine(*device);
-  render::Options options;
+  pipeline::DrawOptions options;
+  options.output = request.out;
+  options.layout = render::read_layout(request.layout);
+  options.mask = request.mask;
   options.depth = request.depth;
   options.undistorted = request.undistorted;
-
+  options.force = request.force;
+  options.device = globals.device;
+  const auto [folder, camera] = split_camera(request.camera);
+  options.camera = camera;
+  if (!request.states.empty()) options.states = input_path(request.states);
+  // states of a motion of their own bring its base with them
+  options.base = request.base.empty() ? base_beside(request.states) : input_path(request.base);
+  const pipeline::DrawResult result = pipeline::draw(request.run, folder, options, terminal());
+  int total = 0;
   Json document;
   document["output"] = request.out;
-  std::size_t total = 0;
-  for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
-    const capture::Camera& camera = capture.cameras[c];
-    const std::vector<double>& times = capture.times[c];
-    const double interval = render::median_interval(times);
-    const auto count =
-        std::count_if(times.begin(), times.end(), [&](double time) { return render::covered(states, time, interval); });
-    const Path stem = out / camera.name;
-    std::optional<capture::VideoWriter> movie;
-    if (video)
-      movie.emplace(out, times.size() > 1 ? double(times.size() - 1) / (times.back() - times.front()) : 30.0);
-    else
-      core::make_folder(stem);
-    Recorded seen(folder, camera, layout == render::Layout::drawn ? 0 : recorded[c]);
-    std::size_t written = 0;
-    const auto write = [&](std::vector<render::Frame>& batch) {
-      for (const render::Frame& frame : batch) {
-        const double share = static_cast<double>(frame.frame) / std::max<std::size_t>(1, times.size() - 1);
-        const capture::Image8 picture = render::laid_out(layout, frame, camera, seen.at(frame.frame), share);
-        if (movie)
-          movie->add(picture);
-        else
-          capture::write_png(stem / frame_name(frame.frame, ".png"), picture);
-        if (request.mask)
-          capture::write_png(stem / frame_name(frame.frame, ".mask.png"), render::mask_image(frame, camera));
-        if (request.depth)
-          capture::write_depth_exr(stem / frame_name(frame.frame, ".depth.exr"), camera.width, camera.height,
-                                   render::depth_image(frame, camera));
-        core::report({"write " + camera.name, static_cast<std::int64_t>(++written), count, NAN, NAN, ""});
-      }
-    };
-    render::for_batches(engine, twin.gaussians, twin.chain, states, base, camera, static_cast<int>(c), times, options,
-                        write);
-    if (movie) movie->finish();
-    total += written;
-    document["cameras"][camera.name] = written;
+  for (const auto& [name, frames] : result.frames) {
+    total += frames;
+    document["cameras"][name] = frames;
   }
   if (globals.json)
     std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
