@@ -261,7 +261,6 @@ void take_away_scene(const Help& help, Moment& moment) {
 
 // Adds the user's help to a moment's shots.
 void add_help(const Help& help, const std::vector<Samples>& samples, Moment& moment) {
-  take_away_scene(help, moment);
   for (std::size_t k = 0; k < moment.shots.size(); ++k) {
     const int c = moment.cameras[k];
     int frame = 0;
@@ -272,6 +271,7 @@ void add_help(const Help& help, const std::vector<Samples>& samples, Moment& mom
     for (const Help::Region& region : help.boxes)
       if (region.camera == c && region.frame.value_or(frame) == frame) moment.shots[k].bounds = region.box;
   }
+  take_away_scene(help, moment);  // last, since a shot's frame is told by its picture
 }
 
 // The mask of what lies inside the tube.

@@ -46,6 +46,12 @@ expect_iou 0.8 cam0 'a point'
 run mask "$window" -o "$work/without" --empty "cam0=$window/truth/empty/cam0.png" --json
 expect_code 0 'an empty scene'
 expect_iou 0.75 cam0 'an empty scene'
+# a box is of its frame, also where the scene is known: around all of them this one changes frame 1
+three=$work/three
+"$source_dir/tools/make_clutter" "$three" --seed 43 --frames 3 --scale 0.5 --grasp-error 14 || fail 'make_clutter'
+run mask "$three" -o "$work/no_box" --empty "cam0=$three/truth/empty/cam0.png"
+run mask "$three" -o "$work/box_0" --empty "cam0=$three/truth/empty/cam0.png" --box cam0:0:0,0,250,480
+cmp "$work/no_box/cam0/000001.png" "$work/box_0/cam0/000001.png" || fail "frame 0's box is frame 1's, too"
 expect_error 2 'no camera cam7; it has cam0' mask "$still" -o "$work/none" --point cam7:10,10
 expect_error 2 'outside of the picture' mask "$still" -o "$work/none" --point cam0:9999,10
 expect_error 2 'no such frame' mask "$still" -o "$work/none" --point cam0:3:10,10
