@@ -11,7 +11,7 @@ namespace chainsplat::pipeline {
 struct DrawOptions {
   Path output;         // folder for CAMERA/000000.png, or a video that ends in .mp4
   std::string camera;  // of the capture, this one alone; empty: all, but a video shows one
-  Path states;         // motion, states.csv; empty: the recognized states
+  Path states;         // motion, states.csv, or "-" for standard input; empty: the recognized states
   Path base;           // its base motion, TUM; empty: the capture's own
   render::Layout layout = render::Layout::drawn;
   bool mask = false;         // also 000000.mask.png; no video

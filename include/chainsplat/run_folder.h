@@ -65,6 +65,7 @@ twin::Twin twin_in_scene(const capture::Capture& capture);
 // The twin in `run` with something recognized in it. Throws InputError.
 twin::Twin load_twin(const Path& run);
 void check_drawable(const twin::Twin& twin, const Path& run);  // throws InputError where it has no Gaussians
+Path input_path(const Path& name);                             // the file to open: standard input for "-"
 trajectory::Trajectory read_base(const Path& file);            // a TUM file as a fitted motion; throws InputError
 // The base motion of the capture that the twin was made from, as kept in its folder. Throws InputError.
 trajectory::Trajectory own_base(const Path& run);

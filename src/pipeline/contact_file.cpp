@@ -5,7 +5,7 @@
 #include <string>
 
 #include "chainsplat/core.h"
-#include "pipeline/standard_input.h"
+#include "chainsplat/run_folder.h"
 
 namespace chainsplat::pipeline {
 

@@ -10,7 +10,6 @@
 #include "chainsplat/rope.h"
 #include "chainsplat/run_folder.h"
 #include "pipeline/contact_file.h"
-#include "pipeline/standard_input.h"
 
 namespace chainsplat::pipeline {
 

@@ -111,6 +111,8 @@ void check_drawable(const twin::Twin& twin, const Path& run) {
     throw InputError(run.string(), "has no Gaussians to draw", "recognize it from images first");
 }
 
+Path input_path(const Path& name) { return name == "-" ? Path("/dev/stdin") : name; }
+
 trajectory::Trajectory read_base(const Path& file) {
   return trajectory::fit(trajectory::read_tum(file), file.string());
 }

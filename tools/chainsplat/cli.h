@@ -95,8 +95,6 @@ struct CheckReport {
 CheckReport check_report(const std::string& path, bool with_masks);
 
 // --- results.cpp --------------------------------------------------------------------------------
-// "-" is standard input.
-Path input_path(const std::string& name);
 // "X,Y,Z": numbers between commas, `count` of them (0: one or more). Throws InputError with `where`.
 std::vector<double> numbers(const std::string& text, const std::string& where, std::size_t count);
 // Writes `bytes` to standard output ("-"), into a device or pipe that exists, else as a file in one step.

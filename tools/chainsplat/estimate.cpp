@@ -98,7 +98,7 @@ pipeline::FollowOptions options_of(const Globals& globals, const EstimateRequest
   if (!request.start.empty() && !source.unix_time) source.start = seconds_of(request.start);
   source.frames = capture::read_frame_range(request.frames, "--frames");
   source.pictures = request.serve > 0 || !request.mcap.empty();
-  if (!request.base.empty()) options.base = input_path(request.base);
+  if (!request.base.empty()) options.base = pipeline::input_path(request.base);
   if (request.solver == "newton") options.solver = pipeline::Solver::newton;
   if (request.solver == "silhouette") options.solver = pipeline::Solver::silhouette;
   if (request.solver == "adam") options.solver = pipeline::Solver::adam;

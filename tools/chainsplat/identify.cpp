@@ -91,7 +91,7 @@ pipeline::IdentifyResult identified(const Globals& globals, const Request& reque
   if (request.runs.size() > 1)
     throw InputError("--markers", "goes with one RUN", "name one twin; several files can follow --markers");
   std::vector<Path> files;
-  for (const std::string& name : request.markers) files.push_back(input_path(name));
+  for (const std::string& name : request.markers) files.push_back(pipeline::input_path(name));
   return pipeline::identify_markers(
       request.runs[0], files,
       {.shape_only = request.shape_only, .payload = payload_of(request.payload), .seed = globals.seed}, terminal());
@@ -121,7 +121,8 @@ void identify(const Globals& globals, const Request& request) {
 }
 
 pipeline::OnlineResult identified_online(const OnlineRequest& request) {
-  const pipeline::OnlineOptions options{request.base.empty() ? Path() : input_path(request.base), request.memory};
+  const pipeline::OnlineOptions options{request.base.empty() ? Path() : pipeline::input_path(request.base),
+                                        request.memory};
   if (request.file == "-") return pipeline::identify_online(request.run, std::cin, "-", options, terminal());
   std::ifstream file(request.file);
   return pipeline::identify_online(request.run, file, request.file, options, terminal());

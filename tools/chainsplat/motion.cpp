@@ -42,8 +42,8 @@ std::string wrench_csv(const std::vector<double>& times, const std::vector<math:
 
 void rollout(const Globals& globals, const RolloutRequest& request) {
   pipeline::RolloutOptions options;
-  if (!request.base.empty()) options.base = input_path(request.base);
-  if (!request.initial.empty()) options.initial = input_path(request.initial);
+  if (!request.base.empty()) options.base = pipeline::input_path(request.base);
+  if (!request.initial.empty()) options.initial = pipeline::input_path(request.initial);
   options.rate = request.rate;
   options.check();
   if (globals.json && (request.out == "-" || request.centerline == "-" || request.wrench == "-"))
@@ -94,9 +94,9 @@ void render(const Globals& globals, const RenderRequest& request) {
   options.device = globals.device;
   const auto [folder, camera] = split_camera(request.camera);
   options.camera = camera;
-  if (!request.states.empty()) options.states = input_path(request.states);
+  options.states = request.states;
   // states of a motion of their own bring its base with them
-  options.base = request.base.empty() ? base_beside(request.states) : input_path(request.base);
+  options.base = request.base.empty() ? base_beside(request.states) : pipeline::input_path(request.base);
   const pipeline::DrawResult result = pipeline::draw(request.run, folder, options, terminal());
   int total = 0;
   Json document;

@@ -27,7 +27,7 @@ struct PlanRequest {
 
 // The true rope, held as the twin's is.
 dynamics::Model read_truth(const std::string& file, const twin::Twin& twin) {
-  const twin::Twin truth = twin::load_chain(input_path(file), twin.chain);
+  const twin::Twin truth = twin::load_chain(pipeline::input_path(file), twin.chain);
   if (!truth.parameters) throw InputError(file, "has no masses, stiffness and damping", "give an identified chain");
   return dynamics::make_model(truth.chain, *truth.parameters);
 }
@@ -100,7 +100,7 @@ planning::Problem make_problem(const PlanRequest& request, const pipeline::Rope&
   planning::Problem problem = pipeline::planning_problem(rope);
   char text[160];
   if (!request.initial.empty()) {
-    const chain::States given = twin::read_states(input_path(request.initial), rope.twin.chain.angles());
+    const chain::States given = twin::read_states(pipeline::input_path(request.initial), rope.twin.chain.angles());
     if (given.time.empty()) throw InputError(request.initial, "has no rows", "give at least one");
     problem.initial.theta = given.theta[0];
     if (!given.thetadot.empty()) problem.initial.thetadot = given.thetadot[0];

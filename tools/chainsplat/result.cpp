@@ -91,10 +91,11 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
   twin::Twin twin = pipeline::load_twin(request.run);
   if (exports::ending(request.out) == ".npz")
     twin.states.covariance = pipeline::read_covariances(Path(request.run) / pipeline::kCovarianceFile, twin.states);
-  const chain::States motion =
-      request.states.empty() ? twin.states : twin::read_states(input_path(request.states), twin.chain.angles());
+  const chain::States motion = request.states.empty()
+                                   ? twin.states
+                                   : twin::read_states(pipeline::input_path(request.states), twin.chain.angles());
   const Path beside = base_beside(request.states);
-  const trajectory::Trajectory base = !request.base.empty() ? pipeline::read_base(input_path(request.base))
+  const trajectory::Trajectory base = !request.base.empty() ? pipeline::read_base(pipeline::input_path(request.base))
                                       : !beside.empty()     ? pipeline::read_base(beside)
                                                             : pipeline::own_base(request.run);
   exports::Options options;
@@ -151,9 +152,9 @@ void synthesize(const Globals& globals, const SynthRequest& request) {
   capture::apply(twin.corrections, scene);
   pipeline::check_not_capture(out, scene.folder);
   if (const Path beside = base_beside(request.states); !request.base.empty() || !beside.empty())
-    scene.base = pipeline::read_base(request.base.empty() ? beside : input_path(request.base));
+    scene.base = pipeline::read_base(request.base.empty() ? beside : pipeline::input_path(request.base));
   const chain::States states = !request.states.empty()
-                                   ? twin::read_states(input_path(request.states), twin.chain.angles())
+                                   ? twin::read_states(pipeline::input_path(request.states), twin.chain.angles())
                                : twin.rollout.time.empty() ? twin.states
                                                            : twin.rollout;
   const gpu::DevicePtr device = gpu::open_device({.selector = globals.device});

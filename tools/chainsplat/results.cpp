@@ -15,8 +15,6 @@ namespace chainsplat::tools {
 
 namespace fs = std::filesystem;
 
-Path input_path(const std::string& name) { return name == "-" ? Path("/dev/stdin") : Path(name); }
-
 void write_result(const std::string& name, const std::string& bytes) {
   std::error_code error;
   if (name == "-") {
