@@ -1,0 +1,173 @@
+#include "src/masking/make_stills.h"
+
+#include <algorithm>
+#include <cmath>
+
+#include "src/masking/cut.h"
+#include "src/masking/ribbon.h"
+
+namespace chainsplat::masking {
+
+using capture::View;
+
+namespace {
+
+// The rope hangs at rest, and the grasp may be off: hand-eye calibrations of laboratories are wrong by 3 to 14 mm.
+constexpr double kGraspDeviation = 0.006;  // m, of the grasp,
+constexpr double kGraspScatter = 0.0025;   // m, and from still to still
+constexpr double kHangingBendChange = 6.0 * M_PI / 180, kLyingBendChange = 10.0 * M_PI / 180;  // of neighboring joints
+constexpr double kSureMargin = 25.0;  // nats, by which a rope must be better than those that end elsewhere; with none
+constexpr double kUnsure = 0.7;       // its score is multiplied by this
+constexpr double kLeastStillEvidence = 0.02;  // nats per sample
+constexpr double kFirstWidth = 0.2, kFirstBroadWidth = 0.4,
+                 kKnownWidth = 0.12;                   // deviation of the width before and after it was measured
+constexpr double kBroad = 4.0;                         // px, of a radius beyond which blur hardly changes a width
+constexpr double kLeastWidth = 0.6, kMostWidth = 1.7;  // of the given diameter, as far as it is believed to be wrong
+constexpr int kRibbonRounds = 3;                       // of colors and ribbons; the last keeps the width
+
+// The mask of what lies inside the tube.
+View inside_of(const Tube& tube, const View& picture) {
+  View out;
+  out.camera = picture.camera, out.frame = picture.frame, out.time = picture.time;
+  if (tube.box.empty()) return out;
+  out.x0 = tube.box.x0, out.y0 = tube.box.y0, out.width = tube.box.width(), out.height = tube.box.height();
+  out.rgba.assign(static_cast<std::size_t>(4) * out.width * out.height, 0);
+  for (int y = tube.box.y0; y < tube.box.y1; ++y)
+    for (int x = tube.box.x0; x < tube.box.x1; ++x) {
+      if (tube.at(x, y) >= 0.0f) continue;
+      std::uint8_t* const to = &out.rgba[4 * (static_cast<std::size_t>(y - out.y0) * out.width + x - out.x0)];
+      std::copy_n(&picture.rgba[4 * (static_cast<std::size_t>(y) * picture.width + x)], 3, to);
+      to[3] = 255;
+    }
+  return out;
+}
+
+// What a still shows.
+struct Still {
+  const View* view;
+  const Grown* grown;  // of the moment nearest in time
+  Axis along = {};     // of the grown chain
+  Ribbon ribbon = {};
+  bool broad = false;  // enough pixels across that blur hardly changes the width
+};
+
+// Grows every moment by itself, then with the grasp and the colors that the moments agree upon.
+std::vector<Grown> grow_stills(const Recording& recording, const chain::Chain& chain,
+                               const std::vector<Moment>& moments) {
+  const capture::Capture& scene = recording.capture;
+  math::Vector3 grasp = math::Vector3::Zero();
+  const auto clues_of = [&](const Moment& moment, int pass) {
+    Clues clues;
+    clues.grasp = grasp;
+    clues.bend_change = scene.tabletop ? kLyingBendChange : kHangingBendChange;
+    clues.grasp_deviation = pass ? kGraspScatter : kGraspDeviation;
+    if (!scene.tabletop && scene.gravity.norm() > 0.0)
+      clues.down = scene.base.pose(moment.time).rotation.transpose() * scene.gravity.normalized();
+    return clues;
+  };
+  const auto again = [&](const std::vector<Grown>& grown) {
+    if (grown.size() == 1) return false;
+    for (int axis = 0; axis < 3; ++axis) {
+      std::vector<double> values;
+      for (const Grown& one : grown) values.push_back(one.shift[axis]);
+      grasp[axis] = math::median(values);
+    }
+    return true;
+  };
+  return grow_moments(recording, chain, moments, kLeastStillEvidence, clues_of, again).grown;
+}
+
+// By camera.
+std::vector<std::vector<Still>> stills_of(const std::vector<Samples>& samples, const std::vector<Moment>& moments,
+                                          const std::vector<Grown>& grown) {
+  std::vector<std::vector<Still>> out(samples.size());
+  for (std::size_t c = 0; c < samples.size(); ++c)
+    for (const View& view : samples[c].frames) {
+      std::size_t nearest = 0;
+      for (std::size_t i = 1; i < moments.size(); ++i)
+        if (std::abs(moments[i].time - view.time) < std::abs(moments[nearest].time - view.time)) nearest = i;
+      out[c].push_back({&view, &grown[nearest]});
+    }
+  return out;
+}
+
+math::Pose base_at(const Recording& recording, const Still& still) {
+  math::Pose base = recording.capture.base.pose(still.view->time);
+  base.translation = base * still.grown->shift;
+  return base;
+}
+
+// One camera's colors: from the tubes of the grown chains, or, where there are any already, from the ribbons.
+Look look_of(const Recording& recording, const chain::Chain& chain, int camera, bool ribbons,
+             std::vector<Still>& stills) {
+  const capture::Camera& pinhole = recording.pinholes[camera];
+  Look look;
+  if (const capture::Image8* const empty = recording.help.empty_of(camera); empty && !stills.empty())
+    look.background = empty_scene(*empty, picture_of(*stills.front().view));
+  for (Still& still : stills) {
+    const View& view = *still.view;
+    const bool by_ribbon = ribbons && still.ribbon.axis.points.size() > 1;
+    const math::Pose base = base_at(recording, still);
+    still.along = axis(chain, base, still.grown->theta, pinhole, 0.0, chain.length);
+    const Tube around = tube(by_ribbon ? still.ribbon.axis : still.along, view.width, view.height, kAboutPixels);
+    still.broad = around.radius > kBroad;
+    count_colors(look, picture_of(view), around, reach(chain, base, pinhole), chain,
+                 by_ribbon ? kFitMargin : kGrownMargin * around.radius);
+  }
+  settle(look);
+  return look;
+}
+
+// Colors and ribbons in turn; the width is what the ribbons of all cameras have in common.
+void find_ribbons(const Recording& recording, const chain::Chain& chain, std::vector<std::vector<Still>>& stills) {
+  double width = 1.0;
+  for (int round = 0; round < kRibbonRounds; ++round) {
+    std::vector<double> widths;
+    for (std::size_t c = 0; c < stills.size(); ++c) {
+      const Look look = look_of(recording, chain, static_cast<int>(c), round > 0, stills[c]);
+      core::parallel_for(static_cast<std::int64_t>(stills[c].size()), [&](std::int64_t i) {
+        Still& still = stills[c][i];
+        RibbonOptions ribbon;
+        ribbon.width = width;
+        ribbon.width_deviation = round ? kKnownWidth : still.broad ? kFirstBroadWidth : kFirstWidth;
+        still.ribbon = find_ribbon(look, picture_of(*still.view), still.along, chain.length, ribbon);
+      });
+      for (const Still& still : stills[c])
+        if (!still.ribbon.axis.points.empty()) widths.push_back(still.ribbon.width);
+    }
+    if (widths.empty()) throw_nothing(recording);
+    if (round + 1 < kRibbonRounds) width = std::clamp(math::median(widths), kLeastWidth, kMostWidth);
+  }
+}
+
+double score_of(const Still& still) {
+  // another way from the grasp that explains the picture nearly as well: another cable that crosses, perhaps
+  const double sure = std::min(1.0, kUnsure + (1.0 - kUnsure) * still.grown->margin / kSureMargin);
+  return sure * score(evidence(picture_of(*still.view), still.ribbon.axis));
+}
+
+}  // namespace
+
+Summary make_stills(const Recording& recording, const chain::Chain& chain, const std::vector<Samples>& samples,
+                    const Sink& sink) {
+  const std::vector<Moment> moments = moments_of(recording, samples);
+  const std::vector<Grown> grown = grow_stills(recording, chain, moments);
+  std::vector<std::vector<Still>> stills = stills_of(samples, moments, grown);
+  find_ribbons(recording, chain, stills);
+
+  Summary summary;
+  for (const Grown& one : grown)
+    if (one.shift.norm() > summary.grasp.norm()) summary.grasp = one.shift;
+  for (std::size_t c = 0; c < stills.size(); ++c)
+    for (const Still& still : stills[c]) {
+      const View view = inside_of(tube(still.ribbon.axis, still.view->width, still.view->height, 0.0), *still.view);
+      ++summary.frames;
+      summary.empty += view.width == 0;
+      summary.inside += view.width != 0;
+      sink(static_cast<int>(c), still.view->frame, recorded_mask(view, recording.capture.cameras[c]), score_of(still));
+    }
+  summary.inside /= summary.frames;
+  return summary;
+}
+
+}  // namespace chainsplat::masking
