@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <limits>
+#include <utility>
 
 namespace chainsplat::masking {
 
@@ -110,168 +112,243 @@ double median_of(std::vector<double> values) {
   return values[values.size() / 2];
 }
 
-}  // namespace
+// The picture straightened along the axis: a row for every station, columns across it.
+struct Straight {
+  std::vector<Station> stations;
+  double length;              // m, of the rope
+  double radius;              // px, of the given axis
+  double du;                  // px, between columns
+  double ds;                  // px, between stations
+  int half, columns;          // columns on either side of the axis, and all
+  int about;                  // stations per radius
+  std::vector<Color> colors;  // by station and column
+  std::vector<double> odds;   // log odds of the colors for the rope
+  std::vector<double> steps;  // change of color between a column and the one before it, 0 to 1
 
-Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, double length,
-                   const RibbonOptions& options) {
-  Ribbon out;
-  if (along.points.size() < 2) return out;
-  double radius = 0.0;  // px, of the given axis
-  for (const AxisPoint& p : along.points) radius += p.radius / static_cast<double>(along.points.size());
-  radius = std::max(0.5, radius);
-  const std::vector<Station> stations = stations_of(along, -options.slack, length + options.slack, radius);
-  const int count = static_cast<int>(stations.size());
-  // straighten the picture
-  const double reach = kReach * options.width * radius + kMoreReach;
-  const double du = std::max({kAcross * radius, kLeastAcross, 2.0 * reach / kMostAcross});  // px
-  const int half = static_cast<int>(reach / du), columns = 2 * half + 1;
-  std::vector<Color> colors(static_cast<std::size_t>(count) * columns);
-  std::vector<double> odds(colors.size()), steps(colors.size(), 0.0);
-  const auto at = [&](int i, int k) { return static_cast<std::size_t>(i) * columns + k; };
-  for (int i = 0; i < count; ++i) {
-    const Station& s = stations[i];
+  int count() const { return static_cast<int>(stations.size()); }
+  std::size_t at(int i, int k) const { return static_cast<std::size_t>(i) * columns + k; }
+  double weight() const { return ds / radius; }  // facts of one station
+};
+
+Straight straighten(const Look& look, const Picture& picture, const Axis& along, double length,
+                    const RibbonOptions& options) {
+  Straight out{};
+  out.length = length;
+  for (const AxisPoint& p : along.points) out.radius += p.radius / static_cast<double>(along.points.size());
+  out.radius = std::max(0.5, out.radius);
+  out.stations = stations_of(along, -options.slack, length + options.slack, out.radius);
+  const double reach = kReach * options.width * out.radius + kMoreReach;
+  out.du = std::max({kAcross * out.radius, kLeastAcross, 2.0 * reach / kMostAcross});
+  out.half = static_cast<int>(reach / out.du), out.columns = 2 * out.half + 1;
+  out.ds = (out.stations[1].at - out.stations[0].at).norm();
+  out.about = std::max(1, static_cast<int>(out.radius / std::max(0.1, out.ds)));
+  out.colors.resize(static_cast<std::size_t>(out.count()) * out.columns);
+  out.odds.resize(out.colors.size());
+  for (int i = 0; i < out.count(); ++i) {
+    const Station& s = out.stations[i];
     const Colors& known = s.arclength < 0.5 * length ? look.near : look.far;
-    for (int k = 0; k < columns; ++k) {
-      const Vector2 place = s.at + (k - half) * du * s.across;
-      colors[at(i, k)] = color_at(picture, place);
+    for (int k = 0; k < out.columns; ++k) {
+      const Vector2 place = s.at + (k - out.half) * out.du * s.across;
+      out.colors[out.at(i, k)] = color_at(picture, place);
       const int x = std::clamp(static_cast<int>(place.x()), 0, picture.width - 1),
                 y = std::clamp(static_cast<int>(place.y()), 0, picture.height - 1);
-      odds[at(i, k)] =
+      out.odds[out.at(i, k)] =
           std::clamp(color_odds(known, pixel(picture, x, y)) + 2.0 * difference_odds(look.background, picture, x, y),
                      -kMostOdds, kMostOdds);
     }
   }
-  // steps between columns: the colors on either side, averaged over a radius of length
-  const int apart = std::max(1, static_cast<int>(std::lround(std::max(0.75, 0.2 * radius) / du)));
-  const double ds = (stations[1].at - stations[0].at).norm();  // px
-  const int about = std::max(1, static_cast<int>(radius / std::max(0.1, ds)));
-  std::vector<Color> mean(colors.size());
-  for (int k = 0; k < columns; ++k)
-    for (int i = 0; i < count; ++i) {
+  return out;
+}
+
+// Steps between columns: of the colors on either side, averaged over a radius of length. A full step counts fully at
+// its steepest place only, which is where the outline is.
+void find_steps(Straight& s) {
+  std::vector<Color> mean(s.colors.size());
+  for (int k = 0; k < s.columns; ++k)
+    for (int i = 0; i < s.count(); ++i) {
       Color sum{};
       int n = 0;
-      for (int j = std::max(0, i - about); j <= std::min(count - 1, i + about); ++j, ++n)
-        for (int c = 0; c < 3; ++c) sum[c] += colors[at(j, k)][c];
-      for (int c = 0; c < 3; ++c) mean[at(i, k)][c] = sum[c] / static_cast<float>(n);
+      for (int j = std::max(0, i - s.about); j <= std::min(s.count() - 1, i + s.about); ++j, ++n)
+        for (int c = 0; c < 3; ++c) sum[c] += s.colors[s.at(j, k)][c];
+      for (int c = 0; c < 3; ++c) mean[s.at(i, k)][c] = sum[c] / static_cast<float>(n);
     }
-  // a full step counts fully at its steepest place only, which is where the outline is
-  const int near = std::max(1, static_cast<int>(kSteepest * radius / du));
-  std::vector<double> across(columns, 0.0);
-  for (int i = 0; i < count; ++i) {
-    for (int k = 1; k < columns; ++k)  // between the columns k - 1 and k
-      across[k] = difference(mean[at(i, std::max(0, k - apart))], mean[at(i, std::min(columns - 1, k + apart - 1))]);
-    for (int k = 1; k < columns; ++k) {
+  const int apart = std::max(1, static_cast<int>(std::lround(std::max(0.75, 0.2 * s.radius) / s.du)));
+  const int near = std::max(1, static_cast<int>(kSteepest * s.radius / s.du));
+  s.steps.assign(s.colors.size(), 0.0);
+  std::vector<double> across(s.columns, 0.0);
+  for (int i = 0; i < s.count(); ++i) {
+    for (int k = 1; k < s.columns; ++k)  // between the columns k - 1 and k
+      across[k] =
+          difference(mean[s.at(i, std::max(0, k - apart))], mean[s.at(i, std::min(s.columns - 1, k + apart - 1))]);
+    for (int k = 1; k < s.columns; ++k) {
       const auto first = across.begin() + std::max(1, k - near),
-                 last = across.begin() + std::min(columns, k + near + 1);
+                 last = across.begin() + std::min(s.columns, k + near + 1);
       const double d = across[k];
-      steps[at(i, k)] = d * d / (std::max(1e-9, *std::max_element(first, last)) * (d + kFullStep));
+      s.steps[s.at(i, k)] = d * d / (std::max(1e-9, *std::max_element(first, last)) * (d + kFullStep));
     }
   }
-  // states: the left outline lies before column a, the right one before column b
-  struct State {
-    int a, b;
-  };
-  const double usual = options.width * radius;  // px
-  const auto usual_at = [&](int i) { return options.width * std::max(0.5, stations[i].radius); };
-  std::vector<State> states;
-  std::vector<int> index(static_cast<std::size_t>(columns + 1) * (columns + 1), -1);
-  for (int a = 1; a < columns; ++a)
-    for (int b = a + 1; b < columns; ++b) {
-      const double wide = 0.5 * (b - a) * du / usual, middle = std::abs((0.5 * (a + b) - 0.5 - half) * du) / usual;
+}
+
+// A pair of outlines at one station: the left one lies before column a, the right one before column b.
+struct Outlines {
+  int a, b;
+};
+
+// All pairs of a believable width and place, and their numbers by (a, b); -1: none.
+struct Choices {
+  std::vector<Outlines> all;
+  std::vector<int> number;
+  int columns;
+  int at(int a, int b) const { return number[static_cast<std::size_t>(a) * (columns + 1) + b]; }
+};
+
+Choices choices_of(const Straight& s, const RibbonOptions& options) {
+  Choices out;
+  out.columns = s.columns;
+  out.number.assign(static_cast<std::size_t>(s.columns + 1) * (s.columns + 1), -1);
+  const double usual = options.width * s.radius;  // px
+  for (int a = 1; a < s.columns; ++a)
+    for (int b = a + 1; b < s.columns; ++b) {
+      const double wide = 0.5 * (b - a) * s.du / usual,
+                   middle = std::abs((0.5 * (a + b) - 0.5 - s.half) * s.du) / usual;
       if (wide < kLeastWidth || wide > kMostWidth || middle > 2.0) continue;
-      index[static_cast<std::size_t>(a) * (columns + 1) + b] = static_cast<int>(states.size());
-      states.push_back({a, b});
+      out.number[static_cast<std::size_t>(a) * (s.columns + 1) + b] = static_cast<int>(out.all.size());
+      out.all.push_back({a, b});
     }
-  if (states.empty()) return out;
-  const double weight = ds / radius;  // facts of one station
-  const auto cost_of = [&](int i, const State& s, const std::vector<double>& sums) {
-    const double expected = usual_at(i);
-    const double wide = 0.5 * (s.b - s.a) * du / expected, middle = (0.5 * (s.a + s.b) - 0.5 - half) * du / expected;
-    const bool tip = stations[i].arclength > (1.0 - kTipShare) * length && wide > 1.0;
-    const double width = tip ? kWiderTip * (wide - 1.0) : 0.5 * square((wide - 1.0) / options.width_deviation);
-    return weight * (width + 0.5 * square(middle / kCenter) - kColor * (sums[s.b] - sums[s.a]) * du / radius -
-                     kEdge * (steps[at(i, s.a)] + steps[at(i, s.b)]));
+  return out;
+}
+
+// What speaks against a pair at station i. `sums`: of the odds of the columns before each.
+double cost_of(const Straight& s, const RibbonOptions& options, int i, const Outlines& pair,
+               const std::vector<double>& sums) {
+  const double expected = options.width * std::max(0.5, s.stations[i].radius);
+  const double wide = 0.5 * (pair.b - pair.a) * s.du / expected,
+               middle = (0.5 * (pair.a + pair.b) - 0.5 - s.half) * s.du / expected;
+  const bool tip = s.stations[i].arclength > (1.0 - kTipShare) * s.length && wide > 1.0;
+  const double width = tip ? kWiderTip * (wide - 1.0) : 0.5 * square((wide - 1.0) / options.width_deviation);
+  return s.weight() *
+         (width + 0.5 * square(middle / kCenter) - kColor * (sums[pair.b] - sums[pair.a]) * s.du / s.radius -
+          kEdge * (s.steps[s.at(i, pair.a)] + s.steps[s.at(i, pair.b)]));
+}
+
+// The cheapest way of both outlines from station to station, each by one column at most (dynamic programming).
+std::vector<Outlines> cheapest_way(const Straight& s, const Choices& choices, const RibbonOptions& options) {
+  constexpr int kMoves = 9, kStay = 4;  // by -1, 0 or 1 of the left and of the right outline
+  const auto from = [&](const Outlines& pair, int move) {
+    return Outlines{pair.a + move / 3 - 1, pair.b + move % 3 - 1};
   };
-  // the cheapest way
-  const int many = static_cast<int>(states.size());
-  std::vector<double> best(many), next(many);
-  std::vector<std::uint8_t> came(static_cast<std::size_t>(count) * many, 4);
-  std::vector<double> sums(columns + 1, 0.0);
-  for (int i = 0; i < count; ++i) {
-    for (int k = 0; k < columns; ++k) sums[k + 1] = sums[k] + odds[at(i, k)];
+  const int many = static_cast<int>(choices.all.size());
+  std::vector<double> best(many), next(many), sums(s.columns + 1, 0.0);
+  std::vector<std::uint8_t> came(static_cast<std::size_t>(s.count()) * many, kStay);
+  for (int i = 0; i < s.count(); ++i) {
+    for (int k = 0; k < s.columns; ++k) sums[k + 1] = sums[k] + s.odds[s.at(i, k)];
     for (int n = 0; n < many; ++n) {
-      double least = i ? 1e300 : 0.0;
-      std::uint8_t from = 4;
-      for (int move = 0; i && move < 9; ++move) {
-        const int a = states[n].a + move / 3 - 1, b = states[n].b + move % 3 - 1;
-        if (a < 1 || b >= columns || b <= a) continue;
-        const int m = index[static_cast<std::size_t>(a) * (columns + 1) + b];
+      double least = i ? std::numeric_limits<double>::max() : 0.0;
+      std::uint8_t by = kStay;
+      for (int move = 0; i && move < kMoves; ++move) {
+        const auto [a, b] = from(choices.all[n], move);
+        if (a < 1 || b >= s.columns || b <= a) continue;
+        const int m = choices.at(a, b);
         if (m < 0) continue;
         const double one = best[m] + kMove * ((move / 3 != 1) + (move % 3 != 1));
-        if (one < least) least = one, from = static_cast<std::uint8_t>(move);
+        if (one < least) least = one, by = static_cast<std::uint8_t>(move);
       }
-      next[n] = least + cost_of(i, states[n], sums);
-      came[static_cast<std::size_t>(i) * many + n] = from;
+      next[n] = least + cost_of(s, options, i, choices.all[n], sums);
+      came[static_cast<std::size_t>(i) * many + n] = by;
     }
     std::swap(best, next);
   }
-  std::vector<State> way(count);
+  std::vector<Outlines> way(s.count());
   int n = static_cast<int>(std::min_element(best.begin(), best.end()) - best.begin());
-  for (int i = count - 1; i >= 0; --i) {
-    way[i] = states[n];
-    const int move = came[static_cast<std::size_t>(i) * many + n];
-    if (i) n = index[static_cast<std::size_t>(states[n].a + move / 3 - 1) * (columns + 1) + states[n].b + move % 3 - 1];
+  for (int i = s.count() - 1; i >= 0; --i) {
+    way[i] = choices.all[n];
+    const auto [a, b] = from(way[i], came[static_cast<std::size_t>(i) * many + n]);
+    if (i) n = choices.at(a, b);
   }
-  // where it begins and ends: what each station says for the rope, summed up
-  std::vector<double> edges, speaks(count);
-  for (int i = 0; i < count; ++i) edges.push_back(std::min(steps[at(i, way[i].a)], steps[at(i, way[i].b)]));
+  return way;
+}
+
+// What each station says for the rope between the outlines.
+std::vector<double> words_for_rope(const Straight& s, const std::vector<Outlines>& way) {
+  std::vector<double> edges, out(s.count());
+  for (int i = 0; i < s.count(); ++i) edges.push_back(std::min(s.steps[s.at(i, way[i].a)], s.steps[s.at(i, way[i].b)]));
   const double typical = std::max(0.05, median_of(edges));
-  for (int i = 0; i < count; ++i) {
+  for (int i = 0; i < s.count(); ++i) {
     double inside = 0.0;
-    for (int k = way[i].a; k < way[i].b; ++k) inside += odds[at(i, k)] / (way[i].b - way[i].a);
-    speaks[i] = weight * (std::clamp(inside, -1.0, 1.0) + std::clamp(edges[i] / typical - 0.5, -0.5, 0.5));
+    for (int k = way[i].a; k < way[i].b; ++k) inside += s.odds[s.at(i, k)] / (way[i].b - way[i].a);
+    out[i] = s.weight() * (std::clamp(inside, -1.0, 1.0) + std::clamp(edges[i] / typical - 0.5, -0.5, 0.5));
   }
-  // the change of color along the rope, from the radius before a station to the one from it on
-  std::vector<Color> middle(count);
-  for (int i = 0; i < count; ++i) {
+  return out;
+}
+
+// The change of color along the rope, from the radius before a station to the one from it on; by station, and after the
+// last.
+std::vector<double> changes_along(const Straight& s, const std::vector<Outlines>& way) {
+  std::vector<Color> middle(s.count());
+  for (int i = 0; i < s.count(); ++i) {
     const int center = (way[i].a + way[i].b) / 2, around = (way[i].b - way[i].a) / 4;
     for (int k = center - around; k <= center + around; ++k)
-      for (int c = 0; c < 3; ++c) middle[i][c] += colors[at(i, k)][c] / static_cast<float>(2 * around + 1);
+      for (int c = 0; c < 3; ++c) middle[i][c] += s.colors[s.at(i, k)][c] / static_cast<float>(2 * around + 1);
   }
-  const auto change = [&](int i) {
+  std::vector<double> out(s.count() + 1, 0.0);
+  for (int i = s.about; i + s.about <= s.count(); ++i) {
     Color before{}, after{};
-    if (i - about < 0 || i + about > count) return 0.0;
-    for (int j = 0; j < about; ++j)
+    for (int j = 0; j < s.about; ++j)
       for (int c = 0; c < 3; ++c) {
-        before[c] += middle[i - 1 - j][c] / static_cast<float>(about);
-        after[c] += middle[i + j][c] / static_cast<float>(about);
+        before[c] += middle[i - 1 - j][c] / static_cast<float>(s.about);
+        after[c] += middle[i + j][c] / static_cast<float>(s.about);
       }
     const double d = difference(before, after);
-    return kEndStep * d / (d + kFullStep);
-  };
+    out[i] = kEndStep * d / (d + kFullStep);
+  }
+  return out;
+}
+
+// Where the rope begins and ends: the stations that speak for it, summed up, the change of color at its ends, and the
+// given length.
+std::pair<int, int> ends_of(const Straight& s, const std::vector<Outlines>& way, const RibbonOptions& options) {
+  const std::vector<double> speaks = words_for_rope(s, way), change = changes_along(s, way);
   const double sigma = std::max(1e-4, kEndSigma * options.slack);
-  int begin = 0, end = count;
-  double most = -1e300, sum = 0.0;
-  for (int i = count - 1; i >= 0 && stations[i].arclength > -options.slack; --i) {
+  int begin = 0, end = s.count();
+  double most = std::numeric_limits<double>::lowest(), sum = 0.0;
+  for (int i = s.count() - 1; i >= 0 && s.stations[i].arclength > -options.slack; --i) {
     sum += speaks[i];
-    if (stations[i].arclength > 2.0 * options.slack) continue;
-    const double value = sum + change(i) - 0.5 * square(std::max(0.0, -stations[i].arclength) / sigma);
+    if (s.stations[i].arclength > 2.0 * options.slack) continue;
+    const double value = sum + change[i] - 0.5 * square(std::max(0.0, -s.stations[i].arclength) / sigma);
     if (value > most) most = value, begin = i;
   }
-  most = -1e300, sum = 0.0;
-  for (int i = 0; i < count; ++i) {
+  most = std::numeric_limits<double>::lowest(), sum = 0.0;
+  for (int i = 0; i < s.count(); ++i) {
     sum += speaks[i];
-    if (stations[i].arclength < length - options.slack) continue;
-    const double value = sum + change(i + 1) - 0.5 * square((stations[i].arclength - length) / sigma);
+    if (s.stations[i].arclength < s.length - options.slack) continue;
+    const double value = sum + change[i + 1] - 0.5 * square((s.stations[i].arclength - s.length) / sigma);
     if (value > most) most = value, end = i + 1;
   }
-  if (end - begin < 4) return out;
+  return {begin, end};
+}
+
+}  // namespace
+
+Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, double length,
+                   const RibbonOptions& options) {
+  constexpr int kFewest = 4;  // stations of a ribbon
+  Ribbon out;
+  if (along.points.size() < 2) return out;
+  Straight s = straighten(look, picture, along, length, options);
+  find_steps(s);
+  const Choices choices = choices_of(s, options);
+  if (choices.all.empty()) return out;
+  const std::vector<Outlines> way = cheapest_way(s, choices, options);
+  const auto [begin, end] = ends_of(s, way, options);
+  if (end - begin < kFewest) return out;
+
   std::vector<double> widths;
   for (int i = begin; i < end; ++i) {
-    const double left = (way[i].a - 0.5 - half) * du, right = (way[i].b - 0.5 - half) * du;
+    const Station& station = s.stations[i];
+    const double left = (way[i].a - 0.5 - s.half) * s.du, right = (way[i].b - 0.5 - s.half) * s.du;
     out.axis.points.push_back(
-        {stations[i].at + 0.5 * (left + right) * stations[i].across, 0.5 * (right - left), stations[i].arclength});
-    if (stations[i].arclength < (1.0 - kTipShare) * length) widths.push_back(0.5 * (right - left) / stations[i].radius);
+        {station.at + 0.5 * (left + right) * station.across, 0.5 * (right - left), station.arclength});
+    if (station.arclength < (1.0 - kTipShare) * length) widths.push_back(0.5 * (right - left) / station.radius);
   }
   out.axis.bulge = along.bulge;
   out.width = widths.empty() ? 1.0 : median_of(widths);
