@@ -87,8 +87,11 @@ class Node {
   }
   math::Vector3 unit() const {
     const math::Vector3 value = vector(3);
-    if (std::abs(value.norm() - 1.0) > kLengthTolerance) fail("is not a unit vector", "divide it by its length");
-    return value;
+    const double error = std::abs(value.norm() - 1.0);
+    if (error > kLengthTolerance) fail("is not a unit vector", "divide it by its length");
+    // what save() wrote stays bit by bit; what a hand wrote with fewer digits would scale all that is computed with it
+    constexpr double kRounding = 1e-14;
+    return error > kRounding ? math::Vector3(value.normalized()) : value;
   }
   std::vector<std::pair<std::string, Node>> members() const {  // in the file's order
     if (!value_.is_object()) fail("is not an object", "restore it from a run that works");
