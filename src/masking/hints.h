@@ -10,11 +10,11 @@ namespace chainsplat::masking {
 
 struct Help {
   struct Point {
-    int camera, frame;
+    int camera = 0, frame = 0;
     math::Vector2 at;
   };
   struct Region {
-    int camera;
+    int camera = 0;
     std::optional<int> frame;  // none: all
     Box box;
   };

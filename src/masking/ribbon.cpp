@@ -198,7 +198,7 @@ struct Outlines {
 struct Choices {
   std::vector<Outlines> all;
   std::vector<int> number;
-  int columns;
+  int columns = 0;
   int at(int a, int b) const { return number[static_cast<std::size_t>(a) * (columns + 1) + b]; }
 };
 

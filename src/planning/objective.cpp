@@ -134,7 +134,7 @@ Soft soft_minimum(const Task& task, const dynamics::Model& model, const Rollout&
 struct Terms {
   const Task& task;
   const Sharpness& sharpness;
-  bool derivatives;
+  bool derivatives = false;
   Evaluation sum;
   double counted = 0.0;  // of the value: what is no violation
   int stride = 1;        // nodes between tests of limits and obstacles
