@@ -15,6 +15,7 @@
 
 #include "chainsplat/capture.h"
 #include "chainsplat/encode.h"
+#include "chainsplat/in_memory.h"
 #include "error_of.h"
 
 using namespace chainsplat;
@@ -167,7 +168,7 @@ void check_recorded(const Made& made, const std::string& camera) {
   LoadOptions options;
   options.camera = camera;
   const Capture found = capture::load_recorded(made.load(options), made.path(), options);
-  options.undistort = false;
+  options.pixels = capture::Pixels::recorded;
   options.depth = true;
   const Capture wanted = made.load(options);
   REQUIRE(found.views.size() == wanted.views.size());
@@ -313,11 +314,10 @@ TEST_CASE("image folders, depth, crops") {
               doctest::Approx(0.9 + 0.001 * x).epsilon(1e-4));
       }
   }
-  options.masked = false;
-  const Capture whole = made.load(options);
-  CHECK(whole.views[0].width == kWidth);
-  CHECK(pixel(whole.views[0], 1, 1)[0] == 4);
-  CHECK(pixel(whole.views[0], 1, 1)[3] == 255);
+  capture::FrameReader reader(made.path(), "cam0", {}, capture::Pixels::recorded);
+  const capture::Image8 whole = reader.next()->picture;
+  CHECK(whole.width == kWidth);
+  CHECK(whole.pixels[3 * (kWidth + 1)] == 4);
 }
 
 TEST_CASE("undistortion: straight pixels, masks, and edges that are not darkened") {
@@ -370,7 +370,7 @@ TEST_CASE("undistortion: straight pixels, masks, and edges that are not darkened
   CHECK(capture::view_of(straight.cameras[0], picture, filled(1, [](int, int) { return std::array<double, 3>{}; })).width == 0);
   CHECK_THROWS_AS(capture::view_of(straight.cameras[0], coverage, coverage), InputError);
   // without undistortion the pixels are those of the files
-  options.undistort = false;
+  options.pixels = capture::Pixels::recorded;
   const Capture recorded = made.load(options);
   const Image8 image = capture::read_image8(made.path() / numbered("cam0", 1));
   const View& view = recorded.views[1];
@@ -378,6 +378,84 @@ TEST_CASE("undistortion: straight pixels, masks, and edges that are not darkened
     for (int x = view.x0; x < view.x0 + view.width; ++x)
       if (pixel(view, x, y)[3] == 255) CHECK(pixel(view, x, y)[0] == image.pixels[3 * (y * kWidth + x)]);
   check_recorded(made, "cam0");
+  // which of them a capture has is known where they are used
+  capture::require_pixels(straight, capture::Pixels::undistorted);
+  CHECK(contains(error_of([&] { capture::require_pixels(straight, capture::Pixels::recorded); }), "Pixels::recorded"));
+  CHECK(contains(error_of([&] { capture::require_pixels(recorded, capture::Pixels::undistorted); }),
+                 "Pixels::undistorted"));
+  // whole frames have the same colors
+  capture::FrameReader whole(made.path(), "cam0", {1, -1}, capture::Pixels::undistorted);
+  const std::optional<capture::Frame> frame = whole.next();
+  REQUIRE(frame);
+  CHECK(frame->frame == 1);
+  const View& seen = straight.views[1];
+  for (int y = seen.y0; y < seen.y0 + seen.height; ++y)
+    for (int x = seen.x0; x < seen.x0 + seen.width; ++x)
+      if (pixel(seen, x, y)[3] == 255)
+        CHECK(std::equal(pixel(seen, x, y), pixel(seen, x, y) + 3, &frame->picture.pixels[3 * (y * kWidth + x)]));
+  capture::FrameReader as_recorded(made.path(), "cam0", {1, 2}, capture::Pixels::recorded);
+  CHECK(as_recorded.next()->picture.pixels == image.pixels);
+  CHECK_FALSE(as_recorded.next());
+}
+
+TEST_CASE("a recording in memory is the same capture as its files") {
+  Made made;
+  made.json["cameras"][0]["distortion"] = {-0.2, 0.05, 0.002, -0.001, 0.01};
+  const Capture from_files = made.load();
+  capture::InMemory recording;
+  Json document = made.json;
+  document.erase("base");
+  for (std::size_t c = 0; c < 2; ++c) {
+    const std::string name = from_files.cameras[c].name;
+    for (const char* const key : {"images", "masks", "depth", "depth_scale", "rate", "start"})
+      document["cameras"][c].erase(key);
+    capture::CameraFrames frames{from_files.times[c], {}, {}};
+    for (int k = 0; k < kFrames; ++k) {
+      frames.images.push_back(capture::read_image8(made.path() / numbered(name, k)));
+      frames.masks.push_back(capture::read_image8(made.path() / numbered("masks/" + name, k)));
+    }
+    recording.cameras.push_back(std::move(frames));
+  }
+  recording.document = document.dump();
+  recording.base = from_files.base.samples();
+  const auto check_same = [](const Capture& a, const Capture& b) {
+    REQUIRE(a.views.size() == b.views.size());
+    for (std::size_t v = 0; v < a.views.size(); ++v) {
+      CHECK(a.views[v].rgba == b.views[v].rgba);
+      CHECK(a.views[v].x0 == b.views[v].x0);
+      CHECK(a.views[v].time == b.views[v].time);
+    }
+    CHECK(a.length == b.length);
+    CHECK(a.base.pose(0.1).translation == b.base.pose(0.1).translation);
+  };
+  const Capture loaded = capture::load(recording);
+  check_same(loaded, from_files);
+  check_same(capture::load_recorded(loaded, recording), capture::load_recorded(from_files, made.path()));
+  CHECK_FALSE(capture::load_true_centerline(loaded.folder));
+  // other pixels, another capture
+  capture::InMemory other = recording;
+  other.cameras[1].images[2].pixels[5] ^= 1;
+  CHECK(capture::load(other).hash != loaded.hash);
+  CHECK(capture::load(recording).hash == loaded.hash);
+
+  const auto refused = [&](const std::function<void(capture::InMemory&)>& change) {
+    capture::InMemory wrong = recording;
+    change(wrong);
+    return error_of([&] { capture::load(wrong); });
+  };
+  CHECK(contains(refused([](auto& r) { r.cameras.pop_back(); }), "cameras: are 2, and frames are there of 1"));
+  CHECK(contains(refused([](auto& r) { r.cameras[1].times[2] = r.cameras[1].times[1]; }), "`times` of frame 2"));
+  CHECK(contains(refused([](auto& r) { r.cameras[0].times.clear(); }), "has no frames"));
+  CHECK(contains(refused([](auto& r) { r.cameras[0].images.pop_back(); }), "`images` are not RGB"));
+  CHECK(contains(refused([](auto& r) { r.cameras[0].masks[1].width = 1; }), "`masks` do not have one channel"));
+  CHECK(contains(refused([](auto& r) { r.base.resize(1); }), "base"));
+  CHECK(contains(refused([&](auto& r) {
+                   Json named = document;
+                   named["cameras"][0]["images"] = "cam0.mp4";
+                   r.document = named.dump();
+                 }),
+                 "images: does not go with frames that are in memory"));
+  CHECK(contains(refused([](auto& r) { r.document = "{"; }), "`document`"));
 }
 
 TEST_CASE("what evaluation compares with is loaded but once where no lens distorts") {
@@ -421,6 +499,21 @@ TEST_CASE("videos of images and masks, missing masks, timestamps, empty views") 
           }
         CHECK(different <= 0.03 * object);
       }
+      // whole frames from the middle on, one after the other
+      capture::FrameReader reader(made.path(), "cam0", {1, 3}, capture::Pixels::recorded);
+      for (int k = 1; k < 3; ++k) {
+        const std::optional<capture::Frame> frame = reader.next();
+        REQUIRE(frame);
+        CHECK(frame->frame == k);
+        CHECK(frame->time == loaded.times[0][k]);
+        REQUIRE(frame->picture.pixels.size() == 3u * kWidth * kHeight);
+        const View& view = loaded.views[k];
+        for (int y = 14; y < 30; ++y)
+          for (int x = 22 + k; x < 38 + k; ++x)
+            if (const std::uint8_t* const p = pixel(view, x, y); p[3] == 255)
+              CHECK(std::equal(p, p + 3, &frame->picture.pixels[3 * (y * kWidth + x)]));
+      }
+      CHECK_FALSE(reader.next());
     }
   }
   SUBCASE("masked already: what is not black is the object, with a warning; a background is refused") {

@@ -236,6 +236,7 @@ TEST_CASE("a twin explains pictures of itself, and the metrics know by how much 
   const twin::Twin twin = test::small_twin(chain::Bending::spatial, 400);
   capture::Capture recorded;
   recorded.folder = folder.path;
+  recorded.pixels = capture::Pixels::recorded;
   recorded.base = test::moving_base(1.0);
   recorded.has_depth = true;
   capture::Camera camera = small_camera();

@@ -173,16 +173,18 @@ TEST_CASE("masks while the base rests: nothing that moves is needed") {
 }
 
 TEST_CASE("a rope grown in one moment is where the rope is") {
-  capture::LoadOptions one;
-  one.masked = false;
-  one.first = 30, one.last = 31;
-  const capture::Capture scene = capture::load(kDemo, one);
-  REQUIRE(scene.views.size() == 3);
+  capture::LoadOptions facts;
+  facts.images = false;
+  const capture::Capture scene = capture::load(kDemo, facts);
+  REQUIRE(scene.cameras.size() == 3);
+  std::vector<capture::Frame> frames;
+  for (const capture::Camera& camera : scene.cameras)
+    frames.push_back(*capture::FrameReader(kDemo, camera.name, {30, 31}, capture::Pixels::undistorted).next());
   std::vector<masking::Shot> shots;
-  for (const capture::View& view : scene.views)
-    shots.push_back({{view.rgba.data(), view.width, view.height, 4},
-                     &scene.cameras[view.camera],
-                     scene.cameras[view.camera].world_from_camera.inverse() * scene.base.pose(view.time),
+  for (std::size_t c = 0; c < frames.size(); ++c)
+    shots.push_back({{frames[c].picture.pixels.data(), frames[c].picture.width, frames[c].picture.height, 3},
+                     &scene.cameras[c],
+                     scene.cameras[c].world_from_camera.inverse() * scene.base.pose(frames[c].time),
                      {},
                      {}});
   const chain::Chain rope = chain::make_chain(scene.length, scene.diameter, scene.direction, scene.bending_axis, 10,
@@ -192,7 +194,7 @@ TEST_CASE("a rope grown in one moment is where the rope is") {
   const auto truth = capture::load_true_centerline(kDemo);
   REQUIRE(truth);
   const math::MatrixX line =
-      chain::centerline(rope, chain::link_motions(rope, grown.theta, scene.base.pose(scene.views[0].time)),
+      chain::centerline(rope, chain::link_motions(rope, grown.theta, scene.base.pose(frames[0].time)),
                         chain::equal_arclengths(rope, static_cast<int>(truth->points[30].cols())));
   const double rms = std::sqrt((line - truth->points[30]).colwise().squaredNorm().mean());
   MESSAGE("grown: ", 1e3 * rms, " mm");

@@ -39,7 +39,7 @@ void train_once(int frames, int joints) {
   const identification::Result dynamics =
       identification::identify(found.chain, capture.base, found.states, identify);
   load.depth = true;
-  load.undistort = false;
+  load.pixels = capture::Pixels::recorded;
   const capture::Capture recorded = capture::load(folder, load);
   splat::Engine engine(*device);
   eval::evaluate(engine, found.gaussians, found.chain, found.states, recorded);

@@ -59,7 +59,7 @@ TEST_CASE("a synthesized capture loads and holds what was drawn") {
   synth::write(engine(), twin, twin.states, source, folder.path / "capture", options);
 
   capture::LoadOptions load;
-  load.undistort = false;
+  load.pixels = capture::Pixels::recorded;
   load.depth = true;
   const capture::Capture read = capture::load(folder.path / "capture", load);
   CHECK(read.name == "synth");
@@ -132,7 +132,7 @@ TEST_CASE("only frames that the states cover are written, numbered from 0; video
   const chain::States states = test::swing(twin.chain, 0.1, 0.3);  // 0.3 to 0.4 s; frames 0.2, 0.2333, ...
   synth::write(engine(), twin, states, source, folder.path);
   capture::LoadOptions load;
-  load.undistort = false;
+  load.pixels = capture::Pixels::recorded;
   const capture::Capture read = capture::load(folder.path, load);
   CHECK(read.tabletop);
   CHECK(!read.mass);

@@ -35,6 +35,9 @@ math::Vector2 project(const Camera& camera, const math::Vector3& camera_point);
 math::Vector2 distort(const Camera& camera, const math::Vector2& undistorted_pixel);
 math::Vector2 undistort(const Camera& camera, const math::Vector2& recorded_pixel);
 
+// What the pixels of a picture are: with the lens distortion taken out, or as the camera recorded them.
+enum class Pixels { undistorted, recorded };
+
 // One image of one camera, cropped: pixel (0,0) of the crop is pixel (x0, y0) of the image.
 struct View {
   int camera = 0;     // index into Capture::cameras
@@ -76,6 +79,7 @@ struct Capture {
   std::vector<Camera> cameras;
   std::vector<std::vector<double>> times;  // s, frame times of each camera (of all frames, loaded or not)
   std::vector<View> views;                 // sorted by camera, then frame; only the frames asked for
+  Pixels pixels = Pixels::undistorted;     // of the views
   trajectory::Trajectory base;
   std::vector<GivenSigma> sigma;  // where the capture says so; else what corrected_quantities() says
   std::uint64_t hash = 0;         // of capture.json, the base file and the sizes of the image and mask files
@@ -106,9 +110,8 @@ std::string frame_range_text(const FrameRange& range);  // as it is read; empty:
 
 struct LoadOptions {
   bool images = true;     // false: read capture.json and the base only
-  bool undistort = true;  // false: keep the recorded pixels (for evaluation)
+  Pixels pixels = Pixels::undistorted;  // recorded: for evaluation
   bool depth = false;
-  bool masked = true;        // false: whole frames, RGB as recorded, A = 255, without masks (for making masks)
   int margin = 24;           // px around the mask's bounds
   int first = 0, last = -1;  // frames [first, last) of each camera, by its own numbering; last < 0: to the end
   std::string camera;        // load only this one (`cameras` then holds it alone, at index 0); empty: all
@@ -117,9 +120,8 @@ struct LoadOptions {
 // Loads and checks a capture. `path` is the folder or its capture.json. Throws InputError at a problem; unknown keys
 // and other doubts are warned of.
 Capture load(const Path& path, const LoadOptions& options = {});
-// How many whole frames of each of these cameras may be loaded together, so that a recording may be long: at least 1,
-// and as long as their pixels stay below 128 MiB.
-int frames_at_once(const std::vector<Camera>& cameras);
+// Throws InputError unless the views have such pixels. Where no camera has lens distortion both are the same.
+void require_pixels(const Capture& capture, Pixels pixels);
 
 // Nothing that a capture names may lie outside its folder. Where a symbolic link on the way to `file`, which is named
 // in `folder`, leads out of it, returns in words which link and where to; else an empty text. The folder itself may be
@@ -203,6 +205,29 @@ class VideoReader {
   double rate() const;        // mean frames per second by the stream's header, 0 when unknown
   double time() const;        // s, of the last frame by the stream's clock; NaN when it has none
   double first_time() const;  // s, of a camera's first frame, which may have been skipped; NaN for a recording
+
+ private:
+  struct Implementation;
+  std::unique_ptr<Implementation> implementation_;
+};
+
+// A whole picture of one camera.
+struct Frame {
+  int frame = 0;      // the camera's frame number
+  double time = 0.0;  // s, by capture.json
+  Image8 picture;     // RGB
+};
+
+// Reads the whole frames of one camera of a capture, one after the other, however long it is; masks are not read.
+class FrameReader {
+ public:
+  // `capture`: the folder or its capture.json; `camera`: its name; `frames`: end where the recording ends. Throws
+  // InputError, as next() does where a frame cannot be read.
+  FrameReader(const Path& capture, const std::string& camera, const FrameRange& frames, Pixels pixels);
+  ~FrameReader();
+  FrameReader(FrameReader&&) noexcept;
+  FrameReader& operator=(FrameReader&&) noexcept;
+  std::optional<Frame> next();  // none at the end
 
  private:
   struct Implementation;

@@ -10,7 +10,7 @@ namespace chainsplat::eval {
 capture::Image8 whole_image(const render::Frame& frame, const capture::Camera& camera);
 
 // A few moments of the capture (rows, in time); for every camera three pictures side by side: observed, drawn from the
-// recognized states, drawn from the rollout (left out where there is none). `recorded`: loaded with undistort = false.
+// recognized states, drawn from the rollout (left out where there is none). `recorded`: with recorded pixels.
 capture::Image8 comparison(splat::Engine& engine, const twin::Twin& twin, const capture::Capture& recorded);
 
 }  // namespace chainsplat::eval

@@ -28,9 +28,9 @@ struct Metrics {
   int empty_clouds = 0;  // number of frames with depth but without a Chamfer distance: no rendered or no true point
 };
 
-// Draws the states through every camera of the capture, which must be loaded with undistort = false and, for the
-// Chamfer distance, with depth, and compares. Frames that the states do not cover are left out with a warning; throws
-// InputError if none is left.
+// Draws the states through every camera of the capture, whose views must have recorded pixels and, for the Chamfer
+// distance, depth, and compares. Frames that the states do not cover are left out with a warning; throws InputError if
+// none is left, or for undistorted pixels.
 Metrics evaluate(splat::Engine& engine, const splat::Gaussians& gaussians, const chain::Chain& chain,
                  const chain::States& states, const capture::Capture& recorded);
 

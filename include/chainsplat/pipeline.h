@@ -17,6 +17,9 @@
 #include "chainsplat/solve.h"
 #include "chainsplat/twin.h"
 
+namespace chainsplat::capture {
+struct InMemory;
+}
 namespace chainsplat::force {
 struct Estimate;
 }
@@ -63,6 +66,9 @@ struct TrainResult {
 // "identify", "joint", "rollout", "evaluate", and writes them to log.jsonl. A call that was stopped goes on with
 // `resume`, with the same bits as if nothing had happened.
 TrainResult train(const Path& capture, const Path& run, const TrainOptions& options,
+                  const core::Listener& listener = {});
+// The same of a capture that is in memory (in_memory.h); the run does not say where its capture lies.
+TrainResult train(const capture::InMemory& capture, const Path& run, const TrainOptions& options,
                   const core::Listener& listener = {});
 
 // What of a capture was given wrongly by a little, without training: what train corrects, and what it says of it.

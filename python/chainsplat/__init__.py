@@ -22,6 +22,7 @@ from ._core import (
     InputError,
     Parameters,
     Plan,
+    Recording,
     States,
     Trajectory,
     Twin,
@@ -35,6 +36,6 @@ from ._core import (
     train,
     write_png,
 )
-from .captures import write_capture
+from .captures import recording, write_capture
 
 __all__ = [name for name in dir() if name[0] != "_" and name != "captures"] + ["__version__"]

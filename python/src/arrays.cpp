@@ -86,6 +86,20 @@ capture::Image8 image_of(const Bytes& picture, const std::string& name) {
           {picture.data(), picture.data() + picture.size()}};
 }
 
+std::vector<capture::Image8> images_of(const Bytes& pictures, const std::string& name) {
+  const int channels = pictures.ndim() == 4 ? static_cast<int>(pictures.shape(3)) : 1;
+  if (pictures.ndim() == 3)
+    check_shape(pictures, name, {-1, -1, -1});
+  else
+    check_shape(pictures, name, {-1, -1, -1, 3});
+  const auto height = static_cast<int>(pictures.shape(1)), width = static_cast<int>(pictures.shape(2));
+  const py::ssize_t size = pictures.size() / std::max<py::ssize_t>(1, pictures.shape(0));
+  std::vector<capture::Image8> out;
+  for (py::ssize_t k = 0; k < pictures.shape(0); ++k)
+    out.push_back({width, height, channels, {pictures.data() + k * size, pictures.data() + (k + 1) * size}});
+  return out;
+}
+
 py::array_t<double> array_of(const math::Pose& pose) {
   py::array_t<double> out({4, 4});
   fill(pose, out.mutable_data());

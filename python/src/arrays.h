@@ -31,6 +31,8 @@ math::Pose pose_of(const Numbers& matrix, const std::string& name);  // 4 x 4; t
 std::vector<math::VectorX> rows_of(const Numbers& table, const std::string& name, py::ssize_t columns);
 std::vector<double> list_of(const Numbers& list, const std::string& name);
 capture::Image8 image_of(const Bytes& picture, const std::string& name);  // H x W x 3, or H x W
+// T x H x W x 3, or T x H x W
+std::vector<capture::Image8> images_of(const Bytes& pictures, const std::string& name);
 
 py::array_t<double> array_of(const math::Pose& pose);                // 4 x 4
 py::array_t<double> array_of(const std::vector<math::Pose>& poses);  // count x 4 x 4

@@ -2,6 +2,7 @@
 #include <algorithm>
 
 #include "chainsplat/dynamics.h"
+#include "chainsplat/in_memory.h"
 #include "chainsplat/render.h"
 #include "module.h"
 
@@ -140,7 +141,7 @@ void add_types(py::module_& m) {
           [](const Path& folder, bool images, const std::string& camera, int first, int last) {
             capture::LoadOptions options;
             options.images = images, options.camera = camera, options.first = first, options.last = last;
-            options.undistort = false;
+            options.pixels = capture::Pixels::recorded;
             return unlocked([&] { return capture::load(folder, options); });
           },
           arg("folder"), arg("images") = false, arg("camera") = "", arg("first") = 0, arg("last") = -1,
@@ -165,6 +166,18 @@ void add_types(py::module_& m) {
       .def(
           "mask", [](const capture::Capture& c, int camera, int frame) { return picture(c, camera, frame, true); },
           arg("camera"), arg("frame"), "(H, W) uint8: 255 in the object.");
+
+  // made by chainsplat.recording()
+  py::class_<capture::InMemory>(m, "Recording", "A capture whose pictures are in memory, for train().")
+      .def(py::init([](const std::string& document, const Trajectory& base, const std::vector<Bytes>& images,
+                       const std::vector<Bytes>& masks, const std::vector<Numbers>& times) {
+             capture::InMemory out{document, base.samples(), {}};
+             for (std::size_t c = 0; c < times.size(); ++c)
+               out.cameras.push_back(
+                   {list_of(times[c], "times"), images_of(images[c], "images"), images_of(masks[c], "masks")});
+             return out;
+           }),
+           arg("document"), arg("base"), arg("images"), arg("masks"), arg("times"));
 
   m.def(
       "write_png", [](const Path& file, const Bytes& image) { capture::write_png(file, image_of(image, "image")); },

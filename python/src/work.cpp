@@ -1,6 +1,8 @@
 // Long work: train, identify, evaluate, plan, excite.
 #include <cmath>
+#include <variant>
 
+#include "chainsplat/in_memory.h"
 #include "chainsplat/motion_files.h"
 #include "chainsplat/pipeline.h"
 #include "module.h"
@@ -23,16 +25,24 @@ std::string text_of(const py::handle& value) {
 }
 
 // `options`: by the names of the program's job files (formats.md).
-std::shared_ptr<Twin> train(const Path& capture, const Path& folder, const std::optional<ProgressFunction>& progress,
-                            bool resume, bool force, const Path& picture, bool anyway, std::uint64_t seed,
-                            const std::string& device, const py::kwargs& settings) {
+std::shared_ptr<Twin> train(const std::variant<Path, const capture::InMemory*>& capture, const Path& folder,
+                            const std::optional<ProgressFunction>& progress, bool resume, bool force,
+                            const Path& picture, bool anyway, std::uint64_t seed, const std::string& device,
+                            const py::kwargs& settings) {
   pipeline::TrainOptions options;
   options.resume = resume, options.force = force, options.picture = picture, options.anyway = anyway;
   options.seed = seed, options.device = device;
   for (const auto& [name, value] : settings)
     if (!value.is_none())
       pipeline::set(options, name.cast<std::string>(), text_of(value), "`" + name.cast<std::string>() + "`");
-  run(progress, [&](const core::Listener& listener) { pipeline::train(capture, folder, options, listener); });
+  run(progress, [&](const core::Listener& listener) {
+    if (const auto* const path = std::get_if<Path>(&capture))
+      pipeline::train(*path, folder, options, listener);
+    else if (const capture::InMemory* const recording = std::get<const capture::InMemory*>(capture))
+      pipeline::train(*recording, folder, options, listener);
+    else
+      throw InputError("`capture`", "is None", "give a folder or a Recording");
+  });
   return unlocked([&] { return std::make_shared<Twin>(pipeline::load_rope(folder), device); });
 }
 
@@ -160,7 +170,8 @@ void add_work(py::module_& m) {
   using py::arg;
   m.def("train", &train, arg("capture"), arg("run"), arg("progress") = py::none(), arg("resume") = false,
         arg("force") = false, arg("picture") = "", arg("anyway") = false, arg("seed") = 0, arg("device") = "",
-        "Makes the twin of a capture in the folder `run`, and returns it. progress: called with (stage, step, total, "
+        "Makes the twin of a capture, a folder or a Recording, in the folder `run`, and returns it. progress: called "
+        "with (stage, step, total, "
         "loss). Further options by name: joints, bending ('planar', 'spatial'), twist, every, frames ('0:60'), mode "
         "('fast', 'paper'), stages, joint, fixed. Ctrl-C stops it and leaves a checkpoint, from which `resume` goes on "
         "with "

@@ -277,15 +277,32 @@ class Module(unittest.TestCase):
         capture = cs.Capture.load(DEMO, images=True, last=8)
         folder = pathlib.Path(self.folder.name) / "arrays"
         cameras = capture.cameras
-        cs.write_capture(folder, cameras=cameras, base=capture.base, length=capture.length, diameter=capture.diameter,
-                         images=[[capture.image(c, k) for k in range(8)] for c in range(3)],
-                         masks=[[capture.mask(c, k) for k in range(8)] for c in range(3)],
-                         times=[capture.times[c][:8] for c in range(3)], direction=(0, 0, -1), bending_axis=(0, 1, 0))
+        arrays = dict(cameras=cameras, base=capture.base, length=capture.length, diameter=capture.diameter,
+                      images=[[capture.image(c, k) for k in range(8)] for c in range(3)],
+                      masks=[[capture.mask(c, k) for k in range(8)] for c in range(3)],
+                      times=[capture.times[c][:8] for c in range(3)], direction=(0, 0, -1), bending_axis=(0, 1, 0))
+        cs.write_capture(folder, **arrays)
         again = cs.Capture.load(folder, images=True)
         np.testing.assert_array_equal(again.image(1, 5), capture.image(1, 5))
         np.testing.assert_allclose(again.cameras[2].world_from_camera, cameras[2].world_from_camera, atol=1e-12)
-        twin = cs.train(folder, pathlib.Path(self.folder.name) / "arrays_run", joints=3, stages=["recognize"])
+        options = dict(joints=3, stages=["recognize", "evaluate"])
+        run = pathlib.Path(self.folder.name) / "arrays_run"
+        twin = cs.train(folder, run, **options)
         self.assertEqual(len(twin.states), 8)
+        # the same bits without files
+        recording = cs.recording(**arrays)
+        run_in_memory = pathlib.Path(self.folder.name) / "memory_run"
+        in_memory = cs.train(recording, run_in_memory, **options)
+        np.testing.assert_array_equal(in_memory.states.theta, twin.states.theta)
+        for name in ("gaussians.ply", "metrics.json"):
+            self.assertEqual((run_in_memory / name).read_bytes(), (run / name).read_bytes())
+        self.assertEqual(len(cs.train(recording, run_in_memory, resume=True, **options).states), 8)
+        arrays["times"][1] = arrays["times"][1][::-1]
+        with self.assertRaises(cs.InputError) as caught:
+            cs.train(cs.recording(**arrays), pathlib.Path(self.folder.name) / "no_run")
+        self.assertIn("`times` of frame 1", caught.exception.what)
+        with self.assertRaises(cs.InputError):
+            cs.train(None, run)
 
     def test_errors_say_where_what_and_how(self):
         with self.assertRaises(cs.InputError) as caught:

@@ -116,16 +116,36 @@ Camera read_optics(const ObjectReader& reader) {
   return camera;
 }
 
-}  // namespace
-
-CameraSource read_camera(const ObjectReader& reader, const std::string& where, const Path& folder) {
+CameraSource read_named(const ObjectReader& reader, const std::string& where) {
   CameraSource source;
   source.where = where;
   source.camera = read_optics(reader);
   source.camera.name = reader.text("name", true, "a short name like cam0").value_or("");
   if (reader.has("name") && !good_name(source.camera.name))
     reader.problem("name", in_quotes(source.camera.name) + " cannot name a folder", "use letters, digits, - and _");
+  return source;
+}
 
+}  // namespace
+
+CameraSource read_camera(const ObjectReader& reader, const std::string& where, const CameraFrames& frames) {
+  CameraSource source = read_named(reader, where);
+  for (const char* const key : {"images", "masks", "depth", "depth_scale", "rate", "start", "timestamps"})
+    if (reader.has(key)) reader.problem(key, "does not go with frames that are in memory", "leave it out");
+  const auto pictures_of = [](const std::vector<Image8>& pictures) {
+    ImageSource out;
+    out.pictures = &pictures;
+    out.frames = static_cast<int>(pictures.size());
+    return out;
+  };
+  source.images = pictures_of(frames.images);
+  if (!frames.masks.empty()) source.masks = pictures_of(frames.masks);
+  source.times = frames.times;
+  return source;
+}
+
+CameraSource read_camera(const ObjectReader& reader, const std::string& where, const Path& folder) {
+  CameraSource source = read_named(reader, where);
   if (const auto images = image_source(reader, "images", folder, true)) source.images = *images;
   source.masks = image_source(reader, "masks", folder, false);
   source.depth = image_source(reader, "depth", folder, false);

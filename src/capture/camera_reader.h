@@ -9,5 +9,7 @@ namespace chainsplat::capture {
 
 // Reads a camera and where its frames lie, which are not looked at. `where`: the object's place, for later messages.
 CameraSource read_camera(const ObjectReader& reader, const std::string& where, const Path& folder);
+// Of a camera whose frames are in memory: where it names files or a rate, that is a problem.
+CameraSource read_camera(const ObjectReader& reader, const std::string& where, const CameraFrames& frames);
 
 }  // namespace chainsplat::capture

@@ -106,6 +106,23 @@ std::vector<double> read_timestamps(const Path& file) {
   return times;
 }
 
+double median_interval(const std::vector<double>& times) {
+  std::vector<double> intervals;
+  for (std::size_t k = 1; k < times.size(); ++k) intervals.push_back(times[k] - times[k - 1]);
+  return math::median(intervals);
+}
+
+// A recording that is too long has no times. `key`: what says how long it is.
+void check_span(CameraSource& source, const std::string& key, Findings& findings) {
+  if (const double seconds = source.times.back() - source.times.front(); seconds > kLongestRecording) {
+    findings.problems.push_back({source.where + key,
+                                 "the frames span " + core::brief(seconds) + " s and a recording at most " +
+                                     core::exact(kLongestRecording) + " s, for the motion between all is computed",
+                                 "correct it or split the recording"});
+    source.times.clear();
+  }
+}
+
 // Sets source.times and source.interval from the timestamps, or else from start and rate.
 void set_times(CameraSource& source, const Path& folder, Findings& findings) {
   const int frames = source.images.frames;
@@ -129,21 +146,41 @@ void set_times(CameraSource& source, const Path& folder, Findings& findings) {
       findings.doubts.push_back(source.timestamps->string() + ": has " + std::to_string(count) + " times for " +
                                 std::to_string(frames) + " frames; the last ones are ignored");
     source.times.resize(frames);
-    std::vector<double> intervals;
-    for (int k = 1; k < frames; ++k) intervals.push_back(source.times[k] - source.times[k - 1]);
-    source.interval = math::median(intervals);
+    source.interval = median_interval(source.times);
   } else {
     source.times.resize(frames);
     for (int k = 0; k < frames; ++k) source.times[k] = source.start + k / source.rate;
     source.interval = 1.0 / source.rate;
   }
-  if (const double seconds = source.times.back() - source.times.front(); seconds > kLongestRecording) {
-    findings.problems.push_back({source.where + (source.timestamps ? ".timestamps" : ".rate"),
-                                 "the frames span " + core::brief(seconds) + " s and a recording at most " +
-                                     core::exact(kLongestRecording) + " s, for the motion between all is computed",
-                                 "correct it or split the recording"});
+  check_span(source, source.timestamps ? ".timestamps" : ".rate", findings);
+}
+
+// The frames of a camera that are in memory.
+void survey_pictures(CameraSource& source, bool masked, Findings& findings) {
+  const auto wrong = [&](const std::string& what, const std::string& mend) {
+    findings.problems.push_back({source.where, what, mend});
     source.times.clear();
-  }
+  };
+  const std::size_t count = source.times.size();
+  const auto fits = [&](const std::vector<Image8>& pictures, int channels) {
+    const Camera& camera = source.camera;
+    const std::size_t bytes = static_cast<std::size_t>(camera.width) * camera.height * channels;
+    return pictures.size() == count && std::all_of(pictures.begin(), pictures.end(), [&](const Image8& picture) {
+             return picture.width == camera.width && picture.height == camera.height && picture.channels == channels &&
+                    picture.pixels.size() == bytes;
+           });
+  };
+  if (count == 0 || count > kMostFrames)
+    return wrong("has no frames, or more than " + std::to_string(kMostFrames), "give its `times` and `images`");
+  for (std::size_t k = 0; k < count; ++k)
+    if (!std::isfinite(source.times[k]) || (k > 0 && !(source.times[k] > source.times[k - 1])))
+      return wrong("`times` of frame " + std::to_string(k) + " is not after the one before", "give increasing seconds");
+  if (!fits(*source.images.pictures, 3))
+    return wrong("`images` are not RGB of the camera's size, one per time", "give them as recorded");
+  if (masked && source.masks && !fits(*source.masks->pictures, 1))
+    return wrong("`masks` do not have one channel and the camera's size, one per time", "give one per image");
+  source.interval = median_interval(source.times);
+  check_span(source, "", findings);
 }
 
 }  // namespace
@@ -193,6 +230,7 @@ void survey_frames(Manifest& manifest, bool masked, Findings& findings) {
   core::parallel_for(static_cast<std::int64_t>(manifest.cameras.size()), [&](std::int64_t c) {
     CameraSource& source = manifest.cameras[c];
     Findings& mine = found[c];
+    if (source.images.pictures) return survey_pictures(source, masked, mine);
     if (source.images.file.empty() && source.images.names.before.empty()) return;
     const Path& folder = manifest.capture.folder;
     if (!count_frames(source.images, folder, source.where + ".images", &source.video_rate, &source.camera, mine))

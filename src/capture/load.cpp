@@ -4,9 +4,6 @@
 
 namespace chainsplat::capture {
 
-namespace {
-
-// Throws the first problem, if there is one, with the number of the others.
 void throw_first(const Findings& findings) {
   if (findings.problems.empty()) return;
   const Problem& first = findings.problems.front();
@@ -15,28 +12,49 @@ void throw_first(const Findings& findings) {
                    first.mend + (others ? " (and " + std::to_string(others) + " more: see 'chainsplat check')" : ""));
 }
 
+namespace {
+
+bool has_lens(const Capture& capture) {
+  return std::any_of(capture.cameras.begin(), capture.cameras.end(), [](const Camera& c) { return c.distorted(); });
+}
+
 }  // namespace
 
-Capture load(const Path& path, const LoadOptions& options) {
+void require_pixels(const Capture& capture, Pixels pixels) {
+  if (capture.pixels == pixels || !has_lens(capture)) return;
+  const bool recorded = pixels == Pixels::recorded;
+  throw InputError(
+      "`capture`", recorded ? "was loaded without its lens distortion" : "was loaded with its lens distortion",
+      std::string("load it with LoadOptions::pixels = Pixels::") + (recorded ? "recorded" : "undistorted"));
+}
+
+namespace {
+
+// `source`: a path or a recording in memory.
+template <class Source>
+Capture load_from(const Source& source, const LoadOptions& options) {
   Findings findings;
-  Manifest manifest = read_manifest(path, options.camera, options.images && options.masked, findings);
+  Manifest manifest = read_manifest(source, options.camera, options.images, findings);
   throw_first(findings);
   if (manifest.cameras.size() == 1 && options.camera.empty())
     findings.doubts.push_back(manifest.file.string() + ": cameras: only one; depth along its rays is hardly seen");
-  Capture capture = std::move(manifest.capture);
-  if (options.images) load_views(manifest, options, findings, capture.views);
+  std::vector<View> views;
+  if (options.images) load_views(manifest, options, findings, views);
   for (const std::string& doubt : findings.doubts) core::warn(doubt);
   throw_first(findings);
+  Capture capture = std::move(manifest.capture);
+  capture.pixels = options.pixels;
+  capture.views = std::move(views);
   return capture;
 }
 
-Capture load_recorded(Capture loaded, const Path& path, LoadOptions options) {
-  options.undistort = false;
+template <class Source>
+Capture load_recorded_from(Capture loaded, const Source& source, LoadOptions options) {
+  options.pixels = Pixels::recorded;
   options.depth = true;
-  if (std::any_of(loaded.cameras.begin(), loaded.cameras.end(), [](const Camera& c) { return c.distorted(); }))
-  {
+  if (has_lens(loaded)) {
     // as recorded, but poses, clocks and base are those of `loaded`, which may have been corrected
-    Capture recorded = load(path, options);
+    Capture recorded = load(source, options);
     recorded.cameras = loaded.cameras;
     recorded.times = loaded.times;
     recorded.base = loaded.base;
@@ -46,10 +64,23 @@ Capture load_recorded(Capture loaded, const Path& path, LoadOptions options) {
     return recorded;
   }
   Findings findings;
-  const Manifest manifest = read_manifest(path, options.camera, options.images && options.masked, findings);
+  const Manifest manifest = read_manifest(source, options.camera, options.images, findings);
   throw_first(findings);
   add_depth(manifest, loaded.views);
+  loaded.pixels = Pixels::recorded;
   return loaded;
+}
+
+}  // namespace
+
+Capture load(const Path& path, const LoadOptions& options) { return load_from(path, options); }
+Capture load(const InMemory& recording, const LoadOptions& options) { return load_from(recording, options); }
+
+Capture load_recorded(Capture loaded, const Path& path, LoadOptions options) {
+  return load_recorded_from(std::move(loaded), path, std::move(options));
+}
+Capture load_recorded(Capture loaded, const InMemory& recording, LoadOptions options) {
+  return load_recorded_from(std::move(loaded), recording, std::move(options));
 }
 
 }  // namespace chainsplat::capture

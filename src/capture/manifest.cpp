@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <set>
 
 #include "chainsplat/corrections.h"
@@ -29,12 +30,12 @@ constexpr double kPerpendicular = 1e-3;    // rad
 constexpr double kLateClock = 0.08;
 constexpr double kTopMeters = 5.0;  // m; a longer rope is doubted, as it may be in millimeters
 
-// Reads the base trajectory and checks that it covers the frames of all cameras.
-void read_base(Manifest& manifest, const Path& file, Findings& findings) {
+// Fits the base trajectory and checks that it covers the frames of all cameras. `file`: for messages.
+void read_base(Manifest& manifest, const std::string& file,
+               const std::function<std::vector<trajectory::Sample>()>& read, Findings& findings) {
   Capture& capture = manifest.capture;
   try {
-    require_own_file(capture.folder, file);
-    capture.base = trajectory::fit(trajectory::read_tum(file), file.string());
+    capture.base = trajectory::fit(read(), file);
   } catch (const InputError& error) {
     findings.problems.push_back({manifest.file.string() + ": base", error.what(), "correct the file"});
     return;
@@ -46,7 +47,7 @@ void read_base(Manifest& manifest, const Path& file, Findings& findings) {
     first = std::min(first, source.times.front());
     last = std::max(last, source.times.back());
     if (source.times.front() < capture.base.start() - slack || source.times.back() > capture.base.end() + slack)
-      findings.problems.push_back({file.string(),
+      findings.problems.push_back({file,
                                    "covers " + core::brief(capture.base.start()) + " to " +
                                        core::brief(capture.base.end()) + " s, but the frames of " + source.camera.name +
                                        " are at " + core::brief(source.times.front()) + " to " +
@@ -56,8 +57,8 @@ void read_base(Manifest& manifest, const Path& file, Findings& findings) {
   // frames that a clock of the base, late or early, leaves without a base
   std::vector<trajectory::Sample> samples = trajectory::continued(capture.base, first, last);
   if (samples.size() == capture.base.samples().size()) return;
-  findings.doubts.push_back(file.string() + ": does not cover all frames; it is continued with its last velocity");
-  capture.base = trajectory::fit(std::move(samples), file.string());
+  findings.doubts.push_back(file + ": does not cover all frames; it is continued with its last velocity");
+  capture.base = trajectory::fit(std::move(samples), file);
 }
 
 // "sigma": how sure each thing is that may be corrected, with the same keys as "corrections" in twin.json.
@@ -126,6 +127,28 @@ std::uint64_t capture_hash(const std::string& text, const Manifest& manifest, co
         hash = core::fnv1a(error ? "-" : std::to_string(size) + " ", hash);
       }
     }
+  return hash;
+}
+
+template <class T>
+std::uint64_t hash_of(const std::vector<T>& values, std::uint64_t hash) {
+  return core::fnv1a({reinterpret_cast<const char*>(values.data()), values.size() * sizeof(T)}, hash);
+}
+
+std::uint64_t capture_hash(const InMemory& recording) {
+  std::uint64_t hash = core::fnv1a(recording.document);
+  for (const trajectory::Sample& sample : recording.base) {
+    const auto& rotation = sample.pose.rotation.reshaped();
+    std::vector<double> numbers(rotation.begin(), rotation.end());
+    numbers.insert(numbers.end(), sample.pose.translation.begin(), sample.pose.translation.end());
+    numbers.push_back(sample.time);
+    hash = hash_of(numbers, hash);
+  }
+  for (const CameraFrames& frames : recording.cameras) {
+    hash = hash_of(frames.times, hash);
+    for (const std::vector<Image8>* pictures : {&frames.images, &frames.masks})
+      for (const Image8& picture : *pictures) hash = hash_of(picture.pixels, hash);
+  }
   return hash;
 }
 
@@ -199,8 +222,9 @@ void read_table(const ObjectReader& top, Capture& capture) {
 }
 
 // The cameras, of which those not asked for are only checked for their names. `only`: the one asked for; empty: all.
-void read_cameras(const ObjectReader& top, const std::string& file, const std::string& only, Manifest& manifest,
-                  Findings& findings) {
+// `recording`: null for files.
+void read_cameras(const ObjectReader& top, const std::string& file, const std::string& only, const InMemory* recording,
+                  Manifest& manifest, Findings& findings) {
   const Json* cameras = top.find("cameras", true, "a list of cameras");
   if (cameras && (!cameras->is_array() || cameras->empty())) {
     top.problem("cameras", "is not a list of at least one camera", "describe every camera as an object");
@@ -211,6 +235,13 @@ void read_cameras(const ObjectReader& top, const std::string& file, const std::s
                 std::to_string(cameras->size()) + " are more than " + std::to_string(kMostCameras) +
                     ", whose frames no memory holds at once",
                 "leave out what is not needed");
+    cameras = nullptr;
+  }
+  if (recording && cameras && cameras->size() != recording->cameras.size()) {
+    top.problem("cameras",
+                "are " + std::to_string(cameras->size()) + ", and frames are there of " +
+                    std::to_string(recording->cameras.size()),
+                "give the frames of each");
     cameras = nullptr;
   }
   std::set<std::string> names;
@@ -229,10 +260,55 @@ void read_cameras(const ObjectReader& top, const std::string& file, const std::s
       findings.problems.push_back(
           {where + ".name", in_quotes(own_name) + " is used twice", "give every camera its own name"});
     if (!only.empty() && own_name != only) continue;
-    manifest.cameras.push_back(read_camera(ObjectReader(&value, where, findings), where, manifest.capture.folder));
+    const ObjectReader reader(&value, where, findings);
+    manifest.cameras.push_back(recording ? read_camera(reader, where, recording->cameras[c])
+                                         : read_camera(reader, where, manifest.capture.folder));
   }
   if (!only.empty() && cameras && manifest.cameras.empty())
     findings.problems.push_back({file, "has no camera " + in_quotes(only), "choose one of " + all_names});
+}
+
+// `manifest` says where it is; `recording`: null for files.
+void read_document(const std::string& text, const std::string& camera, bool masked, const InMemory* recording,
+                   Manifest& manifest, Findings& findings) {
+  Capture& capture = manifest.capture;
+  const std::string file = manifest.file.string();
+  const Json json = parse_object(text, file, "{ \"format\": \"chainsplat-capture/1\", ... }");
+
+  const ObjectReader top(&json, file + ": ", findings);
+  const auto format = top.text("format", true, "\"chainsplat-capture/1\"");
+  if (format && *format != "chainsplat-capture/1") {
+    top.problem("format", in_quotes(*format) + " is not chainsplat-capture/1", "convert the capture to this format");
+    return;  // the other keys would be judged by the wrong rules
+  }
+
+  read_scene(top, capture);
+  read_object(top, capture);
+  read_grasp(top, capture);
+  read_table(top, capture);
+  const auto base = recording ? std::nullopt : top.path("base", true, "\"base.tum\"");
+  if (recording && top.has("base")) top.problem("base", "does not go with a motion in memory", "leave it out");
+  read_cameras(top, file, camera, recording, manifest, findings);
+
+  // the files that it names
+  survey_frames(manifest, masked, findings);
+  const Path base_file = base ? capture.folder / *base : Path();
+  const auto read_file = [&] {
+    require_own_file(capture.folder, base_file);
+    return trajectory::read_tum(base_file);
+  };
+  if (recording)
+    read_base(
+        manifest, "`base`", [&] { return recording->base; }, findings);
+  if (base) read_base(manifest, base_file.string(), read_file, findings);
+  for (const CameraSource& source : manifest.cameras) {
+    capture.cameras.push_back(source.camera);
+    capture.times.push_back(source.times);
+    capture.has_depth = capture.has_depth || source.depth.has_value();
+  }
+  read_sigma(top.child("sigma", false, "{ \"object\": { \"length\": 0.003 } }"), capture);
+  if (findings.problems.empty())
+    capture.hash = recording ? capture_hash(*recording) : capture_hash(text, manifest, base_file);
 }
 
 }  // namespace
@@ -241,37 +317,16 @@ Manifest read_manifest(const Path& path, const std::string& camera, bool masked,
   Manifest manifest;
   std::error_code error;
   manifest.file = std::filesystem::is_directory(path, error) ? path / "capture.json" : path;
-  Capture& capture = manifest.capture;
-  capture.folder = manifest.file.has_parent_path() ? manifest.file.parent_path() : Path(".");
+  manifest.capture.folder = manifest.file.has_parent_path() ? manifest.file.parent_path() : Path(".");
   if (std::filesystem::exists(manifest.file, error)) require_file(manifest.file);
-  const std::string text = core::read_file(manifest.file);
-  const std::string file = manifest.file.string();
-  const Json json = parse_object(text, file, "{ \"format\": \"chainsplat-capture/1\", ... }");
+  read_document(core::read_file(manifest.file), camera, masked, nullptr, manifest, findings);
+  return manifest;
+}
 
-  const ObjectReader top(&json, file + ": ", findings);
-  const auto format = top.text("format", true, "\"chainsplat-capture/1\"");
-  if (format && *format != "chainsplat-capture/1") {
-    top.problem("format", in_quotes(*format) + " is not chainsplat-capture/1", "convert the capture to this format");
-    return manifest;  // the other keys would be judged by the wrong rules
-  }
-
-  read_scene(top, capture);
-  read_object(top, capture);
-  read_grasp(top, capture);
-  read_table(top, capture);
-  const auto base = top.path("base", true, "\"base.tum\"");
-  read_cameras(top, file, camera, manifest, findings);
-
-  // the files that it names
-  survey_frames(manifest, masked, findings);
-  if (base) read_base(manifest, capture.folder / *base, findings);
-  for (const CameraSource& source : manifest.cameras) {
-    capture.cameras.push_back(source.camera);
-    capture.times.push_back(source.times);
-    capture.has_depth = capture.has_depth || source.depth.has_value();
-  }
-  read_sigma(top.child("sigma", false, "{ \"object\": { \"length\": 0.003 } }"), capture);
-  if (findings.problems.empty()) capture.hash = capture_hash(text, manifest, base ? capture.folder / *base : Path());
+Manifest read_manifest(const InMemory& recording, const std::string& camera, bool masked, Findings& findings) {
+  Manifest manifest;
+  manifest.file = "`document`";
+  read_document(recording.document, camera, masked, &recording, manifest, findings);
   return manifest;
 }
 

@@ -6,6 +6,7 @@
 #include <vector>
 #include "chainsplat/capture.h"
 #include "chainsplat/frame_pattern.h"
+#include "chainsplat/in_memory.h"
 
 namespace chainsplat::capture {
 
@@ -20,11 +21,12 @@ struct Findings {
   std::vector<std::string> doubts;
 };
 
-// A video, or one image file per frame by a printf pattern.
+// A video, one image file per frame by a printf pattern, or pictures in memory.
 struct ImageSource {
   bool video = false;
-  Path file;           // the video
-  FramePattern names;  // paths of the image files
+  Path file;                                      // the video
+  FramePattern names;                             // paths of the image files
+  const std::vector<Image8>* pictures = nullptr;  // in memory
   int frames = 0;
   Path frame_file(int frame) const { return names.file(frame); }  // the image file of a pattern
 };
@@ -44,14 +46,19 @@ struct CameraSource {
 };
 
 struct Manifest {
-  Path file;                          // capture.json
+  Path file;                          // capture.json; in memory a name for messages
   Capture capture;                    // without views; without `base` where it could not be read
   std::vector<CameraSource> cameras;  // in the order of capture.cameras
 };
 
 // Reads as much as it can and collects the findings. `masked` false: mask files are ignored. `camera`: read only this
-// one, unless empty. Throws InputError when capture.json itself cannot be read.
+// one, unless empty. Throws InputError when capture.json itself cannot be read. The pictures of a recording in memory
+// are referred to.
 Manifest read_manifest(const Path& path, const std::string& camera, bool masked, Findings& findings);
+Manifest read_manifest(const InMemory& recording, const std::string& camera, bool masked, Findings& findings);
+
+// Throws the first problem, if there is one, with the number of the others.
+void throw_first(const Findings& findings);
 
 // Loads the views of all cameras for the frames from options.first to options.last (src/capture/views.cpp).
 // Throws InputError for images that cannot be read.

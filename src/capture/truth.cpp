@@ -21,6 +21,7 @@ std::optional<TrueCenterline> load_true_centerline(const Path& capture_folder) {
   const Path folder =
       std::filesystem::is_directory(capture_folder, error) ? capture_folder : capture_folder.parent_path();
   const Path file = folder / "truth" / "centreline.csv";
+  if (capture_folder.empty()) return std::nullopt;  // a recording in memory
   if (!std::filesystem::exists(file, error)) return std::nullopt;
   const std::string text = core::read_file(file);
   TrueCenterline truth;

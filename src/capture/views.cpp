@@ -1,12 +1,11 @@
 // Decoding, masking, undistorting and cropping: from the files of a capture to its views.
 #include <algorithm>
 #include <cmath>
-#include <exception>
-#include <functional>
 
 #include "chainsplat/image_model.h"
 #include "image_files.h"
 #include "manifest.h"
+#include "pictures.h"
 
 namespace chainsplat::capture {
 
@@ -18,7 +17,7 @@ namespace {
 constexpr std::uint8_t kBlackLossless = 0, kBlackLossy = 16;
 constexpr double kMostCovered = 0.5;  // share of an image; more means that nothing was masked
 
-using Pixels = std::vector<std::uint8_t>;
+using Bytes = std::vector<std::uint8_t>;
 
 struct Bounds {
   int x0 = 0, y0 = 0, x1 = 0, y1 = 0;  // [x0, x1) x [y0, y1)
@@ -48,25 +47,9 @@ Bounds bounds_of(const std::uint8_t* mask, int width, int height) {
   return bounds;
 }
 
-// Returns the bilinear sample of a channel at a pixel position (centers at +0.5); outside the image, the value of the
-// nearest pixel.
-double sample(const std::uint8_t* image, int width, int height, int channels, int channel, const Vector2& position) {
-  const double x = std::clamp(position.x() - 0.5, 0.0, width - 1.0),
-               y = std::clamp(position.y() - 0.5, 0.0, height - 1.0);
-  const int x0 = static_cast<int>(x), y0 = static_cast<int>(y);
-  const int x1 = std::min(x0 + 1, width - 1), y1 = std::min(y0 + 1, height - 1);
-  const double fx = x - x0, fy = y - y0;
-  const auto at = [&](int column, int row) {
-    return static_cast<double>(image[(static_cast<std::size_t>(row) * width + column) * channels + channel]);
-  };
-  return (1 - fy) * ((1 - fx) * at(x0, y0) + fx * at(x1, y0)) + fy * ((1 - fx) * at(x0, y1) + fx * at(x1, y1));
-}
-
 bool recorded(const Camera& camera, const Vector2& position) {
   return position.x() >= 0 && position.y() >= 0 && position.x() <= camera.width && position.y() <= camera.height;
 }
-
-Vector2 center(int x, int y) { return {x + 0.5, y + 0.5}; }
 
 // Returns a rectangle of undistorted pixels that holds all that the recorded rectangle shows. Undistorting the border
 // suffices, because it maps to the border.
@@ -91,11 +74,11 @@ Bounds undistorted_bounds(const Camera& camera, const Bounds& bounds) {
 }
 
 // Sets the view's crop and alpha from the full mask in recorded pixels; an empty mask leaves the view empty.
-void cut_mask(View& view, const Camera& camera, const Pixels& mask, bool undistorting, int margin) {
+void cut_mask(View& view, const Camera& camera, const Bytes& mask, bool undistorting, int margin) {
   Bounds bounds = bounds_of(mask.data(), camera.width, camera.height);
   if (bounds.empty()) return;
   // undistort the mask where it may be inside
-  Pixels straight;  // the undistorted mask inside `region`
+  Bytes straight;  // the undistorted mask inside `region`
   Bounds region;
   if (undistorting) {
     region = undistorted_bounds(camera, bounds);
@@ -132,16 +115,13 @@ void cut_mask(View& view, const Camera& camera, const Pixels& mask, bool undisto
 
 // Sets the colors of the pixels inside the mask. They are sampled from the unmasked image, so that edges are not
 // darkened.
-void fill_color(View& view, const Camera& camera, const Pixels& rgb, bool undistorting) {
+void fill_color(View& view, const Camera& camera, const Bytes& rgb, bool undistorting) {
   for (int y = 0; y < view.height; ++y)
     for (int x = 0; x < view.width; ++x) {
       std::uint8_t* const out = &view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x)];
       if (out[3] == 0) continue;
       if (undistorting) {
-        const Vector2 position = distort(camera, center(view.x0 + x, view.y0 + y));
-        for (int c = 0; c < 3; ++c)
-          out[c] =
-              static_cast<std::uint8_t>(std::lround(sample(rgb.data(), camera.width, camera.height, 3, c, position)));
+        straight_color(camera, rgb, view.x0 + x, view.y0 + y, out);
       } else {
         std::copy_n(&rgb[3 * (static_cast<std::size_t>(view.y0 + y) * camera.width + view.x0 + x)], 3, out);
       }
@@ -162,31 +142,15 @@ void fill_depth(View& view, const Camera& camera, const std::vector<float>& dept
     }
 }
 
-void require_size(const CameraSource& source, const ImageSource& video, const Image8& image) {
-  if (image.width != source.camera.width || image.height != source.camera.height)
-    throw InputError(video.file.string(),
-                     "is " + std::to_string(image.width) + "x" + std::to_string(image.height) +
-                         " pixels, the camera has " + std::to_string(source.camera.width) + "x" +
-                         std::to_string(source.camera.height),
-                     "correct width and height in capture.json or the video");
-}
-
-void require_frame(const ImageSource& video, bool got, int frame) {
-  if (!got)
-    throw InputError(video.file.string(),
-                     "ends before frame " + std::to_string(frame) + " of " + std::to_string(video.frames),
-                     "write the video again");
-}
-
-Pixels gray_of(const Image8& rgb) {
-  Pixels gray(rgb.pixels.size() / 3);
+Bytes gray_of(const Image8& rgb) {
+  Bytes gray(rgb.pixels.size() / 3);
   for (std::size_t i = 0; i < gray.size(); ++i)
     gray[i] = static_cast<std::uint8_t>((rgb.pixels[3 * i] + rgb.pixels[3 * i + 1] + rgb.pixels[3 * i + 2]) / 3);
   return gray;
 }
 
-Pixels bright(const Pixels& rgb, std::uint8_t black) {
-  Pixels mask(rgb.size() / 3);
+Bytes bright(const Bytes& rgb, std::uint8_t black) {
+  Bytes mask(rgb.size() / 3);
   for (std::size_t i = 0; i < mask.size(); ++i)
     mask[i] = std::max({rgb[3 * i], rgb[3 * i + 1], rgb[3 * i + 2]}) > black ? 255 : 0;
   return mask;
@@ -198,22 +162,20 @@ void load_video_frames(const CameraSource& source, const LoadOptions& options, i
                        int threads, View* views) {
   const Camera& camera = source.camera;
   VideoReader images(source.images.file, threads);
+  skip_frames(source.images, first, images);
   std::optional<VideoReader> masks;
-  if (options.masked && source.masks && source.masks->video) masks.emplace(source.masks->file, threads);
-  for (int k = 0; k < first; ++k) {
-    require_frame(source.images, images.skip(), k);
-    if (masks) require_frame(*source.masks, masks->skip(), k);
+  if (source.masks && source.masks->video) {
+    masks.emplace(source.masks->file, threads);
+    skip_frames(*source.masks, first, *masks);
   }
   Image8 image, mask;
   for (int k = first; k < last; ++k) {
-    require_frame(source.images, images.next(image), k);
-    require_size(source, source.images, image);
+    next_frame(source, source.images, k, images, image);
     View& view = views[k - first];
     if (masks) {
-      require_frame(*source.masks, masks->next(mask), k);
-      require_size(source, *source.masks, mask);
+      next_frame(source, *source.masks, k, *masks, mask);
       cut_mask(view, camera, gray_of(mask), undistorting, options.margin);
-    } else if (options.masked && !source.masks) {
+    } else if (!source.masks) {
       cut_mask(view, camera, bright(image.pixels, kBlackLossy), undistorting, options.margin);
     }
     fill_color(view, camera, image.pixels, undistorting);
@@ -224,30 +186,16 @@ void load_video_frames(const CameraSource& source, const LoadOptions& options, i
 void load_mask_video(const CameraSource& source, const LoadOptions& options, int first, int last, bool undistorting,
                      int threads, View* views) {
   VideoReader masks(source.masks->file, threads);
-  for (int k = 0; k < first; ++k) require_frame(*source.masks, masks.skip(), k);
+  skip_frames(*source.masks, first, masks);
   Image8 mask;
   for (int k = first; k < last; ++k) {
-    require_frame(*source.masks, masks.next(mask), k);
-    require_size(source, *source.masks, mask);
+    next_frame(source, *source.masks, k, masks, mask);
     cut_mask(views[k - first], source.camera, gray_of(mask), undistorting, options.margin);
   }
 }
 
-// As core::parallel_for(), but throws the exception of the lowest index, so that messages do not depend on the threads.
-void for_each_in_parallel(std::int64_t count, const std::function<void(std::int64_t)>& body) {
-  std::vector<std::exception_ptr> failures(static_cast<std::size_t>(count));
-  core::parallel_for(count, [&](std::int64_t i) {
-    try {
-      body(i);
-    } catch (...) {
-      failures[i] = std::current_exception();
-    }
-  });
-  for (const std::exception_ptr& failure : failures)
-    if (failure) std::rethrow_exception(failure);
-}
-
 bool lossless(const ImageSource& images) {
+  if (images.pictures) return true;
   const std::string& ending = images.names.after;
   return ending.ends_with(".png") || ending.ends_with(".PNG") || ending.ends_with(".bmp") || ending.ends_with(".tif") ||
          ending.ends_with(".tiff");
@@ -260,7 +208,7 @@ struct Range {
   bool undistorting = false;
 };
 
-// The frames of all cameras that are asked for, with their views, which are whole and white where masks do not count.
+// The frames of all cameras that are asked for, with their views, which are empty yet.
 std::vector<Range> make_views(const Manifest& manifest, const LoadOptions& options, std::vector<View>& views) {
   std::vector<Range> ranges;
   views.clear();
@@ -270,18 +218,13 @@ std::vector<Range> make_views(const Manifest& manifest, const LoadOptions& optio
     range.last = options.last < 0 ? source.images.frames : std::min(options.last, source.images.frames);
     range.first = std::clamp(options.first, 0, range.last);
     range.offset = views.size();
-    range.undistorting = options.undistort && source.camera.distorted();
+    range.undistorting = options.pixels == Pixels::undistorted && source.camera.distorted();
     ranges.push_back(range);
     for (int k = range.first; k < range.last; ++k) {
       View view;
       view.camera = c;
       view.frame = k;
       view.time = source.times[k];
-      if (!options.masked) {
-        view.width = source.camera.width;
-        view.height = source.camera.height;
-        view.rgba.assign(static_cast<std::size_t>(4) * view.width * view.height, 255);
-      }
       views.push_back(std::move(view));
     }
   }
@@ -291,8 +234,8 @@ std::vector<Range> make_views(const Manifest& manifest, const LoadOptions& optio
 // Color, and the mask of images that are masked already, and depth of one view, as far as they are image files.
 void load_frame_files(const CameraSource& source, const LoadOptions& options, bool undistorting, View& view) {
   if (!source.images.video) {
-    const Pixels rgb = read_rgb(source.images.frame_file(view.frame), source.camera.width, source.camera.height);
-    if (options.masked && !source.masks)
+    const Bytes rgb = rgb_of(source, view.frame);
+    if (!source.masks)
       cut_mask(view, source.camera, bright(rgb, lossless(source.images) ? kBlackLossless : kBlackLossy), undistorting,
                options.margin);
     fill_color(view, source.camera, rgb, undistorting);
@@ -321,7 +264,9 @@ void check_masks(const Manifest& manifest, const CameraSource& source, const Ran
                                  source.masks ? "the masks cover more than half of the image"
                                               : "is missing and the background of the images is not black",
                                  source.masks ? std::string("the object must be 255 and the rest 0")
-                                              : "make them: chainsplat mask " + manifest.capture.folder.string()});
+                                 : manifest.capture.folder.empty()
+                                     ? std::string("give masks")
+                                     : "make them: chainsplat mask " + manifest.capture.folder.string()});
   if (visible == 0) {
     const std::string what = source.camera.name + " never sees the object: every mask is empty";
     if (range.first == 0 && range.last == source.images.frames)
@@ -336,18 +281,17 @@ void check_masks(const Manifest& manifest, const CameraSource& source, const Ran
 void load_views(const Manifest& manifest, const LoadOptions& options, Findings& findings, std::vector<View>& views) {
   const std::vector<Range> ranges = make_views(manifest, options, views);
   const auto total = static_cast<std::int64_t>(views.size());
-  if (options.masked)
-    for (const CameraSource& source : manifest.cameras)
-      if (!source.masks)
-        findings.doubts.push_back(source.where +
-                                  ".masks: is missing; the images are taken as masked already (black background)");
+  for (const CameraSource& source : manifest.cameras)
+    if (!source.masks)
+      findings.doubts.push_back(source.where +
+                                ".masks: is missing; the images are taken as masked already (black background)");
 
   // masks from image files come first, because they decide which part of an image is kept
   for_each_in_parallel(total, [&](std::int64_t i) {
     View& view = views[i];
     const CameraSource& source = manifest.cameras[view.camera];
-    if (!options.masked || !source.masks || source.masks->video) return;
-    const Pixels mask = read_mask(source.masks->frame_file(view.frame), source.camera.width, source.camera.height);
+    if (!source.masks || source.masks->video) return;
+    const Bytes mask = mask_of(source, view.frame);
     cut_mask(view, source.camera, mask, ranges[view.camera].undistorting, options.margin);
   });
   // videos, with one task per camera; where the cameras do not fill the threads evenly, the decoders use more threads
@@ -362,15 +306,14 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
     View* const mine = views.data() + range.offset;
     if (source.images.video)
       load_video_frames(source, options, range.first, range.last, range.undistorting, decoder_threads, mine);
-    else if (options.masked && source.masks && source.masks->video)
+    else if (source.masks && source.masks->video)
       load_mask_video(source, options, range.first, range.last, range.undistorting, decoder_threads, mine);
   });
   for_each_in_parallel(total, [&](std::int64_t i) {
     View& view = views[i];
     load_frame_files(manifest.cameras[view.camera], options, ranges[view.camera].undistorting, view);
   });
-  for (int c = 0; options.masked && c < cameras; ++c)
-    check_masks(manifest, manifest.cameras[c], ranges[c], views, findings);
+  for (int c = 0; c < cameras; ++c) check_masks(manifest, manifest.cameras[c], ranges[c], views, findings);
 }
 
 void add_depth(const Manifest& manifest, std::vector<View>& views) {
@@ -405,13 +348,6 @@ View view_of(const Camera& camera, const Image8& picture, const Image8& mask, in
   cut_mask(view, camera, mask.pixels, camera.distorted(), margin);
   fill_color(view, camera, picture.pixels, camera.distorted());
   return view;
-}
-
-int frames_at_once(const std::vector<Camera>& cameras) {
-  constexpr std::size_t kMostAtOnce = 32u << 20;  // px, 128 MiB of RGBA
-  std::size_t pixels = 1;
-  for (const Camera& camera : cameras) pixels += static_cast<std::size_t>(camera.width) * camera.height;
-  return static_cast<int>(std::max<std::size_t>(1, kMostAtOnce / pixels));
 }
 
 Image8 rgb(const View& view) {

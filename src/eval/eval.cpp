@@ -175,6 +175,7 @@ FrameMetrics compare(const render::Frame& drawn, const capture::View& view, cons
 
 Metrics evaluate(splat::Engine& engine, const splat::Gaussians& gaussians, const chain::Chain& chain,
                  const chain::States& states, const capture::Capture& recorded) {
+  capture::require_pixels(recorded, capture::Pixels::recorded);
   const auto truth = capture::load_true_centerline(recorded.folder);
   Metrics metrics;
 

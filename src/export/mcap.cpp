@@ -216,21 +216,25 @@ namespace {
 void for_each_picture(const Path& capture, const capture::Capture& facts,
                       const std::function<void(double, int, const std::string&)>& use) {
   constexpr int kQuality = 85;  // of JPEG
-  const int at_once = capture::frames_at_once(facts.cameras);
-  std::size_t frames = 0;
-  for (const std::vector<double>& times : facts.times) frames = std::max(frames, times.size());
-  capture::LoadOptions load;
-  load.masked = load.undistort = false;
-  for (load.first = 0; load.first < static_cast<int>(frames); load.first = load.last) {
-    load.last = std::min(static_cast<int>(frames), load.first + at_once);
-    const capture::Capture part = capture::load(capture, load);
-    const auto time = [&](const capture::View& view) { return facts.times[view.camera][view.frame]; };
-    std::vector<const capture::View*> views;
-    for (const capture::View& view : part.views) views.push_back(&view);
-    std::stable_sort(views.begin(), views.end(), [&](const auto* a, const auto* b) { return time(*a) < time(*b); });
-    for (const capture::View* const view : views)
-      use(time(*view), view->camera, capture::jpeg(capture::rgb(*view), kQuality));
+  struct Camera {
+    capture::FrameReader reader;
+    std::optional<capture::Frame> next;
+  };
+  std::vector<Camera> cameras;
+  for (const capture::Camera& camera : facts.cameras) {
+    cameras.push_back({{capture, camera.name, {}, capture::Pixels::recorded}, {}});
+    cameras.back().next = cameras.back().reader.next();
+  }
+  for (;;) {
     core::stop_if_requested();
+    int first = -1;
+    double earliest = std::numeric_limits<double>::infinity();
+    for (int c = 0; c < static_cast<int>(cameras.size()); ++c)
+      if (const auto& next = cameras[c].next; next && facts.times[c][next->frame] < earliest)
+        first = c, earliest = facts.times[c][next->frame];
+    if (first < 0) return;
+    use(earliest, first, capture::jpeg(cameras[first].next->picture, kQuality));
+    cameras[first].next = cameras[first].reader.next();
   }
 }
 

@@ -13,6 +13,7 @@
 
 namespace chainsplat::masking {
 
+using capture::Frame;
 using capture::View;
 
 namespace {
@@ -94,11 +95,11 @@ std::vector<Samples> take_samples(const Recording& recording, Progress& progress
     const double room = kSampleBytes / (cameras * frame_bytes(recording.capture.cameras[c]));
     const int stride =
         std::max(1, frames_of(recording, c) / static_cast<int>(std::clamp<double>(room, kLeastSamples, kSamples)));
-    each_block(recording, c, [&](std::vector<View>& views) {
-      for (View& view : views)
-        if ((view.frame - recording.first) % stride == 0 || recording.help.points_at(c, view.frame))
-          samples[c].frames.push_back(std::move(view));
-      progress.tell("samples", views.size());
+    each_block(recording, c, [&](std::vector<Frame>& frames) {
+      for (Frame& frame : frames)
+        if ((frame.frame - recording.first) % stride == 0 || recording.help.points_at(c, frame.frame))
+          samples[c].frames.push_back(std::move(frame));
+      progress.tell("samples", frames.size());
     });
   }
   return samples;
@@ -122,20 +123,20 @@ chain::States grown_states(const Recording& recording, const chain::Chain& chain
 Look learn(const Recording& recording, const chain::Chain& chain, int camera, const Samples& samples,
            const chain::States& states, const std::vector<View>* masks) {
   const capture::Camera& pinhole = recording.pinholes[camera];
-  const auto base_at = [&](const View& view) { return recording.capture.base.pose(view.time); };
+  const auto base_at = [&](const Frame& frame) { return recording.capture.base.pose(frame.time); };
   const std::vector<Picture> pictures = samples.pictures();
   std::vector<Tube> tubes;
-  for (const View& view : samples.frames)
-    tubes.push_back(tube(chain, base_at(view), at(states, view.time), pinhole, 0.0, chain.length, kAboutPixels));
+  for (const Frame& frame : samples.frames)
+    tubes.push_back(tube(chain, base_at(frame), at(states, frame.time), pinhole, 0.0, chain.length, kAboutPixels));
   Look look;
   if (masks) look.marks = marks(pictures, tubes, chain);  // a grown chain is too inaccurate for marks
   for (std::size_t i = 0; i < tubes.size(); ++i) {
-    const View& view = samples.frames[i];
+    const Frame& frame = samples.frames[i];
     const View* mask = nullptr;
     if (masks)
       mask = &*std::find_if(masks->begin(), masks->end(),
-                            [&](const View& m) { return m.camera == camera && m.frame == view.frame; });
-    count_colors(look, pictures[i], tubes[i], reach(chain, base_at(view), pinhole), chain,
+                            [&](const View& m) { return m.camera == camera && m.frame == frame.frame; });
+    count_colors(look, pictures[i], tubes[i], reach(chain, base_at(frame), pinhole), chain,
                  masks ? kFitMargin : kGrownMargin * tubes[i].radius, mask);
   }
   settle(look);
@@ -160,18 +161,20 @@ void cut_all(const Recording& recording, const chain::Chain& chain, const chain:
              const std::vector<Look>& looks, double place, const std::function<void(std::size_t)>& tell,
              const std::function<void(std::vector<View>&, const std::vector<double>& scores)>& consume) {
   for (int c = 0; c < static_cast<int>(looks.size()); ++c)
-    each_block(recording, c, [&](std::vector<View>& views) {
-      std::vector<double> scores(views.size());
-      core::parallel_for(static_cast<std::int64_t>(views.size()), [&](std::int64_t i) {
+    each_block(recording, c, [&](std::vector<Frame>& frames) {
+      std::vector<View> views(frames.size());
+      std::vector<double> scores(frames.size());
+      core::parallel_for(static_cast<std::int64_t>(frames.size()), [&](std::int64_t i) {
         if (core::stop_requested()) throw Interrupted(core::stop_requested());
-        View& view = views[i];
-        const math::Pose base = recording.capture.base.pose(view.time);
-        const math::VectorX theta = at(states, view.time);
+        Frame& frame = frames[i];
+        const Picture picture = picture_of(frame);
+        const math::Pose base = recording.capture.base.pose(frame.time);
+        const math::VectorX theta = at(states, frame.time);
         const capture::Camera& pinhole = recording.pinholes[c];
-        View masked = cut(looks[c], picture_of(view), pinhole, chain, base, theta, place);
-        masked.camera = c, masked.frame = view.frame, masked.time = view.time;
-        scores[i] = score(evidence(picture_of(view), axis(chain, base, theta, pinhole, 0.0, chain.length)));
-        view = std::move(masked);
+        views[i] = cut(looks[c], picture, pinhole, chain, base, theta, place);
+        views[i].camera = c, views[i].frame = frame.frame, views[i].time = frame.time;
+        scores[i] = score(evidence(picture, axis(chain, base, theta, pinhole, 0.0, chain.length)));
+        frame.picture = {};  // the masks of all frames are kept
         tell(1);
       });
       consume(views, scores);

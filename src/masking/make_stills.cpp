@@ -8,6 +8,7 @@
 
 namespace chainsplat::masking {
 
+using capture::Frame;
 using capture::View;
 
 namespace {
@@ -26,9 +27,9 @@ constexpr double kLeastWidth = 0.6, kMostWidth = 1.7;  // of the given diameter,
 constexpr int kRibbonRounds = 3;                       // of colors and ribbons; the last keeps the width
 
 // The mask of what lies inside the tube.
-View inside_of(const Tube& tube, const View& picture) {
+View inside_of(const Tube& tube, int camera, const Frame& frame) {
   View out;
-  out.camera = picture.camera, out.frame = picture.frame, out.time = picture.time;
+  out.camera = camera, out.frame = frame.frame, out.time = frame.time;
   if (tube.box.empty()) return out;
   out.x0 = tube.box.x0, out.y0 = tube.box.y0, out.width = tube.box.width(), out.height = tube.box.height();
   out.rgba.assign(static_cast<std::size_t>(4) * out.width * out.height, 0);
@@ -36,7 +37,7 @@ View inside_of(const Tube& tube, const View& picture) {
     for (int x = tube.box.x0; x < tube.box.x1; ++x) {
       if (tube.at(x, y) >= 0.0f) continue;
       std::uint8_t* const to = &out.rgba[4 * (static_cast<std::size_t>(y - out.y0) * out.width + x - out.x0)];
-      std::copy_n(&picture.rgba[4 * (static_cast<std::size_t>(y) * picture.width + x)], 3, to);
+      std::copy_n(&frame.picture.pixels[3 * (static_cast<std::size_t>(y) * frame.picture.width + x)], 3, to);
       to[3] = 255;
     }
   return out;
@@ -44,7 +45,7 @@ View inside_of(const Tube& tube, const View& picture) {
 
 // What a still shows.
 struct Still {
-  const View* view;
+  const Frame* frame;
   const Grown* grown;  // of the moment nearest in time
   Axis along = {};     // of the grown chain
   Ribbon ribbon = {};
@@ -82,17 +83,17 @@ std::vector<std::vector<Still>> stills_of(const std::vector<Samples>& samples, c
                                           const std::vector<Grown>& grown) {
   std::vector<std::vector<Still>> out(samples.size());
   for (std::size_t c = 0; c < samples.size(); ++c)
-    for (const View& view : samples[c].frames) {
+    for (const Frame& frame : samples[c].frames) {
       std::size_t nearest = 0;
       for (std::size_t i = 1; i < moments.size(); ++i)
-        if (std::abs(moments[i].time - view.time) < std::abs(moments[nearest].time - view.time)) nearest = i;
-      out[c].push_back({&view, &grown[nearest]});
+        if (std::abs(moments[i].time - frame.time) < std::abs(moments[nearest].time - frame.time)) nearest = i;
+      out[c].push_back({&frame, &grown[nearest]});
     }
   return out;
 }
 
 math::Pose base_at(const Recording& recording, const Still& still) {
-  math::Pose base = recording.capture.base.pose(still.view->time);
+  math::Pose base = recording.capture.base.pose(still.frame->time);
   base.translation = base * still.grown->shift;
   return base;
 }
@@ -103,15 +104,15 @@ Look look_of(const Recording& recording, const chain::Chain& chain, int camera, 
   const capture::Camera& pinhole = recording.pinholes[camera];
   Look look;
   if (const capture::Image8* const empty = recording.help.empty_of(camera); empty && !stills.empty())
-    look.background = empty_scene(*empty, picture_of(*stills.front().view));
+    look.background = empty_scene(*empty, picture_of(*stills.front().frame));
   for (Still& still : stills) {
-    const View& view = *still.view;
+    const Picture picture = picture_of(*still.frame);
     const bool by_ribbon = ribbons && still.ribbon.axis.points.size() > 1;
     const math::Pose base = base_at(recording, still);
     still.along = axis(chain, base, still.grown->theta, pinhole, 0.0, chain.length);
-    const Tube around = tube(by_ribbon ? still.ribbon.axis : still.along, view.width, view.height, kAboutPixels);
+    const Tube around = tube(by_ribbon ? still.ribbon.axis : still.along, picture.width, picture.height, kAboutPixels);
     still.broad = around.radius > kBroad;
-    count_colors(look, picture_of(view), around, reach(chain, base, pinhole), chain,
+    count_colors(look, picture, around, reach(chain, base, pinhole), chain,
                  by_ribbon ? kFitMargin : kGrownMargin * around.radius);
   }
   settle(look);
@@ -130,7 +131,7 @@ void find_ribbons(const Recording& recording, const chain::Chain& chain, std::ve
         RibbonOptions ribbon;
         ribbon.width = width;
         ribbon.width_deviation = round ? kKnownWidth : still.broad ? kFirstBroadWidth : kFirstWidth;
-        still.ribbon = find_ribbon(look, picture_of(*still.view), still.along, chain.length, ribbon);
+        still.ribbon = find_ribbon(look, picture_of(*still.frame), still.along, chain.length, ribbon);
       });
       for (const Still& still : stills[c])
         if (!still.ribbon.axis.points.empty()) widths.push_back(still.ribbon.width);
@@ -143,7 +144,7 @@ void find_ribbons(const Recording& recording, const chain::Chain& chain, std::ve
 double score_of(const Still& still) {
   // another way from the grasp that explains the picture nearly as well: another cable that crosses, perhaps
   const double sure = std::min(1.0, kUnsure + (1.0 - kUnsure) * still.grown->margin / kSureMargin);
-  return sure * score(evidence(picture_of(*still.view), still.ribbon.axis));
+  return sure * score(evidence(picture_of(*still.frame), still.ribbon.axis));
 }
 
 }  // namespace
@@ -160,11 +161,13 @@ Summary make_stills(const Recording& recording, const chain::Chain& chain, const
     if (one.shift.norm() > summary.grasp.norm()) summary.grasp = one.shift;
   for (std::size_t c = 0; c < stills.size(); ++c)
     for (const Still& still : stills[c]) {
-      const View view = inside_of(tube(still.ribbon.axis, still.view->width, still.view->height, 0.0), *still.view);
+      const Picture picture = picture_of(*still.frame);
+      const Tube rope = tube(still.ribbon.axis, picture.width, picture.height, 0.0);
+      const View view = inside_of(rope, static_cast<int>(c), *still.frame);
       ++summary.frames;
       summary.empty += view.width == 0;
       summary.inside += view.width != 0;
-      sink(static_cast<int>(c), still.view->frame, recorded_mask(view, recording.capture.cameras[c]), score_of(still));
+      sink(static_cast<int>(c), still.frame->frame, recorded_mask(view, recording.capture.cameras[c]), score_of(still));
     }
   summary.inside /= summary.frames;
   return summary;

@@ -11,9 +11,8 @@ using math::Vector2;
 
 namespace {
 
-// Memory for the whole frames of one camera that are held at once. Reaching a block of a video means decoding all
-// before it, so that with small blocks the time would grow with the square of the recording's length.
-constexpr double kBlockBytes = 512.0 * 1024 * 1024;
+// Memory for the frames of one camera that are held at once, so that all threads have some.
+constexpr double kBlockBytes = 128.0 * 1024 * 1024;
 
 // Where the scene without the rope is known, a moment's shots show what differs from it.
 void take_away_scene(const Help& help, Moment& moment) {
@@ -30,8 +29,8 @@ void add_help(const Help& help, const std::vector<Samples>& samples, Moment& mom
   for (std::size_t k = 0; k < moment.shots.size(); ++k) {
     const int c = moment.cameras[k];
     int frame = 0;
-    for (const View& view : samples[c].frames)
-      if (picture_of(view).pixels == moment.shots[k].picture.pixels) frame = view.frame;
+    for (const capture::Frame& one : samples[c].frames)
+      if (picture_of(one).pixels == moment.shots[k].picture.pixels) frame = one.frame;
     for (const Help::Point& point : help.points)
       if (point.camera == c && point.frame == frame) moment.shots[k].on_rope.push_back(point.at);
     for (const Help::Region& region : help.boxes)
@@ -48,29 +47,33 @@ int frames_of(const Recording& recording, int camera) {
   return std::max(0, last - std::min(recording.first, last));
 }
 
-double frame_bytes(const capture::Camera& camera) { return 4.0 * camera.width * camera.height; }
+double frame_bytes(const capture::Camera& camera) { return 3.0 * camera.width * camera.height; }
 
-void each_block(const Recording& recording, int camera, const std::function<void(std::vector<View>&)>& body) {
-  const int begin = recording.first, end = begin + frames_of(recording, camera);
-  const int most = static_cast<int>(std::clamp(kBlockBytes / frame_bytes(recording.capture.cameras[camera]), 1.0, 1e6));
-  for (int first = begin; first < end; first += most) {
-    capture::LoadOptions options;
-    options.masked = false;
-    options.camera = recording.capture.cameras[camera].name;
-    options.first = first;
-    options.last = std::min(end, first + most);
-    capture::Capture block = capture::load(recording.path, options);
-    for (View& view : block.views) view.camera = camera;
-    body(block.views);
-    if (core::stop_requested()) throw Interrupted(core::stop_requested());
+void each_block(const Recording& recording, int camera, const std::function<void(std::vector<capture::Frame>&)>& body) {
+  const capture::Camera& from = recording.capture.cameras[camera];
+  const auto most = static_cast<std::size_t>(std::clamp(kBlockBytes / frame_bytes(from), 1.0, 1e6));
+  capture::FrameReader reader(recording.path, from.name, {recording.first, recording.last},
+                              capture::Pixels::undistorted);
+  std::vector<capture::Frame> block;
+  for (;;) {
+    std::optional<capture::Frame> frame = reader.next();
+    if (frame) block.push_back(std::move(*frame));
+    if (block.size() == most || (!frame && !block.empty())) {
+      body(block);
+      block.clear();
+      if (core::stop_requested()) throw Interrupted(core::stop_requested());
+    }
+    if (!frame) return;
   }
 }
 
-Picture picture_of(const View& view) { return {view.rgba.data(), view.width, view.height, 4}; }
+Picture picture_of(const capture::Frame& frame) {
+  return {frame.picture.pixels.data(), frame.picture.width, frame.picture.height, 3};
+}
 
 std::vector<Picture> Samples::pictures() const {
   std::vector<Picture> out;
-  for (const View& view : frames) out.push_back(picture_of(view));
+  for (const capture::Frame& frame : frames) out.push_back(picture_of(frame));
   return out;
 }
 
@@ -81,7 +84,7 @@ std::vector<Moment> moments_of(const Recording& recording, const std::vector<Sam
   std::vector<Moment> moments;
   const auto times_of = [](const Samples& some) {
     std::vector<double> times;
-    for (const View& view : some.frames) times.push_back(view.time);
+    for (const capture::Frame& frame : some.frames) times.push_back(frame.time);
     return times;
   };
   const std::vector<double> times = times_of(*first);
@@ -92,9 +95,12 @@ std::vector<Moment> moments_of(const Recording& recording, const std::vector<Sam
     const std::vector<int> nearest = capture::frames_at(times, times_of(samples[c]), reach);
     for (std::size_t m = 0; m < times.size(); ++m) {
       if (nearest[m] < 0) continue;
-      const View& view = samples[c].frames[nearest[m]];
-      moments[m].shots.push_back(
-          {picture_of(view), &cameras[c], cameras[c].world_from_camera.inverse() * scene.base.pose(view.time), {}, {}});
+      const capture::Frame& frame = samples[c].frames[nearest[m]];
+      moments[m].shots.push_back({picture_of(frame),
+                                  &cameras[c],
+                                  cameras[c].world_from_camera.inverse() * scene.base.pose(frame.time),
+                                  {},
+                                  {}});
       moments[m].cameras.push_back(static_cast<int>(c));
     }
   }

@@ -29,14 +29,14 @@ struct Recording {
 };
 
 int frames_of(const Recording& recording, int camera);
-double frame_bytes(const capture::Camera& camera);  // of a whole frame in memory
-// Calls `body` with whole undistorted frames of one camera, block by block. Throws Interrupted.
-void each_block(const Recording& recording, int camera, const std::function<void(std::vector<capture::View>&)>& body);
-Picture picture_of(const capture::View& view);
+double frame_bytes(const capture::Camera& camera);  // in memory
+// Calls `body` with the undistorted frames of one camera, some at a time for many threads. Throws Interrupted.
+void each_block(const Recording& recording, int camera, const std::function<void(std::vector<capture::Frame>&)>& body);
+Picture picture_of(const capture::Frame& frame);
 
 // Some whole frames of one camera, from which its appearance is learned.
 struct Samples {
-  std::vector<capture::View> frames;
+  std::vector<capture::Frame> frames;
   std::vector<Picture> pictures() const;
 };
 

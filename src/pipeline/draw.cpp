@@ -106,32 +106,6 @@ void check_motion(const Path& run, const Path& capture, const DrawOptions& optio
                        "covers none of the times of " + cameras[c].name, "give states at the camera's times");
 }
 
-// What a camera recorded, read in parts, so that a recording may be long.
-class Recorded {
- public:
-  // `frames`: that may be asked for, from the first on.
-  Recorded(Path capture, const capture::Camera& camera, int frames)
-      : capture_(std::move(capture)), frames_(frames), at_once_(capture::frames_at_once({camera})) {
-    load_.undistort = false, load_.masked = false, load_.camera = camera.name;
-  }
-  // RGB; empty where there is none. Frames are asked for in order.
-  capture::Image8 at(int frame) {
-    if (frame >= frames_) return {};
-    if (views_.empty() || frame >= load_.last) {
-      load_.first = frame, load_.last = std::min(frames_, frame + at_once_);
-      views_.clear();
-      views_ = capture::load(capture_, load_).views;
-    }
-    return capture::rgb(views_[frame - load_.first]);
-  }
-
- private:
-  Path capture_;
-  capture::LoadOptions load_;
-  std::vector<capture::View> views_;
-  int frames_, at_once_;
-};
-
 // Where the pictures of one camera go.
 class Files {
  public:
@@ -171,12 +145,20 @@ int draw_camera(splat::Engine& engine, const Motion& motion, const Path& capture
   const std::vector<double>& times = motion.scene.times[c];
   const int count = covered_frames(motion, c);
   Files files(options, camera, times);
-  Recorded seen(capture, camera, options.layout == render::Layout::drawn ? 0 : motion.recorded[c]);
+  std::optional<capture::FrameReader> reader;
+  if (options.layout != render::Layout::drawn)
+    reader.emplace(capture, camera.name, capture::FrameRange{0, motion.recorded[c]}, capture::Pixels::recorded);
+  // RGB; empty where there is none. Frames are asked for in order.
+  const auto recorded_at = [&](int number) {
+    while (std::optional<capture::Frame> frame = reader ? reader->next() : std::nullopt)
+      if (frame->frame == number) return std::move(frame->picture);
+    return capture::Image8{};
+  };
   int written = 0;
   const auto write = [&](std::vector<render::Frame>& batch) {
     for (const render::Frame& frame : batch) {
       const double share = static_cast<double>(frame.frame) / std::max<std::size_t>(1, times.size() - 1);
-      files.add(frame, render::laid_out(options.layout, frame, camera, seen.at(frame.frame), share));
+      files.add(frame, render::laid_out(options.layout, frame, camera, recorded_at(frame.frame), share));
       core::report({"write " + camera.name, ++written, count, NAN, NAN, ""});
     }
   };

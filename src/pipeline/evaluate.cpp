@@ -111,7 +111,7 @@ Evaluation evaluate(const Path& run, const Path& capture, const EvaluateOptions&
   check_drawable(twin, run);
   capture::LoadOptions load;
   load.first = options.frames.first, load.last = options.frames.last;
-  load.undistort = false;
+  load.pixels = capture::Pixels::recorded;
   load.depth = true;
   capture::Capture recorded = capture::load(capture, load);
   capture::apply(twin.corrections, recorded);

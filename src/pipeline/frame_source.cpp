@@ -65,20 +65,16 @@ FrameSource open_capture(const SourceOptions& options) {
   load.camera = options.camera;
   load.first = options.frames.first, load.last = options.frames.last;
   FrameSource source;
-  const auto loaded = [&] {
-    capture::Capture capture = capture::load(options.source, load);
-    source.unverified.clear();
-    for (const capture::Camera& camera : capture.cameras)
-      source.unverified.push_back(is_unverified(options.corrections, camera));
-    capture::apply(options.corrections, capture);
-    return std::make_shared<const capture::Capture>(std::move(capture));
-  };
-  const auto recorded = loaded();
-  std::shared_ptr<const capture::Capture> whole;
+  const auto recorded = std::make_shared<capture::Capture>(capture::load(options.source, load));
+  for (const capture::Camera& camera : recorded->cameras)
+    source.unverified.push_back(is_unverified(options.corrections, camera));
+  capture::apply(options.corrections, *recorded);
+  // in memory beforehand, so that frames come as fast as they are followed
+  const auto pictures = std::make_shared<std::vector<capture::Image8>>();
   if (options.pictures) {
-    load.camera = recorded->cameras.front().name;
-    load.masked = load.undistort = false;
-    whole = loaded();
+    capture::FrameReader reader(options.source, recorded->cameras.front().name, options.frames,
+                                capture::Pixels::recorded);
+    while (std::optional<capture::Frame> frame = reader.next()) pictures->push_back(std::move(frame->picture));
   }
   source.cameras = recorded->cameras;
   source.base = recorded->base;
@@ -87,7 +83,7 @@ FrameSource open_capture(const SourceOptions& options) {
   std::vector<double> moments;
   for (const capture::View& view : recorded->views)
     if (view.camera == 0) moments.push_back(view.time);
-  source.next = [recorded, whole, together = capture::views_at(*recorded, moments),
+  source.next = [recorded, pictures, together = capture::views_at(*recorded, moments),
                  at = std::size_t{0}](LiveFrame& frame) mutable {
     if (at >= together.size()) return false;
     const capture::View& leader = recorded->views[at];
@@ -95,7 +91,7 @@ FrameSource open_capture(const SourceOptions& options) {
     frame.time = leader.time;
     frame.views.clear();
     for (const int v : together[at]) frame.views.push_back(recorded->views[v]);
-    if (whole) frame.picture = capture::rgb(whole->views.at(at));
+    if (!pictures->empty()) frame.picture = pictures->at(at);
     ++at;
     frame.arrived = core::seconds_now();
     return true;

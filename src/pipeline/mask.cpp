@@ -137,19 +137,6 @@ capture::FrameRange frames_of(const capture::Capture& scene, int camera, const c
   return {asked.first, asked.last < 0 ? all : std::min(all, asked.last)};
 }
 
-// Calls `body` with the frames of one camera as recorded, few of them in memory at once.
-void each_frame(const Path& path, const capture::Camera& camera, const capture::FrameRange& frames,
-                const std::function<void(const capture::View&)>& body) {
-  capture::LoadOptions block;
-  block.masked = block.undistort = false;
-  block.camera = camera.name;
-  const int most = capture::frames_at_once({camera});
-  for (int begin = frames.first; begin < frames.last; begin += most) {
-    block.first = begin, block.last = std::min(frames.last, begin + most);
-    for (const capture::View& view : capture::load(path, block).views) body(view);
-  }
-}
-
 // What another program says the mask of a frame is, as 0 and 255. Throws WorkError where it is none. `where`: which
 // frame.
 Image8 object_mask(const Image8& given, const Image8& picture, const std::string& where) {
@@ -186,16 +173,16 @@ masking::Summary masks_by_command(const Path& path, const Places& places, const 
   for (const std::vector<double>& times : scene.times) total += static_cast<std::int64_t>(times.size());
   for (int c = 0; c < static_cast<int>(scene.cameras.size()); ++c) {
     const std::string& name = scene.cameras[c].name;
-    each_frame(path, scene.cameras[c], frames_of(scene, c, options.frames), [&](const capture::View& view) {
+    capture::FrameReader reader(path, name, options.frames, capture::Pixels::recorded);
+    while (const std::optional<capture::Frame> frame = reader.next()) {
       core::stop_if_requested();
-      const std::string where = name + ", frame " + std::to_string(view.frame);
-      const Image8 picture = capture::rgb(view);
-      const Image8 mask = object_mask(options.command(name, view.frame, picture), picture, where);
+      const std::string where = name + ", frame " + std::to_string(frame->frame);
+      const Image8 mask = object_mask(options.command(name, frame->frame, frame->picture), frame->picture, where);
       ++summary.frames;
       summary.empty += std::none_of(mask.pixels.begin(), mask.pixels.end(), [](std::uint8_t p) { return p != 0; });
-      keep(c, view.frame, mask);
+      keep(c, frame->frame, mask);
       core::report({"mask", summary.frames, total, std::nan(""), std::nan(""), where});
-    });
+    }
   }
   if (summary.frames == 0)
     throw InputError(path.string(), "has no frame in the range asked for", "choose frames that it has");
@@ -274,8 +261,8 @@ Image8 contact_sheet(const Path& path, const Places& places, const capture::Fram
       masking::PreviewTile tile{camera.name, frame, {}, capture::read_image8(places.wanted[c].file(frame)), {}};
       for (const MaskScore& one : scores)
         if (one.camera == camera.name && one.frame == frame) tile.score = one.score;
-      each_frame(path, camera, {frame, frame + 1},
-                 [&](const capture::View& view) { tile.picture = capture::rgb(view); });
+      tile.picture =
+          capture::FrameReader(path, camera.name, {frame, frame + 1}, capture::Pixels::recorded).next()->picture;
       tiles.push_back(std::move(tile));
     }
   }

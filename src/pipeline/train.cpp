@@ -5,6 +5,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/comparison.h"
+#include "chainsplat/in_memory.h"
 #include "chainsplat/recognition.h"
 #include "chainsplat/run_folder.h"
 #include "chainsplat/silhouette.h"
@@ -19,6 +20,7 @@ namespace fs = std::filesystem;
 // All that one call works on.
 struct Training {
   Path capture_path, run;
+  const capture::InMemory* recording = nullptr;  // instead of capture_path, which is then a name for messages
   TrainOptions options;
   capture::LoadOptions load;
   capture::Capture capture;
@@ -78,8 +80,9 @@ twin::Twin new_twin(const Training& t) {
   twin.provenance.capture = t.capture.name;
   twin.provenance.capture_hash = hash_text(t.capture.hash);
   // from the run folder, so that the two can be moved together
-  twin.provenance.path =
-      fs::proximate(fs::absolute(t.capture_path), fs::absolute(t.run)).lexically_normal().generic_string();
+  if (!t.recording)
+    twin.provenance.path =
+        fs::proximate(fs::absolute(t.capture_path), fs::absolute(t.run)).lexically_normal().generic_string();
   return twin;
 }
 
@@ -116,7 +119,7 @@ void load_capture(Training& t) {
   t.load.first = t.options.frames.first, t.load.last = t.options.frames.last;
   // read now, because a file that is wrong must not end a work that is done
   t.load.depth = asked_for(t, Stage::evaluate);
-  t.capture = capture::load(t.capture_path, t.load);
+  t.capture = t.recording ? capture::load(*t.recording, t.load) : capture::load(t.capture_path, t.load);
   check_not_capture(t.run, t.capture.folder);
   if (asked_for(t, Stage::recognize)) check_views(t);
   if (asked_for(t, Stage::evaluate)) capture::load_true_centerline(t.capture.folder);  // to find what is wrong with it
@@ -314,7 +317,8 @@ void evaluate(Training& t) {
   const Stopwatch watch(t.twin, "evaluate");
   core::report({"evaluate", 0, 0, NAN, NAN, "drawing every frame and comparing"});
   const twin::Twin& twin = t.twin;
-  const capture::Capture recorded = capture::load_recorded(std::move(t.capture), t.capture_path, t.load);
+  const capture::Capture recorded = t.recording ? capture::load_recorded(std::move(t.capture), *t.recording, t.load)
+                                                : capture::load_recorded(std::move(t.capture), t.capture_path, t.load);
   splat::Engine engine(*t.device);
   TrainResult& r = t.result;
   r.recognized = eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, recorded);
@@ -389,12 +393,11 @@ void run_logged(Training& t, bool was_there, core::Listener listener) {
   }
 }
 
-}  // namespace
-
-TrainResult train(const Path& capture, const Path& run, const TrainOptions& options, const core::Listener& listener) {
+// `t` has the request.
+TrainResult run_training(Training t, const core::Listener& listener) {
   const core::ListenerScope scope(listener);
-  Training t;
-  t.capture_path = capture, t.run = run, t.options = options;
+  const Path run = t.run;
+  const TrainOptions options = t.options;
   options.check();
   check_outputs(t);
   prepare(t);
@@ -411,6 +414,21 @@ TrainResult train(const Path& capture, const Path& run, const TrainOptions& opti
   run_logged(t, was_there, listener);
   t.result.twin = std::move(t.twin);
   return std::move(t.result);
+}
+
+}  // namespace
+
+TrainResult train(const Path& capture, const Path& run, const TrainOptions& options, const core::Listener& listener) {
+  Training t;
+  t.capture_path = capture, t.run = run, t.options = options;
+  return run_training(std::move(t), listener);
+}
+
+TrainResult train(const capture::InMemory& capture, const Path& run, const TrainOptions& options,
+                  const core::Listener& listener) {
+  Training t;
+  t.recording = &capture, t.capture_path = "`capture`", t.run = run, t.options = options;
+  return run_training(std::move(t), listener);
 }
 
 }  // namespace chainsplat::pipeline

@@ -11,6 +11,7 @@
 namespace chainsplat::recognition {
 
 Result recognize(gpu::Device& device, const capture::Capture& capture, const Options& options) {
+  capture::require_pixels(capture, capture::Pixels::undistorted);
   return options.mode == Mode::paper ? recognize_paper(device, capture, options)
                                      : recognize_fast(device, capture, options);
 }

@@ -13,9 +13,9 @@ constexpr int kWidth = 480;         // px, at most: a phone's, and half of a usu
 constexpr int kMostPictures = 300;  // 10 s at 30 Hz; longer recordings lose frames evenly
 constexpr int kQuality = 60;        // of JPEG: about 8 kB for 480 x 360
 
-// The RGB picture of a whole view with its sides divided by `shrink`, every pixel the mean of what it covers.
-capture::Image8 shrunk(const capture::View& view, int shrink) {
-  capture::Image8 out{view.width / shrink, view.height / shrink, 3, {}};
+// A picture with its sides divided by `shrink`, every pixel the mean of what it covers.
+capture::Image8 shrunk(const capture::Image8& picture, int shrink) {
+  capture::Image8 out{picture.width / shrink, picture.height / shrink, 3, {}};
   out.pixels.resize(3u * out.width * out.height);
   for (int y = 0; y < out.height; ++y)
     for (int x = 0; x < out.width; ++x)
@@ -23,7 +23,8 @@ capture::Image8 shrunk(const capture::View& view, int shrink) {
         int sum = 0;
         for (int dy = 0; dy < shrink; ++dy)
           for (int dx = 0; dx < shrink; ++dx)
-            sum += view.rgba[4 * (static_cast<std::size_t>(y * shrink + dy) * view.width + x * shrink + dx) + c];
+            sum +=
+                picture.pixels[3 * (static_cast<std::size_t>(y * shrink + dy) * picture.width + x * shrink + dx) + c];
         out.pixels[3 * (static_cast<std::size_t>(y) * out.width + x) + c] =
             static_cast<std::uint8_t>((sum + shrink * shrink / 2) / (shrink * shrink));
       }
@@ -43,19 +44,15 @@ Video read_video(const Path& capture, const std::string& camera, const twin::Twi
   const double interval = render::median_interval(times);
   const int frames = static_cast<int>(times.size());
   const int every = (frames + kMostPictures - 1) / kMostPictures, shrink = (seen.width + kWidth - 1) / kWidth;
-  const int at_once = capture::frames_at_once(facts.cameras);
   Video out;
   out.camera = seen.name;
-  load.images = true;
-  load.masked = false;
-  for (load.first = 0; load.first < frames; load.first = load.last) {
-    load.last = std::min(frames, load.first + at_once);
-    for (const capture::View& view : capture::load(capture, load).views) {
-      if (view.frame % every != 0 || !render::covered(twin.states, times[view.frame], interval)) continue;
-      out.times.push_back(times[view.frame]);
-      out.jpegs.push_back(capture::jpeg(shrunk(view, shrink), kQuality));
-    }
+  capture::FrameReader reader(capture, seen.name, {}, capture::Pixels::undistorted);
+  while (const std::optional<capture::Frame> frame = reader.next()) {
     core::stop_if_requested();
+    const double time = times[frame->frame];
+    if (frame->frame % every != 0 || !render::covered(twin.states, time, interval)) continue;
+    out.times.push_back(time);
+    out.jpegs.push_back(capture::jpeg(shrunk(frame->picture, shrink), kQuality));
   }
   return out;
 }

@@ -247,6 +247,7 @@ void warn_of_unseen(const Sequence& s, const std::string& name) {
 }  // namespace
 
 SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capture, const Options& options) {
+  capture::require_pixels(capture, capture::Pixels::undistorted);
   Sequence s = make_sequence(chain, capture, options);
   fit_forward(s);
   repair(s);

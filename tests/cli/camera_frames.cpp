@@ -51,7 +51,7 @@ std::vector<std::uint8_t> jpeg(const capture::Image8& rgb) {
 int main(int, char** argv) {
   capture::LoadOptions options;
   options.camera = argv[2];
-  options.undistort = false;
+  options.pixels = capture::Pixels::recorded;
   const capture::Capture recorded = capture::load(argv[1], options);
   const Path folder = argv[3];
   std::ofstream raw(folder / "rgb", std::ios::binary), packed(folder / "yuyv", std::ios::binary),

@@ -14,7 +14,7 @@ bare() {  # the demo without masks
 
 # an image that is not masked leads to this command
 bare
-expect_error 2 'make them: chainsplat mask' train "$capture" -o "$work/run" --frames 0:12
+expect_error 2 "make them: chainsplat mask $capture" train "$capture" -o "$work/run" --frames 0:12
 run check "$capture"
 expect_code 2 'check, no masks'
 expect_output '^problem: .*make them: chainsplat mask' 'check, no masks'
