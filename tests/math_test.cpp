@@ -1,4 +1,5 @@
 #include "chainsplat/math.h"
+#include "chainsplat/rectangle.h"
 
 #include <doctest/doctest.h>
 
@@ -99,4 +100,20 @@ TEST_CASE("factors of what is not positive definite are told apart") {
     m(1, 1) = value;
     CHECK(both(false));
   }
+}
+
+TEST_CASE("rectangles of pixels") {
+  using math::Rectangle;
+  const auto same = [](const Rectangle& a, const Rectangle& b) {
+    return a.x0 == b.x0 && a.y0 == b.y0 && a.x1 == b.x1 && a.y1 == b.y1;
+  };
+  const Rectangle a{1, 2, 5, 8}, b{4, 0, 9, 3}, apart{7, 7, 9, 9};
+  CHECK(a.width() == 4);
+  CHECK(a.height() == 6);
+  CHECK(same(math::intersection(a, b), {4, 2, 5, 3}));
+  CHECK(math::intersection(a, apart).empty());
+  CHECK(same(math::enclosing(a, b), {1, 0, 9, 8}));
+  CHECK(same(math::enclosing({}, b), b));
+  CHECK(same(math::enclosing(a, {3, 3, 3, 4}), a));
+  CHECK(same(math::grown(a, 2), {-1, 0, 7, 10}));
 }

@@ -6,6 +6,7 @@
 #include <functional>
 #include <vector>
 #include "chainsplat/capture.h"
+#include "chainsplat/rectangle.h"
 #include "chainsplat/splat.h"
 #include "chainsplat/twin.h"
 
@@ -62,12 +63,8 @@ Images images(splat::Engine& engine, const splat::Gaussians& gaussians, const ch
               const chain::States& states, const trajectory::Trajectory& base, const capture::Camera& camera,
               const std::vector<double>& times, const Options& options = {});
 
-// Pixel rectangle [x0, x1) x [y0, y1) of the undistorted image outside which no replica's alpha reaches 1/255.
-struct Bounds {
-  int x0 = 0, y0 = 0, x1 = 0, y1 = 0;
-  bool empty() const { return x1 <= x0 || y1 <= y0; }
-};
+// The pixels of the undistorted image outside which no replica's alpha reaches 1/255.
 // The result is not cut to the image. `motions` are those of chain::link_motions.
-Bounds reach(const splat::Gaussians& gaussians, const std::vector<math::Pose>& motions, const capture::Camera& camera);
+math::Rectangle reach(const splat::Gaussians& gaussians, const std::vector<math::Pose>& motions, const capture::Camera& camera);
 
 }  // namespace chainsplat::render

@@ -3,12 +3,14 @@
 #include <cmath>
 
 #include "chainsplat/image_model.h"
+#include "chainsplat/rectangle.h"
 #include "image_files.h"
 #include "manifest.h"
 #include "pictures.h"
 
 namespace chainsplat::capture {
 
+using math::Rectangle;
 using math::Vector2;
 
 namespace {
@@ -19,19 +21,9 @@ constexpr double kMostCovered = 0.5;  // share of an image; more means that noth
 
 using Bytes = std::vector<std::uint8_t>;
 
-struct Bounds {
-  int x0 = 0, y0 = 0, x1 = 0, y1 = 0;  // [x0, x1) x [y0, y1)
-  bool empty() const { return x1 <= x0 || y1 <= y0; }
-};
-
-Bounds grown(const Bounds& bounds, int margin, int width, int height) {
-  return {std::max(0, bounds.x0 - margin), std::max(0, bounds.y0 - margin), std::min(width, bounds.x1 + margin),
-          std::min(height, bounds.y1 + margin)};
-}
-
 // Returns the bounds of the mask's inside pixels; empty where there are none.
-Bounds bounds_of(const std::uint8_t* mask, int width, int height) {
-  Bounds bounds{width, height, 0, 0};
+Rectangle bounds_of(const std::uint8_t* mask, int width, int height) {
+  Rectangle bounds{width, height, 0, 0};
   const auto inside = [](std::uint8_t value) { return value >= image_model::kObjectMask; };
   for (int y = 0; y < height; ++y) {
     const std::uint8_t* const row = mask + static_cast<std::size_t>(y) * width;
@@ -53,7 +45,7 @@ bool recorded(const Camera& camera, const Vector2& position) {
 
 // Returns a rectangle of undistorted pixels that holds all that the recorded rectangle shows. Undistorting the border
 // suffices, because it maps to the border.
-Bounds undistorted_bounds(const Camera& camera, const Bounds& bounds) {
+Rectangle undistorted_bounds(const Camera& camera, const Rectangle& bounds) {
   constexpr int kStep = 8;   // px between points of the border
   constexpr int kSlack = 2;  // px, for the curve between the points and the bilinear footprint
   Vector2 low(1e9, 1e9), high(-1e9, -1e9);
@@ -75,11 +67,11 @@ Bounds undistorted_bounds(const Camera& camera, const Bounds& bounds) {
 
 // Sets the view's crop and alpha from the full mask in recorded pixels; an empty mask leaves the view empty.
 void cut_mask(View& view, const Camera& camera, const Bytes& mask, bool undistorting, int margin) {
-  Bounds bounds = bounds_of(mask.data(), camera.width, camera.height);
+  Rectangle bounds = bounds_of(mask.data(), camera.width, camera.height);
   if (bounds.empty()) return;
   // undistort the mask where it may be inside
   Bytes straight;  // the undistorted mask inside `region`
-  Bounds region;
+  Rectangle region;
   if (undistorting) {
     region = undistorted_bounds(camera, bounds);
     const int width = region.x1 - region.x0, height = region.y1 - region.y0;
@@ -97,7 +89,7 @@ void cut_mask(View& view, const Camera& camera, const Bytes& mask, bool undistor
     bounds = {bounds.x0 + region.x0, bounds.y0 + region.y0, bounds.x1 + region.x0, bounds.y1 + region.y0};
   }
   // crop with a margin and set alpha
-  const Bounds crop = grown(bounds, margin, camera.width, camera.height);
+  const Rectangle crop = intersection(grown(bounds, margin), {0, 0, camera.width, camera.height});
   view.x0 = crop.x0;
   view.y0 = crop.y0;
   view.width = crop.x1 - crop.x0;

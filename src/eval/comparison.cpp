@@ -16,19 +16,13 @@ constexpr int kSheetWidth = 2000;  // px, about, of the enlarged comparison
 constexpr int kMostZoom = 3;
 constexpr std::uint8_t kGapLevel = 96;  // gray
 
-struct Bounds {
-  int x0 = 0, y0 = 0, x1 = 0, y1 = 0;
-  int width() const { return x1 - x0; }
-  int height() const { return y1 - y0; }
-};
-
 std::uint8_t level(float value) {
   return static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(value, 0.0f, 1.0f)));
 }
 
 // Copies the part of an RGB picture at (x0, y0) of its image that lies in `bounds` to (left, top) of `sheet`.
 template <class Pixel>  // Pixel(index, channel) -> level
-void paste(int x0, int y0, int width, int height, const Pixel& pixel, const Bounds& bounds, int left, int top,
+void paste(int x0, int y0, int width, int height, const Pixel& pixel, const math::Rectangle& bounds, int left, int top,
            Image8& sheet) {
   for (int y = std::max(y0, bounds.y0); y < std::min(y0 + height, bounds.y1); ++y)
     for (int x = std::max(x0, bounds.x0); x < std::min(x0 + width, bounds.x1); ++x)
@@ -37,19 +31,19 @@ void paste(int x0, int y0, int width, int height, const Pixel& pixel, const Boun
             pixel(static_cast<std::size_t>(y - y0) * width + (x - x0), c);
 }
 
-void paste(const capture::View& view, const Bounds& bounds, int left, int top, Image8& sheet) {
+void paste(const capture::View& view, const math::Rectangle& bounds, int left, int top, Image8& sheet) {
   paste(
       view.x0, view.y0, view.width, view.height, [&](std::size_t i, int c) { return view.rgba[4 * i + c]; }, bounds,
       left, top, sheet);
 }
 
-void paste(const render::Frame& frame, const Bounds& bounds, int left, int top, Image8& sheet) {
+void paste(const render::Frame& frame, const math::Rectangle& bounds, int left, int top, Image8& sheet) {
   paste(
       frame.x0, frame.y0, frame.picture.width, frame.picture.height,
       [&](std::size_t i, int c) { return level(frame.picture.rgba[4 * i + c]); }, bounds, left, top, sheet);
 }
 
-void blacken(int left, int top, const Bounds& bounds, Image8& sheet) {
+void blacken(int left, int top, const math::Rectangle& bounds, Image8& sheet) {
   for (int y = 0; y < bounds.height(); ++y)
     std::fill_n(sheet.pixels.begin() + 3 * (static_cast<std::ptrdiff_t>(top + y) * sheet.width + left),
                 3 * bounds.width(), std::uint8_t{0});
@@ -123,7 +117,7 @@ Image8 comparison(splat::Engine& engine, const twin::Twin& twin, const capture::
       const capture::View& view = *column.views[row];
       const int top = static_cast<int>(row) * (height + kGap);
       const int x0 = view.x0 + (view.width - width) / 2, y0 = view.y0 + (view.height - height) / 2;
-      const Bounds window{x0, y0, x0 + width, y0 + height};
+      const math::Rectangle window{x0, y0, x0 + width, y0 + height};
       int x = left;
       blacken(x, top, window, sheet);
       paste(view, window, x, top, sheet);

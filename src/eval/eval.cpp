@@ -13,6 +13,7 @@ namespace chainsplat::eval {
 
 using image_model::kSsimReach;
 using math::MatrixX;
+using math::Rectangle;
 
 namespace {
 
@@ -21,19 +22,10 @@ constexpr float kSolid = 0.5f;         // least 1 - T_end of the object
 constexpr int kCenterlinePoints = 97;  // mathematics.md 9
 constexpr double kSameTime = 1e-6;     // s; times closer than this are equal
 
-struct Rectangle {
-  int x0 = 0, y0 = 0, x1 = 0, y1 = 0;
-  bool empty() const { return x1 <= x0 || y1 <= y0; }
-};
-
-// The rectangle that encloses both, grown by the reach of SSIM's window, within the image.
+// What holds both, grown by the reach of SSIM's window, within the image.
 Rectangle compared(const Rectangle& a, const Rectangle& b, const capture::Camera& camera) {
   if (a.empty() && b.empty()) return {};
-  Rectangle all = a.empty() ? b : a;
-  if (!a.empty() && !b.empty())
-    all = {std::min(a.x0, b.x0), std::min(a.y0, b.y0), std::max(a.x1, b.x1), std::max(a.y1, b.y1)};
-  return {std::max(0, all.x0 - kSsimReach), std::max(0, all.y0 - kSsimReach),
-          std::min(camera.width, all.x1 + kSsimReach), std::min(camera.height, all.y1 + kSsimReach)};
+  return intersection(grown(enclosing(a, b), kSsimReach), {0, 0, camera.width, camera.height});
 }
 
 double psnr(double squared_sum, double count) {
@@ -125,7 +117,7 @@ FrameMetrics compare(const render::Frame& drawn, const capture::View& view, cons
   const splat::Picture& picture = drawn.picture;
   const Rectangle area = compared({view.x0, view.y0, view.x0 + view.width, view.y0 + view.height},
                                   {drawn.x0, drawn.y0, drawn.x0 + picture.width, drawn.y0 + picture.height}, camera);
-  const int width = area.x1 - area.x0, height = area.y1 - area.y0;
+  const int width = area.width(), height = area.height();
   std::vector<float> recorded(3u * width * height, 0.0f), rendered(3u * width * height, 0.0f);
   double squared = 0.0, object_squared = 0.0;
   std::int64_t object = 0, both = 0, either = 0;

@@ -47,7 +47,7 @@ constexpr int kNeighbors[4][2] = {{1, 0}, {0, 1}, {1, 1}, {-1, 1}};
 
 // Returns the labels (0 or 255) of the box's pixels by a minimum cut. `odds`: log odds per pixel, NaN where the pixel
 // is certainly outside.
-cv::Mat least_cut(const Picture& picture, const Box& box, const std::vector<float>& odds) {
+cv::Mat least_cut(const Picture& picture, const math::Rectangle& box, const std::vector<float>& odds) {
   const int width = box.width(), height = box.height();
   // one node per undecided pixel
   std::vector<int> node(odds.size(), -1);
@@ -136,7 +136,7 @@ std::vector<double> hidden_odds(const Look& appearance, const Picture& picture, 
 // hidden, whatever the marks, because the rope may have turned about itself.
 cv::Mat unusual_odds(const Look& appearance, const Picture& picture, const Tube& place, const chain::Chain& chain) {
   // mark the tube's pixels and those among them without the marks
-  const Box& box = place.box;
+  const math::Rectangle& box = place.box;
   cv::Mat in_tube(box.height(), box.width(), CV_32F, cv::Scalar(0)), other = in_tube.clone();
   int pixels = 0, unusual = 0;
   for (int y = box.y0; y < box.y1; ++y)
@@ -194,7 +194,7 @@ capture::View cut(const Look& appearance, const Picture& picture, const capture:
   const Reach where = reach(chain, base, camera);
   Tube place;
   if (theta) place = tube(chain, base, *theta, camera, 0.0, chain.length, kBand + (doubt - 1.0) * 2.0 * kPlacePixels);
-  const Box box = theta ? place.box : where.box;
+  const math::Rectangle box = theta ? place.box : where.box;
   capture::View view;
   if (box.empty()) return view;
   std::vector<float> odds(static_cast<std::size_t>(box.width()) * box.height(), std::nanf(""));

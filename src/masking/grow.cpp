@@ -256,7 +256,7 @@ struct Search {
         if (const auto* const rgb = pixel_at(in.picture, tip + pixels * u * across + beside_at(k, pixels) * forward))
           samples.beside[turn++ % 2].push_back(coarse(rgb));
   }
-  static bool pixel_outside(const Box& box, const Vector2& at) {
+  static bool pixel_outside(const math::Rectangle& box, const Vector2& at) {
     return at.x() < box.x0 || at.y() < box.y0 || at.x() >= box.x1 || at.y() >= box.y1;
   }
 

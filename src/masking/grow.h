@@ -22,7 +22,7 @@ struct Shot {
   const capture::Camera* camera = nullptr;
   math::Pose camera_from_base;
   std::vector<math::Vector2> on_rope;  // px, undistorted: points that the user says lie on the rope
-  std::optional<Box> bounds;           // the rope lies in here
+  std::optional<math::Rectangle> bounds;  // the rope lies in here
 };
 
 // What is known of the rope besides its size.

@@ -55,8 +55,8 @@ Help::Region region_of(const BoxHint& hint, const capture::Capture& scene) {
   const Vector2 low = capture::undistort(scene.cameras[c], Vector2(x0, y0)),
                 high = capture::undistort(scene.cameras[c], Vector2(x1, y1));
   return {c, hint.frame,
-          Box{static_cast<int>(std::floor(low.x())), static_cast<int>(std::floor(low.y())),
-              static_cast<int>(std::ceil(high.x())), static_cast<int>(std::ceil(high.y()))}};
+          math::Rectangle{static_cast<int>(std::floor(low.x())), static_cast<int>(std::floor(low.y())),
+                          static_cast<int>(std::ceil(high.x())), static_cast<int>(std::ceil(high.y()))}};
 }
 
 capture::Image8 picture_of(const EmptyScene& hint, const capture::Camera& camera) {

@@ -16,7 +16,7 @@ struct Help {
   struct Region {
     int camera = 0;
     std::optional<int> frame;  // none: all
-    Box box;
+    math::Rectangle box;
   };
   std::vector<Point> points;
   std::vector<Region> boxes;

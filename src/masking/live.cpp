@@ -42,10 +42,10 @@ struct LiveMasks::State {
   int frames = 0;
 
   void map_straight();
-  Picture straightened(const capture::Image8& recorded, const Box& box);
-  void learn_first_frame(const Picture& picture, const Box& box);
+  Picture straightened(const capture::Image8& recorded, const math::Rectangle& box);
+  void learn_first_frame(const Picture& picture, const math::Rectangle& box);
   std::optional<math::VectorX> grown_in(const Picture& picture, const math::Pose& base) const;
-  void learn_background(const Picture& picture, const Box& box, const Tube& around);
+  void learn_background(const Picture& picture, const math::Rectangle& box, const Tube& around);
   void learn_colors(const Picture& picture, const Reach& where, const Tube& around, const capture::View& mask);
 };
 
@@ -85,7 +85,7 @@ void LiveMasks::State::map_straight() {
 }
 
 // The frame without its lens distortion, inside the box. It is seen as long as `recorded` and the work space are.
-Picture LiveMasks::State::straightened(const capture::Image8& recorded, const Box& box) {
+Picture LiveMasks::State::straightened(const capture::Image8& recorded, const math::Rectangle& box) {
   const int width = camera.width, height = camera.height;
   if (!camera.distorted()) return {recorded.pixels.data(), width, height, 3};
   straight.resize(recorded.pixels.size());
@@ -99,7 +99,7 @@ Picture LiveMasks::State::straightened(const capture::Image8& recorded, const Bo
 }
 
 // The first frame's colors count as surroundings, since the rope covers little of them.
-void LiveMasks::State::learn_first_frame(const Picture& picture, const Box& box) {
+void LiveMasks::State::learn_first_frame(const Picture& picture, const math::Rectangle& box) {
   for (int y = box.y0; y < box.y1; ++y)
     for (int x = box.x0; x < box.x1; ++x) look.near.surroundings[color_bin(pixel(picture, x, y))] += 1.0;
   look.far.surroundings = look.near.surroundings;
@@ -116,7 +116,7 @@ std::optional<math::VectorX> LiveMasks::State::grown_in(const Picture& picture, 
 }
 
 // Learns the background in the box where the tube is not.
-void LiveMasks::State::learn_background(const Picture& picture, const Box& box, const Tube& around) {
+void LiveMasks::State::learn_background(const Picture& picture, const math::Rectangle& box, const Tube& around) {
   Background& background = look.background;
   for (int y = box.y0; y < box.y1; ++y)
     for (int x = box.x0; x < box.x1; ++x) {

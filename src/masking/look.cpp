@@ -156,7 +156,7 @@ struct Cells {
 Marks marks(std::span<const Picture> frames, std::span<const Tube> tubes, const chain::Chain& chain) {
   Cells cells(chain);
   for (std::size_t i = 0; i < frames.size(); ++i) {
-    const Box& box = tubes[i].box;
+    const math::Rectangle& box = tubes[i].box;
     for (int y = box.y0; y < box.y1; ++y)
       for (int x = box.x0; x < box.x1; ++x) cells.add(tubes[i], x, y, pixel(frames[i], x, y));
   }

@@ -54,7 +54,7 @@ inline const std::uint8_t* pixel(const Picture& picture, int x, int y) {
 
 // The pixels that the rope can reach at all: nearer to the grasp than its length, and not behind the grasp.
 struct Reach {
-  Box box;
+  math::Rectangle box;
   math::Vector2 grasp, along;         // px; unit, or zero where the rope points at the camera
   double radius = 0.0, behind = 0.0;  // px around the grasp, and px against `along`
   bool holds(int x, int y) const {

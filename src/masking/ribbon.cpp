@@ -106,11 +106,8 @@ std::vector<Station> stations_of(const Axis& axis, double from, double to, doubl
   return out;
 }
 
-double median_of(std::vector<double> values) {
-  if (values.empty()) return 0.0;
-  std::nth_element(values.begin(), values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2), values.end());
-  return values[values.size() / 2];
-}
+// Keeps the order of the values.
+double median_of(std::vector<double> values) { return math::median(values); }
 
 // The picture straightened along the axis: a row for every station, columns across it.
 struct Straight {
@@ -351,7 +348,7 @@ Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, 
     if (station.arclength < (1.0 - kTipShare) * length) widths.push_back(0.5 * (right - left) / station.radius);
   }
   out.axis.bulge = along.bulge;
-  out.width = widths.empty() ? 1.0 : median_of(widths);
+  out.width = widths.empty() ? 1.0 : math::median(widths);
   return out;
 }
 
@@ -399,7 +396,7 @@ Evidence evidence(const Picture& picture, const Axis& axis) {
   for (int c = 0; c < 3; ++c) {
     std::vector<double> values;
     for (const Color& one : sides[1]) values.push_back(one[c]);
-    usual[c] = static_cast<float>(median_of(values));
+    usual[c] = static_cast<float>(math::median(values));
   }
   std::vector<double> spread;
   for (const Color& one : sides[1]) spread.push_back(difference(one, usual));

@@ -4,18 +4,12 @@
 
 #include "chainsplat/capture.h"
 #include "chainsplat/chain.h"
+#include "chainsplat/rectangle.h"
 
 namespace chainsplat::masking {
 
-struct Box {  // pixels [x0, x1) x [y0, y1)
-  int x0 = 0, y0 = 0, x1 = 0, y1 = 0;
-  bool empty() const { return x1 <= x0 || y1 <= y0; }
-  int width() const { return x1 - x0; }
-  int height() const { return y1 - y0; }
-};
-
 struct Tube {
-  Box box;
+  math::Rectangle box;
   std::vector<float> outside;  // px to the outline, negative inside; kFar beyond the requested reach
   std::vector<float> along;    // m, arclength of the nearest point of the centerline
   std::vector<char> left;      // whether it is left of the centerline, seen toward the free end in the picture

@@ -19,7 +19,8 @@ constexpr double kFar = 1e6;  // px; keeps very large bounds in the range of int
 
 }  // namespace
 
-Bounds reach(const splat::Gaussians& g, const std::vector<math::Pose>& motions, const capture::Camera& camera) {
+math::Rectangle reach(const splat::Gaussians& g, const std::vector<math::Pose>& motions,
+                      const capture::Camera& camera) {
   CHAINSPLAT_CHECK(static_cast<int>(motions.size()) == g.links, std::to_string(motions.size()));
   const math::Pose camera_from_world = camera.world_from_camera.inverse();
   std::vector<math::Pose> camera_from_home;

@@ -5,6 +5,7 @@
 
 namespace chainsplat::render {
 
+using math::Rectangle;
 using math::Vector2;
 
 namespace {
@@ -15,19 +16,11 @@ constexpr int kBorderStep = 8;                   // px between the border points
 constexpr double kTimeSlack = 1e-9;              // s; covers the rounding of frame times
 constexpr float kSolid = 0.5f;                   // least alpha of the object (formats.md 5.4)
 
-Bounds cut(const Bounds& a, const Bounds& b) {
-  return {std::max(a.x0, b.x0), std::max(a.y0, b.y0), std::min(a.x1, b.x1), std::min(a.y1, b.y1)};
-}
-
-Bounds grown(const Bounds& bounds, int margin) {
-  return {bounds.x0 - margin, bounds.y0 - margin, bounds.x1 + margin, bounds.y1 + margin};
-}
-
-Bounds image_of(const capture::Camera& camera) { return {0, 0, camera.width, camera.height}; }
+Rectangle image_of(const capture::Camera& camera) { return {0, 0, camera.width, camera.height}; }
 
 // The rectangle that encloses the image of the border of `bounds` under `map`.
 template <class Map>
-Bounds mapped(const Bounds& bounds, Map map) {
+Rectangle mapped(const Rectangle& bounds, Map map) {
   Vector2 low(1e9, 1e9), high(-1e9, -1e9);
   const auto include = [&](double x, double y) {
     const Vector2 p = map(Vector2(x, y));
@@ -45,7 +38,7 @@ Bounds mapped(const Bounds& bounds, Map map) {
 // The position of every recorded pixel's center in the undistorted image; made once per camera.
 struct Lens {
   bool active = false;
-  Bounds field_of_view;           // undistorted rectangle that encloses the whole recorded image
+  Rectangle field_of_view;        // undistorted rectangle that encloses the whole recorded image
   std::vector<Vector2> straight;  // width x height, undistorted px
 };
 
@@ -67,7 +60,7 @@ Lens make_lens(const capture::Camera& camera, bool undistorted) {
 
 // Warps the picture of the undistorted rectangle `drawn` to the recorded pixels of `crop`. Colors are interpolated
 // bilinearly, black outside; depth is that of the nearest pixel, because a mean across an edge lies on no surface.
-splat::Picture warp(const splat::Picture& from, const Bounds& drawn, const Bounds& crop, const Lens& lens,
+splat::Picture warp(const splat::Picture& from, const Rectangle& drawn, const Rectangle& crop, const Lens& lens,
                     int image_width) {
   splat::Picture to;
   to.width = crop.x1 - crop.x0;
@@ -132,7 +125,7 @@ void for_batches(splat::Engine& engine, const splat::Gaussians& gaussians, const
   // plan every frame that the states cover: link motions and the rectangles to draw and to return
   struct Plan {
     Frame frame;
-    Bounds drawn, crop;  // undistorted and recorded pixels
+    Rectangle drawn, crop;  // undistorted and recorded pixels
     std::vector<math::Pose> motions;
   };
   std::vector<Plan> plans;
@@ -147,11 +140,13 @@ void for_batches(splat::Engine& engine, const splat::Gaussians& gaussians, const
   core::parallel_for(static_cast<std::int64_t>(plans.size()), [&](std::int64_t k) {
     Plan& plan = plans[k];
     plan.motions = chain::link_motions(chain, chain::interpolate(states, plan.frame.time), base.pose(plan.frame.time));
-    const Bounds content = cut(reach(gaussians, plan.motions, camera), grown(lens.field_of_view, options.margin));
+    const Rectangle content =
+        intersection(reach(gaussians, plan.motions, camera), grown(lens.field_of_view, options.margin));
     if (content.empty()) return;
     const auto to_recorded = [&](const Vector2& p) { return capture::distort(camera, p); };
-    plan.drawn = lens.active ? content : cut(grown(content, options.margin), image_of(camera));
-    plan.crop = lens.active ? cut(grown(mapped(cut(content, lens.field_of_view), to_recorded), options.margin),
+    plan.drawn = lens.active ? content : intersection(grown(content, options.margin), image_of(camera));
+    plan.crop = lens.active ? intersection(
+                                  grown(mapped(intersection(content, lens.field_of_view), to_recorded), options.margin),
                                   image_of(camera))
                             : plan.drawn;
     if (plan.crop.empty()) plan.drawn = plan.crop = {};
