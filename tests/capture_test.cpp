@@ -5,6 +5,7 @@
 
 #include <sys/stat.h>
 #include <unistd.h>
+#include <zlib.h>
 
 #include <cmath>
 #include <filesystem>
@@ -857,6 +858,22 @@ TEST_CASE("files that are missing, cut off or of another kind") {
     CHECK(contains(made.refused(), "cam0/000002.png"));
     made.write(numbered("cam0", 2), "not an image");
     CHECK(contains(made.refused(), "cam0/000002.png: is not a readable image"));
+  }
+  SUBCASE("a sound PNG of too little data, of which libpng would print a line") {
+    const std::string whole = core::read_file(made.path() / numbered("masks/cam1", 2));
+    const auto number = [](std::uint32_t value) {
+      std::string bytes;
+      for (const int shift : {24, 16, 8, 0}) bytes += static_cast<char>(value >> shift & 0xff);
+      return bytes;
+    };
+    const auto chunk = [&](const std::string& content) {  // name and data
+      const auto sum = ::crc32(0, reinterpret_cast<const Bytef*>(content.data()), static_cast<uInt>(content.size()));
+      return number(static_cast<std::uint32_t>(content.size() - 4)) + content + number(static_cast<std::uint32_t>(sum));
+    };
+    const std::string deflated = "\x78\x9c";  // of nothing
+    const std::string head = "IHDR" + number(kWidth) + number(kHeight) + std::string("\x08\x00\x00\x00\x00", 5);
+    made.write(numbered("masks/cam1", 2), whole.substr(0, 8) + chunk(head) + chunk("IDAT" + deflated) + chunk("IEND"));
+    CHECK(contains(made.refused(), "000002.png: has less data than pixels"));
   }
   SUBCASE("a depth image of 8 bits") {
     capture::write_png(made.path() / numbered("depth/cam0", 0), disk_mask(0));

@@ -1,7 +1,8 @@
-// chainsplat/json.h - JSON from outside, read with bounds. Not installed: no header that is names the JSON library.
+// chainsplat/json.h - JSON from outside, read with bounds, and written. Not installed: no header that is names the JSON library.
 #pragma once
 #include <cstdint>
 #include <nlohmann/json_fwd.hpp>
+#include <string>
 #include <string_view>
 
 namespace chainsplat::core {
@@ -18,5 +19,10 @@ nlohmann::ordered_json parse_json_or_discard(std::string_view text);
 int whole_number(const nlohmann::ordered_json& value);
 // The same of a whole number from 0 on.
 std::uint64_t unsigned_number(const nlohmann::ordered_json& value);
+
+// The text of a document, with `indent` spaces per level; below 0: on one line. Bytes that are no UTF-8, as names of
+// files may have, become U+FFFD.
+std::string json_text(const nlohmann::ordered_json& document, int indent = 1);
+std::string json_text(const nlohmann::json& document, int indent = 1);
 
 }  // namespace chainsplat::core

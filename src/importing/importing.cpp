@@ -9,6 +9,7 @@
 
 #include "base_log.h"
 #include "calibration.h"
+#include "chainsplat/json.h"
 #include "chainsplat/text.h"
 #include "clock.h"
 #include "document.h"
@@ -524,7 +525,7 @@ void write_capture(const Path& out, const Options& options, const std::vector<Ca
     document["cameras"].push_back(camera_json(camera, images, masks));
     imported.pictures.push_back(write_picture(out, camera, motion, options));
   }
-  core::write_file(out / "capture.json", document.dump(1, ' ', false, Json::error_handler_t::replace) + "\n");
+  core::write_file(out / "capture.json", core::json_text(document) + "\n");
 }
 
 }  // namespace
@@ -649,8 +650,7 @@ Imported import_capture(const Path& out, const Options& given) {
   } catch (const InputError& damaged) {  // found only while copying
     throw WorkError(damaged.where, damaged.problem, damaged.mend + "; " + out.string() + " is unfinished");
   }
-  core::write_file(out / kImportFile,
-                   provenance(given, origin, notes).dump(1, ' ', false, Json::error_handler_t::replace) + "\n");
+  core::write_file(out / kImportFile, core::json_text(provenance(given, origin, notes)) + "\n");
   return imported;
 }
 

@@ -404,8 +404,7 @@ void collect(const BatchPlan& plan, const Path& folder) {
   for (const BatchJob& job : plan.jobs) rows.push_back(read_row(job, folder));
   const Groups groups = group(rows);
   core::write_file(folder / "results.csv", csv(rows));
-  core::write_file(folder / "results.json",
-                   json(rows, groups).dump(1, ' ', false, Json::error_handler_t::replace) + "\n");
+  core::write_file(folder / "results.json", core::json_text(json(rows, groups)) + "\n");
   core::write_file(folder / "results.html", html(rows, groups));
 }
 

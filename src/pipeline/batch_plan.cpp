@@ -253,7 +253,7 @@ void save_plan(const BatchPlan& plan, const Path& folder) {
                     {"settings", job.settings},
                     {"seed", job.seed},
                     {"arguments", job.arguments}});
-  core::write_file(folder / kPlanFile, Json{{"format", "chainsplat-batch/1"}, {"jobs", jobs}}.dump(1) + "\n");
+  core::write_file(folder / kPlanFile, core::json_text(Json{{"format", "chainsplat-batch/1"}, {"jobs", jobs}}) + "\n");
 }
 
 BatchPlan load_plan(const Path& folder) {

@@ -56,7 +56,7 @@ void save_end(const Path& folder, const BatchJob& job, const JobEnd& end) {
                       {"stopped", end.stopped},
                       {"seconds", std::round(end.seconds * 1e3) / 1e3},
                       {"error", end.error}};
-  core::write_file(end_file(folder, job), document.dump(1, ' ', false, Json::error_handler_t::replace) + "\n");
+  core::write_file(end_file(folder, job), core::json_text(document) + "\n");
 }
 
 bool load_end(const Path& folder, const BatchJob& job, JobEnd& end) {

@@ -259,6 +259,7 @@ const std::vector<capture::Camera>& Tracker::cameras() const { return implementa
 
 void FollowOptions::check() const {
   if (drop < 1) throw InputError("`drop`", "must be 1 or more", "give 2 for every second frame");
+  if (std::isnan(source.rate)) throw InputError("`rate`", "is not a number", "give frames a second");
 }
 
 struct Follower::Implementation {

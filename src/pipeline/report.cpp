@@ -34,24 +34,30 @@ nlohmann::ordered_json read_metrics(const Path& file) {
   return metrics;
 }
 
-}  // namespace
-
-std::string report(const Path& run, const ReportOptions& options, const core::Listener& listener) {
-  const core::ListenerScope scope(listener);
+// `anyhow`: also without the capture, where it is another one by now.
+std::string page_of(const Path& run, const ReportOptions& options, bool anyhow) {
   report::Contents contents;
   Path folder;
   contents.twin = load_twin(run);
   contents.base = own_base(run, contents.twin.states);
   contents.twin.states.covariance = read_covariances(run / kCovarianceFile, contents.twin.states);
   contents.metrics = read_metrics(run / kMetricsFile);
-  if (std::optional<capture::Capture> facts = own_recording(contents.twin, run, options.capture)) {
+  std::optional<capture::Capture> facts;
+  std::string why = "its capture is not there any more";
+  try {
+    facts = own_recording(contents.twin, run, options.capture);
+  } catch (const InputError& error) {
+    if (!anyhow) throw;
+    why = error.what();
+  }
+  if (facts) {
     contents.cameras = std::move(facts->cameras);
     contents.times = std::move(facts->times);
     folder = facts->folder;
   } else if (!options.videos.empty()) {
     throw InputError("`video`", "the capture of " + run.string() + " is not there any more", "name it with `capture`");
   } else {
-    core::warn(run.string() + ": its capture is not there any more; the report shows no cameras");
+    core::warn(run.string() + ": " + why + "; the report shows no cameras");
   }
   for (const std::string& camera : options.videos) {
     core::report({"video", 0, 0, NAN, NAN, "frames of " + camera});
@@ -60,6 +66,17 @@ std::string report(const Path& run, const ReportOptions& options, const core::Li
   return report::page(contents);
 }
 
-void write_report(const Path& run) { core::write_file(run / kReportFile, report(run, {})); }
+}  // namespace
+
+std::string report(const Path& run, const ReportOptions& options, const core::Listener& listener) {
+  const core::ListenerScope scope(listener);
+  constexpr bool kAnyhow = false;
+  return page_of(run, options, kAnyhow);
+}
+
+void write_report(const Path& run) {
+  constexpr bool kAnyhow = true;  // the page comes last, when the twin is saved
+  core::write_file(run / kReportFile, page_of(run, {}, kAnyhow));
+}
 
 }  // namespace chainsplat::pipeline

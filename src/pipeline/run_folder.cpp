@@ -276,13 +276,13 @@ void ProgressLog::write(const core::Progress& progress) {
   record["total"] = progress.total;
   record["loss"] = progress.loss;  // NaN is written as null
   record["psnr"] = progress.psnr;
-  write(record.dump(-1, ' ', false, nlohmann::json::error_handler_t::replace));
+  write(core::json_text(record, -1));
 }
 
 void ProgressLog::write(const std::string& json) {
   nlohmann::ordered_json entry = core::parse_json(json);
   entry["seconds"] = std::round((core::seconds_now() - opened_) * 1e3) / 1e3;
-  file_ << entry.dump(-1, ' ', false, nlohmann::json::error_handler_t::replace) << std::endl;
+  file_ << core::json_text(entry, -1) << std::endl;
 }
 
 }  // namespace chainsplat::pipeline

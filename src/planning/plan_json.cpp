@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <nlohmann/json.hpp>
 
+#include "chainsplat/json.h"
 #include "chainsplat/motion_files.h"
 #include "chainsplat/solve_json.h"
 
@@ -117,7 +118,7 @@ std::string plan_json(const Problem& problem, const Options& options, const Plan
                       std::span<const Simulated> simulated) {
   Json document = document_of(problem, options, plan, horizon);
   for (const Simulated& s : simulated) document["simulated"][s.name] = loop_json(s.loop, options.tolerance);
-  return document.dump(1, ' ', false, Json::error_handler_t::replace) + "\n";
+  return core::json_text(document) + "\n";
 }
 
 }  // namespace chainsplat::planning

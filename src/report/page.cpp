@@ -4,6 +4,7 @@
 #include <string_view>
 
 #include "chainsplat/image_model.h"
+#include "chainsplat/json.h"
 #include "chainsplat/report.h"
 #include "chainsplat/twin_json.h"
 #include "report_page.h"
@@ -269,7 +270,7 @@ std::string page(const Contents& contents) {
   CHAINSPLAT_CHECK(place != std::string_view::npos, "the page has no place for data");
   std::string out(kWhole.substr(0, place));
   // a name with "</script>" in it would end the data
-  for (const char letter : document(contents).dump(-1, ' ', false, Json::error_handler_t::replace))
+  for (const char letter : core::json_text(document(contents), -1))
     if (letter == '<')
       out += "\\u003c";
     else

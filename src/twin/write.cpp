@@ -28,7 +28,7 @@ Json list(const Vector& values) {
 Json list(const math::VectorX& values) { return list(std::vector<double>(values.begin(), values.end())); }
 
 // JSON text of a value. Bytes of file names that are not UTF-8 are replaced, because JSON cannot represent them.
-std::string text_of(const Json& value) { return value.dump(-1, ' ', false, Json::error_handler_t::replace); }
+std::string text_of(const Json& value) { return core::json_text(value, -1); }
 
 // Prints objects, and lists of objects or of lists, over several lines, but a list of numbers on one line.
 void print(const Json& value, const std::string& indent, std::string& out) {

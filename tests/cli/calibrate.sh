@@ -11,6 +11,8 @@ expect_output 'Print .*board.svg at 100 %.*' 'a board'
 grep -q '^<svg .*width="260.000mm" height="196.000mm"' "$work/board.svg" || fail 'a board: another size'
 python3 -c 'import json, sys; d = json.load(open(sys.argv[1])); assert d["tag_size"] == 0.06 and d["first_id"] == 5, d' "$board" ||
   fail 'a board: another description'
+run calibrate --board-svg "$work/"$'b\xff.svg' --json
+expect_code 0 'calibrate --board-svg, a name that is no UTF-8'
 expect_error 2 'exists already' calibrate --board-svg "$work/board.svg"
 expect_error 2 '--tags: .5by7. is no grid' calibrate --board-svg "$work/other.svg" --tags 5by7
 expect_error 2 '--spacing: .*too little white' calibrate --board-svg "$work/other.svg" --spacing 1mm

@@ -38,6 +38,16 @@ run identify "$work/anew"
 expect_code 0 identify
 cmp -s "$work/anew/report.html" "$page" && fail 'identify: the page still has the metrics of before'
 
+# where the capture is another one by now, what was identified is not lost
+cp -r "$work/anew" "$work/elsewhere"
+cp -r "$demo" "$work/other_capture"
+chmod -R u+w "$work/other_capture"
+sed -i 's|"path":"[^"]*"|"path":"../other_capture"|; s|"path": "[^"]*"|"path": "../other_capture"|' "$work/elsewhere/twin.json"
+echo >>"$work/other_capture/capture.json"
+run identify "$work/elsewhere"
+expect_code 0 'identify, another capture'
+grep -q 'has changed since.*shows no cameras' "$work/stderr" || fail 'identify, another capture: does not say so'
+
 if [ -z "$browser" ]; then
   [ "$failures" -eq 0 ] || finish
   echo 'skipped: there is no chromium'

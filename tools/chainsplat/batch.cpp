@@ -15,6 +15,7 @@
 #include <sstream>
 
 #include "chainsplat/gpu.h"
+#include "chainsplat/json.h"
 #include "chainsplat/run_folder.h"
 #include "cli.h"
 
@@ -72,7 +73,7 @@ std::string status_json(const BatchPlan& plan, const Path& folder) {
                     {"settings", job.settings},
                     {"seed", job.seed}});
   }
-  return Json{{"folder", folder.string()}, {"jobs", jobs}}.dump(1, ' ', false, Json::error_handler_t::replace) + "\n";
+  return core::json_text(Json{{"folder", folder.string()}, {"jobs", jobs}}) + "\n";
 }
 
 // The lines of a batch on a terminal, redrawn in place; plain lines elsewhere.

@@ -20,6 +20,7 @@
 #include "chainsplat/estimation.h"
 #include "chainsplat/eval.h"
 #include "chainsplat/image_model.h"
+#include "chainsplat/json.h"
 #include "chainsplat/pipeline.h"
 #include "chainsplat/recognition.h"
 #include "chainsplat/render.h"
@@ -409,7 +410,7 @@ void bench(const Globals& globals, const Request& request) {
   if (!globals.json)
     std::cout << "largest memory of the process: " << std::fixed << std::setprecision(0) << peak_memory_mib()
               << " MiB\n";
-  if (globals.json) std::cout << document.dump(1) << "\n";
+  if (globals.json) std::cout << core::json_text(document) << "\n";
 }
 
 }  // namespace

@@ -9,6 +9,7 @@
 
 #include "camera_options.h"
 #include "chainsplat/calibration.h"
+#include "chainsplat/json.h"
 #include "cli.h"
 
 namespace chainsplat::tools {
@@ -53,7 +54,7 @@ void write_board(const Globals& globals, const Request& request) {
   core::write_file(svg, calibration::board_svg(board));
   core::write_file(json, calibration::write_board(board));
   if (globals.json) {
-    std::cout << Json{{"svg", svg.string()}, {"board", json.string()}}.dump(1) << "\n";
+    std::cout << core::json_text(Json{{"svg", svg.string()}, {"board", json.string()}}) << "\n";
     return;
   }
   std::cout << "Print " << core::printable(svg.string()) << " at 100 %, glue it on something flat, measure the ruler "
@@ -127,7 +128,7 @@ void calibrate(const Globals& globals, Request& request) {
     Json document = calibration::to_json(result);
     document["pictures"] = Json::array();
     for (const Path& picture : result.pictures) document["pictures"].push_back(picture.string());
-    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+    std::cout << core::json_text(document) << "\n";
   } else {
     for (const std::string& note : result.notes) std::cout << core::printable(with_options(note)) << "\n";
     std::cout << table(result);

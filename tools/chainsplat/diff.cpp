@@ -166,7 +166,7 @@ void diff(const Globals& globals, const std::string& first, const std::string& s
       for (const Difference& d : part->found())
         document[key].push_back({{"what", d.what}, {"first", d.first}, {"second", d.second}, {"note", d.note}});
     }
-    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+    std::cout << core::json_text(document) << "\n";
     return;
   }
   const auto print = [](const char* title, const Comparison& part, const char* same) {

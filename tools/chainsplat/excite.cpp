@@ -7,6 +7,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/excitation.h"
+#include "chainsplat/json.h"
 #include "chainsplat/motion_files.h"
 #include "chainsplat/rope.h"
 #include "chainsplat/run_folder.h"
@@ -75,7 +76,7 @@ void write_files(const Request& request, const excitation::Result& result, const
   core::write_file(beside("base.csv", ".csv"), planning::motion_csv(result.motion, times));
   if (single) return;
   core::write_file(out / "states.csv", twin::states_csv(result.states));
-  core::write_file(out / "excite.json", document.dump(1) + "\n");
+  core::write_file(out / "excite.json", core::json_text(document) + "\n");
 }
 
 void print(const Request& request, const excitation::Result& result) {
@@ -127,7 +128,7 @@ void excite(const Globals& globals, Request& request) {
   const Json document = document_of(result, request);
   write_files(request, result, document);
   if (globals.json)
-    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+    std::cout << core::json_text(document) << "\n";
   else
     print(request, result);
 }

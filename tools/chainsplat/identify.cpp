@@ -9,6 +9,7 @@
 #include <memory>
 #include <nlohmann/json.hpp>
 
+#include "chainsplat/json.h"
 #include "chainsplat/pipeline.h"
 #include "chainsplat/properties.h"
 #include "chainsplat/run_folder.h"
@@ -107,7 +108,7 @@ void identify(const Globals& globals, const Request& request) {
   }
   end_progress();
   if (globals.json) {
-    std::cout << document_of(result.twins[0], request.runs).dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+    std::cout << core::json_text(document_of(result.twins[0], request.runs)) << "\n";
     return;
   }
   print_estimates(result.twins[0].estimates);
@@ -142,7 +143,7 @@ void identify_online(const Globals& globals, const OnlineRequest& request) {
     document["before"] = before.values;
     document["estimates"] = now.values;
     document["standard_errors"] = now.standard_errors;
-    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+    std::cout << core::json_text(document) << "\n";
     return;
   }
   char text[200];

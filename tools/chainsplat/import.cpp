@@ -7,6 +7,7 @@
 
 #include "camera_options.h"
 #include "chainsplat/importing.h"
+#include "chainsplat/json.h"
 #include "cli.h"
 
 namespace chainsplat::tools {
@@ -114,7 +115,7 @@ void import_capture(const Globals& globals, Request& request) {
     document["notes"] = notes;
     document["pictures"] = pictures;
     document["check"] = report.document;
-    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+    std::cout << core::json_text(document) << "\n";
   } else {
     for (const std::string& note : notes) std::cout << core::printable(note) << "\n";
     std::cout << report.text;

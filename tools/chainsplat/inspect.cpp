@@ -9,6 +9,7 @@
 
 #include "chainsplat/capture.h"
 #include "chainsplat/gpu.h"
+#include "chainsplat/json.h"
 #include "chainsplat/pipeline.h"
 #include "chainsplat/twin_json.h"
 #include "cli.h"
@@ -22,7 +23,7 @@ using Json = nlohmann::ordered_json;
 void check(const Globals& globals, const std::string& path) {
   const CheckReport report = check_report(path, true);
   if (globals.json)
-    std::cout << report.document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+    std::cout << core::json_text(report.document) << "\n";
   else
     std::cout << report.text;
   if (report.problems == 0) return;
@@ -63,7 +64,7 @@ void doctor(const Globals& globals) {
   document["missing"] = found.missing;
   document["validation_layer"] = found.validation_layer;
   document["pipeline_cache"] = found.pipeline_cache;
-  std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+  std::cout << core::json_text(document) << "\n";
 }
 
 }  // namespace

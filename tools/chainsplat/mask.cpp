@@ -11,6 +11,7 @@
 #include <nlohmann/json.hpp>
 #include <optional>
 
+#include "chainsplat/json.h"
 #include "chainsplat/masks.h"
 #include "cli.h"
 
@@ -176,7 +177,7 @@ void print_document(const Request& request, const pipeline::MaskResult& result) 
   if (grasp.norm() > 0.0) document["grasp_offset"] = {grasp.x(), grasp.y(), grasp.z()};
   if (!request.preview.empty()) document["preview"] = request.preview;
   for (const auto& [camera, iou] : result.agreement) document["iou"][camera] = iou;
-  std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+  std::cout << core::json_text(document) << "\n";
 }
 
 void make_masks(const Globals& globals, const Request& request) {

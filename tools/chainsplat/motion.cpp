@@ -6,6 +6,7 @@
 
 #include "chainsplat/draw.h"
 #include "chainsplat/dynamics/base_wrench.h"
+#include "chainsplat/json.h"
 #include "chainsplat/pipeline.h"
 #include "chainsplat/run_folder.h"
 #include "chainsplat/twin.h"
@@ -75,7 +76,7 @@ void rollout(const Globals& globals, const RolloutRequest& request) {
   document["rows"] = states.time.size();
   document["start"] = states.time.front();
   document["end"] = states.time.back();
-  std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+  std::cout << core::json_text(document) << "\n";
 }
 
 struct RenderRequest {
@@ -106,7 +107,7 @@ void render(const Globals& globals, const RenderRequest& request) {
     document["cameras"][name] = frames;
   }
   if (globals.json)
-    std::cout << document.dump(1, ' ', false, Json::error_handler_t::replace) << "\n";
+    std::cout << core::json_text(document) << "\n";
   else
     say(std::to_string(total) + " frames: " + request.out);
 }

@@ -1,9 +1,12 @@
 // new.cpp - a twin without videos: empty, to identify from measured markers, or a rod of known stiffness and mass.
 #include <CLI/CLI.hpp>
+#include <cmath>
 #include <iostream>
 #include <memory>
 #include <nlohmann/json.hpp>
+#include <utility>
 
+#include "chainsplat/json.h"
 #include "chainsplat/pipeline.h"
 #include "chainsplat/run_folder.h"
 #include "cli.h"
@@ -52,7 +55,18 @@ dynamics::Parameters rod(const chain::Chain& chain, const Request& request, cons
   return rod;
 }
 
+// What CLI11's bounds let pass: no comparison with NaN is true.
+void check_numbers(const Request& request) {
+  for (const auto& [option, value] : {std::pair("--length", request.length),
+                                      {"--diameter", request.diameter},
+                                      {"--mass", request.mass},
+                                      {"--bending-stiffness", request.bending_stiffness},
+                                      {"--retardation", request.retardation}})
+    if (std::isnan(value)) throw InputError(option, "is not a number", "give one");
+}
+
 void make_new(const Globals& globals, const Request& request) {
+  check_numbers(request);
   if (request.bending_stiffness >= 0.0 && !(request.mass > 0.0))
     throw InputError("--bending-stiffness", "moves nothing without a mass", "give --mass too");
   if (request.retardation > 0.0 && request.bending_stiffness < 0.0)
@@ -91,7 +105,7 @@ void make_new(const Globals& globals, const Request& request) {
     document["run"] = request.out;
     document["joints"] = twin.chain.links() - 1;
     document["angles"] = twin.chain.angles();
-    std::cout << document.dump(1, ' ', false, nlohmann::ordered_json::error_handler_t::replace) << "\n";
+    std::cout << core::json_text(document) << "\n";
   } else {
     std::cout << "twin: " << request.out << "\n";
   }

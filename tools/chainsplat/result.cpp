@@ -8,6 +8,7 @@
 #include "chainsplat/capture.h"
 #include "chainsplat/eval.h"
 #include "chainsplat/export.h"
+#include "chainsplat/json.h"
 #include "chainsplat/pipeline.h"
 #include "chainsplat/run_folder.h"
 #include "chainsplat/synth.h"
@@ -67,9 +68,7 @@ void report(const Globals& globals, const ReportRequest& request) {
   write_result(request.out, page);
   if (request.out == "-") return;
   if (globals.json)
-    std::cout << nlohmann::ordered_json{{"output", request.out}, {"bytes", page.size()}}.dump(
-                     -1, ' ', false, nlohmann::ordered_json::error_handler_t::replace)
-              << "\n";
+    std::cout << core::json_text(nlohmann::ordered_json{{"output", request.out}, {"bytes", page.size()}}, -1) << "\n";
   else
     say("written: " + request.out + ", " + std::to_string(page.size() / 1024) + " KiB; open it in a browser");
 }
@@ -123,7 +122,7 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
   if (globals.json) {
     nlohmann::ordered_json document{{"output", request.out}, {"files", nlohmann::ordered_json::array()}};
     for (const Path& file : files) document["files"].push_back(file.string());
-    std::cout << document.dump(-1, ' ', false, nlohmann::ordered_json::error_handler_t::replace) << "\n";
+    std::cout << core::json_text(document, -1) << "\n";
     return;
   }
   for (const Path& file : files) say("written: " + file.string());
@@ -165,9 +164,7 @@ void synthesize(const Globals& globals, const SynthRequest& request) {
   options.video = !request.images;
   synth::write(engine, twin, states, scene, out, options);
   if (globals.json)
-    std::cout << nlohmann::ordered_json{{"capture", request.out}}.dump(-1, ' ', false,
-                                                                       nlohmann::ordered_json::error_handler_t::replace)
-              << "\n";
+    std::cout << core::json_text(nlohmann::ordered_json{{"capture", request.out}}, -1) << "\n";
   else
     say("capture: " + request.out);
 }

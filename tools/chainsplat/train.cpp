@@ -4,6 +4,7 @@
 #include <memory>
 #include <nlohmann/json.hpp>
 
+#include "chainsplat/json.h"
 #include "chainsplat/pipeline.h"
 #include "chainsplat/properties.h"
 #include "chainsplat/run_folder.h"
@@ -64,7 +65,7 @@ void train(const Globals& globals, const Request& request) {
   const pipeline::TrainResult result = pipeline::train(request.capture, request.out, options, terminal());
   end_progress();
   if (globals.json) {
-    std::cout << summary_json(result, Path(request.out).string()).dump(1) << "\n";
+    std::cout << core::json_text(summary_json(result, Path(request.out).string())) << "\n";
     return;
   }
   std::vector<MetricsRow> rows;

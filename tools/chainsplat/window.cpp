@@ -10,6 +10,7 @@
 
 #include "chainsplat/core.h"
 #include "chainsplat/image_model.h"
+#include "chainsplat/json.h"
 #include "page_server.h"
 #include "window_page.h"
 
@@ -80,7 +81,7 @@ struct Window::Implementation {
     document["latency"] = latency;
     out.rest = rgb;
     lock.unlock();  // the estimator waits for no text
-    const std::string text = document.dump();
+    const std::string text = core::json_text(document, -1);
     out.type = "application/octet-stream";
     out.body.assign(4, '\0');
     for (int i = 0; i < 4; ++i) out.body[i] = static_cast<char>(text.size() >> 8 * i & 0xff);

@@ -100,8 +100,10 @@ std::string damage_of_png(const Path& file) {
     stream.read(reinterpret_cast<char*>(b), sizeof b);
     return std::uint32_t{b[0]} << 24u | std::uint32_t{b[1]} << 16u | std::uint32_t{b[2]} << 8u | b[3];
   };
+  constexpr std::uint64_t kMostInflated = 1032;  // bytes that one byte of deflate's can become
   std::error_code error;
   const std::uintmax_t at_most = std::filesystem::file_size(file, error);
+  std::uint64_t needed = 0, compressed = 0;  // bytes of the rows, and of what they are to be made from
   for (std::vector<char> chunk;;) {  // each chunk has its length, name, data and the checksum of name and data
     const std::uint32_t length = number();
     if (!stream || length > at_most) return kCutOff;
@@ -112,13 +114,19 @@ std::string damage_of_png(const Path& file) {
     if (::crc32(0, reinterpret_cast<const Bytef*>(chunk.data()), static_cast<uInt>(chunk.size())) != sum)
       return "is damaged";
     const std::string_view name(chunk.data(), 4);
-    if (name == "IHDR" && length >= 8)
-      for (const std::size_t at : {4u, 8u}) {
-        std::uint32_t side = 0;
-        for (std::size_t i = 0; i < 4; ++i) side = side << 8u | static_cast<unsigned char>(chunk[at + i]);
-        if (side == 0 || side > kLargestSide) return "claims a side of " + std::to_string(side) + " pixels";
-      }
-    if (name == "IEND") return "";
+    if (name == "IHDR" && length >= 10) {
+      const auto byte = [&](std::size_t at) { return std::uint32_t{static_cast<unsigned char>(chunk[at])}; };
+      const auto side = [&](std::size_t at) {
+        return byte(at) << 24u | byte(at + 1) << 16u | byte(at + 2) << 8u | byte(at + 3);
+      };
+      const std::uint32_t width = side(4), height = side(8), bits = byte(12), color = byte(13);
+      for (const std::uint32_t one : {width, height})
+        if (one == 0 || one > kLargestSide) return "claims a side of " + std::to_string(one) + " pixels";
+      const std::uint64_t channels = (color & 1u) != 0 ? 1 : 1 + (color & 2u) + (color >> 2u & 1u);
+      needed = height * ((width * channels * bits + 7) / 8);
+    }
+    if (name == "IDAT") compressed += length;
+    if (name == "IEND") return compressed * kMostInflated < needed ? "has less data than pixels" : "";
   }
 }
 
