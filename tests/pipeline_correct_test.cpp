@@ -49,6 +49,21 @@ TEST_CASE("half a pixel is named and taken back, and is not found where there is
   }
 }
 
+TEST_CASE("a base that no camera sees is a problem, not a crash") {
+  for (const double far : {30.0, 5e5}) {  // m, no unit's factor
+    capture::Capture capture = demo();
+    std::vector<trajectory::Sample> samples = capture.base.samples();
+    for (trajectory::Sample& sample : samples) sample.pose.translation.z() += far;
+    capture.base = trajectory::fit(samples, "base.tum");
+    const pipeline::Corrected found = pipeline::correct(capture, {}, false);
+    const capture::Finding* const said = finding(found.verdict, "unseen", "base");
+    REQUIRE(said);
+    CHECK(said->impossible);
+    CHECK(found.corrections.empty());
+    CHECK(pipeline::correct(capture, {}, true).corrections.empty());
+  }
+}
+
 TEST_CASE("a darker camera is named, and its pictures stay as they are") {
   constexpr double kDark = 0.7;
   capture::Capture capture = demo();

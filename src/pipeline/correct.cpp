@@ -318,6 +318,13 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
     chain = chain_of(chain::Bending::planar);
     sequence = silhouette::fit_sequence(chain, capture);
   }
+  if (std::none_of(sequence.frames.begin(), sequence.frames.end(),
+                   [](const auto& f) { return f.residual_pixels > 0.0; })) {
+    out.verdict.push_back({"unseen", "base", 0.0, 0.0, "share", false, false, true, -1,
+                           "no camera sees the rope where the base's motion and the grasp put it: the base and the "
+                           "cameras are not in one world, or not all in meters"});
+    return out;
+  }
   silhouette::CorrectionOptions options;
   options.held = fixed;
   for (const double shift : kShifts) options.mistakes.push_back(shifted_images(capture, shift));

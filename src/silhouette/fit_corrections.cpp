@@ -360,11 +360,16 @@ std::vector<const capture::View*> views_of(const capture::Capture& capture) {
 std::vector<VectorX> choose_frames(const SequenceFit& sequence, int most, const capture::Capture& capture,
                                    CorrectionProblem& problem) {
   const Frames all = frames_of(capture);
-  const int every = std::max(1, (static_cast<int>(all.times.size()) + most - 1) / most);
+  const auto seen = [&](int f) { return !all.views[f].empty() && sequence.frames[f].residual_pixels > 0.0; };
+  const int count = static_cast<int>(all.times.size());
+  int every = std::max(1, (count + most - 1) / most);
+  bool any = false;
+  for (int f = 0; f < count; f += every) any = any || seen(f);
+  if (!any) every = 1;
   std::vector<VectorX> theta;
   std::vector<int> needed;
-  for (int f = 0; f < static_cast<int>(all.times.size()); f += every) {
-    if (all.views[f].empty() || sequence.frames[f].residual_pixels <= 0.0) continue;
+  for (int f = 0; f < count; f += every) {
+    if (!seen(f)) continue;
     problem.frames.push_back({all.times[f], sequence.states.thetadot[f], all.views[f]});
     theta.push_back(sequence.states.theta[f]);
     needed.insert(needed.end(), all.views[f].begin(), all.views[f].end());
@@ -451,6 +456,7 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
   const int n = chain.angles(), m = layout.size;
   for (int k = 0; k < n; ++k) problem.held.push_back(chain::is_twist(chain, k));
   const std::vector<VectorX> theta = choose_frames(sequence, options.frames, capture, problem);
+  CHAINSPLAT_CHECK(!theta.empty(), "a frame in which the rope is seen");
 
   VectorX x = VectorX::Zero(m + n * static_cast<int>(theta.size()));
   for (std::size_t f = 0; f < theta.size(); ++f) x.segment(m + static_cast<int>(f) * n, n) = theta[f];
