@@ -81,6 +81,8 @@ chmod +x "$work/bin/sbatch"
 PATH="$work/bin:$PATH" run batch "$work/jobs.toml" -o "$work/100%j" --launcher slurm
 expect_code 0 'slurm, a folder with a percent sign'
 grep -q '^--output=.*/100%%j/logs/slurm-%a\.txt$' "$work/sbatch" || fail 'slurm: the folder of the logs is filled in'
+PATH="$work/bin:$PATH" run --json batch "$work/jobs.toml" -o "$work/100%j" --launcher slurm
+expect_output '"slurm_job": "7"' 'slurm --json'
 
 # interrupted at work: the trainings leave checkpoints
 "$program" batch "$work/jobs.toml" -o "$work/batch" >"$work/stdout" 2>"$work/stderr" </dev/null &
@@ -108,6 +110,15 @@ stamp=$(stat -c %Y.%i "$work/batch/good-joints_3/twin.json")
 expect_failure
 grep -q '1 of them done already' "$work/stderr" || fail 'batch again: does not know what is done'
 [ "$stamp" = "$(stat -c %Y.%i "$work/batch/good-joints_3/twin.json")" ] || fail 'batch again: did a done job anew'
+# a task whose job is done still answers in JSON
+index=$(python3 -c 'import json, sys; print([j["name"] for j in json.load(open(sys.argv[1]))["jobs"]].index("good-joints_3"))' "$work/batch/batch.json")
+run batch task "$work/batch" --index "$index" --json
+expect_code 0 'batch task --json'
+python3 - "$work/stdout" <<'PYTHON' || fail 'batch task --json: not the JSON of its job'
+import json, sys
+(job,) = json.load(open(sys.argv[1]))['jobs']
+assert job['name'] == 'good-joints_3' and job['state'] == 'done', job
+PYTHON
 sed -i 's/planar/spatial/' "$work/jobs.toml"
 expect_error 2 'made with other options' batch "$work/jobs.toml" -o "$work/batch"
 

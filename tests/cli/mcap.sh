@@ -120,6 +120,9 @@ PYTHON
 expect_error 2 'is there already; name another file, or give --force' export "$work/run" -o "$work/run.mcap"
 expect_error 2 'standard output is for the estimates' estimate "$work/run" --camera "$demo:cam0" --mcap -
 expect_error 2 'nowhere' estimate "$work/run" --camera "$demo:cam0" --mcap "$work/nowhere/live.mcap"
+python3 -c 'import json, sys; print(json.dumps(json.load(open(sys.argv[1]))["cameras"][0]))' "$demo/capture.json" >"$work/camera.json"
+expect_error 2 'has no frame' estimate "$work/run" --camera - --calibration "$work/camera.json" --mcap "$work/empty.mcap"
+[ ! -e "$work/empty.mcap" ] || fail 'estimate without a frame: left a recording'
 run export "$work/run" -o "$work/run.mcap" --force --no-pictures
 expect_code 0 'without pictures'
 "$python" "$source_dir/tests/read_mcap.py" "$work/run.mcap" | grep -q cameras && fail 'pictures although --no-pictures'

@@ -187,8 +187,12 @@ void submit(const BatchPlan& plan, const Path& folder, const std::vector<const B
   const int status = pipe ? ::pclose(pipe) : -1;
   while (!answer.empty() && answer.back() == '\n') answer.pop_back();
   if (status != 0) throw WorkError("sbatch", answer.empty() ? "failed" : answer, "see to Slurm, then run this again");
-  std::cout << "slurm job " << answer << ": " << todo.size() << " tasks; 'chainsplat batch status " << folder.string()
-            << "' tells how far they are\n";
+  if (globals.json)
+    std::cout << core::json_text(Json{{"folder", folder.string()}, {"slurm_job", answer}, {"tasks", todo.size()}})
+              << "\n";
+  else
+    std::cout << "slurm job " << answer << ": " << todo.size() << " tasks; 'chainsplat batch status " << folder.string()
+              << "' tells how far they are\n";
 }
 
 void batch(const Globals& globals, const Request& request) {
@@ -211,7 +215,10 @@ void batch(const Globals& globals, const Request& request) {
   say(std::to_string(plan.jobs.size()) + " jobs" +
       (already > 0 ? ", " + std::to_string(already) + " of them done already" : ""));
   if (slurm) {
-    if (!todo.empty()) submit(plan, folder, todo, request, globals);
+    if (!todo.empty())
+      submit(plan, folder, todo, request, globals);
+    else if (globals.json)
+      std::cout << status_json(plan, folder);
     return;
   }
   BatchOutcome outcome;
@@ -241,7 +248,7 @@ void batch(const Globals& globals, const Request& request) {
                     "'chainsplat batch status' tells why; the same command tries them again");
 }
 
-// One job, as a task of Slurm.
+// One job, as a task of Slurm. Its JSON is that of `status`, with the one job.
 void task(const Globals& globals, const std::string& dir, int index) {
   const Path folder = fs::absolute(dir).lexically_normal();
   const BatchPlan plan = pipeline::load_plan(folder);
@@ -250,8 +257,11 @@ void task(const Globals& globals, const std::string& dir, int index) {
   if (index < 0 || index >= static_cast<int>(plan.jobs.size()))
     throw InputError("batch task", "there is no job " + std::to_string(index), "give --index 0 and up");
   const BatchJob& job = plan.jobs[index];
+  const auto print = [&] {
+    if (globals.json) std::cout << status_json({{job}}, folder);
+  };
   watch_signals();
-  if (pipeline::state_of(folder, job).kind == Kind::done) return;
+  if (pipeline::state_of(folder, job).kind == Kind::done) return print();
   pipeline::BatchOptions options;
   options.device = globals.device;
   options.threads = core::threads();
@@ -266,6 +276,7 @@ void task(const Globals& globals, const std::string& dir, int index) {
       ::poll(nullptr, 0, 60000);
     }
   if (outcome.signal) throw Interrupted(outcome.signal);
+  print();
   if (outcome.failed > 0)
     throw WorkError(job.name, pipeline::state_of(folder, job).detail,
                     "see " + pipeline::log_file(folder, job).string());

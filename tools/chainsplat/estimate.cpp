@@ -197,9 +197,9 @@ struct Ending {
   const EstimateRequest& request;
   const pipeline::Follower& follower;
   Tally tally;
-  chain::States states = {};          // of all frames, where a centerline is to be written,
-  std::vector<math::Pose> base = {};  // and the base there, as it was believed to stand
-  std::optional<exports::McapRecording> recording = {};
+  chain::States states = {};                             // of all frames, where a centerline is to be written,
+  std::vector<math::Pose> base = {};                     // and the base there, as it was believed to stand
+  std::optional<exports::McapRecording> recording = {};  // begun by the first frame: without one there is no file
 
   void keep(const pipeline::Followed& followed) {
     count(tally, followed.estimate, followed.latency);
@@ -232,7 +232,6 @@ void estimate(const Globals& globals, const EstimateRequest& request) {
   std::optional<Push> push;
   if (page || !request.mcap.empty()) push.emplace(follower);
   Ending ending{request, follower, {}};
-  if (!request.mcap.empty()) ending.recording.emplace(request.mcap, follower.twin().chain, follower.cameras());
   watch_signals();  // a camera never ends by itself
   try {
     follower.follow([&](const pipeline::Followed& followed) {
@@ -240,7 +239,10 @@ void estimate(const Globals& globals, const EstimateRequest& request) {
       std::cout << estimation::to_json(followed.estimate, followed.latency, request.covariance) << "\n";
       flush_output();
       const std::optional<force::Estimate> pushed = push ? push->update(followed.estimate) : std::nullopt;
-      if (ending.recording) record(followed, follower, pushed, *ending.recording);
+      if (!request.mcap.empty()) {
+        if (!ending.recording) ending.recording.emplace(request.mcap, follower.twin().chain, follower.cameras());
+        record(followed, follower, pushed, *ending.recording);
+      }
       if (page) page->show(followed, pushed);
     });
   } catch (const Interrupted&) {
