@@ -4,7 +4,6 @@
 #include <poll.h>
 #include <unistd.h>
 
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <array>
 #include <csignal>
@@ -18,6 +17,7 @@
 #include "chainsplat/json.h"
 #include "chainsplat/run_folder.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -284,54 +284,54 @@ void task(const Globals& globals, const std::string& dir, int index) {
 
 }  // namespace
 
-void add_batch_command(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* command = app.add_subcommand("batch", "Many trainings: captures x settings x seeds, unattended");
+void add_batch_command(Command app, const Globals& globals, Job& job) {
+  Command command = app.add_command("batch", "Many trainings: captures x settings x seeds, unattended");
   auto request = std::make_shared<Request>();
   command
-      ->add_option("JOBS", request->jobs,
-                   "Job file in TOML:\n"
-                   "  captures = [\"captures/free_*\"]  # globs, from this file's folder\n"
-                   "  seeds = [0, 1]                  # default: 0\n"
-                   "  [settings]                      # any option of train; lists make a grid\n"
-                   "  joints = [6, 8]\n"
-                   "  mode = \"fast\"\n"
-                   "[[settings]] several times: one grid each. Run again, it does what is missing or failed")
-      ->type_name("JOBS.toml");
-  command->add_option("-o,--output", request->out, "Folder for the runs, their logs and results.html, .csv, .json")
-      ->type_name("DIR");
-  command->add_option("--jobs", request->parallel, "Trainings at a time (default: as measured best for the device)")
-      ->check(CLI::Range(1, 1024))
-      ->type_name("N");
-  command->add_option("--launcher", request->launcher, "local (default) or slurm: a job array, one task a job")
-      ->check(CLI::IsMember({"local", "slurm"}))
-      ->type_name("KIND");
-  command->add_option("--time-limit", request->time_limit, "Of a Slurm task (default 1:00:00)")->type_name("H:MM:SS");
+      .add_option("JOBS", request->jobs,
+                  "Job file in TOML:\n"
+                  "  captures = [\"captures/free_*\"]  # globs, from this file's folder\n"
+                  "  seeds = [0, 1]                  # default: 0\n"
+                  "  [settings]                      # any option of train; lists make a grid\n"
+                  "  joints = [6, 8]\n"
+                  "  mode = \"fast\"\n"
+                  "[[settings]] several times: one grid each. Run again, it does what is missing or failed")
+      .type_name("JOBS.toml");
+  command.add_option("-o,--output", request->out, "Folder for the runs, their logs and results.html, .csv, .json")
+      .type_name("DIR");
+  command.add_option("--jobs", request->parallel, "Trainings at a time (default: as measured best for the device)")
+      .in_range(1, 1024)
+      .type_name("N");
+  command.add_option("--launcher", request->launcher, "local (default) or slurm: a job array, one task a job")
+      .one_of({"local", "slurm"})
+      .type_name("KIND");
+  command.add_option("--time-limit", request->time_limit, "Of a Slurm task (default 1:00:00)").type_name("H:MM:SS");
   command
-      ->add_option("--warn", request->warn_seconds,
-                   "Seconds before the time limit at which a Slurm task leaves a checkpoint and is queued again\n"
-                   "(default 60)")
-      ->check(CLI::Range(1, 86400))
-      ->type_name("N");
+      .add_option("--warn", request->warn_seconds,
+                  "Seconds before the time limit at which a Slurm task leaves a checkpoint and is queued again\n"
+                  "(default 60)")
+      .in_range(1, 86400)
+      .type_name("N");
   command
-      ->add_option("--sbatch", request->sbatch, "More options of sbatch, as one text: \"--partition=gpu --gres=gpu:1\"")
-      ->type_name("TEXT");
-  command->callback([&globals, &job, request] {
+      .add_option("--sbatch", request->sbatch, "More options of sbatch, as one text: \"--partition=gpu --gres=gpu:1\"")
+      .type_name("TEXT");
+  command.callback([&globals, &job, request] {
     if (!job) job = [&globals, request] { batch(globals, *request); };
   });
 
   auto folder = std::make_shared<std::string>();
   const auto with_folder = [&](const char* name, const char* help) {
-    CLI::App* sub = command->add_subcommand(name, help);
-    sub->add_option("DIR", *folder, "Folder of the batch")->required();
+    Command sub = command.add_command(name, help);
+    sub.add_option("DIR", *folder, "Folder of the batch").required();
     return sub;
   };
-  with_folder("status", "How far each job is")->callback([&globals, &job, folder] {
+  with_folder("status", "How far each job is").callback([&globals, &job, folder] {
     job = [&globals, folder] {
       std::cout << (globals.json ? status_json(pipeline::load_plan(*folder), *folder)
                                  : status_text(pipeline::load_plan(*folder), *folder));
     };
   });
-  with_folder("collect", "Metrics of all runs as DIR/results.csv, .json and .html")->callback([&globals, &job, folder] {
+  with_folder("collect", "Metrics of all runs as DIR/results.csv, .json and .html").callback([&globals, &job, folder] {
     job = [&globals, folder] {
       pipeline::collect(pipeline::load_plan(*folder), *folder);
       if (!globals.json)
@@ -341,9 +341,9 @@ void add_batch_command(CLI::App& app, const Globals& globals, Job& job) {
     };
   });
   auto index = std::make_shared<int>(-1);
-  CLI::App* one = with_folder("task", "One job of the plan; what a Slurm task runs");
-  one->add_option("--index", *index, "Its number in batch.json (default: SLURM_ARRAY_TASK_ID)")->type_name("N");
-  one->callback(
+  Command one = with_folder("task", "One job of the plan; what a Slurm task runs");
+  one.add_option("--index", *index, "Its number in batch.json (default: SLURM_ARRAY_TASK_ID)").type_name("N");
+  one.callback(
       [&globals, &job, folder, index] { job = [&globals, folder, index] { task(globals, *folder, *index); }; });
 }
 

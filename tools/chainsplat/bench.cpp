@@ -3,7 +3,6 @@
 #include <sys/resource.h>
 #include <unistd.h>
 
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -27,6 +26,7 @@
 #include "chainsplat/run_folder.h"
 #include "chainsplat/splat.h"
 #include "cli.h"
+#include "command_line.h"
 #include "machine.h"
 
 namespace chainsplat::tools {
@@ -415,29 +415,26 @@ void bench(const Globals& globals, const Request& request) {
 
 }  // namespace
 
-void add_bench_command(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* command = app.add_subcommand("bench", "Measure drawing and training steps on fixed synthetic scenes");
+void add_bench_command(Command app, const Globals& globals, Job& job) {
+  Command command = app.add_command("bench", "Measure drawing and training steps on fixed synthetic scenes");
   auto request = std::make_shared<Request>();
-  command->add_option("--gaussians", request->gaussians,
-                      "Numbers of Gaussians, with commas between, in place of the fixed cases");
-  command->add_option("--views", request->views,
-                      "Views a submission, with commas between, in place of the fixed cases");
+  command.add_option("--gaussians", request->gaussians,
+                     "Numbers of Gaussians, with commas between, in place of the fixed cases");
+  command.add_option("--views", request->views, "Views a submission, with commas between, in place of the fixed cases");
   command
-      ->add_option("--capture", request->capture,
-                   "Also the whole work on this capture: training by stage, drawing every frame, following the rope")
-      ->type_name("CAPTURE");
+      .add_option("--capture", request->capture,
+                  "Also the whole work on this capture: training by stage, drawing every frame, following the rope")
+      .type_name("CAPTURE");
   command
-      ->add_option("--trainings", request->trainings,
-                   "Do the capture's work so many times and say how the memory of the process grows")
-      ->check(CLI::Range(1, 10000))
-      ->capture_default_str();
-  command->add_flag("--only-capture", request->only_capture, "Nothing but the capture's work");
-  command->add_flag("--whole", request->whole, "Whole images of 640x480 in these, not crops about the rope");
-  command->add_option("--scene", request->scene, "far (1 % of the image), close (8 %) or both")->capture_default_str();
-  command->add_option("--repeats", request->repeats, "Measurements of each")
-      ->check(CLI::Range(1, 10000))
-      ->capture_default_str();
-  command->callback([&globals, &job, request] { job = [&globals, request] { bench(globals, *request); }; });
+      .add_option("--trainings", request->trainings,
+                  "Do the capture's work so many times and say how the memory of the process grows")
+      .in_range(1, 10000)
+      .shows_default();
+  command.add_flag("--only-capture", request->only_capture, "Nothing but the capture's work");
+  command.add_flag("--whole", request->whole, "Whole images of 640x480 in these, not crops about the rope");
+  command.add_option("--scene", request->scene, "far (1 % of the image), close (8 %) or both").shows_default();
+  command.add_option("--repeats", request->repeats, "Measurements of each").in_range(1, 10000).shows_default();
+  command.callback([&globals, &job, request] { job = [&globals, request] { bench(globals, *request); }; });
 }
 
 }  // namespace chainsplat::tools

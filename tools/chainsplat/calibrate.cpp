@@ -1,5 +1,4 @@
 // calibrate.cpp - cameras from videos of a printed board, and the board.
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cstdio>
 #include <iostream>
@@ -11,6 +10,7 @@
 #include "chainsplat/calibration.h"
 #include "chainsplat/json.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -148,30 +148,28 @@ void calibrate(const Globals& globals, Request& request) {
 
 }  // namespace
 
-void add_calibrate_command(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* command = app.add_subcommand(
+void add_calibrate_command(Command app, const Globals& globals, Job& job) {
+  Command command = app.add_command(
       "calibrate", "Intrinsics, poses and clocks of cameras from videos of a printed board; the board itself");
   auto request = std::make_shared<Request>();
   calibration::Options& options = request->options;
-  command->add_option("OUT", request->out,
-                      "Folder for the result: NAME.json of every camera, calibration.json, pictures");
+  command.add_option("OUT", request->out,
+                     "Folder for the result: NAME.json of every camera, calibration.json, pictures");
   const auto several = [&](const char* name, std::vector<std::string>& into, const char* help, const char* type) {
-    command->add_option(name, into, help)->type_name(type)->allow_extra_args(false);
+    command.add_option(name, into, help).type_name(type).one_each();
   };
   several("--camera", request->cameras, "What a camera saw of the board: a video, a folder of images, or a pattern",
           "NAME=VIDEO");
-  command->add_option("--board", request->board, "The board, as --board-svg writes it")->type_name("FILE.json");
+  command.add_option("--board", request->board, "The board, as --board-svg writes it").type_name("FILE.json");
   command
-      ->add_option(
-          "--base", request->base,
-          "Log of the robot that moved the board, as of import: TUM, or a table with named columns.\nThe poses "
-          "are then in its world (default: a hand moved it)")
-      ->type_name("FILE[#NAME]");
+      .add_option("--base", request->base,
+                  "Log of the robot that moved the board, as of import: TUM, or a table with named columns.\nThe poses "
+                  "are then in its world (default: a hand moved it)")
+      .type_name("FILE[#NAME]");
   command
-      ->add_option(
-          "--world", request->world,
-          "Without --base, whose frame the poses are in: camera (the first), or board (where it is seen first)")
-      ->check(CLI::IsMember({"camera", "board"}));
+      .add_option("--world", request->world,
+                  "Without --base, whose frame the poses are in: camera (the first), or board (where it is seen first)")
+      .one_of({"camera", "board"});
   several("--timestamps", request->timestamps, "Times of its frames, one per line or a table's column",
           "NAME=FILE[#COLUMN]");
   several("--rate", request->rates, "Its frames per second (default: the video's)", "[NAME=]HZ");
@@ -179,28 +177,28 @@ void add_calibrate_command(CLI::App& app, const Globals& globals, Job& job) {
           "Time of its frame 0 by the log's clock (default 0; up to 1 s more or less is found); auto: anywhere in the "
           "log.\nWith --timestamps added to them",
           "[NAME=]S|auto");
-  command->add_option("--columns", options.log.columns, "As of import: which column of the log is what")
-      ->type_name("time=NAME,...");
-  command->add_option("--urdf", options.log.urdf, "The arm, where the log has its joint angles")->type_name("FILE");
-  command->add_option("--flange", options.log.flange, "Link of the URDF (default: the last one)")->type_name("LINK");
-  command->add_option("--base-unit", options.log.base_unit,
-                      "Of the log's positions: m, cm, mm (default: by name or size)");
-  command->add_option("--time-unit", options.log.time_unit, "Of all stamps: s, ms, us, ns (default: by name or size)");
-  command->add_option("--angle-unit", options.log.angle_unit,
-                      "Of the log's angles: rad, deg (default: by name or size)");
-  command->add_option("--rotation", options.log.rotation,
-                      "What rx, ry, rz are: rotvec, rpy (default: rotvec in rad, rpy in deg)");
-  command->add_option("--board-svg", request->svg, "Write a board to print, and FILE.json beside it; nothing else")
-      ->type_name("FILE.svg");
-  command->add_option("--tags", request->tags, "Of the board to print (default 5x7, on A4)")->type_name("COLUMNSxROWS");
-  command->add_option("--tag-size", request->tag_size, "Edge of a black square, m or with a unit (default 27mm)")
-      ->type_name("M");
-  command->add_option("--spacing", request->spacing, "White between two squares (default 9mm)")->type_name("M");
-  command->add_option("--first-id", request->first_id, "Number of its first tag (default 0)")
-      ->check(CLI::Range(0, 100000))
-      ->type_name("N");
-  command->add_flag("--force", options.force, "Replace a calibration or board that was made before");
-  command->callback([&globals, &job, request] { job = [&globals, request] { calibrate(globals, *request); }; });
+  command.add_option("--columns", options.log.columns, "As of import: which column of the log is what")
+      .type_name("time=NAME,...");
+  command.add_option("--urdf", options.log.urdf, "The arm, where the log has its joint angles").type_name("FILE");
+  command.add_option("--flange", options.log.flange, "Link of the URDF (default: the last one)").type_name("LINK");
+  command.add_option("--base-unit", options.log.base_unit,
+                     "Of the log's positions: m, cm, mm (default: by name or size)");
+  command.add_option("--time-unit", options.log.time_unit, "Of all stamps: s, ms, us, ns (default: by name or size)");
+  command.add_option("--angle-unit", options.log.angle_unit,
+                     "Of the log's angles: rad, deg (default: by name or size)");
+  command.add_option("--rotation", options.log.rotation,
+                     "What rx, ry, rz are: rotvec, rpy (default: rotvec in rad, rpy in deg)");
+  command.add_option("--board-svg", request->svg, "Write a board to print, and FILE.json beside it; nothing else")
+      .type_name("FILE.svg");
+  command.add_option("--tags", request->tags, "Of the board to print (default 5x7, on A4)").type_name("COLUMNSxROWS");
+  command.add_option("--tag-size", request->tag_size, "Edge of a black square, m or with a unit (default 27mm)")
+      .type_name("M");
+  command.add_option("--spacing", request->spacing, "White between two squares (default 9mm)").type_name("M");
+  command.add_option("--first-id", request->first_id, "Number of its first tag (default 0)")
+      .in_range(0, 100000)
+      .type_name("N");
+  command.add_flag("--force", options.force, "Replace a calibration or board that was made before");
+  command.callback([&globals, &job, request] { job = [&globals, request] { calibrate(globals, *request); }; });
 }
 
 }  // namespace chainsplat::tools

@@ -9,6 +9,7 @@
 
 #include "chainsplat/run_folder.h"
 #include "cli.h"
+#include "command_line.h"
 #include "help.h"
 
 using namespace chainsplat;
@@ -94,22 +95,23 @@ int run(int argc, char** argv) {
       ->type_name("FILE.jsonl");
   app.add_flag("--no-progress", globals.no_progress, "No progress, but messages");
   app.add_flag("--json", globals.json, "Standard output is one JSON document and nothing else");
-  tools::add_training_commands(app, globals, job);
-  tools::add_identify_command(app, globals, job);
-  tools::add_motion_commands(app, globals, job);
-  tools::add_result_commands(app, globals, job);
-  tools::add_estimation_commands(app, globals, job);
-  tools::add_force_commands(app, globals, job);
-  tools::add_planning_commands(app, globals, job);
-  tools::add_excite_command(app, globals, job);
-  tools::add_inspection_commands(app, globals, job);
-  tools::add_batch_command(app, globals, job);
-  tools::add_diff_command(app, globals, job);
-  tools::add_new_command(app, globals, job);
-  tools::add_import_command(app, globals, job);
-  tools::add_calibrate_command(app, globals, job);
-  tools::add_mask_command(app, globals, job);
-  tools::add_bench_command(app, globals, job);
+  const tools::Command program(&app);
+  tools::add_training_commands(program, globals, job);
+  tools::add_identify_command(program, globals, job);
+  tools::add_motion_commands(program, globals, job);
+  tools::add_result_commands(program, globals, job);
+  tools::add_estimation_commands(program, globals, job);
+  tools::add_force_commands(program, globals, job);
+  tools::add_planning_commands(program, globals, job);
+  tools::add_excite_command(program, globals, job);
+  tools::add_inspection_commands(program, globals, job);
+  tools::add_batch_command(program, globals, job);
+  tools::add_diff_command(program, globals, job);
+  tools::add_new_command(program, globals, job);
+  tools::add_import_command(program, globals, job);
+  tools::add_calibrate_command(program, globals, job);
+  tools::add_mask_command(program, globals, job);
+  tools::add_bench_command(program, globals, job);
   tools::add_describe_commands(app, job);
   for (CLI::App* command : app.get_subcommands({}))
     command->footer(

@@ -21,6 +21,8 @@ struct Payload;
 
 namespace chainsplat::tools {
 
+class Command;
+
 // Options that stand before or after any command.
 struct Globals {
   std::string device;  // number or part of a name; empty: chosen
@@ -33,22 +35,22 @@ struct Globals {
 using Job = std::function<void()>;
 
 // Each adds its commands to `app`; the one that was named sets `job`.
-void add_training_commands(CLI::App& app, const Globals& globals, Job& job);  // train, recognize
-void add_identify_command(CLI::App& app, const Globals& globals, Job& job);
-void add_motion_commands(CLI::App& app, const Globals& globals, Job& job);      // rollout, render
-void add_result_commands(CLI::App& app, const Globals& globals, Job& job);      // eval, report, export, synth
-void add_inspection_commands(CLI::App& app, const Globals& globals, Job& job);  // check, doctor
-void add_planning_commands(CLI::App& app, const Globals& globals, Job& job);    // plan
-void add_excite_command(CLI::App& app, const Globals& globals, Job& job);
-void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job);  // estimate
-void add_force_commands(CLI::App& app, const Globals& globals, Job& job);       // force
-void add_new_command(CLI::App& app, const Globals& globals, Job& job);
-void add_batch_command(CLI::App& app, const Globals& globals, Job& job);  // batch
-void add_diff_command(CLI::App& app, const Globals& globals, Job& job);   // diff
-void add_mask_command(CLI::App& app, const Globals& globals, Job& job);
-void add_import_command(CLI::App& app, const Globals& globals, Job& job);
-void add_calibrate_command(CLI::App& app, const Globals& globals, Job& job);
-void add_bench_command(CLI::App& app, const Globals& globals, Job& job);
+void add_training_commands(Command app, const Globals& globals, Job& job);  // train, recognize
+void add_identify_command(Command app, const Globals& globals, Job& job);
+void add_motion_commands(Command app, const Globals& globals, Job& job);      // rollout, render
+void add_result_commands(Command app, const Globals& globals, Job& job);      // eval, report, export, synth
+void add_inspection_commands(Command app, const Globals& globals, Job& job);  // check, doctor
+void add_planning_commands(Command app, const Globals& globals, Job& job);    // plan
+void add_excite_command(Command app, const Globals& globals, Job& job);
+void add_estimation_commands(Command app, const Globals& globals, Job& job);  // estimate
+void add_force_commands(Command app, const Globals& globals, Job& job);       // force
+void add_new_command(Command app, const Globals& globals, Job& job);
+void add_batch_command(Command app, const Globals& globals, Job& job);  // batch
+void add_diff_command(Command app, const Globals& globals, Job& job);   // diff
+void add_mask_command(Command app, const Globals& globals, Job& job);
+void add_import_command(Command app, const Globals& globals, Job& job);
+void add_calibrate_command(Command app, const Globals& globals, Job& job);
+void add_bench_command(Command app, const Globals& globals, Job& job);
 void add_describe_commands(CLI::App& app, Job& job);  // completions, manual
 
 // --- describe.cpp --------------------------------------------------------------------------------
@@ -80,7 +82,7 @@ void flush_output();
 // in their place: `frames` becomes --frames.
 std::string with_options(const std::string& text);
 // --tip-mass KG[,SIGMA] and what it says: nothing where `numbers` is empty. Throws InputError.
-void add_payload_option(CLI::App& command, std::vector<double>& numbers);
+void add_payload_option(Command command, std::vector<double>& numbers);
 std::optional<capture::Payload> payload_of(const std::vector<double>& numbers);
 
 // --- inspect.cpp --------------------------------------------------------------------------------

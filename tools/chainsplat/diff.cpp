@@ -1,5 +1,4 @@
 // diff.cpp - diff: what differs between two runs, and by how much.
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
@@ -11,6 +10,7 @@
 #include "chainsplat/json.h"
 #include "chainsplat/run_folder.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -188,13 +188,12 @@ void diff(const Globals& globals, const std::string& first, const std::string& s
 
 }  // namespace
 
-void add_diff_command(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* command =
-      app.add_subcommand("diff", "What differs between two runs: how they were made, and what came out");
+void add_diff_command(Command app, const Globals& globals, Job& job) {
+  Command command = app.add_command("diff", "What differs between two runs: how they were made, and what came out");
   auto runs = std::make_shared<std::pair<std::string, std::string>>();
-  command->add_option("RUN", runs->first, "Run folder")->required();
-  command->add_option("OTHER", runs->second, "Another run folder")->required();
-  command->callback([&globals, &job, runs] { job = [&globals, runs] { diff(globals, runs->first, runs->second); }; });
+  command.add_option("RUN", runs->first, "Run folder").required();
+  command.add_option("OTHER", runs->second, "Another run folder").required();
+  command.callback([&globals, &job, runs] { job = [&globals, runs] { diff(globals, runs->first, runs->second); }; });
 }
 
 }  // namespace chainsplat::tools

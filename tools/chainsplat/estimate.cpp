@@ -1,5 +1,4 @@
 // estimate.cpp - a rope followed frame by frame: one JSON line a frame on standard output, flushed.
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -20,6 +19,7 @@
 #include "chainsplat/run_folder.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
+#include "command_line.h"
 #include "window.h"
 
 namespace chainsplat::tools {
@@ -265,58 +265,55 @@ void estimate(const Globals& globals, const EstimateRequest& request) {
 
 }  // namespace
 
-void add_estimation_commands(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* command = app.add_subcommand("estimate", "Follow the rope: one JSON line a frame on standard output");
+void add_estimation_commands(Command app, const Globals& globals, Job& job) {
+  Command command = app.add_command("estimate", "Follow the rope: one JSON line a frame on standard output");
   auto request = std::make_shared<EstimateRequest>();
-  command->add_option("RUN", request->run, "Run folder of a twin")->required();
+  command.add_option("RUN", request->run, "Run folder of a twin").required();
   command
-      ->add_option(
-          "--camera", request->camera,
-          "CAPTURE:NAME one camera of a capture, CAPTURE all of them together; with --calibration a video, a\n"
-          "V4L2 device such as /dev/video0, or - for raw RGB24 frames on standard input, of the rope on black\n"
-          "or as it comes: then masks are made")
-      ->required()
-      ->type_name("SOURCE");
-  command->add_option("--calibration", request->calibration, "Camera object as in capture.json")
-      ->type_name("FILE.json");
-  command->add_option("--rate", request->rate, "Frames a second (default: the calibration's, else the video's)")
-      ->check(CLI::Range(1e-3, 1e6))
-      ->type_name("HZ");
+      .add_option("--camera", request->camera,
+                  "CAPTURE:NAME one camera of a capture, CAPTURE all of them together; with --calibration a video, a\n"
+                  "V4L2 device such as /dev/video0, or - for raw RGB24 frames on standard input, of the rope on black\n"
+                  "or as it comes: then masks are made")
+      .required()
+      .type_name("SOURCE");
+  command.add_option("--calibration", request->calibration, "Camera object as in capture.json").type_name("FILE.json");
+  command.add_option("--rate", request->rate, "Frames a second (default: the calibration's, else the video's)")
+      .in_range(1e-3, 1e6)
+      .type_name("HZ");
   command
-      ->add_option(
-          "--start", request->start,
-          "Time of the first frame by the base motion's clock (default: the calibration's, else 0); 'unix': a\n"
-          "device's own time stamps in Unix time, for a base motion that is stamped so")
-      ->type_name("SECONDS|unix");
-  command->add_option("--base", request->base, "Base motion (default: the capture's; with --calibration at rest)")
-      ->type_name("FILE.tum");
+      .add_option("--start", request->start,
+                  "Time of the first frame by the base motion's clock (default: the calibration's, else 0); 'unix': a\n"
+                  "device's own time stamps in Unix time, for a base motion that is stamped so")
+      .type_name("SECONDS|unix");
+  command.add_option("--base", request->base, "Base motion (default: the capture's; with --calibration at rest)")
+      .type_name("FILE.tum");
   command
-      ->add_option("--solver", request->solver,
-                   "newton: outlines, then the colors inside them, drawn on the Vulkan device (default, where there\n"
-                   "is one)\n"
-                   "silhouette: outlines alone, without a device\n"
-                   "adam: the paper's, 10 Adam steps on the rendering loss from the last frame's angles, without\n"
-                   "deviations; to compare with")
-      ->check(CLI::IsMember({"newton", "silhouette", "adam"}))
-      ->type_name("KIND");
-  command->add_option("--frames", request->frames, "Only frames A to B - 1")->type_name("A:B");
-  command->add_option("--drop", request->drop, "Use every N-th frame (default 1)")->type_name("N");
+      .add_option("--solver", request->solver,
+                  "newton: outlines, then the colors inside them, drawn on the Vulkan device (default, where there\n"
+                  "is one)\n"
+                  "silhouette: outlines alone, without a device\n"
+                  "adam: the paper's, 10 Adam steps on the rendering loss from the last frame's angles, without\n"
+                  "deviations; to compare with")
+      .one_of({"newton", "silhouette", "adam"})
+      .type_name("KIND");
+  command.add_option("--frames", request->frames, "Only frames A to B - 1").type_name("A:B");
+  command.add_option("--drop", request->drop, "Use every N-th frame (default 1)").type_name("N");
   command
-      ->add_option("--centerline", request->centerline, "Also write the world points of the grasp, joints and free end")
-      ->type_name("FILE.csv");
+      .add_option("--centerline", request->centerline, "Also write the world points of the grasp, joints and free end")
+      .type_name("FILE.csv");
   command
-      ->add_option("--mcap", request->mcap,
-                   "Also a recording for Foxglove or rerun: pictures, transforms, joints, trust, force")
-      ->type_name("FILE.mcap");
+      .add_option("--mcap", request->mcap,
+                  "Also a recording for Foxglove or rerun: pictures, transforms, joints, trust, force")
+      .type_name("FILE.mcap");
   command
-      ->add_option("--serve", request->serve,
-                   "Show picture, chain, trust and latency in a browser at http://127.0.0.1:PORT/; recorded frames at\n"
-                   "their own pace")
-      ->check(CLI::Range(1, 65535))
-      ->type_name("PORT");
-  command->add_flag("--covariance", request->covariance,
-                    "Also the covariance of theta and thetadot together: its lower triangle, row by row");
-  command->callback([&globals, &job, request] { job = [&globals, request] { estimate(globals, *request); }; });
+      .add_option("--serve", request->serve,
+                  "Show picture, chain, trust and latency in a browser at http://127.0.0.1:PORT/; recorded frames at\n"
+                  "their own pace")
+      .in_range(1, 65535)
+      .type_name("PORT");
+  command.add_flag("--covariance", request->covariance,
+                   "Also the covariance of theta and thetadot together: its lower triangle, row by row");
+  command.callback([&globals, &job, request] { job = [&globals, request] { estimate(globals, *request); }; });
 }
 
 }  // namespace chainsplat::tools

@@ -1,5 +1,4 @@
 // excite.cpp - excite: the base motion that is to be recorded next.
-#include <CLI/CLI.hpp>
 #include <cmath>
 #include <cstdio>
 #include <iostream>
@@ -13,6 +12,7 @@
 #include "chainsplat/run_folder.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -135,42 +135,41 @@ void excite(const Globals& globals, Request& request) {
 
 }  // namespace
 
-void add_excite_command(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* command =
-      app.add_subcommand("excite", "Propose the base motion to record next: the parameters' errors shrink most");
+void add_excite_command(Command app, const Globals& globals, Job& job) {
+  Command command =
+      app.add_command("excite", "Propose the base motion to record next: the parameters' errors shrink most");
   auto request = std::make_shared<Request>();
   excitation::Options& options = request->options;
   options.limits.stroke = 0.2;
-  command->add_option("RUN", request->run, "Run folder of an identified twin")->required();
+  command.add_option("RUN", request->run, "Run folder of an identified twin").required();
   command
-      ->add_option(
-          "-o,--output", request->out,
-          "Folder for base.tum, base.csv, states.csv, excite.json; or a file NAME.tum, with NAME.csv beside it")
-      ->required()
-      ->type_name("MOTION");
+      .add_option("-o,--output", request->out,
+                  "Folder for base.tum, base.csv, states.csv, excite.json; or a file NAME.tum, with NAME.csv beside it")
+      .required()
+      .type_name("MOTION");
   command
-      ->add_option("--axes", request->axes,
-                   "What moves (default: x, for a chain with two bending axes x,y, on a table x,y,yaw)")
-      ->type_name("x,y,z,yaw");
-  command->add_option("--duration", options.duration, "Of the motion, s (default 5)");
-  command->add_option("--velocity", options.limits.velocity, "Limit of the base, m/s (default 1.5)");
-  command->add_option("--acceleration", options.limits.acceleration, "Limit of the base, m/s^2 (default 10)");
-  command->add_option("--jerk", options.limits.jerk, "Limit of the base, m/s^3 (default 200)");
-  command->add_option("--stroke", options.limits.stroke,
-                      "Farthest from the start along an axis, m (default 0.2): keep the rope where the cameras see it");
-  command->add_option("--yaw-velocity", options.limits.yaw_velocity, "Limit, rad/s (default 3.1)");
-  command->add_option("--yaw-acceleration", options.limits.yaw_acceleration, "Limit, rad/s^2 (default 20)");
-  command->add_option("--yaw-jerk", options.limits.yaw_jerk, "Limit, rad/s^3 (default 400)");
-  command->add_option("--turn", options.limits.turn, "Farthest yaw from the start, rad (default 1.6)");
-  command->add_option("--max-bend", options.max_bend, "Largest change of a joint's angle, rad (default 1.2)");
+      .add_option("--axes", request->axes,
+                  "What moves (default: x, for a chain with two bending axes x,y, on a table x,y,yaw)")
+      .type_name("x,y,z,yaw");
+  command.add_option("--duration", options.duration, "Of the motion, s (default 5)");
+  command.add_option("--velocity", options.limits.velocity, "Limit of the base, m/s (default 1.5)");
+  command.add_option("--acceleration", options.limits.acceleration, "Limit of the base, m/s^2 (default 10)");
+  command.add_option("--jerk", options.limits.jerk, "Limit of the base, m/s^3 (default 200)");
+  command.add_option("--stroke", options.limits.stroke,
+                     "Farthest from the start along an axis, m (default 0.2): keep the rope where the cameras see it");
+  command.add_option("--yaw-velocity", options.limits.yaw_velocity, "Limit, rad/s (default 3.1)");
+  command.add_option("--yaw-acceleration", options.limits.yaw_acceleration, "Limit, rad/s^2 (default 20)");
+  command.add_option("--yaw-jerk", options.limits.yaw_jerk, "Limit, rad/s^3 (default 400)");
+  command.add_option("--turn", options.limits.turn, "Farthest yaw from the start, rad (default 1.6)");
+  command.add_option("--max-bend", options.max_bend, "Largest change of a joint's angle, rad (default 1.2)");
   command
-      ->add_option("--noise", request->noise,
-                   "What a recorded point will be off the model, mm (default: as in the twin's own recording)")
-      ->check(CLI::PositiveNumber);
-  command->add_option("--frame-rate", options.frame_rate, "Frames a second of the recording to come (default 30)");
-  command->add_option("--rate", request->rate, "Rows a second of the files (default 100)")->type_name("HZ");
-  command->add_flag("--force", request->force, "Write into a folder that is not empty");
-  command->callback([&globals, &job, request] { job = [&globals, request] { excite(globals, *request); }; });
+      .add_option("--noise", request->noise,
+                  "What a recorded point will be off the model, mm (default: as in the twin's own recording)")
+      .positive();
+  command.add_option("--frame-rate", options.frame_rate, "Frames a second of the recording to come (default 30)");
+  command.add_option("--rate", request->rate, "Rows a second of the files (default 100)").type_name("HZ");
+  command.add_flag("--force", request->force, "Write into a folder that is not empty");
+  command.callback([&globals, &job, request] { job = [&globals, request] { excite(globals, *request); }; });
 }
 
 }  // namespace chainsplat::tools

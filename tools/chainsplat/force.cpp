@@ -1,13 +1,13 @@
 // force.cpp - the force that the outside exerts on the rope, from angles over time: one JSON line a time step.
 #include "chainsplat/force.h"
 
-#include <CLI/CLI.hpp>
 #include <cstdio>
 #include <iostream>
 #include <memory>
 
 #include "chainsplat/pipeline.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -53,26 +53,26 @@ void force(const Globals& globals, const ForceRequest& request) {
 
 }  // namespace
 
-void add_force_commands(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* command = app.add_subcommand("force", "The outside's force on the rope: one JSON line a time step");
+void add_force_commands(Command app, const Globals& globals, Job& job) {
+  Command command = app.add_command("force", "The outside's force on the rope: one JSON line a time step");
   auto request = std::make_shared<ForceRequest>();
-  command->add_option("RUN", request->run, "Run folder of an identified twin")->required();
-  command->add_option("--states", request->states, "Angles over time; - is standard input")->type_name("STATES.csv");
-  command->add_option("--estimate", request->estimate, "Output of 'chainsplat estimate'; - is standard input")
-      ->type_name("FILE.jsonl");
-  command->add_option("--base", request->base, "Base motion (default: that of the twin's own capture)")
-      ->type_name("FILE.tum");
+  command.add_option("RUN", request->run, "Run folder of an identified twin").required();
+  command.add_option("--states", request->states, "Angles over time; - is standard input").type_name("STATES.csv");
+  command.add_option("--estimate", request->estimate, "Output of 'chainsplat estimate'; - is standard input")
+      .type_name("FILE.jsonl");
+  command.add_option("--base", request->base, "Base motion (default: that of the twin's own capture)")
+      .type_name("FILE.tum");
   command
-      ->add_option("--contact", request->contact,
-                   "Where it is touched: X,Y,Z in the world, FILE.csv with time,x,y,z, or auto (default).\n"
-                   "Points farther than three diameters from the rope do not touch it")
-      ->type_name("X,Y,Z|FILE.csv|auto");
-  command->add_option("--hand", request->hand, "Point cloud of the hand; the nearest Gaussian is touched")
-      ->excludes("--contact")
-      ->type_name("FILE.ply");
-  command->add_flag("--live", request->live,
-                    "While states come in: a line is written two states after its own, from these and earlier ones");
-  command->callback([&globals, &job, request] { job = [&globals, request] { force(globals, *request); }; });
+      .add_option("--contact", request->contact,
+                  "Where it is touched: X,Y,Z in the world, FILE.csv with time,x,y,z, or auto (default).\n"
+                  "Points farther than three diameters from the rope do not touch it")
+      .type_name("X,Y,Z|FILE.csv|auto");
+  command.add_option("--hand", request->hand, "Point cloud of the hand; the nearest Gaussian is touched")
+      .excludes("--contact")
+      .type_name("FILE.ply");
+  command.add_flag("--live", request->live,
+                   "While states come in: a line is written two states after its own, from these and earlier ones");
+  command.callback([&globals, &job, request] { job = [&globals, request] { force(globals, *request); }; });
 }
 
 }  // namespace chainsplat::tools

@@ -1,6 +1,5 @@
 // identify.cpp - identify: a twin's dynamics from its recognized states, from marker trajectories or from live
 // estimates.
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cstdio>
 #include <fstream>
@@ -15,6 +14,7 @@
 #include "chainsplat/run_folder.h"
 #include "chainsplat/solve_json.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -161,51 +161,49 @@ void identify_online(const Globals& globals, const OnlineRequest& request) {
 
 }  // namespace
 
-void add_identify_command(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* identifier =
-      app.add_subcommand("identify", "The second stage alone: masses, stiffness, damping, friction of a twin");
+void add_identify_command(Command app, const Globals& globals, Job& job) {
+  Command identifier =
+      app.add_command("identify", "The second stage alone: masses, stiffness, damping, friction of a twin");
   auto request = std::make_shared<Request>();
   identifier
-      ->add_option("RUN", request->runs,
-                   "Run folder with recognized states; it is updated. Several of one rope get one set of parameters,\n"
-                   "each its own initial state and rollout")
-      ->required();
-  CLI::Option* markers =
+      .add_option("RUN", request->runs,
+                  "Run folder with recognized states; it is updated. Several of one rope get one set of parameters,\n"
+                  "each its own initial state and rollout")
+      .required();
+  Option markers =
       identifier
-          ->add_option("--markers", request->markers,
-                       "Measured positions of points of the rope and the base's motion instead of recognized states;\n"
-                       "RUN can be an empty twin (see new). Several files of one rope give one set of parameters; RUN\n"
-                       "keeps the motion of the first")
-          ->type_name("FILE.csv ...");
-  identifier->add_flag("--shape-only", request->shape_only, "With --markers: only the angles at each time, no dynamics")
-      ->needs(markers);
+          .add_option("--markers", request->markers,
+                      "Measured positions of points of the rope and the base's motion instead of recognized states;\n"
+                      "RUN can be an empty twin (see new). Several files of one rope give one set of parameters; RUN\n"
+                      "keeps the motion of the first")
+          .type_name("FILE.csv ...");
+  identifier.add_flag("--shape-only", request->shape_only, "With --markers: only the angles at each time, no dynamics")
+      .needs(markers);
   identifier
-      ->add_flag(
+      .add_flag(
           "--joint", request->joint,
           "Then refine angles, Gaussians and dynamics of one RUN together with the capture's images: helps where\n"
           "a single camera hardly sees depth")
-      ->excludes(markers);
-  add_payload_option(*identifier, request->payload);
+      .excludes(markers);
+  add_payload_option(identifier, request->payload);
   auto online = std::make_shared<OnlineRequest>();
-  CLI::Option* stream =
+  Option stream =
       identifier
-          ->add_option(
-              "--online", online->file,
-              "Follow the states that 'estimate' printed (-: standard input): the twin's parameters move with\n"
-              "the rope, old frames are forgotten")
-          ->type_name("FILE.jsonl")
-          ->excludes(markers)
-          ->excludes("--joint");
+          .add_option("--online", online->file,
+                      "Follow the states that 'estimate' printed (-: standard input): the twin's parameters move with\n"
+                      "the rope, old frames are forgotten")
+          .type_name("FILE.jsonl")
+          .excludes(markers)
+          .excludes("--joint");
   identifier
-      ->add_option("--base", online->base, "With --online: the base's motion meanwhile (default: the capture's own)")
-      ->type_name("FILE.tum")
-      ->needs(stream);
+      .add_option("--base", online->base, "With --online: the base's motion meanwhile (default: the capture's own)")
+      .type_name("FILE.tum")
+      .needs(stream);
   identifier
-      ->add_option("--memory", online->memory,
-                   "With --online: seconds in which old frames fade (default 5; inf: never)")
-      ->type_name("S")
-      ->needs(stream);
-  identifier->callback([&globals, &job, request, online] {
+      .add_option("--memory", online->memory, "With --online: seconds in which old frames fade (default 5; inf: never)")
+      .type_name("S")
+      .needs(stream);
+  identifier.callback([&globals, &job, request, online] {
     job = [&globals, request, online] {
       if (online->file.empty()) return identify(globals, *request);
       if (request->runs.size() != 1)

@@ -1,5 +1,4 @@
 // import.cpp - a capture from videos, calibrations of other programs and a robot's log.
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <iostream>
 #include <memory>
@@ -9,6 +8,7 @@
 #include "chainsplat/importing.h"
 #include "chainsplat/json.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -130,24 +130,24 @@ void import_capture(const Globals& globals, Request& request) {
 
 }  // namespace
 
-void add_import_command(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* importer =
-      app.add_subcommand("import", "Make a capture from videos, calibrations of other programs and a robot's log");
+void add_import_command(Command app, const Globals& globals, Job& job) {
+  Command importer =
+      app.add_command("import", "Make a capture from videos, calibrations of other programs and a robot's log");
   auto request = std::make_shared<Request>();
   importing::Options& options = request->options;
-  importer->add_option("OUT", request->out, "Capture folder to make")->required();
+  importer.add_option("OUT", request->out, "Capture folder to make").required();
   const auto several = [&](const char* name, std::vector<std::string>& into, const char* help, const char* type) {
-    return importer->add_option(name, into, help)->type_name(type)->allow_extra_args(false);
+    return importer.add_option(name, into, help).type_name(type).one_each();
   };
   several("--camera", request->cameras, "Frames of a camera: a video, a folder of images, or a pattern like f%04d.png",
           "NAME=VIDEO")
-      ->required();
+      .required();
   several("--calibration", request->calibrations,
           ("Its intrinsics, and its pose where the file has one. Without NAME= of all cameras.\nKnown: " +
            importing::known_calibrations())
               .c_str(),
           "[NAME=]FILE[#KEY]")
-      ->required();
+      .required();
   several("--pose", request->poses_of, "Its pose, where the calibration has none: a file, or the numbers",
           "NAME=FILE[#KEY]|x,y,z,qx,qy,qz,qw");
   several("--masks", request->masks,
@@ -161,63 +161,60 @@ void add_import_command(CLI::App& app, const Globals& globals, Job& job) {
           "them",
           "[NAME=]S|auto");
   importer
-      ->add_option(
+      .add_option(
           "--base", request->base,
           "Robot's log: TUM, or a table with named columns; with --urdf joint angles. #NAME: which of several poses")
-      ->required()
-      ->type_name("FILE[#NAME]");
+      .required()
+      .type_name("FILE[#NAME]");
   importer
-      ->add_option("--columns", options.columns,
-                   "Which column is what, where names do not tell: time, x, y, z, qx to qw, rx to rz, roll, pitch, yaw")
-      ->type_name("time=NAME,...");
-  importer->add_option("--urdf", request->urdf, "The arm, where the log has its joint angles")->type_name("FILE");
-  importer->add_option("--flange", options.flange, "Link of the URDF (default: the last one)")->type_name("LINK");
+      .add_option("--columns", options.columns,
+                  "Which column is what, where names do not tell: time, x, y, z, qx to qw, rx to rz, roll, pitch, yaw")
+      .type_name("time=NAME,...");
+  importer.add_option("--urdf", request->urdf, "The arm, where the log has its joint angles").type_name("FILE");
+  importer.add_option("--flange", options.flange, "Link of the URDF (default: the last one)").type_name("LINK");
   importer
-      ->add_option("--tool", request->tool,
-                   "Pose of the grasp in the frame of the log's poses, the flange (default: the same)")
-      ->type_name("x,y,z,qx,qy,qz,qw");
+      .add_option("--tool", request->tool,
+                  "Pose of the grasp in the frame of the log's poses, the flange (default: the same)")
+      .type_name("x,y,z,qx,qy,qz,qw");
   importer
-      ->add_option("--base-world", request->base_world,
-                   "Pose of the log's world in the capture's, or the capture's axes in the log's")
-      ->type_name("x,y,z,qx,qy,qz,qw|x,-z,y");
-  importer->add_option("--camera-world", request->camera_world, "The same of the world of the calibrations")
-      ->type_name("x,y,z,qx,qy,qz,qw|x,-z,y");
-  importer->add_option("--length", request->length, "From the grasp to the free end, m or with a unit: 0.3, 30cm")
-      ->required()
-      ->type_name("M");
-  importer->add_option("--diameter", request->diameter, "Of the rope, m or with a unit")->required()->type_name("M");
-  importer->add_option("--mass", request->mass, "Of this length of rope, kg or with a unit: 0.06, 60g")
-      ->type_name("KG");
-  importer->add_option("--scenario", request->scenario, "free: it hangs or swings; tabletop: it lies on a table")
-      ->check(CLI::IsMember({"free", "tabletop"}))
-      ->required();
+      .add_option("--base-world", request->base_world,
+                  "Pose of the log's world in the capture's, or the capture's axes in the log's")
+      .type_name("x,y,z,qx,qy,qz,qw|x,-z,y");
+  importer.add_option("--camera-world", request->camera_world, "The same of the world of the calibrations")
+      .type_name("x,y,z,qx,qy,qz,qw|x,-z,y");
+  importer.add_option("--length", request->length, "From the grasp to the free end, m or with a unit: 0.3, 30cm")
+      .required()
+      .type_name("M");
+  importer.add_option("--diameter", request->diameter, "Of the rope, m or with a unit").required().type_name("M");
+  importer.add_option("--mass", request->mass, "Of this length of rope, kg or with a unit: 0.06, 60g").type_name("KG");
+  importer.add_option("--scenario", request->scenario, "free: it hangs or swings; tabletop: it lies on a table")
+      .one_of({"free", "tabletop"})
+      .required();
+  importer.add_option("--direction", request->direction, "Where the rope leaves the gripper, in the frame of the grasp")
+      .required()
+      .type_name("-z|X,Y,Z");
   importer
-      ->add_option("--direction", request->direction, "Where the rope leaves the gripper, in the frame of the grasp")
-      ->required()
-      ->type_name("-z|X,Y,Z");
+      .add_option("--bending-axis", request->bending_axis,
+                  "Axis of planar bending, same frame (default: by motion or table)")
+      .type_name("y|X,Y,Z");
+  importer.add_option("--table", request->table, "Height of its surface, m, or a point and its normal")
+      .type_name("H|x,y,z,nx,ny,nz");
+  importer.add_option("--gravity", request->gravity, "World, m/s^2 (default 0,0,-9.81)").type_name("X,Y,Z");
+  importer.add_option("--name", options.name, "Of the capture (default: the folder's)").type_name("NAME");
   importer
-      ->add_option("--bending-axis", request->bending_axis,
-                   "Axis of planar bending, same frame (default: by motion or table)")
-      ->type_name("y|X,Y,Z");
-  importer->add_option("--table", request->table, "Height of its surface, m, or a point and its normal")
-      ->type_name("H|x,y,z,nx,ny,nz");
-  importer->add_option("--gravity", request->gravity, "World, m/s^2 (default 0,0,-9.81)")->type_name("X,Y,Z");
-  importer->add_option("--name", options.name, "Of the capture (default: the folder's)")->type_name("NAME");
-  importer
-      ->add_option("--poses", options.poses,
-                   "Which way the cameras' poses map (default: by source, else so that the grasp is in view)")
-      ->type_name("camera-to-world|world-to-camera");
-  importer->add_option("--camera-axes", request->camera_axes, "Axes of the cameras (default: by source)")
-      ->check(CLI::IsMember({"opencv", "opengl", "ros"}));
-  importer->add_option("--camera-unit", options.camera_unit, "Of the cameras' positions: m, cm, mm (default: by size)");
-  importer->add_option("--base-unit", options.base_unit,
-                       "Of the log's positions: m, cm, mm (default: by name or size)");
-  importer->add_option("--time-unit", options.time_unit, "Of all stamps: s, ms, us, ns (default: by name or size)");
-  importer->add_option("--angle-unit", options.angle_unit, "Of the log's angles: rad, deg (default: by name or size)");
-  importer->add_option("--rotation", options.rotation,
-                       "What rx, ry, rz are: rotvec, rpy (default: rotvec in rad, rpy in deg)");
-  importer->add_flag("--force", options.force, "Replace a capture that was imported before");
-  importer->callback([&globals, &job, request] { job = [&globals, request] { import_capture(globals, *request); }; });
+      .add_option("--poses", options.poses,
+                  "Which way the cameras' poses map (default: by source, else so that the grasp is in view)")
+      .type_name("camera-to-world|world-to-camera");
+  importer.add_option("--camera-axes", request->camera_axes, "Axes of the cameras (default: by source)")
+      .one_of({"opencv", "opengl", "ros"});
+  importer.add_option("--camera-unit", options.camera_unit, "Of the cameras' positions: m, cm, mm (default: by size)");
+  importer.add_option("--base-unit", options.base_unit, "Of the log's positions: m, cm, mm (default: by name or size)");
+  importer.add_option("--time-unit", options.time_unit, "Of all stamps: s, ms, us, ns (default: by name or size)");
+  importer.add_option("--angle-unit", options.angle_unit, "Of the log's angles: rad, deg (default: by name or size)");
+  importer.add_option("--rotation", options.rotation,
+                      "What rx, ry, rz are: rotvec, rpy (default: rotvec in rad, rpy in deg)");
+  importer.add_flag("--force", options.force, "Replace a capture that was imported before");
+  importer.callback([&globals, &job, request] { job = [&globals, request] { import_capture(globals, *request); }; });
 }
 
 }  // namespace chainsplat::tools

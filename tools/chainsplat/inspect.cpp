@@ -1,5 +1,4 @@
 // inspect.cpp - check and doctor: what is in a capture, what this machine can do.
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <iostream>
 #include <memory>
@@ -13,6 +12,7 @@
 #include "chainsplat/pipeline.h"
 #include "chainsplat/twin_json.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -115,15 +115,14 @@ CheckReport check_report(const std::string& path, bool with_masks) {
   return out;
 }
 
-void add_inspection_commands(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* checker = app.add_subcommand("check", "Say what is in a capture, and what is wrong with it");
+void add_inspection_commands(Command app, const Globals& globals, Job& job) {
+  Command checker = app.add_command("check", "Say what is in a capture, and what is wrong with it");
   auto path = std::make_shared<std::string>();
-  checker->add_option("CAPTURE", *path, "The capture's folder or its capture.json")->required();
-  checker->callback([&globals, &job, path] { job = [&globals, path] { check(globals, *path); }; });
+  checker.add_option("CAPTURE", *path, "The capture's folder or its capture.json").required();
+  checker.callback([&globals, &job, path] { job = [&globals, path] { check(globals, *path); }; });
 
-  CLI::App* examiner =
-      app.add_subcommand("doctor", "List the Vulkan devices, which is chosen and why, what is missing");
-  examiner->callback([&globals, &job] { job = [&globals] { doctor(globals); }; });
+  Command examiner = app.add_command("doctor", "List the Vulkan devices, which is chosen and why, what is missing");
+  examiner.callback([&globals, &job] { job = [&globals] { doctor(globals); }; });
 }
 
 }  // namespace chainsplat::tools

@@ -2,7 +2,6 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
@@ -14,6 +13,7 @@
 #include "chainsplat/json.h"
 #include "chainsplat/masks.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -197,45 +197,45 @@ void make_masks(const Globals& globals, const Request& request) {
 
 }  // namespace
 
-void add_mask_command(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* command = app.add_subcommand(
+void add_mask_command(Command app, const Globals& globals, Job& job) {
+  Command command = app.add_command(
       "mask",
       "Make object masks for a capture that has none: from the known cameras, base motion, length and\n"
       "diameter, the background and the colors near the grasp; or by an outside program, frame by frame");
   auto request = std::make_shared<Request>();
-  command->add_option("CAPTURE", request->capture, "The capture's folder or its capture.json")->required();
+  command.add_option("CAPTURE", request->capture, "The capture's folder or its capture.json").required();
   command
-      ->add_option("-o,--output", request->out,
-                   "Write FOLDER/CAMERA/000000.png and leave the capture alone (default: into the capture, where its\n"
-                   "'masks' keys say or masks/CAMERA/%06d.png, which is then named in capture.json); where the\n"
-                   "capture has masks, says how well they agree")
-      ->type_name("FOLDER");
+      .add_option("-o,--output", request->out,
+                  "Write FOLDER/CAMERA/000000.png and leave the capture alone (default: into the capture, where its\n"
+                  "'masks' keys say or masks/CAMERA/%06d.png, which is then named in capture.json); where the\n"
+                  "capture has masks, says how well they agree")
+      .type_name("FOLDER");
   command
-      ->add_option("--command", request->command,
-                   "Run this for every frame instead: {image} is a PNG to read, {mask} a PNG of the same size to\n"
-                   "write, 255 for the object; example: 'segment {image} --out {mask}'")
-      ->type_name("LINE");
-  command->add_option("--frames", request->frames, "Only frames A to B - 1, with -o")->type_name("A:B");
+      .add_option("--command", request->command,
+                  "Run this for every frame instead: {image} is a PNG to read, {mask} a PNG of the same size to\n"
+                  "write, 255 for the object; example: 'segment {image} --out {mask}'")
+      .type_name("LINE");
+  command.add_option("--frames", request->frames, "Only frames A to B - 1, with -o").type_name("A:B");
   command
-      ->add_option("--point", request->points,
-                   "A point on the rope, as clicked, in recorded pixels of the first frame (or CAMERA:FRAME:X,Y);\n"
-                   "may be given several times")
-      ->type_name("CAMERA:X,Y")
-      ->allow_extra_args(false);
+      .add_option("--point", request->points,
+                  "A point on the rope, as clicked, in recorded pixels of the first frame (or CAMERA:FRAME:X,Y);\n"
+                  "may be given several times")
+      .type_name("CAMERA:X,Y")
+      .one_each();
   command
-      ->add_option("--box", request->boxes,
-                   "The rope lies in this box, in recorded pixels, in all frames (or CAMERA:FRAME:...)")
-      ->type_name("CAMERA:X0,Y0,X1,Y1")
-      ->allow_extra_args(false);
-  command->add_option("--empty", request->empty, "A picture of the camera without the rope")
-      ->type_name("CAMERA=FILE")
-      ->allow_extra_args(false);
+      .add_option("--box", request->boxes,
+                  "The rope lies in this box, in recorded pixels, in all frames (or CAMERA:FRAME:...)")
+      .type_name("CAMERA:X0,Y0,X1,Y1")
+      .one_each();
+  command.add_option("--empty", request->empty, "A picture of the camera without the rope")
+      .type_name("CAMERA=FILE")
+      .one_each();
   command
-      ->add_option("--preview", request->preview,
-                   "Also write a contact sheet: some frames of every camera with the masks' outlines and scores")
-      ->type_name("FILE.png");
-  command->add_flag("--force", request->force, "Replace masks that are there");
-  command->callback([&globals, &job, request] { job = [&globals, request] { make_masks(globals, *request); }; });
+      .add_option("--preview", request->preview,
+                  "Also write a contact sheet: some frames of every camera with the masks' outlines and scores")
+      .type_name("FILE.png");
+  command.add_flag("--force", request->force, "Replace masks that are there");
+  command.callback([&globals, &job, request] { job = [&globals, request] { make_masks(globals, *request); }; });
 }
 
 }  // namespace chainsplat::tools

@@ -1,5 +1,4 @@
 // motion.cpp - rollout and render: a twin set in motion, and drawn.
-#include <CLI/CLI.hpp>
 #include <iostream>
 #include <memory>
 #include <nlohmann/json.hpp>
@@ -11,6 +10,7 @@
 #include "chainsplat/run_folder.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -114,57 +114,57 @@ void render(const Globals& globals, const RenderRequest& request) {
 
 }  // namespace
 
-void add_motion_commands(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* roller = app.add_subcommand("rollout", "Set the twin in motion under a base trajectory");
+void add_motion_commands(Command app, const Globals& globals, Job& job) {
+  Command roller = app.add_command("rollout", "Set the twin in motion under a base trajectory");
   auto request = std::make_shared<RolloutRequest>();
-  roller->add_option("RUN", request->run, "Run folder of an identified twin")->required();
+  roller.add_option("RUN", request->run, "Run folder of an identified twin").required();
   roller
-      ->add_option("--base", request->base,
-                   "Base motion, 'timestamp tx ty tz qx qy qz qw' a line (default: the capture's own)")
-      ->type_name("FILE.tum");
-  roller->add_option("-o,--output", request->out, "States to write; - is standard output")
-      ->required()
-      ->type_name("STATES.csv");
-  roller->add_option("--rate", request->rate, "Rows a second (default 30)")->type_name("HZ");
+      .add_option("--base", request->base,
+                  "Base motion, 'timestamp tx ty tz qx qy qz qw' a line (default: the capture's own)")
+      .type_name("FILE.tum");
+  roller.add_option("-o,--output", request->out, "States to write; - is standard output")
+      .required()
+      .type_name("STATES.csv");
+  roller.add_option("--rate", request->rate, "Rows a second (default 30)").type_name("HZ");
   roller
-      ->add_option("--centerline", request->centerline, "Also write the world points of the grasp, joints and free end")
-      ->type_name("FILE.csv");
+      .add_option("--centerline", request->centerline, "Also write the world points of the grasp, joints and free end")
+      .type_name("FILE.csv");
   roller
-      ->add_option(
+      .add_option(
           "--wrench", request->wrench,
           "Also write what the gripper exerts on the rope: force, and moment about the grasp; N, N m, world axes")
-      ->type_name("FILE.csv");
+      .type_name("FILE.csv");
   roller
-      ->add_option("--initial", request->initial,
-                   "Start from its first row (default: the identified state; with --base at rest), or from the state\n"
-                   "that fits the first half second of a file of markers")
-      ->type_name("FILE.csv");
-  roller->callback([&globals, &job, request] { job = [&globals, request] { rollout(globals, *request); }; });
+      .add_option("--initial", request->initial,
+                  "Start from its first row (default: the identified state; with --base at rest), or from the state\n"
+                  "that fits the first half second of a file of markers")
+      .type_name("FILE.csv");
+  roller.callback([&globals, &job, request] { job = [&globals, request] { rollout(globals, *request); }; });
 
-  CLI::App* renderer = app.add_subcommand("render", "Draw the twin through the cameras of a capture");
+  Command renderer = app.add_command("render", "Draw the twin through the cameras of a capture");
   auto drawing = std::make_shared<RenderRequest>();
-  renderer->add_option("RUN", drawing->run, "Run folder of a twin")->required();
-  renderer->add_option("--states", drawing->states, "Motion to draw (default: the recognized states)")
-      ->type_name("STATES.csv");
-  renderer->add_option("--camera", drawing->camera, "Whose cameras; with :NAME only that one")
-      ->required()
-      ->type_name("CAPTURE[:NAME]");
-  renderer->add_option("-o,--output", drawing->out, "Folder for CAMERA/000000.png ..., or a video that ends in .mp4")
-      ->required()
-      ->type_name("OUT");
+  renderer.add_option("RUN", drawing->run, "Run folder of a twin").required();
+  renderer.add_option("--states", drawing->states, "Motion to draw (default: the recognized states)")
+      .type_name("STATES.csv");
+  renderer.add_option("--camera", drawing->camera, "Whose cameras; with :NAME only that one")
+      .required()
+      .type_name("CAPTURE[:NAME]");
+  renderer.add_option("-o,--output", drawing->out, "Folder for CAMERA/000000.png ..., or a video that ends in .mp4")
+      .required()
+      .type_name("OUT");
   renderer
-      ->add_option("--base", drawing->base,
-                   "Base motion (default: the one kept beside the states, else that of --camera's capture)")
-      ->type_name("FILE.tum");
-  renderer->add_flag("--mask", drawing->mask, "Also 000000.mask.png: 255 where the rope covers half or more");
-  renderer->add_flag("--depth", drawing->depth, "Also 000000.depth.exr: meters along the optical axis, 0 = none");
+      .add_option("--base", drawing->base,
+                  "Base motion (default: the one kept beside the states, else that of --camera's capture)")
+      .type_name("FILE.tum");
+  renderer.add_flag("--mask", drawing->mask, "Also 000000.mask.png: 255 where the rope covers half or more");
+  renderer.add_flag("--depth", drawing->depth, "Also 000000.depth.exr: meters along the optical axis, 0 = none");
   renderer
-      ->add_option("--layout", drawing->layout,
-                   "drawn (default), or on what the camera recorded: side-by-side, overlay, wipe, outline, error")
-      ->type_name("NAME");
-  renderer->add_flag("--undistorted", drawing->undistorted, "Leave the lens distortion out");
-  renderer->add_flag("--force", drawing->force, "Write into a folder that is not empty");
-  renderer->callback([&globals, &job, drawing] { job = [&globals, drawing] { render(globals, *drawing); }; });
+      .add_option("--layout", drawing->layout,
+                  "drawn (default), or on what the camera recorded: side-by-side, overlay, wipe, outline, error")
+      .type_name("NAME");
+  renderer.add_flag("--undistorted", drawing->undistorted, "Leave the lens distortion out");
+  renderer.add_flag("--force", drawing->force, "Write into a folder that is not empty");
+  renderer.callback([&globals, &job, drawing] { job = [&globals, drawing] { render(globals, *drawing); }; });
 }
 
 }  // namespace chainsplat::tools

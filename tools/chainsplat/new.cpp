@@ -1,5 +1,4 @@
 // new.cpp - a twin without videos: empty, to identify from measured markers, or a rod of known stiffness and mass.
-#include <CLI/CLI.hpp>
 #include <cmath>
 #include <iostream>
 #include <memory>
@@ -10,6 +9,7 @@
 #include "chainsplat/pipeline.h"
 #include "chainsplat/run_folder.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -113,48 +113,48 @@ void make_new(const Globals& globals, const Request& request) {
 
 }  // namespace
 
-void add_new_command(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* command =
-      app.add_subcommand("new", "Make a twin without videos: empty, to identify from markers, or of a known rod");
+void add_new_command(Command app, const Globals& globals, Job& job) {
+  Command command =
+      app.add_command("new", "Make a twin without videos: empty, to identify from markers, or of a known rod");
   auto request = std::make_shared<Request>();
-  command->add_option("-o,--output", request->out, "Run folder to make: the twin")->required()->type_name("RUN");
-  command->add_option("--length", request->length, "From the grasp to the free end, m")
-      ->required()
-      ->check(CLI::PositiveNumber)
-      ->type_name("M");
-  command->add_option("--diameter", request->diameter, "m (default 0.02)")->check(CLI::PositiveNumber)->type_name("M");
-  command->add_option("--joints", request->joints, "Joints along the rope (default 8)")
-      ->check(CLI::Range(1, pipeline::kMostJoints))
-      ->type_name("N");
-  command->add_option("--bending", request->bending, "Axes a joint: planar (one) or spatial (two, default)")
-      ->check(CLI::IsMember({"planar", "spatial"}))
-      ->type_name("KIND");
-  command->add_option("--direction", request->direction, "Where the rope leaves the grasp, base frame (default 0,0,-1)")
-      ->delimiter(',')
-      ->expected(3)
-      ->type_name("X,Y,Z");
-  command->add_option("--bending-axis", request->bending_axis, "Axis of bending, base frame (default: across, near y)")
-      ->delimiter(',')
-      ->expected(3)
-      ->type_name("X,Y,Z");
-  command->add_option("--gravity", request->gravity, "World frame, m/s^2 (default 0,0,-9.81)")
-      ->delimiter(',')
-      ->expected(3)
-      ->type_name("X,Y,Z");
-  command->add_option("--mass", request->mass, "Of the rope, kg (default: unknown, forces are per kilogram)")
-      ->check(CLI::PositiveNumber)
-      ->type_name("KG");
-  add_payload_option(*command, request->payload);
+  command.add_option("-o,--output", request->out, "Run folder to make: the twin").required().type_name("RUN");
+  command.add_option("--length", request->length, "From the grasp to the free end, m")
+      .required()
+      .positive()
+      .type_name("M");
+  command.add_option("--diameter", request->diameter, "m (default 0.02)").positive().type_name("M");
+  command.add_option("--joints", request->joints, "Joints along the rope (default 8)")
+      .in_range(1, pipeline::kMostJoints)
+      .type_name("N");
+  command.add_option("--bending", request->bending, "Axes a joint: planar (one) or spatial (two, default)")
+      .one_of({"planar", "spatial"})
+      .type_name("KIND");
+  command.add_option("--direction", request->direction, "Where the rope leaves the grasp, base frame (default 0,0,-1)")
+      .delimiter(',')
+      .expected(3)
+      .type_name("X,Y,Z");
+  command.add_option("--bending-axis", request->bending_axis, "Axis of bending, base frame (default: across, near y)")
+      .delimiter(',')
+      .expected(3)
+      .type_name("X,Y,Z");
+  command.add_option("--gravity", request->gravity, "World frame, m/s^2 (default 0,0,-9.81)")
+      .delimiter(',')
+      .expected(3)
+      .type_name("X,Y,Z");
+  command.add_option("--mass", request->mass, "Of the rope, kg (default: unknown, forces are per kilogram)")
+      .positive()
+      .type_name("KG");
+  add_payload_option(command, request->payload);
   command
-      ->add_option("--bending-stiffness", request->bending_stiffness,
-                   "EI of a uniform straight rod, N m^2; with --mass the twin is then ready for rollout")
-      ->check(CLI::NonNegativeNumber)
-      ->type_name("EI");
-  command->add_option("--retardation", request->retardation, "Its damping over its stiffness, s (default 0)")
-      ->check(CLI::NonNegativeNumber)
-      ->type_name("S");
-  command->add_flag("--force", request->force, "Also into a folder that is not empty");
-  command->callback([&globals, &job, request] { job = [&globals, request] { make_new(globals, *request); }; });
+      .add_option("--bending-stiffness", request->bending_stiffness,
+                  "EI of a uniform straight rod, N m^2; with --mass the twin is then ready for rollout")
+      .not_negative()
+      .type_name("EI");
+  command.add_option("--retardation", request->retardation, "Its damping over its stiffness, s (default 0)")
+      .not_negative()
+      .type_name("S");
+  command.add_flag("--force", request->force, "Also into a folder that is not empty");
+  command.callback([&globals, &job, request] { job = [&globals, request] { make_new(globals, *request); }; });
 }
 
 }  // namespace chainsplat::tools

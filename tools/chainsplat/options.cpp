@@ -1,10 +1,10 @@
 // options.cpp - what a field of the library's options structs is called on the command line.
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <map>
 
 #include "chainsplat/capture.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -49,15 +49,15 @@ std::string with_options(const std::string& text) {
   return out;
 }
 
-void add_payload_option(CLI::App& command, std::vector<double>& numbers) {
+void add_payload_option(Command command, std::vector<double>& numbers) {
   command
       .add_option(
           "--tip-mass", numbers,
           "kg, of what hangs at the free end beside the rope, and its standard deviation after a comma; 0: nothing\n"
           "(default: not known; found where the motion tells it)")
-      ->delimiter(',')
-      ->expected(1, 2)
-      ->type_name("KG");
+      .delimiter(',')
+      .expected(1, 2)
+      .type_name("KG");
 }
 
 std::optional<capture::Payload> payload_of(const std::vector<double>& numbers) {

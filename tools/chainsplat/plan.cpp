@@ -1,5 +1,4 @@
 // plan.cpp - a base motion that makes the rope hit a target.
-#include <CLI/CLI.hpp>
 #include <cstdlib>
 #include <iostream>
 #include <memory>
@@ -10,6 +9,7 @@
 #include "chainsplat/run_folder.h"
 #include "chainsplat/twin.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -199,77 +199,76 @@ void plan(const Globals& globals, PlanRequest& request) {
 
 }  // namespace
 
-void add_planning_commands(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* planner = app.add_subcommand("plan", "Find a base motion that makes the rope hit a target");
+void add_planning_commands(Command app, const Globals& globals, Job& job) {
+  Command planner = app.add_command("plan", "Find a base motion that makes the rope hit a target");
   auto request = std::make_shared<PlanRequest>();
   planning::Limits& limits = request->options.limits;
-  planner->add_option("RUN", request->run, "Run folder of an identified twin")->required();
+  planner.add_option("RUN", request->run, "Run folder of an identified twin").required();
   planner
-      ->add_option("--target", request->targets,
-                   "Point to hit, m, world: in free space at any time, on a table at the end, at rest.\n"
-                   "Several are hit one after the other. random:SEED: a point that a random motion passes")
-      ->required()
-      ->type_name("X,Y,Z");
+      .add_option("--target", request->targets,
+                  "Point to hit, m, world: in free space at any time, on a table at the end, at rest.\n"
+                  "Several are hit one after the other. random:SEED: a point that a random motion passes")
+      .required()
+      .type_name("X,Y,Z");
   planner
-      ->add_option(
+      .add_option(
           "--hit", request->hit,
           "With what: tip, the nearest point of the last link or of the whole rope (default: tip, on a table rope)")
-      ->check(CLI::IsMember({"tip", "last-link", "rope"}));
-  planner->add_option("-o,--output", request->out, "Folder for base.tum, base.csv, states.csv, plan.json, picture.svg")
-      ->required()
-      ->type_name("PLAN");
-  planner->add_option("--axes", request->axes, "What moves (default: x, for a chain with two bending axes x,y)")
-      ->type_name("x,y,z,yaw");
+      .one_of({"tip", "last-link", "rope"});
+  planner.add_option("-o,--output", request->out, "Folder for base.tum, base.csv, states.csv, plan.json, picture.svg")
+      .required()
+      .type_name("PLAN");
+  planner.add_option("--axes", request->axes, "What moves (default: x, for a chain with two bending axes x,y)")
+      .type_name("x,y,z,yaw");
   planner
-      ->add_option("--horizon", request->horizon,
-                   "Seconds for each target (default 3), or free: the shortest that does")
-      ->type_name("S|free");
-  planner->add_option("--initial", request->initial, "Start from its first row (default: at rest)")
-      ->type_name("STATES.csv");
+      .add_option("--horizon", request->horizon, "Seconds for each target (default 3), or free: the shortest that does")
+      .type_name("S|free");
+  planner.add_option("--initial", request->initial, "Start from its first row (default: at rest)")
+      .type_name("STATES.csv");
   planner
-      ->add_option("--state-from", request->state_from,
-                   "Start from what one camera shows in its first frame, with the base where it is then, at rest")
-      ->type_name("CAPTURE:NAME")
-      ->excludes("--initial");
+      .add_option("--state-from", request->state_from,
+                  "Start from what one camera shows in its first frame, with the base where it is then, at rest")
+      .type_name("CAPTURE:NAME")
+      .excludes("--initial");
   planner
-      ->add_option("--terminal", request->terminal,
-                   "Where the base ends, from its start, one number an axis (default: free)")
-      ->type_name("OFFSETS");
-  planner->add_option("--window", request->window, "smooth: no acceleration at the ends; paper: s^2(1-s)^2")
-      ->check(CLI::IsMember({"smooth", "paper"}));
-  planner->add_option("--velocity", limits.velocity, "Limit of the base, m/s (default 1.5)");
-  planner->add_option("--acceleration", limits.acceleration, "Limit of the base, m/s^2 (default 10)");
-  planner->add_option("--jerk", limits.jerk, "Limit of the base, m/s^3 (default 200)");
-  planner->add_option("--stroke", limits.stroke, "Farthest from the start along an axis, m (default 0.6)");
-  planner->add_option("--yaw-velocity", limits.yaw_velocity, "Limit, rad/s (default 3.1)");
-  planner->add_option("--yaw-acceleration", limits.yaw_acceleration, "Limit, rad/s^2 (default 20)");
-  planner->add_option("--yaw-jerk", limits.yaw_jerk, "Limit, rad/s^3 (default 400)");
-  planner->add_option("--turn", limits.turn, "Farthest yaw from the start, rad (default 1.6)");
-  planner->add_option("--keep-out-sphere", request->spheres, "Rope and gripper stay out of it")->type_name("X,Y,Z,R");
-  planner->add_option("--keep-out-box", request->boxes, "Rope and gripper stay out of it")->type_name("X,Y,Z,X,Y,Z");
-  planner->add_option("--gripper-radius", request->options.gripper_radius,
-                      "Of a sphere about the base, m (default 0.04)");
-  planner->add_option("--tolerance", request->options.tolerance, "A smaller miss counts as reached, m (default 0.001)");
-  planner->add_option("--starts", request->options.starts, "Random motions to begin from (default 24)")
-      ->check(CLI::Range(0, 100000));
+      .add_option("--terminal", request->terminal,
+                  "Where the base ends, from its start, one number an axis (default: free)")
+      .type_name("OFFSETS");
+  planner.add_option("--window", request->window, "smooth: no acceleration at the ends; paper: s^2(1-s)^2")
+      .one_of({"smooth", "paper"});
+  planner.add_option("--velocity", limits.velocity, "Limit of the base, m/s (default 1.5)");
+  planner.add_option("--acceleration", limits.acceleration, "Limit of the base, m/s^2 (default 10)");
+  planner.add_option("--jerk", limits.jerk, "Limit of the base, m/s^3 (default 200)");
+  planner.add_option("--stroke", limits.stroke, "Farthest from the start along an axis, m (default 0.6)");
+  planner.add_option("--yaw-velocity", limits.yaw_velocity, "Limit, rad/s (default 3.1)");
+  planner.add_option("--yaw-acceleration", limits.yaw_acceleration, "Limit, rad/s^2 (default 20)");
+  planner.add_option("--yaw-jerk", limits.yaw_jerk, "Limit, rad/s^3 (default 400)");
+  planner.add_option("--turn", limits.turn, "Farthest yaw from the start, rad (default 1.6)");
+  planner.add_option("--keep-out-sphere", request->spheres, "Rope and gripper stay out of it").type_name("X,Y,Z,R");
+  planner.add_option("--keep-out-box", request->boxes, "Rope and gripper stay out of it").type_name("X,Y,Z,X,Y,Z");
+  planner.add_option("--gripper-radius", request->options.gripper_radius,
+                     "Of a sphere about the base, m (default 0.04)");
+  planner.add_option("--tolerance", request->options.tolerance, "A smaller miss counts as reached, m (default 0.001)");
+  planner.add_option("--starts", request->options.starts, "Random motions to begin from (default 24)")
+      .in_range(0, 100000);
   planner
-      ->add_option("--samples", request->options.samples,
-                   "Also plan for N parameter sets drawn from the identification's covariance")
-      ->check(CLI::Range(0, 1000))
-      ->type_name("N");
-  planner->add_flag("--worst-case", request->options.worst_case, "Minimize the samples' worst miss, not the mean");
-  planner->add_option("--simulate", request->simulate, "Also play the plan on this true chain (a twin.json's 'chain')")
-      ->type_name("CHAIN.json");
-  planner->add_flag("--mpc", request->mpc,
-                    "With --simulate: plan the rest anew from the state that is seen; base.* is\n"
-                    "then the motion as corrected");
-  planner->add_option("--mpc-rate", request->loop.rate, "Replans a second (default 10)")->type_name("HZ");
+      .add_option("--samples", request->options.samples,
+                  "Also plan for N parameter sets drawn from the identification's covariance")
+      .in_range(0, 1000)
+      .type_name("N");
+  planner.add_flag("--worst-case", request->options.worst_case, "Minimize the samples' worst miss, not the mean");
+  planner.add_option("--simulate", request->simulate, "Also play the plan on this true chain (a twin.json's 'chain')")
+      .type_name("CHAIN.json");
+  planner.add_flag("--mpc", request->mpc,
+                   "With --simulate: plan the rest anew from the state that is seen; base.* is\n"
+                   "then the motion as corrected");
+  planner.add_option("--mpc-rate", request->loop.rate, "Replans a second (default 10)").type_name("HZ");
   planner
-      ->add_option("--target-velocity", request->target_velocity, "With --mpc: the target moves from the start on, m/s")
-      ->type_name("VX,VY,VZ");
-  planner->add_option("--rate", request->rate, "Rows a second of the files (default 100)")->type_name("HZ");
-  planner->add_flag("--force", request->force, "Write into a folder that is not empty");
-  planner->callback([&globals, &job, request] { job = [&globals, request] { plan(globals, *request); }; });
+      .add_option("--target-velocity", request->target_velocity, "With --mpc: the target moves from the start on, m/s")
+      .type_name("VX,VY,VZ");
+  planner.add_option("--rate", request->rate, "Rows a second of the files (default 100)").type_name("HZ");
+  planner.add_flag("--force", request->force, "Write into a folder that is not empty");
+  planner.callback([&globals, &job, request] { job = [&globals, request] { plan(globals, *request); }; });
 }
 
 }  // namespace chainsplat::tools

@@ -1,5 +1,4 @@
 // result.cpp - eval, report, export, synth: how good a twin is, and what others can do with it.
-#include <CLI/CLI.hpp>
 #include <algorithm>
 #include <iostream>
 #include <memory>
@@ -13,6 +12,7 @@
 #include "chainsplat/run_folder.h"
 #include "chainsplat/synth.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -171,73 +171,70 @@ void synthesize(const Globals& globals, const SynthRequest& request) {
 
 }  // namespace
 
-void add_result_commands(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* evaluator = app.add_subcommand("eval", "Measure how well a twin explains a capture");
+void add_result_commands(Command app, const Globals& globals, Job& job) {
+  Command evaluator = app.add_command("eval", "Measure how well a twin explains a capture");
   auto request = std::make_shared<EvalRequest>();
-  evaluator->add_option("RUN", request->run, "Run folder of a twin")->required();
-  evaluator->add_option("CAPTURE", request->capture, "Its own capture, or another one of the same rope (rollout only)")
-      ->required();
-  evaluator->add_option("-o,--output", request->out, "Also write the metrics as JSON")->type_name("FILE.json");
-  evaluator->add_option("--frames", request->frames, "Only these frames: from A up to, not including, B")
-      ->type_name("A:B");
-  evaluator->add_option("--picture", request->picture, "Also make a picture: observed beside rendered frames")
-      ->type_name("FILE.png");
-  evaluator->callback([&globals, &job, request] { job = [&globals, request] { evaluate(globals, *request); }; });
+  evaluator.add_option("RUN", request->run, "Run folder of a twin").required();
+  evaluator.add_option("CAPTURE", request->capture, "Its own capture, or another one of the same rope (rollout only)")
+      .required();
+  evaluator.add_option("-o,--output", request->out, "Also write the metrics as JSON").type_name("FILE.json");
+  evaluator.add_option("--frames", request->frames, "Only these frames: from A up to, not including, B")
+      .type_name("A:B");
+  evaluator.add_option("--picture", request->picture, "Also make a picture: observed beside rendered frames")
+      .type_name("FILE.png");
+  evaluator.callback([&globals, &job, request] { job = [&globals, request] { evaluate(globals, *request); }; });
 
-  CLI::App* reporter =
-      app.add_subcommand("report", "Show the twin as one page for a browser: replay, verdict, metrics, numbers");
+  Command reporter =
+      app.add_command("report", "Show the twin as one page for a browser: replay, verdict, metrics, numbers");
   auto showing = std::make_shared<ReportRequest>();
-  reporter->add_option("RUN", showing->run, "Run folder of a twin")->required();
-  reporter->add_option("-o,--output", showing->out, "Page to write; - is standard output")
-      ->required()
-      ->type_name("FILE.html");
+  reporter.add_option("RUN", showing->run, "Run folder of a twin").required();
+  reporter.add_option("-o,--output", showing->out, "Page to write; - is standard output")
+      .required()
+      .type_name("FILE.html");
   reporter
-      ->add_option("--video", showing->options.videos, "Cameras whose frames go into the page, small: about 2 MB each")
-      ->delimiter(',')
-      ->type_name("CAMERA,...");
-  reporter->add_option("--capture", showing->capture, "The twin's own capture, where it has moved")
-      ->type_name("CAPTURE");
-  reporter->callback([&globals, &job, showing] { job = [&globals, showing] { report(globals, *showing); }; });
+      .add_option("--video", showing->options.videos, "Cameras whose frames go into the page, small: about 2 MB each")
+      .delimiter(',')
+      .type_name("CAMERA,...");
+  reporter.add_option("--capture", showing->capture, "The twin's own capture, where it has moved").type_name("CAPTURE");
+  reporter.callback([&globals, &job, showing] { job = [&globals, showing] { report(globals, *showing); }; });
 
-  CLI::App* exporter = app.add_subcommand("export", "Write the twin for other programs, by the file's ending");
+  Command exporter = app.add_command("export", "Write the twin for other programs, by the file's ending");
   auto exporting = std::make_shared<ExportRequest>();
-  exporter->add_option("RUN", exporting->run, "Run folder of a twin")->required();
+  exporter.add_option("RUN", exporting->run, "Run folder of a twin").required();
   std::string endings;
   for (const std::string& ending : exports::endings()) endings += (endings.empty() ? "" : " ") + ending;
-  exporter->add_option("-o,--output", exporting->out, "File to write; its ending says what: " + endings)
-      ->required()
-      ->type_name("FILE");
-  exporter->add_option("--states", exporting->states, "Motion to write (default: the recognized states)")
-      ->type_name("STATES.csv");
+  exporter.add_option("-o,--output", exporting->out, "File to write; its ending says what: " + endings)
+      .required()
+      .type_name("FILE");
+  exporter.add_option("--states", exporting->states, "Motion to write (default: the recognized states)")
+      .type_name("STATES.csv");
   exporter
-      ->add_option("--base", exporting->base,
-                   "Its base motion (default: the one kept beside the states, else the capture's own)")
-      ->type_name("FILE.tum");
-  exporter->add_flag("--mesh", exporting->mesh, "In glTF also a skinned tube, for viewers that draw no splats");
-  exporter->add_flag("--raw", exporting->raw,
-                     "Gaussians as trained, without what our renderer adds on the image and other viewers do not");
-  exporter->add_flag("--no-pictures", exporting->no_pictures, "In MCAP without what the capture's cameras saw");
-  exporter->add_flag("--force", exporting->force, "Replace files that are there");
-  exporter->callback(
-      [&globals, &job, exporting] { job = [&globals, exporting] { export_twin(globals, *exporting); }; });
+      .add_option("--base", exporting->base,
+                  "Its base motion (default: the one kept beside the states, else the capture's own)")
+      .type_name("FILE.tum");
+  exporter.add_flag("--mesh", exporting->mesh, "In glTF also a skinned tube, for viewers that draw no splats");
+  exporter.add_flag("--raw", exporting->raw,
+                    "Gaussians as trained, without what our renderer adds on the image and other viewers do not");
+  exporter.add_flag("--no-pictures", exporting->no_pictures, "In MCAP without what the capture's cameras saw");
+  exporter.add_flag("--force", exporting->force, "Replace files that are there");
+  exporter.callback([&globals, &job, exporting] { job = [&globals, exporting] { export_twin(globals, *exporting); }; });
 
-  CLI::App* synthesizer = app.add_subcommand("synth", "Draw a capture from a twin: videos, masks, depth, truth");
+  Command synthesizer = app.add_command("synth", "Draw a capture from a twin: videos, masks, depth, truth");
   auto scene = std::make_shared<SynthRequest>();
-  synthesizer->add_option("RUN", scene->run, "Run folder of a twin")->required();
-  synthesizer->add_option("-o,--output", scene->out, "Capture folder to make")->required()->type_name("CAPTURE");
+  synthesizer.add_option("RUN", scene->run, "Run folder of a twin").required();
+  synthesizer.add_option("-o,--output", scene->out, "Capture folder to make").required().type_name("CAPTURE");
+  synthesizer.add_option("--states", scene->states, "Motion to draw (default: the rollout, else the recognized states)")
+      .type_name("STATES.csv");
   synthesizer
-      ->add_option("--states", scene->states, "Motion to draw (default: the rollout, else the recognized states)")
-      ->type_name("STATES.csv");
+      .add_option("--camera", scene->camera, "Whose cameras, base motion and table (default: the twin's own capture)")
+      .type_name("CAPTURE[:NAME]");
   synthesizer
-      ->add_option("--camera", scene->camera, "Whose cameras, base motion and table (default: the twin's own capture)")
-      ->type_name("CAPTURE[:NAME]");
-  synthesizer
-      ->add_option("--base", scene->base,
-                   "Base motion (default: the one kept beside the states, else that of the capture)")
-      ->type_name("FILE.tum");
-  synthesizer->add_flag("--images", scene->images, "Images without loss instead of videos");
-  synthesizer->add_flag("--force", scene->force, "Write into a folder that is not empty");
-  synthesizer->callback([&globals, &job, scene] { job = [&globals, scene] { synthesize(globals, *scene); }; });
+      .add_option("--base", scene->base,
+                  "Base motion (default: the one kept beside the states, else that of the capture)")
+      .type_name("FILE.tum");
+  synthesizer.add_flag("--images", scene->images, "Images without loss instead of videos");
+  synthesizer.add_flag("--force", scene->force, "Write into a folder that is not empty");
+  synthesizer.callback([&globals, &job, scene] { job = [&globals, scene] { synthesize(globals, *scene); }; });
 }
 
 }  // namespace chainsplat::tools

@@ -1,5 +1,4 @@
 // train.cpp - train, recognize: a twin from a capture.
-#include <CLI/CLI.hpp>
 #include <iostream>
 #include <memory>
 #include <nlohmann/json.hpp>
@@ -11,6 +10,7 @@
 #include "chainsplat/solve_json.h"
 #include "chainsplat/twin_json.h"
 #include "cli.h"
+#include "command_line.h"
 
 namespace chainsplat::tools {
 
@@ -80,60 +80,58 @@ void train(const Globals& globals, const Request& request) {
   if (!request.picture.empty() && result.recognized) std::cout << "picture: " << request.picture << "\n";
 }
 
-void add_recognition_options(CLI::App& command, Request& request) {
+void add_recognition_options(Command command, Request& request) {
   pipeline::TrainOptions& options = request.options;
-  command.add_option("CAPTURE", request.capture, "The capture's folder or its capture.json")->required();
-  command.add_option("-o,--output", request.out, "Run folder to make: the twin")->required()->type_name("RUN");
+  command.add_option("CAPTURE", request.capture, "The capture's folder or its capture.json").required();
+  command.add_option("-o,--output", request.out, "Run folder to make: the twin").required().type_name("RUN");
   command.add_flag("--force", options.force, "Begin again in a run folder that is not empty");
   command.add_flag("--resume", options.resume, "Continue in a run folder that was left unfinished");
   command
       .add_option("--joints", request.joints,
                   "Joints along the rope, 1 to 64 (default: 8, 12 or 16, as many as its bends ask for)")
-      ->type_name("N|auto");
+      .type_name("N|auto");
   command
       .add_option(
           "--bending", request.bending,
           "Axes a joint: planar (one), spatial (two) or auto (default: planar on a table; in free space spatial\n"
           "unless the rope hardly leaves its plane)")
-      ->check(CLI::IsMember({"auto", "planar", "spatial"}))
-      ->type_name("KIND");
+      .one_of({"auto", "planar", "spatial"})
+      .type_name("KIND");
   command.add_flag("--twist", options.twist, "Also a twist axis a joint");
   command.add_option("--every", options.every, "Train the Gaussians on every N-th frame (default 5)")
-      ->check(CLI::PositiveNumber)
-      ->type_name("N");
-  command.add_option("--frames", request.frames, "Only these frames: from A up to, not including, B")->type_name("A:B");
+      .positive()
+      .type_name("N");
+  command.add_option("--frames", request.frames, "Only these frames: from A up to, not including, B").type_name("A:B");
   command.add_option("--mode", request.mode, "fast (default) or paper: the paper's own procedure, slow")
-      ->check(CLI::IsMember({"fast", "paper"}))
-      ->type_name("MODE");
+      .one_of({"fast", "paper"})
+      .type_name("MODE");
   command
       .add_option("--fixed", options.fixed,
                   "Take as given what is else corrected: cameras,focal,time,length,diameter,grasp,masks,colors, or all")
-      ->delimiter(',')
-      ->type_name("LIST");
+      .delimiter(',')
+      .type_name("LIST");
   command.add_flag("--anyway", options.anyway,
                    "Go on where check names a mistake in the capture; do not trust the twin");
 }
 
 }  // namespace
 
-void add_training_commands(CLI::App& app, const Globals& globals, Job& job) {
-  CLI::App* trainer =
-      app.add_subcommand("train", "Make a twin from a capture: recognize, identify, roll out, evaluate");
+void add_training_commands(Command app, const Globals& globals, Job& job) {
+  Command trainer = app.add_command("train", "Make a twin from a capture: recognize, identify, roll out, evaluate");
   auto request = std::make_shared<Request>();
-  add_recognition_options(*trainer, *request);
-  trainer->add_option("--stages", request->stages, "Only these, by comma: recognize,identify,rollout,evaluate")
-      ->type_name("LIST");
-  trainer->add_flag("--joint", request->options.joint,
-                    "Refine angles, Gaussians and dynamics together: helps where a single camera hardly sees depth");
-  trainer->add_option("--picture", request->picture, "Also make a picture: observed beside rendered frames")
-      ->type_name("FILE.png");
-  trainer->callback([&globals, &job, request] { job = [&globals, request] { train(globals, *request); }; });
+  add_recognition_options(trainer, *request);
+  trainer.add_option("--stages", request->stages, "Only these, by comma: recognize,identify,rollout,evaluate")
+      .type_name("LIST");
+  trainer.add_flag("--joint", request->options.joint,
+                   "Refine angles, Gaussians and dynamics together: helps where a single camera hardly sees depth");
+  trainer.add_option("--picture", request->picture, "Also make a picture: observed beside rendered frames")
+      .type_name("FILE.png");
+  trainer.callback([&globals, &job, request] { job = [&globals, request] { train(globals, *request); }; });
 
-  CLI::App* recognizer =
-      app.add_subcommand("recognize", "The first stage of train alone: Gaussians and angles from images");
+  Command recognizer = app.add_command("recognize", "The first stage of train alone: Gaussians and angles from images");
   auto recognition = std::make_shared<Request>();
-  add_recognition_options(*recognizer, *recognition);
-  recognizer->callback([&globals, &job, recognition] {
+  add_recognition_options(recognizer, *recognition);
+  recognizer.callback([&globals, &job, recognition] {
     recognition->stages = "recognize";
     job = [&globals, recognition] { train(globals, *recognition); };
   });
