@@ -7,6 +7,7 @@
 
 #include "dynamics/planar.h"
 #include "dynamics/spatial.h"
+#include "src/math/decompositions.h"
 
 using namespace chainsplat;
 using namespace chainsplat::dynamics;

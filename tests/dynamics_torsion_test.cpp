@@ -3,6 +3,7 @@
 #include <cmath>
 
 #include "chainsplat/dynamics.h"
+#include "src/math/decompositions.h"
 
 using namespace chainsplat;
 using namespace chainsplat::dynamics;

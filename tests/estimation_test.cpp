@@ -11,6 +11,7 @@
 #include "chainsplat/gpu.h"
 #include "reference_colors.h"
 #include "src/estimation/predict.h"
+#include "src/math/decompositions.h"
 
 namespace {
 

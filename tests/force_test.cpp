@@ -10,6 +10,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/identification.h"
+#include "src/math/decompositions.h"
 
 namespace {
 

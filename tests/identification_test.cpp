@@ -1,4 +1,5 @@
 #include "chainsplat/identification.h"
+#include "src/math/decompositions.h"
 
 #include <doctest/doctest.h>
 #include <algorithm>

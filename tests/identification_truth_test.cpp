@@ -8,6 +8,7 @@
 
 #include "chainsplat/identification.h"
 #include "identification/unknowns.h"
+#include "src/math/decompositions.h"
 
 using namespace chainsplat;
 using namespace chainsplat::identification;

@@ -1,5 +1,6 @@
 #include "chainsplat/math.h"
 #include "chainsplat/rectangle.h"
+#include "src/math/decompositions.h"
 
 #include <doctest/doctest.h>
 

@@ -1,4 +1,5 @@
 #include "chainsplat/refinement.h"
+#include "src/math/decompositions.h"
 
 #include <doctest/doctest.h>
 
@@ -163,7 +164,6 @@ TEST_CASE("a camera alone sees depth better with the dynamics; twice the same") 
   CHECK(error(first.states) < 0.9 * error(found.states));
   const Result second = refined();
   CHECK(first.gaussians.mean == second.gaussians.mean);
-  for (std::size_t k = 0; k < found.states.time.size(); ++k)
-    CHECK(first.states.theta[k] == second.states.theta[k]);
+  for (std::size_t k = 0; k < found.states.time.size(); ++k) CHECK(first.states.theta[k] == second.states.theta[k]);
   CHECK(gpu::validation_messages(*device) == 0);
 }

@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "chainsplat/solve_json.h"
+#include "src/math/decompositions.h"
 
 using namespace chainsplat;
 using namespace chainsplat::solve;
@@ -299,9 +300,7 @@ TEST_CASE("many fits evaluated at once, each by its own loop, are those one by o
   std::vector<Descent> fits;
   std::vector<NormalEquations> now(starts.size());
   for (const VectorX& start : starts) fits.push_back(begin(start, options));
-  const auto running = [&] {
-    return std::any_of(fits.begin(), fits.end(), [](const Descent& d) { return !d.done; });
-  };
+  const auto running = [&] { return std::any_of(fits.begin(), fits.end(), [](const Descent& d) { return !d.done; }); };
   while (running())
     for (std::size_t i = 0; i < starts.size(); ++i) {
       if (fits[i].done) continue;

@@ -10,6 +10,7 @@
 #include "chainsplat/splat.h"
 #include "gpu/device.h"
 #include "reference_colors.h"
+#include "src/math/decompositions.h"
 
 using namespace chainsplat;
 using math::MatrixX;

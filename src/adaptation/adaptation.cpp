@@ -4,13 +4,14 @@
 #include <cmath>
 
 #include "chainsplat/dynamics/parametrization.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::adaptation {
 namespace {
 
-constexpr double kRateSd = 1.0;       // rad/s, of the first frame's rates
-constexpr int kMaxRejected = 5;       // frames in a row, after which the state starts anew
-constexpr double kMaxStep = 0.3;      // of a log in one frame: beyond, the linearization is worthless
+constexpr double kRateSd = 1.0;   // rad/s, of the first frame's rates
+constexpr int kMaxRejected = 5;   // frames in a row, after which the state starts anew
+constexpr double kMaxStep = 0.3;  // of a log in one frame: beyond, the linearization is worthless
 
 MatrixX symmetric(const MatrixX& m) { return 0.5 * (m + m.transpose()); }
 
@@ -101,7 +102,7 @@ void ParameterFilter::Belief::forget(double interval) {
   // in units of what is expected, the information of the eigenvector with variance v fades towards 1
   const VectorX unit = expected.cwiseSqrt();
   const Eigen::SelfAdjointEigenSolver<MatrixX> eigen(
-      symmetric(unit.cwiseInverse().asDiagonal() * block * unit.cwiseInverse().asDiagonal()));
+      MatrixX(symmetric(unit.cwiseInverse().asDiagonal() * block * unit.cwiseInverse().asDiagonal())));
   VectorX grown = eigen.eigenvalues();
   for (double& v : grown) {
     v = std::max(v, 1e-12);
@@ -150,8 +151,7 @@ bool ParameterFilter::Belief::observe(const Observation& seen, const dynamics::B
     throw InputError("`online`", "a number of the frame at " + core::exact(seen.time) + " s is not finite",
                      "leave lost frames out");
   if ((seen.sigma.array() < 0.0).any())
-    throw InputError("`online`",
-                     "a standard deviation of the frame at " + core::exact(seen.time) + " s is negative",
+    throw InputError("`online`", "a standard deviation of the frame at " + core::exact(seen.time) + " s is negative",
                      "give what 'estimate' prints for this rope");
   if (started && !(seen.time > time))
     throw InputError("`online`", "times go backwards at " + core::exact(seen.time) + " s",

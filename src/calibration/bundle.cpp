@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include "src/math/decompositions.h"
 
 namespace chainsplat::calibration {
 
@@ -319,7 +320,7 @@ Certainty certainty(const Bundle& bundle) {
   // unknowns have units of very different size
   const VectorX size = information.diagonal().cwiseAbs().cwiseSqrt().cwiseMax(1e-12).cwiseInverse();
   const MatrixX scaled = size.asDiagonal() * information * size.asDiagonal();
-  const Eigen::SelfAdjointEigenSolver<MatrixX> axes(0.5 * (scaled + scaled.transpose()));
+  const Eigen::SelfAdjointEigenSolver<MatrixX> axes(MatrixX(0.5 * (scaled + scaled.transpose())));
   const VectorX least = axes.eigenvalues().cwiseMax(1e-14);
   Certainty out;
   out.absorbed = static_cast<double>(information.rows());

@@ -1,6 +1,7 @@
 #include "chainsplat/chain.h"
 
 #include "chainsplat/core.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::chain {
 

@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "chainsplat/dynamics.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::dynamics {
 namespace {

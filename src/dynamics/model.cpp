@@ -4,6 +4,7 @@
 #include "chainsplat/dynamics/base_wrench.h"
 #include "planar.h"
 #include "spatial.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::dynamics {
 namespace {

@@ -5,6 +5,7 @@
 #include <iterator>
 
 #include "shaders/shared/color.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::estimation {
 

@@ -7,6 +7,7 @@
 #include <numbers>
 
 #include "chainsplat/silhouette.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::estimation {
 
@@ -155,7 +156,7 @@ void learn_setup(State& state, std::span<const capture::View* const> views, cons
   Setup& setup = state.setup;
   const chain::Chain& chain = state.given.model.chain;
   const int n = chain.angles();
-  const Eigen::LLT<MatrixX> factor(predicted.covariance.topLeftCorner(n, n));
+  const Eigen::LLT<MatrixX> factor(MatrixX(predicted.covariance.topLeftCorner(n, n)));
   if (!math::is_positive(factor)) return;
   silhouette::Options options = state.options.silhouette;
   options.prior.mean = predicted.mean.head(n);

@@ -1,6 +1,7 @@
 #include "src/estimation/unknown_force.h"
 
 #include <algorithm>
+#include "src/math/decompositions.h"
 
 namespace chainsplat::estimation {
 

@@ -5,6 +5,7 @@
 #include <limits>
 
 #include "chainsplat/excitation.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::excitation {
 namespace {

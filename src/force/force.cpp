@@ -8,6 +8,7 @@
 
 #include "chainsplat/dynamics/parametrization.h"
 #include "force/track.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::force {
 

@@ -2,6 +2,7 @@
 #include <cmath>
 
 #include "chainsplat/force.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::force {
 namespace {

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <limits>
 
+#include "src/math/decompositions.h"
 #include "unknowns.h"
 
 namespace chainsplat::identification {
@@ -651,7 +652,7 @@ MatrixX covariance_of(const Problem& problem, const MatrixX& hessian, const Roll
     add_part(problem, i,
              covariance_of_scores(problem.parts[i], rollouts.states[i], rollouts.slopes[i], rollouts.values[i], limit),
              meat);
-  const Eigen::LDLT<MatrixX> factor(hessian + prior);
+  const Eigen::LDLT<MatrixX> factor(MatrixX(hessian + prior));
   const MatrixX bread = factor.solve(MatrixX::Identity(prior.rows(), prior.cols()));
   const MatrixX out = bread * meat * bread;
   // the sandwich is itself an estimate, of few independent frames: never less than what the weights alone promise
@@ -674,7 +675,8 @@ std::vector<dynamics::Estimates::Weak> weak_directions(const Problem& problem, s
   const MatrixX prior = problem.precision.topLeftCorner(shared, shared);
   const VectorX deviation = prior.ldlt().solve(MatrixX::Identity(shared, shared)).diagonal().cwiseMax(0.0).cwiseSqrt();
   if (!information.allFinite()) return {};  // its covariance is said not to be known
-  const Eigen::SelfAdjointEigenSolver<MatrixX> eigen(deviation.asDiagonal() * information * deviation.asDiagonal());
+  const Eigen::SelfAdjointEigenSolver<MatrixX> eigen(
+      MatrixX(deviation.asDiagonal() * information * deviation.asDiagonal()));
   constexpr double kLarge = 0.3;  // a component that is named: a tenth of the vector's square
   std::vector<dynamics::Estimates::Weak> weak;
   for (int i = 0; i < shared && eigen.eigenvalues()[i] < 1.0; ++i) {
@@ -729,7 +731,7 @@ double lack_of_evidence(const Problem& problem, const Fit& fit, double least) {
   const Misfit found = misfit_of(rollouts);
   const double scale = std::max(found.scale, least);
   const MatrixX data = solve::dense(normal_equations(problem, rollouts, kInfinity)).matrix / (scale * scale);
-  const Eigen::LDLT<MatrixX> posterior(data + problem.precision), prior(problem.precision);
+  const Eigen::LDLT<MatrixX> posterior(MatrixX(data + problem.precision)), prior(problem.precision);
   if (!math::is_positive(posterior) || !math::is_positive(prior)) return kInfinity;
   const double shrunk = posterior.vectorD().array().log().sum() - prior.vectorD().array().log().sum();
   const VectorX off = fit.p - problem.mean;

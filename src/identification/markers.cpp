@@ -3,6 +3,7 @@
 #include <cstdio>
 
 #include "chainsplat/identification.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::identification {
 namespace {
@@ -101,11 +102,10 @@ VectorX along_polygon(const chain::Chain& chain, const math::Pose& pose, const M
       return 0.5 * off.squaredNorm();
     };
     VectorX joint = theta.segment(last - count + 1, count);
-    solve::least_squares(
-        joint, evaluate,
-        {.steps = kAimIterations,
-         .checked = false,
-         .damping = {.rule = solve::Damping::Rule::fixed, .first = kAimDamping}});
+    solve::least_squares(joint, evaluate,
+                         {.steps = kAimIterations,
+                          .checked = false,
+                          .damping = {.rule = solve::Damping::Rule::fixed, .first = kAimDamping}});
     theta.segment(last - count + 1, count) = joint;
   }
   return theta;

@@ -1,6 +1,7 @@
 #include "unknowns.h"
 
 #include <cmath>
+#include "src/math/decompositions.h"
 
 namespace chainsplat::identification {
 

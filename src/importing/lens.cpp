@@ -4,6 +4,7 @@
 #include <cmath>
 #include <limits>
 #include <numbers>
+#include "src/math/decompositions.h"
 
 namespace chainsplat::importing {
 

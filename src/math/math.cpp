@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <numeric>
+#include "src/math/decompositions.h"
 
 namespace chainsplat::math {
 

@@ -1,6 +1,7 @@
 #include "parameter_correction.h"
 
 #include <cmath>
+#include "src/math/decompositions.h"
 
 namespace chainsplat::planning {
 namespace {

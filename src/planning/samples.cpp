@@ -1,6 +1,7 @@
 // Parameter sets drawn from what identification knows (mathematics.md 8, robustness).
 #include "chainsplat/dynamics/parametrization.h"
 #include "chainsplat/planning.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::planning {
 
@@ -12,7 +13,8 @@ std::vector<dynamics::Parameters> draw_parameters(const chain::Chain& chain, con
     throw InputError("`samples`", "the twin knows no covariance of its parameters",
                      "identify it again or leave `samples` out");
   // a covariance that was written and read may be off positive by rounding
-  const Eigen::SelfAdjointEigenSolver<MatrixX> eigen(0.5 * (estimates.covariance + estimates.covariance.transpose()));
+  const Eigen::SelfAdjointEigenSolver<MatrixX> eigen(
+      MatrixX(0.5 * (estimates.covariance + estimates.covariance.transpose())));
   const MatrixX root = eigen.eigenvectors() * eigen.eigenvalues().cwiseMax(0.0).cwiseSqrt().asDiagonal();
   const std::vector<dynamics::Unknown> unknowns = dynamics::unknowns_of(chain, estimates);
   core::Random random(seed);

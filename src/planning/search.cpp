@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include "src/math/decompositions.h"
 
 namespace chainsplat::planning {
 namespace {

@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "src/math/decompositions.h"
 #include "src/recognition/modes.h"
 
 namespace chainsplat::recognition {
@@ -18,7 +19,8 @@ AnglePrior prior_of(const silhouette::SequenceFit& fit) {
 }
 
 solve::Summary refine_states(gpu::Device& device, const capture::Capture& capture, const chain::Chain& chain,
-                   const splat::Gaussians& gaussians, const AnglePrior& prior, int iterations, chain::States& states) {
+                             const splat::Gaussians& gaussians, const AnglePrior& prior, int iterations,
+                             chain::States& states) {
   const std::vector<FrameViews> frames = assign_views(capture, states.time);
   std::vector<int> seen;
   for (int k = 0; k < static_cast<int>(frames.size()); ++k)

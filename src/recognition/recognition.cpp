@@ -5,6 +5,7 @@
 #include <cmath>
 #include <sstream>
 
+#include "src/math/decompositions.h"
 #include "src/recognition/checkpoint.h"
 #include "src/recognition/modes.h"
 
@@ -43,8 +44,9 @@ std::string job_text(const capture::Capture& capture, const Options& options) {
   ranges.erase(std::unique(ranges.begin(), ranges.end()), ranges.end());
   std::string frames;
   for (const std::string& range : ranges) frames += (frames.empty() ? "" : ",") + range;
-  const char* const bending =
-      !options.bending ? "auto" : *options.bending == chain::Bending::planar ? "planar" : "spatial";
+  const char* const bending = !options.bending                             ? "auto"
+                              : *options.bending == chain::Bending::planar ? "planar"
+                                                                           : "spatial";
   std::vector<double> geometry{capture.length, capture.diameter};  // which may have been corrected
   for (const capture::Camera& camera : capture.cameras) {
     const math::Pose& pose = camera.world_from_camera;
@@ -53,13 +55,13 @@ std::string job_text(const capture::Capture& capture, const Options& options) {
   }
   std::ostringstream text;
   text << "capture " << capture.hash << "\nframes " << frames << "\n--joints "
-       << (options.joints ? std::to_string(*options.joints) : "auto") << "\n--bending "
-       << bending << "\n--twist " << (options.twist ? "yes" : "no") << "\n--every " << options.every << "\n--mode "
+       << (options.joints ? std::to_string(*options.joints) : "auto") << "\n--bending " << bending << "\n--twist "
+       << (options.twist ? "yes" : "no") << "\n--every " << options.every << "\n--mode "
        << (options.mode == Mode::paper ? "paper" : "fast") << "\n--seed " << options.seed << "\nbudget "
-       << options.budget << "\nstep " << core::exact(options.step) << "\npaper's Gaussians "
-       << options.paper_gaussians << "\npaper's iterations " << options.paper_iterations << "\ntimes of frames "
-       << hashed(times, core::fnv1a("")) << "\ncameras and size " << hashed(geometry, core::fnv1a(""))
-       << "\nimages and masks " << hashed(pictures, core::fnv1a("")) << "\n";
+       << options.budget << "\nstep " << core::exact(options.step) << "\npaper's Gaussians " << options.paper_gaussians
+       << "\npaper's iterations " << options.paper_iterations << "\ntimes of frames " << hashed(times, core::fnv1a(""))
+       << "\ncameras and size " << hashed(geometry, core::fnv1a("")) << "\nimages and masks "
+       << hashed(pictures, core::fnv1a("")) << "\n";
   return text.str();
 }
 

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include "src/math/decompositions.h"
 
 namespace chainsplat::recognition {
 
@@ -252,7 +253,7 @@ Refined refine_angles(const chain::Chain& chain, const capture::Capture& capture
     out.covariances.push_back(normal.size() > 0 ? math::MatrixX((normal + 1e-6 * unit).inverse()) : unit);
     // where a part of the rope is hardly seen, elimination without symmetry loses the sign of small variances
     if (!math::is_covariance(out.covariances.back()))
-      out.covariances.back() = (normal + 1e-6 * unit).ldlt().solve(unit);
+      out.covariances.back() = math::MatrixX(normal + 1e-6 * unit).ldlt().solve(unit);
   }
   out.summary = solve::together(summaries);
   return out;

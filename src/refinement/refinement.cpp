@@ -3,6 +3,7 @@
 #include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
+#include "src/math/decompositions.h"
 
 namespace chainsplat::refinement {
 
@@ -19,8 +20,7 @@ constexpr double kSettled = 5e-5;          // m, RMS over nodes: a thirtieth of 
 MatrixX node_metric(const chain::Chain& chain, const VectorX& theta) {
   const auto motions = chain::link_motions(chain, theta, {});
   const MatrixX axes = chain::world_axes(chain, theta, {});
-  return chain::displacement_metric(
-      chain::point_jacobians(chain, axes, motions, chain::shape_points(chain, false)));
+  return chain::displacement_metric(chain::point_jacobians(chain, axes, motions, chain::shape_points(chain, false)));
 }
 
 void check_sizes(const chain::States& images, const chain::States& rollout) {
@@ -95,7 +95,7 @@ chain::States combine(const chain::Chain& chain, const chain::States& images, co
     const MatrixX model = noise.model_error * noise.model_error *
                           node_metric(chain, rollout.theta[k]).ldlt().solve(MatrixX::Identity(n, n));
     // gain of the images over the rollout: model (image + model)^-1
-    const MatrixX gain = (image + model).ldlt().solve(model).transpose();
+    const MatrixX gain = MatrixX(image + model).ldlt().solve(model).transpose();
     out.theta[k] = rollout.theta[k] + gain * (images.theta[k] - rollout.theta[k]);
     MatrixX covariance = gain * image;
     covariance = 0.5 * (covariance + covariance.transpose()).eval();

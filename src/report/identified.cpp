@@ -8,6 +8,7 @@
 
 #include "chainsplat/dynamics/parametrization.h"
 #include "chainsplat/report.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::report {
 

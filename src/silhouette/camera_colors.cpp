@@ -8,6 +8,7 @@
 #include "chainsplat/core.h"
 #include "chainsplat/corrections.h"
 #include "chainsplat/image_model.h"
+#include "src/math/decompositions.h"
 #include "src/silhouette/frame.h"
 
 namespace chainsplat::silhouette {
@@ -206,7 +207,7 @@ Channel fit_channel(const std::vector<Patch>& patches, int channel, const Vector
   covariance = sum.inverse();
   VectorX variance = covariance.diagonal().cwiseMax(0.0);
   for (int s = 0; s < kStretches && normal[s].size() > 0; ++s) {
-    const VectorX without = (sum - normal[s]).ldlt().solve(right[s]);
+    const VectorX without = MatrixX(sum - normal[s]).ldlt().solve(right[s]);
     variance += (kStretches - 1.0) / kStretches * without.cwiseAbs2();
   }
   return {x, variance.cwiseSqrt()};

@@ -1,4 +1,5 @@
 #include "src/silhouette/correction_equations.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::silhouette {
 

@@ -3,6 +3,7 @@
 #include <numeric>
 
 #include "chainsplat/core.h"
+#include "src/math/decompositions.h"
 #include "src/silhouette/correction_equations.h"
 
 namespace chainsplat::silhouette {
@@ -18,12 +19,12 @@ namespace {
 // Gauss-Newton. Outlines farther from the rope than a cut do not count (Tukey); it starts wide, since what is given may
 // be wrong by many pixels, and narrows until the residuals' own spread sets it.
 constexpr int kSteps = 40;
-constexpr double kStep = 0.02;            // of the prior deviations, and rad: smaller steps end it
-constexpr double kLongestStep = 50.0;     // the same, in one step
-constexpr double kWidestCut = 30.0;       // px
-constexpr double kNarrowing = 0.6;        // of that cut from step to step
-constexpr double kWideEnd = 8.0;          // half widths: the reach of the free end as long as the cut is wide
-constexpr double kLeastSize = 0.5;        // share of the given length and diameter below which no correction goes
+constexpr double kStep = 0.02;         // of the prior deviations, and rad: smaller steps end it
+constexpr double kLongestStep = 50.0;  // the same, in one step
+constexpr double kWidestCut = 30.0;    // px
+constexpr double kNarrowing = 0.6;     // of that cut from step to step
+constexpr double kWideEnd = 8.0;       // half widths: the reach of the free end as long as the cut is wide
+constexpr double kLeastSize = 0.5;     // share of the given length and diameter below which no correction goes
 // The priors' penalty is kTails / 2 ln(1 + |y|^2 / kTails) in units of their deviation: nearly a Gaussian's for what a
 // careful laboratory gets wrong, and for a fault ten times that nearly flat.
 constexpr double kTails = 2.0;

@@ -2,6 +2,7 @@
 #include <cmath>
 #include <limits>
 
+#include "src/math/decompositions.h"
 #include "src/silhouette/observations.h"
 
 namespace chainsplat::silhouette {

@@ -1,5 +1,6 @@
 // Damped normal equations, dense and in the arrow form.
 #include "chainsplat/solve.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::solve {
 namespace {

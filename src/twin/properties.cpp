@@ -7,6 +7,7 @@
 #include <limits>
 
 #include "chainsplat/dynamics/parametrization.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::twin {
 namespace {

@@ -1,0 +1,36 @@
+// decompositions.h - Eigen's decompositions of matrices of any size, compiled once, by math. A source that uses one and
+// includes this compiles 3 to 7 s sooner. It holds for plain matrices: of an expression Eigen would compile its own, so
+// that sources write MatrixX(a + b).ldlt().
+#pragma once
+#include <Eigen/Dense>
+
+#include "chainsplat/math.h"
+
+namespace Eigen {
+
+extern template class LDLT<MatrixXd>;
+extern template LDLT<MatrixXd>& LDLT<MatrixXd>::compute<MatrixXd>(const EigenBase<MatrixXd>&);
+extern template void LDLT<MatrixXd>::_solve_impl_transposed<true>(const VectorXd&, VectorXd&) const;
+extern template void LDLT<MatrixXd>::_solve_impl_transposed<true>(const MatrixXd&, MatrixXd&) const;
+extern template void LDLT<MatrixXd>::_solve_impl_transposed<true>(const MatrixXd::IdentityReturnType&, MatrixXd&) const;
+
+extern template class LLT<MatrixXd>;
+extern template LLT<MatrixXd>& LLT<MatrixXd>::compute<MatrixXd>(const EigenBase<MatrixXd>&);
+extern template void LLT<MatrixXd>::_solve_impl_transposed<true>(const VectorXd&, VectorXd&) const;
+extern template void LLT<MatrixXd>::_solve_impl_transposed<true>(const MatrixXd&, MatrixXd&) const;
+extern template void LLT<MatrixXd>::_solve_impl_transposed<true>(const MatrixXd::IdentityReturnType&, MatrixXd&) const;
+
+extern template class ColPivHouseholderQR<MatrixXd>;
+extern template ColPivHouseholderQR<MatrixXd>& ColPivHouseholderQR<MatrixXd>::compute<MatrixXd>(
+    const EigenBase<MatrixXd>&);
+extern template void ColPivHouseholderQR<MatrixXd>::_solve_impl(const VectorXd&, VectorXd&) const;
+extern template void ColPivHouseholderQR<MatrixXd>::_solve_impl(const MatrixXd&, MatrixXd&) const;
+
+extern template class PartialPivLU<MatrixXd>;  // of MatrixXd::inverse()
+
+extern template class SelfAdjointEigenSolver<MatrixXd>;
+extern template SelfAdjointEigenSolver<MatrixXd>& SelfAdjointEigenSolver<MatrixXd>::compute<MatrixXd>(
+    const EigenBase<MatrixXd>&, int);
+extern template class GeneralizedSelfAdjointEigenSolver<MatrixXd>;
+
+}  // namespace Eigen
