@@ -1,0 +1,1 @@
+// precompiled.cpp - an object beside the headers that all modules read precompiled (CMakeLists.txt).
