@@ -8,6 +8,7 @@
 
 #include <atomic>
 #include <cmath>
+#include <limits>
 #include <nlohmann/json.hpp>
 
 using namespace chainsplat;
@@ -124,4 +125,10 @@ TEST_CASE("numbers for people have few digits, and none too few") {
   CHECK(core::brief(0.012345678) == "0.01235");
   CHECK(core::brief(0.0) == "0");
   CHECK(core::brief(1763800000.25) == "1763800000.25");
+  CHECK(core::with_error(0.00047591, 4.83e-5) == "0.000476 +- 0.000048");
+  CHECK(core::with_error(1.14196, 0.000462) == "1.14196 +- 0.00046");
+  CHECK(core::with_error(-1234.4, 27.3) == "-1234 +- 27");
+  CHECK(core::with_error(1e300, 1.0).size() > 300);
+  CHECK(core::with_error(0.5, std::numeric_limits<double>::quiet_NaN()) == "0.5 +- nan");
+  CHECK(core::with_error(0.5, 0.0) == "0.5 +- 0");
 }

@@ -1,12 +1,13 @@
 #include "chainsplat/properties.h"
 
 #include <Eigen/Eigenvalues>
+#include <algorithm>
 #include <cmath>
-#include <cstdio>
 #include <exception>
 #include <limits>
 
 #include "chainsplat/dynamics/parametrization.h"
+#include "chainsplat/text.h"
 #include "src/math/decompositions.h"
 
 namespace chainsplat::twin {
@@ -114,12 +115,17 @@ std::vector<Property> properties(const dynamics::Model& model, const dynamics::E
 }
 
 std::string describe(const std::vector<Property>& properties) {
+  constexpr int kNames = 22, kNumbers = 26;  // columns
   std::string out;
-  char line[160];
   for (const Property& p : properties) {
-    std::snprintf(line, sizeof line, "%-22s %10.4g +- %.2g %s\n", p.name.c_str(), p.value, p.sigma,
-                  p.unit == "1" ? "" : p.unit.c_str());
-    out += line;
+    std::string line = p.name;
+    line.append(std::max<int>(1, kNames - static_cast<int>(line.size())), ' ');
+    line += core::with_error(p.value, p.sigma);
+    if (p.unit != "1") {
+      line.append(std::max<int>(1, kNames + kNumbers - static_cast<int>(line.size())), ' ');
+      line += p.unit;
+    }
+    out += line + "\n";
   }
   return out;
 }
