@@ -1,1 +1,1 @@
-// precompiled.cpp - an object beside the headers that all modules read precompiled (CMakeLists.txt).
+// precompiled.cpp - empty. CMake precompiles headers for a target, and a target needs a source (CMakeLists.txt).

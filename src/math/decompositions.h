@@ -1,6 +1,6 @@
-// decompositions.h - Eigen's decompositions of matrices of any size, compiled once, by math. A source that uses one and
-// includes this compiles 3 to 7 s sooner. It holds for plain matrices: of an expression Eigen would compile its own, so
-// that sources write MatrixX(a + b).ldlt().
+// decompositions.h - Eigen's decompositions of matrices of any size, compiled once, in decompositions.cpp. Every source
+// that factors a matrix includes this, else it compiles the same code again (design.md, 'Compile time'). The instances
+// are for plain matrices: a sum or product is to be evaluated first, as in MatrixX(a + b).ldlt().
 #pragma once
 #include <Eigen/Dense>
 

@@ -6,7 +6,7 @@ export VK_DRIVER_FILES=/nonexistent VK_ICD_FILENAMES=/nonexistent
 expect_error 2 'mass' new -o "$work/bad" --length 0.3 --mass 0
 expect_error 2 'mass' new -o "$work/bad" --length 0.3 --mass=-1
 expect_error 2 'length' new -o "$work/bad" --length 0
-expect_error 2 'length: is not a number' new -o "$work/bad" --length nan
+expect_error 2 "length: 'nan' is not a number above 0" new -o "$work/bad" --length nan
 expect_error 2 'bending-axis' new -o "$work/bad" --length 0.3 --bending-axis 0,0,1
 expect_error 2 'bending-stiffness: .*mass' new -o "$work/bad" --length 0.3 --bending-stiffness 1e-3
 [ -e "$work/bad" ] && fail 'new: a refused twin was written'

@@ -57,6 +57,7 @@ expect_error 2 '--output' train capture
 expect_error 2 'nonsense' train capture -o run --nonsense
 expect_error 2 'joints' train capture -o run --joints none
 expect_error 2 'joints' train capture -o run --joints 0
+expect_error 2 "--every: '-1' is not a number above 0; " train capture -o run --every -1
 expect_error 2 'bending' train capture -o run --bending sideways
 expect_error 2 'polish' train capture -o run --stages recognize,polish
 expect_error 2 '--frames' train capture -o run --frames 5:5

@@ -1,10 +1,25 @@
 #include "command_line.h"
 
 #include <CLI/CLI.hpp>
+#include <cmath>
 #include <cstdint>
 #include <filesystem>
 
 namespace chainsplat::tools {
+
+namespace {
+
+// CLI11's own checks of this kind print the largest double, in 309 digits.
+CLI::Validator finite_number(bool (*good)(double), const std::string& what, const std::string& in_help) {
+  return {[good, what](const std::string& text) {
+            double value = 0.0;
+            const bool number = CLI::detail::lexical_cast(text, value) && std::isfinite(value);
+            return number && good(value) ? std::string() : "'" + text + "' is not " + what;
+          },
+          in_help};
+}
+
+}  // namespace
 
 Option& Option::required() {
   option_->required();
@@ -32,12 +47,12 @@ Option& Option::in_range(double least, double most) {
 }
 
 Option& Option::positive() {
-  option_->check(CLI::PositiveNumber);
+  option_->check(finite_number([](double value) { return value > 0.0; }, "a number above 0", "POSITIVE"));
   return *this;
 }
 
 Option& Option::not_negative() {
-  option_->check(CLI::NonNegativeNumber);
+  option_->check(finite_number([](double value) { return value >= 0.0; }, "a number from 0 on", "NONNEGATIVE"));
   return *this;
 }
 

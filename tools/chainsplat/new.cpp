@@ -129,18 +129,12 @@ void add_new_command(Command app, const Globals& globals, Job& job) {
   command.add_option("--bending", request->bending, "Axes a joint: planar (one) or spatial (two, default)")
       .one_of({"planar", "spatial"})
       .type_name("KIND");
-  command.add_option("--direction", request->direction, "Where the rope leaves the grasp, base frame (default 0,0,-1)")
-      .delimiter(',')
-      .expected(3)
-      .type_name("X,Y,Z");
-  command.add_option("--bending-axis", request->bending_axis, "Axis of bending, base frame (default: across, near y)")
-      .delimiter(',')
-      .expected(3)
-      .type_name("X,Y,Z");
-  command.add_option("--gravity", request->gravity, "World frame, m/s^2 (default 0,0,-9.81)")
-      .delimiter(',')
-      .expected(3)
-      .type_name("X,Y,Z");
+  const auto three = [&](const char* name, std::vector<double>& into, const char* help) {
+    command.add_option(name, into, help).delimiter(',').expected(3).type_name("X,Y,Z");
+  };
+  three("--direction", request->direction, "Where the rope leaves the grasp, base frame (default 0,0,-1)");
+  three("--bending-axis", request->bending_axis, "Axis of bending, base frame (default: across, near y)");
+  three("--gravity", request->gravity, "World frame, m/s^2 (default 0,0,-9.81)");
   command.add_option("--mass", request->mass, "Of the rope, kg (default: unknown, forces are per kilogram)")
       .positive()
       .type_name("KG");
