@@ -94,7 +94,8 @@ int link_at(const Chain& chain, double arclength);
 MatrixX centerline(const Chain& chain, const std::vector<Pose>& motions, const std::vector<double>& arclengths);
 // Length of rope whose bending joint j = 1.. stands for, m: from the middle of the link before it to the middle of its
 // own (mathematics.md 3.2). A first joint on the clamp has only the half behind it; where a base link reaches from the
-// clamp to the first joint, that joint also stands for all of it. Stiffness is EI over this length.
+// clamp to the first joint, that joint also stands for all of it. Without tension a rod's joint has EI over this length
+// (dynamics/rod.h).
 double bent_length(const Chain& chain, int joint);
 // The nodes: grasp, every joint, free end, 3 x (n_l + 2). Where s_1 = 0 the first two coincide.
 MatrixX nodes(const Chain& chain, const std::vector<Pose>& motions);

@@ -22,8 +22,8 @@ struct Quantity {
   double value = 0.0;           // in `unit`
   std::optional<double> error;  // one standard deviation; none: not estimated
 };
-// What identification found. Empty before it. `base`: where the rope hangs from when its swing is computed.
-std::vector<Quantity> identified(const twin::Twin& twin, const trajectory::Trajectory& base);
+// What identification found. Empty before it.
+std::vector<Quantity> identified(const twin::Twin& twin);
 
 // Standard deviations of the rollout's angles at its times, rad, by the covariance of what was identified: first order,
 // within the model. Empty where there is no covariance, and for the paper's integrator, whose steps have no

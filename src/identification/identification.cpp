@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <limits>
 
 #include "src/math/decompositions.h"
@@ -747,6 +748,28 @@ struct Candidate {
   double lack = kInfinity;  // of evidence
 };
 
+// A fit, and again about the rod that it found, until that is the rod that its joints are in proportion to. `about`:
+// the problem about a rod.
+Candidate fit_about_rod(const Extras& extras, const std::function<Problem(const Rod&)>& about, const Options& options) {
+  constexpr int kMost = 3;
+  constexpr double kSame =
+      0.05;  // of the logarithm of a stiffness: the joints' proportions then change by half of that
+  const bool taut = options.fit_stiffness && !options.tabletop;
+  Rod rod;
+  Fit fit = fit_centerline(about(rod), options);
+  for (int i = 0; i < kMost && taut && fit.cost < kInfinity; ++i) {
+    const Problem last = about(rod);
+    const Rod found = rod_of(last.chain, last.parts[0].unknowns, last.of_part(fit.p, 0));
+    if (!(found.tension.front() > 0.0) || std::abs(std::log(found.bending_stiffness / rod.bending_stiffness)) < kSame)
+      break;
+    const Fit before = fit;
+    improve(about(found), kInfinity, true, options.max_iterations, fit);
+    if (fit.cost == kInfinity) return {extras, about(rod), before};
+    rod = found;
+  }
+  return {extras, about(rod), std::move(fit)};
+}
+
 // The model of every rope, or one with friction in bending or a payload where the data ask for it.
 Candidate fit_candidates(const chain::Chain& chain, std::vector<Part> parts, const Options& options) {
   // Misfit that needs no further explanation. What is expected of markers is generous; of recognized angles it is a
@@ -755,10 +778,12 @@ Candidate fit_candidates(const chain::Chain& chain, std::vector<Part> parts, con
   constexpr double kEvidence = 5.0;  // in favor of what a rope need not have, natural logarithm
   std::vector<Candidate> tried;
   const auto attempt = [&](const Extras& extras) {
-    std::vector<Part> own = parts;
-    for (Part& part : own) part.unknowns = make_unknowns(chain, options, part.start, extras);
-    tried.push_back({extras, make_problem(chain, std::move(own)), {}});
-    tried.back().fit = fit_centerline(tried.back().problem, options);
+    const auto about = [&](const Rod& rod) {
+      std::vector<Part> own = parts;
+      for (Part& part : own) part.unknowns = make_unknowns(chain, options, part.start, extras, rod);
+      return make_problem(chain, std::move(own));
+    };
+    tried.push_back(fit_about_rod(extras, about, options));
   };
   attempt({});
   const auto within = [&](const Candidate& one) {

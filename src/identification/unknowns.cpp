@@ -1,6 +1,8 @@
 #include "unknowns.h"
 
 #include <cmath>
+
+#include "chainsplat/dynamics/rod.h"
 #include "src/math/decompositions.h"
 
 namespace chainsplat::identification {
@@ -71,7 +73,7 @@ struct Draft {
   std::vector<Smooth> smooth = {};
   int angles = chain.angles(), links = chain.links() - 1;
   double torque = 0.0;     // N m (or per kg), of the rope's weight at its length
-  double reference = 0.0;  // m, of rope that a joint stands for in the mean
+  double reference = 0.0;  // mean_bent_length
   bool stiff = options.fit_stiffness && !options.paper;
 
   void hold(const char* name, const char* reason) { u.held.emplace_back(name, reason); }
@@ -89,6 +91,11 @@ struct Draft {
   }
 };
 
+// m, of rope that a joint stands for in the mean
+double mean_bent_length(const chain::Chain& chain) {
+  return (chain.length - chain.joint_arclength[0]) / (chain.links() - 1);
+}
+
 Draft begin(const chain::Chain& chain, const Options& options, const Start& start) {
   Draft d{chain, options};
   d.u.total_mass = options.mass.value_or(1.0);
@@ -96,7 +103,7 @@ Draft begin(const chain::Chain& chain, const Options& options, const Start& star
                                     : "set to 1 kg: only ratios to it are observable, forces are per kg");
   d.u.initial = {0.0, start.theta, start.thetadot};
   d.torque = d.u.total_mass * options.gravity.norm() * chain.length;
-  d.reference = (chain.length - chain.joint_arclength[0]) / d.links;
+  d.reference = mean_bent_length(chain);
 
   dynamics::Parameters& unit = d.u.reference;
   unit.viscous_friction = unit.coulomb_friction = unit.air_linear = unit.air_quadratic = all(d.links, 0.0);
@@ -113,19 +120,42 @@ Draft begin(const chain::Chain& chain, const Options& options, const Start& star
   return d;
 }
 
-void add_stiffness(Draft& d) {
+// Joints in proportion to those of the rod under tension; those that twist the rope are as without.
+void shape_as_rod(Draft& d, const Rod& rod) {
+  dynamics::Parameters& unit = d.u.reference;
+  std::vector<double> tension = rod.tension;
+  if (tension.empty()) {
+    dynamics::Parameters uniform = unit;
+    for (double& mass : uniform.link_mass) mass *= d.u.total_mass / d.chain.length;
+    uniform.tip_mass = d.options.tip_mass.value_or(0.0);
+    tension = dynamics::hanging_tension(d.chain, uniform);
+  }
+  const double prior = std::exp(d.means.back()) * d.reference;
+  for (int k = 0; k < d.angles; ++k) {
+    if (chain::is_twist(d.chain, k)) continue;
+    const int joint = d.chain.child_link[k];
+    const double bending = rod.bending_stiffness > 0.0 ? rod.bending_stiffness : prior;
+    const double slack = dynamics::rod_joint(d.chain, joint, bending, 0.0).stiffness;
+    const dynamics::RodJoint taut = dynamics::rod_joint(d.chain, joint, bending, tension[joint - 1]);
+    unit.stiffness[k] *= taut.stiffness / slack;
+    unit.damping[k] *= taut.slope / slack;
+  }
+}
+
+void add_stiffness(Draft& d, const Rod& rod) {
   dynamics::Parameters& unit = d.u.reference;
   if (!d.stiff) return d.hold("stiffness", d.options.paper ? "0, as in the paper" : "held at 0 on request");
   unit.stiffness = unit.damping;
   d.add(Quantity::stiffness, 0, std::log(kStiffnessPart * d.torque), kSharedSd);
+  if (twists_within_links(d.chain, d.options))
+    for (int k = 0; k < d.angles; k += 2) unit.torsional_stiffness.push_back(unit.stiffness[k]);
+  shape_as_rod(d, rod);
   // two fingers hold a rope more stiffly one way than the other (a foam noodle in a gripper: 1.5)
   if (d.options.per_joint && d.angles > 1 && d.chain.child_link[1] == 1 && !chain::is_twist(d.chain, 1))
     d.add(Quantity::grasp_stiffness, 0, 0.0, kGraspSd);
   if (chain::has_twist(d.chain)) d.add(Quantity::twist_stiffness, 0, 0.0, kTwistSd);
-  if (twists_within_links(d.chain, d.options)) {
-    for (int k = 0; k < d.angles; k += 2) unit.torsional_stiffness.push_back(unit.stiffness[k]);
+  if (!unit.torsional_stiffness.empty())
     d.add(Quantity::torsional_stiffness, 0, -std::log(1.0 + kPoissonRatio), kTorsionSd);
-  }
 }
 
 // Damping of the usual size: a logarithm.
@@ -239,9 +269,10 @@ Unknowns finish(Draft d) {
 
 }  // namespace
 
-Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const Start& start, const Extras& extras) {
+Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const Start& start, const Extras& extras,
+                       const Rod& rod) {
   Draft d = begin(chain, options, start);
-  add_stiffness(d);
+  add_stiffness(d, rod);
   if (options.paper) {
     add_as_in_paper(d);
   } else {
@@ -288,6 +319,12 @@ std::vector<std::string> Unknowns::names() const {
 
 State apply(const chain::Chain& chain, const Unknowns& u, const VectorX& p) {
   return {dynamics::moved(chain, u.reference, u.list, p, u.total_mass), dynamics::moved(u.initial, u.list, p)};
+}
+
+Rod rod_of(const chain::Chain& chain, const Unknowns& u, const VectorX& p) {
+  const int stiffness = u.first(Quantity::stiffness);
+  return {stiffness < 0 ? 0.0 : std::exp(p[stiffness]) * mean_bent_length(chain),
+          dynamics::hanging_tension(chain, apply(chain, u, p).parameters)};
 }
 
 std::vector<dynamics::Tangent> tangents(const chain::Chain& chain, const Unknowns& u, const VectorX& p) {

@@ -36,6 +36,13 @@ struct Extras {
   bool payload = false;   // of unknown mass
 };
 
+// The rod that the joints' stiffnesses and dampings are in proportion to those of (dynamics/rod.h): under tension their
+// proportions depend on its stiffness, so that a fit is made again about the rod that was found.
+struct Rod {
+  double bending_stiffness = 0.0;  // N m^2; not positive: that of the prior
+  std::vector<double> tension;     // N, in every joint; empty: of a uniform rope
+};
+
 // What is known of the initial state beforehand: rad, rad/s, and the deviations of one.
 struct Start {
   VectorX theta, thetadot, theta_sd;
@@ -43,8 +50,11 @@ struct Start {
 };
 
 // Priors follow mathematics.md 5.
-Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const Start& start,
-                       const Extras& extras = {});
+Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const Start& start, const Extras& extras = {},
+                       const Rod& rod = {});
+
+// The rod that a fit found.
+Rod rod_of(const chain::Chain& chain, const Unknowns& unknowns, const VectorX& p);
 
 // The initial state alone, of a rope of these parameters.
 Unknowns make_state_unknowns(const chain::Chain& chain, const dynamics::Parameters& parameters, const Start& start);

@@ -1,5 +1,4 @@
 // identified.cpp - what identification found, in the units that people know, with first-order errors.
-#include <Eigen/Eigenvalues>
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
@@ -7,8 +6,9 @@
 #include <numbers>
 
 #include "chainsplat/dynamics/parametrization.h"
+#include "chainsplat/dynamics/rod.h"
+#include "chainsplat/properties.h"
 #include "chainsplat/report.h"
-#include "src/math/decompositions.h"
 
 namespace chainsplat::report {
 
@@ -53,6 +53,16 @@ std::optional<double> estimate(const dynamics::Estimates& e, const std::string& 
   return at == e.names.end() ? std::nullopt : std::optional<double>(e.values[at - e.names.begin()]);
 }
 
+const twin::Property* property(const std::vector<twin::Property>& properties, const char* name) {
+  for (const twin::Property& each : properties)
+    if (each.name == name) return &each;
+  return nullptr;
+}
+
+std::optional<double> error_of(const twin::Property& property) {
+  return std::isfinite(property.sigma) ? std::optional<double>(property.sigma) : std::nullopt;
+}
+
 void add_masses(const twin::Twin& twin, std::vector<Quantity>& out) {
   const Parameters& p = *twin.parameters;
   const double total = dynamics::total_mass(p), fraction = p.tip_mass / total;
@@ -65,23 +75,22 @@ void add_masses(const twin::Twin& twin, std::vector<Quantity>& out) {
          times(total * fraction * (1.0 - fraction), deviation(twin.estimates, {{"logit_tip_mass_fraction", 1.0}}))});
 }
 
-// Bending stiffness and retardation time from the common numbers of all joints, whose errors the fit tells.
-void add_bending(const twin::Twin& twin, std::vector<Quantity>& out) {
+void add_bending(const twin::Twin& twin, const std::vector<twin::Property>& properties, std::vector<Quantity>& out) {
   const chain::Chain& chain = twin.chain;
   const Parameters& p = *twin.parameters;
   const dynamics::Estimates& e = twin.estimates;
-  const double reference = (chain.length - chain.joint_arclength[0]) / (chain.links() - 1);
   const auto stiffness = estimate(e, "log_stiffness"), damping = estimate(e, "log_damping");
-  if (stiffness) {
+  if (const twin::Property* bending = property(properties, "bending_stiffness"); bending && stiffness) {
+    const std::vector<double> tension = dynamics::hanging_tension(chain, p);
     double low = INFINITY, high = 0.0;
     for (int k = 0; k < chain.angles(); ++k) {
       if (chain::is_twist(chain, k)) continue;
-      const double each = p.stiffness[k] * chain::bent_length(chain, chain.child_link[k]);
+      const int joint = chain.child_link[k];
+      const double each = dynamics::rod_stiffness(chain, joint, p.stiffness[k], tension[joint - 1]);
       low = std::min(low, each), high = std::max(high, each);
     }
-    const double bending = std::exp(*stiffness) * reference;
-    out.push_back({"bending stiffness EI", "N m\u00b2", text("%.2g to %.2g from joint to joint", low, high), bending,
-                   times(bending, deviation(e, {{"log_stiffness", 1.0}}))});
+    out.push_back({"bending stiffness EI", "N m\u00b2", text("%.2g to %.2g from joint to joint", low, high),
+                   bending->value, error_of(*bending)});
   }
   if (stiffness && damping) {
     const double retardation = std::exp(*damping - *stiffness);
@@ -101,53 +110,13 @@ void add_bending(const twin::Twin& twin, std::vector<Quantity>& out) {
   }
 }
 
-// Frequency (Hz) and damping ratio of the slowest swing about the equilibrium under a base at rest.
-std::optional<std::pair<double, double>> slowest_swing(const chain::Chain& chain, const Parameters& parameters,
-                                                       const math::Pose& base, const VectorX& start) {
-  const dynamics::Model model = dynamics::make_model(chain, parameters);
-  const VectorX theta = dynamics::static_equilibrium(model, base, start).theta;
-  const Eigen::Index n = theta.size();
-  const dynamics::Linearization at =
-      dynamics::linearize(model, dynamics::at_rest(base), math::Vector6::Zero(), theta, VectorX::Zero(n));
-  const Eigen::LLT<MatrixX> mass(at.mass);
-  if (!math::is_positive(mass)) return {};
-  MatrixX system = MatrixX::Zero(2 * n, 2 * n);
-  system.topRightCorner(n, n).setIdentity();
-  system.bottomLeftCorner(n, n) = -mass.solve(at.stiffness);
-  system.bottomRightCorner(n, n) = -mass.solve(at.damping);
-  const Eigen::VectorXcd rates = Eigen::EigenSolver<MatrixX>(system, false).eigenvalues();
-  std::complex<double> slowest = 0.0;
-  for (const std::complex<double>& rate : rates)
-    if (rate.imag() > 0.0 && (slowest == 0.0 || std::abs(rate) < std::abs(slowest))) slowest = rate;
-  if (slowest == 0.0) return {};
-  return std::pair(slowest.imag() / (2.0 * std::numbers::pi), -slowest.real() / std::abs(slowest));
-}
-
-void add_swing(const twin::Twin& twin, const math::Pose& base, std::vector<Quantity>& out) {
-  constexpr double kStep = 1e-3;  // of an unknown's scale, for differences
-  const chain::Chain& chain = twin.chain;
-  const VectorX none;
-  const auto found = slowest_swing(chain, *twin.parameters, base, none);
-  if (!found) return;
-  const VectorX rest = dynamics::static_equilibrium(dynamics::make_model(chain, *twin.parameters), base).theta;
-  const std::vector<dynamics::Unknown> unknowns = dynamics::unknowns_of(chain, twin.estimates);
-  std::map<std::string, double> by_frequency, by_ratio;
-  for (std::size_t i = 0; i < unknowns.size(); ++i) {
-    if (!dynamics::is_parameter(unknowns[i].quantity)) continue;
-    const double step = kStep * dynamics::scale_of(unknowns[i].quantity);
-    const auto moved = [&](double by) {
-      return slowest_swing(chain, dynamics::moved(chain, *twin.parameters, {&unknowns[i], 1}, VectorX::Constant(1, by)),
-                           base, rest);
-    };
-    const auto up = moved(step), down = moved(-step);
-    if (!up || !down) return;
-    by_frequency[twin.estimates.names[i]] = (up->first - down->first) / (2.0 * step);
-    by_ratio[twin.estimates.names[i]] = (up->second - down->second) / (2.0 * step);
-  }
-  out.push_back({"slowest swing", "Hz", "hanging from the base at rest, small", found->first,
-                 deviation(twin.estimates, by_frequency)});
-  out.push_back({"its damping ratio", "", "without drag, which is quadratic", found->second,
-                 deviation(twin.estimates, by_ratio)});
+// Of the rope that hangs from a base at rest; none on a table, or where it hangs nowhere.
+void add_swing(const std::vector<twin::Property>& properties, std::vector<Quantity>& out) {
+  if (const twin::Property* frequency = property(properties, "first_frequency"))
+    out.push_back(
+        {"slowest swing", "Hz", "hanging from a base at rest, small", frequency->value, error_of(*frequency)});
+  if (const twin::Property* ratio = property(properties, "damping_ratio"))
+    out.push_back({"its damping ratio", "", "without drag, which is quadratic", ratio->value, error_of(*ratio)});
 }
 
 void add_resistance(const twin::Twin& twin, std::vector<Quantity>& out) {
@@ -178,18 +147,14 @@ void add_resistance(const twin::Twin& twin, std::vector<Quantity>& out) {
 
 }  // namespace
 
-std::vector<Quantity> identified(const twin::Twin& twin, const trajectory::Trajectory& base) {
+std::vector<Quantity> identified(const twin::Twin& twin) {
   std::vector<Quantity> out;
   if (!twin.parameters) return out;
+  const std::vector<twin::Property> properties =
+      twin::properties(dynamics::make_model(twin.chain, *twin.parameters), twin.estimates, twin.known_mass);
   add_masses(twin, out);
-  add_bending(twin, out);
-  if (!twin.tabletop) {
-    try {
-      add_swing(twin, base.samples().empty() ? math::Pose() : base.pose(base.start()), out);
-    } catch (const WorkError&) {
-      // a rope that stands on its grasp has no stable equilibrium: it does not swing
-    }
-  }
+  add_bending(twin, properties, out);
+  add_swing(properties, out);
   add_resistance(twin, out);
   return out;
 }

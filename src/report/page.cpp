@@ -208,7 +208,7 @@ void add_identification(const Contents& contents, Json& out) {
   const twin::Twin& twin = contents.twin;
   if (!twin.parameters) return;
   out["identified"] = Json::array();
-  for (const Quantity& q : identified(twin, contents.base))
+  for (const Quantity& q : identified(twin))
     out["identified"].push_back({{"name", q.name},
                                  {"value", q.value},
                                  {"error", q.error ? Json(*q.error) : Json()},

@@ -7,6 +7,7 @@
 #include <limits>
 
 #include "chainsplat/dynamics/parametrization.h"
+#include "chainsplat/dynamics/rod.h"
 #include "chainsplat/text.h"
 #include "src/math/decompositions.h"
 
@@ -45,9 +46,11 @@ std::vector<Property> values(const dynamics::Model& model, bool known_mass, Vect
   const std::string per_mass = known_mass ? "" : "/kg";
   double bending = 0.0, twisting = 0.0, friction = 0.0, mass = 0.0, length = 0.0, held = 0.0;
   int bends = 0;
+  const std::vector<double> tension = dynamics::hanging_tension(chain, p);
   for (int k = 0; k < chain.angles(); ++k) {
     if (chain::is_twist(chain, k)) continue;
-    bending += p.stiffness[k] * chain::bent_length(chain, chain.child_link[k]);
+    const int joint = chain.child_link[k];
+    bending += dynamics::rod_stiffness(chain, joint, p.stiffness[k], tension[joint - 1]);
     if (!p.bending_friction.empty()) friction += p.bending_friction[k];
     ++bends;
   }

@@ -5,6 +5,7 @@
 #include <nlohmann/json.hpp>
 #include <utility>
 
+#include "chainsplat/dynamics/rod.h"
 #include "chainsplat/json.h"
 #include "chainsplat/pipeline.h"
 #include "chainsplat/run_folder.h"
@@ -47,9 +48,11 @@ dynamics::Parameters rod(const chain::Chain& chain, const Request& request, cons
   for (int j = 1; j <= links; ++j)
     rod.link_mass.push_back(request.mass * (chain.link_end(j) - chain.link_start(j)) / chain.length);
   if (!request.payload.empty()) rod.tip_mass = request.payload[0];
+  const std::vector<double> tension = dynamics::hanging_tension(chain, rod);
   for (const int link : chain.child_link) {
-    rod.stiffness.push_back(request.bending_stiffness / chain::bent_length(chain, link));
-    rod.damping.push_back(request.retardation * rod.stiffness.back());
+    const dynamics::RodJoint joint = dynamics::rod_joint(chain, link, request.bending_stiffness, tension[link - 1]);
+    rod.stiffness.push_back(joint.stiffness);
+    rod.damping.push_back(request.retardation * joint.slope);
     rod.rest_angle.push_back(0.0);
   }
   return rod;

@@ -1,0 +1,73 @@
+#include "chainsplat/dynamics/rod.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace chainsplat::dynamics {
+namespace {
+
+// A link that is so short beside sqrt(EI/T) is as good as without tension: the formulas would only lose digits.
+constexpr double kShort = 1e-4;
+// Of how far the first link turns with a clamp: a base link longer than sqrt(EI/T) leaves it nothing to turn with.
+constexpr double kLeastTurn = 0.02;
+
+double stiffness_of(const chain::Chain& chain, int joint, double bending_stiffness, double tension) {
+  const double straight = bending_stiffness / chain::bent_length(chain, joint);
+  if (!(tension > 0.0) || !(bending_stiffness > 0.0)) return straight;
+  const double decay = std::sqrt(bending_stiffness / tension);  // m
+  const double own = chain.link_end(joint) - chain.link_start(joint);
+  const double before = chain.link_end(joint - 1) - chain.link_start(joint - 1);
+  if (joint > 1) {
+    const double length = 0.5 * (before + own), half = 0.5 * length / decay;
+    return half < kShort ? straight : tension * length / (4.0 * std::pow(std::sinh(half), 2));
+  }
+  const double part = own / decay, fading = -std::expm1(-part);
+  if (part < kShort) return straight;
+  // of a turn of the clamp by 1, that of the first link: then the rope below hangs where the rod would
+  const double turn = std::max((decay - before) / own * fading, kLeastTurn);
+  return tension * own / fading * turn / (1.0 - turn);
+}
+
+}  // namespace
+
+std::vector<double> hanging_tension(const chain::Chain& chain, const Parameters& parameters) {
+  std::vector<double> out(chain.links() - 1, 0.0);
+  if (parameters.table_normal) return out;
+  double mass = parameters.tip_mass;
+  for (std::size_t j = out.size(); j-- > 0;) {
+    mass += parameters.link_mass[j];
+    out[j] = mass * parameters.gravity.norm();
+  }
+  return out;
+}
+
+RodJoint rod_joint(const chain::Chain& chain, int joint, double bending_stiffness, double tension) {
+  if (!(tension > 0.0)) {
+    const double stiffness = stiffness_of(chain, joint, bending_stiffness, 0.0);
+    return {stiffness, stiffness};
+  }
+  constexpr double kStep = 1e-4;  // of log EI: central differences are exact to 1e-8
+  const auto at = [&](double by) { return stiffness_of(chain, joint, bending_stiffness * std::exp(by), tension); };
+  return {at(0.0), (at(kStep) - at(-kStep)) / (2.0 * kStep)};
+}
+
+double rod_stiffness(const chain::Chain& chain, int joint, double stiffness, double tension) {
+  if (!(stiffness > 0.0)) return 0.0;
+  // It grows with the rod's: bisection of its logarithm, from the rod that it is without tension.
+  constexpr double kWidest = 40.0;  // of a logarithm: under a tension that no such joint can stand the rod is limp
+  constexpr int kHalvings = 50;     // of an interval of length 1 and more, to the last digits
+  const auto softer = [&](double logarithm) {
+    return stiffness_of(chain, joint, std::exp(logarithm), tension) < stiffness;
+  };
+  const double start = std::log(stiffness * chain::bent_length(chain, joint));
+  double low = start, high = start;
+  while (softer(high) && high < start + kWidest) high += 1.0;
+  while (!softer(low) && low > start - kWidest) low -= 1.0;
+  for (int i = 0; i < kHalvings; ++i) {
+    const double middle = 0.5 * (low + high);
+    (softer(middle) ? low : high) = middle;
+  }
+  return std::exp(0.5 * (low + high));
+}
+
+}  // namespace chainsplat::dynamics
