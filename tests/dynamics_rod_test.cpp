@@ -32,7 +32,7 @@ Model hanging(const RodCase& rod, int joints, bool under_tension) {
   for (int j = 1; j <= joints; ++j)
     p.link_mass.push_back(rod.mass * (chain.link_end(j) - chain.link_start(j)) / rod.length);
   p.tip_mass = rod.tip;
-  const std::vector<double> tension = hanging_tension(chain, p);
+  const std::vector<double> tension = hanging_tension(p, std::vector<double>(joints, 1.0));
   for (int j = 1; j <= joints; ++j) {
     const RodJoint joint = rod_joint(chain, j, rod.bending, under_tension ? tension[j - 1] : 0.0);
     p.stiffness.push_back(joint.stiffness);
@@ -105,12 +105,19 @@ TEST_CASE("a rod's bending stiffness is told from a joint's, whatever the tensio
   CHECK(std::isfinite(rod_stiffness(chain, 1, 1e-12, 1e3)));
 }
 
-TEST_CASE("a hanging rope carries what is below, on a table nothing") {
+TEST_CASE("a hanging rope carries what is below, a level or a standing one and one on a table nothing") {
   const Model model = hanging({0.4, 0.08, 0.02, 1e-3, 0.0}, 4, true);
-  const std::vector<double> tension = hanging_tension(model.chain, model.parameters);
-  CHECK(tension[0] == doctest::Approx(0.1 * 9.81));
-  CHECK(tension[3] == doctest::Approx(0.04 * 9.81));
+  const auto tension = [&](const Vector3& axis, double turn, const Parameters& p) {
+    math::Pose base;
+    base.rotation = Eigen::AngleAxisd(turn, axis).toRotationMatrix();
+    return hanging_tension(p, hanging_shares(model.chain, VectorX::Zero(4), base, p.gravity));
+  };
+  const std::vector<double> down = tension(Vector3::UnitX(), 0.0, model.parameters);
+  CHECK(down[0] == doctest::Approx(0.1 * 9.81));
+  CHECK(down[3] == doctest::Approx(0.04 * 9.81));
+  CHECK(tension(Vector3::UnitX(), M_PI / 3, model.parameters)[0] == doctest::Approx(0.5 * 0.1 * 9.81));
+  CHECK(tension(Vector3::UnitY(), 3.0, model.parameters) == std::vector<double>(4, 0.0));
   Parameters flat = model.parameters;
   flat.table_normal = Vector3::UnitZ();
-  CHECK(hanging_tension(model.chain, flat) == std::vector<double>(4, 0.0));
+  CHECK(tension(Vector3::UnitX(), 0.0, flat) == std::vector<double>(4, 0.0));
 }

@@ -2,6 +2,7 @@
 #include <doctest/doctest.h>
 #include <cmath>
 
+#include "chainsplat/dynamics/rod.h"
 #include "chainsplat/identification.h"
 
 using namespace chainsplat;
@@ -170,11 +171,14 @@ TEST_CASE("how stiff a rope is in torsion is found where it bends in space") {
   p.link_mass.assign(kJoints, 0.02);
   for (auto* zeros : {&p.viscous_friction, &p.coulomb_friction, &p.air_linear}) zeros->assign(kJoints, 0.0);
   p.air_quadratic.assign(kJoints, 0.001);
+  constexpr double kBending = 8e-4, kRetardation = 0.06;  // N m^2, s
+  const std::vector<double> tension = dynamics::hanging_tension(p, std::vector<double>(kJoints, 1.0));
   for (int k = 0; k < 2 * kJoints; ++k) {
-    p.stiffness.push_back(k < 2 ? 0.02 : 0.01), p.damping.push_back(p.stiffness.back() * 0.06);
+    const dynamics::RodJoint rod = dynamics::rod_joint(chain, k / 2 + 1, kBending, tension[k / 2]);
+    p.stiffness.push_back(rod.stiffness), p.damping.push_back(kRetardation * rod.slope);
     p.rest_angle.push_back(0.35 * std::cos(1.1 * k));
   }
-  for (int j = 0; j < kJoints; ++j) p.torsional_stiffness.push_back(kRatio * p.stiffness[2 * j]);
+  for (int j = 1; j <= kJoints; ++j) p.torsional_stiffness.push_back(kRatio * kBending / chain::bent_length(chain, j));
   p.radius = 0.01;
   p.substeps = 16;
   std::vector<trajectory::Sample> samples;

@@ -6,6 +6,7 @@
 #include <cstdio>
 #include <map>
 
+#include "chainsplat/dynamics/rod.h"
 #include "chainsplat/identification.h"
 #include "identification/unknowns.h"
 #include "src/math/decompositions.h"
@@ -63,8 +64,6 @@ Truth make_truth(const Case& what) {
   p.tip_mass = what.table ? 0.0 : kTip * kMass;
   p.link_mass = fill((kMass - p.tip_mass) / 8.0);
   p.viscous_friction = p.air_linear = p.air_quadratic = p.coulomb_friction = p.rest_angle = fill(0.0);
-  p.stiffness = fill(what.stiff ? kStiffness : 0.0), p.damping = fill(kDamping);
-  p.stiffness[0] *= 2.0, p.damping[0] *= 2.0;  // the first joint stands for half a link (mathematics.md 3.2)
   p.radius = 0.01;
   p.substeps = 32;
   auto& v = truth.values;
@@ -78,6 +77,15 @@ Truth make_truth(const Case& what) {
   } else {
     p.air_quadratic = fill(kDrag * kLength / 8.0);
     v["log_drag"] = std::log(kDrag), v["logit_tip_mass_fraction"] = std::log(kTip / (1.0 - kTip));
+  }
+  // joints of a uniform rod (mathematics.md 3.2); without stiffness only the first differs: it stands for half a link
+  constexpr double kLink = kLength / 8.0;
+  const std::vector<double> tension = dynamics::hanging_tension(p, fill(1.0));
+  for (int j = 1; j <= 8; ++j) {
+    const double under = what.stiff ? tension[j - 1] : 0.0;
+    const dynamics::RodJoint rod = dynamics::rod_joint(truth.chain, j, kStiffness * kLink, under);
+    p.stiffness.push_back(what.stiff ? rod.stiffness : 0.0);
+    p.damping.push_back(kDamping / kStiffness * rod.slope);
   }
   std::vector<trajectory::Sample> samples;
   for (int k = 0; k <= kFrames * 4; ++k) samples.push_back({k / 120.0, base_at(k / 120.0).pose});

@@ -30,13 +30,22 @@ double stiffness_of(const chain::Chain& chain, int joint, double bending_stiffne
 
 }  // namespace
 
-std::vector<double> hanging_tension(const chain::Chain& chain, const Parameters& parameters) {
-  std::vector<double> out(chain.links() - 1, 0.0);
+std::vector<double> hanging_shares(const chain::Chain& chain, const VectorX& theta, const math::Pose& base,
+                                   const Vector3& gravity) {
+  const std::vector<math::Pose> motions = chain::link_motions(chain, theta, base);
+  std::vector<double> out;
+  for (int link = 1; link < chain.links(); ++link)
+    out.push_back(std::max(0.0, (motions[link].rotation * chain.direction).dot(gravity.normalized())));
+  return out;
+}
+
+std::vector<double> hanging_tension(const Parameters& parameters, const std::vector<double>& shares) {
+  std::vector<double> out(parameters.link_mass.size(), 0.0);
   if (parameters.table_normal) return out;
   double mass = parameters.tip_mass;
   for (std::size_t j = out.size(); j-- > 0;) {
     mass += parameters.link_mass[j];
-    out[j] = mass * parameters.gravity.norm();
+    out[j] = mass * parameters.gravity.norm() * shares[j];
   }
   return out;
 }

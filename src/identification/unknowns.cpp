@@ -122,21 +122,15 @@ Draft begin(const chain::Chain& chain, const Options& options, const Start& star
 
 // Joints in proportion to those of the rod under tension; those that twist the rope are as without.
 void shape_as_rod(Draft& d, const Rod& rod) {
+  if (rod.tension.empty()) return;
   dynamics::Parameters& unit = d.u.reference;
-  std::vector<double> tension = rod.tension;
-  if (tension.empty()) {
-    dynamics::Parameters uniform = unit;
-    for (double& mass : uniform.link_mass) mass *= d.u.total_mass / d.chain.length;
-    uniform.tip_mass = d.options.tip_mass.value_or(0.0);
-    tension = dynamics::hanging_tension(d.chain, uniform);
-  }
   const double prior = std::exp(d.means.back()) * d.reference;
   for (int k = 0; k < d.angles; ++k) {
     if (chain::is_twist(d.chain, k)) continue;
     const int joint = d.chain.child_link[k];
     const double bending = rod.bending_stiffness > 0.0 ? rod.bending_stiffness : prior;
     const double slack = dynamics::rod_joint(d.chain, joint, bending, 0.0).stiffness;
-    const dynamics::RodJoint taut = dynamics::rod_joint(d.chain, joint, bending, tension[joint - 1]);
+    const dynamics::RodJoint taut = dynamics::rod_joint(d.chain, joint, bending, rod.tension[joint - 1]);
     unit.stiffness[k] *= taut.stiffness / slack;
     unit.damping[k] *= taut.slope / slack;
   }
@@ -321,10 +315,21 @@ State apply(const chain::Chain& chain, const Unknowns& u, const VectorX& p) {
   return {dynamics::moved(chain, u.reference, u.list, p, u.total_mass), dynamics::moved(u.initial, u.list, p)};
 }
 
-Rod rod_of(const chain::Chain& chain, const Unknowns& u, const VectorX& p) {
+Rod uniform_rod(const chain::Chain& chain, const Options& options, const std::vector<double>& shares) {
+  dynamics::Parameters uniform;
+  uniform.gravity = options.gravity;
+  if (options.tabletop) uniform.table_normal = options.table_normal;
+  uniform.tip_mass = options.tip_mass.value_or(0.0);
+  const double mass = options.mass.value_or(1.0) - uniform.tip_mass;
+  for (int link = 1; link < chain.links(); ++link)
+    uniform.link_mass.push_back(mass * (chain.link_end(link) - chain.link_start(link)) / chain.length);
+  return {0.0, dynamics::hanging_tension(uniform, shares)};
+}
+
+Rod rod_of(const chain::Chain& chain, const Unknowns& u, const VectorX& p, const std::vector<double>& shares) {
   const int stiffness = u.first(Quantity::stiffness);
   return {stiffness < 0 ? 0.0 : std::exp(p[stiffness]) * mean_bent_length(chain),
-          dynamics::hanging_tension(chain, apply(chain, u, p).parameters)};
+          dynamics::hanging_tension(apply(chain, u, p).parameters, shares)};
 }
 
 std::vector<dynamics::Tangent> tangents(const chain::Chain& chain, const Unknowns& u, const VectorX& p) {

@@ -6,7 +6,6 @@
 #include <numbers>
 
 #include "chainsplat/dynamics/parametrization.h"
-#include "chainsplat/dynamics/rod.h"
 #include "chainsplat/properties.h"
 #include "chainsplat/report.h"
 
@@ -80,18 +79,8 @@ void add_bending(const twin::Twin& twin, const std::vector<twin::Property>& prop
   const Parameters& p = *twin.parameters;
   const dynamics::Estimates& e = twin.estimates;
   const auto stiffness = estimate(e, "log_stiffness"), damping = estimate(e, "log_damping");
-  if (const twin::Property* bending = property(properties, "bending_stiffness"); bending && stiffness) {
-    const std::vector<double> tension = dynamics::hanging_tension(chain, p);
-    double low = INFINITY, high = 0.0;
-    for (int k = 0; k < chain.angles(); ++k) {
-      if (chain::is_twist(chain, k)) continue;
-      const int joint = chain.child_link[k];
-      const double each = dynamics::rod_stiffness(chain, joint, p.stiffness[k], tension[joint - 1]);
-      low = std::min(low, each), high = std::max(high, each);
-    }
-    out.push_back({"bending stiffness EI", "N m\u00b2", text("%.2g to %.2g from joint to joint", low, high),
-                   bending->value, error_of(*bending)});
-  }
+  if (const twin::Property* bending = property(properties, "bending_stiffness"); bending && stiffness)
+    out.push_back({"bending stiffness EI", "N m\u00b2", "mean of the joints", bending->value, error_of(*bending)});
   if (stiffness && damping) {
     const double retardation = std::exp(*damping - *stiffness);
     out.push_back({"retardation time", "s", "damping over stiffness", retardation,

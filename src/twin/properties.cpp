@@ -17,15 +17,13 @@ namespace {
 using math::MatrixX;
 using math::VectorX;
 
-// First mode about the shape in which the rope hangs from a base at rest, found from `near` on; left out where there is
-// none.
-void add_first_mode(const dynamics::Model& model, VectorX& near, std::vector<Property>& out) {
-  const math::Pose base;
+// First mode about the shape in which the rope hangs from a base at rest; left out where it has none.
+void add_first_mode(const dynamics::Model& model, const VectorX& hanging, std::vector<Property>& out) {
   dynamics::Linearization at;
   try {
-    near = dynamics::static_equilibrium(model, base, near).theta;
-    at = dynamics::linearize(model, dynamics::at_rest(base), math::Vector6::Zero(), near, VectorX::Zero(near.size()));
-  } catch (const std::exception&) {  // it hangs nowhere, or a joint has no inertia
+    at = dynamics::linearize(model, dynamics::at_rest(math::Pose()), math::Vector6::Zero(), hanging,
+                             VectorX::Zero(hanging.size()));
+  } catch (const std::exception&) {  // a joint has no inertia
     return;
   }
   const MatrixX stiffness = 0.5 * (at.stiffness + at.stiffness.transpose());
@@ -38,6 +36,17 @@ void add_first_mode(const dynamics::Model& model, VectorX& near, std::vector<Pro
   out.push_back({"first_frequency", "Hz", turn / (2.0 * M_PI)});
 }
 
+// The shape in which the rope hangs from a base at rest, found from `near` on; empty on a table, and where it hangs
+// nowhere.
+VectorX hanging_from(const dynamics::Model& model, const VectorX& near) {
+  if (model.parameters.table_normal) return {};
+  try {
+    return dynamics::static_equilibrium(model, math::Pose(), near).theta;
+  } catch (const std::exception&) {
+    return {};
+  }
+}
+
 // Each with the deviation that the covariance cannot know of, mostly 0. `near`: the shape at rest, of a rope that is
 // much the same; empty: not known.
 std::vector<Property> values(const dynamics::Model& model, bool known_mass, VectorX& near) {
@@ -46,7 +55,13 @@ std::vector<Property> values(const dynamics::Model& model, bool known_mass, Vect
   const std::string per_mass = known_mass ? "" : "/kg";
   double bending = 0.0, twisting = 0.0, friction = 0.0, mass = 0.0, length = 0.0, held = 0.0;
   int bends = 0;
-  const std::vector<double> tension = dynamics::hanging_tension(chain, p);
+  const VectorX hanging = hanging_from(model, near);
+  std::vector<double> shares(p.link_mass.size(), 0.0);
+  if (hanging.size() > 0) {
+    near = hanging;
+    shares = dynamics::hanging_shares(chain, hanging, math::Pose(), p.gravity);
+  }
+  const std::vector<double> tension = dynamics::hanging_tension(p, shares);
   for (int k = 0; k < chain.angles(); ++k) {
     if (chain::is_twist(chain, k)) continue;
     const int joint = chain.child_link[k];
@@ -67,7 +82,7 @@ std::vector<Property> values(const dynamics::Model& model, bool known_mass, Vect
     out.push_back(
         {"torsional_stiffness", "N m^2" + per_mass, twisting / static_cast<double>(p.torsional_stiffness.size())});
   if (!p.bending_friction.empty()) out.push_back({"bending_friction", "N m" + per_mass, friction / bends});
-  if (!p.table_normal) add_first_mode(model, near, out);
+  if (hanging.size() > 0) add_first_mode(model, hanging, out);
   out.push_back({"mass_per_length", known_mass ? "kg/m" : "1/m", mass / length});
   if (p.table_normal) {
     // one coefficient belongs to the two materials: what the links' differ by is error

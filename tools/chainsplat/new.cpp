@@ -48,12 +48,24 @@ dynamics::Parameters rod(const chain::Chain& chain, const Request& request, cons
   for (int j = 1; j <= links; ++j)
     rod.link_mass.push_back(request.mass * (chain.link_end(j) - chain.link_start(j)) / chain.length);
   if (!request.payload.empty()) rod.tip_mass = request.payload[0];
-  const std::vector<double> tension = dynamics::hanging_tension(chain, rod);
-  for (const int link : chain.child_link) {
-    const dynamics::RodJoint joint = dynamics::rod_joint(chain, link, request.bending_stiffness, tension[link - 1]);
-    rod.stiffness.push_back(joint.stiffness);
-    rod.damping.push_back(request.retardation * joint.slope);
-    rod.rest_angle.push_back(0.0);
+  rod.rest_angle.assign(chain.angles(), 0.0);
+  const auto stand_for_rod = [&](const std::vector<double>& tension) {
+    rod.stiffness.clear(), rod.damping.clear();
+    for (const int link : chain.child_link) {
+      const dynamics::RodJoint joint = dynamics::rod_joint(chain, link, request.bending_stiffness, tension[link - 1]);
+      rod.stiffness.push_back(joint.stiffness);
+      rod.damping.push_back(request.retardation * joint.slope);
+    }
+  };
+  stand_for_rod(std::vector<double>(links, 0.0));
+  if (!(request.bending_stiffness > 0.0)) return rod;
+  // how it hangs says how taut it is, which changes little how it hangs
+  try {
+    const math::VectorX hanging = dynamics::static_equilibrium(dynamics::make_model(chain, rod), math::Pose()).theta;
+    const std::vector<double> shares = dynamics::hanging_shares(chain, hanging, math::Pose(), gravity);
+    stand_for_rod(dynamics::hanging_tension(rod, shares));
+  } catch (const WorkError&) {
+    // it stands on its grasp, where nothing is taut
   }
   return rod;
 }

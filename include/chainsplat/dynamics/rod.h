@@ -10,9 +10,12 @@
 
 namespace chainsplat::dynamics {
 
-// Tension, N, in every joint j = 1.. of the rope that hangs at rest, its links' and tip's weight below that joint; 0 on
-// a table. Per kilogram of rope where the masses are.
-std::vector<double> hanging_tension(const chain::Chain& chain, const Parameters& parameters);
+// How much links 1.. hang: the cosine of their angle with gravity, 0 where they are level or point up.
+std::vector<double> hanging_shares(const chain::Chain& chain, const VectorX& theta, const math::Pose& base,
+                                   const Vector3& gravity);
+// Tension, N, in every joint j = 1.. of a rope at rest: the weight of the links and the tip from there on, as much as
+// link j hangs; 0 on a table. Per kilogram of rope where the masses are.
+std::vector<double> hanging_tension(const Parameters& parameters, const std::vector<double>& shares);
 
 struct RodJoint {
   double stiffness = 0.0;  // N m/rad
