@@ -1,4 +1,4 @@
-// Joints of a rod under tension, against a chain of so many joints that tension changes none of them.
+// The joint at the grasp of a rod under tension, against a chain of so many joints that tension does not change it.
 #include "chainsplat/dynamics/rod.h"
 
 #include <doctest/doctest.h>
@@ -32,9 +32,9 @@ Model hanging(const RodCase& rod, int joints, bool under_tension) {
   for (int j = 1; j <= joints; ++j)
     p.link_mass.push_back(rod.mass * (chain.link_end(j) - chain.link_start(j)) / rod.length);
   p.tip_mass = rod.tip;
-  const std::vector<double> tension = hanging_tension(p, std::vector<double>(joints, 1.0));
+  const double tension = under_tension ? grasp_tension(p, 1.0) : 0.0;
   for (int j = 1; j <= joints; ++j) {
-    const RodJoint joint = rod_joint(chain, j, rod.bending, under_tension ? tension[j - 1] : 0.0);
+    const RodJoint joint = rod_joint(chain, j, rod.bending, tension);
     p.stiffness.push_back(joint.stiffness);
     p.damping.push_back(kRetardation * joint.slope);
   }
@@ -77,10 +77,10 @@ TEST_CASE("eight joints hang and swing as the rod under tension does") {
     CAPTURE(rod.bending);
     CAPTURE(rod.first_joint);
     // without the tension the moment at the grasp is 2 to 43 % off where the rope bends within one or two links
-    CHECK(std::abs(taut.offset / fine.offset - 1.0) < 0.02);
+    CHECK(std::abs(taut.offset / fine.offset - 1.0) < 0.03);
     CHECK(std::abs(taut.moment / fine.moment - 1.0) < 0.01);
-    CHECK(std::abs(taut.frequency / fine.frequency - 1.0) < 0.003);
-    CHECK(std::abs(taut.ratio / fine.ratio - 1.0) < 0.01);
+    CHECK(std::abs(taut.frequency / fine.frequency - 1.0) < 0.004);
+    CHECK(std::abs(taut.ratio / fine.ratio - 1.0) < 0.02);
     if (rod.first_joint > 0.0) continue;  // there the errors of a rod without tension happen to cancel
     CHECK(std::abs(taut.moment - fine.moment) < std::abs(slack.moment - fine.moment));
     CHECK(std::abs(taut.frequency - fine.frequency) < std::abs(slack.frequency - fine.frequency));
@@ -105,19 +105,17 @@ TEST_CASE("a rod's bending stiffness is told from a joint's, whatever the tensio
   CHECK(std::isfinite(rod_stiffness(chain, 1, 1e-12, 1e3)));
 }
 
-TEST_CASE("a hanging rope carries what is below, a level or a standing one and one on a table nothing") {
+TEST_CASE("a hanging rope carries its weight at the grasp, a level or a standing one and one on a table nothing") {
   const Model model = hanging({0.4, 0.08, 0.02, 1e-3, 0.0}, 4, true);
   const auto tension = [&](const Vector3& axis, double turn, const Parameters& p) {
     math::Pose base;
     base.rotation = Eigen::AngleAxisd(turn, axis).toRotationMatrix();
-    return hanging_tension(p, hanging_shares(model.chain, VectorX::Zero(4), base, p.gravity));
+    return grasp_tension(p, hanging_share(model.chain, VectorX::Zero(4), base, p.gravity));
   };
-  const std::vector<double> down = tension(Vector3::UnitX(), 0.0, model.parameters);
-  CHECK(down[0] == doctest::Approx(0.1 * 9.81));
-  CHECK(down[3] == doctest::Approx(0.04 * 9.81));
-  CHECK(tension(Vector3::UnitX(), M_PI / 3, model.parameters)[0] == doctest::Approx(0.5 * 0.1 * 9.81));
-  CHECK(tension(Vector3::UnitY(), 3.0, model.parameters) == std::vector<double>(4, 0.0));
+  CHECK(tension(Vector3::UnitX(), 0.0, model.parameters) == doctest::Approx(0.1 * 9.81));
+  CHECK(tension(Vector3::UnitX(), M_PI / 3, model.parameters) == doctest::Approx(0.5 * 0.1 * 9.81));
+  CHECK(tension(Vector3::UnitY(), 3.0, model.parameters) == 0.0);
   Parameters flat = model.parameters;
   flat.table_normal = Vector3::UnitZ();
-  CHECK(tension(Vector3::UnitX(), 0.0, flat) == std::vector<double>(4, 0.0));
+  CHECK(tension(Vector3::UnitX(), 0.0, flat) == 0.0);
 }

@@ -78,12 +78,11 @@ Truth make_truth(const Case& what) {
     p.air_quadratic = fill(kDrag * kLength / 8.0);
     v["log_drag"] = std::log(kDrag), v["logit_tip_mass_fraction"] = std::log(kTip / (1.0 - kTip));
   }
-  // joints of a uniform rod (mathematics.md 3.2); without stiffness only the first differs: it stands for half a link
+  // joints of a uniform rod (mathematics.md 3.2)
   constexpr double kLink = kLength / 8.0;
-  const std::vector<double> tension = dynamics::hanging_tension(p, fill(1.0));
+  const double tension = what.stiff ? dynamics::grasp_tension(p, 1.0) : 0.0;
   for (int j = 1; j <= 8; ++j) {
-    const double under = what.stiff ? tension[j - 1] : 0.0;
-    const dynamics::RodJoint rod = dynamics::rod_joint(truth.chain, j, kStiffness * kLink, under);
+    const dynamics::RodJoint rod = dynamics::rod_joint(truth.chain, j, kStiffness * kLink, tension);
     p.stiffness.push_back(what.stiff ? rod.stiffness : 0.0);
     p.damping.push_back(kDamping / kStiffness * rod.slope);
   }

@@ -13,16 +13,13 @@ constexpr double kLeastTurn = 0.02;
 
 double stiffness_of(const chain::Chain& chain, int joint, double bending_stiffness, double tension) {
   const double straight = bending_stiffness / chain::bent_length(chain, joint);
-  if (!(tension > 0.0) || !(bending_stiffness > 0.0)) return straight;
+  if (joint > 1 || !(tension > 0.0) || !(bending_stiffness > 0.0)) return straight;
   const double decay = std::sqrt(bending_stiffness / tension);  // m
-  const double own = chain.link_end(joint) - chain.link_start(joint);
-  const double before = chain.link_end(joint - 1) - chain.link_start(joint - 1);
-  if (joint > 1) {
-    const double length = 0.5 * (before + own), half = 0.5 * length / decay;
-    return half < kShort ? straight : tension * length / (4.0 * std::pow(std::sinh(half), 2));
-  }
-  const double part = own / decay, fading = -std::expm1(-part);
-  if (part < kShort) return straight;
+  const double own = chain.link_end(1) - chain.link_start(1);
+  const double before = chain.link_end(0) - chain.link_start(0);
+  if (own / decay < kShort) return straight;
+  // links turn less and less by this factor, the logarithm of whose inverse is
+  const double falling = 2.0 * std::asinh(0.5 * own / decay), fading = -std::expm1(-falling);
   // of a turn of the clamp by 1, that of the first link: then the rope below hangs where the rod would
   const double turn = std::max((decay - before) / own * fading, kLeastTurn);
   return tension * own / fading * turn / (1.0 - turn);
@@ -30,28 +27,17 @@ double stiffness_of(const chain::Chain& chain, int joint, double bending_stiffne
 
 }  // namespace
 
-std::vector<double> hanging_shares(const chain::Chain& chain, const VectorX& theta, const math::Pose& base,
-                                   const Vector3& gravity) {
-  const std::vector<math::Pose> motions = chain::link_motions(chain, theta, base);
-  std::vector<double> out;
-  for (int link = 1; link < chain.links(); ++link)
-    out.push_back(std::max(0.0, (motions[link].rotation * chain.direction).dot(gravity.normalized())));
-  return out;
+double hanging_share(const chain::Chain& chain, const VectorX& theta, const math::Pose& base, const Vector3& gravity) {
+  const math::Pose first = chain::link_motions(chain, theta, base)[1];
+  return std::max(0.0, (first.rotation * chain.direction).dot(gravity.normalized()));
 }
 
-std::vector<double> hanging_tension(const Parameters& parameters, const std::vector<double>& shares) {
-  std::vector<double> out(parameters.link_mass.size(), 0.0);
-  if (parameters.table_normal) return out;
-  double mass = parameters.tip_mass;
-  for (std::size_t j = out.size(); j-- > 0;) {
-    mass += parameters.link_mass[j];
-    out[j] = mass * parameters.gravity.norm() * shares[j];
-  }
-  return out;
+double grasp_tension(const Parameters& parameters, double share) {
+  return parameters.table_normal ? 0.0 : total_mass(parameters) * parameters.gravity.norm() * share;
 }
 
 RodJoint rod_joint(const chain::Chain& chain, int joint, double bending_stiffness, double tension) {
-  if (!(tension > 0.0)) {
+  if (joint > 1 || !(tension > 0.0)) {
     const double stiffness = stiffness_of(chain, joint, bending_stiffness, 0.0);
     return {stiffness, stiffness};
   }

@@ -41,7 +41,7 @@ struct Part {
   BaseGrid grids[2];                  // half the substeps, for the way to the minimum, and all of them
   std::vector<std::size_t> nodes[2];  // of the grid, up to and with each output
   bool has_markers = false;           // the points are markers; unseen ones have no weight
-  std::vector<double> shares = {};    // how much the links hang, in the mean (dynamics/rod.h)
+  double hanging = 0.0;               // how much the rope hangs, in the mean (dynamics/rod.h)
   Start start = {};
 };
 
@@ -414,12 +414,9 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
     for (Eigen::Index i = 0; i < part.theta[k].size(); ++i)
       part.theta[k][i] -= 2.0 * M_PI * std::round((part.theta[k][i] - part.theta[k - 1][i]) / (2.0 * M_PI));
   part.has_markers = markers != nullptr;
-  part.shares.assign(chain.links() - 1, 0.0);
-  for (std::size_t k = 0; k < frames; ++k) {
-    const std::vector<double> now =
-        dynamics::hanging_shares(chain, part.theta[k], base.pose(recognized.time[k]), options.gravity);
-    for (std::size_t j = 0; j < now.size(); ++j) part.shares[j] += now[j] / static_cast<double>(frames);
-  }
+  for (std::size_t k = 0; k < frames; ++k)
+    part.hanging += dynamics::hanging_share(chain, part.theta[k], base.pose(recognized.time[k]), options.gravity) /
+                    static_cast<double>(frames);
   if (!markers) part.points = chain::shape_points(chain, true);
   for (std::size_t i = 0; markers && i < markers->arclengths.size(); ++i)
     part.points.push_back(chain::centerline_point(chain, markers->arclengths[i]));
@@ -757,19 +754,21 @@ struct Candidate {
 };
 
 // A fit, and again about the rod that it found, until that is the rod that its joints are in proportion to. `about`:
-// the problem about a rod; `shares`: how much its links hang.
-Candidate fit_about_rod(const Extras& extras, const std::function<Problem(const Rod&)>& about,
-                        const std::vector<double>& shares, const Options& options) {
+// the problem about a rod; `hanging`: how much the rope hangs.
+Candidate fit_about_rod(const Extras& extras, const std::function<Problem(const Rod&)>& about, double hanging,
+                        const Options& options) {
   constexpr int kMost = 3;
   constexpr double kSame = 0.05;  // of a logarithm of stiffness: proportions then change by half of that
   Candidate now{extras, about({}), {}};
-  Rod rod = uniform_rod(now.problem.chain, options, shares);
+  const auto rod_at = [&](const VectorX& p) {
+    return rod_of(now.problem.chain, now.problem.parts[0].unknowns, now.problem.of_part(p, 0), hanging);
+  };
+  Rod rod = rod_at(now.problem.mean);
   now.problem.parts = about(rod).parts;
   now.fit = fit_centerline(now.problem, options);
   for (int i = 0; i < kMost && now.fit.cost < kInfinity; ++i) {
-    const Rod found =
-        rod_of(now.problem.chain, now.problem.parts[0].unknowns, now.problem.of_part(now.fit.p, 0), shares);
-    const bool slack = !(found.bending_stiffness > 0.0) || !(found.tension.front() > 0.0);
+    const Rod found = rod_at(now.fit.p);
+    const bool slack = !(found.bending_stiffness > 0.0) || !(found.tension > 0.0);
     if (slack || std::abs(std::log(found.bending_stiffness / rod.bending_stiffness)) < kSame) break;
     const Candidate before = now;
     now.problem.parts = about(found).parts;
@@ -786,9 +785,8 @@ Candidate fit_candidates(const chain::Chain& chain, std::vector<Part> parts, con
   // millimeter, within which errors of calibration look like physics.
   const double within_errors = parts.front().has_markers ? 0.3 : 1.0;
   constexpr double kEvidence = 5.0;  // in favor of what a rope need not have, natural logarithm
-  std::vector<double> shares(chain.links() - 1, 0.0);
-  for (const Part& part : parts)
-    for (std::size_t j = 0; j < shares.size(); ++j) shares[j] += part.shares[j] / static_cast<double>(parts.size());
+  double hanging = 0.0;
+  for (const Part& part : parts) hanging += part.hanging / static_cast<double>(parts.size());
   std::vector<Candidate> tried;
   const auto attempt = [&](const Extras& extras) {
     const auto about = [&](const Rod& rod) {
@@ -796,7 +794,7 @@ Candidate fit_candidates(const chain::Chain& chain, std::vector<Part> parts, con
       for (Part& part : own) part.unknowns = make_unknowns(chain, options, part.start, extras, rod);
       return make_problem(chain, std::move(own));
     };
-    tried.push_back(fit_about_rod(extras, about, shares, options));
+    tried.push_back(fit_about_rod(extras, about, hanging, options));
   };
   attempt({});
   const auto within = [&](const Candidate& one) {

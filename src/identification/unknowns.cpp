@@ -120,19 +120,16 @@ Draft begin(const chain::Chain& chain, const Options& options, const Start& star
   return d;
 }
 
-// Joints in proportion to those of the rod under tension; those that twist the rope are as without.
-void shape_as_rod(Draft& d, const Rod& rod) {
-  if (rod.tension.empty()) return;
-  dynamics::Parameters& unit = d.u.reference;
+// The joint at the grasp is that of the rod under tension.
+void hold_as_rod(Draft& d, const Rod& rod) {
   const double prior = std::exp(d.means.back()) * d.reference;
-  for (int k = 0; k < d.angles; ++k) {
+  const double bending = rod.bending_stiffness > 0.0 ? rod.bending_stiffness : prior;
+  const double slack = dynamics::rod_joint(d.chain, 1, bending, 0.0).stiffness;
+  const dynamics::RodJoint taut = dynamics::rod_joint(d.chain, 1, bending, rod.tension);
+  for (int k = 0; k < d.angles && d.chain.child_link[k] == 1; ++k) {
     if (chain::is_twist(d.chain, k)) continue;
-    const int joint = d.chain.child_link[k];
-    const double bending = rod.bending_stiffness > 0.0 ? rod.bending_stiffness : prior;
-    const double slack = dynamics::rod_joint(d.chain, joint, bending, 0.0).stiffness;
-    const dynamics::RodJoint taut = dynamics::rod_joint(d.chain, joint, bending, rod.tension[joint - 1]);
-    unit.stiffness[k] *= taut.stiffness / slack;
-    unit.damping[k] *= taut.slope / slack;
+    d.u.reference.stiffness[k] *= taut.stiffness / slack;
+    d.u.reference.damping[k] *= taut.slope / slack;
   }
 }
 
@@ -143,7 +140,7 @@ void add_stiffness(Draft& d, const Rod& rod) {
   d.add(Quantity::stiffness, 0, std::log(kStiffnessPart * d.torque), kSharedSd);
   if (twists_within_links(d.chain, d.options))
     for (int k = 0; k < d.angles; k += 2) unit.torsional_stiffness.push_back(unit.stiffness[k]);
-  shape_as_rod(d, rod);
+  hold_as_rod(d, rod);
   // two fingers hold a rope more stiffly one way than the other (a foam noodle in a gripper: 1.5)
   if (d.options.per_joint && d.angles > 1 && d.chain.child_link[1] == 1 && !chain::is_twist(d.chain, 1))
     d.add(Quantity::grasp_stiffness, 0, 0.0, kGraspSd);
@@ -315,21 +312,10 @@ State apply(const chain::Chain& chain, const Unknowns& u, const VectorX& p) {
   return {dynamics::moved(chain, u.reference, u.list, p, u.total_mass), dynamics::moved(u.initial, u.list, p)};
 }
 
-Rod uniform_rod(const chain::Chain& chain, const Options& options, const std::vector<double>& shares) {
-  dynamics::Parameters uniform;
-  uniform.gravity = options.gravity;
-  if (options.tabletop) uniform.table_normal = options.table_normal;
-  uniform.tip_mass = options.tip_mass.value_or(0.0);
-  const double mass = options.mass.value_or(1.0) - uniform.tip_mass;
-  for (int link = 1; link < chain.links(); ++link)
-    uniform.link_mass.push_back(mass * (chain.link_end(link) - chain.link_start(link)) / chain.length);
-  return {0.0, dynamics::hanging_tension(uniform, shares)};
-}
-
-Rod rod_of(const chain::Chain& chain, const Unknowns& u, const VectorX& p, const std::vector<double>& shares) {
+Rod rod_of(const chain::Chain& chain, const Unknowns& u, const VectorX& p, double share) {
   const int stiffness = u.first(Quantity::stiffness);
   return {stiffness < 0 ? 0.0 : std::exp(p[stiffness]) * mean_bent_length(chain),
-          dynamics::hanging_tension(apply(chain, u, p).parameters, shares)};
+          dynamics::grasp_tension(apply(chain, u, p).parameters, share)};
 }
 
 std::vector<dynamics::Tangent> tangents(const chain::Chain& chain, const Unknowns& u, const VectorX& p) {

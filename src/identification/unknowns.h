@@ -39,8 +39,8 @@ struct Extras {
 // The rod that the joints' stiffnesses and dampings are in proportion to those of (dynamics/rod.h): under tension their
 // proportions depend on its stiffness, so that a fit is made again about the rod that was found.
 struct Rod {
-  double bending_stiffness = 0.0;    // N m^2; not positive: that of the prior
-  std::vector<double> tension = {};  // N, in every joint; empty: none
+  double bending_stiffness = 0.0;  // N m^2; not positive: that of the prior
+  double tension = 0.0;            // N, at the grasp
 };
 
 // What is known of the initial state beforehand: rad, rad/s, and the deviations of one.
@@ -53,10 +53,8 @@ struct Start {
 Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const Start& start, const Extras& extras = {},
                        const Rod& rod = {});
 
-// Before any fit: of the prior's stiffness, and as heavy all along. `shares`: how much its links hang.
-Rod uniform_rod(const chain::Chain& chain, const Options& options, const std::vector<double>& shares);
-// The rod that a fit found.
-Rod rod_of(const chain::Chain& chain, const Unknowns& unknowns, const VectorX& p, const std::vector<double>& shares);
+// The rod that a fit found. `share`: how much the rope hangs.
+Rod rod_of(const chain::Chain& chain, const Unknowns& unknowns, const VectorX& p, double share);
 
 // The initial state alone, of a rope of these parameters.
 Unknowns make_state_unknowns(const chain::Chain& chain, const dynamics::Parameters& parameters, const Start& start);

@@ -56,16 +56,13 @@ std::vector<Property> values(const dynamics::Model& model, bool known_mass, Vect
   double bending = 0.0, twisting = 0.0, friction = 0.0, mass = 0.0, length = 0.0, held = 0.0;
   int bends = 0;
   const VectorX hanging = hanging_from(model, near);
-  std::vector<double> shares(p.link_mass.size(), 0.0);
-  if (hanging.size() > 0) {
-    near = hanging;
-    shares = dynamics::hanging_shares(chain, hanging, math::Pose(), p.gravity);
-  }
-  const std::vector<double> tension = dynamics::hanging_tension(p, shares);
+  if (hanging.size() > 0) near = hanging;
+  const double tension = hanging.size() == 0 ? 0.0
+                                             : dynamics::grasp_tension(
+                                                   p, dynamics::hanging_share(chain, hanging, math::Pose(), p.gravity));
   for (int k = 0; k < chain.angles(); ++k) {
     if (chain::is_twist(chain, k)) continue;
-    const int joint = chain.child_link[k];
-    bending += dynamics::rod_stiffness(chain, joint, p.stiffness[k], tension[joint - 1]);
+    bending += dynamics::rod_stiffness(chain, chain.child_link[k], p.stiffness[k], tension);
     if (!p.bending_friction.empty()) friction += p.bending_friction[k];
     ++bends;
   }

@@ -49,21 +49,20 @@ dynamics::Parameters rod(const chain::Chain& chain, const Request& request, cons
     rod.link_mass.push_back(request.mass * (chain.link_end(j) - chain.link_start(j)) / chain.length);
   if (!request.payload.empty()) rod.tip_mass = request.payload[0];
   rod.rest_angle.assign(chain.angles(), 0.0);
-  const auto stand_for_rod = [&](const std::vector<double>& tension) {
+  const auto stand_for_rod = [&](double tension) {
     rod.stiffness.clear(), rod.damping.clear();
     for (const int link : chain.child_link) {
-      const dynamics::RodJoint joint = dynamics::rod_joint(chain, link, request.bending_stiffness, tension[link - 1]);
+      const dynamics::RodJoint joint = dynamics::rod_joint(chain, link, request.bending_stiffness, tension);
       rod.stiffness.push_back(joint.stiffness);
       rod.damping.push_back(request.retardation * joint.slope);
     }
   };
-  stand_for_rod(std::vector<double>(links, 0.0));
+  stand_for_rod(0.0);
   if (!(request.bending_stiffness > 0.0)) return rod;
   // how it hangs says how taut it is, which changes little how it hangs
   try {
     const math::VectorX hanging = dynamics::static_equilibrium(dynamics::make_model(chain, rod), math::Pose()).theta;
-    const std::vector<double> shares = dynamics::hanging_shares(chain, hanging, math::Pose(), gravity);
-    stand_for_rod(dynamics::hanging_tension(rod, shares));
+    stand_for_rod(dynamics::grasp_tension(rod, dynamics::hanging_share(chain, hanging, math::Pose(), gravity)));
   } catch (const WorkError&) {
     // it stands on its grasp, where nothing is taut
   }
