@@ -113,11 +113,13 @@ class BoardRenderer {
   std::array<float, 2> ray(double u, double v) const {
     const auto& [k1, k2, p1, p2, k3] = camera_.distortion;
     const double bent_x = (u - camera_.cx) / camera_.fx, bent_y = (v - camera_.cy) / camera_.fy;
-    double x = bent_x, y = bent_y;
-    for (int i = 0; i < 60; ++i) {
+    double x = bent_x, y = bent_y, change = 1.0;
+    for (int i = 0; i < 60 && change > 1e-10; ++i) {  // a thousandth of a float's last digit
       const double rr = x * x + y * y, radial = 1 + k1 * rr + k2 * rr * rr + k3 * rr * rr * rr;
       const double dx = 2 * p1 * x * y + p2 * (rr + 2 * x * x), dy = p1 * (rr + 2 * y * y) + 2 * p2 * x * y;
-      x = (bent_x - dx) / radial, y = (bent_y - dy) / radial;
+      const double next_x = (bent_x - dx) / radial, next_y = (bent_y - dy) / radial;
+      change = std::abs(next_x - x) + std::abs(next_y - y);
+      x = next_x, y = next_y;
     }
     return {static_cast<float>(x), static_cast<float>(y)};
   }
