@@ -5,6 +5,7 @@
 #include <functional>
 #include <string>
 
+#include "chainsplat/dynamics/rod.h"
 #include "chainsplat/identification.h"
 
 using namespace chainsplat;
@@ -13,6 +14,8 @@ using math::VectorX;
 
 namespace {
 
+constexpr double kStiffness = 0.012, kDamping = 6e-4;  // N m/rad, N m s/rad, of joints but the one at the grasp
+
 dynamics::Model rope() {
   const chain::Chain chain =
       chain::make_chain(0.3, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 5, chain::Bending::planar, false);
@@ -20,9 +23,14 @@ dynamics::Model rope() {
   dynamics::Parameters p;
   p.link_mass = fill(5, 0.012), p.viscous_friction = p.coulomb_friction = p.air_linear = fill(5, 0.0);
   p.air_quadratic = fill(5, 0.0144 * 0.06);
-  p.stiffness = fill(5, 0.012), p.damping = fill(5, 6e-4), p.rest_angle = fill(5, 0.02);
-  p.stiffness[0] *= 2.0, p.damping[0] *= 2.0;  // the first joint stands for half a link (mathematics.md 3.2)
+  p.rest_angle = fill(5, 0.02);
   p.radius = 0.01, p.tip_mass = 0.002;
+  const double link = chain.length / 5, tension = dynamics::grasp_tension(p, 1.0);  // m, N
+  for (int j = 1; j <= 5; ++j) {
+    const dynamics::RodJoint joint = dynamics::rod_joint(chain, j, kStiffness * link, tension);
+    p.stiffness.push_back(joint.stiffness);
+    p.damping.push_back(kDamping / kStiffness * joint.slope);
+  }
   return dynamics::make_model(chain, p);
 }
 
@@ -105,7 +113,7 @@ TEST_CASE("the proposed motion keeps the limits, tells more than the old one, an
       const Recording recording = record(model, motion, 4.0, seed);
       const dynamics::Parameters q =
           identification::identify(model.chain, recording.base, recording.states, options).parameters;
-      for (const double log : {std::log(q.stiffness[2] / 0.012), std::log(q.damping[2] / 6e-4),
+      for (const double log : {std::log(q.stiffness[2] / kStiffness), std::log(q.damping[2] / kDamping),
                                std::log(q.air_quadratic[2] / model.parameters.air_quadratic[2])})
         sum += log * log;
     }

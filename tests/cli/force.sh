@@ -169,20 +169,21 @@ END
 mean_sigma() { python3 -c 'import json, sys
 lines = [json.loads(line) for line in sys.stdin]
 print(sum(line["sigma"][0] for line in lines))' <"$work/stdout"; }
-force
+# where it is touched is given: else the spread of where it may be counts, too
+force --contact 0,0,0.3
 all=$(mean_sigma)
 edit_twin 'covariance[0][0] = None'
-run force "$work/edited" --states "$states" --base "$demo/base.tum"
+run force "$work/edited" --states "$states" --base "$demo/base.tum" --contact 0,0,0.3
 expect_code 0 'force, a null in the covariance'
 grep -q 'warning: twin.json: identification.covariance: has null for log_stiffness; .*leave out' "$work/stderr" ||
   fail 'force, a null in the covariance: no warning'
 some=$(mean_sigma)
 edit_twin 'covariance[:] = [[None] * len(names) for _ in names]'
-run force "$work/edited" --states "$states" --base "$demo/base.tum"
+run force "$work/edited" --states "$states" --base "$demo/base.tum" --contact 0,0,0.3
 grep -q 'warning: twin.json: .*null for log_stiffness, .*assume' "$work/stderr" ||
   fail 'force, no covariance: no warning'
 edit_twin 'covariance[:] = [[0.0] * len(names) for _ in names]'
-run force "$work/edited" --states "$states" --base "$demo/base.tum"
+run force "$work/edited" --states "$states" --base "$demo/base.tum" --contact 0,0,0.3
 none=$(mean_sigma)
 awk -v all="$all" -v some="$some" -v none="$none" 'BEGIN { exit !(all > none && some > none) }' ||
   fail "force, a null in the covariance: of the sigmas $all (all known), $some (one unknown), $none (all certain) the last is not the least"
