@@ -32,7 +32,7 @@ Model hanging(const RodCase& rod, int joints, bool under_tension) {
   for (int j = 1; j <= joints; ++j)
     p.link_mass.push_back(rod.mass * (chain.link_end(j) - chain.link_start(j)) / rod.length);
   p.tip_mass = rod.tip;
-  const double tension = under_tension ? grasp_tension(p, 1.0) : 0.0;
+  const double tension = under_tension ? grasp_tension(p, p.gravity) : 0.0;
   for (int j = 1; j <= joints; ++j) {
     const RodJoint joint = rod_joint(chain, j, rod.bending, tension);
     p.stiffness.push_back(joint.stiffness);
@@ -110,7 +110,7 @@ TEST_CASE("a hanging rope carries its weight at the grasp, a level or a standing
   const auto tension = [&](const Vector3& axis, double turn, const Parameters& p) {
     math::Pose base;
     base.rotation = Eigen::AngleAxisd(turn, axis).toRotationMatrix();
-    return grasp_tension(p, hanging_share(model.chain, VectorX::Zero(4), base, p.gravity));
+    return grasp_tension(p, first_direction(model.chain, VectorX::Zero(4), base));
   };
   CHECK(tension(Vector3::UnitX(), 0.0, model.parameters) == doctest::Approx(0.1 * 9.81));
   CHECK(tension(Vector3::UnitX(), M_PI / 3, model.parameters) == doctest::Approx(0.5 * 0.1 * 9.81));

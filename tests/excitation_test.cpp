@@ -25,7 +25,7 @@ dynamics::Model rope() {
   p.air_quadratic = fill(5, 0.0144 * 0.06);
   p.rest_angle = fill(5, 0.02);
   p.radius = 0.01, p.tip_mass = 0.002;
-  const double link = chain.length / 5, tension = dynamics::grasp_tension(p, 1.0);  // m, N
+  const double link = chain.length / 5, tension = dynamics::grasp_tension(p, p.gravity);  // m, N
   for (int j = 1; j <= 5; ++j) {
     const dynamics::RodJoint joint = dynamics::rod_joint(chain, j, kStiffness * link, tension);
     p.stiffness.push_back(joint.stiffness);

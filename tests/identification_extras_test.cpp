@@ -172,7 +172,7 @@ TEST_CASE("how stiff a rope is in torsion is found where it bends in space") {
   for (auto* zeros : {&p.viscous_friction, &p.coulomb_friction, &p.air_linear}) zeros->assign(kJoints, 0.0);
   p.air_quadratic.assign(kJoints, 0.001);
   constexpr double kBending = 8e-4, kRetardation = 0.06;  // N m^2, s
-  const double tension = dynamics::grasp_tension(p, 1.0);
+  const double tension = dynamics::grasp_tension(p, p.gravity);
   for (int k = 0; k < 2 * kJoints; ++k) {
     const dynamics::RodJoint rod = dynamics::rod_joint(chain, k / 2 + 1, kBending, tension);
     p.stiffness.push_back(rod.stiffness), p.damping.push_back(kRetardation * rod.slope);

@@ -80,7 +80,7 @@ Truth make_truth(const Case& what) {
   }
   // joints of a uniform rod (mathematics.md 3.2)
   constexpr double kLink = kLength / 8.0;
-  const double tension = what.stiff ? dynamics::grasp_tension(p, 1.0) : 0.0;
+  const double tension = what.stiff ? dynamics::grasp_tension(p, p.gravity) : 0.0;
   for (int j = 1; j <= 8; ++j) {
     const dynamics::RodJoint rod = dynamics::rod_joint(truth.chain, j, kStiffness * kLink, tension);
     p.stiffness.push_back(what.stiff ? rod.stiffness : 0.0);

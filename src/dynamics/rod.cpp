@@ -27,13 +27,13 @@ double stiffness_of(const chain::Chain& chain, int joint, double bending_stiffne
 
 }  // namespace
 
-double hanging_share(const chain::Chain& chain, const VectorX& theta, const math::Pose& base, const Vector3& gravity) {
-  const math::Pose first = chain::link_motions(chain, theta, base)[1];
-  return std::max(0.0, (first.rotation * chain.direction).dot(gravity.normalized()));
+Vector3 first_direction(const chain::Chain& chain, const VectorX& theta, const math::Pose& base) {
+  return chain::link_motions(chain, theta, base)[1].rotation * chain.direction;
 }
 
-double grasp_tension(const Parameters& parameters, double share) {
-  return parameters.table_normal ? 0.0 : total_mass(parameters) * parameters.gravity.norm() * share;
+double grasp_tension(const Parameters& parameters, const Vector3& direction) {
+  if (parameters.table_normal) return 0.0;
+  return std::max(0.0, total_mass(parameters) * parameters.gravity.dot(direction.normalized()));
 }
 
 RodJoint rod_joint(const chain::Chain& chain, int joint, double bending_stiffness, double tension) {

@@ -41,7 +41,8 @@ struct Part {
   BaseGrid grids[2];                  // half the substeps, for the way to the minimum, and all of them
   std::vector<std::size_t> nodes[2];  // of the grid, up to and with each output
   bool has_markers = false;           // the points are markers; unseen ones have no weight
-  double hanging = 0.0;               // how much the rope hangs, in the mean (dynamics/rod.h)
+  // of the first link, world axes, in the mean: of a rope that swings that in which it hangs
+  Vector3 direction = Vector3::Zero();
   Start start = {};
 };
 
@@ -415,8 +416,8 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
       part.theta[k][i] -= 2.0 * M_PI * std::round((part.theta[k][i] - part.theta[k - 1][i]) / (2.0 * M_PI));
   part.has_markers = markers != nullptr;
   for (std::size_t k = 0; k < frames; ++k)
-    part.hanging += dynamics::hanging_share(chain, part.theta[k], base.pose(recognized.time[k]), options.gravity) /
-                    static_cast<double>(frames);
+    part.direction +=
+        dynamics::first_direction(chain, part.theta[k], base.pose(recognized.time[k])) / static_cast<double>(frames);
   if (!markers) part.points = chain::shape_points(chain, true);
   for (std::size_t i = 0; markers && i < markers->arclengths.size(); ++i)
     part.points.push_back(chain::centerline_point(chain, markers->arclengths[i]));
@@ -754,14 +755,14 @@ struct Candidate {
 };
 
 // A fit, and again about the rod that it found, until that is the rod that its joints are in proportion to. `about`:
-// the problem about a rod; `hanging`: how much the rope hangs.
-Candidate fit_about_rod(const Extras& extras, const std::function<Problem(const Rod&)>& about, double hanging,
+// the problem about a rod; `direction`: of the first link at rest.
+Candidate fit_about_rod(const Extras& extras, const std::function<Problem(const Rod&)>& about, const Vector3& direction,
                         const Options& options) {
-  constexpr int kMost = 3;
-  constexpr double kSame = 0.05;  // of a logarithm of stiffness: proportions then change by half of that
+  constexpr int kMost = 5;
+  constexpr double kSame = 0.005;  // of a logarithm of stiffness: a tenth of the least error of one
   Candidate now{extras, about({}), {}};
   const auto rod_at = [&](const VectorX& p) {
-    return rod_of(now.problem.chain, now.problem.parts[0].unknowns, now.problem.of_part(p, 0), hanging);
+    return rod_of(now.problem.chain, now.problem.parts[0].unknowns, now.problem.of_part(p, 0), direction);
   };
   Rod rod = rod_at(now.problem.mean);
   now.problem.parts = about(rod).parts;
@@ -785,8 +786,8 @@ Candidate fit_candidates(const chain::Chain& chain, std::vector<Part> parts, con
   // millimeter, within which errors of calibration look like physics.
   const double within_errors = parts.front().has_markers ? 0.3 : 1.0;
   constexpr double kEvidence = 5.0;  // in favor of what a rope need not have, natural logarithm
-  double hanging = 0.0;
-  for (const Part& part : parts) hanging += part.hanging / static_cast<double>(parts.size());
+  Vector3 direction = Vector3::Zero();
+  for (const Part& part : parts) direction += part.direction;
   std::vector<Candidate> tried;
   const auto attempt = [&](const Extras& extras) {
     const auto about = [&](const Rod& rod) {
@@ -794,7 +795,7 @@ Candidate fit_candidates(const chain::Chain& chain, std::vector<Part> parts, con
       for (Part& part : own) part.unknowns = make_unknowns(chain, options, part.start, extras, rod);
       return make_problem(chain, std::move(own));
     };
-    tried.push_back(fit_about_rod(extras, about, hanging, options));
+    tried.push_back(fit_about_rod(extras, about, direction, options));
   };
   attempt({});
   const auto within = [&](const Candidate& one) {

@@ -312,10 +312,10 @@ State apply(const chain::Chain& chain, const Unknowns& u, const VectorX& p) {
   return {dynamics::moved(chain, u.reference, u.list, p, u.total_mass), dynamics::moved(u.initial, u.list, p)};
 }
 
-Rod rod_of(const chain::Chain& chain, const Unknowns& u, const VectorX& p, double share) {
+Rod rod_of(const chain::Chain& chain, const Unknowns& u, const VectorX& p, const math::Vector3& direction) {
   const int stiffness = u.first(Quantity::stiffness);
   return {stiffness < 0 ? 0.0 : std::exp(p[stiffness]) * mean_bent_length(chain),
-          dynamics::grasp_tension(apply(chain, u, p).parameters, share)};
+          dynamics::grasp_tension(apply(chain, u, p).parameters, direction)};
 }
 
 std::vector<dynamics::Tangent> tangents(const chain::Chain& chain, const Unknowns& u, const VectorX& p) {

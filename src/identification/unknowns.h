@@ -53,8 +53,8 @@ struct Start {
 Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const Start& start, const Extras& extras = {},
                        const Rod& rod = {});
 
-// The rod that a fit found. `share`: how much the rope hangs.
-Rod rod_of(const chain::Chain& chain, const Unknowns& unknowns, const VectorX& p, double share);
+// The rod that a fit found. `direction`: of the first link at rest, world axes.
+Rod rod_of(const chain::Chain& chain, const Unknowns& unknowns, const VectorX& p, const math::Vector3& direction);
 
 // The initial state alone, of a rope of these parameters.
 Unknowns make_state_unknowns(const chain::Chain& chain, const dynamics::Parameters& parameters, const Start& start);

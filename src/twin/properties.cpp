@@ -57,9 +57,8 @@ std::vector<Property> values(const dynamics::Model& model, bool known_mass, Vect
   int bends = 0;
   const VectorX hanging = hanging_from(model, near);
   if (hanging.size() > 0) near = hanging;
-  const double tension = hanging.size() == 0 ? 0.0
-                                             : dynamics::grasp_tension(
-                                                   p, dynamics::hanging_share(chain, hanging, math::Pose(), p.gravity));
+  const double tension =
+      hanging.size() == 0 ? 0.0 : dynamics::grasp_tension(p, dynamics::first_direction(chain, hanging, math::Pose()));
   for (int k = 0; k < chain.angles(); ++k) {
     if (chain::is_twist(chain, k)) continue;
     bending += dynamics::rod_stiffness(chain, chain.child_link[k], p.stiffness[k], tension);

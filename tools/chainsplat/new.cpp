@@ -62,7 +62,7 @@ dynamics::Parameters rod(const chain::Chain& chain, const Request& request, cons
   // how it hangs says how taut it is, which changes little how it hangs
   try {
     const math::VectorX hanging = dynamics::static_equilibrium(dynamics::make_model(chain, rod), math::Pose()).theta;
-    stand_for_rod(dynamics::grasp_tension(rod, dynamics::hanging_share(chain, hanging, math::Pose(), gravity)));
+    stand_for_rod(dynamics::grasp_tension(rod, dynamics::first_direction(chain, hanging, math::Pose())));
   } catch (const WorkError&) {
     // it stands on its grasp, where nothing is taut
   }

@@ -9,11 +9,12 @@
 
 namespace chainsplat::dynamics {
 
-// How much the first link hangs: the cosine of its angle with gravity, 0 where it is level or points up.
-double hanging_share(const chain::Chain& chain, const VectorX& theta, const math::Pose& base, const Vector3& gravity);
-// Tension, N, at the grasp of a rope at rest: its weight as much as it hangs; 0 on a table. Per kilogram of rope where
-// the masses are.
-double grasp_tension(const Parameters& parameters, double share);
+// Where the first link goes from the grasp: a unit vector, world axes.
+Vector3 first_direction(const chain::Chain& chain, const VectorX& theta, const math::Pose& base);
+// Tension, N, at the grasp of a rope at rest whose first link goes in this direction (of any length): its weight times
+// the cosine between that and gravity; 0 where it is level or points up, and on a table. Per kilogram of rope where the
+// masses are.
+double grasp_tension(const Parameters& parameters, const Vector3& direction);
 
 struct RodJoint {
   double stiffness = 0.0;  // N m/rad
