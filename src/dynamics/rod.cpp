@@ -6,10 +6,11 @@
 namespace chainsplat::dynamics {
 namespace {
 
-// A link that is so short beside sqrt(EI/T) is as good as without tension: the formulas would only lose digits.
+// Of sqrt(EI/T): beside it, a link that is as short as this is as good as without tension, and the formulas only lose
+// digits.
 constexpr double kShort = 1e-4;
-// Of how far the first link turns with a clamp: a base link longer than sqrt(EI/T) leaves it nothing to turn with.
-constexpr double kLeastTurn = 0.02;
+// Of sqrt(EI/T): what a base link leaves of it at least. One that is longer than sqrt(EI/T) would leave nothing.
+constexpr double kLeastLeft = 0.02;
 
 double stiffness_of(const chain::Chain& chain, int joint, double bending_stiffness, double tension) {
   const double straight = bending_stiffness / chain::bent_length(chain, joint);
@@ -18,11 +19,11 @@ double stiffness_of(const chain::Chain& chain, int joint, double bending_stiffne
   const double own = chain.link_end(1) - chain.link_start(1);
   const double before = chain.link_end(0) - chain.link_start(0);
   if (own / decay < kShort) return straight;
-  // links turn less and less by this factor, the logarithm of whose inverse is
-  const double falling = 2.0 * std::asinh(0.5 * own / decay), fading = -std::expm1(-falling);
-  // of a turn of the clamp by 1, that of the first link: then the rope below hangs where the rod would
-  const double turn = std::max((decay - before) / own * fading, kLeastTurn);
-  return tension * own / fading * turn / (1.0 - turn);
+  // the slopes of a chain's links fall by a factor of 1 - lost from link to link
+  const double lost = -std::expm1(-2.0 * std::asinh(0.5 * own / decay));
+  // the slope of the first link, over that of the clamp, with which the rope below hangs where the rod's would
+  const double slope = std::max(decay - before, kLeastLeft * decay) / own * lost;
+  return tension * own / lost * slope / (1.0 - slope);
 }
 
 }  // namespace

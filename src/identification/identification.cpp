@@ -754,12 +754,12 @@ struct Candidate {
   double lack = kInfinity;  // of evidence
 };
 
-// A fit, and again about the rod that it found, until that is the rod that its joints are in proportion to. `about`:
-// the problem about a rod; `direction`: of the first link at rest.
+// Fits, and fits again about the rod that was found, until that no longer changes. `about` makes the problem about a
+// rod; `direction`: of the first link at rest.
 Candidate fit_about_rod(const Extras& extras, const std::function<Problem(const Rod&)>& about, const Vector3& direction,
                         const Options& options) {
   constexpr int kMost = 5;
-  constexpr double kSame = 0.005;  // of a logarithm of stiffness: a tenth of the least error of one
+  constexpr double kSame = 0.005;  // of log EI, whose standard errors are 0.05 and more
   Candidate now{extras, about({}), {}};
   const auto rod_at = [&](const VectorX& p) {
     return rod_of(now.problem.chain, now.problem.parts[0].unknowns, now.problem.of_part(p, 0), direction);

@@ -36,8 +36,8 @@ struct Extras {
   bool payload = false;   // of unknown mass
 };
 
-// The rod that the joints' stiffnesses and dampings are in proportion to those of (dynamics/rod.h): under tension their
-// proportions depend on its stiffness, so that a fit is made again about the rod that was found.
+// The rod under tension that says how much stiffer the joint at the grasp is than the others (dynamics/rod.h). That
+// ratio depends on the rod's stiffness, which the fit finds: it is fitted again about the rod that was found.
 struct Rod {
   double bending_stiffness = 0.0;  // N m^2; not positive: that of the prior
   double tension = 0.0;            // N, at the grasp

@@ -59,7 +59,8 @@ std::string filled_in(const std::string& line, const Path& image, const Path& ma
 struct Exchange {
   Path folder;
   Exchange() {
-    std::string name = (fs::temp_directory_path() / "chainsplat-mask.XXXXXX").string();
+    std::string name =
+        (fs::temp_directory_path() / ("chainsplat-mask." + std::string(6, 'X'))).string();  // mkdtemp replaces them
     if (!mkdtemp(name.data())) throw WorkError(name, "cannot be made", "make room or set TMPDIR");
     folder = name;
   }
