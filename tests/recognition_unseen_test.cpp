@@ -2,6 +2,7 @@
 #include <doctest/doctest.h>
 
 #include <cmath>
+#include <memory>
 #include <numbers>
 #include <vector>
 
@@ -26,20 +27,23 @@ struct Rope {
   chain::Chain chain = chain::make_chain(kLength, kDiameter, -math::Vector3::UnitZ(), math::Vector3::UnitY(), 8,
                                          chain::Bending::spatial, false);
   splat::Gaussians gaussians;
-  std::vector<double> angle;  // of every Gaussian, from the bending axis on
   std::vector<math::Pose> motions = chain::link_motions(chain, math::VectorX::Zero(chain.angles()), {});
-  std::vector<recognition::Viewpoint> views;  // two cameras at 40 degrees to either side of the bending axis, 1 m away
+  // two cameras at 40 degrees to either side of the bending axis, 1 m away, whose masks show the rope everywhere
+  std::vector<std::unique_ptr<capture::Camera>> cameras;
+  capture::View everywhere;
+  std::vector<recognition::Viewpoint> views;
 
   // Those that a camera could see (nearly) have the texture and lie at 0.85 of the radius, the others are gray at 0.75.
-  explicit Rope(double slope) {
+  // `light`: how much brighter the side of the bending axis is.
+  explicit Rope(double slope, double light = 0.0) {
     constexpr int kCount = 1500;
     core::Random random(3);
     gaussians.resize(kCount, chain.links(), 1);
     for (int i = 0; i < kCount; ++i) {
       const double s = kLength * (i + random.uniform()) / kCount, at = 2.0 * std::numbers::pi * random.uniform();
-      angle.push_back(at);
       const bool seen = std::cos(at) > std::cos(130.0 * std::numbers::pi / 180.0);
-      const math::Vector3 color = seen ? texture(s, at, slope) : math::Vector3(0.5, 0.5, 0.5);
+      const math::Vector3 color =
+          seen ? math::Vector3((1.0 + light * std::cos(at)) * texture(s, at, slope)) : math::Vector3(0.5, 0.5, 0.5);
       const math::Vector3 mean = s * chain.direction + (seen ? 0.85 : 0.75) * 0.5 * kDiameter * normal(at);
       for (int c = 0; c < 3; ++c) {
         gaussians.mean[3 * i + c] = static_cast<float>(mean[c]);
@@ -49,10 +53,19 @@ struct Rope {
       gaussians.opacity_logit[i] = 2.0f;
       gaussians.link_logits[gaussians.links * i + chain::link_at(chain, s)] = 12.0f;
     }
-    for (const double side : {-1.0, 1.0}) {
-      const double at = side * 40.0 * std::numbers::pi / 180.0;
-      views.push_back({normal(at) + 0.5 * kLength * chain.direction, motions});
-    }
+    everywhere.width = everywhere.height = 64;
+    everywhere.rgba.assign(std::size_t{4} * 64 * 64, 255);
+    for (const double side : {-1.0, 1.0}) look_from(side * 40.0 * std::numbers::pi / 180.0);
+  }
+  void look_from(double at) {
+    auto camera = std::make_unique<capture::Camera>();
+    camera->width = camera->height = 64;
+    camera->fx = camera->fy = 64.0, camera->cx = camera->cy = 32.0;
+    camera->world_from_camera.rotation =
+        (math::Matrix3() << normal(at).cross(chain.direction), chain.direction, -normal(at)).finished();
+    camera->world_from_camera.translation = normal(at) + 0.5 * kLength * chain.direction;
+    views.push_back({camera.get(), &everywhere, motions});
+    cameras.push_back(std::move(camera));
   }
   math::Vector3 normal(double at) const {
     return std::cos(at) * chain.bending_axis + std::sin(at) * chain.direction.cross(chain.bending_axis);
@@ -61,16 +74,20 @@ struct Rope {
     return math::Vector3(gaussians.mean[3 * i], gaussians.mean[3 * i + 1], gaussians.mean[3 * i + 2])
         .dot(chain.direction);
   }
+  // About the axis, from the bending axis on.
+  double angle(int i) const {
+    const math::Vector3 mean(gaussians.mean[3 * i], gaussians.mean[3 * i + 1], gaussians.mean[3 * i + 2]);
+    return std::atan2(mean.dot(normal(0.5 * std::numbers::pi)), mean.dot(normal(0.0)));
+  }
   // RMS error of the colors of those behind, where the texture along the helix was seen at all.
-  double error_behind(double slope) const {
+  double error_behind(double slope, double light = 0.0) const {
     double square = 0.0;
     int count = 0;
     for (int i = 0; i < gaussians.count; ++i) {
       const double s = arclength(i);
-      if (std::cos(angle[i]) > -0.85 || s < 0.06 || s > kLength - 0.06) continue;
-      const math::Vector3 wanted = texture(s, angle[i], slope);
-      for (int c = 0; c < 3; ++c)
-        square += std::pow(0.5 + image_model::kSh0 * gaussians.sh[12 * i + c] - wanted[c], 2) / 3.0;
+      if (std::cos(angle(i)) > -0.85 || s < 0.06 || s > kLength - 0.06) continue;
+      const math::Vector3 wanted = (1.0 + light * std::cos(angle(i))) * texture(s, angle(i), slope);
+      square += (splat::base_color(gaussians, i) - wanted).squaredNorm() / 3.0;
       ++count;
     }
     REQUIRE(count > 50);
@@ -78,10 +95,11 @@ struct Rope {
   }
 };
 
+constexpr double kSlope = 0.045 / (2.0 * std::numbers::pi);  // one turn moves it by one period: it is closed
+
 }  // namespace
 
 TEST_CASE("a texture that winds about the rope goes on where no camera saw it") {
-  constexpr double kSlope = 0.045 / (2.0 * std::numbers::pi);  // one turn moves it by one period: it is closed
   Rope rope(kSlope);
   const splat::Gaussians before = rope.gaussians;
   const double gray = rope.error_behind(kSlope);
@@ -90,17 +108,22 @@ TEST_CASE("a texture that winds about the rope goes on where no camera saw it") 
   CHECK(count > 200);
   CHECK(count < 500);
   CHECK(rope.error_behind(kSlope) < 0.3 * gray);
+  // those that were seen stay, in their order, before the new ones
+  int kept = 0;
   for (int i = 0; i < before.count; ++i) {
-    const bool seen = std::cos(rope.angle[i]) > std::cos(120.0 * std::numbers::pi / 180.0);
-    const bool same =
-        before.mean[3 * i] == rope.gaussians.mean[3 * i] && before.sh[12 * i] == rope.gaussians.sh[12 * i];
-    if (seen) CHECK(same);
-    if (std::cos(rope.angle[i]) > -0.9) continue;
-    // on the surface, at the radius of the others
+    const math::Vector3 mean(before.mean[3 * i], before.mean[3 * i + 1], before.mean[3 * i + 2]);
+    const double at = std::atan2(mean.dot(rope.normal(0.5 * std::numbers::pi)), mean.dot(rope.normal(0.0)));
+    if (std::cos(at) < std::cos(120.0 * std::numbers::pi / 180.0)) continue;
+    while (kept < rope.gaussians.count && rope.gaussians.mean[3 * kept] != before.mean[3 * i]) ++kept;
+    REQUIRE(kept < rope.gaussians.count);
+    CHECK(rope.gaussians.sh[12 * kept] == before.sh[12 * i]);
+  }
+  CHECK(kept < rope.gaussians.count - count);
+  for (int i = rope.gaussians.count - count; i < rope.gaussians.count; ++i) {  // at the radius of the others
     const math::Vector3 mean(rope.gaussians.mean[3 * i], rope.gaussians.mean[3 * i + 1],
                              rope.gaussians.mean[3 * i + 2]);
     const math::Vector3 out = mean - mean.dot(rope.chain.direction) * rope.chain.direction;
-    if (rope.arclength(i) < 0.29) CHECK(out.norm() == doctest::Approx(0.85 * 0.5 * kDiameter).epsilon(0.02));
+    CHECK(out.norm() == doctest::Approx(0.85 * 0.5 * kDiameter).epsilon(0.02));
   }
 }
 
@@ -111,17 +134,38 @@ TEST_CASE("a texture of rings goes on as rings, and one color stays one color") 
   CHECK(rings.error_behind(0.0) < 0.3 * gray);
 
   Rope plain(0.0);
-  for (int i = 0; i < plain.gaussians.count; ++i)
-    for (int c = 0; c < 3; ++c) plain.gaussians.sh[12 * i + c] = c == 0 ? 1.0f : -1.0f;
+  for (int i = 0; i < plain.gaussians.count; ++i) splat::set_base_color(plain.gaussians, i, {0.78, 0.22, 0.22});
   recognition::finish_unseen(plain.chain, plain.views, plain.gaussians);
   for (int i = 0; i < plain.gaussians.count; ++i)
-    for (int c = 0; c < 3; ++c) CHECK(std::abs(plain.gaussians.sh[12 * i + c] - (c == 0 ? 1.0f : -1.0f)) < 1e-4f);
+    CHECK((splat::base_color(plain.gaussians, i) - math::Vector3(0.78, 0.22, 0.22)).norm() < 1e-4);
+}
+
+TEST_CASE("the side that the light does not reach is guessed darker") {
+  constexpr double kLight = 0.4;
+  Rope rope(kSlope, kLight);
+  recognition::finish_unseen(rope.chain, rope.views, rope.gaussians);
+  CHECK(rope.error_behind(kSlope, kLight) < 0.08);
+  CHECK(rope.error_behind(kSlope) > 0.12);  // of the texture without its light
+}
+
+TEST_CASE("where masks show that something else is in front, nothing is guessed") {
+  Rope rope(kSlope);
+  const splat::Gaussians before = rope.gaussians;
+  for (int y = 0; y < 25; ++y)  // the picture's upper part, down to 0.04 m of the rope
+    for (int x = 0; x < 64; ++x) rope.everywhere.rgba[4 * (64 * y + x) + 3] = 0;
+  const int count = recognition::finish_unseen(rope.chain, rope.views, rope.gaussians);
+  CHECK(count > 100);
+  int above = 0, above_before = 0;
+  for (int i = 0; i < rope.gaussians.count; ++i) above += rope.arclength(i) < 0.03;
+  for (int i = 0; i < before.count; ++i) above_before += -before.mean[3 * i + 2] < 0.03f;
+  CHECK(above == above_before);
+  for (int i = rope.gaussians.count - count; i < rope.gaussians.count; ++i) CHECK(rope.arclength(i) > 0.03);
 }
 
 TEST_CASE("nothing is guessed of a rope that was seen from all around") {
   Rope rope(0.0);
   const double half = std::numbers::pi;
-  for (const double at : {half - 0.6, half + 0.6}) rope.views.push_back({rope.normal(at), rope.motions});
+  for (const double at : {half - 0.6, half + 0.6}) rope.look_from(at);
   const splat::Gaussians before = rope.gaussians;
   CHECK(recognition::finish_unseen(rope.chain, rope.views, rope.gaussians) == 0);
   CHECK(rope.gaussians.mean == before.mean);

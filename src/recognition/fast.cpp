@@ -300,8 +300,8 @@ void add_gaussians(Job& job, const std::vector<LastDrawn>& last, int budget, int
 
 void guess_unseen(Job& job, const std::vector<splat::ViewSpec>& specs) {
   std::vector<Viewpoint> viewpoints;
-  for (const splat::ViewSpec& spec : specs)
-    viewpoints.push_back({spec.camera->world_from_camera.translation, spec.motions});
+  for (std::size_t i = 0; i < specs.size(); ++i)
+    viewpoints.push_back({specs[i].camera, &job.capture.views[job.training.views[i]], specs[i].motions});
   const int unseen = finish_unseen(job.result.chain, viewpoints, job.gaussians);
   core::say_more("recognize: " + std::to_string(unseen) + " of " + std::to_string(job.gaussians.count) +
                  " Gaussians lie where no camera saw the rope; their colors are guessed");
@@ -372,6 +372,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   if (job.first_round <= kRounds) {
     train_round(job, engine, kRounds);
     job.gaussians = engine.gaussians();
+    guess_unseen(job, specs);  // without a gradient Adam moves them, too
     save(job, engine, kRounds + 1, 0);
   }
   refine_all_frames(job, engine);

@@ -10,7 +10,7 @@ namespace chainsplat::recognition {
 
 namespace {
 
-constexpr float kOwnLinkLogit = 12.0f;        // softmax of 12 against zeros: other links below 1/255 by far
+constexpr float kOwnLinkLogit = 12.0f;  // softmax of 12 against zeros: other links below 1/255 by far
 constexpr double kShell = 0.75;         // of the radius, where Gaussians start: most of what is seen is the surface
 constexpr double kCoverage = 0.55;      // sigma in units of the spacing on the shell: neighbors overlap
 constexpr float kStartOpacity = 2.0f;   // logit, 0.88: ropes are opaque
@@ -104,6 +104,23 @@ splat::Gaussians place_along_chain(const chain::Chain& chain, const capture::Cap
   return g;
 }
 
+splat::Gaussians rows_of(const splat::Gaussians& gaussians, std::span<const int> rows, int more) {
+  splat::Gaussians out;
+  out.resize(static_cast<int>(rows.size()) + more, gaussians.links, gaussians.degree);
+  const auto copy = [&](std::vector<float> splat::Gaussians::*values, int width) {
+    for (std::size_t i = 0; i < rows.size(); ++i)
+      std::copy_n((gaussians.*values).begin() + static_cast<std::ptrdiff_t>(width) * rows[i], width,
+                  (out.*values).begin() + static_cast<std::ptrdiff_t>(width * i));
+  };
+  copy(&splat::Gaussians::mean, 3);
+  copy(&splat::Gaussians::rotation, 4);
+  copy(&splat::Gaussians::log_scale, 3);
+  copy(&splat::Gaussians::opacity_logit, 1);
+  copy(&splat::Gaussians::sh, 3 * gaussians.sh_coefficients());
+  copy(&splat::Gaussians::link_logits, gaussians.links);
+  return out;
+}
+
 Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, const capture::Capture& capture,
                       std::span<const Drawn> drawn, int budget, int most_added, core::Random& random) {
   Changed changed;
@@ -117,7 +134,6 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
       kept.push_back(i);
   }
   changed.removed = gaussians.count - static_cast<int>(kept.size());
-  splat::Gaussians old = gaussians;
   const int room = std::min(most_added, budget - static_cast<int>(kept.size()));
 
   // candidates: pixels of all pictures, weighted by their squared error
@@ -144,20 +160,7 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
     }
   }
   const int added = candidates.empty() ? 0 : std::max(0, room);
-  gaussians = splat::Gaussians{};
-  gaussians.resize(static_cast<int>(kept.size()) + added, old.links, old.degree);
-  const auto copy_row = [&](const std::vector<float>& from, std::vector<float>& to, int width, int i, int k) {
-    std::copy_n(from.begin() + static_cast<std::ptrdiff_t>(width) * k, width,
-                to.begin() + static_cast<std::ptrdiff_t>(width) * i);
-  };
-  for (int i = 0; i < static_cast<int>(kept.size()); ++i) {
-    copy_row(old.mean, gaussians.mean, 3, i, kept[i]);
-    copy_row(old.rotation, gaussians.rotation, 4, i, kept[i]);
-    copy_row(old.log_scale, gaussians.log_scale, 3, i, kept[i]);
-    copy_row(old.opacity_logit, gaussians.opacity_logit, 1, i, kept[i]);
-    copy_row(old.sh, gaussians.sh, 3 * old.sh_coefficients(), i, kept[i]);
-    copy_row(old.link_logits, gaussians.link_logits, old.links, i, kept[i]);
-  }
+  gaussians = rows_of(gaussians, kept, added);
   const double spacing = std::sqrt(std::numbers::pi * chain.diameter * chain.length / std::max(1, gaussians.count));
   int next = static_cast<int>(kept.size());
   for (int a = 0; a < added; ++a) {
@@ -201,7 +204,7 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
                  math::Vector3(p[0], p[1], p[2]) / 255.0, link);
   }
   changed.added = next - static_cast<int>(kept.size());
-  gaussians.resize(next, old.links, old.degree);
+  gaussians.resize(next, gaussians.links, gaussians.degree);
   return changed;
 }
 

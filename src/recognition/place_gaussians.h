@@ -17,6 +17,9 @@ splat::Gaussians place_along_chain(const chain::Chain& chain, const capture::Cap
                                    const chain::States& states, const std::vector<FrameViews>& frames,
                                    std::span<const int> training, int count, core::Random& random);
 
+// These Gaussians, in this order, and `more` new ones after them, as Gaussians::resize() makes them.
+splat::Gaussians rows_of(const splat::Gaussians& gaussians, std::span<const int> rows, int more);
+
 // One picture, its view and the link motions that drew it.
 struct Drawn {
   const capture::View* view = nullptr;

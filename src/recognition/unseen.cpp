@@ -6,6 +6,9 @@
 #include <optional>
 #include <vector>
 
+#include "chainsplat/image_model.h"
+#include "src/recognition/place_gaussians.h"
+
 namespace chainsplat::recognition {
 
 namespace {
@@ -15,28 +18,35 @@ using math::Vector3;
 constexpr double kTurn = 2.0 * std::numbers::pi;
 constexpr int kColumns = 36;          // of cells around the tube
 constexpr double kCellLength = 0.15;  // diameters along it
-constexpr double kUnseen = -0.2;  // largest cosine between surface normal and view ray of what no camera saw: what lies
-                                  // just behind the limb still shapes the outline
-constexpr double kTrusted = 0.4;  // least cosine of a color that others are taken from
-constexpr double kReach = 0.12;   // diameters, over which colors are averaged
-constexpr double kInside = 0.4;   // of the radius: what is closer to the axis has no side
+constexpr double kUnseen = -0.05;     // largest cosine between surface normal and view ray of what no camera saw: what
+                                   // lies at the limb shapes the outline
+constexpr double kTrusted = 0.4;     // least cosine of a color that others are taken from
+constexpr double kReach = 0.12;      // diameters, over which colors are averaged
+constexpr double kInside = 0.4;      // of the radius: what is closer to the axis has no side
+constexpr double kSpacing = 0.16;    // diameters, of the layer that is put there: about that of what was seen
 constexpr double kThickness = 0.04;  // diameters, sigma across the surface
 constexpr double kCoverage = 0.5;    // sigma along the surface in units of the spacing
 constexpr float kOpaque = 3.0f;      // logit, 0.95
+constexpr float kHard = 12.0f;       // logit of the own link
+constexpr double kHidden = 0.2;      // least share of the pictures that show something else where the rope must be
 constexpr double kSteepest = 4.0;    // radii per radian, of a helix
 constexpr int kSlopes = 161;         // that are tried
 constexpr double kRepeats = 0.3;     // least correlation of a texture with itself along a helix
+constexpr double kLit = 0.5;         // least share of what differs around the rope that its light must explain
+constexpr double kDarkest = 0.2;     // of the mean light: what lies around a rope reaches every side of it
 
 // Cells of the surface at home: row i of arclength, column j of angle about the axis, from the bending axis on.
 struct Surface {
   const chain::Chain& chain;
   int rows = 1;
   std::vector<double> facing;                 // best cosine of any view
+  std::vector<char> hidden;                   // by something that is no rope
   std::vector<std::optional<Vector3>> color;  // of trusted cells
 
   explicit Surface(const chain::Chain& of)
       : chain(of), rows(std::max(2, static_cast<int>(std::ceil(of.length / (kCellLength * of.diameter))))) {
     facing.assign(static_cast<std::size_t>(rows) * kColumns, -1.0);
+    hidden.resize(facing.size());
     color.resize(facing.size());
   }
   double arclength(int row) const { return (row + 0.5) * chain.length / rows; }
@@ -60,7 +70,7 @@ struct Surface {
   }
 };
 
-// A Gaussian's center about the axis.
+// A place on or in the tube about the axis.
 struct Place {
   double arclength, angle, radius;
 };
@@ -71,21 +81,36 @@ Place place_of(const Surface& surface, const splat::Gaussians& g, int i) {
   return {mean.dot(surface.chain.direction), angle < 0.0 ? angle + kTurn : angle, std::hypot(x, y)};
 }
 
+bool in_mask(const Viewpoint& from, const Vector3& world) {
+  const Vector3 point = from.camera->world_from_camera.inverse() * world;
+  if (point.z() < image_model::kNear) return false;
+  const math::Vector2 pixel = capture::project(*from.camera, point);
+  const capture::View& view = *from.view;
+  const int x = static_cast<int>(std::floor(pixel.x())) - view.x0,
+            y = static_cast<int>(std::floor(pixel.y())) - view.y0;
+  if (x < 0 || y < 0 || x >= view.width || y >= view.height) return false;
+  return view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] >= image_model::kObjectMask;
+}
+
 void look(std::span<const Viewpoint> views, Surface& surface) {
+  constexpr double kWithin = 0.8;  // of the radius: masks are a pixel off at the outline
   const double radius = 0.5 * surface.chain.diameter;
-  for (int row = 0; row < surface.rows; ++row) {
-    const double s = surface.arclength(row);
+  core::parallel_for(surface.rows, [&](std::int64_t row) {
+    const double s = surface.arclength(static_cast<int>(row));
     const int link = chain::link_at(surface.chain, s);
     for (int column = 0; column < kColumns; ++column) {
-      const Vector3 normal = surface.normal(Surface::angle(column));
-      const Vector3 point = s * surface.chain.direction + radius * normal;
-      double& best = surface.facing[surface.cell(row, column)];
+      const Vector3 normal = surface.normal(Surface::angle(column)), axis = s * surface.chain.direction;
+      const std::size_t cell = surface.cell(static_cast<int>(row), column);
+      double hidden = 0.0;
       for (const Viewpoint& view : views) {
         const math::Pose& motion = view.motions[link];
-        best = std::max(best, (motion.rotation * normal).dot((view.center - motion * point).normalized()));
+        const Vector3 ray = view.camera->world_from_camera.translation - motion * Vector3(axis + radius * normal);
+        surface.facing[cell] = std::max(surface.facing[cell], (motion.rotation * normal).dot(ray.normalized()));
+        hidden += in_mask(view, motion * Vector3(axis + kWithin * radius * normal)) ? 0.0 : 1.0;
       }
+      surface.hidden[cell] = hidden > kHidden * static_cast<double>(views.size());
     }
-  }
+  });
 }
 
 void color_trusted(const splat::Gaussians& g, const std::vector<Place>& places, double radius, Surface& surface) {
@@ -149,8 +174,43 @@ double slope_of_texture(const Surface& surface) {
   return slope;
 }
 
-// From the nearest colors along the helix in both directions, the nearer the more.
-std::optional<Vector3> guessed(const Surface& surface, double arclength, double angle, double slope) {
+// How bright the same texture is on each side of the rope, to the first harmonic: of what lights a convex thing, that
+// is most, and it goes on to sides that were not seen without running away.
+struct Light {
+  double mean = 1.0, cosine = 0.0, sine = 0.0;  // of the angle about the axis; any unit
+  double at(double side) const {
+    return std::max(kDarkest * mean, mean + cosine * std::cos(side) + sine * std::sin(side));
+  }
+};
+
+// Along the rope a texture shows all that it has on every side, so that the means of columns differ by their light.
+Light light_of(const Surface& surface) {
+  math::MatrixX design(kColumns, 3);
+  math::VectorX means(kColumns);
+  Eigen::Index seen = 0;
+  for (int column = 0; column < kColumns; ++column) {
+    double sum = 0.0;
+    int count = 0;
+    for (int row = 0; row < surface.rows; ++row)
+      if (const std::optional<Vector3>& color = surface.color[surface.cell(row, column)]) sum += color->mean(), ++count;
+    if (2 * count < surface.rows) continue;
+    const double side = Surface::angle(column);
+    design.row(seen) << 1.0, std::cos(side), std::sin(side);
+    means[seen++] = sum / count;
+  }
+  if (2 * seen < kColumns) return {};  // less than half of the rope tells nothing of the other
+  const auto columns = design.topRows(seen);
+  const auto brightness = means.head(seen);
+  const Vector3 found = (columns.transpose() * columns).ldlt().solve(columns.transpose() * brightness);
+  const double left = (columns * found - brightness).squaredNorm();
+  const double differs = (brightness.array() - brightness.mean()).square().sum();
+  if (!(left < (1.0 - kLit) * differs) || !(found[0] > 0.0)) return {};
+  return {found[0], found[1], found[2]};
+}
+
+// From the nearest colors along the helix in both directions, the nearer the more, in the light of this side.
+std::optional<Vector3> guessed(const Surface& surface, const Light& light, double arclength, double angle,
+                               double slope) {
   const int column = static_cast<int>(angle / kTurn * kColumns);
   Vector3 sum = Vector3::Zero();
   double weight = 0.0;
@@ -161,12 +221,56 @@ std::optional<Vector3> guessed(const Surface& surface, double arclength, double 
       const std::optional<Vector3> color =
           s >= 0.0 && s <= surface.chain.length ? surface.color_at(s, there) : std::nullopt;
       if (!color) continue;
-      sum += *color / (turn * turn);
+      sum += light.at(angle) / light.at(Surface::angle(there)) * *color / (turn * turn);
       weight += 1.0 / (turn * turn);
       break;
     }
   if (weight == 0.0) return {};
-  return Vector3(sum / weight);
+  return Vector3((sum / weight).cwiseMin(1.0));
+}
+
+// Evenly over the part of the surface that no camera saw.
+struct Guess {
+  double arclength, angle;
+  Vector3 color;
+};
+std::vector<Guess> guesses(const Surface& surface, double radius) {
+  const chain::Chain& chain = surface.chain;
+  const double slope = slope_of_texture(surface), spacing = kSpacing * chain.diameter;
+  const Light light = light_of(surface);
+  const int rows = std::max(1, static_cast<int>(chain.length / spacing)),
+            columns = std::max(3, static_cast<int>(kTurn * radius / spacing));
+  std::vector<Guess> out;
+  for (int row = 0; row < rows; ++row)
+    for (int column = 0; column < columns; ++column) {
+      const double s = (row + 0.5) * chain.length / rows;
+      const double angle = (column + (row % 2 ? 0.75 : 0.25)) * kTurn / columns;  // every other row between these
+      const std::size_t cell = surface.cell_at(s, angle);
+      if (surface.facing[cell] >= kUnseen || surface.hidden[cell]) continue;
+      if (const std::optional<Vector3> color = guessed(surface, light, s, angle, slope))
+        out.push_back({s, angle, *color});
+    }
+  return out;
+}
+
+void put(const chain::Chain& chain, const Guess& guess, double radius, int i, splat::Gaussians& gaussians,
+         const Surface& surface) {
+  const Vector3 normal = surface.normal(guess.angle);
+  const Vector3 mean = guess.arclength * chain.direction + radius * normal;
+  math::Matrix3 axes;  // along the rope, around it, across the surface
+  axes << chain.direction, normal.cross(chain.direction), normal;
+  const Eigen::Quaterniond turn(axes);
+  const double along = kCoverage * kSpacing * chain.diameter;
+  const double sizes[3] = {along, along, kThickness * chain.diameter};
+  for (int c = 0; c < 3; ++c) {
+    gaussians.mean[3 * i + c] = static_cast<float>(mean[c]);
+    gaussians.log_scale[3 * i + c] = static_cast<float>(std::log(sizes[c]));
+  }
+  const double wxyz[4] = {turn.w(), turn.x(), turn.y(), turn.z()};
+  for (int c = 0; c < 4; ++c) gaussians.rotation[4 * i + c] = static_cast<float>(wxyz[c]);
+  gaussians.opacity_logit[i] = kOpaque;
+  gaussians.link_logits[gaussians.links * i + chain::link_at(chain, guess.arclength)] = kHard;
+  splat::set_base_color(gaussians, i, guess.color);
 }
 
 }  // namespace
@@ -176,45 +280,26 @@ int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, s
   look(views, surface);
   const double full = 0.5 * chain.diameter;
   std::vector<Place> places;
-  std::vector<int> unseen;
+  std::vector<int> kept;
   std::vector<double> radii;
   for (int i = 0; i < gaussians.count; ++i) {
     const Place at = place_of(surface, gaussians, i);
     places.push_back(at);
-    if (at.radius < kInside * full || at.arclength < 0.0 || at.arclength > chain.length) continue;
+    const std::size_t cell = surface.cell_at(at.arclength, at.angle);
+    const bool side = at.radius >= kInside * full && at.arclength >= 0.0 && at.arclength <= chain.length;
     const bool tip = at.arclength > chain.length - kInside * full;  // its face is seen from below
-    if (!tip && surface.facing[surface.cell_at(at.arclength, at.angle)] < kUnseen) unseen.push_back(i);
-    if (surface.facing[surface.cell_at(at.arclength, at.angle)] >= kTrusted) radii.push_back(at.radius);
+    if (!side || tip || surface.facing[cell] >= kUnseen || surface.hidden[cell]) kept.push_back(i);
+    if (side && surface.facing[cell] >= kTrusted) radii.push_back(at.radius);
   }
-  if (unseen.empty() || radii.empty()) return 0;
+  if (radii.empty()) return 0;
   const double radius = math::median(radii);
   color_trusted(gaussians, places, radius, surface);
-  const double slope = slope_of_texture(surface);
-  const double cells = static_cast<double>(
-      std::count_if(surface.facing.begin(), surface.facing.end(), [](double f) { return f < kUnseen; }));
-  const double area = cells / static_cast<double>(surface.facing.size()) * kTurn * radius * chain.length;
-  const double spacing = std::sqrt(area / static_cast<double>(unseen.size()));
-  const int terms = gaussians.sh_coefficients();
-  for (const int i : unseen) {
-    const std::optional<Vector3> color = guessed(surface, places[i].arclength, places[i].angle, slope);
-    if (!color) continue;
-    const Vector3 normal = surface.normal(places[i].angle);
-    const Vector3 mean = places[i].arclength * chain.direction + radius * normal;
-    math::Matrix3 axes;  // along the rope, around it, across the surface
-    axes << chain.direction, normal.cross(chain.direction), normal;
-    const Eigen::Quaterniond turn(axes);
-    const double sizes[3] = {kCoverage * spacing, kCoverage * spacing, kThickness * chain.diameter};
-    for (int c = 0; c < 3; ++c) {
-      gaussians.mean[3 * i + c] = static_cast<float>(mean[c]);
-      gaussians.log_scale[3 * i + c] = static_cast<float>(std::log(sizes[c]));
-    }
-    const double wxyz[4] = {turn.w(), turn.x(), turn.y(), turn.z()};
-    for (int c = 0; c < 4; ++c) gaussians.rotation[4 * i + c] = static_cast<float>(wxyz[c]);
-    gaussians.opacity_logit[i] = kOpaque;
-    std::fill_n(&gaussians.sh[3 * static_cast<std::size_t>(terms) * i], 3 * terms, 0.0f);
-    splat::set_base_color(gaussians, i, *color);
-  }
-  return static_cast<int>(unseen.size());
+  const std::vector<Guess> found = guesses(surface, radius);
+  if (found.empty()) return 0;
+  gaussians = rows_of(gaussians, kept, static_cast<int>(found.size()));
+  for (std::size_t i = 0; i < found.size(); ++i)
+    put(chain, found[i], radius, static_cast<int>(kept.size() + i), gaussians, surface);
+  return static_cast<int>(found.size());
 }
 
 }  // namespace chainsplat::recognition
