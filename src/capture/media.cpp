@@ -1,42 +1,23 @@
 #include "media.h"
 
-#include <dlfcn.h>
-
-#include <cstring>
-
 #include "chainsplat/encode.h"
 #include "image_files.h"
+#include "src/core/own_library.h"
 
 namespace chainsplat::capture {
 
 namespace {
 
-// Returns the table of a library of this program, which lies where the program's run path says: beside it in the build
-// folder, in a folder of the program's own where it is installed. It stays loaded until the process ends.
-template <class Library>
-const Library& load_library(const std::string& name) {
-  const std::string file = name + ".so";
-  constexpr const char* kMend =
-      "install chainsplat-media, or what chainsplat was built with; where only Python has it, give pictures as arrays";
-  void* const library = ::dlopen(file.c_str(), RTLD_LAZY | RTLD_LOCAL);
-  const void* const table = library ? ::dlsym(library, name.c_str()) : nullptr;
-  if (!table) {
-    const char* const reason = ::dlerror();
-    throw WorkError(file, std::string("cannot be loaded (") + (reason ? reason : "it is empty") + ")", kMend);
-  }
-  const auto& out = *static_cast<const Library*>(table);
-  if (std::strcmp(out.version, CHAINSPLAT_VERSION) != 0)
-    throw WorkError(file, std::string("is of version ") + out.version + ", the program of " CHAINSPLAT_VERSION, kMend);
-  return out;
-}
+constexpr const char* kMend =
+    "install chainsplat-media, or what chainsplat was built with; where only Python has it, give pictures as arrays";
 
 const media::ImageLibrary& images() {
-  static const media::ImageLibrary& library = load_library<media::ImageLibrary>("chainsplat_images");
+  static const media::ImageLibrary& library = core::own_library<media::ImageLibrary>("chainsplat_images", kMend);
   return library;
 }
 
 const media::VideoLibrary& videos() {
-  static const media::VideoLibrary& library = load_library<media::VideoLibrary>("chainsplat_videos");
+  static const media::VideoLibrary& library = core::own_library<media::VideoLibrary>("chainsplat_videos", kMend);
   return library;
 }
 

@@ -1,10 +1,9 @@
 // src/capture/media.h - images and videos are read and written by two shared libraries of the program's own, loaded at
 // first use: OpenImageIO and libav bring some 330 further libraries, and most commands need none of them.
 //
-// chainsplat_images.so is src/capture/media/images.cpp, chainsplat_videos.so is src/capture/media/videos.cpp. Each
-// exports one table of functions under its own name, and these functions do what those of capture.h and image_files.h
-// do that are named like them. They throw the same exceptions. A library has a copy of `core` to itself, so that what
-// belongs to the process as a whole, its listener and the request to stop, reaches it through Host.
+// chainsplat_images.so is src/capture/media/images.cpp, chainsplat_videos.so is src/capture/media/videos.cpp
+// (src/core/own_library.h). The functions of their tables do what those of capture.h and image_files.h do that are
+// named like them. The process's listener and the request to stop reach them through Host.
 #pragma once
 #include "chainsplat/capture.h"
 
