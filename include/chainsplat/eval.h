@@ -11,10 +11,12 @@
 
 namespace chainsplat::eval {
 
-struct FrameMetrics {  // a metric that does not apply is NaN (no depth, no truth, nothing in the mask)
+class LpipsTrunk;  // lpips.h
+
+struct FrameMetrics {  // a metric that does not apply is NaN (no depth, no truth, no trunk)
   int camera = 0, frame = 0;
-  double time = 0, psnr = 0, psnr_object = 0, ssim = 0, iou = 0, chamfer = 0, centerline_rms = 0, tip_rms = 0,
-         shape_rms = 0;
+  double time = 0, psnr = 0, psnr_object = 0, ssim = 0, lpips = 0, iou = 0, chamfer = 0, centerline_rms = 0,
+         tip_rms = 0, shape_rms = 0;
 };
 
 // dB; the PSNR of two equal images, and the most that any image gets, because a mean needs a finite number.
@@ -29,13 +31,14 @@ struct Metrics {
 };
 
 // Draws the states through every camera of the capture, whose views must have recorded pixels and, for the Chamfer
-// distance, depth, and compares. Frames that the states do not cover are left out with a warning; throws InputError if
-// none is left, or for undistorted pixels.
+// distance, depth, and compares; with `trunk` by LPIPS, too. Frames that the states do not cover are left out with a
+// warning; throws InputError if none is left, for undistorted pixels, and for cameras that are too small for LPIPS.
 Metrics evaluate(splat::Engine& engine, const splat::Gaussians& gaussians, const chain::Chain& chain,
-                 const chain::States& states, const capture::Capture& recorded);
+                 const chain::States& states, const capture::Capture& recorded, const LpipsTrunk* trunk = nullptr);
 
-// All metrics of one frame but centerline_rms and tip_rms; both pictures in recorded pixels.
-FrameMetrics compare(const render::Frame& drawn, const capture::View& view, const capture::Camera& camera);
+// All metrics of one frame but those of the centerline; both pictures in recorded pixels. LPIPS with `trunk` only.
+FrameMetrics compare(const render::Frame& drawn, const capture::View& view, const capture::Camera& camera,
+                     const LpipsTrunk* trunk = nullptr);
 
 // The object M of metrics.json (formats.md 2.7) as JSON text, without metrics that do not apply; and "empty_clouds" if
 // it is not 0.

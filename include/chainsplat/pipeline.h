@@ -154,6 +154,7 @@ struct EvaluateOptions {
   capture::FrameRange frames;
   Path picture;  // PNG of observed beside rendered frames; empty: none
   std::string device;
+  Path lpips;  // trunk for LPIPS (lpips.h); empty: without
 };
 struct Evaluation {
   std::optional<eval::Metrics> recognized, rollout;

@@ -63,9 +63,10 @@ void identify(const std::vector<Path>& runs, bool joint, const std::vector<Path>
   });
 }
 
-py::dict evaluate(const Path& folder, const Path& capture, const Path& picture, const std::string& device) {
+py::dict evaluate(const Path& folder, const Path& capture, const Path& picture, const std::string& device,
+                  const Path& lpips) {
   pipeline::EvaluateOptions options;
-  options.picture = picture, options.device = device;
+  options.picture = picture, options.device = device, options.lpips = lpips;
   pipeline::Evaluation found;
   run({}, [&](const core::Listener& listener) { found = pipeline::evaluate(folder, capture, options, listener); });
   py::dict out;
@@ -76,6 +77,7 @@ py::dict evaluate(const Path& folder, const Path& capture, const Path& picture, 
     for (const auto& [key, value] : {std::pair("psnr", m.psnr),
                                      {"psnr_object", m.psnr_object},
                                      {"ssim", m.ssim},
+                                     {"lpips", m.lpips},
                                      {"iou", m.iou},
                                      {"chamfer", m.chamfer},
                                      {"centerline_rms", m.centerline_rms},
@@ -182,9 +184,9 @@ void add_work(py::module_& m) {
       "Finds the dynamics of recognized runs anew, one set of parameters for all, or of one run from marker files, and "
       "saves them there.");
   m.def(
-      "evaluate", &evaluate, arg("run"), arg("capture"), arg("picture") = "", arg("device") = "",
+      "evaluate", &evaluate, arg("run"), arg("capture"), arg("picture") = "", arg("device") = "", arg("lpips") = "",
       "How well a twin explains a capture: {'recognized': {'iou': ..., 'psnr': ...}, 'rollout': {...}}, means over all "
-      "frames; dB, m.");
+      "frames; dB, m. `lpips`: a trunk that tools/lpips_trunk made, for LPIPS, too.");
 
   py::class_<Planned>(m, "Plan", "A base motion that brings the rope to its targets, and what it comes to.")
       .def_property_readonly("reached", [](const Planned& p) { return p.plan.reached; })

@@ -272,6 +272,15 @@ class Module(unittest.TestCase):
         document = json.loads((self.run_folder / "metrics.json").read_text())
         self.assertGreater(metrics["rollout"]["iou"], 0.5)
         self.assertIn("recognized", document)
+        self.assertNotIn("lpips", metrics["rollout"])
+        trunks = DEMO.parent.parent / "tests" / "data" / "lpips"
+        with self.assertRaises(cs.InputError):
+            cs.evaluate(self.run_folder, DEMO, lpips=trunks / "one_output.onnx")
+        metrics = cs.evaluate(self.run_folder, DEMO, lpips=trunks / "trunk.onnx")
+        for part in ("recognized", "rollout"):
+            self.assertGreater(metrics[part]["lpips"], 0)
+            self.assertLess(metrics[part]["lpips"], 0.05)
+            self.assertEqual(metrics[part]["psnr"], document[part]["mean"]["psnr"])
 
     def test_a_capture_from_arrays_is_read_and_trained(self):
         capture = cs.Capture.load(DEMO, images=True, last=8)

@@ -2,11 +2,13 @@
 
 #include <algorithm>
 #include <array>
+#include <atomic>
 #include <cmath>
 #include <limits>
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/image_model.h"
+#include "chainsplat/lpips.h"
 #include "src/eval/depth_image.h"
 
 namespace chainsplat::eval {
@@ -74,16 +76,44 @@ void compare_centerlines(FrameMetrics& metrics, const chain::Chain& chain, const
   metrics.shape_rms = std::sqrt((offset.colwise() - offset.col(0)).colwise().squaredNorm().mean());
 }
 
+// LPIPS of two RGB images that are black outside of `area`, where they are given.
+double lpips_in(const LpipsTrunk& trunk, const std::vector<float>& a, const std::vector<float>& b,
+                const Rectangle& area, const capture::Camera& camera) {
+  // what is not black in one of them
+  Rectangle shown;
+  for (int y = area.y0, k = 0; y < area.y1; ++y)
+    for (int x = area.x0; x < area.x1; ++x, k += 3)
+      if (a[k] > 0.0f || a[k + 1] > 0.0f || a[k + 2] > 0.0f || b[k] > 0.0f || b[k + 1] > 0.0f || b[k + 2] > 0.0f)
+        shown = enclosing(shown, {x, y, x + 1, y + 1});
+  if (shown.empty()) return 0.0;
+
+  const Rectangle crop = lpips_crop(shown, camera.width, camera.height);
+  const auto cropped = [&](const std::vector<float>& rgb) {
+    std::vector<float> out(3u * crop.width() * crop.height(), 0.0f);
+    for (int y = shown.y0; y < shown.y1; ++y)
+      std::copy_n(rgb.begin() + 3 * (static_cast<std::ptrdiff_t>(area.width()) * (y - area.y0) + shown.x0 - area.x0),
+                  3 * shown.width(),
+                  out.begin() + 3 * (static_cast<std::ptrdiff_t>(crop.width()) * (y - crop.y0) + shown.x0 - crop.x0));
+    return out;
+  };
+  return lpips(trunk, cropped(a), cropped(b), crop.width(), crop.height(), camera.width, camera.height);
+}
+
 struct Metric {
   const char* name;
   double FrameMetrics::*value;
   bool squared;  // averaged as root mean square
 };
 constexpr std::array kMetrics{
-    Metric{"psnr", &FrameMetrics::psnr, false},       Metric{"psnr_object", &FrameMetrics::psnr_object, false},
-    Metric{"ssim", &FrameMetrics::ssim, false},       Metric{"iou", &FrameMetrics::iou, false},
-    Metric{"chamfer", &FrameMetrics::chamfer, false}, Metric{"centerline_rms", &FrameMetrics::centerline_rms, true},
-    Metric{"tip_rms", &FrameMetrics::tip_rms, true},  Metric{"shape_rms", &FrameMetrics::shape_rms, true},
+    Metric{"psnr", &FrameMetrics::psnr, false},
+    Metric{"psnr_object", &FrameMetrics::psnr_object, false},
+    Metric{"ssim", &FrameMetrics::ssim, false},
+    Metric{"lpips", &FrameMetrics::lpips, false},
+    Metric{"iou", &FrameMetrics::iou, false},
+    Metric{"chamfer", &FrameMetrics::chamfer, false},
+    Metric{"centerline_rms", &FrameMetrics::centerline_rms, true},
+    Metric{"tip_rms", &FrameMetrics::tip_rms, true},
+    Metric{"shape_rms", &FrameMetrics::shape_rms, true},
 };
 
 // Mean over the frames of one camera; camera < 0: of all.
@@ -106,7 +136,8 @@ FrameMetrics mean_of(const std::vector<FrameMetrics>& frames, int camera) {
 
 }  // namespace
 
-FrameMetrics compare(const render::Frame& drawn, const capture::View& view, const capture::Camera& camera) {
+FrameMetrics compare(const render::Frame& drawn, const capture::View& view, const capture::Camera& camera,
+                     const LpipsTrunk* trunk) {
   FrameMetrics metrics;
   metrics.camera = view.camera;
   metrics.frame = view.frame;
@@ -160,16 +191,31 @@ FrameMetrics compare(const render::Frame& drawn, const capture::View& view, cons
   metrics.psnr = psnr(squared, 3.0 * full);
   metrics.psnr_object = object > 0 ? psnr(object_squared, 3.0 * static_cast<double>(object)) : kNone;
   metrics.ssim = ssim(rendered, recorded, width, height, full);
+  metrics.lpips = trunk ? lpips_in(*trunk, rendered, recorded, area, camera) : kNone;
   metrics.iou = either > 0 ? static_cast<double>(both) / static_cast<double>(either) : 1.0;
   metrics.chamfer = chamfer(depth, true_depth, camera);
   return metrics;
 }
 
 Metrics evaluate(splat::Engine& engine, const splat::Gaussians& gaussians, const chain::Chain& chain,
-                 const chain::States& states, const capture::Capture& recorded) {
+                 const chain::States& states, const capture::Capture& recorded, const LpipsTrunk* trunk) {
   capture::require_pixels(recorded, capture::Pixels::recorded);
+  for (const capture::Camera& camera : recorded.cameras)
+    if (trunk && std::min(camera.width, camera.height) < kLeastLpipsSide)
+      throw InputError(camera.name,
+                       "images of " + std::to_string(camera.width) + "x" + std::to_string(camera.height) +
+                           " pixels are too small for LPIPS, which needs " + std::to_string(kLeastLpipsSide) +
+                           " a side",
+                       "evaluate it without");
   const auto truth = capture::load_true_centerline(recorded.folder);
   Metrics metrics;
+  // LPIPS takes tenths of a second a frame: only then is there something to see, and to stop
+  std::atomic<std::int64_t> compared_frames = 0;
+  const auto one_more = [&] {
+    core::stop_if_requested();
+    core::report({"evaluate", ++compared_frames, static_cast<std::int64_t>(recorded.views.size()), kNone, kNone,
+                  "comparing, with LPIPS"});
+  };
 
   // draw and compare the frames of each camera, a batch at a time
   for (int c = 0; c < static_cast<int>(recorded.cameras.size()); ++c) {
@@ -192,8 +238,9 @@ Metrics evaluate(splat::Engine& engine, const splat::Gaussians& gaussians, const
                           metrics.frames.resize(first + batch.size());
                           core::parallel_for(static_cast<std::int64_t>(batch.size()), [&](std::int64_t k) {
                             FrameMetrics& frame = metrics.frames[first + k];
-                            frame = compare(batch[k], *views[batch[k].frame], camera);
+                            frame = compare(batch[k], *views[batch[k].frame], camera, trunk);
                             if (truth) compare_centerlines(frame, chain, states, recorded.base, *truth);
+                            if (trunk) one_more();
                           });
                           for (std::size_t k = 0; k < batch.size(); ++k)
                             metrics.empty_clouds +=

@@ -6,6 +6,7 @@
 #include "chainsplat/comparison.h"
 #include "chainsplat/gpu.h"
 #include "chainsplat/identification.h"
+#include "chainsplat/lpips.h"
 #include "chainsplat/marker_files.h"
 #include "chainsplat/motion_files.h"
 #include "chainsplat/pipeline.h"
@@ -107,6 +108,7 @@ Evaluation evaluate(const Path& run, const Path& capture, const EvaluateOptions&
                     const core::Listener& listener) {
   const core::ListenerScope scope(listener);
   if (!options.picture.empty()) check_output_file(options.picture.string());
+  const eval::LpipsTrunkPtr trunk = options.lpips.empty() ? nullptr : eval::open_lpips_trunk(options.lpips);
   twin::Twin twin = load_twin(run);
   check_drawable(twin, run);
   capture::LoadOptions load;
@@ -124,9 +126,9 @@ Evaluation evaluate(const Path& run, const Path& capture, const EvaluateOptions&
   const gpu::DevicePtr device = gpu::open_device({.selector = options.device});
   splat::Engine engine(*device);
   Evaluation found;
-  if (own) found.recognized = eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, recorded);
+  if (own) found.recognized = eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, recorded, trunk.get());
   if (!twin.rollout.time.empty())
-    found.rollout = eval::evaluate(engine, twin.gaussians, twin.chain, twin.rollout, recorded);
+    found.rollout = eval::evaluate(engine, twin.gaussians, twin.chain, twin.rollout, recorded, trunk.get());
   if (!options.picture.empty()) capture::write_png(options.picture, eval::comparison(engine, twin, recorded));
   return found;
 }

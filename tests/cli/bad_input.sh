@@ -136,6 +136,22 @@ fresh; sed -i '0,/"rate": [0-9.]*/s//"rate": 1e-7/' "$capture/capture.json"
 refused 'rate: 1e-07 is not between'
 fresh; echo '1e7 0 0 1 0 0 0 1' >>"$capture/base.tum"
 refused 'base\.tum: pose .* a motion lasts at most 86400 s'
+# what is no trunk for LPIPS: found before anything else is read
+trunks=$source_dir/tests/data/lpips
+not_a_trunk() {  # pattern file
+  expect_error 2 "$1" eval "$work/nowhere" "$demo" --lpips "$2" -o "$work/metrics.json"
+  [ -e "$work/metrics.json" ] && fail "$1: something was written"
+}
+not_a_trunk 'missing\.onnx: No such file' "$work/missing.onnx"
+not_a_trunk 'is a folder' "$work"
+head -c 5000 "$demo/cam1.mp4" >"$work/garbage.onnx"
+not_a_trunk 'garbage\.onnx: is no network' "$work/garbage.onnx"
+head -c 9000 "$trunks/trunk.onnx" >"$work/cut.onnx"
+not_a_trunk 'cut\.onnx: is no network' "$work/cut.onnx"
+not_a_trunk 'one_output\.onnx: has 1 output, not the features of five layers; make it with tools/lpips_trunk' "$trunks/one_output.onnx"
+not_a_trunk 'channels\.onnx: has features of 3, 3, 3, 3, 3 channels' "$trunks/channels.onnx"
+not_a_trunk 'nowhere' "$trunks/trunk.onnx"
+
 twin=$source_dir/tests/data/planning/free
 expect_error 2 '--rate: .* 1000000 rows' rollout "$twin" --initial "$twin/states.csv" -o "$work/states.csv" --rate 99999999999
 expect_error 2 '--rate: .* 1000000 rows' plan "$twin" --target 0.1,0,0.3 -o "$work/plan" --rate 99999999999

@@ -124,6 +124,10 @@ expect_code 0 'render video'
 run eval "$work/whole" "$demo" --frames 0:12 --json
 expect_code 0 eval
 [ "$(head -c 1 "$work/stdout")" = '{' ] || fail 'eval --json: does not begin with {'
+run eval "$work/whole" "$demo" --frames 0:4 --lpips "$source_dir/tests/data/lpips/trunk.onnx"
+expect_code 0 'eval --lpips'
+expect_output 'SSIM +LPIPS +IoU' 'eval --lpips'
+expect_output '^rollout mean +[0-9.]+ +[0-9.]+ +0\.[0-9]+ +0\.[0-9]{5} +0\.' 'eval --lpips'
 run export "$work/whole" -o "$work/twin.glb"
 expect_code 0 export
 [ "$(head -c 4 "$work/twin.glb")" = glTF ] || fail 'export: no glTF'

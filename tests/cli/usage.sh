@@ -124,9 +124,11 @@ expect_code 2 'rollout with standard error closed'
 [ -s "$work/log.jsonl" ] && fail "rollout with standard error closed: in its log '$(cat "$work/log.jsonl")'"
 
 # the libraries that bring hundreds of others are loaded where an image is read, and missed there in one line
-ldd "$program" | grep -E 'OpenImageIO|libav' && fail 'the program itself links OpenImageIO or libav'
+ldd "$program" | grep -E 'OpenImageIO|libav|opencv_dnn' && fail 'the program itself links OpenImageIO, libav or networks'
 cp "$program" "$work/alone"
 [ "$("$work/alone" --version)" = "$("$program" --version)" ] || fail 'alone: no version'
 program=$work/alone
 expect_error 1 'chainsplat_(images|videos).so: cannot be loaded .*; install' check "$source_dir/assets/demo_free_30"
+expect_error 1 'chainsplat_networks.so: cannot be loaded .*LPIPS needs it: install' eval "$work/twin" "$source_dir/assets/demo_free_30" \
+  --lpips "$source_dir/tests/data/lpips/trunk.onnx"
 finish

@@ -1,7 +1,8 @@
 """A script of one's own with an installed wheel: wheel.py RUN CAPTURE.
 
-Loads a twin, rolls it out, draws it, follows it from its own pictures; files of images are refused with a reason.
+Loads a twin, rolls it out, draws it, follows it from its own pictures; files of images and LPIPS are refused with a reason.
 """
+import pathlib
 import sys
 
 import numpy as np
@@ -26,5 +27,11 @@ assert np.linalg.norm(ends[0] - ends[1]) < 0.01
 try:
     cs.Capture.load(capture)
     sys.exit("files of images are read, of which this wheel has no reader")
+except cs.WorkError as error:
+    print(error)
+trunk = pathlib.Path(__file__).parent.parent / "data" / "lpips" / "trunk.onnx"
+try:
+    cs.evaluate(run, capture, lpips=trunk)
+    sys.exit("LPIPS is computed, for which this wheel has no networks")
 except cs.WorkError as error:
     print(error)

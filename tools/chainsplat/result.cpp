@@ -21,7 +21,7 @@ namespace {
 namespace fs = std::filesystem;
 
 struct EvalRequest {
-  std::string run, capture, out, picture, frames;
+  std::string run, capture, out, picture, frames, lpips;
 };
 
 void evaluate(const Globals& globals, const EvalRequest& request) {
@@ -31,7 +31,8 @@ void evaluate(const Globals& globals, const EvalRequest& request) {
     throw InputError("--json", "standard output is wanted by '-o -' too", "leave one of them out");
   const pipeline::Evaluation found = pipeline::evaluate(
       request.run, request.capture,
-      {capture::read_frame_range(request.frames, "--frames"), request.picture, globals.device}, terminal());
+      {capture::read_frame_range(request.frames, "--frames"), request.picture, globals.device, request.lpips},
+      terminal());
   const eval::Metrics *recognized = found.recognized ? &*found.recognized : nullptr,
                       *rollout = found.rollout ? &*found.rollout : nullptr;
   const std::string json = pipeline::metrics_json(recognized, rollout);
@@ -182,6 +183,8 @@ void add_result_commands(Command app, const Globals& globals, Job& job) {
       .type_name("A:B");
   evaluator.add_option("--picture", request->picture, "Also make a picture: observed beside rendered frames")
       .type_name("FILE.png");
+  evaluator.add_option("--lpips", request->lpips, "Also measure LPIPS, with a trunk that tools/lpips_trunk made")
+      .type_name("TRUNK.onnx");
   evaluator.callback([&globals, &job, request] { job = [&globals, request] { evaluate(globals, *request); }; });
 
   Command reporter =

@@ -1,6 +1,7 @@
 // results.cpp - texts of the command line, and results on their way out.
 #include <unistd.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
@@ -53,7 +54,10 @@ void check_not_input(const std::string& output, const Path& run, const std::vect
 
 std::string metrics_table(const std::vector<MetricsRow>& rows) {
   constexpr double kMillimeters = 1e3;
-  std::string text = "                    PSNR dB  object dB    SSIM     IoU  Chamfer mm  centerline mm  from grasp\n";
+  const bool lpips =
+      std::any_of(rows.begin(), rows.end(), [](const auto& row) { return std::isfinite(row.metrics->lpips); });
+  std::string text = "                    PSNR dB  object dB    SSIM" + std::string(lpips ? "    LPIPS" : "") +
+                     "     IoU  Chamfer mm  centerline mm  from grasp\n";
   const auto cell = [&](int width, int digits, double value) {
     char out[64];
     if (std::isfinite(value))
@@ -69,6 +73,7 @@ std::string metrics_table(const std::vector<MetricsRow>& rows) {
     cell(9, 2, row.metrics->psnr);
     cell(11, 2, row.metrics->psnr_object);
     cell(8, 4, row.metrics->ssim);
+    if (lpips) cell(9, 5, row.metrics->lpips);
     cell(8, 3, row.metrics->iou);
     cell(12, 2, kMillimeters * row.metrics->chamfer);
     cell(15, 2, kMillimeters * row.metrics->centerline_rms);

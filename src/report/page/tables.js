@@ -77,8 +77,8 @@ function worstFrame(report, camera) {
 }
 
 const metricColumns = [['psnr_object', 'object PSNR, dB', 1, 1], ['psnr', 'PSNR, dB', 1, 1], ['iou', 'overlap (IoU)', 1, 3],
-                       ['ssim', 'SSIM', 1, 4], ['chamfer', 'Chamfer, mm', 1e3, 2], ['centerline_rms', 'centerline, mm', 1e3, 2],
-                       ['tip_rms', 'tip, mm', 1e3, 2]];
+                       ['ssim', 'SSIM', 1, 4], ['lpips', 'LPIPS', 1, 5], ['chamfer', 'Chamfer, mm', 1e3, 2],
+                       ['centerline_rms', 'centerline, mm', 1e3, 2], ['tip_rms', 'tip, mm', 1e3, 2]];
 
 function fillMetrics(box, report) {
   const known = report.motions.filter(motion => motion.metrics);
