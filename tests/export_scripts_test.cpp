@@ -1,5 +1,5 @@
-// What exports for NumPy and MuJoCo hold. With CHAINSPLAT_TEST_EXPORTS=FOLDER they are left there, beside what the
-// program says of the same motion, for tests/cli/exports.sh, which runs them.
+// What exports for NumPy and MuJoCo hold, URDF among them. With CHAINSPLAT_TEST_EXPORTS=FOLDER they are left there,
+// beside what the program says of the same motion, for tests/cli/exports.sh, which runs them.
 #include <doctest/doctest.h>
 
 #include <cmath>
@@ -64,7 +64,8 @@ void write_all(twin::Twin twin, const Path& folder) {
   twin.estimates.names = {"log_stiffness", "log_damping"};
   twin.estimates.values = twin.estimates.standard_errors = {0.1, 0.2};
   twin.estimates.covariance = math::MatrixX::Identity(2, 2);
-  for (const char* const name : {"rope.xml", "twin.npz"}) exports::write(twin, twin.states, base, folder / name);
+  for (const char* const name : {"rope.xml", "rope.urdf", "twin.npz"})
+    exports::write(twin, twin.states, base, folder / name);
   core::write_file(folder / "rollout.csv", twin::states_csv(twin.rollout));
   core::write_file(folder / "centerline.csv", twin::centerline_csv(twin.chain, twin.rollout, base));
 }
@@ -80,12 +81,15 @@ TEST_CASE("exports for NumPy and MuJoCo: every file that was named, the same byt
   write_all(free, folder / "free");
   write_all(table_twin(), folder / "table");
   write_all(twisting_twin(), folder / "twisting");
-  for (const char* const name : {"rope.xml", "rope_base.csv", "rope_play.py", "twin.npz", "twin.py"})
+  twin::Twin thin = free;  // as --mode paper has it
+  thin.parameters->radius = 0.0, thin.parameters->tip_mass = 0.0;
+  write_all(thin, folder / "thin");
+  for (const char* const name : {"rope.xml", "rope_base.csv", "rope_play.py", "rope.urdf", "twin.npz", "twin.py"})
     CHECK(std::filesystem::file_size(folder / "free" / name) > 100);
   CHECK(exports::files("a/rope.xml") == std::vector<Path>{"a/rope.xml", "a/rope_base.csv", "a/rope_play.py"});
   CHECK(exports::files("a/b.c.npz") == std::vector<Path>{"a/b.c.npz", "a/b.c.py"});
   write_all(free, folder / "again");
-  for (const char* const name : {"rope.xml", "twin.npz"})
+  for (const char* const name : {"rope.xml", "rope.urdf", "twin.npz"})
     CHECK(core::read_file(folder / "free" / name) == core::read_file(folder / "again" / name));
 
   // a name with markup in it stays a name, and cannot end the comment

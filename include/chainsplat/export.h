@@ -12,6 +12,7 @@
 //               NAME.py, which poses the twin.
 //   .mcap       a recording for Foxglove and rerun (mcap.h).
 //   .xml        MJCF for MuJoCo, and beside it NAME_base.csv and NAME_play.py, which plays it as the twin moves.
+//   .urdf       URDF for robots' programs: links, joints, shapes and inertias; the file says what URDF has no word for.
 // The namespace is not `export`, which is a keyword.
 #pragma once
 #include <string>
@@ -74,5 +75,12 @@ struct MujocoFiles {
   std::string model, base, player;
 };
 MujocoFiles mujoco(const twin::Twin& twin, const trajectory::Trajectory& base, const std::string& stem);
+
+// The rope as URDF, links and joints named as MuJoCo's, link_0 the root. Angles with a common joint have a link
+// `cross_K` between them; all its mass, and that of link_0, is taken from the next link's joint, so that the mass
+// matrix is the twin's to 1e-5. Left out, and told with its size at the file's head: stiffness (which
+// Gazebo reads from elements of its own), rest angles, drag, friction on a table, how friction in bending builds up,
+// the motion. The twin must be identified.
+std::string urdf(const twin::Twin& twin);
 
 }  // namespace chainsplat::exports

@@ -179,8 +179,8 @@ void add_twin(py::module_& m) {
             });
           },
           arg("file"), arg("states") = py::none(), arg("base") = py::none(), arg("mesh") = false,
-          "Writes .glb, .gltf, .ply, .csv, .npz or .xml (MuJoCo), with a motion: the rollout, unless `states` are "
-          "given.")
+          "Writes .glb, .gltf, .ply, .csv, .npz, .xml (MuJoCo), .urdf or .mcap, with a motion: the rollout, unless "
+          "`states` are given.")
 
       .def_property_readonly(
           "angles", [](const Twin& t) { return t.rope.twin.chain.angles(); }, "n")

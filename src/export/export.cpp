@@ -9,6 +9,9 @@ namespace chainsplat::exports {
 
 namespace {
 
+constexpr const char* kNotIdentified = "the twin's dynamics are not identified";
+constexpr const char* kIdentify = "run 'chainsplat identify'";
+
 // NAME.xml with `what` instead of its ending: NAME_play.py.
 Path beside(Path file, const std::string& what) { return file.replace_filename(file.stem().string() + what); }
 
@@ -19,7 +22,7 @@ void require(bool there, const Path& file, const std::string& what, const std::s
 }  // namespace
 
 const std::vector<std::string>& endings() {
-  static const std::vector<std::string> known{".glb", ".gltf", ".ply", ".csv", ".npz", ".xml", ".mcap"};
+  static const std::vector<std::string> known{".glb", ".gltf", ".ply", ".csv", ".npz", ".xml", ".urdf", ".mcap"};
   return known;
 }
 
@@ -63,9 +66,11 @@ void write(const twin::Twin& twin, const chain::States& motion, const trajectory
              twin::centerline_csv(twin.chain, motion, base.samples().empty() ? at_rest : base)};
   } else if (kind == ".npz") {
     bytes = {npz(twin, motion, base), npz_script()};
+  } else if (kind == ".urdf") {
+    require(twin.parameters.has_value(), file, kNotIdentified, kIdentify);
+    bytes = {urdf(twin)};
   } else if (kind == ".xml") {
-    require(twin.parameters && twin.initial, file, "the twin's dynamics are not identified",
-            "run 'chainsplat identify'");
+    require(twin.parameters && twin.initial, file, kNotIdentified, kIdentify);
     MujocoFiles made = mujoco(twin, base, file.stem().string());
     bytes = {std::move(made.model), std::move(made.base), std::move(made.player)};
   } else {

@@ -8,6 +8,7 @@
 #include "chainsplat/export.h"
 #include "parts.h"
 #include "scripts.h"
+#include "xml_text.h"
 
 namespace chainsplat::exports {
 
@@ -25,49 +26,6 @@ constexpr double kDensity = 1e-3, kThin = 1e-4, kHalfLength = 0.1;  // kg/m^3, m
 const std::array<std::pair<double, double>, 3> kGauss{
     {{0.5 * (1.0 - std::sqrt(0.6)), 5.0 / 18}, {0.5, 8.0 / 18}, {0.5 * (1.0 + std::sqrt(0.6)), 5.0 / 18}}};
 
-template <class Values>
-std::string list(const Values& values) {
-  std::string out;
-  for (const double value : values) out.append(out.empty() ? "" : " ").append(core::exact(value + 0.0));
-  return out;
-}
-
-std::string attribute(const char* name, const std::string& value) {
-  return std::string(" ") + name + "=\"" + value + "\"";
-}
-
-template <class Values>
-std::string attribute(const char* name, const Values& values) {
-  return attribute(name, list(values));
-}
-
-std::string attribute(const char* name, double value) { return attribute(name, core::exact(value)); }
-
-// A name as an XML attribute.
-std::string escaped(const std::string& text) {
-  std::string out;
-  for (const char letter : core::printable(text)) switch (letter) {
-      case '&':
-        out += "&amp;";
-        break;
-      case '<':
-        out += "&lt;";
-        break;
-      case '>':
-        out += "&gt;";
-        break;
-      case '"':
-        out += "&quot;";
-        break;
-      case '-':
-        out += out.ends_with('-') ? " -" : "-";
-        break;  // two in a row would end a comment
-      default:
-        out += letter;
-    }
-  return out;
-}
-
 std::array<double, 4> wxyz(const Matrix3& rotation) {
   const Eigen::Quaterniond q(rotation);
   return {q.w(), q.x(), q.y(), q.z()};
@@ -77,47 +35,6 @@ std::array<double, 4> wxyz(const Matrix3& rotation) {
 std::array<double, 4> turn_of_z(const Vector3& to) {
   const Eigen::Quaterniond q = Eigen::Quaterniond::FromTwoVectors(Vector3::UnitZ(), to);
   return {q.w(), q.x(), q.y(), q.z()};
-}
-
-// Mass, center of mass and inertia about it, of a link with the tip's mass where it is the last.
-struct Inertia {
-  double mass = 0.0;
-  Vector3 center = Vector3::Zero();
-  Matrix3 about = Matrix3::Zero();
-};
-
-Matrix3 point_inertia(double mass, const Vector3& arm) {
-  return mass * (arm.squaredNorm() * Matrix3::Identity() - arm * arm.transpose());
-}
-
-Inertia inertia_of(const chain::Chain& chain, const dynamics::Parameters& p, int link) {
-  const double mass = p.link_mass[link - 1], length = chain.link_end(link) - chain.link_start(link);
-  const Vector3& d = chain.direction;
-  const double across = mass * (length * length / 12.0 + p.radius * p.radius / 4.0);
-  const Matrix3 along = d * d.transpose();
-  Inertia out{mass, 0.5 * length * d,
-              across * (Matrix3::Identity() - along) + 0.5 * mass * p.radius * p.radius * along};
-  if (link + 1 < chain.links() || p.tip_mass <= 0.0) return out;
-  const Vector3 tip = length * d, center = (mass * out.center + p.tip_mass * tip) / (mass + p.tip_mass);
-  out.about += point_inertia(mass, out.center - center) + point_inertia(p.tip_mass, tip - center);
-  out.mass += p.tip_mass;
-  out.center = center;
-  return out;
-}
-
-// The mean color of a link's Gaussians, weighted by opacity; gray without any.
-std::array<double, 4> color_of_link(const splat::Gaussians& g, int link) {
-  std::array<double, 4> sum{0, 0, 0, 1};
-  double weight = 0.0;
-  for (int i = 0; i < g.count; ++i) {
-    if (surest_link(g, i) != link) continue;
-    const double opacity = 1.0 / (1.0 + std::exp(-static_cast<double>(g.opacity_logit[i])));
-    weight += opacity;
-    const Vector3 color = splat::base_color(g, i);
-    for (int c = 0; c < 3; ++c) sum[c] += opacity * color[c];
-  }
-  for (int c = 0; c < 3; ++c) sum[c] = weight > 0.0 ? std::round(1e3 * sum[c] / weight) / 1e3 : 0.5;
-  return sum;
 }
 
 std::string joints_of(const chain::Chain& chain, const dynamics::Parameters& p, int link, const std::string& indent) {
@@ -211,13 +128,9 @@ std::string keyframe(const twin::Twin& twin, const trajectory::BaseMotion& base)
 
 std::string head(const twin::Twin& twin, const std::string& stem) {
   const dynamics::Parameters& p = *twin.parameters;
-  Vector3 gravity = p.gravity;
-  if (p.table_normal && p.table_carries_weight) gravity -= p.table_normal->dot(gravity) * *p.table_normal;
   std::string out =
-      "<!-- The rope " + escaped(twin.provenance.capture) +
-      " as identified by chainsplat " CHAINSPLAT_VERSION ". SI units" +
-      (twin.known_mass ? "" : ", but the whole mass counts as 1 kg") + ".\n     " + escaped(stem) +
-      "_play.py moves the base as " + escaped(stem) + "_base.csv says" +
+      "<!-- " + what_it_is(twin) + ".\n     " + escaped(stem) + "_play.py moves the base as " + escaped(stem) +
+      "_base.csv says" +
       (p.table_normal ? " and adds the table's friction,\n     which MJCF cannot say: without it the rope "
                         "slides freely. The table carries the weight"
                       : "") +
@@ -226,7 +139,7 @@ std::string head(const twin::Twin& twin, const std::string& stem) {
       ".\n     Contacts are off: give geoms contype and conaffinity where the rope is to touch things. -->\n";
   return out + "<mujoco" + attribute("model", escaped(twin.provenance.capture)) + ">\n" +
          "  <compiler angle=\"radian\" autolimits=\"true\" inertiafromgeom=\"false\"/>\n  <option" +
-         attribute("timestep", kTimestep) + attribute("gravity", gravity) +
+         attribute("timestep", kTimestep) + attribute("gravity", gravity_felt(p)) +
          attribute("integrator", std::string("implicitfast")) + attribute("density", kDensity) +
          attribute("viscosity", 0.0) + "/>\n" +
          "  <default>\n    <geom contype=\"0\" conaffinity=\"0\" mass=\"0\"/>\n    <default class=\"drag\">\n"

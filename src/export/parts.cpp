@@ -1,6 +1,15 @@
 #include "parts.h"
 
+#include <algorithm>
+#include <cmath>
+
+#include "chainsplat/export.h"
+#include "xml_text.h"
+
 namespace chainsplat::exports {
+
+using math::Matrix3;
+using math::Vector3;
 
 std::vector<math::Pose> local_poses(const chain::Chain& chain, const math::VectorX& theta, const math::Pose& base) {
   const std::vector<math::Pose> motions = chain::link_motions(chain, theta, base);
@@ -11,6 +20,50 @@ std::vector<math::Pose> local_poses(const chain::Chain& chain, const math::Vecto
     local.push_back(j == 0 ? world[0] : world[j - 1].inverse() * world[j]);
   }
   return local;
+}
+
+Matrix3 point_inertia(double mass, const Vector3& arm) {
+  return mass * (arm.squaredNorm() * Matrix3::Identity() - arm * arm.transpose());
+}
+
+Inertia inertia_of(const chain::Chain& chain, const dynamics::Parameters& p, int link) {
+  const double mass = p.link_mass[link - 1], length = chain.link_end(link) - chain.link_start(link);
+  const Vector3& d = chain.direction;
+  const double across = mass * (length * length / 12.0 + p.radius * p.radius / 4.0);
+  const Matrix3 along = d * d.transpose();
+  const double about_itself = std::max(0.5 * mass * p.radius * p.radius, kLeastInertia);
+  Inertia out{mass, 0.5 * length * d, across * (Matrix3::Identity() - along) + about_itself * along};
+  if (link + 1 < chain.links() || p.tip_mass <= 0.0) return out;
+  const Vector3 tip = length * d, center = (mass * out.center + p.tip_mass * tip) / (mass + p.tip_mass);
+  out.about += point_inertia(mass, out.center - center) + point_inertia(p.tip_mass, tip - center);
+  out.mass += p.tip_mass;
+  out.center = center;
+  return out;
+}
+
+Vector3 gravity_felt(const dynamics::Parameters& p) {
+  if (!p.table_normal || !p.table_carries_weight) return p.gravity;
+  return p.gravity - p.table_normal->dot(p.gravity) * *p.table_normal;
+}
+
+std::array<double, 4> color_of_link(const splat::Gaussians& g, int link) {
+  std::array<double, 4> sum{0, 0, 0, 1};
+  double weight = 0.0;
+  for (int i = 0; i < g.count; ++i) {
+    if (surest_link(g, i) != link) continue;
+    const double opacity = 1.0 / (1.0 + std::exp(-static_cast<double>(g.opacity_logit[i])));
+    weight += opacity;
+    const Vector3 color = splat::base_color(g, i);
+    for (int c = 0; c < 3; ++c) sum[c] += opacity * color[c];
+  }
+  for (int c = 0; c < 3; ++c) sum[c] = weight > 0.0 ? std::round(1e3 * sum[c] / weight) / 1e3 : 0.5;
+  return sum;
+}
+
+std::string what_it_is(const twin::Twin& twin) {
+  return "The rope " + escaped(twin.provenance.capture) +
+         " as identified by chainsplat " CHAINSPLAT_VERSION ". SI units" +
+         (twin.known_mass ? "" : ", but the whole mass counts as 1 kg");
 }
 
 }  // namespace chainsplat::exports

@@ -1,6 +1,6 @@
 #!/bin/bash
-# Exports for NumPy and MuJoCo, run as their readers run them: twin.py poses the links as the program does, and MuJoCo moves the
-# rope as the rollout does. $1: the program, $2: test_export, which makes the files. Python is $CHAINSPLAT_PYTHON, else python3;
+# Exports for NumPy and MuJoCo, run as their readers run them: twin.py poses the links as the program does, MuJoCo moves the
+# rope as the rollout does, and reads from the URDF the same links and inertia. $1: the program, $2: test_export, which makes the files. Python is $CHAINSPLAT_PYTHON, else python3;
 # without NumPy all is skipped (77), without MuJoCo its part.
 . "$(dirname "$0")/lib.sh"
 python=${CHAINSPLAT_PYTHON:-python3}
@@ -50,7 +50,56 @@ print(f'{np.sqrt((error**2).mean()):.4f} degrees RMS, worst {abs(error).max():.4
 assert np.sqrt((error**2).mean()) <= float(sys.argv[1])
 PYTHON
   }
+  urdf() {  # free, table, twisting or thin
+    (cd "$work/made/$1" && "$python" - <<'PYTHON') || fail "$1: MuJoCo reads another rope from the URDF"
+import mujoco
+import numpy as np
+from twin import Twin
+t = Twin('twin.npz')
+def read(name):  # the model, its data, and the numbers of the joints' places and rates
+    model = mujoco.MjModel.from_xml_path(name)
+    joints = [model.joint(f'theta_{k + 1}') for k in range(len(t.axes))]
+    return model, mujoco.MjData(model), [int(j.qposadr[0]) for j in joints], [int(j.dofadr[0]) for j in joints]
+def mass(model, data, rates):
+    full = np.zeros((model.nv, model.nv))
+    if hasattr(data, 'qM'):
+        mujoco.mj_fullM(model, full, data.qM)
+    else:
+        mujoco.mj_fullM(model, data, full)
+    return full[np.ix_(rates, rates)]
+ours, other = read('rope.urdf'), read('rope.xml')
+links = len(t.link_start)
+assert ours[0].nv == len(t.axes) and ours[0].nbody == 2 + len(t.axes)
+assert np.isclose(ours[0].body_mass.sum(), t.link_mass.sum() + t.tip_mass, rtol=1e-12)
+assert np.allclose(ours[0].opt.gravity, other[0].opt.gravity, atol=0)
+for (model, _, _, rates), name in ((ours, 'urdf'), (other, 'xml')):
+    assert (model.dof_damping[rates] == t.damping).all(), name
+assert (ours[0].dof_frictionloss[ours[3]] == getattr(t, 'bending_friction', 0)).all()
+rng = np.random.default_rng(4)
+apart = heavier = 0
+for _ in range(20):
+    theta = rng.uniform(-1.2, 1.2, len(t.axes))
+    for model, data, places, _ in ours, other:
+        data.qpos[places] = theta
+        mujoco.mj_forward(model, data)
+    data = ours[1]
+    assert data.ncon == 0
+    for j, pose in enumerate(t.link_poses(theta, np.eye(4))):
+        body = data.body(f'link_{j}')
+        apart = max(apart, abs(body.xpos - pose[:3, 3]).max(), abs(body.xmat.reshape(3, 3) - pose[:3, :3]).max())
+    mine, his = mass(*ours[:2], ours[3]), mass(*other[:2], other[3])
+    own = np.sqrt(np.diag(his))
+    heavier = max(heavier, abs((mine - his) / np.outer(own, own)).max())
+print(f'URDF: links {apart:.1e}, mass matrix {heavier:.1e}')
+assert apart < 1e-12 and heavier < 1e-5
+PYTHON
+  }
+  urdf free
+  urdf table
+  urdf twisting
+  urdf thin
   moves free 0.01
+  moves thin 0.01
   moves twisting 0.02
   moves table 0.02
 else

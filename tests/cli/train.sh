@@ -131,6 +131,13 @@ expect_output '^rollout mean +[0-9.]+ +[0-9.]+ +0\.[0-9]+ +0\.[0-9]{5} +0\.' 'ev
 run export "$work/whole" -o "$work/twin.glb"
 expect_code 0 export
 [ "$(head -c 4 "$work/twin.glb")" = glTF ] || fail 'export: no glTF'
+run export "$work/whole" -o "$work/rope.urdf"
+expect_code 0 'export .urdf'
+python3 -c 'import sys, xml.dom.minidom as dom; dom.parse(sys.argv[1])' "$work/rope.urdf" || fail 'export: the URDF is no XML'
+cp "$work/rope.urdf" "$work/kept.urdf"
+expect_error 2 'is there already; name another file, or give --force' export "$work/whole" -o "$work/rope.urdf"
+run export "$work/whole" -o "$work/rope.urdf" --force
+cmp -s "$work/rope.urdf" "$work/kept.urdf" || fail 'export: the same URDF twice has other bytes'
 gaussians=$(cksum <"$work/whole/gaussians.ply")
 expect_error 2 'would be overwritten' export "$work/whole" -o "$work/whole/gaussians.ply"
 [ "$gaussians" = "$(cksum <"$work/whole/gaussians.ply")" ] || fail 'export: its input is gone'

@@ -63,7 +63,7 @@ expect_error 2 'polish' train capture -o run --stages recognize,polish
 expect_error 2 '--frames' train capture -o run --frames 5:5
 expect_error 2 '--frames' train capture -o run --frames some
 expect_error 2 'twin.json' rollout "$work/none" -o "$work/states.csv"
-expect_error 2 'ending' export "$work/none" -o "$work/twin.obj"
+expect_error 2 "ending '.obj' is not known; choose one of .*[.]urdf" export "$work/none" -o "$work/twin.obj"
 run check ''
 expect_code 2 "check ''"
 grep -q "^chainsplat: error: '': " "$work/stderr" || fail "check '': the error line has an empty place"
