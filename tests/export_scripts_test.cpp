@@ -64,7 +64,7 @@ void write_all(twin::Twin twin, const Path& folder) {
   twin.estimates.names = {"log_stiffness", "log_damping"};
   twin.estimates.values = twin.estimates.standard_errors = {0.1, 0.2};
   twin.estimates.covariance = math::MatrixX::Identity(2, 2);
-  for (const char* const name : {"rope.xml", "rope.urdf", "twin.npz"})
+  for (const char* const name : {"rope.xml", "rope.urdf", "rope.usda", "twin.npz"})
     exports::write(twin, twin.states, base, folder / name);
   core::write_file(folder / "rollout.csv", twin::states_csv(twin.rollout));
   core::write_file(folder / "centerline.csv", twin::centerline_csv(twin.chain, twin.rollout, base));

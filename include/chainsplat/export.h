@@ -13,6 +13,7 @@
 //   .mcap       a recording for Foxglove and rerun (mcap.h).
 //   .xml        MJCF for MuJoCo, and beside it NAME_base.csv and NAME_play.py, which plays it as the twin moves.
 //   .urdf       URDF for robots' programs: links, joints, shapes and inertias; the file says what URDF has no word for.
+//   .usda       USD as text: a capsule per link, colored, and the motion; no physics, no Gaussians.
 // The namespace is not `export`, which is a keyword.
 #pragma once
 #include <string>
@@ -82,5 +83,11 @@ MujocoFiles mujoco(const twin::Twin& twin, const trajectory::Trajectory& base, c
 // Gazebo reads from elements of its own), rest angles, drag, friction on a table, how friction in bending builds up,
 // the motion. The twin must be identified.
 std::string urdf(const twin::Twin& twin);
+
+// The rope as a USD stage in text, z up, meters: prim `rope`, in it `link_0` with `link_1` in it and so on, in the link
+// frames of mathematics.md 2.2, each with a capsule `shape` in the mean color of its Gaussians, as thick as the rope.
+// The motion is time samples; time codes are its frames, counted from 0 at its rate (rounded to whole ones a second).
+// Never fails: without motion the rope is at home, without Gaussians gray.
+std::string usd(const twin::Twin& twin, const chain::States& motion, const trajectory::Trajectory& base);
 
 }  // namespace chainsplat::exports

@@ -22,7 +22,8 @@ void require(bool there, const Path& file, const std::string& what, const std::s
 }  // namespace
 
 const std::vector<std::string>& endings() {
-  static const std::vector<std::string> known{".glb", ".gltf", ".ply", ".csv", ".npz", ".xml", ".urdf", ".mcap"};
+  static const std::vector<std::string> known{".glb", ".gltf", ".ply",  ".csv", ".npz",
+                                              ".xml", ".urdf", ".usda", ".mcap"};
   return known;
 }
 
@@ -66,6 +67,8 @@ void write(const twin::Twin& twin, const chain::States& motion, const trajectory
              twin::centerline_csv(twin.chain, motion, base.samples().empty() ? at_rest : base)};
   } else if (kind == ".npz") {
     bytes = {npz(twin, motion, base), npz_script()};
+  } else if (kind == ".usda") {
+    bytes = {usd(twin, motion, base)};
   } else if (kind == ".urdf") {
     require(twin.parameters.has_value(), file, kNotIdentified, kIdentify);
     bytes = {urdf(twin)};

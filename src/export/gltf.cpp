@@ -24,10 +24,6 @@ const double kHalfRoot = std::sqrt(0.5);
 
 double sigmoid(double x) { return 1.0 / (1.0 + std::exp(-x)); }
 
-double linear_from_srgb(double value) {
-  return value <= 0.04045 ? value / 12.92 : std::pow((value + 0.055) / 1.055, 2.4);
-}
-
 // Unit quaternion x, y, z, w with the sign nearer to `previous`: viewers differ in how they interpolate across a flip.
 std::array<double, 4> quaternion(const math::Matrix3& rotation, const std::array<double, 4>& previous) {
   const Eigen::Quaterniond q = Eigen::Quaterniond(rotation).normalized();

@@ -60,6 +60,10 @@ std::array<double, 4> color_of_link(const splat::Gaussians& g, int link) {
   return sum;
 }
 
+double linear_from_srgb(double value) {
+  return value <= 0.04045 ? value / 12.92 : std::pow((value + 0.055) / 1.055, 2.4);
+}
+
 std::string what_it_is(const twin::Twin& twin) {
   return "The rope " + escaped(twin.provenance.capture) +
          " as identified by chainsplat " CHAINSPLAT_VERSION ". SI units" +

@@ -35,6 +35,8 @@ math::Vector3 gravity_felt(const dynamics::Parameters& p);
 // The mean color of a link's Gaussians, weighted by opacity, RGBA in 0..1 with three digits; gray without any.
 std::array<double, 4> color_of_link(const splat::Gaussians& g, int link);
 
+double linear_from_srgb(double value);  // of a color, both in 0..1
+
 // For a comment at a file's head, without its full stop: the rope's name, escaped for XML, and the units.
 std::string what_it_is(const twin::Twin& twin);
 

@@ -17,10 +17,6 @@ constexpr double kRingsPerDiameter = 4.0;
 constexpr double kBlend = 0.5;   // diameters to either side of a joint in which the skin passes from link to link
 constexpr double kSmooth = 0.1;  // diameters: reach of a Gaussian's color on the skin, one deviation
 
-double linear_from_srgb(double value) {
-  return value <= 0.04045 ? value / 12.92 : std::pow((value + 0.055) / 1.055, 2.4);
-}
-
 // Colors of the Gaussians around a point, the nearer and the more opaque the more.
 Vector3 color_at(const splat::Gaussians& g, const Vector3& point, double reach) {
   Vector3 sum = Vector3::Constant(1e-12 * 0.5);

@@ -1,7 +1,8 @@
 #!/bin/bash
-# Exports for NumPy and MuJoCo, run as their readers run them: twin.py poses the links as the program does, MuJoCo moves the
-# rope as the rollout does, and reads from the URDF the same links and inertia. $1: the program, $2: test_export, which makes the files. Python is $CHAINSPLAT_PYTHON, else python3;
-# without NumPy all is skipped (77), without MuJoCo its part.
+# Exports for NumPy, OpenUSD and MuJoCo, run as their readers run them: twin.py and OpenUSD pose the links as the program does,
+# MuJoCo moves the rope as the rollout does and reads the same links and inertia from the URDF. $1: the program, $2: test_export,
+# which makes the files. Python is $CHAINSPLAT_PYTHON, else python3; without NumPy all is skipped (77), without OpenUSD (package
+# usd-core) or MuJoCo its part.
 . "$(dirname "$0")/lib.sh"
 python=${CHAINSPLAT_PYTHON:-python3}
 if ! "$python" -c 'import numpy' 2>/dev/null; then
@@ -36,6 +37,51 @@ PYTHON
 poses free
 poses table
 poses twisting
+
+if "$python" -c 'import pxr' 2>/dev/null; then
+  usd() {  # free, table or twisting
+    (cd "$work/made/$1" && "$python" - <<'PYTHON') || fail "$1: OpenUSD reads another motion"
+import numpy as np
+from pxr import Usd, UsdGeom
+from twin import Twin
+t = Twin('twin.npz')
+stage = Usd.Stage.Open('rope.usda')
+assert UsdGeom.GetStageUpAxis(stage) == 'Z' and UsdGeom.GetStageMetersPerUnit(stage) == 1
+codes = (t.time - t.time[0]) * stage.GetTimeCodesPerSecond()
+assert abs(codes - np.arange(len(codes))).max() < 1e-6
+codes = np.arange(len(codes))
+assert stage.GetStartTimeCode() == 0 and stage.GetEndTimeCode() == codes[-1]
+path, apart = stage.GetDefaultPrim().GetPath(), 0
+for j in range(len(t.link_start)):
+    path = path.AppendChild(f'link_{j}')
+    prim = stage.GetPrimAtPath(path)
+    for code, poses in zip(codes, t.link_pose):
+        matrix = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(float(code))
+        apart = max(apart, abs(np.array(matrix).T - poses[j]).max())
+    shape = UsdGeom.Capsule(stage.GetPrimAtPath(path.AppendChild('shape')))
+    ends = np.array(shape.ComputeLocalToWorldTransform(float(codes[-1]))).T @ [[0, 0], [0, 0], [-0.5, 0.5], [1, 1]]
+    middle = (ends[:, 0] + ends[:, 1])[:3] / 2
+    wanted = np.append(t.link_start, t.length)[j:j + 2].mean() - t.link_start[j]
+    assert abs(middle - (t.link_pose[-1, j] @ np.append(wanted * t.direction, 1))[:3]).max() < 1e-12
+    axis = (ends[:, 1] - ends[:, 0])[:3]
+    assert abs(axis - t.link_pose[-1, j, :3, :3] @ t.direction).max() < 1e-7
+    assert np.allclose(UsdGeom.Boundable.ComputeExtentFromPlugins(shape, 0), shape.GetExtentAttr().Get())
+print(f'USD: links {apart:.1e}')
+try:  # what usdchecker runs, from OpenUSD 25 on
+    from pxr import UsdValidation
+    found = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators()).Validate(stage)
+    assert not found, [each.GetMessage() for each in found]
+except ImportError:
+    pass
+assert apart < 1e-8  # OpenUSD takes turns by less than that for none
+PYTHON
+  }
+  usd free
+  usd table
+  usd twisting
+else
+  echo "USD is not read: $python has no pxr"
+fi
 
 if "$python" -c 'import mujoco' 2>/dev/null; then
   moves() {  # free, table or twisting; degrees
