@@ -180,8 +180,7 @@ void add_twin(py::module_& m) {
           },
           arg("file"), arg("states") = py::none(), arg("base") = py::none(), arg("mesh") = false,
           "Writes .glb, .gltf, .ply, .csv, .npz, .xml (MuJoCo), .urdf, .usda or .mcap, with a motion: the rollout, "
-          "unless "
-          "`states` are given.")
+          "unless `states` are given.")
 
       .def_property_readonly(
           "angles", [](const Twin& t) { return t.rope.twin.chain.angles(); }, "n")

@@ -98,6 +98,7 @@ PYTHON
   }
   urdf() {  # free, table, twisting or thin
     (cd "$work/made/$1" && "$python" - <<'PYTHON') || fail "$1: MuJoCo reads another rope from the URDF"
+import re
 import mujoco
 import numpy as np
 from twin import Twin
@@ -138,6 +139,23 @@ for _ in range(20):
     heavier = max(heavier, abs((mine - his) / np.outer(own, own)).max())
 print(f'URDF: links {apart:.1e}, mass matrix {heavier:.1e}')
 assert apart < 1e-12 and heavier < 1e-5
+
+# as stiff as its head says it moves as the MJCF does, the base at rest and no air
+def row(name):
+    return np.array(re.search(name + '.*: (.*)', open('rope.urdf').read())[1].split(), float)
+other[0].opt.density = 0
+ours[0].opt.timestep, ours[0].opt.integrator = other[0].opt.timestep, other[0].opt.integrator
+ours[0].dof_frictionloss[:] = 0
+ours[0].jnt_stiffness[:], ours[0].qpos_spring[:] = row('stiffness of the joints'), row('angles at rest')
+for _, data, places, rates in ours, other:
+    data.qpos[places], data.qvel[rates] = row('angles there'), row('rates there')
+for _ in range(int(1 / ours[0].opt.timestep)):
+    other[1].qpos[:7], other[1].qvel[:6] = (0, 0, 0, 1, 0, 0, 0), 0
+    for model, data, _, _ in ours, other:
+        mujoco.mj_step(model, data)
+theirs = other[1].qpos[other[2]]
+print(f'URDF: {np.degrees(abs(ours[1].qpos - theirs).max()):.1e} degrees after 1 s of {np.degrees(abs(theirs).max()):.1f}')
+assert abs(ours[1].qpos - theirs).max() < 1e-4
 PYTHON
   }
   urdf free
