@@ -194,23 +194,4 @@ TEST_CASE("the next recording is designed from where this one began, and compare
   CHECK(problem.recorded_start == rope.twin.states.time.front());
   CHECK(problem.recorded_end == rope.twin.states.time.back());
   CHECK((problem.recorded(0.4).velocity - rope.base.at(0.4).velocity).norm() == 0.0);
-
-  // noise: of one coordinate of the links' ends
-  CHECK(pipeline::recorded_noise(rope) == 0.5e-3);  // alike: the least that a recording has
-  for (math::VectorX& theta : rope.twin.states.theta) theta[0] += 0.05;
-  double sum = 0.0, count = 0.0;
-  for (std::size_t k = 0; k < rope.twin.states.time.size(); ++k) {
-    const math::Pose pose = rope.base.pose(rope.twin.states.time[k]);
-    for (int link = 1; link < rope.twin.chain.links(); ++link) {
-      const auto end = [&](const math::VectorX& theta) {
-        const chain::Chain& chain = rope.twin.chain;
-        return math::Vector3(chain::link_motions(chain, theta, pose)[link] * (chain.link_end(link) * chain.direction));
-      };
-      sum += (end(rope.twin.states.theta[k]) - end(rope.twin.rollout.theta[k])).squaredNorm();
-      count += 3.0;
-    }
-  }
-  CHECK(pipeline::recorded_noise(rope) == doctest::Approx(std::sqrt(sum / count)));
-  rope.twin.rollout.time.clear();
-  CHECK(pipeline::recorded_noise(rope) == 2e-3);  // nothing to compare
 }

@@ -24,7 +24,9 @@ struct Options {
   double duration = 5.0;             // s
   planning::Limits limits;           // `stroke` too: keep the rope inside of what the cameras see
   double frame_rate = 30.0;          // 1/s, of the recording
-  double noise = 2e-3;               // m, sd of a recorded point's coordinate about the model
+  // m, sd of a recorded point's coordinate about the model; without: as large as it was in the recording that was
+  // identified, by what its covariance says that it told
+  std::optional<double> noise;
   double max_bend = 1.2;             // rad, of one angle from where it starts: beyond, recognition is not to be trusted
   int starts = 24;                   // random motions, of which the best is refined
   int generations = 24;              // of eight changes of it each
@@ -39,7 +41,8 @@ struct Problem {
   math::Pose base;                  // at the start
   dynamics::InitialState initial;   // at rest
   dynamics::Estimates estimates;    // what is known: names, covariance
-  dynamics::BaseFunction recorded;  // base motion of the recording that was identified, to compare with; may be empty
+  // Base motion of the recording that was identified, to compare with and to know its noise by; may be empty.
+  dynamics::BaseFunction recorded;
   double recorded_start = 0.0, recorded_end = 0.0;  // s
 };
 
@@ -57,6 +60,7 @@ struct Result {
   planning::Motion motion;
   planning::Peaks peaks;
   chain::States states;  // predicted, at the frame rate
+  double noise = 0.0;    // m, that was reckoned with
   Prediction prediction;
 };
 

@@ -103,9 +103,6 @@ FirstSight start_as_seen(const Rope& rope, const Path& capture, const std::strin
 // What to record next (excitation.h): a motion from rest where this rope's recording began, compared with one more
 // recording of the old motion. Throws InputError before identification.
 excitation::Problem excitation_problem(const Rope& rope);
-// By how much points of the recorded rope are off the rolled-out one, m, RMS of one coordinate: the noise of a
-// recording to come. 2 mm where there is nothing to compare, at least 0.5 mm.
-double recorded_noise(const Rope& rope);
 
 // The force from outside along `states` under `base`, one a time: where it acts is found, or it acts at what is nearest
 // to `contact`, m, world. Throws InputError for fewer than three states, and for times that the base does not cover.

@@ -149,7 +149,7 @@ Excited excite(const Twin& twin, double duration, const std::string& axes, doubl
   options.limits.stroke = stroke, options.limits.velocity = velocity;
   options.limits.acceleration = acceleration, options.limits.jerk = jerk;
   return unlocked([&] {
-    options.noise = noise ? *noise : pipeline::recorded_noise(twin.rope);
+    options.noise = noise;
     return Excited{excitation::excite(pipeline::excitation_problem(twin.rope), options), duration};
   });
 }

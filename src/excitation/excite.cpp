@@ -91,12 +91,46 @@ Known known_parameters(const Problem& problem) {
   return known;
 }
 
+// What one more recording of the old motion tells where points have the given noise; empty where there is none.
+MatrixX told_by_repetition(const Problem& problem, std::span<const dynamics::Unknown> unknowns, double frame_rate,
+                           double noise) {
+  if (!problem.recorded) return {};
+  std::vector<double> times;
+  for (int k = 0; problem.recorded_start + k / frame_rate <= problem.recorded_end + 1e-9; ++k)
+    times.push_back(problem.recorded_start + k / frame_rate);
+  if (times.size() < 2) return {};
+  dynamics::InitialState initial = problem.initial;
+  initial.time = problem.recorded_start;
+  return information(problem.model, unknowns, problem.recorded, initial, times, noise);
+}
+
+// The noise with which the old recording tells no combination of parameters better than the twin knows it, and one as
+// well (mathematics.md 5.7): errors of the model, of marks and of images, as identification met them.
+double noise_of_recording(const Problem& problem, const Known& known, double frame_rate) {
+  constexpr double kUnknown = 2e-3;  // m, where there is no old motion
+  constexpr double kSame = 1e-3;     // of the noise
+  constexpr int kMost = 10;          // usually three; the initial state, which has a prior, makes it more than one
+  const MatrixX root = known.covariance.llt().matrixL();
+  double noise = kUnknown;
+  for (int i = 0; i < kMost; ++i) {
+    const MatrixX told = told_by_repetition(problem, known.unknowns, frame_rate, noise);
+    if (!told.size()) return kUnknown;
+    const Eigen::SelfAdjointEigenSolver<MatrixX> eigen(MatrixX(root.transpose() * told * root), Eigen::EigenvaluesOnly);
+    const double factor = std::sqrt(eigen.eigenvalues().maxCoeff());
+    if (!std::isfinite(factor) || !(factor > 0.0)) return kUnknown;
+    noise *= factor;
+    if (std::abs(factor - 1.0) < kSame) break;
+  }
+  return noise;
+}
+
 // All that stays the same during the search.
 struct Search {
   const Problem& problem;
   const Options& options;
   std::vector<Axis> axes;
   Known known;
+  double noise = 0.0;  // m
   double known_log_det = 0.0;
   std::vector<double> times;  // s, of the frames
   dynamics::InitialState initial;
@@ -114,8 +148,10 @@ Search make_search(const Problem& problem, const Options& options) {
                 options.axes.empty() ? default_axes(problem) : options.axes,
                 known_parameters(problem),
                 0.0,
+                0.0,
                 {},
                 problem.initial};
+  search.noise = options.noise ? *options.noise : noise_of_recording(problem, search.known, options.frame_rate);
   search.known_log_det = log_det(search.known.information);
   for (int k = 0; k / options.frame_rate <= options.duration + 1e-9; ++k)
     search.times.push_back(k / options.frame_rate);
@@ -139,7 +175,7 @@ bool stays_within_bend(const Search& search, const planning::Motion& motion) {
 MatrixX told_by(const Search& search, const planning::Motion& motion, chain::States* states = nullptr) {
   return information(
       search.problem.model, search.known.unknowns, [&](double t) { return planning::base_at(motion, t); },
-      search.initial, search.times, search.options.noise, states);
+      search.initial, search.times, search.noise, states);
 }
 
 // Makes the motion as large as limits and rope allow, and values it.
@@ -211,19 +247,6 @@ Candidate refine(const Search& search, Candidate best, core::Random& random) {
   return best;
 }
 
-// What one more recording of the old motion would tell; empty where there is none.
-MatrixX told_by_repetition(const Search& search) {
-  const Problem& problem = search.problem;
-  if (!problem.recorded) return {};
-  std::vector<double> times;
-  for (int k = 0; problem.recorded_start + k / search.options.frame_rate <= problem.recorded_end + 1e-9; ++k)
-    times.push_back(problem.recorded_start + k / search.options.frame_rate);
-  if (times.size() < 2) return {};
-  dynamics::InitialState initial = search.initial;
-  initial.time = problem.recorded_start;
-  return information(problem.model, search.known.unknowns, problem.recorded, initial, times, search.options.noise);
-}
-
 std::vector<double> standard_errors(const MatrixX& information) {
   const MatrixX covariance = information.ldlt().solve(MatrixX::Identity(information.rows(), information.cols()));
   std::vector<double> out;
@@ -239,7 +262,8 @@ Prediction predict(const Search& search, const Candidate& best, const MatrixX& t
   out.now = standard_errors(known.information);
   out.excited = standard_errors(known.information + told);
   out.gain = (best.value - search.known_log_det) / size;
-  if (const MatrixX again = told_by_repetition(search); again.size()) {
+  if (const MatrixX again = told_by_repetition(search.problem, known.unknowns, search.options.frame_rate, search.noise);
+      again.size()) {
     out.repeated = standard_errors(known.information + again);
     out.repeated_gain = (log_det(known.information + again) - search.known_log_det) / size;
   }
@@ -253,7 +277,7 @@ void Options::check() const {
   if (!(duration >= kShortest && duration <= kLongest))
     throw InputError("`duration`", "is " + core::exact(duration) + " s",
                      "give " + core::exact(kShortest) + " to " + core::exact(kLongest) + " s");
-  const std::pair<const char*, double> positive[] = {{"`noise`", noise},
+  const std::pair<const char*, double> positive[] = {{"`noise`", noise.value_or(1.0)},
                                                      {"`frame_rate`", frame_rate},
                                                      {"`max_bend`", max_bend},
                                                      {"`velocity`", limits.velocity},
@@ -282,6 +306,7 @@ Result excite(const Problem& problem, const Options& options) {
   Result result;
   result.motion = best.motion;
   result.peaks = planning::peaks(best.motion, 0.0, options.duration, options.limits);
+  result.noise = search.noise;
   const MatrixX told = told_by(search, best.motion, &result.states);
   result.prediction = predict(search, best, told);
   return result;

@@ -264,22 +264,4 @@ excitation::Problem excitation_problem(const Rope& rope) {
   return problem;
 }
 
-double recorded_noise(const Rope& rope) {
-  constexpr double kLeast = 0.5e-3, kUnknown = 2e-3;  // m
-  const twin::Twin& twin = rope.twin;
-  double sum = 0.0;
-  std::size_t count = 0;
-  for (std::size_t k = 0; k < std::min(twin.states.time.size(), twin.rollout.time.size()); ++k) {
-    if (twin.states.time[k] != twin.rollout.time[k]) return kUnknown;
-    const math::Pose pose = rope.base.pose(twin.states.time[k]);
-    const auto place = [&](const math::VectorX& theta) {
-      return chain::nodes(twin.chain, chain::link_motions(twin.chain, theta, pose));
-    };
-    const math::MatrixX off = place(twin.states.theta[k]) - place(twin.rollout.theta[k]);
-    sum += off.rightCols(twin.chain.links() - 1).squaredNorm();
-    count += 3 * (twin.chain.links() - 1);
-  }
-  return count == 0 ? kUnknown : std::max(kLeast, std::sqrt(sum / static_cast<double>(count)));
-}
-
 }  // namespace chainsplat::pipeline

@@ -34,7 +34,7 @@ Json document_of(const excitation::Result& result, const Request& request) {
   const excitation::Prediction& p = result.prediction;
   Json out;
   out["duration"] = request.options.duration;
-  out["noise"] = request.options.noise;
+  out["noise"] = result.noise;
   out["gain"] = p.gain;
   if (!p.repeated.empty()) out["repeated_gain"] = p.repeated_gain;
   out["parameters"] = Json::array();
@@ -121,7 +121,7 @@ void excite(const Globals& globals, Request& request) {
 
   const pipeline::Rope rope = pipeline::load_rope(request.run);
   const excitation::Problem problem = pipeline::excitation_problem(rope);
-  options.noise = request.noise > 0.0 ? 1e-3 * request.noise : pipeline::recorded_noise(rope);
+  if (request.noise > 0.0) options.noise = 1e-3 * request.noise;
   const excitation::Result result = excitation::excite(problem, options);
   end_progress();
 
