@@ -8,6 +8,7 @@
 #include <cmath>
 #include <functional>
 #include <nlohmann/json.hpp>
+#include <optional>
 
 #include "chainsplat/identification.h"
 #include "src/math/decompositions.h"
@@ -529,6 +530,105 @@ TEST_CASE("a line is JSON, whatever its numbers are") {
   CHECK(line["arclength"].is_null());
   CHECK(line["sigma"][1].is_null());
   CHECK(line["unit"] == "N/kg");
+}
+
+// What a push on a rope of two links is told as.
+force::Estimate told() {
+  force::Estimate e;
+  e.time = 0.1 + 0.2;  // no short decimal
+  e.contact = {2, 0.15, Vector3::Zero(), 0.0};
+  e.point = Vector3(0.1, 0.0, 1.0 / 3.0);
+  e.force = Vector3(0.1, -2.0, 1e-5);
+  e.covariance << 4e-4, 1e-5, 0.0, 1e-5, 9e-4, -2e-4, 0.0, -2e-4, 0.09;
+  e.sigma = e.covariance.diagonal().cwiseSqrt();
+  e.low = e.force - Vector3(0.01, 0.0, 0.0), e.high = e.force + Vector3(0.0, 0.3, 0.0);
+  e.observed = Vector3(0.99, 0.5, 0.0);
+  e.probability = 0.97, e.arclength_sigma = 0.004;
+  e.touching = true, e.moving = false;
+  return e;
+}
+
+const chain::Chain& two_links() {
+  static const chain::Chain rope =
+      chain::make_chain(0.2, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 2, chain::Bending::planar, false);
+  return rope;
+}
+
+TEST_CASE("a line that is read back is the estimate that it was written from") {
+  const force::Estimate e = told();
+  for (const bool known : {true, false}) {
+    const force::Line line = force::from_json(force::to_json(e, known), "forces.jsonl: line 1", two_links(), -1.0);
+    CHECK(line.known_mass == known);
+    const force::Estimate& read = line.estimate;
+    CHECK(read.time == e.time);
+    CHECK(read.contact.link == e.contact.link);
+    CHECK(read.contact.arclength == e.contact.arclength);
+    for (const auto member : {&force::Estimate::point, &force::Estimate::force, &force::Estimate::sigma,
+                              &force::Estimate::low, &force::Estimate::high, &force::Estimate::observed})
+      CHECK(read.*member == e.*member);
+    CHECK(read.covariance == e.covariance);
+    CHECK(read.probability == e.probability);
+    CHECK(read.arclength_sigma == e.arclength_sigma);
+    CHECK(read.touching == e.touching);
+    CHECK(read.moving == e.moving);
+  }
+}
+
+TEST_CASE("a line that no force can have is refused with its place and field") {
+  const Json sound = Json::parse(force::to_json(told(), true));
+  // without a value the field is left out
+  const auto refused = [&](const std::string& field, const std::optional<Json>& value, const std::string& says) {
+    CAPTURE(field);
+    CAPTURE(says);
+    Json line = sound;
+    if (value)
+      line[field] = *value;
+    else
+      line.erase(field);
+    try {
+      force::from_json(line.dump(), "forces.jsonl: line 7", two_links(), 0.0);
+      FAIL("it was taken");
+    } catch (const InputError& error) {
+      const std::string text = error.what();
+      CHECK(text.find("forces.jsonl: line 7: " + field) != std::string::npos);
+      CHECK(text.find(says) != std::string::npos);
+      CHECK(text.find('\n') == std::string::npos);
+    }
+  };
+  CHECK_NOTHROW(force::from_json(sound.dump(), "line", two_links(), 0.0));
+  for (const auto& [field, value] : sound.items()) {
+    CAPTURE(field);
+    refused(field, std::nullopt, "is missing");
+    refused(field, Json(), "is no");  // what is not finite is written as null
+    refused(field, Json::object(), "is no");
+  }
+  refused("time", 0.0, "is not after");
+  refused("time", 1e300, "is not from");
+  refused("link", 3, "is not from 0 to 2");
+  refused("link", -1, "is not from 0 to 2");
+  refused("link", 1.5, "is no whole number");
+  refused("link", 4294967297, "is not from 0 to 2");
+  refused("arclength", 0.21, "is not from 0 to");
+  refused("arclength_sigma", -1e-9, "is not from 0 to");
+  refused("point", Json({0.0, 1e7, 0.0}), "is not from");
+  refused("force", Json({0.0, 0.0}), "is no list of 3 numbers");
+  refused("force", Json({0.0, nullptr, 0.0}), "is no finite number");
+  refused("force", Json({0.0, 1e10, 0.0}), "is not from");
+  refused("sigma", Json({-0.02, 0.03, 0.3}), "is not from 0 to");
+  refused("sigma", Json({0.02, 0.03, 0.4}), "is not that of the covariance");
+  refused("covariance", Json({1, 2, 1, 0, 0, 1}), "is not positive semidefinite");
+  refused("covariance", Json({1, 0, 1, 0, 0, -1}), "is not positive semidefinite");
+  refused("covariance", Json({{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}), "is no list of 6 numbers");
+  refused("covariance", Json({1, 0, 1, 0, 0, 1e300}), "is not from");
+  refused("low", Json({1, 1, 1}), "is above high");
+  refused("observed", Json({0.0, 1.5, 0.0}), "is not from 0 to 1");
+  refused("probability", 1.5, "is not from 0 to 1");
+  refused("touching", 1, "is not true or false");
+  refused("moving", "yes", "is not true or false");
+  refused("unit", "lbf", "is not N or N/kg");
+  for (const char* line : {"", "[]", "{", "nan", "{\"time\":1e999}"})
+    CHECK_THROWS_AS(force::from_json(line, "line", two_links(), 0.0), InputError);
+  CHECK_THROWS_AS(force::from_json(std::string(1 << 20, '['), "line", two_links(), 0.0), InputError);
 }
 
 }  // namespace

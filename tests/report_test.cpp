@@ -4,6 +4,7 @@
 #include <doctest/doctest.h>
 
 #include <cmath>
+#include <nlohmann/json.hpp>
 #include <numbers>
 
 #include "chainsplat/dynamics/parametrization.h"
@@ -108,4 +109,97 @@ TEST_CASE("a page holds its data, and names in it end no script") {
   CHECK(page.find("\\u003c/script>\\u003cb>") != std::string::npos);
   CHECK(page.find("http") == page.find("http-equiv"));  // nothing from the network
   CHECK(page.find("@DATA@") == std::string::npos);
+}
+
+TEST_CASE("how large a force is, and how sure that is") {
+  force::Estimate e;
+  e.force = e.low = e.high = math::Vector3(3.0, 4.0, 0.0);
+  e.covariance = math::Vector3(0.01, 0.04, 100.0).asDiagonal();
+  report::ForceSize size = report::size_of(e);
+  CHECK(size.value == doctest::Approx(5.0));
+  CHECK(size.error == doctest::Approx(std::sqrt(0.36 * 0.01 + 0.64 * 0.04)));  // nothing of the component across
+  CHECK(size.least == doctest::Approx(5.0 - 2 * size.error));
+  CHECK(size.most == doctest::Approx(5.0 + 2 * size.error));
+  // friction at rest leaves a box, which reaches beyond zero in x only
+  e.low = math::Vector3(-1.0, 2.0, 0.0), e.high = math::Vector3(3.0, 6.0, 0.0);
+  size = report::size_of(e);
+  CHECK(size.least == doctest::Approx(2.0 - 2 * size.error));
+  CHECK(size.most == doctest::Approx(std::hypot(3.0, 6.0) + 2 * size.error));
+  // a force of zero has no direction
+  e.force = e.low = e.high = math::Vector3::Zero();
+  size = report::size_of(e);
+  CHECK(size.error == doctest::Approx(10.0));
+  CHECK(size.least == 0.0);
+
+  std::vector<force::Estimate> forces(3);
+  forces[0].force.x() = 2.0, forces[1].force.x() = 1.0, forces[2].force.x() = 0.5;
+  CHECK(report::largest(forces) == nullptr);
+  forces[1].touching = forces[2].touching = true;
+  CHECK(report::largest(forces) == &forces[1]);
+}
+
+namespace {
+
+report::Contents followed_contents(int states) {
+  report::Contents contents;
+  contents.twin = test::small_twin();
+  contents.base = test::moving_base(1.0);
+  report::Followed followed;
+  for (int k = 0; k < states; ++k) {
+    followed.states.time.push_back(k / 30.0);
+    followed.states.theta.push_back(math::VectorX::Constant(contents.twin.chain.angles(), 0.1));
+    followed.sigma.push_back(math::VectorX::Constant(contents.twin.chain.angles(), 0.01));
+    followed.base.emplace_back();
+    followed.forces.emplace_back().time = k / 30.0;
+  }
+  contents.followed = std::move(followed);
+  return contents;
+}
+
+nlohmann::json data_of(const std::string& page) {
+  const std::string begin = "<script type=\"application/json\" id=\"data\">";
+  const std::size_t from = page.find(begin) + begin.size();
+  return nlohmann::json::parse(page.substr(from, page.find("</script>", from) - from));
+}
+
+}  // namespace
+
+TEST_CASE("a page shows what was followed, and its largest force") {
+  report::Contents contents = followed_contents(20);
+  force::Estimate& push = contents.followed->forces[7];
+  push.touching = true;
+  push.force = push.low = push.high = math::Vector3(0.3, 0.0, 0.4);
+  push.covariance = 1e-4 * math::Matrix3::Identity();
+  push.contact.arclength = 0.2, push.arclength_sigma = 0.01;
+  const nlohmann::json data = data_of(report::page(contents));
+  REQUIRE(data["motions"].size() == 3);
+  CHECK(data["motions"][2]["name"] == "followed");
+  CHECK(data["motions"][2]["own"] == true);
+  CHECK(data["motions"][2]["gap"].get<double>() == doctest::Approx(3.5 / 30.0));
+  const nlohmann::json& largest = data["forces"]["largest"];
+  CHECK(largest["value"].get<double>() == doctest::Approx(0.5));
+  CHECK(largest["error"].get<double>() == doctest::Approx(0.01));
+  CHECK(largest["time"].get<double>() == doctest::Approx(7 / 30.0));
+  CHECK(data["forces"]["unit"] == "N");
+  CHECK(data["forces"]["length"].get<double>() <= 0.8 * 0.3 / 0.5 + 1e-12);  // the arrow stays in the picture
+
+  // nothing touches; no forces; no stream
+  push.touching = false;
+  CHECK_FALSE(data_of(report::page(contents))["forces"].contains("largest"));
+  contents.followed->forces.clear();
+  CHECK_FALSE(data_of(report::page(contents)).contains("forces"));
+  contents.followed.reset();
+  CHECK(data_of(report::page(contents))["motions"].size() == 2);
+}
+
+TEST_CASE("of a long stream the page keeps states in equal steps, and all that it says of the largest force") {
+  report::Contents contents = followed_contents(30001);
+  force::Estimate& push = contents.followed->forces[10001];
+  push.touching = true;
+  push.force.x() = 0.7;
+  const nlohmann::json data = data_of(report::page(contents));
+  CHECK(data["motions"][2]["frames"] == 30001);
+  CHECK(data["motions"][2]["time"].get<std::string>().size() == 4 * ((7501 * 8 + 2) / 3));  // every fourth, in base64
+  CHECK(data["motions"][2]["gap"].get<double>() == doctest::Approx(4 * 3.5 / 30.0));
+  CHECK(data["forces"]["largest"]["value"].get<double>() == doctest::Approx(0.7));
 }

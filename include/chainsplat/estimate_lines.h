@@ -42,7 +42,7 @@ std::optional<EstimateLine> read_estimate_line(const std::string& line, const st
                                                double before);
 
 // The next line; false at the end. Throws InputError where it is longer than any that is meant (a device may never end
-// one), or cannot be read.
-bool next_line(std::istream& in, std::string& line, const std::string& where);
+// one), or cannot be read. `command`: whose output is to be given instead.
+bool next_line(std::istream& in, std::string& line, const std::string& where, const std::string& command = "estimate");
 
 }  // namespace chainsplat::estimation

@@ -96,14 +96,15 @@ Contact nearest_contact(const chain::Chain& chain, const splat::Gaussians& gauss
 struct Estimate {
   double time = 0.0;  // s
   Contact contact;
-  Vector3 point = Vector3::Zero();     // m, place of the contact, world
-  Vector3 force = Vector3::Zero();     // N, or N per kilogram of rope; times the probability of an automatic contact
-  Vector3 sigma = Vector3::Zero();     // standard errors, in the unit of the force
-  Vector3 low = Vector3::Zero();       // bounds of the force per component, without sigma, where friction at rest of
-  Vector3 high = Vector3::Zero();      // all links together may hide a part of it (mathematics.md 7); else the force
-  Vector3 observed = Vector3::Zero();  // 0 (the prior alone decides) to 1, per component
-  double probability = 0.0;            // of a contact
-  double arclength_sigma = 0.0;        // m, of an automatic contact; else 0
+  Vector3 point = Vector3::Zero();       // m, place of the contact, world
+  Vector3 force = Vector3::Zero();       // N, or N per kilogram of rope; times the probability of an automatic contact
+  Vector3 sigma = Vector3::Zero();       // standard errors, in the unit of the force
+  Matrix3 covariance = Matrix3::Zero();  // of the force, in its unit squared; sigma has the roots of its diagonal
+  Vector3 low = Vector3::Zero();         // bounds of the force per component, without sigma, where friction at rest of
+  Vector3 high = Vector3::Zero();        // all links together may hide a part of it (mathematics.md 7); else the force
+  Vector3 observed = Vector3::Zero();    // 0 (the prior alone decides) to 1, per component
+  double probability = 0.0;              // of a contact
+  double arclength_sigma = 0.0;          // m, of an automatic contact; else 0
   bool touching = false;
   bool moving = true;  // false: the rope rests where it is touched, and friction there may hide forces
 };
@@ -149,5 +150,16 @@ bool is_finite(const Estimate& estimate);
 // Returns the line of formats.md 3.2, without line feed; numbers that are not finite become null. `known_mass` false:
 // forces are per kilogram of rope, and the line's unit is N/kg.
 std::string to_json(const Estimate& estimate, bool known_mass);
+
+// A line read back. The contact's home position and distance do not stand in it: they are zero.
+struct Line {
+  Estimate estimate;
+  bool known_mass = true;  // false: the unit is N/kg
+};
+// Reads a line of to_json(), of a rope with this chain. `before`: s, time of the line before. Throws InputError with
+// `where` and the field that is missing, of another type, not finite, or not what a force on this rope can have: a
+// contact outside of the chain, a covariance that is none or does not belong to sigma, a time that is not after
+// `before`.
+Line from_json(const std::string& line, const std::string& where, const chain::Chain& chain, double before);
 
 }  // namespace chainsplat::force

@@ -108,7 +108,7 @@ IdentifyResult identify(const std::vector<Path>& runs, const IdentifyOptions& op
                         const core::Listener& listener = {});
 
 struct MarkerOptions {
-  bool shape_only = false;  // fit the states, identify nothing
+  bool shape_only = false;                  // fit the states, identify nothing
   std::optional<capture::Payload> payload;  // instead of what the twin knows of it
   std::uint64_t seed = 0;
 };
@@ -194,8 +194,14 @@ ForceResult forces(const Path& run, const ForceOptions& options, const EachForce
 struct ReportOptions {
   Path capture;  // that the twin was made from; empty: where the twin says that it is, if it is there
   std::vector<std::string> videos;  // cameras whose frames, made small, become a part of the page
+  // A rope that was followed; "-" is standard input, for one of the three.
+  Path estimate;  // lines of estimates (estimate_lines.h), which also tell how the base is off; empty: none
+  Path forces;    // lines of forces (force.h) at times of these estimates; empty: none
+  Path base;      // base motion of the estimates, TUM; empty: the capture's own
+
+  void check() const;
 };
-// The page of a run (report.h), as `train` writes it to report.html, but with videos where asked.
+// The page of a run (report.h), as `train` writes it to report.html, but with videos and what was followed where asked.
 std::string report(const Path& run, const ReportOptions& options, const core::Listener& listener = {});
 
 }  // namespace chainsplat::pipeline

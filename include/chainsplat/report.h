@@ -1,5 +1,5 @@
 // chainsplat/report.h - a twin as one page for a browser: a 3-D replay, the verdict, metrics, angles, identified
-// numbers (formats.md 5.9).
+// numbers, and a rope that was followed with the forces on it (formats.md 5.10).
 //
 // The page is one HTML text without anything outside of it. Its sources are src/report/page/; the data stand in it as
 // JSON with binary arrays in base64. Names from files are shown as text and never become markup. It draws with the
@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "chainsplat/capture.h"
+#include "chainsplat/force.h"
 #include "chainsplat/trajectory.h"
 #include "chainsplat/twin.h"
 
@@ -40,6 +41,29 @@ struct Video {
 // where the capture has no such camera.
 Video read_video(const Path& capture, const std::string& camera, const twin::Twin& twin);
 
+// A rope that was followed (estimation.h), and what pushed it meanwhile (force.h).
+struct Followed {
+  chain::States states;              // time and theta of the frames in which it was followed
+  std::vector<math::VectorX> sigma;  // rad, standard deviations of theta, one a state; empty: not known
+  std::vector<math::Pose> base;      // world, where the grasp is believed to be, one a state
+  // Whether it is what the twin was made from: the same clock and motion of the base, so that videos and the twin's own
+  // motions belong beside it.
+  bool own_recording = true;
+  std::vector<force::Estimate> forces;  // in order, at some of the states' times; empty: not known
+};
+
+// How large a force is, in its unit.
+struct ForceSize {
+  double value = 0.0;
+  double error = 0.0;  // one standard deviation, along the force; of a force of zero, in the worst direction
+  // What it may be: two errors to either side, and beyond them what friction at rest may hide (force::Estimate::low and
+  // high). At least 0.
+  double least = 0.0, most = 0.0;
+};
+ForceSize size_of(const force::Estimate& estimate);
+// The estimate with the largest force among those in which something touches the rope; null: nothing does.
+const force::Estimate* largest(const std::vector<force::Estimate>& forces);
+
 struct Contents {
   twin::Twin twin;  // with `states.covariance` where it is known
   trajectory::Trajectory base;
@@ -48,9 +72,11 @@ struct Contents {
   std::vector<std::vector<double>> times;
   nlohmann::ordered_json metrics;  // as metrics.json has them; null: not evaluated
   std::vector<Video> videos;
+  std::optional<Followed> followed;  // none: not given
 };
 
-// The page. The twin must have states.
+// The page. The twin must have states, and with forces dynamics. Of a long stream that was followed it keeps states in
+// equal steps, 10,000 at most.
 std::string page(const Contents& contents);
 
 }  // namespace chainsplat::report

@@ -15,9 +15,9 @@ namespace {
 using Json = nlohmann::ordered_json;
 
 // No rope turns so far or so fast, and no clock runs so long: far below, squares and products could overflow.
-constexpr double kMostAngle = 1e6;  // rad, rad/s
-constexpr double kMostTime = 1e12;  // s, thirty thousand years
-constexpr double kLatest = 60.0;    // s, of the base's stamps
+constexpr double kMostAngle = 1e6;      // rad, rad/s
+constexpr double kMostTime = 1e12;      // s, thirty thousand years
+constexpr double kLatest = 60.0;        // s, of the base's stamps
 constexpr double kLargestShift = 10.0;  // m, of the rope in the grasp
 
 [[noreturn]] void refuse(const std::string& where, const char* field, const std::string& what) {
@@ -129,17 +129,17 @@ std::optional<EstimateLine> read_estimate_line(const std::string& line, const st
   return out;
 }
 
-bool next_line(std::istream& in, std::string& line, const std::string& where) {
+bool next_line(std::istream& in, std::string& line, const std::string& where, const std::string& command) {
   constexpr std::size_t kLongest =
       64 << 20;  // bytes; an estimate of a thousand angles, with covariance, has half of it
   line.clear();
   for (char letter = 0; in.get(letter);) {
     if (letter == '\n') return true;
     if (line.size() == kLongest)
-      throw InputError(where, "has a line of more than 64 MiB", "give the output of 'chainsplat estimate'");
+      throw InputError(where, "has a line of more than 64 MiB", "give the output of 'chainsplat " + command + "'");
     line += letter;
   }
-  if (in.bad()) throw InputError(where, "cannot be read", "give the output of 'chainsplat estimate'");
+  if (in.bad()) throw InputError(where, "cannot be read", "give the output of 'chainsplat " + command + "'");
   return !line.empty();
 }
 

@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <nlohmann/json.hpp>
 #include <numeric>
 
 #include "chainsplat/dynamics/parametrization.h"
@@ -268,10 +267,10 @@ Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, 
     }
     // a named contact is certain
     const double believed = automatic ? e.probability : 1.0;
-    const Vector3 variance = covariance.diagonal();
     e.force = believed * force;
-    e.sigma = (variance + believed * (1.0 - believed) * force.cwiseProduct(force)).cwiseSqrt();
-    e.observed = (Vector3::Ones() - variance.cwiseQuotient(touch.prior.diagonal())).cwiseMax(0.0);
+    e.covariance = covariance + believed * (1.0 - believed) * force * force.transpose();
+    e.sigma = e.covariance.diagonal().cwiseSqrt();
+    e.observed = (Vector3::Ones() - covariance.diagonal().cwiseQuotient(touch.prior.diagonal())).cwiseMax(0.0);
     e.touching = e.probability > 0.5 && e.force.norm() > kTouchingWeight * dynamics::total_mass(p) * p.gravity.norm() &&
                  force.dot(covariance.ldlt().solve(force)) > kTouchingErrors * kTouchingErrors;
     // friction at rest may balance any force up to its limit: bounds around the force if it balanced none
@@ -515,31 +514,5 @@ std::vector<Estimate> LiveForce::finish() {
 }
 
 std::size_t LiveForce::taken() const { return state_->taken; }
-
-bool is_finite(const Estimate& e) {
-  for (const Vector3& v : {e.point, e.force, e.sigma, e.low, e.high, e.observed})
-    if (!v.allFinite()) return false;
-  return std::isfinite(e.time) && std::isfinite(e.contact.arclength) && std::isfinite(e.probability) &&
-         std::isfinite(e.arclength_sigma);
-}
-
-std::string to_json(const Estimate& e, bool known_mass) {
-  const auto list = [](const Vector3& v) { return nlohmann::ordered_json{v.x(), v.y(), v.z()}; };
-  const nlohmann::ordered_json line{{"time", e.time},
-                                    {"link", e.contact.link},
-                                    {"arclength", e.contact.arclength},
-                                    {"point", list(e.point)},
-                                    {"force", list(e.force)},
-                                    {"sigma", list(e.sigma)},
-                                    {"touching", e.touching},
-                                    {"probability", e.probability},
-                                    {"observed", list(e.observed)},
-                                    {"low", list(e.low)},
-                                    {"high", list(e.high)},
-                                    {"arclength_sigma", e.arclength_sigma},
-                                    {"moving", e.moving},
-                                    {"unit", known_mass ? "N" : "N/kg"}};
-  return line.dump();
-}
 
 }  // namespace chainsplat::force

@@ -1,15 +1,14 @@
 // forces.cpp - the force that the outside exerts on a rope: along states in memory, and from the files of a run.
 #include <algorithm>
 #include <cmath>
-#include <fstream>
 #include <limits>
-#include <map>
 
 #include "chainsplat/estimate_lines.h"
 #include "chainsplat/pipeline.h"
 #include "chainsplat/rope.h"
 #include "chainsplat/run_folder.h"
 #include "pipeline/contact_file.h"
+#include "pipeline/streams.h"
 
 namespace chainsplat::pipeline {
 
@@ -19,18 +18,6 @@ constexpr double kNear = 3.0;       // diameters from the rope within which some
 constexpr double kLiveApart = 0.1;  // s, how far from a state a line of a contact file may be, where states come in
 constexpr const char* kFew = "has fewer than three states";
 constexpr const char* kMore = "give more: forces need accelerations";
-
-// Throws InputError where `base` does not cover the states, which go from `first` to `last`, s.
-void check_covered(const trajectory::Trajectory& base, double first, double last, const std::string& where,
-                   const std::string& mend) {
-  constexpr double kSlack = 1.0 / 30.0;    // s, a frame beyond the last sample
-  if (base.samples().size() <= 1) return;  // it rests
-  if (first < base.start() - kSlack || last > base.end() + kSlack)
-    throw InputError(where,
-                     "the base motion covers " + core::exact(base.start()) + " to " + core::exact(base.end()) +
-                         " s, the states " + core::exact(first) + " to " + core::exact(last) + " s",
-                     mend);
-}
 
 // What touches is nearest to one of the `points` (m, world, columns).
 force::ContactAt contact_near(const twin::Twin& twin, const dynamics::BaseFunction& base, const math::MatrixX& points) {
@@ -56,19 +43,6 @@ struct State {
   std::optional<estimation::BaseCorrection> base{};  // what the line says of the base
 };
 
-// A line of `estimate`; none where it is lost. `before`: time of the state before.
-std::optional<State> read_estimate(const std::string& text, const std::string& where, const chain::Chain& chain,
-                                   double before) {
-  const std::optional<estimation::EstimateLine> line =
-      estimation::read_estimate_line(text, where, chain.angles(), before);
-  if (!line) return {};
-  State out{line->time, line->theta, {}, line->base};
-  if (line->sigma.size() == 0) return out;  // as estimate's solver adam writes it
-  out.standing =
-      line->covariance.size() > 0 ? line->covariance : force::angle_covariance(chain, line->theta, line->sigma);
-  return out;
-}
-
 // Gives every state to `take`, as soon as its line is there.
 void each_state(const ForceOptions& options, const chain::Chain& chain, const std::function<void(const State&)>& take) {
   if (options.estimate.empty()) {
@@ -76,26 +50,13 @@ void each_state(const ForceOptions& options, const chain::Chain& chain, const st
     for (std::size_t f = 0; f < states.time.size(); ++f) take({states.time[f], states.theta[f], {}});
     return;
   }
-  const std::string name = options.estimate.string();
-  std::ifstream in(input_path(options.estimate));
-  if (!in) throw InputError(name, "cannot be read", "give the output of estimate, or - for standard input");
-  double before = -std::numeric_limits<double>::infinity();
-  std::optional<bool> known;  // whether the lines have deviations
-  std::string line;
-  for (int number = 1; estimation::next_line(in, line, name); ++number) {
-    core::stop_if_requested();
-    if (line.empty()) continue;
-    const std::string where = name + ": line " + std::to_string(number);
-    const auto state = read_estimate(line, where, chain, before);
-    if (!state) continue;
-    before = state->time;
-    if (!known) known = state->standing.size() > 0;
-    if (*known != (state->standing.size() > 0))
-      throw InputError(
-          where, *known ? "has no deviations, unlike the lines before" : "has deviations, unlike the lines before",
-          "give the output of one run of estimate");
-    take(*state);
-  }
+  each_estimate(options.estimate, chain.angles(), [&](const estimation::EstimateLine& line) {
+    State state{line.time, line.theta, {}, line.base};
+    if (line.sigma.size() > 0)  // estimate's solver adam writes none
+      state.standing =
+          line.covariance.size() > 0 ? line.covariance : force::angle_covariance(chain, line.theta, line.sigma);
+    take(state);
+  });
 }
 
 // One call: what it was given, and what it has come to.
@@ -109,55 +70,37 @@ class Work {
   const ForceResult& result() const { return result_; }
 
  private:
-  trajectory::BaseMotion base_at(double time) const;
   force::ContactAt named_contact(double apart) const;
   force::ContactAt contact(double apart);
   void check_near() const;
-  void check_time(double first, double last) const;
   void check_finite(const force::Estimate& estimate) const;
   void tell(const force::Estimate& estimate);
 
-  const Path& run_;
   const ForceOptions& options_;
   const EachForce& each_;
   std::string source_;  // of the states, for messages
   twin::Twin twin_;
   dynamics::Model model_;
-  trajectory::Trajectory base_;
-  dynamics::BaseFunction given_ = [this](double time) { return base_.at(time); };
-  estimation::BaseCorrection known_;                          // how that was mended before
-  std::map<double, estimation::BaseCorrection> corrections_;  // by time: what the states say of the base
+  StreamBase base_;
   std::vector<dynamics::Model> deviations_;
   double least_ = std::numeric_limits<double>::infinity();  // m, of what is said to touch, from the rope
   ForceResult result_;
 };
 
 Work::Work(const Path& run, const ForceOptions& options, const EachForce& each)
-    : run_(run),
-      options_(options),
+    : options_(options),
       each_(each),
       source_((options.estimate.empty() ? options.states : options.estimate).string()),
       twin_(load_twin(run)),
       model_(model_of(twin_, run)),
-      base_(options.base.empty() ? own_base(run) : read_base(input_path(options.base))) {
-  if (options.base.empty()) {
-    core::warn("`base`: is missing; the base motion of the twin's own capture is assumed");
-    known_ = estimation::base_correction(twin_.corrections);
-  }
+      base_(run, twin_, options.base) {
   deviations_ = force::deviations(model_, twin_.estimates);
   result_.known_mass = twin_.known_mass;
 }
 
-// Mended by the last state before a time, or by the first.
-trajectory::BaseMotion Work::base_at(double time) const {
-  auto at = corrections_.upper_bound(time);
-  if (at != corrections_.begin()) --at;
-  return estimation::corrected(given_, at == corrections_.end() ? estimation::BaseCorrection{} : at->second, time);
-}
-
 // What is said to touch; empty: automatic. `apart`: s, how far from a time a line of a file may be.
 force::ContactAt Work::named_contact(double apart) const {
-  const dynamics::BaseFunction base = [this](double time) { return base_at(time); };
+  const dynamics::BaseFunction base = [this](double time) { return base_.at(time); };
   if (!options_.hand.empty()) {
     const math::MatrixX points = twin::read_points(options_.hand);
     if (points.cols() == 0) throw InputError(options_.hand.string(), "has no point", "give a point cloud of the hand");
@@ -198,11 +141,6 @@ void Work::check_near() const {
                      "give meters in the world frame, and the base motion of the states");
 }
 
-void Work::check_time(double first, double last) const {
-  check_covered(base_, first, last, (options_.base.empty() ? run_ : options_.base).string(),
-                "give the base motion of these states with `base`");
-}
-
 void Work::check_finite(const force::Estimate& estimate) const {
   if (!force::is_finite(estimate))
     throw InputError(source_, "the force at " + core::exact(estimate.time) + " s is not a finite number",
@@ -219,14 +157,14 @@ void Work::tell(const force::Estimate& estimate) {
 void Work::live() {
   const force::ContactAt touched = contact(kLiveApart);
   force::LiveForce live(
-      model_, deviations_, [this](double time) { return base_at(time); }, touched);
+      model_, deviations_, [this](double time) { return base_.at(time); }, touched);
   double first = std::numeric_limits<double>::infinity();
   try {
     each_state(options_, twin_.chain, [&](const State& state) {
       first = std::min(first, state.time);
-      check_time(first, state.time);
-      // it goes for the few states before it, too
-      corrections_ = {{state.time, estimation::remaining(state.base, known_)}};
+      base_.check_covers(first, state.time);
+      base_.forget();  // it goes for the few states before it, too
+      base_.mend(state.time, state.base);
       if (const auto estimate = live.update(state.time, state.theta, state.standing)) tell(*estimate);
     });
     if (live.taken() < 3) throw InputError(source_, kFew, kMore);
@@ -241,21 +179,21 @@ void Work::live() {
 void Work::whole() {
   chain::States states;
   each_state(options_, twin_.chain, [&](const State& state) {
-    corrections_[state.time] = estimation::remaining(state.base, known_);
+    base_.mend(state.time, state.base);
     states.time.push_back(state.time);
     states.theta.push_back(state.theta);
     if (state.standing.size() > 0) states.covariance.push_back(state.standing);
   });
   const std::size_t count = states.time.size();
   if (count < 3) throw InputError(source_, kFew, kMore);
-  check_time(states.time.front(), states.time.back());
-  twin::warn_beyond(twin_.validity, twin::validity_of(twin_.chain, base_, states), source_);
+  base_.check_covers(states.time.front(), states.time.back());
+  twin::warn_beyond(twin_.validity, twin::validity_of(twin_.chain, base_.given(), states), source_);
   const force::Motion motion = force::smooth(states);
   const force::ContactAt touched = contact((states.time.back() - states.time.front()) / (count - 1.0));
   const std::vector<std::optional<force::Contact>> contacts = contacts_along(motion, touched);
   if (touched) check_near();
   const std::vector<force::Estimate> found = force::estimate(
-      model_, deviations_, [this](double time) { return base_at(time); }, motion, contacts);
+      model_, deviations_, [this](double time) { return base_.at(time); }, motion, contacts);
   for (const force::Estimate& estimate : found) check_finite(estimate);
   for (const force::Estimate& estimate : found) tell(estimate);
 }

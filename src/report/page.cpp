@@ -5,6 +5,7 @@
 
 #include "chainsplat/image_model.h"
 #include "chainsplat/json.h"
+#include "chainsplat/render.h"
 #include "chainsplat/report.h"
 #include "chainsplat/twin_json.h"
 #include "report_page.h"
@@ -137,11 +138,10 @@ Json overlap_json(const Json& metrics) {
 }
 
 Json motion_json(const std::string& name, const chain::States& states, const std::vector<VectorX>& sigma,
-                 const trajectory::Trajectory& base, const Json& metrics) {
+                 const std::vector<math::Pose>& base, const Json& metrics) {
   std::vector<double> poses;
   Eigen::Quaterniond before(1, 0, 0, 0);
-  for (const double time : states.time) {
-    const math::Pose pose = base.samples().empty() ? math::Pose() : base.pose(time);
+  for (const math::Pose& pose : base) {
     Eigen::Quaterniond q(pose.rotation);
     if (q.dot(before) < 0.0) q.coeffs() *= -1.0;  // cubics between them need one sign
     before = q;
@@ -160,6 +160,44 @@ Json motion_json(const std::string& name, const chain::States& states, const std
   return out;
 }
 
+std::vector<math::Pose> poses_at(const trajectory::Trajectory& base, const std::vector<double>& times) {
+  std::vector<math::Pose> out;
+  for (const double time : times) out.push_back(base.samples().empty() ? math::Pose() : base.pose(time));
+  return out;
+}
+
+// Every n-th, where all would be too many to draw.
+template <class Value>
+std::vector<Value> thinned(const std::vector<Value>& values, std::size_t every) {
+  std::vector<Value> out;
+  for (std::size_t k = 0; k < values.size(); k += every) out.push_back(values[k]);
+  return out;
+}
+
+std::size_t step_through(std::size_t count) {
+  constexpr std::size_t kMost = 10000;  // five minutes at 30 Hz, and what a browser draws in a frame
+  return (count + kMost - 1) / kMost;
+}
+
+// A step in time that is longer is one over frames in which the rope was lost.
+double longest_step(const std::vector<double>& times) {
+  constexpr double kLost = 3.5;  // median steps: a few frames that a busy machine drops are no gap
+  return kLost * render::median_interval(times);
+}
+
+Json followed_json(const Followed& followed) {
+  const std::size_t every = step_through(followed.states.time.size());
+  chain::States states;
+  states.time = thinned(followed.states.time, every);
+  states.theta = thinned(followed.states.theta, every);
+  Json out = motion_json("followed", states, thinned(followed.sigma, followed.sigma.empty() ? 1 : every),
+                         thinned(followed.base, every), {});
+  out["gap"] = longest_step(states.time);
+  out["frames"] = followed.states.time.size();
+  out["own"] = followed.own_recording;
+  return out;
+}
+
 Json motions_json(const Contents& contents) {
   const twin::Twin& twin = contents.twin;
   const auto metrics = [&](const char* key) {
@@ -169,10 +207,54 @@ Json motions_json(const Contents& contents) {
   for (const math::MatrixX& covariance : twin.states.covariance)
     sigma.push_back(covariance.diagonal().cwiseMax(0.0).cwiseSqrt());
   Json out = Json::array();
-  out.push_back(motion_json("recognized", twin.states, sigma, contents.base, metrics("recognized")));
+  out.push_back(
+      motion_json("recognized", twin.states, sigma, poses_at(contents.base, twin.states.time), metrics("recognized")));
   if (!twin.rollout.time.empty())
-    out.push_back(motion_json("rolled out", twin.rollout, rollout_deviations(twin, contents.base), contents.base,
-                              metrics("rollout")));
+    out.push_back(motion_json("rolled out", twin.rollout, rollout_deviations(twin, contents.base),
+                              poses_at(contents.base, twin.rollout.time), metrics("rollout")));
+  if (contents.followed) out.push_back(followed_json(*contents.followed));
+  return out;
+}
+
+// Forces at their times: `values` has point 3, force 3, covariance xx xy xz yy yz zz, size, its error, least and most.
+Json forces_json(const twin::Twin& twin, const std::vector<force::Estimate>& forces) {
+  constexpr std::uint8_t kTouching = 1, kMoving = 2;
+  constexpr double kLongest = 0.8;  // of the rope, the longest arrow: it shall stay in the picture
+  const force::Estimate* const most = largest(forces);
+  // as in the live window a force as large as the rope's weight is half as long as the rope
+  const double weight = dynamics::total_mass(*twin.parameters) * twin.parameters->gravity.norm();
+  double length = 0.5 * twin.chain.length / weight;
+  if (most) length = std::min(length, kLongest * twin.chain.length / size_of(*most).value);
+  std::vector<double> values, times;
+  std::vector<std::uint8_t> flags;
+  for (const force::Estimate& e : thinned(forces, step_through(forces.size()))) {
+    times.push_back(e.time);
+    values.insert(values.end(), e.point.begin(), e.point.end());
+    values.insert(values.end(), e.force.begin(), e.force.end());
+    for (int row = 0; row < 3; ++row)
+      for (int column = row; column < 3; ++column) values.push_back(e.covariance(row, column));
+    const ForceSize size = size_of(e);
+    for (const double each : {size.value, size.error, size.least, size.most}) values.push_back(each);
+    flags.push_back(static_cast<std::uint8_t>((e.touching ? kTouching : 0) | (e.moving ? kMoving : 0)));
+  }
+  Json out{
+      {"time", binary<double>(times)},
+      {"values", binary<float>(values)},
+      {"flags", binary<std::uint8_t>(flags)},
+      {"gap", longest_step(times)},
+      {"length", length},
+      {"unit", twin.known_mass ? "N" : "N/kg"},
+      {"hidden", std::any_of(forces.begin(), forces.end(), [](const force::Estimate& e) { return e.low != e.high; })}};
+  if (most) {
+    const ForceSize size = size_of(*most);
+    out["largest"] = {{"time", most->time},
+                      {"value", size.value},
+                      {"error", size.error},
+                      {"least", size.least},
+                      {"most", size.most},
+                      {"arclength", most->contact.arclength},
+                      {"arclength_error", most->arclength_sigma}};
+  }
   return out;
 }
 
@@ -251,6 +333,8 @@ Json document(const Contents& contents) {
   if (twin.tabletop)
     out["table"] = {{"point", list(twin.table_point.value_or(Vector3::Zero()))},
                     {"normal", list(twin.table_normal.value_or(Vector3::UnitZ()))}};
+  if (contents.followed && !contents.followed->forces.empty())
+    out["forces"] = forces_json(twin, contents.followed->forces);
   if (twin.gaussians.count > 0) out["splats"] = splats_json(twin.gaussians);
   if (!twin.corrections.empty()) {
     out["corrections"] = twin::to_json(twin.corrections);
@@ -266,6 +350,8 @@ Json document(const Contents& contents) {
 std::string page(const Contents& contents) {
   constexpr std::string_view kPlace = "@DATA@", kWhole = kPage;
   CHAINSPLAT_CHECK(!contents.twin.states.time.empty(), contents.twin.provenance.capture);
+  CHAINSPLAT_CHECK(!contents.followed || contents.followed->forces.empty() || contents.twin.parameters,
+                   "forces of a twin without dynamics");
   const std::size_t place = kWhole.find(kPlace);
   CHAINSPLAT_CHECK(place != std::string_view::npos, "the page has no place for data");
   std::string out(kWhole.substr(0, place));

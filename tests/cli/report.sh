@@ -48,6 +48,73 @@ run identify "$work/elsewhere"
 expect_code 0 'identify, another capture'
 grep -q 'has changed since.*shows no cameras' "$work/stderr" || fail 'identify, another capture: does not say so'
 
+# what was followed, and what pushed it: nothing did, so a line of force is made into a push
+run estimate "$work/run" --camera "$demo:cam0"
+expect_code 0 estimate
+head -24 "$work/stdout" >"$work/lines.jsonl"
+run force "$work/run" --estimate "$work/lines.jsonl"
+expect_code 0 force
+python3 - "$work/stdout" "$work/forces.jsonl" <<'PYTHON'
+import json, sys
+lines = [json.loads(line) for line in open(sys.argv[1])]
+for line in lines:
+    line["touching"] = False
+lines[12].update(touching=True, probability=0.99, force=[0.3, 0.0, 0.1], low=[0.3, 0.0, 0.1], high=[0.3, 0.0, 0.1],
+                 sigma=[0.03, 0.2, 0.04], covariance=[0.0009, 0.001, 0.04, 0, 0, 0.0016], arclength=0.2, arclength_sigma=0.01)
+open(sys.argv[2], "w").write("".join(json.dumps(line) + "\n" for line in lines))
+PYTHON
+streams=(--estimate "$work/lines.jsonl" --forces "$work/forces.jsonl")
+run report "$work/run" -o "$work/followed.html" "${streams[@]}" --video cam1
+expect_code 0 'report --estimate --forces'
+grep -q 'warning: --base: is missing' "$work/stderr" || fail 'report --estimate without --base: does not say what it takes'
+run report "$work/run" -o "$work/estimate.html" --estimate - --base "$demo/base.tum"
+expect_code 2 'report --estimate of an empty standard input'
+"$program" -q report "$work/run" -o "$work/estimate.html" --estimate - --base "$demo/base.tum" <"$work/lines.jsonl" ||
+  fail 'report --estimate -'
+grep -q '"name":"followed".*"own":true' "$work/estimate.html" || fail 'report --base: its own recording counts as another'
+# another recording: later, and its base elsewhere
+python3 - "$demo/base.tum" "$work/base.tum" "$work" <<'PYTHON'
+import json, sys
+rows = [line.split() for line in open(sys.argv[1]) if line.strip() and line[0] != "#"]
+open(sys.argv[2], "w").writelines(" ".join([repr(float(r[0]) + 1000), repr(float(r[1]) + 1), *r[2:]]) + "\n" for r in rows)
+for name in "lines", "forces":
+    lines = [json.loads(line) for line in open(f"{sys.argv[3]}/{name}.jsonl")]
+    for line in lines:
+        line["time"] += 1000
+        if "point" in line:
+            line["point"][0] += 1
+    open(f"{sys.argv[3]}/{name}_later.jsonl", "w").writelines(json.dumps(line) + "\n" for line in lines)
+PYTHON
+later=(--estimate "$work/lines_later.jsonl" --forces "$work/forces_later.jsonl")
+run report "$work/run" -o "$work/apart.html" "${later[@]}" --base "$work/base.tum" --video cam1
+expect_code 0 'report of another recording'
+expect_error 2 'run: the base motion covers .*--base' report "$work/run" -o "$work/no.html" "${later[@]}"
+
+# what does not belong together
+expect_error 2 '--forces: no --estimate' report "$work/run" -o "$work/no.html" --forces "$work/forces.jsonl"
+expect_error 2 '--base: no --estimate' report "$work/run" -o "$work/no.html" --base "$demo/base.tum"
+expect_error 2 'more than one is standard input' report "$work/run" -o "$work/no.html" --estimate - --forces -
+expect_error 2 'would be overwritten' report "$work/run" -o "$work/lines.jsonl" "${streams[@]}"
+expect_error 2 'would be overwritten' report "$work/run" -o "$work/run/twin.json"
+expect_error 2 'forces_later.jsonl: line 1: time: 1000.* is no time of the estimates' report "$work/run" -o "$work/no.html" \
+  --estimate "$work/lines.jsonl" --forces "$work/forces_later.jsonl"
+expect_error 2 "lines.jsonl: line 1: is no line of 'chainsplat force'|lines.jsonl: line 1: link: is missing" report "$work/run" \
+  -o "$work/no.html" --estimate "$work/lines.jsonl" --forces "$work/lines.jsonl"
+: >"$work/empty.jsonl"
+expect_error 2 'empty.jsonl: has no line' report "$work/run" -o "$work/no.html" --estimate "$work/lines.jsonl" --forces "$work/empty.jsonl"
+expect_error 2 'empty.jsonl: has no frame' report "$work/run" -o "$work/no.html" --estimate "$work/empty.jsonl"
+sed '2s/"theta":\[[^,]*,/"theta":[/' "$work/lines.jsonl" >"$work/bad.jsonl"
+expect_error 2 'bad.jsonl: line 2: theta: has .* angles, the twin' report "$work/run" -o "$work/no.html" --estimate "$work/bad.jsonl"
+bad_force() {  # sed's command for the third line, pattern
+  sed "3$1" "$work/forces.jsonl" >"$work/bad.jsonl"
+  expect_error 2 "bad.jsonl: line 3: $2" report "$work/run" -o "$work/no.html" --estimate "$work/lines.jsonl" --forces "$work/bad.jsonl"
+}
+bad_force 's/"covariance": \[[^,]*/"covariance": [-1/' 'covariance: is not positive semidefinite'
+bad_force 's/"force": \[[^,]*/"force": [NaN/' "is no line of 'chainsplat force'"
+bad_force 's/"link": [0-9]*/"link": 4/' 'link: 4 is not from 0 to 3'
+bad_force 's/"unit": "N"/"unit": "N\/kg"/' "unit: is N/kg, but the twin's mass is known"
+[ -e "$work/no.html" ] && fail 'report of what does not belong together: wrote a page'
+
 if [ -z "$browser" ]; then
   [ "$failures" -eq 0 ] || finish
   echo 'skipped: there is no chromium'
@@ -86,6 +153,17 @@ check wide '"images":true' 'sections":"replay,verdict,metrics,angles,overlap,ide
 python3 "$(dirname "$0")/report_pictures.py" "$work/wide.dom" "$work/frames" 45 40 || fail 'the page draws other pictures than render'
 drive "$work/video.html" phone 400 11
 check phone '"images":true'
+
+# what was followed: a force where it pushes, on a phone, too; videos beside it only where they are of the same recording
+for width in 1200 400; do
+  drive "$work/followed.html" "followed_$width" "$width" 11
+  check "followed_$width" '"followed":true' '"apart":false' '"videos":true' '"beyond":true' '"arrow":true' '"no_arrow":true' '"plot":true' \
+    '"largest":"Largest force from outside: 0.316 ± 0.031 N at 0.40 s, 0.200 ± 0.010 m from the grasp' '"about":"24 frames from 0.00 to 0.77 s'
+done
+drive "$work/apart.html" apart 1000 11
+check apart '"followed":true' '"apart":true' '"videos":false' '"beyond":true' '"arrow":true' '"no_arrow":true' '"about":"24 frames from 1000.00 to 1000.77 s; of another'
+drive "$work/estimate.html" estimate 1000 11
+check estimate '"followed":true' '"apart":false' '"beyond":true'
 
 # one moment alone, as a link asks for it, pixel by pixel on the screen
 timeout 300 "$browser" --headless --no-sandbox --user-data-dir="$work/profile" --hide-scrollbars --window-size=320,240 \

@@ -18,6 +18,38 @@ function picture(camera, frame, motion) {
   document.body.append(shot);
 }
 
+// What was followed is shown, and a force only where something touches, only on its layer.
+function checkFollowed() {
+  const {forces} = report, overlay = () => { drawNow(); return at('overlay').toDataURL(); };
+  at('motions').children[motions.indexOf(followed)].click();
+  checks.followed = motions[state.motion] === followed && first === together().reduce((t, m) => Math.min(t, m.time[0]), Infinity) &&
+    at('legend_angles').textContent.includes('followed \u00b1 2 \u03c3') && at('followed').offsetHeight > 0;
+  checks.apart = followed.apart;
+  setCamera(report.cameras.findIndex(camera => report.videos.some(video => video.camera === camera.name)));
+  checks.videos = Boolean(videoOf());
+  setCamera(-1);
+  checks.about = at('about_followed').textContent;
+  setTime(followed.time[followed.time.length - 1] + 2 * followed.gap);
+  state.time = followed.time[followed.time.length - 1] + 2 * followed.gap;
+  drawNow();
+  checks.beyond = at('splats').style.visibility === 'hidden' && at('hint').textContent === 'not followed at this time';
+  if (!forces) return;
+  const arrow = k => {
+    setTime(forces.time[k]);
+    toggles.push(true);
+    const shown = overlay();
+    toggles.push(false);
+    const hidden = overlay();
+    toggles.push(true);
+    return shown !== hidden && overlay() === shown;
+  };
+  checks.arrow = arrow(forces.flags.findIndex(flag => flag & 1));
+  checks.no_arrow = !arrow(forces.flags.findIndex(flag => !(flag & 1)));
+  const pen = at('plot_force').getContext('2d'), {data} = pen.getImageData(0, 0, at('plot_force').width, at('plot_force').height);
+  checks.plot = data.some(value => value > 0);
+  checks.largest = [...document.querySelectorAll('#verdict li')].map(line => line.textContent).find(text => text.includes('force'));
+}
+
 async function drive(frames) {
   if (paint) report.cameras.forEach((_, camera) => frames.forEach(frame => picture(camera, frame, motions.length - 1)));
   state.plain = false;
@@ -48,6 +80,7 @@ async function drive(frames) {
   stage.dispatchEvent(new WheelEvent('wheel', {deltaY: 100, cancelable: true}));
   checks.orbit = state.orbit.yaw !== yaw && state.orbit.distance > distance;
   drawNow();
+  if (followed) checkFollowed();
   checks.width = document.documentElement.scrollWidth <= innerWidth;
   checks.images = document.images.length === 0;
   checks.title = document.title;

@@ -326,6 +326,7 @@ const std::map<std::string, Read> kReaders = {
     {"contacts", contacts},
     {"covariance", covariance},
     {"estimates", estimates},
+    {"forces", forces},
     {"image", image},
     {"jobs", jobs},
     {"manifest", manifest},

@@ -31,6 +31,7 @@ void checkpoint(std::string_view bytes);
 void colmap(std::string_view bytes);
 void contacts(std::string_view bytes);
 void estimates(std::string_view bytes);
+void forces(std::string_view bytes);
 void metrics(std::string_view bytes);
 void online(std::string_view bytes);
 void pose(std::string_view bytes);

@@ -104,8 +104,9 @@ void write_result(const std::string& name, const std::string& bytes);
 // The base motion that is kept beside a file of states: NAME.base.tum beside NAME.csv, as rollout writes it, or
 // base.tum beside the states.csv or rollout.csv of a run or plan. Empty: there is none.
 Path base_beside(const std::string& states);
-// Throws InputError where `output` is a file of the run folder, or one of `inputs`.
-void check_not_input(const std::string& output, const Path& run, const std::vector<std::string>& inputs);
+// Throws InputError where `output` is one of `inputs` (empty and "-": none), or also a file of the run folder.
+void check_not_input(const std::string& output, const std::vector<std::string>& inputs);
+void check_not_input(const std::string& output, const Path& run, std::vector<std::string> inputs);
 // CAPTURE[:camera] as the two; the second is empty for all cameras. A folder whose own name has a colon is taken as it
 // is.
 std::pair<std::string, std::string> split_camera(const std::string& text);

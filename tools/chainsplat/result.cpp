@@ -57,13 +57,20 @@ void evaluate(const Globals& globals, const EvalRequest& request) {
 struct ReportRequest {
   std::string run, out;
   pipeline::ReportOptions options;
-  std::string capture;
+  std::string capture, estimate, forces, base;
 };
 
 void report(const Globals& globals, const ReportRequest& request) {
+  std::vector<std::string> inputs{request.estimate, request.forces, request.base};
+  for (const std::string name : pipeline::kRunFiles)  // of them only the page may be written anew
+    if (name != pipeline::kReportFile) inputs.push_back((Path(request.run) / name).string());
+  check_not_input(request.out, inputs);
   pipeline::check_output_file(request.out);
   pipeline::ReportOptions options = request.options;
   options.capture = request.capture;
+  options.estimate = request.estimate;
+  options.forces = request.forces;
+  options.base = request.base;
   const std::string page = pipeline::report(request.run, options, terminal());
   end_progress();
   write_result(request.out, page);
@@ -199,6 +206,13 @@ void add_result_commands(Command app, const Globals& globals, Job& job) {
       .delimiter(',')
       .type_name("CAMERA,...");
   reporter.add_option("--capture", showing->capture, "The twin's own capture, where it has moved").type_name("CAPTURE");
+  reporter
+      .add_option("--estimate", showing->estimate, "Also what 'estimate' followed, its JSON lines; - is standard input")
+      .type_name("FILE.jsonl");
+  reporter.add_option("--forces", showing->forces, "The forces that 'force' told from them, its JSON lines")
+      .type_name("FORCES.jsonl");
+  reporter.add_option("--base", showing->base, "Base motion of the estimates (default: that of the twin's own capture)")
+      .type_name("FILE.tum");
   reporter.callback([&globals, &job, showing] { job = [&globals, showing] { report(globals, *showing); }; });
 
   Command exporter = app.add_command("export", "Write the twin for other programs, by the file's ending");

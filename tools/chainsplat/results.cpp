@@ -41,15 +41,16 @@ Path base_beside(const std::string& states) {
   return of_a_folder && fs::is_regular_file(folder, error) ? folder : Path();
 }
 
-void check_not_input(const std::string& output, const Path& run, const std::vector<std::string>& inputs) {
+void check_not_input(const std::string& output, const std::vector<std::string>& inputs) {
   std::error_code error;
-  const auto refuse = [&](const Path& input) {
-    if (!fs::equivalent(output, input, error)) return;
-    throw InputError(output, "is a file that is read, and would be overwritten", "name another file");
-  };
-  for (const char* name : pipeline::kRunFiles) refuse(run / name);
   for (const std::string& input : inputs)
-    if (!input.empty() && input != "-") refuse(input);
+    if (!input.empty() && input != "-" && fs::equivalent(output, input, error))
+      throw InputError(output, "is a file that is read, and would be overwritten", "name another file");
+}
+
+void check_not_input(const std::string& output, const Path& run, std::vector<std::string> inputs) {
+  for (const char* name : pipeline::kRunFiles) inputs.push_back((run / name).string());
+  check_not_input(output, inputs);
 }
 
 std::string metrics_table(const std::vector<MetricsRow>& rows) {

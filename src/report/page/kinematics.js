@@ -38,8 +38,7 @@ function aboutAxis(axis, angle) {
 function rowAt(times, values, columns, time) {
   const count = times.length, row = k => Array.from(values.subarray(k * columns, (k + 1) * columns));
   if (count === 1) return row(0);
-  let i = 0;
-  while (i < count - 2 && times[i + 1] <= time) ++i;
+  const i = Math.min(lastNotAfter(times, time), count - 2);
   const h = times[i + 1] - times[i], u = Math.min(1, Math.max(0, (time - times[i]) / h));
   const slope = k => {
     const a = Math.max(k - 1, 0), b = Math.min(k + 1, count - 1);
@@ -48,6 +47,24 @@ function rowAt(times, values, columns, time) {
   const u2 = u * u, u3 = u2 * u, parts = [row(i), slope(i), row(i + 1), slope(i + 1)];
   const weights = [2 * u3 - 3 * u2 + 1, u3 - 2 * u2 + u, 3 * u2 - 2 * u3, u3 - u2];
   return parts[0].map((_, c) => parts.reduce((sum, part, k) => sum + weights[k] * part[c], 0));
+}
+
+// Index of the last of the increasing `times` that is not after `time`; 0 before the first.
+function lastNotAfter(times, time) {
+  let low = 0, high = times.length;
+  while (high - low > 1) {
+    const middle = (low + high) >> 1;
+    if (times[middle] <= time) low = middle; else high = middle;
+  }
+  return low;
+}
+
+// Whether a motion says where the rope is: one that was followed does not beyond its ends and where it was lost.
+function isKnown({time: times, gap}, time) {
+  if (gap === undefined) return true;
+  const k = lastNotAfter(times, time);
+  if (time < times[0] || k === times.length - 1) return Math.abs(time - times[k]) <= gap / 2;
+  return time === times[k] || times[k + 1] - times[k] <= gap;
 }
 
 function basePose(motion, time) {

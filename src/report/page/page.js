@@ -13,8 +13,13 @@ function unpack() {
   for (const motion of report.motions) {
     motion.time = doubles(motion.time), motion.theta = floats(motion.theta), motion.base = floats(motion.base);
     motion.sigma = motion.sigma && floats(motion.sigma);
+    motion.apart = motion.own === false;  // of another recording, with another clock
     for (const frames of Object.values(motion.overlap || {}))
       frames.values = floats(frames.values), frames.times = doubles(frames.times), frames.numbers = new Int32Array(bytes(frames.numbers));
+  }
+  if (report.forces) {
+    const {forces} = report;
+    forces.time = doubles(forces.time), forces.values = floats(forces.values), forces.flags = new Uint8Array(bytes(forces.flags));
   }
   for (const camera of report.cameras) camera.times = doubles(camera.times);
   for (const video of report.videos) {
@@ -30,17 +35,24 @@ function unpack() {
 
 unpack();
 const {chain, motions} = report, up = unit(scaled(report.gravity, -1));
-const first = Math.min(...motions.map(m => m.time[0])), last = Math.max(...motions.map(m => m.time[m.time.length - 1]));
-const state = {time: first, motion: motions.length - 1, camera: -1, playing: false, links: false, line: false, axes: false,
-               others: true, mode: 'off', plain: false, orbit: null};
+const followed = motions.find(m => m.name === 'followed');
+const styles = {
+  recognized: {color: 'first', line: 'dashed', dash: [4, 3]}, 'rolled out': {color: 'second', line: 'solid', dash: []},
+  followed: {color: 'third', line: 'dotted', dash: [1.5, 2.5]},
+};
+// Those that have a clock in common with the chosen one, and the times that they cover.
+const together = () => motions.filter(m => m.apart === motions[state.motion].apart);
+let first = 0, last = 0;
+const state = {time: -Infinity, motion: motions.length - 1, camera: -1, playing: false, links: false, line: false, axes: false,
+               others: true, push: Boolean(report.forces), mode: 'off', plain: false, orbit: null};
 const paint = report.splats && makePainter(at('splats'), report.splats, report.model);
 
 function freshOrbit() {
-  const motion = motions[0], poses = linkMotions(chain, motion, (first + last) / 2), nodes = nodesOf(chain, poses);
+  const motion = together()[0], halfway = (motion.time[0] + motion.time[motion.time.length - 1]) / 2;
+  const nodes = nodesOf(chain, linkMotions(chain, motion, halfway));
   const middle = scaled(nodes.reduce(add), 1 / nodes.length);
   return {target: middle, distance: 1.8 * chain.length, yaw: 0.6, pitch: 0.2};
 }
-state.orbit = freshOrbit();
 
 // Colors of the theme as the canvas needs them.
 const probe = document.body.appendChild(element('span', '', {hidden: true}));
@@ -48,11 +60,11 @@ function ink(name) {
   probe.style.color = `var(--${name})`;
   return getComputedStyle(probe).color;
 }
-const motionInk = k => ink(motions[k].name === 'recognized' ? 'first' : 'second');
+const motionInk = motion => ink(styles[motion.name].color);
 const linkTints = [[0.9, 0.5, 0.2], [0.25, 0.6, 0.9]];
 const axisInks = ['#e05a4f', '#4fae62', '#5a7fe0'];
 
-const videoOf = () => state.camera < 0 ? null : report.videos.find(v => v.camera === report.cameras[state.camera].name) || null;
+const videoOf = () => state.camera < 0 || motions[state.motion].apart ? null : report.videos.find(v => v.camera === report.cameras[state.camera].name) || null;
 
 // Canvases as large as the stage, or as the chosen camera's picture fits into it.
 function layOut() {
@@ -80,12 +92,24 @@ function drawVideo() {
   splats.clipPath = shown && mode === 'wipe' ? `inset(0 0 0 ${at('wipe').value}%)` : '';
   splats.background = shown && mode === 'wipe' ? '#000' : '';
   splats.mixBlendMode = shown && mode === 'difference' ? 'difference' : '';
-  splats.visibility = shown && mode === 'outline' ? 'hidden' : '';
+  splats.visibility = shown && mode === 'outline' || !isKnown(motions[state.motion], state.time) ? 'hidden' : '';
   if (!shown) return;
   let k = 0;
   while (k < video.times.length - 1 && Math.abs(video.times[k + 1] - state.time) <= Math.abs(video.times[k] - state.time)) ++k;
   pen.globalAlpha = mode === 'dim' ? 0.45 : 1;
   if (video.pictures[k].complete) pen.drawImage(video.pictures[k], 0, 0, canvas.width, canvas.height);
+}
+
+// The force at the chosen time, where something touches the rope then.
+function pushNow() {
+  const {forces} = report, {apart} = motions[state.motion];
+  if (!forces || !state.push || followed.apart !== apart) return null;
+  let k = lastNotAfter(forces.time, state.time);
+  if (k + 1 < forces.time.length && forces.time[k + 1] - state.time < state.time - forces.time[k]) ++k;
+  if (Math.abs(forces.time[k] - state.time) > forces.gap / 2 || !(forces.flags[k] & 1)) return null;
+  const row = Array.from(forces.values.subarray(16 * k, 16 * k + 16));
+  return {point: row.slice(0, 3), force: row.slice(3, 6), covariance: row.slice(6, 12), size: row[12], error: row[13],
+          moving: Boolean(forces.flags[k] & 2)};
 }
 
 function drawStage() {
@@ -102,31 +126,36 @@ function drawStage() {
     strokeLine(pen, camera, scale, path, ink('soft'), ratio, [3 * ratio, 3 * ratio]);
     for (const other of report.cameras) drawCamera(pen, camera, scale, other, ink('soft'), ratio);
   }
-  if (state.mode === 'outline' && videoOf()) drawOutline(pen, at('splats'), ink('accent'), ratio);
+  if (state.mode === 'outline' && videoOf() && isKnown(motion, state.time)) drawOutline(pen, at('splats'), ink('accent'), ratio);
   if (state.line || !paint)
-    motions.forEach((each, k) => drawCenterline(pen, camera, scale, nodesOf(chain, linkMotions(chain, each, state.time)), motionInk(k), ratio,
-                                                k === state.motion ? null : [5 * ratio, 4 * ratio]));
-  if (state.axes) drawAxes(pen, camera, scale, chain, poses, axisInks, ratio);
+    for (const each of together())
+      if (isKnown(each, state.time))
+        drawCenterline(pen, camera, scale, nodesOf(chain, linkMotions(chain, each, state.time)), motionInk(each), ratio,
+                       each === motion ? null : [5 * ratio, 4 * ratio]);
+  if (state.axes && isKnown(motion, state.time)) drawAxes(pen, camera, scale, chain, poses, axisInks, ratio);
+  const push = pushNow();
+  if (push)
+    drawForce(pen, camera, scale, push, report.forces.length, withError(push.size, push.error) + ' ' + report.forces.unit, ink('push'), ratio);
 }
 
 const columnOf = (values, count, k) => Float64Array.from({length: values.length / count}, (_, i) => values[i * count + k] * radiansToDegrees);
 
-function angleCurves() {
+function angleCurves(motion) {
   const count = chain.angles.length, chosen = Number(at('angle').value), curves = [];
-  for (const [m, motion] of motions.entries())
-    for (let k = 0; k < count; ++k)
-      if (chosen < 0 || chosen === k)
-        curves.push({times: motion.time, values: columnOf(motion.theta, count, k), dash: motion.name === 'recognized',
-                     band: motion.sigma && columnOf(motion.sigma, count, k).map(s => 2 * s),
-                     color: chosen < 0 ? `hsl(${300 * k / count} 60% 52%)` : motionInk(m)});
+  for (let k = 0; k < count; ++k)
+    if (chosen < 0 || chosen === k)
+      curves.push({times: motion.time, values: columnOf(motion.theta, count, k), dash: styles[motion.name].dash, gap: motion.gap,
+                   band: motion.sigma && columnOf(motion.sigma, count, k).map(s => 2 * s),
+                   color: chosen < 0 ? `hsl(${300 * k / count} 60% 52%)` : motionInk(motion)});
   return curves;
 }
 
-function differenceCurves(curves) {
-  if (motions.length < 2) return [];
-  const half = curves.length / 2;
-  return curves.slice(0, half).map((seen, k) => {
-    const made = curves[half + k], band = seen.band || made.band;
+function differenceCurves() {
+  const [recognized, rolled] = ['recognized', 'rolled out'].map(name => together().find(m => m.name === name));
+  if (!recognized || !rolled) return [];
+  const all = angleCurves(rolled);
+  return angleCurves(recognized).map((seen, k) => {
+    const made = all[k], band = seen.band || made.band;
     const both = band && band.map((_, i) => Math.hypot(seen.band ? seen.band[i] : 0, made.band ? made.band[i] : 0));
     return {times: seen.times, values: made.values.map((v, i) => v - seen.values[i]), band: both, color: made.color};
   });
@@ -134,16 +163,25 @@ function differenceCurves(curves) {
 
 function overlapCurves() {
   const curves = [];
-  for (const [m, motion] of motions.entries())
-    Object.values(motion.overlap || {}).forEach(frames => curves.push({times: frames.times, values: frames.values, color: motionInk(m)}));
+  for (const motion of motions)
+    Object.values(motion.overlap || {}).forEach(frames => curves.push({times: frames.times, values: frames.values, color: motionInk(motion)}));
   return curves;
 }
 
+// Thick where something touches the rope.
+function forceCurves() {
+  const {time: times, values, flags, gap} = report.forces, column = c => Float32Array.from(times, (_, k) => values[16 * k + c]);
+  const size = column(12), color = ink('push');
+  return [{times, values: size, between: [column(14), column(15)], gap, color},
+          {times, values: size.map((v, k) => flags[k] & 1 ? v : NaN), gap, color, width: 3}];
+}
+
 function drawPlots() {
-  const colors = {soft: ink('soft'), line: ink('line'), ink: ink('ink')}, angles = angleCurves(), difference = differenceCurves(angles);
-  drawPlot(at('plot_angles'), angles, 'degrees', state.time, colors);
-  at('plot_difference').hidden = !difference.length;
+  const colors = {soft: ink('soft'), line: ink('line'), ink: ink('ink')}, difference = differenceCurves();
+  drawPlot(at('plot_angles'), together().flatMap(angleCurves), 'degrees', state.time, colors);
+  at('plot_difference').hidden = at('legend_difference').hidden = !difference.length;
   drawPlot(at('plot_difference'), difference, 'degrees', state.time, colors);
+  if (report.forces) drawPlot(at('plot_force'), forceCurves(), report.forces.unit, state.time, colors);
   drawPlot(at('plot_overlap'), overlapCurves(), 'IoU', state.time, colors);
 }
 
@@ -158,6 +196,7 @@ function drawNow() {
   asked = false;
   drawStage();
   if (!state.plain) drawPlots();
+  sayHint();
   at('clock').textContent = state.time.toFixed(2) + ' s';
   at('time').value = state.time;
   document.body.dataset.time = state.time;
@@ -172,30 +211,50 @@ function press(group, chosen) {
   [...at(group).children].forEach((button, k) => button.setAttribute('aria-pressed', k === chosen));
 }
 
+function sayHint() {
+  const camera = report.cameras[state.camera];
+  at('hint').textContent = !isKnown(motions[state.motion], state.time) ? 'not followed at this time'
+    : !paint ? 'This browser has no WebGL 2, or the twin no Gaussians: the centerlines alone.'
+    : !camera ? 'drag to turn, wheel or pinch to come closer, shift-drag to move'
+    : camera.distorted ? 'without the distortion of the lens' : '';
+}
+
 function setCamera(index) {
   state.camera = index;
   press('cameras', index + 1);
   at('behind').hidden = !videoOf();
-  const camera = report.cameras[index];
-  at('hint').textContent = !paint ? 'This browser has no WebGL 2, or the twin no Gaussians: the centerlines alone.'
-    : !camera ? 'drag to turn, wheel or pinch to come closer, shift-drag to move'
-    : camera.distorted ? 'without the distortion of the lens' : '';
   layOut();
   redraw();
 }
 
 function setMotion(index) {
+  const other = motions[index].apart !== motions[state.motion].apart || state.time === -Infinity;
   state.motion = index;
   press('motions', index);
+  at('behind').hidden = !videoOf();
+  if (other) {
+    const shown = together();
+    first = Math.min(...shown.map(m => m.time[0])), last = Math.max(...shown.map(m => m.time[m.time.length - 1]));
+    at('time').min = first, at('time').max = last;
+    state.orbit = freshOrbit();
+    legend('legend_angles', shown.map(m => [m.name + (m.sigma ? ' \u00b1 2 \u03c3' : ''), styles[m.name].color, styles[m.name].line]));
+    setTime(state.time);
+  }
   redraw();
 }
 
 // A moment of a camera, by the names that findings and metrics use.
 function look(subject, frame, motion) {
   const index = report.cameras.findIndex(c => c.name === subject), times = index < 0 ? motions[0].time : report.cameras[index].times;
-  if (motion) setMotion(motions.findIndex(m => m.name === motion));
+  if (motion || motions[state.motion].apart) setMotion(motion ? motions.findIndex(m => m.name === motion) : 0);
   if (index >= 0) setCamera(index);
   setTime(times[Math.min(frame, times.length - 1)]);
+  at('replay').scrollIntoView({block: 'nearest'});
+}
+
+function lookAt(time, motion) {
+  setMotion(motions.findIndex(m => m.name === motion));
+  setTime(time);
   at('replay').scrollIntoView({block: 'nearest'});
 }
 
@@ -218,7 +277,6 @@ function play(on) {
 }
 
 function listen() {
-  at('time').min = first, at('time').max = last;
   at('time').oninput = event => setTime(Number(event.target.value));
   at('play').onclick = () => play(!state.playing);
   at('angle').onchange = at('wipe').oninput = redraw;
@@ -240,8 +298,12 @@ function listen() {
     if (event.key === ' ') event.preventDefault(), play(!state.playing);
     if (event.key === 'ArrowLeft' || event.key === 'ArrowRight') setTime(state.time + (event.key === 'ArrowLeft' ? -1 : 1) / 30);
   });
-  for (const id of ['plot_angles', 'plot_difference', 'plot_overlap'])
-    at(id).onpointerdown = at(id).onpointermove = event => event.buttons && at(id).timeAt && setTime(at(id).timeAt(event.offsetX));
+  for (const [id, motion] of [['plot_angles', null], ['plot_difference', null], ['plot_overlap', motions[0]], ['plot_force', followed]])
+    at(id).onpointerdown = at(id).onpointermove = event => {
+      if (!event.buttons || !at(id).timeAt) return;
+      if (motion && motion.apart !== motions[state.motion].apart) setMotion(motions.indexOf(motion));
+      setTime(at(id).timeAt(event.offsetX));
+    };
   listenToOrbit(at('stage'));
 }
 
@@ -290,6 +352,16 @@ function followLink() {
   if (asks.has('play')) play(true);
 }
 
+// Entries: text, color of the theme, style of its line.
+function legend(id, entries) {
+  at(id).replaceChildren();
+  for (const [text, color, line] of entries) {
+    const mark = element('i');
+    mark.style.borderColor = `var(--${color})`, mark.style.borderTopStyle = line;
+    at(id).append(mark, text);
+  }
+}
+
 const toggles = {};
 function fill() {
   at('name').textContent = report.name || 'twin';
@@ -299,7 +371,8 @@ function fill() {
     `${motions[0].time.length} frames; chainsplat ${report.version}, seed ${report.seed}${report.device ? ', ' + report.device : ''}`;
   ['free view', ...report.cameras.map(c => c.name)].forEach((name, k) => at('cameras').append(element('button', name, {onclick: () => setCamera(k - 1)})));
   motions.forEach((motion, k) => at('motions').append(element('button', motion.name, {onclick: () => setMotion(k)})));
-  for (const [key, name] of [['links', 'link colors'], ['line', 'centerlines'], ['axes', 'screw axes'], ['others', 'cameras and path']]) {
+  const layers = [['links', 'link colors'], ['line', 'centerlines'], ['axes', 'screw axes'], ['others', 'cameras and path']];
+  for (const [key, name] of report.forces ? [...layers, ['push', 'forces']] : layers) {
     const button = element('button', name);
     toggles[key] = on => { state[key] = on; button.setAttribute('aria-pressed', on); redraw(); };
     button.onclick = () => toggles[key](!state[key]);
@@ -307,16 +380,13 @@ function fill() {
     at('layers').append(button);
   }
   at('angle').append(element('option', 'all angles', {value: -1}), ...chain.angles.map((name, k) => element('option', name, {value: k})));
-  const legend = (id, entries) => entries.forEach(([text, color, dashed]) => {
-    const mark = element('i');
-    mark.style.borderColor = color, mark.style.borderTopStyle = dashed ? 'dashed' : 'solid';
-    at(id).append(mark, text);
-  });
-  legend('legend_angles', motions.map(m => [m.name + (m.sigma ? ' \u00b1 2 \u03c3' : ''), m.name === 'recognized' ? 'var(--first)' : 'var(--second)', m.name === 'recognized']));
   const measured = motions.filter(m => m.overlap);
-  legend('legend_overlap', measured.map(m => [m.name + ', a curve a camera', m.name === 'recognized' ? 'var(--first)' : 'var(--second)', false]));
+  legend('legend_overlap', measured.map(m => [m.name + ', a curve a camera', styles[m.name].color, 'solid']));
   at('overlap').hidden = !measured.length;
-  fillVerdict(at('verdict'), report, look);
+  at('followed').hidden = !followed;
+  at('plot_force').hidden = !report.forces;
+  if (followed) fillFollowed(at('about_followed'), at('legend_force'), followed, report.forces, () => lookAt(report.forces.largest.time, 'followed'));
+  fillVerdict(at('verdict'), report, look, lookAt);
   fillMetrics(at('metrics'), report);
   fillIdentified(at('identified'), report);
   fillCorrections(at('corrections'), report);

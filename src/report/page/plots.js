@@ -1,11 +1,13 @@
-// Curves over time on a canvas: { times, values, band, color, dash } each, bands of two standard deviations around them.
+// Curves over time on a canvas: { times, values, band, color, dash, gap, width } each, bands of two standard deviations
+// around them, or what is `between` [low, high]. Steps in time that are longer than the gap interrupt a curve.
 
 function drawPlot(canvas, curves, unit, cursor, colors) {
   const ratio = devicePixelRatio || 1, pen = canvas.getContext('2d');
   const width = canvas.width = Math.round(canvas.clientWidth * ratio), height = canvas.height = Math.round(canvas.clientHeight * ratio);
   const left = 46 * ratio, bottom = height - 18 * ratio, top = 8 * ratio, right = width - 6 * ratio;
   let [start, end, low, high] = [Infinity, -Infinity, Infinity, -Infinity];
-  for (const {times, values, band} of curves) {
+  for (const {times, values, band, between} of curves) {
+    if (between) low = Math.min(low, ...extent(between[0])), high = Math.max(high, ...extent(between[1]));
     start = Math.min(start, times[0]), end = Math.max(end, times[times.length - 1]);
     values.forEach((v, k) => {
       const b = band && isFinite(band[k]) ? band[k] : 0;
@@ -37,26 +39,38 @@ function drawPlot(canvas, curves, unit, cursor, colors) {
   pen.fillText(unit, left + 4 * ratio, top + 10 * ratio);
   for (const curve of curves) drawCurve(pen, curve, x, y, ratio);
   pen.fillStyle = colors.ink;
-  pen.fillRect(Math.round(x(cursor)), top, ratio, bottom - top);
+  if (cursor >= start && cursor <= end) pen.fillRect(Math.round(x(cursor)), top, ratio, bottom - top);
   canvas.timeAt = place => start + (place * ratio - left) / (right - left) * (end - start);
 }
 
-function drawCurve(pen, {times, values, band, color, dash}, x, y, ratio) {
+// Least and largest finite number, without a limit on how many there are.
+function extent(values) {
+  let [low, high] = [Infinity, -Infinity];
+  for (const v of values) if (isFinite(v)) low = Math.min(low, v), high = Math.max(high, v);
+  return [low, high];
+}
+
+function drawCurve(pen, {times, values, band, between, color, dash, gap = Infinity, width = 1.3}, x, y, ratio) {
   pen.fillStyle = pen.strokeStyle = color;
-  if (band) {
+  if (band || between) {
+    const low = k => between ? between[0][k] : values[k] - band[k], high = k => between ? between[1][k] : values[k] + band[k];
     pen.globalAlpha = 0.16;
-    pen.beginPath();
-    for (let k = 0; k < times.length; ++k) pen.lineTo(x(times[k]), y(values[k] + band[k]));
-    for (let k = times.length - 1; k >= 0; --k) pen.lineTo(x(times[k]), y(values[k] - band[k]));
-    pen.fill();
+    for (let begin = 0, end; begin < times.length; begin = end) {
+      for (end = begin + 1; end < times.length && times[end] - times[end - 1] <= gap;) ++end;
+      pen.beginPath();
+      for (let k = begin; k < end; ++k) pen.lineTo(x(times[k]), y(high(k)));
+      for (let k = end - 1; k >= begin; --k) pen.lineTo(x(times[k]), y(low(k)));
+      pen.fill();
+    }
     pen.globalAlpha = 1;
   }
-  pen.lineWidth = 1.3 * ratio;
-  pen.setLineDash(dash ? [4 * ratio, 3 * ratio] : []);
+  pen.lineWidth = width * ratio;
+  pen.setLineDash((dash || []).map(length => length * ratio));
   pen.beginPath();
   let on = false;
   for (let k = 0; k < times.length; ++k) {
     const there = isFinite(values[k]);
+    if (k > 0 && times[k] - times[k - 1] > gap) on = false;
     if (there) on ? pen.lineTo(x(times[k]), y(values[k])) : pen.moveTo(x(times[k]), y(values[k]));
     on = there;
   }

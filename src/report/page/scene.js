@@ -33,6 +33,48 @@ function drawCenterline(pen, camera, scale, nodes, color, ratio, dash) {
   }
 }
 
+// An ellipse that two standard deviations about a world point look like; `covariance` xx xy xz yy yz zz, m^2.
+function drawSpread(pen, camera, scale, point, covariance, color, ratio) {
+  const at = pixelOf(camera, scale, point), [x, y, z] = turnBack(camera.pose, minus(point, camera.pose.slice(9)));
+  if (!at) return;
+  const [xx, xy, xz, yy, yz, zz] = covariance, fx = scale * camera.fx / z, fy = scale * camera.fy / z;
+  const times = v => [xx * v[0] + xy * v[1] + xz * v[2], xy * v[0] + yy * v[1] + yz * v[2], xz * v[0] + yz * v[1] + zz * v[2]];
+  const u = turn(camera.pose, [fx, 0, -fx * x / z]), v = turn(camera.pose, [0, fy, -fy * y / z]);
+  const a = dot(u, times(u)), b = dot(u, times(v)), d = dot(v, times(v));
+  const middle = (a + d) / 2, radius = Math.hypot((a - d) / 2, b), root = w => 2 * Math.sqrt(Math.max(0, w));
+  pen.beginPath();
+  pen.ellipse(at[0], at[1], root(middle + radius), root(middle - radius), 0.5 * Math.atan2(2 * b, a - d), 0, 2 * Math.PI);
+  pen.fillStyle = pen.strokeStyle = color;
+  pen.globalAlpha = 0.14;
+  pen.fill();
+  pen.globalAlpha = 0.7;
+  pen.lineWidth = ratio;
+  pen.stroke();
+  pen.globalAlpha = 1;
+}
+
+// A force: an arrow from where it acts, the spread of where its head may be, and how large it is. `length`: m a unit.
+// Dashed where the rope rests and friction may hide a part of it.
+function drawForce(pen, camera, scale, push, length, text, color, ratio) {
+  const head = add(push.point, scaled(push.force, length)), from = pixelOf(camera, scale, push.point), to = pixelOf(camera, scale, head);
+  if (!from || !to) return;
+  drawSpread(pen, camera, scale, head, scaled(push.covariance, length * length), color, ratio);
+  strokeLine(pen, camera, scale, [push.point, head], color, 3 * ratio, push.moving ? null : [6 * ratio, 4 * ratio]);
+  const reach = Math.hypot(to[0] - from[0], to[1] - from[1]), size = Math.min(11 * ratio, 0.6 * reach);
+  const along = reach > 0 ? [(to[0] - from[0]) / reach, (to[1] - from[1]) / reach] : [1, 0];
+  pen.fillStyle = color;
+  pen.beginPath();
+  for (const [back, aside] of [[-0.2, 0], [1, 0.5], [1, -0.5]])
+    pen.lineTo(to[0] - size * (back * along[0] - aside * along[1]), to[1] - size * (back * along[1] + aside * along[0]));
+  pen.fill();
+  pen.beginPath();
+  pen.arc(from[0], from[1], 4 * ratio, 0, 7);
+  pen.fill();
+  pen.font = `600 ${13 * ratio}px sans-serif`;
+  const room = pen.measureText(text).width, edge = 4 * ratio, aside = along[0] < 0 ? -room - 10 * ratio : 10 * ratio;
+  pen.fillText(text, Math.max(edge, Math.min(pen.canvas.width - room - edge, to[0] + aside)), to[1] - 8 * ratio);
+}
+
 // Every joint's axes through its point, one color an axis of a joint.
 function drawAxes(pen, camera, scale, chain, poses, colors, ratio) {
   const nodes = nodesOf(chain, poses), half = 1.5 * chain.diameter;

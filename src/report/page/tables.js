@@ -39,7 +39,22 @@ function lookButton(text, look) {
   return element('button', text, {className: 'look', onclick: look});
 }
 
-function fillVerdict(box, report, look) {
+// "0.42 \u00b1 0.05 N at 2.40 s, 0.180 \u00b1 0.004 m from the grasp", with what friction at rest may hide.
+function forceText({largest, unit}) {
+  const {value, error, least, most, arclength, arclength_error: spread, time} = largest;
+  const hidden = most > value + 2.01 * error || least < Math.max(0, value - 2.01 * error);  // more than two errors
+  return withError(value, error) + ' ' + unit + (hidden ? ` (friction at rest leaves ${figure(least, 2)} to ${figure(most, 2)})` : '') +
+    ` at ${time.toFixed(2)} s, ${spread > 0 ? withError(arclength, spread) : figure(arclength)} m from the grasp`;
+}
+
+// The error with two significant digits, the value with as many decimals.
+function withError(value, error) {
+  if (!(error > 0) || !isFinite(error)) return figure(value);
+  const decimals = Math.max(0, Math.min(9, 1 - Math.floor(Math.log10(error))));
+  return value.toFixed(decimals) + ' \u00b1 ' + error.toFixed(decimals);
+}
+
+function fillVerdict(box, report, look, lookAt) {
   const findings = report.verdict || [], doubts = findings.filter(f => !f.trusted);
   const [word, kind] = report.trusted === undefined ? ['not examined', 'doubt'] : !report.trusted ? ['do not trust this twin', 'bad']
     : findings.length ? ['trusted, with remarks', 'doubt'] : ['trusted', 'good'];
@@ -55,6 +70,12 @@ function fillVerdict(box, report, look) {
     if (!worst) continue;
     const line = element('li', `${camera.name}: the ${worst.motion} twin fits worst at ${worst.time.toFixed(2)} s, overlap ${figure(worst.iou)} `);
     line.append(lookButton('look', () => look(camera.name, worst.frame, worst.motion)));
+    list.append(line);
+  }
+  if (report.forces) {
+    const {largest} = report.forces;
+    const line = element('li', largest ? `Largest force from outside: ${forceText(report.forces)} ` : 'Nothing touched the rope while it was followed.');
+    if (largest) line.append(lookButton('look', () => lookAt(largest.time, 'followed')));
     list.append(line);
   }
   const common = ['log_stiffness', 'log_damping', 'log_drag'], poor = (report.weak || []).filter(w => common.includes(w[0]));
@@ -74,6 +95,23 @@ function worstFrame(report, camera) {
     });
   }
   return worst;
+}
+
+// What was followed and what pushed it, above and below the plot of the forces.
+function fillFollowed(above, below, motion, forces, look) {
+  const {time, gap, frames, own} = motion;
+  let gaps = 0;
+  for (let k = 1; k < time.length; ++k) gaps += time[k] - time[k - 1] > gap;
+  above.append(element('p', `${frames} frames from ${time[0].toFixed(2)} to ${time[time.length - 1].toFixed(2)} s` +
+    (gaps ? `, interrupted ${gaps === 1 ? 'once' : gaps + ' times'}` : '') +
+    (own ? '.' : '; of another recording than the twin was made from, with a clock of its own.')));
+  if (!forces) return;
+  const line = element('p', forces.largest ? `Largest force from outside: ${forceText(forces)} ` : 'Nothing touched the rope.');
+  if (forces.largest) line.append(lookButton('look', look));
+  above.append(line);
+  below.textContent = `Force from outside \u00b1 2 \u03c3${forces.hidden ? ' and what friction at rest may hide' : ''}, thick where something touches the rope. ` +
+    `In the replay 10 cm of an arrow are ${figure(0.1 / forces.length, 2)} ${forces.unit}; around its head are 2 \u03c3` +
+    (forces.hidden ? ', and it is dashed where friction at rest may hide a part.' : '.');
 }
 
 const metricColumns = [['psnr_object', 'object PSNR, dB', 1, 1], ['psnr', 'PSNR, dB', 1, 1], ['iou', 'overlap (IoU)', 1, 3],
