@@ -221,9 +221,9 @@ Json forces_json(const twin::Twin& twin, const std::vector<force::Estimate>& for
   constexpr std::uint8_t kTouching = 1, kMoving = 2;
   constexpr double kLongest = 0.8;  // of the rope, the longest arrow: it shall stay in the picture
   const force::Estimate* const most = largest(forces);
-  // as in the live window a force as large as the rope's weight is half as long as the rope
+  // a force as large as the rope's weight is as long as the rope
   const double weight = dynamics::total_mass(*twin.parameters) * twin.parameters->gravity.norm();
-  double length = 0.5 * twin.chain.length / weight;
+  double length = twin.chain.length / weight;
   if (most) length = std::min(length, kLongest * twin.chain.length / size_of(*most).value);
   std::vector<double> values, times;
   std::vector<std::uint8_t> flags;

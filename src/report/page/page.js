@@ -140,12 +140,17 @@ function drawStage() {
 
 const columnOf = (values, count, k) => Float64Array.from({length: values.length / count}, (_, i) => values[i * count + k] * radiansToDegrees);
 
+// Single angles are known much worse than the shape that they make together (neighbors' errors cancel): of a rope that was
+// followed with many of them the bands would hide all curves.
+const mostBands = 12;
+const hasBand = motion => motion.sigma && (motion !== followed || chain.angles.length <= mostBands || Number(at('angle').value) >= 0);
+
 function angleCurves(motion) {
   const count = chain.angles.length, chosen = Number(at('angle').value), curves = [];
   for (let k = 0; k < count; ++k)
     if (chosen < 0 || chosen === k)
       curves.push({times: motion.time, values: columnOf(motion.theta, count, k), dash: styles[motion.name].dash, gap: motion.gap,
-                   band: motion.sigma && columnOf(motion.sigma, count, k).map(s => 2 * s),
+                   band: hasBand(motion) && columnOf(motion.sigma, count, k).map(s => 2 * s),
                    color: chosen < 0 ? `hsl(${300 * k / count} 60% 52%)` : motionInk(motion)});
   return curves;
 }
@@ -168,12 +173,12 @@ function overlapCurves() {
   return curves;
 }
 
-// Thick where something touches the rope.
+// Thick where something touches the rope, and pale where nothing does.
 function forceCurves() {
-  const {time: times, values, flags, gap} = report.forces, column = c => Float32Array.from(times, (_, k) => values[16 * k + c]);
-  const size = column(12), color = ink('push');
-  return [{times, values: size, between: [column(14), column(15)], gap, color},
-          {times, values: size.map((v, k) => flags[k] & 1 ? v : NaN), gap, color, width: 3}];
+  const {time: times, values, flags, gap} = report.forces, color = ink('push');
+  const column = (c, all) => Float32Array.from(times, (_, k) => all || flags[k] & 1 ? values[16 * k + c] : NaN);
+  return [{times, values: column(12, true), between: [column(14, true), column(15, true)], gap, color, shade: 0.06},
+          {times, values: column(12), between: [column(14), column(15)], gap, color, width: 3, shade: 0.2}];
 }
 
 function drawPlots() {
@@ -237,10 +242,15 @@ function setMotion(index) {
     first = Math.min(...shown.map(m => m.time[0])), last = Math.max(...shown.map(m => m.time[m.time.length - 1]));
     at('time').min = first, at('time').max = last;
     state.orbit = freshOrbit();
-    legend('legend_angles', shown.map(m => [m.name + (m.sigma ? ' \u00b1 2 \u03c3' : ''), styles[m.name].color, styles[m.name].line]));
     setTime(state.time);
   }
+  sayAngles();
   redraw();
+}
+
+function sayAngles() {
+  legend('legend_angles', together().map(m => [m.name + (hasBand(m) ? ' \u00b1 2 \u03c3' : m.sigma ? ' (\u00b1 2 \u03c3 of one angle)' : ''),
+                                               styles[m.name].color, styles[m.name].line]));
 }
 
 // A moment of a camera, by the names that findings and metrics use.
@@ -279,7 +289,8 @@ function play(on) {
 function listen() {
   at('time').oninput = event => setTime(Number(event.target.value));
   at('play').onclick = () => play(!state.playing);
-  at('angle').onchange = at('wipe').oninput = redraw;
+  at('angle').onchange = () => { sayAngles(); redraw(); };
+  at('wipe').oninput = redraw;
   at('mode').onchange = event => {
     state.mode = event.target.value;
     at('wipe').hidden = state.mode !== 'wipe';

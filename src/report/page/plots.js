@@ -1,5 +1,6 @@
-// Curves over time on a canvas: { times, values, band, color, dash, gap, width } each, bands of two standard deviations
-// around them, or what is `between` [low, high]. Steps in time that are longer than the gap interrupt a curve.
+// Curves over time on a canvas: { times, values, band, color, dash, gap, width, shade } each, bands of two standard
+// deviations around them, or what is `between` [low, high]. What is no number and steps in time that are longer than the
+// gap interrupt curves and bands.
 
 function drawPlot(canvas, curves, unit, cursor, colors) {
   const ratio = devicePixelRatio || 1, pen = canvas.getContext('2d');
@@ -50,13 +51,15 @@ function extent(values) {
   return [low, high];
 }
 
-function drawCurve(pen, {times, values, band, between, color, dash, gap = Infinity, width = 1.3}, x, y, ratio) {
+function drawCurve(pen, {times, values, band, between, color, dash, gap = Infinity, width = 1.3, shade = 0.16}, x, y, ratio) {
   pen.fillStyle = pen.strokeStyle = color;
   if (band || between) {
     const low = k => between ? between[0][k] : values[k] - band[k], high = k => between ? between[1][k] : values[k] + band[k];
-    pen.globalAlpha = 0.16;
+    const known = k => isFinite(high(k) - low(k));
+    pen.globalAlpha = shade;
     for (let begin = 0, end; begin < times.length; begin = end) {
-      for (end = begin + 1; end < times.length && times[end] - times[end - 1] <= gap;) ++end;
+      for (end = begin + 1; end < times.length && times[end] - times[end - 1] <= gap && known(end) === known(begin);) ++end;
+      if (!known(begin)) continue;
       pen.beginPath();
       for (let k = begin; k < end; ++k) pen.lineTo(x(times[k]), y(high(k)));
       for (let k = end - 1; k >= begin; --k) pen.lineTo(x(times[k]), y(low(k)));

@@ -109,7 +109,7 @@ function fillFollowed(above, below, motion, forces, look) {
   const line = element('p', forces.largest ? `Largest force from outside: ${forceText(forces)} ` : 'Nothing touched the rope.');
   if (forces.largest) line.append(lookButton('look', look));
   above.append(line);
-  below.textContent = `Force from outside \u00b1 2 \u03c3${forces.hidden ? ' and what friction at rest may hide' : ''}, thick where something touches the rope. ` +
+  below.textContent = `Force from outside \u00b1 2 \u03c3${forces.hidden ? ' and what friction at rest may hide' : ''}, thick where something touches the rope, pale where nothing does. ` +
     `In the replay 10 cm of an arrow are ${figure(0.1 / forces.length, 2)} ${forces.unit}; around its head are 2 \u03c3` +
     (forces.hidden ? ', and it is dashed where friction at rest may hide a part.' : '.');
 }
