@@ -32,6 +32,7 @@ function checkFollowed() {
   setTime(followed.time[followed.time.length - 1] + 2 * followed.gap);
   state.time = followed.time[followed.time.length - 1] + 2 * followed.gap;
   drawNow();
+  checks.lost = followed.time.some((t, k) => k > 0 && t - followed.time[k - 1] > followed.gap && !isKnown(followed, t - followed.gap / 2));
   checks.beyond = at('splats').style.visibility === 'hidden' && at('hint').textContent === 'not followed at this time';
   if (!forces) return;
   const arrow = k => {
