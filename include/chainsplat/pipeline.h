@@ -108,7 +108,7 @@ IdentifyResult identify(const std::vector<Path>& runs, const IdentifyOptions& op
                         const core::Listener& listener = {});
 
 struct MarkerOptions {
-  bool shape_only = false;                  // fit the states, identify nothing
+  bool shape_only = false;  // fit the states, identify nothing
   std::optional<capture::Payload> payload;  // instead of what the twin knows of it
   std::uint64_t seed = 0;
 };

@@ -223,7 +223,7 @@ Json forces_json(const twin::Twin& twin, const std::vector<force::Estimate>& for
   const force::Estimate* const most = largest(forces);
   // a force as large as the rope's weight is as long as the rope
   const double weight = dynamics::total_mass(*twin.parameters) * twin.parameters->gravity.norm();
-  double length = twin.chain.length / weight;
+  double length = weight > 0.0 ? twin.chain.length / weight : twin.chain.length;
   if (most) length = std::min(length, kLongest * twin.chain.length / size_of(*most).value);
   std::vector<double> values, times;
   std::vector<std::uint8_t> flags;
