@@ -170,6 +170,11 @@ drive "$work/apart.html" apart 1000 11
 check apart '"followed":true' '"apart":true' '"videos":false' '"beyond":true' '"arrow":true' '"no_arrow":true' '"about":"20 frames from 1000.00 to 1000.77 s, interrupted once; of another'
 drive "$work/estimate.html" estimate 1000 11
 check estimate '"followed":true' '"apart":false' '"beyond":true'
+sed 's/"touching": true/"touching": false/' "$work/forces.jsonl" >"$work/calm.jsonl"
+run report "$work/run" -o "$work/calm.html" --estimate "$work/lines.jsonl" --forces "$work/calm.jsonl"
+expect_code 0 'report of forces that touch nothing'
+drive "$work/calm.html" calm 1000 11
+check calm '"followed":true' '"arrow":"none"' '"no_arrow":true' '"plot":true' '"largest":"Nothing touched the rope'
 
 # one moment alone, as a link asks for it, pixel by pixel on the screen
 timeout 300 "$browser" --headless --no-sandbox --user-data-dir="$work/profile" --hide-scrollbars --window-size=320,240 \

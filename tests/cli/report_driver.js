@@ -44,10 +44,13 @@ function checkFollowed() {
     toggles.push(true);
     return shown !== hidden && overlay() === shown;
   };
-  checks.arrow = arrow(forces.flags.findIndex(flag => flag & 1));
+  const touched = forces.flags.findIndex(flag => flag & 1);
+  checks.arrow = touched < 0 ? 'none' : arrow(touched);
   checks.no_arrow = !arrow(forces.flags.findIndex(flag => !(flag & 1)));
-  const pen = at('plot_force').getContext('2d'), {data} = pen.getImageData(0, 0, at('plot_force').width, at('plot_force').height);
-  checks.plot = data.some(value => value > 0);
+  const {width, height} = at('plot_force'), {data} = at('plot_force').getContext('2d').getImageData(0, 0, width, height);
+  let curve = 0;  // pixels of the forces' color, red and blue
+  for (let i = 0; i < data.length; i += 4) curve += data[i + 3] > 100 && data[i] > data[i + 1] + 60 && data[i + 2] > data[i + 1] + 30;
+  checks.plot = curve > width / 2;
   checks.largest = [...document.querySelectorAll('#verdict li')].map(line => line.textContent).find(text => text.includes('force'));
 }
 

@@ -140,10 +140,10 @@ function drawStage() {
 
 const columnOf = (values, count, k) => Float64Array.from({length: values.length / count}, (_, i) => values[i * count + k] * radiansToDegrees);
 
-// Single angles are known much worse than the shape that they make together (neighbors' errors cancel): of a rope that was
-// followed with many of them the bands would hide all curves.
+// Single angles are known much worse than the shape that they make together (neighbors' errors cancel): of many of them
+// the bands would hide all curves.
 const mostBands = 12;
-const hasBand = motion => motion.sigma && (motion !== followed || chain.angles.length <= mostBands || Number(at('angle').value) >= 0);
+const hasBand = motion => motion.sigma && (chain.angles.length <= mostBands || Number(at('angle').value) >= 0);
 
 function angleCurves(motion) {
   const count = chain.angles.length, chosen = Number(at('angle').value), curves = [];

@@ -8,7 +8,8 @@ function drawPlot(canvas, curves, unit, cursor, colors) {
   const left = 46 * ratio, bottom = height - 18 * ratio, top = 8 * ratio, right = width - 6 * ratio;
   let [start, end, low, high] = [Infinity, -Infinity, Infinity, -Infinity];
   for (const {times, values, band, between} of curves) {
-    if (between) low = Math.min(low, ...extent(between[0])), high = Math.max(high, ...extent(between[1]));
+    for (const bound of between || [])
+      for (const v of extent(bound)) low = Math.min(low, v), high = Math.max(high, v);
     start = Math.min(start, times[0]), end = Math.max(end, times[times.length - 1]);
     values.forEach((v, k) => {
       const b = band && isFinite(band[k]) ? band[k] : 0;
@@ -44,11 +45,11 @@ function drawPlot(canvas, curves, unit, cursor, colors) {
   canvas.timeAt = place => start + (place * ratio - left) / (right - left) * (end - start);
 }
 
-// Least and largest finite number, without a limit on how many there are.
+// Least and largest finite number, without a limit on how many there are; nothing where none is finite.
 function extent(values) {
   let [low, high] = [Infinity, -Infinity];
   for (const v of values) if (isFinite(v)) low = Math.min(low, v), high = Math.max(high, v);
-  return [low, high];
+  return low <= high ? [low, high] : [];
 }
 
 function drawCurve(pen, {times, values, band, between, color, dash, gap = Infinity, width = 1.3, shade = 0.16}, x, y, ratio) {
