@@ -249,8 +249,9 @@ function setMotion(index) {
 }
 
 function sayAngles() {
-  legend('legend_angles', together().map(m => [m.name + (hasBand(m) ? ' \u00b1 2 \u03c3' : m.sigma ? ' (\u00b1 2 \u03c3 of one angle)' : ''),
-                                               styles[m.name].color, styles[m.name].line]));
+  const shown = together();
+  legend('legend_angles', shown.map(m => [m.name + (hasBand(m) ? ' \u00b1 2 \u03c3' : ''), styles[m.name].color, styles[m.name].line]));
+  if (shown.some(m => m.sigma && !hasBand(m))) at('legend_angles').append(' (a single angle has its \u00b1 2 \u03c3)');
 }
 
 // A moment of a camera, by the names that findings and metrics use.
