@@ -490,6 +490,14 @@ TEST_CASE("other programs' splats are read; damaged ones are refused") {
   CHECK(g.mean == std::vector<float>{5, 6, 7});
   CHECK(g.sh == std::vector<float>{12, 13, 14});
 
+  // which are guessed is told only where some are
+  splat::Gaussians some = test::small_twin(chain::Bending::planar, 20).gaussians;
+  CHECK(twin::gaussians_ply(some).find("guessed") == std::string::npos);
+  some.guessed[7] = 1;
+  core::write_file(file, twin::gaussians_ply(some));
+  CHECK(twin::read_ply(file).guessed == some.guessed);
+  CHECK(twin::read_ply(file).link_logits == some.link_logits);
+
   const std::string good = twin::gaussians_ply(test::small_twin(chain::Bending::planar, 20).gaussians);
   for (std::size_t size = 0; size < good.size(); size += 53) {
     core::write_file(file, good.substr(0, size));

@@ -23,7 +23,9 @@ struct Options {
   int every = 5;  // frames that train the Gaussians
   Mode mode = Mode::fast;
   std::uint64_t seed = 0;
-  int budget = 0;  // most Gaussians (fast); 0: 100 a diameter of the rope's length (1,500 for 30 cm of 2 cm)
+  // Most Gaussians that train (fast); 0: 100 a diameter of the rope's length (1,500 for 30 cm of 2 cm). What no camera
+  // saw gets others, as dense.
+  int budget = 0;
   int paper_gaussians = 5000;
   int paper_iterations = 30000;
   double step = 1.0;    // of Adam's usual step sizes (fast); lowered by itself where the optimization runs away

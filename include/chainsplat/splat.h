@@ -27,6 +27,8 @@ struct Gaussians {
   std::vector<float> opacity_logit;  // count
   std::vector<float> sh;             // count x (degree+1)^2 x 3: RGB of one coefficient after the other
   std::vector<float> link_logits;    // count x links
+  // count; 1: no camera saw it, its place and color are guessed. What trained or drew them does not give it back.
+  std::vector<std::uint8_t> guessed;
   int sh_coefficients() const { return (degree + 1) * (degree + 1); }
   void resize(int count, int links, int degree);  // keeps existing rows; new ones are zero, with rotation (1, 0, 0, 0)
 };

@@ -218,6 +218,7 @@ void add_gaussians(Arrays& arrays, const splat::Gaussians& g) {
   arrays.floats("gaussian_opacity", {count}, opacity);
   arrays.floats("gaussian_sh", {count, terms, 3}, g.sh);
   arrays.floats("gaussian_link_probability", {count, links}, probability);
+  arrays.floats("gaussian_guessed", {count}, {g.guessed.begin(), g.guessed.end()});
 }
 
 }  // namespace

@@ -372,9 +372,9 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   if (job.first_round <= kRounds) {
     train_round(job, engine, kRounds);
     job.gaussians = engine.gaussians();
-    guess_unseen(job, specs);  // without a gradient Adam moves them, too
     save(job, engine, kRounds + 1, 0);
   }
+  guess_unseen(job, specs);  // again: without a gradient Adam moves them, too
   refine_all_frames(job, engine);
   job.result.gaussians = std::move(job.gaussians);
   job.result.states = std::move(job.states);

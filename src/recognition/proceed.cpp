@@ -4,6 +4,7 @@
 
 #include "src/math/decompositions.h"
 #include "src/recognition/modes.h"
+#include "src/recognition/unseen.h"
 
 namespace chainsplat::recognition {
 
@@ -55,7 +56,9 @@ void polish(gpu::Device& device, const capture::Capture& capture, const chain::C
     const std::vector<int> batch = draw_batch(deck, kBatch, static_cast<int>(specs.size()), random);
     engine.step(batch, kLossWeights, rates(static_cast<double>(step) / steps, 1.0), false);
   }
-  gaussians = engine.gaussians();
+  splat::Gaussians trained = engine.gaussians();
+  keep_guessed(gaussians, trained);  // what no camera sees has no gradient, but Adam moves it
+  gaussians = std::move(trained);
 }
 
 }  // namespace chainsplat::recognition

@@ -19,21 +19,20 @@ constexpr double kTurn = 2.0 * std::numbers::pi;
 constexpr int kColumns = 36;          // of cells around the tube
 constexpr double kCellLength = 0.15;  // diameters along it
 constexpr double kUnseen = -0.05;     // largest cosine between surface normal and view ray of what no camera saw: what
-                                   // lies at the limb shapes the outline
-constexpr double kTrusted = 0.4;     // least cosine of a color that others are taken from
-constexpr double kReach = 0.12;      // diameters, over which colors are averaged
-constexpr double kInside = 0.4;      // of the radius: what is closer to the axis has no side
-constexpr double kSpacing = 0.16;    // diameters, of the layer that is put there: about that of what was seen
-constexpr double kThickness = 0.04;  // diameters, sigma across the surface
-constexpr double kCoverage = 0.5;    // sigma along the surface in units of the spacing
-constexpr float kOpaque = 3.0f;      // logit, 0.95
-constexpr float kHard = 12.0f;       // logit of the own link
-constexpr double kHidden = 0.2;      // least share of the pictures that show something else where the rope must be
-constexpr double kSteepest = 4.0;    // radii per radian, of a helix
-constexpr int kSlopes = 161;         // that are tried
-constexpr double kRepeats = 0.3;     // least correlation of a texture with itself along a helix
-constexpr double kLit = 0.5;         // least share of what differs around the rope that its light must explain
-constexpr double kDarkest = 0.2;     // of the mean light: what lies around a rope reaches every side of it
+                                      // lies at the limb shapes the outline
+constexpr double kTrusted = 0.4;      // least cosine of a color that others are taken from
+constexpr double kReach = 0.12;       // diameters, over which colors are averaged
+constexpr double kInside = 0.4;       // of the radius: what is closer to the axis has no side
+constexpr double kThickness = 0.04;   // diameters, sigma across the surface
+constexpr double kCoverage = 0.5;     // sigma along the surface in units of the spacing
+constexpr float kOpaque = 3.0f;       // logit, 0.95
+constexpr float kHard = 12.0f;        // logit of the own link
+constexpr double kHidden = 0.2;       // least share of the pictures that show something else where the rope must be
+constexpr double kSteepest = 4.0;     // radii per radian, of a helix
+constexpr int kSlopes = 161;          // that are tried
+constexpr double kRepeats = 0.3;      // least correlation of a texture with itself along a helix
+constexpr double kLit = 0.5;          // least share of what differs around the rope that its light must explain
+constexpr double kDarkest = 0.2;      // of the mean light: what lies around a rope reaches every side of it
 
 // Cells of the surface at home: row i of arclength, column j of angle about the axis, from the bending axis on.
 struct Surface {
@@ -234,9 +233,9 @@ struct Guess {
   double arclength, angle;
   Vector3 color;
 };
-std::vector<Guess> guesses(const Surface& surface, double radius) {
+std::vector<Guess> guesses(const Surface& surface, double radius, double spacing) {
   const chain::Chain& chain = surface.chain;
-  const double slope = slope_of_texture(surface), spacing = kSpacing * chain.diameter;
+  const double slope = slope_of_texture(surface);
   const Light light = light_of(surface);
   const int rows = std::max(1, static_cast<int>(chain.length / spacing)),
             columns = std::max(3, static_cast<int>(kTurn * radius / spacing));
@@ -253,14 +252,15 @@ std::vector<Guess> guesses(const Surface& surface, double radius) {
   return out;
 }
 
-void put(const chain::Chain& chain, const Guess& guess, double radius, int i, splat::Gaussians& gaussians,
-         const Surface& surface) {
+void put(const Surface& surface, const Guess& guess, double radius, double spacing, int i,
+         splat::Gaussians& gaussians) {
+  const chain::Chain& chain = surface.chain;
   const Vector3 normal = surface.normal(guess.angle);
   const Vector3 mean = guess.arclength * chain.direction + radius * normal;
   math::Matrix3 axes;  // along the rope, around it, across the surface
   axes << chain.direction, normal.cross(chain.direction), normal;
   const Eigen::Quaterniond turn(axes);
-  const double along = kCoverage * kSpacing * chain.diameter;
+  const double along = kCoverage * spacing;
   const double sizes[3] = {along, along, kThickness * chain.diameter};
   for (int c = 0; c < 3; ++c) {
     gaussians.mean[3 * i + c] = static_cast<float>(mean[c]);
@@ -271,6 +271,7 @@ void put(const chain::Chain& chain, const Guess& guess, double radius, int i, sp
   gaussians.opacity_logit[i] = kOpaque;
   gaussians.link_logits[gaussians.links * i + chain::link_at(chain, guess.arclength)] = kHard;
   splat::set_base_color(gaussians, i, guess.color);
+  gaussians.guessed[i] = 1;
 }
 
 }  // namespace
@@ -294,12 +295,23 @@ int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, s
   if (radii.empty()) return 0;
   const double radius = math::median(radii);
   color_trusted(gaussians, places, radius, surface);
-  const std::vector<Guess> found = guesses(surface, radius);
+  // as dense as where it was seen
+  const double cells = static_cast<double>(
+      std::count_if(surface.facing.begin(), surface.facing.end(), [](double facing) { return facing >= kTrusted; }));
+  const double area = cells / static_cast<double>(surface.facing.size()) * kTurn * radius * chain.length;
+  const double spacing = std::sqrt(area / static_cast<double>(radii.size()));
+  const std::vector<Guess> found = guesses(surface, radius, spacing);
   if (found.empty()) return 0;
   gaussians = rows_of(gaussians, kept, static_cast<int>(found.size()));
   for (std::size_t i = 0; i < found.size(); ++i)
-    put(chain, found[i], radius, static_cast<int>(kept.size() + i), gaussians, surface);
+    put(surface, found[i], radius, spacing, static_cast<int>(kept.size() + i), gaussians);
   return static_cast<int>(found.size());
+}
+
+void keep_guessed(const splat::Gaussians& before, splat::Gaussians& trained) {
+  CHAINSPLAT_CHECK(before.count == trained.count && before.degree == trained.degree, std::to_string(trained.count));
+  for (int i = 0; i < before.count; ++i)
+    if (before.guessed[i]) copy_row(before, i, trained, i);
 }
 
 }  // namespace chainsplat::recognition

@@ -21,7 +21,11 @@ struct Viewpoint {
 // seen, with the colors that the texture has around the axis there: ropes are laid or braided, so that what repeats
 // does so along a helix, whose slope is found from what was seen; where nothing repeats, the color at the same
 // arclength. The light of that side is found from how brightness changes around what was seen. Where masks show that
-// something hides the rope, as a gripper does, all stays. design.md, 'Recognition'. Returns how many these are.
+// something hides the rope, as a gripper does, all stays. design.md, 'Recognition'. They are marked as guessed. Returns how
+// many these are.
 int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, splat::Gaussians& gaussians);
+
+// Puts back, after more training, those of `before` that are guessed. Both have the same count and degree.
+void keep_guessed(const splat::Gaussians& before, splat::Gaussians& trained);
 
 }  // namespace chainsplat::recognition

@@ -83,7 +83,7 @@ Json chain_json(const chain::Chain& chain) {
 Json splats_json(const splat::Gaussians& g) {
   const int coefficients = g.sh_coefficients();
   std::vector<float> values;
-  std::vector<std::uint8_t> link;
+  std::vector<std::uint8_t> link, guessed;
   for (int i = 0; i < g.count; ++i) {
     Eigen::Quaterniond q(g.rotation[4 * i], g.rotation[4 * i + 1], g.rotation[4 * i + 2], g.rotation[4 * i + 3]);
     Matrix3 half = q.normalized().toRotationMatrix();
@@ -98,6 +98,7 @@ Json splats_json(const splat::Gaussians& g) {
       const double alpha = opacity * std::exp(static_cast<double>(first[j] - most)) / sum;
       if (alpha <= image_model::kLeastAlpha) continue;
       link.push_back(static_cast<std::uint8_t>(j));
+      guessed.push_back(g.guessed[i]);
       for (int c = 0; c < 3; ++c) values.push_back(g.mean[3 * i + c]);
       for (int row = 0; row < 3; ++row)
         for (int column = row; column < 3; ++column) values.push_back(static_cast<float>(covariance(row, column)));
@@ -111,6 +112,7 @@ Json splats_json(const splat::Gaussians& g) {
           {"degree", g.degree},
           {"stride", 10 + 3 * coefficients},
           {"link", binary<std::uint8_t>(link)},
+          {"guessed", binary<std::uint8_t>(guessed)},
           {"values", binary<float>(values)}};
 }
 

@@ -24,6 +24,7 @@ void Gaussians::resize(int new_count, int new_links, int new_degree) {
   opacity_logit.resize(new_count, 0.0f);
   link_logits.resize(static_cast<std::size_t>(new_count) * links, 0.0f);
   rotation.resize(4 * new_count, 0.0f);
+  guessed.resize(new_count, 0);
   for (int i = old_count; i < new_count; ++i) rotation[4 * i] = 1.0f;
   count = new_count;
 }

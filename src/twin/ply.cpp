@@ -24,6 +24,8 @@ std::size_t rest_index(const splat::Gaussians& g, int gaussian, int channel, int
   return 3u * (static_cast<std::size_t>(g.sh_coefficients()) * gaussian + coefficient) + channel;
 }
 
+constexpr const char* kGuessed = "guessed";  // a property that files may have: 1 where no camera saw the Gaussian
+
 std::vector<std::string> property_names(int coefficients, int links) {
   std::vector<std::string> names{"x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"};
   for (int k = 0; k < 3 * (coefficients - 1); ++k) names.push_back("f_rest_" + std::to_string(k));
@@ -126,7 +128,9 @@ std::string gaussians_ply(const splat::Gaussians& g) {
       "comment logit opacity, ln scale, quaternion wxyz; link_*: logits of the link probability\n"
       "element vertex " +
       std::to_string(g.count) + "\n";
-  const std::vector<std::string> names = property_names(coefficients, g.links);
+  std::vector<std::string> names = property_names(coefficients, g.links);
+  const bool guessed = std::find(g.guessed.begin(), g.guessed.end(), 1) != g.guessed.end();
+  if (guessed) names.push_back(kGuessed);
   for (const std::string& name : names) bytes += "property float " + name + "\n";
   bytes += "end_header\n";
   std::vector<float> row;
@@ -142,6 +146,7 @@ std::string gaussians_ply(const splat::Gaussians& g) {
     row.insert(row.end(), g.rotation.begin() + 4 * i, g.rotation.begin() + 4 * (i + 1));
     const auto links = g.link_logits.begin() + static_cast<std::ptrdiff_t>(g.links) * i;
     row.insert(row.end(), links, links + g.links);
+    if (guessed) row.push_back(static_cast<float>(g.guessed[i]));
     bytes.append(reinterpret_cast<const char*>(row.data()), sizeof(float) * row.size());
   }
   return bytes;
@@ -174,6 +179,9 @@ splat::Gaussians read_ply(const Path& path) {
     offsets.push_back(normal ? 0 : header.properties.at(name).offset);
   }
 
+  const bool guessed = header.has_float(kGuessed);
+  if (guessed) offsets.push_back(header.properties.at(kGuessed).offset);
+
   // values, in the order of property_names()
   splat::Gaussians g;
   g.resize(static_cast<int>(header.count), links, degree);
@@ -184,8 +192,10 @@ splat::Gaussians read_ply(const Path& path) {
       float value = 0.0f;
       std::memcpy(&value, vertex + offsets[next], sizeof value);
       if (!std::isfinite(value))
-        throw InputError(file, names[next] + " of Gaussian " + std::to_string(i) + " is not finite",
-                         "remove the Gaussian");
+        throw InputError(
+            file,
+            (next < names.size() ? names[next] : kGuessed) + (" of Gaussian " + std::to_string(i)) + " is not finite",
+            "remove the Gaussian");
       ++next;
       return value;
     };
@@ -202,6 +212,7 @@ splat::Gaussians read_ply(const Path& path) {
       throw InputError(file, "rot_* of Gaussian " + std::to_string(i) + " has no length",
                        "write a quaternion w, x, y, z");
     for (int j = 0; j < links; ++j) g.link_logits[static_cast<std::size_t>(links) * i + j] = next_value();
+    g.guessed[i] = guessed && next_value() != 0.0f ? 1 : 0;
   }
   return g;
 }

@@ -155,7 +155,7 @@ check() {  # name, what must be in it...
 run render "$work/run" --states "$work/run/rollout.csv" --camera "$demo" -o "$work/frames" --mask
 expect_code 0 render
 drive "$page" wide 1200 2,11,20
-check wide '"images":true' 'sections":"replay,verdict,metrics,angles,overlap,identified'
+check wide '"images":true' '"hatch":true' 'sections":"replay,verdict,metrics,angles,overlap,identified'
 python3 "$(dirname "$0")/report_pictures.py" "$work/wide.dom" "$work/frames" 45 40 || fail 'the page draws other pictures than render'
 drive "$work/video.html" phone 400 11
 check phone '"images":true'

@@ -18,6 +18,21 @@ function picture(camera, frame, motion) {
   document.body.append(shot);
 }
 
+// The side that no camera saw is hatched, only on its layer.
+function checkHatch() {
+  if (!paint || !report.splats.guessed.includes(1)) return 'none';
+  const {yaw} = state.orbit, splats = () => { drawNow(); return at('splats').toDataURL(); };
+  const differs = [0, 1, 2, 3, 4, 5, 6, 7].some(eighth => {
+    state.orbit.yaw = eighth * Math.PI / 4;
+    toggles.guessed(false);
+    const plain = splats();
+    toggles.guessed(true);
+    return splats() !== plain;
+  });
+  state.orbit.yaw = yaw;
+  return differs;
+}
+
 // What was followed is shown, and a force only where something touches, only on its layer.
 function checkFollowed() {
   const {forces} = report, overlay = () => { drawNow(); return at('overlay').toDataURL(); };
@@ -84,6 +99,7 @@ async function drive(frames) {
   stage.dispatchEvent(new WheelEvent('wheel', {deltaY: 100, cancelable: true}));
   checks.orbit = state.orbit.yaw !== yaw && state.orbit.distance > distance;
   drawNow();
+  checks.hatch = checkHatch();
   if (followed) checkFollowed();
   checks.width = document.documentElement.scrollWidth <= innerWidth;
   checks.images = document.images.length === 0;

@@ -9,7 +9,10 @@ const radiansToDegrees = 180 / Math.PI;
 function unpack() {
   const {chain, splats} = report;
   chain.axes = Array.from({length: chain.angles.length}, (_, k) => chain.screws.slice(6 * k, 6 * k + 6));
-  if (splats) splats.values = floats(splats.values), splats.link = new Uint8Array(bytes(splats.link));
+  if (splats) {
+    splats.values = floats(splats.values);
+    for (const name of ['link', 'guessed']) splats[name] = new Uint8Array(bytes(splats[name]));
+  }
   for (const motion of report.motions) {
     motion.time = doubles(motion.time), motion.theta = floats(motion.theta), motion.base = floats(motion.base);
     motion.sigma = motion.sigma && floats(motion.sigma);
@@ -44,7 +47,7 @@ const styles = {
 const together = () => motions.filter(m => m.apart === motions[state.motion].apart);
 let first = 0, last = 0;
 const state = {time: -Infinity, motion: motions.length - 1, camera: -1, playing: false, links: false, line: false, axes: false,
-               others: true, push: Boolean(report.forces), mode: 'off', plain: false, orbit: null};
+               others: true, guessed: true, push: Boolean(report.forces), mode: 'off', plain: false, orbit: null};
 const paint = report.splats && makePainter(at('splats'), report.splats, report.model);
 
 function freshOrbit() {
@@ -116,7 +119,7 @@ function drawStage() {
   const canvas = at('overlay'), pen = canvas.getContext('2d'), chosen = report.cameras[state.camera];
   const camera = chosen || orbitCamera(state.orbit, up, canvas.width, canvas.height), scale = canvas.width / camera.width;
   const ratio = state.plain ? 1 : devicePixelRatio || 1, motion = motions[state.motion], poses = linkMotions(chain, motion, state.time);
-  if (paint) paint(camera, poses, state.links ? linkTints : null);
+  if (paint) paint(camera, poses, state.links ? linkTints : null, state.guessed && !state.plain);
   drawVideo();
   pen.clearRect(0, 0, canvas.width, canvas.height);
   if (state.plain) return;
@@ -384,7 +387,9 @@ function fill() {
   ['free view', ...report.cameras.map(c => c.name)].forEach((name, k) => at('cameras').append(element('button', name, {onclick: () => setCamera(k - 1)})));
   motions.forEach((motion, k) => at('motions').append(element('button', motion.name, {onclick: () => setMotion(k)})));
   const layers = [['links', 'link colors'], ['line', 'centerlines'], ['axes', 'screw axes'], ['others', 'cameras and path']];
-  for (const [key, name] of report.forces ? [...layers, ['push', 'forces']] : layers) {
+  if (report.splats && report.splats.guessed.includes(1)) layers.push(['guessed', 'hatch what no camera saw']);
+  if (report.forces) layers.push(['push', 'forces']);
+  for (const [key, name] of layers) {
     const button = element('button', name);
     toggles[key] = on => { state[key] = on; button.setAttribute('aria-pressed', on); redraw(); };
     button.onclick = () => toggles[key](!state[key]);

@@ -18,7 +18,8 @@ function harmonics(degree, x, y, z) {
   return out;
 }
 
-const floatsPerSplat = 10;  // two half axes, center, color with opacity
+const floatsPerSplat = 10;  // two half axes, center, color with opacity, which is negative where it is hatched
+const hatch = 8;  // pixels from line to line, across what no camera saw
 
 function compile(gl, vertex, fragment) {
   const program = gl.createProgram();
@@ -50,9 +51,10 @@ function makePainter(canvas, splats, model) {
     }`, `
     in vec2 place; in vec4 tone; out vec4 result;
     void main() {
-      float alpha = min(${model.mostAlpha}, tone.a * exp(-0.5 * dot(place, place)));
+      float alpha = min(${model.mostAlpha}, abs(tone.a) * exp(-0.5 * dot(place, place)));
       if (alpha < ${model.leastAlpha}) discard;
-      result = vec4(tone.rgb * alpha, alpha);
+      bool dark = tone.a < 0.0 && mod(gl_FragCoord.x + gl_FragCoord.y, ${hatch}.0) < ${hatch / 2}.0;
+      result = vec4((dark ? 0.4 : 1.0) * tone.rgb * alpha, alpha);
     }`);
   const show = compile(gl, `
     void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0, 1); }`, `
@@ -83,9 +85,9 @@ function makePainter(canvas, splats, model) {
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
   }
 
-  return (camera, poses, tint) => {
+  return (camera, poses, tint, hatched) => {
     const scale = canvas.width / camera.width;  // of the canvas over the recorded picture
-    let count = project(splats, camera, scale, poses, tint, model, found, depth);
+    let count = project(splats, camera, scale, poses, tint, hatched, model, found, depth);
     for (let i = 0; i < count; ++i) order[i] = i;
     order.subarray(0, count).sort((a, b) => depth[b] - depth[a]);
     for (let i = 0; i < count; ++i)
@@ -113,8 +115,8 @@ function makePainter(canvas, splats, model) {
 
 // Fills `out` and `depth` with the splats in front of the camera and returns their number. Rows of J R_cw R_link are the
 // image's axes seen in the home configuration, where the covariances are given.
-function project(splats, camera, scale, poses, tint, model, out, depth) {
-  const {values: s, stride, link, count, degree} = splats, view = camera.pose, terms = (degree + 1) ** 2;
+function project(splats, camera, scale, poses, tint, hatched, model, out, depth) {
+  const {values: s, stride, link, guessed, count, degree} = splats, view = camera.pose, terms = (degree + 1) ** 2;
   const fx = camera.fx * scale, fy = camera.fy * scale, cx = camera.cx * scale, cy = camera.cy * scale;
   const lowPass = model.lowPass * scale * scale, eye = view.slice(9);
   const most = [model.clampMargin * 0.5 * camera.width / camera.fx, model.clampMargin * 0.5 * camera.height / camera.fy];
@@ -142,7 +144,7 @@ function project(splats, camera, scale, poses, tint, model, out, depth) {
       for (let t = 0; t < terms; ++t) tone += seen[t] * s[o + 10 + 3 * t + channel];
       out[at + 6 + channel] = tint ? 0.35 * Math.max(0, tone) + 0.65 * tint[link[i] % tint.length][channel] : Math.max(0, tone);
     }
-    out[at + 9] = s[o + 9];
+    out[at + 9] = hatched && guessed[i] ? -s[o + 9] : s[o + 9];
     depth[n++] = z;
   }
   return n;
