@@ -9,6 +9,11 @@ expect_error 2 'length' new -o "$work/bad" --length 0
 expect_error 2 "length: 'nan' is not a number above 0" new -o "$work/bad" --length nan
 expect_error 2 'bending-axis' new -o "$work/bad" --length 0.3 --bending-axis 0,0,1
 expect_error 2 'bending-stiffness: .*mass' new -o "$work/bad" --length 0.3 --bending-stiffness 1e-3
+expect_error 2 'table: .*direction' new -o "$work/bad" --length 0.3 --table 0,0,0
+expect_error 2 'friction: .*table' new -o "$work/bad" --length 0.3 --friction 0.3
+expect_error 2 'bending-stiffness: .*friction' new -o "$work/bad" --length 0.3 --mass 0.06 --bending-stiffness 1e-3 \
+  --table 0,0,0 --direction 1,0,0
+expect_error 2 'table' new -o "$work/bad" --length 0.3 --table 0,0,inf --direction 1,0,0
 [ -e "$work/bad" ] && fail 'new: a refused twin was written'
 
 # a known rod, moved along x, seen at three points
@@ -52,6 +57,33 @@ run identify "$work/twin" --markers "$work/one.csv" --json
 expect_code 0 'identify --json'
 expect_output '"weak"' 'identify --json'
 expect_error 2 '(one|other).csv: is of another rope' identify "$work/twin" --markers "$work/one.csv" "$work/other.csv"
+
+# a rod on a table, moved across: three markers tell its friction
+base 0.1 | awk '{ print $1, 0, $2, 0.01, 0, 0, 0, 1 }' >"$work/table.tum"
+table=(--length 0.3 --joints 4 --mass 0.06 --table 0,0,0 --direction 1,0,0)
+run new -o "$work/table_rod" "${table[@]}" --bending-stiffness 4.5e-4 --retardation 0.08 --friction 0.25
+expect_code 0 'new --table --bending-stiffness'
+run rollout "$work/table_rod" --base "$work/table.tum" --rate 50 -o "$work/states.csv" --centerline "$work/line.csv"
+expect_code 0 'rollout on a table'
+awk -F, -v base="$work/table.tum" 'BEGIN { while ((getline line < base) > 0) { split(line, b, " "); y[b[1] + 0] = b[3] }
+    print "# marker a 0.15\n# marker b 0.225\n# marker c 0.3"
+    print "time,bx,by,bz,bqw,bqx,bqy,bqz,a_x,a_y,a_z,b_x,b_y,b_z,c_x,c_y,c_z" }
+  NR > 1 { t = sprintf("%.2f", $1) + 0
+    printf "%.2f,0,%.9f,0.01,1,0,0,0,%s,%s,%s,%s,%s,%s,%s,%s,%s\n", t, y[t], $11, $12, $13, $14, $15, $16, $17, $18, $19 }
+' "$work/line.csv" >"$work/table.csv"
+run new -o "$work/table_twin" "${table[@]}"
+expect_code 0 'new --table'
+run identify "$work/table_twin" --markers "$work/table.csv"
+expect_code 0 'identify --markers on a table'
+python3 - "$work/table_twin/twin.json" <<'PYTHON' || fail 'identify --markers on a table: another friction or stiffness than the rod has'
+import json, sys
+twin = json.load(open(sys.argv[1]))
+for name, truth in ("friction_coefficient", 0.25), ("bending_stiffness", 4.5e-4):
+    found = twin["properties"][name]
+    print(name, found)
+    assert abs(found["value"] - truth) < 3 * found["sigma"] and 0 < found["sigma"] < truth, (name, found)
+assert twin["chain"]["scenario"] == "tabletop" and "air_quadratic" not in twin["properties"]
+PYTHON
 
 # what was not in its recording is warned of, and what the gripper must hold is the rope's weight in the mean
 run rollout "$work/twin" --base "$work/one.tum" -o "$work/states.csv" --wrench "$work/wrench.csv"
