@@ -11,26 +11,28 @@ expect_error 2 'bending-axis' new -o "$work/bad" --length 0.3 --bending-axis 0,0
 expect_error 2 'bending-stiffness: .*mass' new -o "$work/bad" --length 0.3 --bending-stiffness 1e-3
 expect_error 2 'table: .*direction' new -o "$work/bad" --length 0.3 --table 0,0,0
 expect_error 2 'friction: .*table' new -o "$work/bad" --length 0.3 --friction 0.3
+expect_error 2 'friction: .*bending-stiffness' new -o "$work/bad" --length 0.3 --table 0,0,0 --direction 1,0,0 --friction 0.3
 expect_error 2 'bending-stiffness: .*friction' new -o "$work/bad" --length 0.3 --mass 0.06 --bending-stiffness 1e-3 \
   --table 0,0,0 --direction 1,0,0
 expect_error 2 'table' new -o "$work/bad" --length 0.3 --table 0,0,inf --direction 1,0,0
 [ -e "$work/bad" ] && fail 'new: a refused twin was written'
 
-# a known rod, moved along x, seen at three points
-base() {  # amplitude in m
-  awk -v a="$1" 'BEGIN { for (k = 0; k <= 300; ++k) { t = k / 100; e = 1 - exp(-(t / 0.4) ^ 3)
-    printf "%.2f %.9f 0 0.5 0 0 0 1\n", t, a * e * sin(2 * 3.14159265 * 0.7 * t) } }'
+# a known rod, moved along x, or on a table along y, seen at three points
+base() {  # amplitude in m, axis
+  awk -v a="$1" -v axis="$2" 'BEGIN { for (k = 0; k <= 300; ++k) { t = k / 100; e = 1 - exp(-(t / 0.4) ^ 3)
+    at = a * e * sin(2 * 3.14159265 * 0.7 * t)
+    printf "%.2f %.9f %.9f %s 0 0 0 1\n", t, axis == "x" ? at : 0, axis == "y" ? at : 0, axis == "x" ? 0.5 : 0.01 } }'
 }
-recording() {  # rod, amplitude, name: name.tum and name.csv
-  base "$2" >"$work/$3.tum"
+recording() {  # rod, amplitude, name, axis (x): name.tum and name.csv
+  base "$2" "${4:-x}" >"$work/$3.tum"
   run rollout "$work/$1" --base "$work/$3.tum" --rate 50 -o "$work/states.csv" --centerline "$work/line.csv"
   expect_code 0 "rollout of $1"
   # nodes of four joints: grasp, joints 1-4 (the first at the grasp), end
-  awk -F, -v base="$work/$3.tum" 'BEGIN { while ((getline line < base) > 0) { split(line, b, " "); x[b[1] + 0] = b[2] }
+  awk -F, -v base="$work/$3.tum" 'BEGIN { while ((getline line < base) > 0) { split(line, b, " "); at[b[1] + 0] = b[2] "," b[3] "," b[4] }
       print "# marker a 0.15\n# marker b 0.225\n# marker c 0.3"
       print "time,bx,by,bz,bqw,bqx,bqy,bqz,a_x,a_y,a_z,b_x,b_y,b_z,c_x,c_y,c_z" }
     NR > 1 { t = sprintf("%.2f", $1) + 0
-      printf "%.2f,%.9f,0,0.5,1,0,0,0,%s,%s,%s,%s,%s,%s,%s,%s,%s\n", t, x[t], $11, $12, $13, $14, $15, $16, $17, $18, $19 }
+      printf "%.2f,%s,1,0,0,0,%s,%s,%s,%s,%s,%s,%s,%s,%s\n", t, at[t], $11, $12, $13, $14, $15, $16, $17, $18, $19 }
   ' "$work/line.csv" >"$work/$3.csv"
 }
 rod() {  # name, EI
@@ -59,18 +61,10 @@ expect_output '"weak"' 'identify --json'
 expect_error 2 '(one|other).csv: is of another rope' identify "$work/twin" --markers "$work/one.csv" "$work/other.csv"
 
 # a rod on a table, moved across: three markers tell its friction
-base 0.1 | awk '{ print $1, 0, $2, 0.01, 0, 0, 0, 1 }' >"$work/table.tum"
 table=(--length 0.3 --joints 4 --mass 0.06 --table 0,0,0 --direction 1,0,0)
 run new -o "$work/table_rod" "${table[@]}" --bending-stiffness 4.5e-4 --retardation 0.08 --friction 0.25
 expect_code 0 'new --table --bending-stiffness'
-run rollout "$work/table_rod" --base "$work/table.tum" --rate 50 -o "$work/states.csv" --centerline "$work/line.csv"
-expect_code 0 'rollout on a table'
-awk -F, -v base="$work/table.tum" 'BEGIN { while ((getline line < base) > 0) { split(line, b, " "); y[b[1] + 0] = b[3] }
-    print "# marker a 0.15\n# marker b 0.225\n# marker c 0.3"
-    print "time,bx,by,bz,bqw,bqx,bqy,bqz,a_x,a_y,a_z,b_x,b_y,b_z,c_x,c_y,c_z" }
-  NR > 1 { t = sprintf("%.2f", $1) + 0
-    printf "%.2f,0,%.9f,0.01,1,0,0,0,%s,%s,%s,%s,%s,%s,%s,%s,%s\n", t, y[t], $11, $12, $13, $14, $15, $16, $17, $18, $19 }
-' "$work/line.csv" >"$work/table.csv"
+recording table_rod 0.1 table y
 run new -o "$work/table_twin" "${table[@]}"
 expect_code 0 'new --table'
 run identify "$work/table_twin" --markers "$work/table.csv"

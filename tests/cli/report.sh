@@ -102,6 +102,7 @@ expect_error 2 '--base: no --estimate' report "$work/run" -o "$work/no.html" --b
 expect_error 2 'more than one is standard input' report "$work/run" -o "$work/no.html" --estimate - --forces -
 expect_error 2 'would be overwritten' report "$work/run" -o "$work/lines.jsonl" "${streams[@]}"
 expect_error 2 'would be overwritten' report "$work/run" -o "$work/run/twin.json"
+expect_error 2 '--json: standard output is wanted' report "$work/run" -o - --json
 expect_error 2 'forces_later.jsonl: line 1: time: 1000.* is no time of the estimates' report "$work/run" -o "$work/no.html" \
   --estimate "$work/lines.jsonl" --forces "$work/forces_later.jsonl"
 expect_error 2 "lines.jsonl: line 1: is no line of 'chainsplat force'|lines.jsonl: line 1: link: is missing" report "$work/run" \

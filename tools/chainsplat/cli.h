@@ -107,6 +107,8 @@ Path base_beside(const std::string& states);
 // Throws InputError where `output` is one of `inputs` (empty and "-": none), or also a file of the run folder.
 void check_not_input(const std::string& output, const std::vector<std::string>& inputs);
 void check_not_input(const std::string& output, const Path& run, std::vector<std::string> inputs);
+// Throws InputError where `output` is standard output and --json wants it, too.
+void check_one_wants_standard_output(const Globals& globals, const std::string& output);
 // CAPTURE[:camera] as the two; the second is empty for all cameras. A folder whose own name has a colon is taken as it
 // is.
 std::pair<std::string, std::string> split_camera(const std::string& text);

@@ -47,8 +47,8 @@ void rollout(const Globals& globals, const RolloutRequest& request) {
   if (!request.initial.empty()) options.initial = pipeline::input_path(request.initial);
   options.rate = request.rate;
   options.check();
-  if (globals.json && (request.out == "-" || request.centerline == "-" || request.wrench == "-"))
-    throw InputError("--json", "standard output is wanted by '-' too", "name a file");
+  for (const std::string& out : {request.out, request.centerline, request.wrench})
+    check_one_wants_standard_output(globals, out);
   pipeline::check_output_file(request.out);
   for (const std::string& out : {request.centerline, request.wrench})
     if (!out.empty()) pipeline::check_output_file(out);

@@ -95,6 +95,8 @@ void make_new(const Globals& globals, const Request& request) {
   const bool on_table = !request.table.empty();
   if (request.friction >= 0.0 && !on_table)
     throw InputError("--friction", "is that of a table, and there is none", "give --table too");
+  if (request.friction >= 0.0 && request.bending_stiffness < 0.0)
+    throw InputError("--friction", "is that of a rod that is known", "give --bending-stiffness too, or identify both");
   if (on_table && request.bending_stiffness >= 0.0 && request.friction < 0.0)
     throw InputError("--bending-stiffness", "does not say how a rod slides on a table", "give --friction too");
   if (on_table && request.direction.empty())

@@ -27,8 +27,7 @@ struct EvalRequest {
 void evaluate(const Globals& globals, const EvalRequest& request) {
   if (!request.out.empty()) pipeline::check_output_file(request.out);
   if (!request.picture.empty()) pipeline::check_output_file(request.picture);
-  if (globals.json && request.out == "-")
-    throw InputError("--json", "standard output is wanted by '-o -' too", "leave one of them out");
+  check_one_wants_standard_output(globals, request.out);
   const pipeline::Evaluation found = pipeline::evaluate(
       request.run, request.capture,
       {capture::read_frame_range(request.frames, "--frames"), request.picture, globals.device, request.lpips},
@@ -65,6 +64,7 @@ void report(const Globals& globals, const ReportRequest& request) {
   for (const std::string name : pipeline::kRunFiles)  // of them only the page may be written anew
     if (name != pipeline::kReportFile) inputs.push_back((Path(request.run) / name).string());
   check_not_input(request.out, inputs);
+  check_one_wants_standard_output(globals, request.out);
   pipeline::check_output_file(request.out);
   pipeline::ReportOptions options = request.options;
   options.capture = request.capture;

@@ -53,6 +53,11 @@ void check_not_input(const std::string& output, const Path& run, std::vector<std
   check_not_input(output, inputs);
 }
 
+void check_one_wants_standard_output(const Globals& globals, const std::string& output) {
+  if (globals.json && output == "-")
+    throw InputError("--json", "standard output is wanted by '-' too", "name a file, or leave --json out");
+}
+
 std::string metrics_table(const std::vector<MetricsRow>& rows) {
   constexpr double kMillimeters = 1e3;
   const bool lpips =
