@@ -27,7 +27,9 @@ struct Options {
   // m, sd of a recorded point's coordinate about the model; without: as large as it was in the recording that was
   // identified, by what its covariance says that it told
   std::optional<double> noise;
-  double max_bend = 1.2;             // rad, of one angle from where it starts: beyond, recognition is not to be trusted
+  // rad, of one angle from where it starts, and at most a bend around two diameters of the rope: beyond, recognition is
+  // not to be trusted
+  double max_bend = 1.2;
   int starts = 24;                   // random motions, of which the best is refined
   int generations = 24;              // of eight changes of it each
   std::uint64_t seed = 0;
@@ -61,18 +63,28 @@ struct Result {
   planning::Peaks peaks;
   chain::States states;  // predicted, at the frame rate
   double noise = 0.0;    // m, that was reckoned with
+  double spread = 0.0;   // m, of the prediction, as Forecast says
   Prediction prediction;
 };
 
 // Same seed, same motion. Throws InputError as Options::check() and where the twin knows no covariance, WorkError where
-// no motion keeps the rope within `max_bend`.
+// no motion keeps the rope within `max_bend` and the twin able to predict it.
 Result excite(const Problem& problem, const Options& options);
 
-// Information about `names` (initial states left out of the sum) in a recording under `base` at `times`, with noise of
-// the given sd on points of the centerline, and the initial state known as well as recognition knows it. Empty where
-// the rollout diverges. `states`: filled where given.
-MatrixX information(const dynamics::Model& model, std::span<const dynamics::Unknown> parameters,
-                    const dynamics::BaseFunction& base, const dynamics::InitialState& initial,
-                    const std::vector<double>& times, double noise, chain::States* states = nullptr);
+// What a recording would show and tell (mathematics.md 5.7).
+struct Forecast {
+  chain::States states;  // predicted
+  // About the parameters, n x n, with the initial state known as well as recognition knows it and left out of the sum;
+  // empty where the rollout diverges.
+  MatrixX information;
+  // m: where the uncertain parameters take the rope's points, RMS over them, at the time at which it is largest.
+  double spread = 0.0;
+};
+
+// Of the base motion `base` at `times`, with points of the centerline off by noise of the given sd (m per coordinate).
+// `covariance`: of the parameters.
+Forecast forecast(const dynamics::Model& model, std::span<const dynamics::Unknown> parameters,
+                  const MatrixX& covariance, const dynamics::BaseFunction& base,
+                  const dynamics::InitialState& initial, const std::vector<double>& times, double noise);
 
 }  // namespace chainsplat::excitation

@@ -19,12 +19,17 @@ constexpr double kFirstChange = 0.5;    // of a weight's spread
 constexpr double kSmallerChange = 0.7;  // by which it shrinks after a generation without a better motion
 constexpr double kMargin = 0.998;       // of a limit: peaks lie between the points of the grid
 constexpr double kGrid = 2e-3;          // s, of that grid
-constexpr int kMaxSofter = 12;          // times that a motion which bends the rope too far is made smaller
+constexpr int kMaxSofter = 16;          // times that a motion which asks too much of rope or twin is made smaller
 constexpr double kSofter = 0.8;
+constexpr double kSharpest = 2.0;  // diameters: the smallest radius that a motion bends the rope to
+// of the length: what the twin's own uncertainty may spread its prediction by. A rollout and a recording that are
+// further apart are no longer related by derivatives.
+constexpr double kMaxSpread = 0.05;
 constexpr int kMostFrames = 100000;  // each has the derivatives of all angles by all parameters: some 10 kB
 
 struct Candidate {
   planning::Motion motion;
+  int softer = 0;  // times that it was made smaller than the arm's limits ask
   double value = -std::numeric_limits<double>::infinity();
 };
 
@@ -91,9 +96,8 @@ Known known_parameters(const Problem& problem) {
   return known;
 }
 
-// What one more recording of the old motion tells where points have the given noise; empty where there is none.
-MatrixX told_by_repetition(const Problem& problem, std::span<const dynamics::Unknown> unknowns, double frame_rate,
-                           double noise) {
+// Of one more recording of the old motion where points have the given noise; without information where there is none.
+Forecast forecast_of_repetition(const Problem& problem, const Known& known, double frame_rate, double noise) {
   if (!problem.recorded) return {};
   std::vector<double> times;
   for (int k = 0; problem.recorded_start + k / frame_rate <= problem.recorded_end + 1e-9; ++k)
@@ -101,11 +105,11 @@ MatrixX told_by_repetition(const Problem& problem, std::span<const dynamics::Unk
   if (times.size() < 2) return {};
   dynamics::InitialState initial = problem.initial;
   initial.time = problem.recorded_start;
-  return information(problem.model, unknowns, problem.recorded, initial, times, noise);
+  return forecast(problem.model, known.unknowns, known.covariance, problem.recorded, initial, times, noise);
 }
 
 // The noise with which the old recording tells no combination of parameters better than the twin knows it, and one as
-// well (mathematics.md 5.7): errors of the model, of marks and of images, as identification met them.
+// well (mathematics.md 5.7): errors of the model, of marks and of images, as identification reckoned with them.
 double noise_of_recording(const Problem& problem, const Known& known, double frame_rate) {
   constexpr double kUnknown = 2e-3;  // m, where there is no old motion
   constexpr double kSame = 1e-3;     // of the noise
@@ -113,7 +117,7 @@ double noise_of_recording(const Problem& problem, const Known& known, double fra
   const MatrixX root = known.covariance.llt().matrixL();
   double noise = kUnknown;
   for (int i = 0; i < kMost; ++i) {
-    const MatrixX told = told_by_repetition(problem, known.unknowns, frame_rate, noise);
+    const MatrixX told = forecast_of_repetition(problem, known, frame_rate, noise).information;
     if (!told.size()) return kUnknown;
     const Eigen::SelfAdjointEigenSolver<MatrixX> eigen(MatrixX(root.transpose() * told * root), Eigen::EigenvaluesOnly);
     const double factor = std::sqrt(eigen.eigenvalues().maxCoeff());
@@ -131,10 +135,21 @@ struct Search {
   std::vector<Axis> axes;
   Known known;
   double noise = 0.0;  // m
+  Forecast repeated;   // of the old motion
+  double max_spread = 0.0;  // m
+  VectorX max_bend;         // rad, per angle
   double known_log_det = 0.0;
   std::vector<double> times;  // s, of the frames
   dynamics::InitialState initial;
 };
+
+VectorX largest_bends(const chain::Chain& chain, double max_bend) {
+  VectorX out = VectorX::Constant(chain.angles(), max_bend);
+  for (int k = 0; k < chain.angles(); ++k)
+    if (!chain::is_twist(chain, k))
+      out[k] = std::min(out[k], chain::bent_length(chain, chain.child_link[k]) / (kSharpest * chain.diameter));
+  return out;
+}
 
 Search make_search(const Problem& problem, const Options& options) {
   if (const double seconds = std::max(options.duration, problem.recorded_end - problem.recorded_start);
@@ -148,10 +163,16 @@ Search make_search(const Problem& problem, const Options& options) {
                 options.axes.empty() ? default_axes(problem) : options.axes,
                 known_parameters(problem),
                 0.0,
+                {},
+                0.0,
+                largest_bends(problem.model.chain, options.max_bend),
                 0.0,
                 {},
                 problem.initial};
   search.noise = options.noise ? *options.noise : noise_of_recording(problem, search.known, options.frame_rate);
+  search.repeated = forecast_of_repetition(problem, search.known, options.frame_rate, search.noise);
+  // a twin that predicts its own recording no better is given motions of that kind
+  search.max_spread = std::max(kMaxSpread * problem.model.chain.length, search.repeated.spread);
   search.known_log_det = log_det(search.known.information);
   for (int k = 0; k / options.frame_rate <= options.duration + 1e-9; ++k)
     search.times.push_back(k / options.frame_rate);
@@ -159,7 +180,7 @@ Search make_search(const Problem& problem, const Options& options) {
   return search;
 }
 
-// Whether the rope follows the motion without a joint that bends beyond `max_bend`.
+// Whether the rope follows the motion without a joint that bends too far.
 bool stays_within_bend(const Search& search, const planning::Motion& motion) {
   const dynamics::Model& model = search.problem.model;
   const auto grid = dynamics::sample_base([&](double t) { return planning::base_at(motion, t); }, 0.0, search.times,
@@ -167,26 +188,28 @@ bool stays_within_bend(const Search& search, const planning::Motion& motion) {
   chain::States states;
   if (!dynamics::simulate(model, grid, search.initial, states)) return false;
   return std::all_of(states.theta.begin(), states.theta.end(), [&](const VectorX& theta) {
-    return (theta - search.initial.theta).cwiseAbs().maxCoeff() <= search.options.max_bend;
+    return ((theta - search.initial.theta).cwiseAbs().array() <= search.max_bend.array()).all();
   });
 }
 
-// What a recording of the motion tells; empty where the rollout diverges. `states`: filled where given.
-MatrixX told_by(const Search& search, const planning::Motion& motion, chain::States* states = nullptr) {
-  return information(
-      search.problem.model, search.known.unknowns, [&](double t) { return planning::base_at(motion, t); },
-      search.initial, search.times, search.noise, states);
+Forecast forecast_of(const Search& search, const planning::Motion& motion) {
+  return forecast(
+      search.problem.model, search.known.unknowns, search.known.covariance,
+      [&](double t) { return planning::base_at(motion, t); }, search.initial, search.times, search.noise);
 }
 
-// Makes the motion as large as limits and rope allow, and values it.
+// Makes the motion as large as limits, rope and twin allow, and values it.
 void evaluate(const Search& search, Candidate& candidate) {
   scale_to_limits(candidate.motion, search.options);
-  int softer = 0;
-  for (; softer < kMaxSofter && !stays_within_bend(search, candidate.motion); ++softer)
-    scale(candidate.motion, kSofter, kSofter);
-  if (softer == kMaxSofter) return;
-  const MatrixX told = told_by(search, candidate.motion);
-  if (told.size()) candidate.value = log_det(search.known.information + told);
+  const auto scale_by = [&](double factor) { scale(candidate.motion, factor, factor); };
+  scale_by(std::pow(kSofter, candidate.softer));
+  for (; candidate.softer < kMaxSofter; ++candidate.softer, scale_by(kSofter)) {
+    if (!stays_within_bend(search, candidate.motion)) continue;
+    const Forecast told = forecast_of(search, candidate.motion);
+    if (!told.information.size() || told.spread > search.max_spread) continue;
+    candidate.value = log_det(search.known.information + told.information);
+    return;
+  }
 }
 
 // Values all of them; returns the best.
@@ -235,6 +258,7 @@ Candidate refine(const Search& search, Candidate best, core::Random& random) {
     std::vector<Candidate> candidates(kChanges, best);
     for (Candidate& c : candidates) {
       c.value = -std::numeric_limits<double>::infinity();
+      c.softer = std::max(0, best.softer - 1);  // most that was tried before is too large again
       for (auto& p : c.motion.pieces) p.weights += change * spread * random_weights(search, random);
     }
     const Candidate other = best_of(search, candidates);
@@ -254,16 +278,15 @@ std::vector<double> standard_errors(const MatrixX& information) {
   return out;
 }
 
-Prediction predict(const Search& search, const Candidate& best, const MatrixX& told) {
+Prediction predict(const Search& search, const Candidate& best, const Forecast& told) {
   const Known& known = search.known;
   const auto size = static_cast<double>(known.unknowns.size());
   Prediction out;
   for (const dynamics::Unknown& unknown : known.unknowns) out.names.push_back(dynamics::name_of(unknown));
   out.now = standard_errors(known.information);
-  out.excited = standard_errors(known.information + told);
+  out.excited = standard_errors(known.information + told.information);
   out.gain = (best.value - search.known_log_det) / size;
-  if (const MatrixX again = told_by_repetition(search.problem, known.unknowns, search.options.frame_rate, search.noise);
-      again.size()) {
+  if (const MatrixX& again = search.repeated.information; again.size()) {
     out.repeated = standard_errors(known.information + again);
     out.repeated_gain = (log_det(known.information + again) - search.known_log_det) / size;
   }
@@ -299,15 +322,19 @@ Result excite(const Problem& problem, const Options& options) {
   std::vector<Candidate> candidates = random_motions(search, random);
   Candidate best = best_of(search, candidates);
   if (!std::isfinite(best.value))
-    throw WorkError("excite", "no motion keeps every joint within " + core::exact(options.max_bend) + " rad",
-                    "raise `max_bend` or lower `acceleration`");
+    throw WorkError("excite",
+                    "no motion keeps every joint within " + core::exact(options.max_bend) + " rad, and the twin's " +
+                        "prediction within " + core::exact(std::round(1e3 * search.max_spread)) + " mm",
+                    "raise `max_bend`, lower `acceleration` or shorten `duration`");
   best = refine(search, best, random);
 
   Result result;
   result.motion = best.motion;
   result.peaks = planning::peaks(best.motion, 0.0, options.duration, options.limits);
   result.noise = search.noise;
-  const MatrixX told = told_by(search, best.motion, &result.states);
+  const Forecast told = forecast_of(search, best.motion);
+  result.states = told.states;
+  result.spread = told.spread;
   result.prediction = predict(search, best, told);
   return result;
 }

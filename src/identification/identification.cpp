@@ -659,13 +659,19 @@ MatrixX covariance_of(const Problem& problem, const MatrixX& hessian, const Roll
     add_part(problem, i,
              covariance_of_scores(problem.parts[i], rollouts.states[i], rollouts.slopes[i], rollouts.values[i], limit),
              meat);
-  const Eigen::LDLT<MatrixX> factor(MatrixX(hessian + prior));
-  const MatrixX bread = factor.solve(MatrixX::Identity(prior.rows(), prior.cols()));
-  const MatrixX out = bread * meat * bread;
-  // the sandwich is itself an estimate, of few independent frames: never less than what the weights alone promise
-  const VectorX least = (bread.diagonal().array() / out.diagonal().array()).max(1.0).sqrt();
-  const MatrixX covariance = least.asDiagonal() * (0.5 * (out + out.transpose())) * least.asDiagonal();
-  if (math::is_positive(factor) && math::is_covariance(covariance)) return covariance;
+  // In coordinates in which the weights alone promise the covariance 1, the sandwich is `scores`. It is itself an
+  // estimate, of few independent frames: along no combination of parameters less than what the weights promise.
+  const Eigen::LLT<MatrixX> factor(MatrixX(hessian + prior));
+  if (factor.info() == Eigen::Success) {
+    factor.matrixL().solveInPlace(meat);
+    MatrixX scores = meat.transpose();
+    factor.matrixL().solveInPlace(scores);
+    const Eigen::SelfAdjointEigenSolver<MatrixX> eigen(MatrixX(0.5 * (scores + scores.transpose())));
+    MatrixX root = eigen.eigenvectors() * eigen.eigenvalues().cwiseMax(1.0).cwiseSqrt().asDiagonal();
+    factor.matrixU().solveInPlace(root);
+    const MatrixX covariance = root * root.transpose();
+    if (math::is_covariance(covariance)) return covariance;
+  }
   core::warn("identify: the data leave the parameters' covariance without meaning; it is written as not known");
   return MatrixX::Constant(prior.rows(), prior.cols(), kUnknown);
 }

@@ -35,6 +35,7 @@ Json document_of(const excitation::Result& result, const Request& request) {
   Json out;
   out["duration"] = request.options.duration;
   out["noise"] = result.noise;
+  out["spread"] = result.spread;
   out["gain"] = p.gain;
   if (!p.repeated.empty()) out["repeated_gain"] = p.repeated_gain;
   out["parameters"] = Json::array();
@@ -103,8 +104,10 @@ void print(const Request& request, const excitation::Result& result) {
     std::cout << line;
   }
   std::snprintf(line, sizeof line,
-                "\npeaks: %.2f m/s, %.1f m/s^2, %.0f m/s^3, %.2f m from the start; motion: ", result.peaks.velocity,
-                result.peaks.acceleration, result.peaks.jerk, result.peaks.stroke);
+                "\nthe twin predicts it within %.2g mm by its own errors\n"
+                "peaks: %.2f m/s, %.1f m/s^2, %.0f m/s^3, %.2f m from the start; motion: ",
+                1e3 * result.spread, result.peaks.velocity, result.peaks.acceleration, result.peaks.jerk,
+                result.peaks.stroke);
   std::cout << line << request.out << "\n";
 }
 
@@ -161,7 +164,7 @@ void add_excite_command(Command app, const Globals& globals, Job& job) {
   command.add_option("--yaw-acceleration", options.limits.yaw_acceleration, "Limit, rad/s^2 (default 20)");
   command.add_option("--yaw-jerk", options.limits.yaw_jerk, "Limit, rad/s^3 (default 400)");
   command.add_option("--turn", options.limits.turn, "Farthest yaw from the start, rad (default 1.6)");
-  command.add_option("--max-bend", options.max_bend, "Largest change of a joint's angle, rad (default 1.2)");
+  command.add_option("--max-bend", options.max_bend, "Largest change of a joint's angle, rad (default 1.2; never around less than two diameters)");
   command
       .add_option("--noise", request->noise,
                   "What a recorded point will be off the model, mm (default: as in the twin's own recording)")

@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <cmath>
 
 #include "chainsplat/excitation.h"
@@ -12,20 +13,20 @@ constexpr double kRateSd = 0.5;    // rad/s
 
 }  // namespace
 
-MatrixX information(const dynamics::Model& model, std::span<const dynamics::Unknown> parameters,
-                    const dynamics::BaseFunction& base, const dynamics::InitialState& initial,
-                    const std::vector<double>& times, double noise, chain::States* states) {
+Forecast forecast(const dynamics::Model& model, std::span<const dynamics::Unknown> parameters,
+                  const MatrixX& covariance, const dynamics::BaseFunction& base,
+                  const dynamics::InitialState& initial, const std::vector<double>& times, double noise) {
   const chain::Chain& chain = model.chain;
   const int n = chain.angles();
   const auto size = static_cast<Eigen::Index>(parameters.size());
+  CHAINSPLAT_CHECK(covariance.rows() == size && covariance.cols() == size, std::to_string(covariance.rows()));
   std::vector<dynamics::Unknown> unknowns(parameters.begin(), parameters.end());
   for (const dynamics::Unknown& state : dynamics::initial_state_unknowns(chain)) unknowns.push_back(state);
   const std::vector<dynamics::Tangent> tangents = dynamics::tangents(chain, model.parameters, unknowns);
-  chain::States rolled;
-  chain::States& motion = states ? *states : rolled;
+  Forecast out;
   dynamics::Sensitivities slopes;
   const dynamics::BaseGrid grid = dynamics::sample_base(base, initial.time, times, model.parameters.substeps);
-  if (!dynamics::simulate(model, grid, initial, motion, tangents, &slopes)) return {};
+  if (!dynamics::simulate(model, grid, initial, out.states, tangents, &slopes)) return out;
 
   const std::vector<chain::MaterialPoint> points = chain::shape_points(chain, true);
   MatrixX sum = MatrixX::Zero(size + 2 * n, size + 2 * n);
@@ -33,14 +34,21 @@ MatrixX information(const dynamics::Model& model, std::span<const dynamics::Unkn
     sum(size + k, size + k) = 1.0 / (kThetaSd * kThetaSd);
     sum(size + n + k, size + n + k) = 1.0 / (kRateSd * kRateSd);
   }
-  for (std::size_t k = 0; k < motion.theta.size(); ++k) {
-    const auto poses = chain::link_motions(chain, motion.theta[k], {});
-    const MatrixX axes = chain::world_axes(chain, motion.theta[k], {});
+  double spread = 0.0;  // m^2
+  for (std::size_t k = 0; k < out.states.theta.size(); ++k) {
+    const auto poses = chain::link_motions(chain, out.states.theta[k], {});
+    const MatrixX axes = chain::world_axes(chain, out.states.theta[k], {});
     const MatrixX by_angle = chain::displacement_metric(chain::point_jacobians(chain, axes, poses, points));
-    sum += kShare / (noise * noise) * slopes.theta[k].transpose() * by_angle * slopes.theta[k];
+    const MatrixX told = slopes.theta[k].transpose() * by_angle * slopes.theta[k];
+    sum += kShare / (noise * noise) * told;
+    spread = std::max(spread, told.topLeftCorner(size, size).cwiseProduct(covariance).sum() /
+                                  static_cast<double>(points.size()));
   }
   const MatrixX cross = sum.topRightCorner(size, 2 * n);
-  return sum.topLeftCorner(size, size) - cross * sum.bottomRightCorner(2 * n, 2 * n).ldlt().solve(cross.transpose());
+  out.information =
+      sum.topLeftCorner(size, size) - cross * sum.bottomRightCorner(2 * n, 2 * n).ldlt().solve(cross.transpose());
+  out.spread = std::sqrt(spread);
+  return out;
 }
 
 }  // namespace chainsplat::excitation
