@@ -201,12 +201,19 @@ Forecast forecast_of(const Search& search, const planning::Motion& motion) {
 // Makes the motion as large as limits, rope and twin allow, and values it.
 void evaluate(const Search& search, Candidate& candidate) {
   scale_to_limits(candidate.motion, search.options);
-  const auto scale_by = [&](double factor) { scale(candidate.motion, factor, factor); };
-  scale_by(std::pow(kSofter, candidate.softer));
-  for (; candidate.softer < kMaxSofter; ++candidate.softer, scale_by(kSofter)) {
+  const auto soften = [&](int times) { scale(candidate.motion, std::pow(kSofter, times), std::pow(kSofter, times)); };
+  soften(candidate.softer);
+  for (int more = 1; candidate.softer < kMaxSofter; candidate.softer += more, soften(more)) {
+    more = 1;
     if (!stays_within_bend(search, candidate.motion)) continue;
     const Forecast told = forecast_of(search, candidate.motion);
-    if (!told.information.size() || told.spread > search.max_spread) continue;
+    if (!told.information.size()) continue;
+    if (const double over = told.spread / search.max_spread; over > 1.0) {
+      // near chaos it falls with the fourth power of the motion's size and faster: several steps at once, since a
+      // forecast is what costs time
+      more = std::max(1, static_cast<int>(std::log(over) / (-4.0 * std::log(kSofter))));
+      continue;
+    }
     candidate.value = log_det(search.known.information + told.information);
     return;
   }
