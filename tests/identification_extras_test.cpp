@@ -171,11 +171,11 @@ TEST_CASE("how stiff a rope is in torsion is found where it bends in space") {
   p.link_mass.assign(kJoints, 0.02);
   for (auto* zeros : {&p.viscous_friction, &p.coulomb_friction, &p.air_linear}) zeros->assign(kJoints, 0.0);
   p.air_quadratic.assign(kJoints, 0.001);
-  constexpr double kBending = 8e-4, kRetardation = 0.06;  // N m^2, s
+  constexpr double kBending = 8e-4, kDampingTime = 0.06;  // N m^2, s
   const double tension = dynamics::grasp_tension(p, p.gravity);
   for (int k = 0; k < 2 * kJoints; ++k) {
     const dynamics::RodJoint rod = dynamics::rod_joint(chain, k / 2 + 1, kBending, tension);
-    p.stiffness.push_back(rod.stiffness), p.damping.push_back(kRetardation * rod.slope);
+    p.stiffness.push_back(rod.stiffness), p.damping.push_back(kDampingTime * rod.slope);
     p.rest_angle.push_back(0.35 * std::cos(1.1 * k));
   }
   for (int j = 1; j <= kJoints; ++j) p.torsional_stiffness.push_back(kRatio * kBending / chain::bent_length(chain, j));
