@@ -95,10 +95,23 @@ void run(const std::optional<ProgressFunction>& progress, const std::function<vo
   if (raised) std::rethrow_exception(raised);
 }
 
+// NumPy 2 lays its types out in another way. pybind11 before 2.12 does not know, and would hand out arrays of one number
+// again and again, without an error.
+void check_numpy() {
+#if PYBIND11_VERSION_HEX < 0x020C0000
+  const auto version = py::module_::import("numpy").attr("__version__").cast<std::string>();
+  if (std::stoi(version) >= 2)
+    throw py::import_error("chainsplat: it was built with pybind11 " + std::to_string(PYBIND11_VERSION_MAJOR) + "." +
+                           std::to_string(PYBIND11_VERSION_MINOR) + ", which cannot exchange arrays with NumPy " +
+                           version + "; install 'numpy<2', or build the module with pip install .");
+#endif
+}
+
 }  // namespace chainsplat::python
 
 PYBIND11_MODULE(_core, m) {
   using namespace chainsplat::python;
+  check_numpy();
   m.doc() = "Digital twins of ropes from videos. Use it as `import chainsplat as cs`.";
   m.attr("__version__") = CHAINSPLAT_VERSION;
   add_errors(m);

@@ -394,6 +394,14 @@ class Module(unittest.TestCase):
         self.assertIn("hits at", example("planned_hit", self.run_folder, ",".join(map(str, target)), out))
         self.assertTrue(cs.Trajectory.read(out).end > 1.0)
 
+    def test_numpy_of_another_layout_is_refused(self):
+        pretend = "import numpy; numpy.__version__ = '2.0.0'; import chainsplat"
+        done = subprocess.run([sys.executable, "-c", pretend], capture_output=True, text=True)
+        if tuple(map(int, os.environ["CHAINSPLAT_PYBIND11"].split(".")[:2])) < (2, 12):
+            self.assertIn("ImportError: chainsplat: it was built with pybind11", done.stderr)
+        else:
+            self.assertEqual(done.returncode, 0, done.stderr)
+
 
 class Stubs(unittest.TestCase):
     def test_stubs_have_the_names_of_the_module(self):
