@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import pathlib
+import re
 import signal
 import subprocess
 import sys
@@ -393,6 +394,31 @@ class Module(unittest.TestCase):
         out = pathlib.Path(self.folder.name) / "hit.tum"
         self.assertIn("hits at", example("planned_hit", self.run_folder, ",".join(map(str, target)), out))
         self.assertTrue(cs.Trajectory.read(out).end > 1.0)
+
+    def test_example_of_mujoco_runs(self):
+        script = pathlib.Path(__file__).parent.parent.parent / "examples/python/mujoco_comparison.py"
+        picture = pathlib.Path(self.folder.name) / "mujoco.png"
+        motion = pathlib.Path(self.folder.name) / "aside.tum"  # a base motion that is not the twin's own
+        time = np.linspace(0.0, 1.0, 121)
+        poses = np.repeat(self.twin.base.pose(0.0)[None], len(time), 0)
+        poses[:, 1, 3] += 0.05 * np.sin(np.pi * time) ** 2
+        cs.Trajectory(time, poses).write(motion)
+        arguments = [str(self.run_folder), str(motion), str(picture)]
+        without = "import runpy, sys; sys.modules['mujoco'] = None; runpy.run_path(sys.argv[1], run_name='__main__')"
+        done = subprocess.run([sys.executable, "-c", without, script, *arguments], capture_output=True, text=True)
+        self.assertEqual((done.returncode, done.stderr.count("\n")), (1, 1), done.stderr)
+        self.assertIn("pip install mujoco", done.stderr)
+        self.assertFalse(picture.exists())
+
+        python = os.environ.get("CHAINSPLAT_PYTHON", sys.executable)
+        if subprocess.run([python, "-c", "import mujoco, chainsplat"], capture_output=True).returncode != 0:
+            self.skipTest(f"{python} has no mujoco that goes with the module (CHAINSPLAT_PYTHON names another one)")
+        done = subprocess.run([python, script, *arguments], capture_output=True, text=True)
+        self.assertEqual(done.returncode, 0, done.stderr)
+        said = re.match(r"\d+ states: angles ([\d.]+) degrees RMS apart, centerline ([\d.]+) mm RMS, ", done.stdout)
+        self.assertLess(float(said[1]), 0.01)
+        self.assertLess(float(said[2]), 0.1)
+        self.assertGreater(picture.stat().st_size, 1000)
 
     def test_numpy_of_another_layout_is_refused(self):
         pretend = "import numpy; numpy.__version__ = '2.0.0'; import chainsplat"
