@@ -182,8 +182,8 @@ TEST_CASE("a forecast spreads as far as the ropes that the covariance allows do"
   for (int i = 0; i < kRopes; ++i) {
     VectorX drawn(5);
     for (double& x : drawn) x = random.normal();
-    const dynamics::Model other = dynamics::make_model(
-        model.chain, dynamics::moved(model.chain, model.parameters, unknowns, root * drawn));
+    const dynamics::Model other =
+        dynamics::make_model(model.chain, dynamics::moved(model.chain, model.parameters, unknowns, root * drawn));
     const chain::States states = dynamics::rollout(other, gentle, start, times);
     for (std::size_t k = 0; k < times.size(); ++k)
       square[k] += (places(states.theta[k]) - places(forecast.states.theta[k])).squaredNorm() /

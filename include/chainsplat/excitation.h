@@ -30,8 +30,8 @@ struct Options {
   // rad, of one angle from where it starts, and at most a bend around two diameters of the rope: beyond, recognition is
   // not to be trusted
   double max_bend = 1.2;
-  int starts = 24;                   // random motions, of which the best is refined
-  int generations = 24;              // of eight changes of it each
+  int starts = 24;       // random motions, of which the best is refined
+  int generations = 24;  // of eight changes of it each
   std::uint64_t seed = 0;
 
   void check() const;  // throws InputError whose `where` names the wrong field
@@ -40,9 +40,9 @@ struct Options {
 struct Problem {
   dynamics::Model model;
   bool tabletop = false;
-  math::Pose base;                  // at the start
-  dynamics::InitialState initial;   // at rest
-  dynamics::Estimates estimates;    // what is known: names, covariance
+  math::Pose base;                 // at the start
+  dynamics::InitialState initial;  // at rest
+  dynamics::Estimates estimates;   // what is known: names, covariance
   // Base motion of the recording that was identified, to compare with and to know its noise by; may be empty.
   dynamics::BaseFunction recorded;
   double recorded_start = 0.0, recorded_end = 0.0;  // s
@@ -84,7 +84,7 @@ struct Forecast {
 // Of the base motion `base` at `times`, with points of the centerline off by noise of the given sd (m per coordinate).
 // `covariance`: of the parameters.
 Forecast forecast(const dynamics::Model& model, std::span<const dynamics::Unknown> parameters,
-                  const MatrixX& covariance, const dynamics::BaseFunction& base,
-                  const dynamics::InitialState& initial, const std::vector<double>& times, double noise);
+                  const MatrixX& covariance, const dynamics::BaseFunction& base, const dynamics::InitialState& initial,
+                  const std::vector<double>& times, double noise);
 
 }  // namespace chainsplat::excitation

@@ -95,8 +95,8 @@ void run(const std::optional<ProgressFunction>& progress, const std::function<vo
   if (raised) std::rethrow_exception(raised);
 }
 
-// NumPy 2 lays its types out in another way. pybind11 before 2.12 does not know, and would hand out arrays of one number
-// again and again, without an error.
+// NumPy 2 lays its types out in another way. pybind11 before 2.12 does not know, and would hand out arrays of one
+// number again and again, without an error.
 void check_numpy() {
 #if PYBIND11_VERSION_HEX < 0x020C0000
   const auto version = py::module_::import("numpy").attr("__version__").cast<std::string>();

@@ -134,8 +134,8 @@ struct Search {
   const Options& options;
   std::vector<Axis> axes;
   Known known;
-  double noise = 0.0;  // m
-  Forecast repeated;   // of the old motion
+  double noise = 0.0;       // m
+  Forecast repeated;        // of the old motion
   double max_spread = 0.0;  // m
   VectorX max_bend;         // rad, per angle
   double known_log_det = 0.0;

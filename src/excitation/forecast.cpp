@@ -14,8 +14,8 @@ constexpr double kRateSd = 0.5;    // rad/s
 }  // namespace
 
 Forecast forecast(const dynamics::Model& model, std::span<const dynamics::Unknown> parameters,
-                  const MatrixX& covariance, const dynamics::BaseFunction& base,
-                  const dynamics::InitialState& initial, const std::vector<double>& times, double noise) {
+                  const MatrixX& covariance, const dynamics::BaseFunction& base, const dynamics::InitialState& initial,
+                  const std::vector<double>& times, double noise) {
   const chain::Chain& chain = model.chain;
   const int n = chain.angles();
   const auto size = static_cast<Eigen::Index>(parameters.size());
@@ -41,8 +41,8 @@ Forecast forecast(const dynamics::Model& model, std::span<const dynamics::Unknow
     const MatrixX by_angle = chain::displacement_metric(chain::point_jacobians(chain, axes, poses, points));
     const MatrixX told = slopes.theta[k].transpose() * by_angle * slopes.theta[k];
     sum += kShare / (noise * noise) * told;
-    spread = std::max(spread, told.topLeftCorner(size, size).cwiseProduct(covariance).sum() /
-                                  static_cast<double>(points.size()));
+    spread = std::max(
+        spread, told.topLeftCorner(size, size).cwiseProduct(covariance).sum() / static_cast<double>(points.size()));
   }
   const MatrixX cross = sum.topRightCorner(size, 2 * n);
   out.information =

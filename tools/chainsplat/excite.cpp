@@ -164,7 +164,8 @@ void add_excite_command(Command app, const Globals& globals, Job& job) {
   command.add_option("--yaw-acceleration", options.limits.yaw_acceleration, "Limit, rad/s^2 (default 20)");
   command.add_option("--yaw-jerk", options.limits.yaw_jerk, "Limit, rad/s^3 (default 400)");
   command.add_option("--turn", options.limits.turn, "Farthest yaw from the start, rad (default 1.6)");
-  command.add_option("--max-bend", options.max_bend, "Largest change of a joint's angle, rad (default 1.2; never around less than two diameters)");
+  command.add_option("--max-bend", options.max_bend,
+                     "Largest change of a joint's angle, rad (default 1.2; never around less than two diameters)");
   command
       .add_option("--noise", request->noise,
                   "What a recorded point will be off the model, mm (default: as in the twin's own recording)")
