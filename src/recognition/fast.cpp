@@ -18,11 +18,13 @@ constexpr int kRounds = 4;
 constexpr int kSteps = 100;  // Adam steps a round
 constexpr double kGaussiansADiameter =
     100.0;  // of the rope's length, when no budget is given: more gain little (design.md, 'Recognition')
-constexpr double kFirstShare = 0.8;  // of the budget, placed at the start; the rest goes where the images ask
-constexpr int kAngleIterations = 1;  // Gauss-Newton steps a round and frame
-constexpr int kFinalIterations = 1;  // for every frame, at the end
-constexpr int kFinalSteps = 120;     // Adam steps after the last round, rates falling
-constexpr int kMostRestarts = 3;     // of a round that runs away, each with smaller steps
+constexpr double kFirstShare = 0.8;        // of the budget, placed at the start; the rest goes where the images ask
+constexpr int kAngleIterations = 1;        // Gauss-Newton steps a round and frame
+constexpr int kFinalIterations = 1;        // for every frame, at the end
+constexpr int kFinalSteps = 160;           // Adam steps after the last round, rates falling
+constexpr double kPastJoint = 0.1;         // diameters that Gaussians may reach past their joints before a round
+constexpr double kPastJointAtLast = 0.25;  // and at last: no step follows that would close the gaps
+constexpr int kMostRestarts = 3;           // of a round that runs away, each with smaller steps
 constexpr int kShRound = 1;  // from this round on colors depend on the view (SH degree 1): +0.7 dB in the object
 
 }  // namespace
@@ -364,6 +366,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     specs = posed_views(job);
     for (std::size_t i = 0; i < specs.size(); ++i) engine.set_motions(static_cast<int>(i), specs[i].motions);
     job.gaussians = engine.gaussians();
+    bound_gaussians(job.result.chain, job.gaussians, kPastJoint * job.result.chain.diameter);
     if (adding)
       add_gaussians(job, last, budget, round, random);
     else
@@ -372,6 +375,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   if (job.first_round <= kRounds) {
     train_round(job, engine, kRounds);
     job.gaussians = engine.gaussians();
+    bound_gaussians(job.result.chain, job.gaussians, kPastJointAtLast * job.result.chain.diameter);
     save(job, engine, kRounds + 1, 0);
   }
   guess_unseen(job, specs);  // again: without a gradient Adam moves them, too

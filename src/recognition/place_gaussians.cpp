@@ -5,6 +5,7 @@
 #include <numbers>
 
 #include "chainsplat/image_model.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::recognition {
 
@@ -211,6 +212,38 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
   changed.added = next - static_cast<int>(kept.size());
   gaussians.resize(next, gaussians.links, gaussians.degree);
   return changed;
+}
+
+void bound_gaussians(const chain::Chain& chain, splat::Gaussians& gaussians, double past) {
+  constexpr double kWidths = 2.0;  // standard deviations that count as a Gaussian's reach
+  for (int i = 0; i < gaussians.count; ++i) {
+    splat::set_base_color(gaussians, i, splat::base_color(gaussians, i).cwiseMax(0.0).cwiseMin(1.0));
+    const math::Vector3 mean(gaussians.mean[3 * i], gaussians.mean[3 * i + 1], gaussians.mean[3 * i + 2]);
+    const double s = mean.dot(chain.direction);
+    float* logits = &gaussians.link_logits[static_cast<std::size_t>(gaussians.links) * i];
+    const auto own = std::max_element(logits, logits + gaussians.links) - logits;
+    const int link = std::clamp(chain::link_at(chain, s), 1, gaussians.links - 1);
+    std::swap(logits[own], logits[link]);
+
+    math::Matrix3 root;  // of the covariance
+    const float* q = &gaussians.rotation[4 * i];
+    root = Eigen::Quaterniond(q[0], q[1], q[2], q[3]).normalized().toRotationMatrix();
+    for (int c = 0; c < 3; ++c) root.col(c) *= std::exp(static_cast<double>(gaussians.log_scale[3 * i + c]));
+    const double along = (root.transpose() * chain.direction).norm();
+    const double before = link > 1 ? s - chain.link_start(link) : chain.length;
+    const double after = link + 1 < gaussians.links ? chain.link_end(link) - s : chain.length;
+    const double room = past + std::min(before, after);
+    if (kWidths * along <= room) continue;
+    root += (room / (kWidths * along) - 1.0) * chain.direction * (chain.direction.transpose() * root);
+    const Eigen::SelfAdjointEigenSolver<math::MatrixX> found(math::MatrixX(root * root.transpose()));
+    math::Matrix3 axes = found.eigenvectors();
+    if (axes.determinant() < 0.0) axes.col(0) *= -1.0;
+    const Eigen::Quaterniond turn(axes);
+    const double wxyz[4] = {turn.w(), turn.x(), turn.y(), turn.z()};
+    for (int c = 0; c < 4; ++c) gaussians.rotation[4 * i + c] = static_cast<float>(wxyz[c]);
+    for (int c = 0; c < 3; ++c)
+      gaussians.log_scale[3 * i + c] = static_cast<float>(0.5 * std::log(std::max(found.eigenvalues()[c], 1e-12)));
+  }
 }
 
 }  // namespace chainsplat::recognition

@@ -38,4 +38,10 @@ struct Changed {
 Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, const capture::Capture& capture,
                       std::span<const Drawn> drawn, int budget, int most_added, core::Random& random);
 
+// Adam lets Gaussians grow across joints, where they tear open or cover what is behind when a joint bends, and base
+// colors leave what a picture can show, which other viewers cut. Base colors are cut to [0, 1]; a Gaussian becomes its
+// place's link's, and is compressed along the rope until it reaches at most `past`, m, beyond that link's joints, at
+// two standard deviations. The rope's ends are no joints. For Gaussians that are hard on one link.
+void bound_gaussians(const chain::Chain& chain, splat::Gaussians& gaussians, double past);
+
 }  // namespace chainsplat::recognition
