@@ -23,10 +23,10 @@ std::uint8_t level(int value) { return static_cast<std::uint8_t>(std::clamp(valu
 
 }  // namespace
 
-void to_rgb(const YCbCr& from, int width, int height, Image8& rgb) {
+void to_rgb(YCbCr from, int width, int height, Image8& rgb) {
   rgb.width = width, rgb.height = height, rgb.channels = 3;
   rgb.pixels.resize(static_cast<std::size_t>(width) * height * 3);
-  const Weights& weight = from.full ? kFull : kLimited;
+  const Weights weight = from.full ? kFull : kLimited;
   const int black = from.full ? 0 : 16;
   constexpr int kHalf = 1 << (kBits - 1);  // rounds
   std::uint8_t* out = rgb.pixels.data();

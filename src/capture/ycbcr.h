@@ -22,6 +22,6 @@ struct YCbCr {
 };
 
 // Sets the picture's size and pixels.
-void to_rgb(const YCbCr& from, int width, int height, Image8& rgb);
+void to_rgb(YCbCr from, int width, int height, Image8& rgb);
 
 }  // namespace chainsplat::capture
