@@ -96,17 +96,23 @@ bool is_y4m(int file) {
 }
 
 FrameStream::FrameStream(Descriptor file, const std::string& where, int width, int height)
-    : file_(std::move(file)), where_(where) {
-  std::vector<std::uint8_t> begin;
-  begin.resize(read(begin, kMagic.size()));
-  if (std::ranges::equal(begin, kMagic)) {
-    read_header(read_line(kLongestLine));
-    return;
-  }
-  if (width <= 0 || height <= 0) refuse("is no Y4M stream", "write it again");
-  bare_ = true;
-  width_ = width, height_ = height;
-  ahead_ = std::move(begin);
+    : file_(std::move(file)), where_(where), width_(width), height_(height) {}
+
+// Reads what the stream begins with, once.
+void FrameStream::begin() {
+  if (begun_) return;
+  std::vector<std::uint8_t> bytes;
+  bytes.resize(read(bytes, kMagic.size()));
+  bare_ = !std::ranges::equal(bytes, kMagic);
+  if (!bare_) read_header(read_line(kLongestLine));
+  if (bare_ && (width_ <= 0 || height_ <= 0)) refuse("is no Y4M stream", "write it again");
+  if (bare_) ahead_ = std::move(bytes);
+  begun_ = true;
+}
+
+double FrameStream::rate() {
+  begin();
+  return rate_;
 }
 
 double FrameStream::time() const {
@@ -156,6 +162,7 @@ std::string FrameStream::read_line(std::size_t most) {
 }
 
 void FrameStream::read_header(const std::string& line) {
+  width_ = height_ = 0;
   std::string_view name = kUnsaid;
   for_each_parameter(line, [&](char letter, std::string_view value) {
     if (letter == 'W') width_ = whole(value).value_or(0);
@@ -189,6 +196,7 @@ bool FrameStream::begin_frame() {
 }
 
 bool FrameStream::next(Image8* rgb) {
+  begin();
   if (!bare_ && !begin_frame()) return false;
   const auto shrunk = [](int size, int by) { return static_cast<std::size_t>((size + (1 << by) - 1) >> by); };
   const std::size_t pixels = static_cast<std::size_t>(width_) * height_;

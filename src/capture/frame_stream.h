@@ -17,18 +17,20 @@ bool is_y4m(int file);
 class FrameStream {
  public:
   // `where`: for messages. A stream that does not begin as Y4M has RGB24 frames of `width` x `height`, where these are
-  // not 0. Throws InputError, and Interrupted where a stop is requested while it waits, as next() does.
+  // not 0. Nothing is read yet, since who sends may wait until this program is ready.
   FrameStream(Descriptor file, const std::string& where, int width = 0, int height = 0);
+  // Both throw InputError, and Interrupted where a stop is requested while they wait.
   bool next(Image8* rgb);  // false at the end; null: without the conversion to RGB
+  double rate();           // frames per second by the stream's header, 0 when unknown
   int frames() const { return frames_; }
-  double rate() const { return rate_; }  // frames per second, 0 when unknown
-  double time() const;                   // s, of the last frame by the stream's rate; NaN when unknown
-  int width() const { return width_; }
+  double time() const;                  // s, of the last frame by the stream's rate; NaN when unknown
+  int width() const { return width_; }  // once a frame was read, as the height
   int height() const { return height_; }
 
  private:
   std::size_t read(std::vector<std::uint8_t>& bytes, std::size_t size);
   std::string read_line(std::size_t most);
+  void begin();
   void read_header(const std::string& line);
   bool begin_frame();
   [[noreturn]] void refuse(const std::string& problem, const std::string& mend) const;
@@ -37,7 +39,7 @@ class FrameStream {
   std::string where_;
   std::vector<std::uint8_t> ahead_;  // bytes that are read and still to be handed out
   std::vector<std::uint8_t> samples_;
-  bool bare_ = false, gray_ = false, full_ = false;
+  bool begun_ = false, bare_ = false, gray_ = false, full_ = false;
   int across_ = 0, down_ = 0;  // of chroma, as YCbCr has them
   int width_ = 0, height_ = 0, frames_ = 0;
   double rate_ = 0.0;

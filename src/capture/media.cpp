@@ -103,7 +103,7 @@ int VideoReader::frames() const {
   return std::visit([](const auto& source) { return source.frames(); }, implementation_->source);
 }
 double VideoReader::rate() const {
-  return std::visit([](const auto& source) { return source.rate(); }, implementation_->source);
+  return std::visit([](auto& source) { return source.rate(); }, implementation_->source);
 }
 double VideoReader::time() const {
   return std::visit([](const auto& source) { return source.time(); }, implementation_->source);
