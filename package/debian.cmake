@@ -39,7 +39,7 @@ set(CPACK_DEBIAN_PACKAGE_CONTROL_STRICT_PERMISSION ON)
 set(CPACK_DEBIAN_COMPRESSION_TYPE xz)
 set(CPACK_DEBIAN_PROGRAM_PACKAGE_SECTION science)
 # The readers of image and video files, with FFmpeg and OpenImageIO, and networks are most of what is installed: a robot that
-# only predicts and plans leaves them out (--no-install-recommends).
+# predicts, plans and follows its cameras leaves them out (--no-install-recommends).
 set(CPACK_DEBIAN_PROGRAM_PACKAGE_RECOMMENDS "chainsplat-media (= ${PROJECT_VERSION}), mesa-vulkan-drivers")
 set(CPACK_DEBIAN_MEDIA_PACKAGE_SECTION libs)
 set(CPACK_DEBIAN_LIBRARY_PACKAGE_SECTION libs)

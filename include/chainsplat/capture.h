@@ -178,22 +178,22 @@ void write_depth_png(const Path& file, int width, int height, const std::vector<
 // (yuv444p for odd sizes), tagged as BT.601 limited range. The same frames give the same bytes. Throws WorkError.
 void write_video(const Path& file, double rate, const std::vector<Image8>& frames);
 
-// The format requested from a camera; 0 leaves the choice to the camera.
+// The format requested from a camera, where 0 leaves the choice to the camera, and the size of bare frames.
 struct DeviceFormat {
   int width = 0, height = 0;
   double rate = 0.0;  // frames per second
 };
 
-// Decodes a video frame by frame, in display order. Colors are converted with swscale's default bicubic filter, with
-// matrix and range from the stream's tags or BT.601 limited without tags. Throws InputError when the file is missing,
-// is no video or has a frame that cannot be decoded.
+// Frames one by one in display order: of a video with libav (MP4, MOV, MKV, WebM, AVI, MPEG, Ogg, FLV, ASF, or a bare
+// stream of H.264, HEVC, AV1 or MJPEG, but nothing that names further files; swscale's bicubic default, matrix and range
+// from the stream's tags, else BT.601 limited), of Y4M or of a camera. Throws InputError where it is missing or damaged.
 class VideoReader {
  public:
-  // Opens a file or pipe (MP4, MOV, MKV, WebM, AVI, MPEG, Ogg, FLV, ASF, or a bare stream of H.264, HEVC, AV1, MJPEG or
-  // Y4M, but no format that names further files), or the camera behind a character device (V4L2), from which `format`
-  // is requested. From a camera each call gets the newest frame: frames that arrived in between are skipped, and so are
-  // damaged ones. next() then throws WorkError when the camera disappears or is silent for 5 s, and Interrupted when a
-  // stop is requested while it waits.
+  // A file or pipe, which is Y4M by its first bytes, the camera behind a character device (V4L2), from which `format` is
+  // requested, or `-`, standard input: Y4M or bare RGB24 of the format's size. From a camera each call gets the newest
+  // frame: frames that arrived in between are skipped, and so are damaged ones. next() then throws WorkError when the
+  // camera disappears or has no good frame for 5 s. Of all but videos it throws Interrupted when a stop is requested
+  // while it waits. Y4M keeps chroma in blocks, by BT.601 in the range that it names, else limited.
   explicit VideoReader(const Path& file, int threads = 1, const DeviceFormat& format = {});
   ~VideoReader();
   VideoReader(VideoReader&&) noexcept;
@@ -204,7 +204,7 @@ class VideoReader {
   int frames() const;         // number of frames so far, a camera's skipped ones included
   double rate() const;        // mean frames per second by the stream's header, 0 when unknown
   double time() const;        // s, of the last frame by the stream's clock; NaN when it has none
-  double first_time() const;  // s, of a camera's first frame, which may have been skipped; NaN for a recording
+  double first_time() const;  // s, of a camera's first frame, which may have been skipped; else NaN
 
  private:
   struct Implementation;

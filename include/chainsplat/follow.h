@@ -31,7 +31,7 @@ struct LiveFrame {
 };
 
 struct SourceOptions {
-  Path source;  // a capture; with `calibration` a video file, a device under /dev or "-": raw RGB24, standard input
+  Path source;  // a capture; with `calibration` a video, a device under /dev or "-": Y4M or RGB24 on standard input
   std::string camera;           // of a capture, by its name; empty: all of them together
   Path calibration;             // camera object as in capture.json
   double rate = 0.0;            // frames per second; 0: the calibration's, else the video's

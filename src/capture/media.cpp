@@ -1,6 +1,13 @@
 #include "media.h"
 
+#include <fcntl.h>
+
+#include <limits>
+#include <variant>
+
+#include "camera_device.h"
 #include "chainsplat/encode.h"
+#include "frame_stream.h"
 #include "image_files.h"
 #include "src/core/own_library.h"
 
@@ -47,29 +54,73 @@ void write_depth_exr(const Path& file, int width, int height, const std::vector<
   images().write_depth_exr(file, width, height, meters);
 }
 
-std::string jpeg(const Image8& image, int quality) { return images().jpeg(image, quality); }
+namespace {
+
+// A compressed video.
+class Video {
+ public:
+  Video(const Path& file, int threads) : decoder_(videos().open(file, threads), videos().close) {}
+  bool next(Image8* rgb) { return videos().next(*decoder_, rgb); }
+  int frames() const { return videos().frames(*decoder_); }
+  double rate() const { return videos().rate(*decoder_); }
+  double time() const { return videos().time(*decoder_); }
+
+ private:
+  std::unique_ptr<media::Decoder, void (*)(media::Decoder*)> decoder_;
+};
+
+// A camera, frames that are not compressed, or a compressed video, by what `file` is and how it begins.
+std::variant<CameraDevice, FrameStream, Video> open_source(const Path& file, int threads, const DeviceFormat& format) {
+  std::error_code error;
+  if (file == "-") return FrameStream(Descriptor(STDIN_FILENO), "standard input", format.width, format.height);
+  if (std::filesystem::is_character_file(file, error)) return CameraDevice(file, format);
+  Descriptor opened(::open(file.c_str(), O_RDONLY | O_CLOEXEC));
+  if (opened.number() >= 0 && is_y4m(opened.number())) return FrameStream(std::move(opened), file.string());
+  return Video(file, threads);  // with a pipe still open here: its writer must not lose its last reader
+}
+
+}  // namespace
 
 struct VideoReader::Implementation {
-  media::Decoder& decoder;
-  ~Implementation() { videos().close(&decoder); }
+  std::variant<CameraDevice, FrameStream, Video> source;
 };
 
 VideoReader::VideoReader(const Path& file, int threads, const DeviceFormat& format)
-    : implementation_(new Implementation{*videos().open(file, threads, format, {core::warn, core::stop_requested})}) {}
+    : implementation_(new Implementation{open_source(file, threads, format)}) {}
 
 VideoReader::~VideoReader() = default;
 VideoReader::VideoReader(VideoReader&&) noexcept = default;
 VideoReader& VideoReader::operator=(VideoReader&&) noexcept = default;
 
-bool VideoReader::next(Image8& rgb) { return videos().next(implementation_->decoder, &rgb); }
-bool VideoReader::skip() { return videos().next(implementation_->decoder, nullptr); }
-bool VideoReader::device() const { return videos().device(implementation_->decoder); }
-int VideoReader::frames() const { return videos().frames(implementation_->decoder); }
-double VideoReader::rate() const { return videos().rate(implementation_->decoder); }
-double VideoReader::time() const { return videos().time(implementation_->decoder); }
-double VideoReader::first_time() const { return videos().first_time(implementation_->decoder); }
+bool VideoReader::next(Image8& rgb) {
+  return std::visit([&](auto& source) { return source.next(&rgb); }, implementation_->source);
+}
+bool VideoReader::skip() {
+  return std::visit([](auto& source) { return source.next(nullptr); }, implementation_->source);
+}
+bool VideoReader::device() const { return std::holds_alternative<CameraDevice>(implementation_->source); }
+int VideoReader::frames() const {
+  return std::visit([](const auto& source) { return source.frames(); }, implementation_->source);
+}
+double VideoReader::rate() const {
+  return std::visit([](auto& source) { return source.rate(); }, implementation_->source);
+}
+double VideoReader::time() const {
+  return std::visit([](const auto& source) { return source.time(); }, implementation_->source);
+}
+double VideoReader::first_time() const {
+  const auto* const camera = std::get_if<CameraDevice>(&implementation_->source);
+  return camera ? camera->first_time() : std::numeric_limits<double>::quiet_NaN();
+}
 
-VideoFacts video_facts(const Path& file) { return videos().video_facts(file); }
+VideoFacts video_facts(const Path& file) {
+  Descriptor opened(::open(file.c_str(), O_RDONLY | O_CLOEXEC));
+  if (opened.number() < 0 || !is_y4m(opened.number())) return videos().video_facts(file);
+  FrameStream stream(std::move(opened), file.string());
+  while (stream.frames() <= kMostFrames && stream.next(nullptr)) {
+  }
+  return {stream.width(), stream.height(), stream.frames(), stream.rate()};
+}
 
 struct VideoWriter::Implementation {
   media::Encoder& encoder;

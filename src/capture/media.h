@@ -1,9 +1,9 @@
-// src/capture/media.h - images and videos are read and written by two shared libraries of the program's own, loaded at
-// first use: OpenImageIO and libav bring some 330 further libraries, and most commands need none of them.
+// src/capture/media.h - image files and compressed videos are read and written by two shared libraries of the program's
+// own, loaded at first use: OpenImageIO and libav bring some 330 further libraries, and most commands need none of them.
 //
 // chainsplat_images.so is src/capture/media/images.cpp, chainsplat_videos.so is src/capture/media/videos.cpp
 // (src/core/own_library.h). The functions of their tables do what those of capture.h and image_files.h do that are
-// named like them. The process's listener and the request to stop reach them through Host.
+// named like them.
 #pragma once
 #include "chainsplat/capture.h"
 
@@ -18,27 +18,19 @@ struct ImageLibrary {
   void (*write_png)(const Path& file, const Image8& image);
   void (*write_depth_png)(const Path& file, int width, int height, const std::vector<float>& meters, double scale);
   void (*write_depth_exr)(const Path& file, int width, int height, const std::vector<float>& meters);
-  std::string (*jpeg)(const Image8& image, int quality);
 };
 
-struct Host {
-  void (*warn)(const std::string& line);
-  int (*stop_requested)() noexcept;
-};
-
-struct Decoder;  // an opened video or camera
+struct Decoder;  // an opened video
 struct Encoder;  // a video that is being written
 
 struct VideoLibrary {
   const char* version;
-  Decoder* (*open)(const Path& file, int threads, const DeviceFormat& format, const Host& host);
+  Decoder* (*open)(const Path& file, int threads);
   void (*close)(Decoder* decoder);
   bool (*next)(Decoder& decoder, Image8* rgb);  // null: without the conversion to RGB
-  bool (*device)(const Decoder& decoder);
   int (*frames)(const Decoder& decoder);
   double (*rate)(const Decoder& decoder);
   double (*time)(const Decoder& decoder);
-  double (*first_time)(const Decoder& decoder);
   VideoFacts (*video_facts)(const Path& file);
   Encoder* (*create)(const Path& file, double rate);
   void (*add)(Encoder& encoder, const Image8& frame);

@@ -1,12 +1,7 @@
 // frame_source.cpp - frames from a capture, a video, a device or standard input.
-#include <poll.h>
-#include <unistd.h>
-
 #include <algorithm>
-#include <cerrno>
 #include <chrono>
 #include <cmath>
-#include <cstring>
 #include <limits>
 
 #include "chainsplat/follow.h"
@@ -16,33 +11,9 @@ namespace chainsplat::pipeline {
 
 namespace {
 
-constexpr int kBlack = 16;         // brightness up to which a pixel of a masked video is background (lossy coding)
-constexpr int kMargin = 24;        // px about what a frame shows
-constexpr int kMostStale = 30;     // frames of a device in a row whose time stamps do not increase
-
-// Raw RGB24 from standard input; an incomplete last frame ends the work. Throws Interrupted where it waits.
-bool read_raw(const capture::Camera& camera, capture::Image8& image) {
-  constexpr int kAttention = 50;  // ms, to a request to stop
-  image.width = camera.width, image.height = camera.height, image.channels = 3;
-  image.pixels.resize(3 * static_cast<std::size_t>(camera.width) * camera.height);
-  std::size_t got = 0;
-  while (got < image.pixels.size()) {
-    core::stop_if_requested();
-    pollfd input{STDIN_FILENO, POLLIN, 0};
-    if (::poll(&input, 1, kAttention) <= 0) continue;
-    const ssize_t count = ::read(STDIN_FILENO, &image.pixels[got], image.pixels.size() - got);
-    if (count < 0 && errno != EINTR && errno != EAGAIN)
-      throw WorkError("standard input", std::string("cannot be read (") + std::strerror(errno) + ")",
-                      "the states so far are kept");
-    if (count == 0) break;
-    got += static_cast<std::size_t>(std::max<ssize_t>(0, count));
-  }
-  if (got == image.pixels.size()) return true;
-  if (got != 0)
-    throw WorkError("standard input", "ends within a frame",
-                    "send whole frames of the calibration's size; the states so far are kept");
-  return false;
-}
+constexpr int kBlack = 16;      // brightness up to which a pixel of a masked video is background (lossy coding)
+constexpr int kMargin = 24;     // px about what a frame shows
+constexpr int kMostStale = 30;  // frames of a device in a row whose time stamps do not increase
 
 // What to add to a device's time stamp to have it in Unix time. Most drivers stamp by the monotonic clock, some in Unix
 // time already.
@@ -102,25 +73,21 @@ FrameSource open_capture(const SourceOptions& options) {
 // Frames of one camera whose calibration is given: from a file, a device or standard input.
 FrameSource open_stream(const SourceOptions& options) {
   const capture::Calibration calibration = capture::read_calibration(options.calibration);
-  const bool standard_input = options.source == "-";
   double rate = options.rate > 0.0 ? options.rate : calibration.rate, start = calibration.start;
   FrameSource source;
   source.cameras = as_corrected(options.corrections, {calibration.camera}, &source.unverified);
   const double late = capture::value_of(options.corrections, calibration.camera.name, "time");
-  std::shared_ptr<capture::VideoReader> reader;
-  if (!standard_input) {
-    const capture::Camera& camera = source.cameras[0];
-    reader = std::make_shared<capture::VideoReader>(
-        options.source, 1, capture::DeviceFormat{.width = camera.width, .height = camera.height, .rate = rate});
-    if (rate <= 0.0) rate = reader->rate();
-  }
-  const bool device = reader && reader->device();
+  const auto reader = std::make_shared<capture::VideoReader>(
+      options.source, 1,
+      capture::DeviceFormat{.width = calibration.camera.width, .height = calibration.camera.height, .rate = rate});
+  if (rate <= 0.0) rate = reader->rate();
+  const bool device = reader->device();
   if (!device && rate <= 0.0)
     throw InputError("`rate`", "is needed to know the frames' times", "give frames a second, for example 30");
   const bool unix = options.unix_time;
   if (unix && !device) throw InputError("`start`", "only a device stamps its frames", "give seconds");
   if (options.start) start = *options.start;
-  const std::string where = standard_input ? "standard input" : options.source.string();
+  const std::string where = options.source == "-" ? "standard input" : options.source.string();
   // a device has a clock of its own, so that frames which were passed over leave a gap in time
   std::optional<double> offset;                             // from that clock to ours
   double stamp = -std::numeric_limits<double>::infinity();  // s, the last frame's by that clock
@@ -129,7 +96,7 @@ FrameSource open_stream(const SourceOptions& options) {
     int stale = 0;  // in a row: some drivers' stamps jitter, others' are none
     do {
       if (frames.last >= 0 && count >= frames.last) return false;
-      if (!(reader ? reader->next(frame.picture) : read_raw(camera, frame.picture))) return false;
+      if (!reader->next(frame.picture)) return false;
       frame.frame = device ? reader->frames() - 1 : count;
       if (frames.last >= 0 && frame.frame >= frames.last) return false;
       if (frame.picture.width != camera.width || frame.picture.height != camera.height)

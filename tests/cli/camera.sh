@@ -1,6 +1,7 @@
 #!/bin/bash
 # camera.sh PROGRAM FAKE_CAMERA CAMERA_FRAMES: estimate from a V4L2 device that fake_camera.cpp plays: the same states as
-# from standard input, always of the newest frame, and what is left when the device changes its mind. Needs no Vulkan.
+# from standard input, always of the newest frame, and what is left when the device changes its mind; from streams of
+# Y4M; and both by a program without the readers of videos and images. Needs no Vulkan.
 . "$(dirname "$0")/lib.sh"
 fake=$2
 demo=$source_dir/assets/demo_free_30
@@ -17,6 +18,9 @@ camera = {key: camera[key] for key in ("name", "width", "height", "fx", "fy", "c
 json.dump(camera, open(sys.argv[2] + "/camera.json", "w"))
 camera["width"] += 2
 json.dump(camera, open(sys.argv[2] + "/other.json", "w"))
+del camera["rate"]
+camera["width"] -= 2
+json.dump(camera, open(sys.argv[2] + "/unpaced.json", "w"))
 END
 
 export FAKE_CAMERA=/dev/video97 FAKE_CAMERA_SIZE=320x240
@@ -65,6 +69,9 @@ silent=$!
 
 # every frame, until it disappears
 from_stdin "$work/all"
+mkdir "$work/alone"
+cp "$program" "$work/alone/chainsplat"
+whole=$program
 live "${yuyv[@]}" "${step[@]}" GONE=60 "${moving[@]}" --centerline "$work/line.csv"
 said 1 '/dev/video97: gives no more frames after 60 \(No such device\); ' 'a device that disappears'
 same "$work/all" 0.02 '' 'YUYV'
@@ -89,11 +96,54 @@ live "${yuyv[@]}" STOPPED=7 "${moving[@]}" --centerline "$work/line.csv"  # in r
 said 1 '/dev/video97: its time stamps do not increase, from frame ([7-9]|10); ' 'time stamps that stand still'
 [ "$(wc -l <"$work/line.csv")" -ge 2 ] || fail 'time stamps that stand still: the centerline was not kept'
 
+# frames of Y4M: from standard input, a pipe, a file, at the stream's own rate
+stream() {  # file for standard input, SOURCE, arguments
+  local input=$1 source=$2
+  shift 2
+  "$program" estimate "$twin" --camera "$source" --base "$demo/base.tum" "$@" >"$work/stdout" 2>"$work/stderr" <"$input"
+  code=$?
+}
+stream "$work/y4m" - "${calibration[@]}"
+expect_code 0 'Y4M from standard input'
+same "$work/all" 0.02 '' 'Y4M from standard input'
+cp "$work/stdout" "$work/streamed"
+mkfifo "$work/frames"
+cat "$work/y4m" >"$work/frames" &
+stream /dev/null "$work/frames" --calibration "$work/unpaced.json"
+expect_code 0 'Y4M from a pipe'
+same "$work/streamed" 0 '' 'Y4M from a pipe'
+cp "$work/y4m" "$work/frames.y4m"
+stream /dev/null "$work/frames.y4m" --calibration "$work/unpaced.json"
+same "$work/streamed" 0 '' 'Y4M from a file'
+head -c 500000 "$work/y4m" >"$work/cut"
+stream "$work/cut" - "${calibration[@]}"
+said 1 'standard input: ends within a frame; write the stream again; the states so far are kept' 'Y4M that is cut off'
+[ "$(wc -l <"$work/stdout")" -eq 3 ] || fail 'Y4M that is cut off: not the states of three frames'
+stream "$work/y4m" - --calibration "$work/other.json"
+said 1 'standard input: frame 0 has 320x240 pixels, the calibration says 322x240; ' 'Y4M of another size'
+echo 'YUV4MPEG2 W320 H240 F30:1 C420p10' >"$work/deep"
+stream "$work/deep" - "${calibration[@]}"
+said 2 "standard input: has Y4M samples of the kind '420p10'; send 8 bits" 'Y4M of 10 bits'
+expect_error 2 '--rate: is needed' estimate "$twin" --camera - --calibration "$work/unpaced.json"
+
 # the camera takes three frames while the program works on one: always the newest, at its own time
-from_stdin "$work/third" --drop 3
+stream "$work/y4m" - "${calibration[@]}" --drop 3
+cp "$work/stdout" "$work/third"
 live "${yuyv[@]}" STRIDE=3 GONE=60 "${moving[@]}"
 sed -i '$d' "$work/stdout"  # what was newest at the end
-same "$work/third" 0.05 '' 'a program that is slower than the camera'
+same "$work/third" 1e-6 '' 'a program that is slower than the camera'
+
+# a program that has neither FFmpeg nor OpenImageIO
+program=$work/alone/chainsplat
+run estimate "$twin" --camera "$demo/cam0.mp4" "${calibration[@]}"
+grep -q 'chainsplat_videos.so: cannot be loaded' "$work/stderr" || fail 'alone: it is not'
+stream "$work/y4m" - "${calibration[@]}" --mcap "$work/alone.mcap" --centerline "$work/line.csv"
+expect_code 0 'alone, from Y4M'
+same "$work/streamed" 0 '' 'alone, from Y4M'
+python3 "$source_dir/tests/read_mcap.py" "$work/alone.mcap" >"$work/mcap" || fail 'alone, from Y4M: the recording'
+live "${mjpg[@]}" "${step[@]}" GONE=60 "${moving[@]}"
+same "$work/all" 0.05 '' 'alone, MJPEG'
+program=$whole
 
 # another size than the calibration's
 live "${yuyv[@]}" "${step[@]}" --calibration "$work/other.json"

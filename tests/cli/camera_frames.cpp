@@ -1,5 +1,6 @@
 // camera_frames CAPTURE CAMERA FOLDER: the frames of a capture's camera, the rope on black, as a live camera would send
-// them: FOLDER/rgb (raw RGB24, one after another), FOLDER/yuyv and FOLDER/mjpg (each frame behind its length in bytes).
+// them: FOLDER/rgb (raw RGB24, one after another), FOLDER/y4m (the same in 4:2:2), FOLDER/yuyv and FOLDER/mjpg (each
+// frame behind its length in bytes).
 #include <OpenImageIO/filesystem.h>
 #include <OpenImageIO/imageio.h>
 
@@ -7,6 +8,8 @@
 #include <cmath>
 #include <cstdio>
 #include <fstream>
+#include <string>
+#include <vector>
 
 #include "chainsplat/capture.h"
 
@@ -34,6 +37,14 @@ std::vector<std::uint8_t> yuyv(const capture::Image8& rgb) {
   return out;
 }
 
+// A frame of Y4M with the samples of `packed`.
+std::string y4m(const std::vector<std::uint8_t>& packed) {
+  std::string out = "FRAME\n";
+  for (const auto& [first, step] : {std::pair<std::size_t, std::size_t>{0, 2}, {1, 4}, {3, 4}})
+    for (std::size_t at = first; at < packed.size(); at += step) out += static_cast<char>(packed[at]);
+  return out;
+}
+
 std::vector<std::uint8_t> jpeg(const capture::Image8& rgb) {
   std::vector<unsigned char> bytes;
   OIIO::Filesystem::IOVecOutput memory(bytes);
@@ -55,7 +66,8 @@ int main(int, char** argv) {
   const capture::Capture recorded = capture::load(argv[1], options);
   const Path folder = argv[3];
   std::ofstream raw(folder / "rgb", std::ios::binary), packed(folder / "yuyv", std::ios::binary),
-      compressed(folder / "mjpg", std::ios::binary);
+      compressed(folder / "mjpg", std::ios::binary), stream(folder / "y4m", std::ios::binary);
+  stream << "YUV4MPEG2 W" << recorded.cameras[0].width << " H" << recorded.cameras[0].height << " F30:1 C422\n";
   for (const capture::View& view : recorded.views) {
     capture::Image8 whole{recorded.cameras[0].width, recorded.cameras[0].height, 3, {}};
     whole.pixels.assign(static_cast<std::size_t>(3) * whole.width * whole.height, 0);
@@ -64,8 +76,10 @@ int main(int, char** argv) {
         std::copy_n(&view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x)], 3,
                     &whole.pixels[3 * (static_cast<std::size_t>(view.y0 + y) * whole.width + view.x0 + x)]);
     raw.write(reinterpret_cast<const char*>(whole.pixels.data()), static_cast<std::streamsize>(whole.pixels.size()));
-    add_frame(packed, yuyv(whole));
+    const std::vector<std::uint8_t> samples = yuyv(whole);
+    add_frame(packed, samples);
+    stream << y4m(samples);
     add_frame(compressed, jpeg(whole));
   }
-  return raw && packed && compressed ? 0 : 1;
+  return raw && packed && compressed && stream ? 0 : 1;
 }

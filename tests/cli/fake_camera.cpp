@@ -2,9 +2,13 @@
 // FAKE_CAMERA names. Its buffers are a memory file, so that mmap() and close() need no help.
 //   FAKE_CAMERA          path of the device, for example /dev/video97
 //   FAKE_CAMERA_SIZE     the only size that it has, for example 320x240
-//   FAKE_CAMERA_YUYV, FAKE_CAMERA_MJPG   frames in that format (see camera_frames.cpp), over and over; one or both
+//   FAKE_CAMERA_YUYV, _UYVY, _NV12, _YU12, _RGB3, _BGR3, _GREY, _MJPG, _H264: frames in that format (see
+//                        camera_frames.cpp), over and over; one or several
 //   FAKE_CAMERA_RATE     frames a second (30), and the time between two stamps
-//   FAKE_CAMERA_YUYV_RATE                the same in that format alone, as where the cable is too slow for it
+//   FAKE_CAMERA_YUYV_RATE and so on      the same in that format alone, as where the cable is too slow for it
+//   FAKE_CAMERA_ROW      bytes from one row to the next of raw frames, where the driver pads them
+//   FAKE_CAMERA_CAN      capabilities in place of V4L2_CAP_VIDEO_CAPTURE | V4L2_CAP_STREAMING
+//   FAKE_CAMERA_BUSY     another program reads it
 //   FAKE_CAMERA_STRIDE   frames that it takes while the program works on one: then its clock is the lines that the
 //   program
 //                        flushes to standard output, and no result depends on the machine's load. Without: real time
@@ -12,6 +16,9 @@
 //   FAKE_CAMERA_GONE     it disappears after so many frames
 //   FAKE_CAMERA_SILENT   it sends nothing any more after so many frames
 //   FAKE_CAMERA_DAMAGED  the frame of this number is damaged on its way
+//   FAKE_CAMERA_TORN     the second half of the frame of this number is missing, and the driver does not say so
+//   FAKE_CAMERA_LOST     the driver has no buffer for the frame of this number
+//   FAKE_CAMERA_FULL     it says that its range is 0..255
 //   FAKE_CAMERA_BACK     the frame of this number is stamped a second too early
 //   FAKE_CAMERA_STOPPED  the frames from this number on are stamped as the one before
 #ifndef _GNU_SOURCE
@@ -19,6 +26,7 @@
 #endif
 #include <dlfcn.h>
 #include <fcntl.h>
+#include <linux/poll.h>
 #include <linux/videodev2.h>
 #include <sys/ioctl.h>
 #include <sys/mman.h>
@@ -93,12 +101,12 @@ std::atomic<int> lines{0};  // flushed by the program
 void read_settings() {
   std::sscanf(std::getenv("FAKE_CAMERA_SIZE"), "%dx%d", &camera.width, &camera.height);
   camera.formats.clear();
-  for (const auto& [name, frames, rate] :
-       {std::tuple(V4L2_PIX_FMT_YUYV, "FAKE_CAMERA_YUYV", "FAKE_CAMERA_YUYV_RATE"),
-        std::tuple(V4L2_PIX_FMT_MJPEG, "FAKE_CAMERA_MJPG", "FAKE_CAMERA_MJPG_RATE")}) {
-    const char* const path = std::getenv(frames);
+  for (const char* const name : {"YUYV", "UYVY", "NV12", "YU12", "RGB3", "BGR3", "MJPG", "GREY", "H264"}) {
+    const std::string frames = std::string("FAKE_CAMERA_") + name;
+    const char* const path = std::getenv(frames.c_str());
     if (!path) continue;
-    Format format{name, setting(rate, setting("FAKE_CAMERA_RATE", 30.0)), {}};
+    Format format{v4l2_fourcc(name[0], name[1], name[2], name[3]),
+                  setting((frames + "_RATE").c_str(), setting("FAKE_CAMERA_RATE", 30.0)), {}};
     std::ifstream file(path, std::ios::binary);
     std::uint32_t size = 0;
     while (file.read(reinterpret_cast<char*>(&size), sizeof size)) {
@@ -108,8 +116,10 @@ void read_settings() {
     camera.formats.push_back(std::move(format));
   }
   camera.format = &camera.formats.at(0);
-  // a compressed frame is never longer than the same as YUYV
-  camera.capacity = (2u * camera.width * camera.height + 4095u) / 4096u * 4096u;
+  std::size_t most = 0;  // bytes of a frame
+  for (const Format& format : camera.formats)
+    for (const std::string& frame : format.frames) most = std::max(most, frame.size());
+  camera.capacity = (most + 4095u) / 4096u * 4096u;
   camera.empty.clear(), camera.full.clear();
 }
 
@@ -127,6 +137,10 @@ int due() {
 void fill_buffers() {
   for (const int end = due(); camera.taken < end; ++camera.taken) {
     if (camera.empty.empty()) continue;
+    if (camera.taken == setting("FAKE_CAMERA_LOST", -1)) {
+      ++camera.damaged;
+      continue;
+    }
     v4l2_buffer buffer = camera.empty.front();
     camera.empty.pop_front();
     const std::string& frame = camera.format->frames[camera.taken % camera.format->frames.size()];
@@ -142,6 +156,10 @@ void fill_buffers() {
     buffer.flags = V4L2_BUF_FLAG_DONE | V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC;
     if (camera.taken == setting("FAKE_CAMERA_DAMAGED", -1)) {
       buffer.flags |= V4L2_BUF_FLAG_ERROR;
+      ++camera.damaged;
+    }
+    if (camera.taken == setting("FAKE_CAMERA_TORN", -1)) {
+      buffer.bytesused /= 2;
       ++camera.damaged;
     }
     camera.full.push_back(buffer);
@@ -179,7 +197,10 @@ int answer(unsigned long request, void* argument) {
       capability = {};
       std::strcpy(reinterpret_cast<char*>(capability.driver), "fake");
       std::strcpy(reinterpret_cast<char*>(capability.card), "no camera");
-      capability.capabilities = capability.device_caps = V4L2_CAP_VIDEO_CAPTURE | V4L2_CAP_STREAMING;
+      // what the whole device can, and what this file of it
+      const double can = setting("FAKE_CAMERA_CAN", V4L2_CAP_VIDEO_CAPTURE | V4L2_CAP_STREAMING);
+      capability.device_caps = static_cast<std::uint32_t>(can);
+      capability.capabilities = V4L2_CAP_VIDEO_CAPTURE | V4L2_CAP_STREAMING | V4L2_CAP_DEVICE_CAPS;
       return 0;
     }
     case VIDIOC_G_INPUT:
@@ -197,6 +218,7 @@ int answer(unsigned long request, void* argument) {
       // as the driver of USB cameras: what it does not have becomes what it has
       v4l2_pix_format& pixels = static_cast<v4l2_format*>(argument)->fmt.pix;
       if (request == VIDIOC_S_FMT) {
+        if (std::getenv("FAKE_CAMERA_BUSY")) return refuse(EBUSY);
         camera.format = &camera.formats[0];
         for (const Format& format : camera.formats)
           if (format.name == pixels.pixelformat) camera.format = &format;
@@ -205,6 +227,8 @@ int answer(unsigned long request, void* argument) {
       pixels.width = camera.width, pixels.height = camera.height;
       pixels.pixelformat = camera.format->name;
       pixels.field = V4L2_FIELD_NONE;
+      pixels.bytesperline = static_cast<std::uint32_t>(setting("FAKE_CAMERA_ROW", 0));
+      if (std::getenv("FAKE_CAMERA_FULL")) pixels.quantization = V4L2_QUANTIZATION_FULL_RANGE;
       pixels.sizeimage = static_cast<std::uint32_t>(camera.capacity);
       return 0;
     }
@@ -234,6 +258,7 @@ int answer(unsigned long request, void* argument) {
     case VIDIOC_STREAMON:
       camera.begun = now();
       camera.taken = camera.damaged = 0;
+      lines = 0;
       return 0;
     case VIDIOC_STREAMOFF:
       return 0;
@@ -280,6 +305,19 @@ int open64(const char* path, int flags, ...) {
 
 int stat(const char* path, struct stat* facts) noexcept {
   return is_camera(path) ? describe(facts) : real<int (*)(const char*, struct stat*)>("stat")(path, facts);
+}
+
+int poll(pollfd* files, unsigned long count, int milliseconds) {
+  if (count != 1 || files->fd < 0 || files->fd != camera.file)
+    return real<int (*)(pollfd*, unsigned long, int)>("poll")(files, count, milliseconds);
+  for (const double end = now() + 1e-3 * milliseconds;; usleep(1000)) {
+    const std::lock_guard lock(camera.mutex);
+    fill_buffers();
+    const bool gone = camera.full.empty() && camera.taken >= setting("FAKE_CAMERA_GONE", INT_MAX);
+    files->revents = static_cast<short>(gone ? POLLERR | POLLHUP : camera.full.empty() ? 0 : files->events);
+    if (files->revents != 0) return 1;
+    if (now() > end) return 0;
+  }
 }
 
 int ioctl(int file, unsigned long request, ...) noexcept {

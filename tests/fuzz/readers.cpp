@@ -17,7 +17,9 @@
 #include "chainsplat/marker_files.h"
 #include "chainsplat/motion_files.h"
 #include "chainsplat/run_folder.h"
+#include "src/capture/frame_stream.h"
 #include "src/capture/image_files.h"
+#include "src/capture/jpeg.h"
 #include "tools/chainsplat/cli.h"
 
 namespace chainsplat::fuzz {
@@ -316,6 +318,28 @@ void video(std::string_view bytes) {
             "as many pixels as the size says");
 }
 
+// A stream of frames that are not compressed; where it does not begin as Y4M they are bare, of 3 x 2 pixels.
+void y4m(std::string_view bytes) {
+  static const Path file = folder() / "stream.y4m";
+  put(file, bytes);
+  capture::FrameStream stream(capture::Descriptor(::open(file.c_str(), O_RDONLY | O_CLOEXEC)), file.string(), 3, 2);
+  capture::Image8 picture;
+  constexpr int kMost = 8;  // frames that are converted
+  while (stream.frames() < kMost && stream.next(&picture))
+    require(picture.pixels.size() == static_cast<std::size_t>(stream.width()) * stream.height() * 3,
+            "as many pixels as the size says");
+}
+
+// A frame of a camera, whose size the driver tells: the first two bytes.
+void jpeg(std::string_view bytes) {
+  if (bytes.size() < 2) return;
+  const auto* const data = reinterpret_cast<const std::uint8_t*>(bytes.data());
+  const int width = 1 + data[0], height = 1 + data[1];
+  capture::Image8 picture;
+  if (capture::read_jpeg({data + 2, bytes.size() - 2}, width, height, picture))
+    require(picture.pixels.size() == static_cast<std::size_t>(width) * height * 3, "as many pixels as the size says");
+}
+
 const std::map<std::string, Read> kReaders = {
     {"batch", batch},
     {"board", board},
@@ -329,6 +353,7 @@ const std::map<std::string, Read> kReaders = {
     {"forces", forces},
     {"image", image},
     {"jobs", jobs},
+    {"jpeg", jpeg},
     {"manifest", manifest},
     {"markers", markers},
     {"metrics", metrics},
@@ -345,6 +370,7 @@ const std::map<std::string, Read> kReaders = {
     {"urdf", urdf},
     {"values", values},
     {"video", video},
+    {"y4m", y4m},
 };
 
 Read reader_of_environment() {

@@ -271,9 +271,10 @@ void add_estimation_commands(Command app, const Globals& globals, Job& job) {
   command.add_option("RUN", request->run, "Run folder of a twin").required();
   command
       .add_option("--camera", request->camera,
-                  "CAPTURE:NAME one camera of a capture, CAPTURE all of them together; with --calibration a video, a\n"
-                  "V4L2 device such as /dev/video0, or - for raw RGB24 frames on standard input, of the rope on black\n"
-                  "or as it comes: then masks are made")
+                  "CAPTURE:NAME one camera of a capture, CAPTURE all of them together; with --calibration a V4L2\n"
+                  "device such as /dev/video0, whose newest frame is used; a video, a pipe, or - for standard input\n"
+                  "with Y4M or raw RGB24 frames: each is used, and a live sender is to drop what is late. Of the rope\n"
+                  "on black or as it comes: then masks are made")
       .required()
       .type_name("SOURCE");
   command.add_option("--calibration", request->calibration, "Camera object as in capture.json").type_name("FILE.json");

@@ -1,5 +1,4 @@
 // Single images with OpenImageIO's ImageInput and ImageOutput, without its cache.
-#include <OpenImageIO/filesystem.h>
 #include <OpenImageIO/imageio.h>
 #include <unistd.h>
 
@@ -188,18 +187,6 @@ void write_depth_exr(const Path& file, int width, int height, const std::vector<
 }
 
 // A quality of 1 to 100.
-std::string jpeg(const Image8& image, int quality) {
-  std::vector<unsigned char> bytes;
-  OIIO::Filesystem::IOVecOutput sink(bytes);
-  OIIO::ImageSpec spec(image.width, image.height, image.channels, OIIO::TypeDesc::UINT8);
-  spec.attribute("Compression", "jpeg:" + std::to_string(quality));
-  const auto output = OIIO::ImageOutput::create("picture.jpg");
-  const bool written = output && output->set_ioproxy(&sink) && output->open("picture.jpg", spec) &&
-                       output->write_image(OIIO::TypeDesc::UINT8, image.pixels.data()) && output->close();
-  if (!written) throw WorkError("picture", "OpenImageIO cannot write JPEG into memory", "install it with libjpeg");
-  return std::string(bytes.begin(), bytes.end());
-}
-
 }  // namespace
 
 const ImageLibrary chainsplat_images = {.version = CHAINSPLAT_VERSION,
@@ -209,7 +196,6 @@ const ImageLibrary chainsplat_images = {.version = CHAINSPLAT_VERSION,
                                         .read_image8 = read_image8,
                                         .write_png = write_png,
                                         .write_depth_png = write_depth_png,
-                                        .write_depth_exr = write_depth_exr,
-                                        .jpeg = jpeg};
+                                        .write_depth_exr = write_depth_exr};
 
 }  // namespace chainsplat::capture::media

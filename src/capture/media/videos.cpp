@@ -1,7 +1,6 @@
-// Videos and cameras with libav: decoding frame by frame, counting, encoding.
+// Videos with libav: decoding frame by frame, counting, encoding.
 extern "C" {
 #include <libavcodec/avcodec.h>
-#include <libavdevice/avdevice.h>
 #include <libavformat/avformat.h>
 #include <libavutil/opt.h>
 #include <libswscale/swscale.h>
@@ -9,15 +8,11 @@ extern "C" {
 
 #include <unistd.h>
 
-#include <atomic>
-#include <chrono>
 #include <cmath>
-#include <condition_variable>
 #include <cstring>
 #include <limits>
 #include <mutex>
 #include <new>
-#include <thread>
 
 #include "src/capture/media.h"
 
@@ -73,69 +68,17 @@ void prepare() {
   });
 }
 
-// An opened file or camera and the index of its video stream.
+// An opened file and the index of its video stream.
 struct Opened {
   Owned<AVFormatContext> format;
   int stream = 0;
   const AVStream& video() const { return *format->streams[stream]; }
 };
 
-bool is_device(const Path& file) {
-  std::error_code error;
-  return std::filesystem::is_character_file(file, error);
-}
-
-// Opens a camera. `encoding` is libavcodec's name; empty: the first of libavdevice's list that the camera has, and the
-// list begins with raw encodings.
-Opened open_camera(const Path& file, const DeviceFormat& format, const char* encoding = "") {
-  avdevice_register_all();
-  AVDictionary* asked = nullptr;
-  if (format.width > 0 && format.height > 0)
-    av_dict_set(&asked, "video_size", (std::to_string(format.width) + "x" + std::to_string(format.height)).c_str(), 0);
-  if (format.rate > 0.0) av_dict_set(&asked, "framerate", core::exact(format.rate).c_str(), 0);
-  if (*encoding) av_dict_set(&asked, "input_format", encoding, 0);
-  AVFormatContext* raw = avformat_alloc_context();
-  if (!raw) throw std::bad_alloc();
-  raw->flags |= AVFMT_FLAG_NONBLOCK;  // a camera may fall silent, and a reader that waits for it must be able to stop
-  const int code = avformat_open_input(&raw, file.c_str(), av_find_input_format("video4linux2"), &asked);
-  av_dict_free(&asked);
-  if (code < 0)
-    throw InputError(file.string(), "is no camera that V4L2 can read in this format (" + error_text(code) + ")",
-                     "'v4l2-ctl --list-devices' and '--list-formats-ext' show what there is");
-  return {Owned<AVFormatContext>(raw), 0};
-}
-
 // The mean rate by the stream's header in frames per second, 0 when unknown.
 double claimed_rate(const AVStream& video) {
   const AVRational rate = video.avg_frame_rate;
   return rate.num > 0 && rate.den > 0 ? av_q2d(rate) : 0.0;
-}
-
-// Opens a camera with raw frames where it has them in the requested size and rate, otherwise with JPEG frames if these
-// come nearer. On USB 2 many cameras have only small or slow raw frames, and larger or faster ones as JPEG.
-Opened open_camera_as_asked(const Path& file, const DeviceFormat& format, const Host& host) {
-  constexpr double kEnough = 0.95;  // share of the requested rate that counts as reached
-  const auto merit = [&](const Opened& opened) {
-    const AVCodecParameters& is = *opened.video().codecpar;
-    const bool sized = format.width <= 0 || (is.width == format.width && is.height == format.height);
-    return std::pair(sized, std::min(format.rate, claimed_rate(opened.video())));
-  };
-  Opened opened = open_camera(file, format);
-  if (const auto raw = merit(opened); raw < std::pair(true, kEnough * format.rate)) {
-    opened.format.reset();  // a camera allows one reader at a time
-    try {
-      opened = open_camera(file, format, "mjpeg");
-    } catch (const InputError&) {
-    }
-    if (!opened.format || merit(opened) <= raw) {
-      opened.format.reset();
-      opened = open_camera(file, format);
-    }
-  }
-  if (const auto [sized, rate] = merit(opened); sized && rate > 0.0 && rate < kEnough * format.rate)
-    host.warn(file.string() + ": gives " + core::exact(rate) + " frames a second in this size instead of " +
-              core::exact(format.rate));
-  return opened;
 }
 
 Opened open_recording(const Path& file) {
@@ -158,86 +101,6 @@ Opened open_recording(const Path& file) {
   opened.stream = code;
   return opened;
 }
-
-// Fetches a camera's frames in a thread as they arrive and keeps the newest. A reader slower than the camera thus
-// misses frames; without the thread up to 32 of them would wait and age in the driver's queue.
-class NewestFrame {
- public:
-  NewestFrame(AVFormatContext& camera, const Host& host) : host_(host), thread_([this, &camera] { fetch(camera); }) {}
-  ~NewestFrame() {
-    stop_ = true;
-    thread_.join();
-  }
-
-  // Waits for a frame newer than that of the last call and moves it into `packet`. Sets `received` to the number of
-  // frames up to it and `first_stamp` to the time stamp of the first. Returns 0, or a negative libav code when the
-  // camera ended or was silent for too long. Throws Interrupted.
-  int wait_for_newest(AVPacket& packet, int& received, std::int64_t& first_stamp) {
-    constexpr double kSilence = 5.0;                     // s without a frame, after which the camera counts as lost
-    constexpr std::chrono::milliseconds kAttention{50};  // between two looks for a request to stop
-    const double begun = core::seconds_now();
-    std::unique_lock lock(mutex_);
-    while (!fresh_) {
-      if (code_ < 0) return code_;
-      if (const int signal = host_.stop_requested()) throw Interrupted(signal);
-      if (core::seconds_now() - begun > kSilence) return AVERROR(ETIMEDOUT);
-      came_.wait_for(lock, kAttention);
-    }
-    fresh_ = false;
-    received = received_;
-    first_stamp = first_stamp_;
-    av_packet_unref(&packet);
-    av_packet_move_ref(&packet, newest_.get());
-    return 0;
-  }
-
- private:
-  void fetch(AVFormatContext& camera) {
-    constexpr std::chrono::milliseconds kPause{1};  // well below the time between two frames
-    const Owned<AVPacket> packet(av_packet_alloc()), last(av_packet_alloc());
-    int count = 0, last_count = 0;
-    while (!stop_) {
-      const int code = av_read_frame(&camera, packet.get());
-      if (code >= 0) {
-        if (count++ == 0) {
-          const std::lock_guard lock(mutex_);
-          first_stamp_ = packet->pts;
-        }
-        if (packet->size > 0) {  // an empty packet was damaged in transmission
-          av_packet_unref(last.get());
-          av_packet_move_ref(last.get(), packet.get());
-          last_count = count;
-        }
-        av_packet_unref(packet.get());
-        continue;
-      }
-      // the queue is empty: publish the last packet, or the error
-      if (last->size > 0 || code != AVERROR(EAGAIN)) {
-        const std::lock_guard lock(mutex_);
-        if (last->size > 0) {
-          av_packet_unref(newest_.get());
-          av_packet_move_ref(newest_.get(), last.get());
-          received_ = last_count;
-          fresh_ = true;
-        }
-        if (code != AVERROR(EAGAIN)) code_ = code;
-        came_.notify_one();
-      }
-      if (code_ < 0) return;
-      std::this_thread::sleep_for(kPause);
-    }
-  }
-
-  Host host_;
-  std::mutex mutex_;
-  std::condition_variable came_;
-  std::atomic<bool> stop_{false};
-  bool fresh_ = false;
-  int received_ = 0, code_ = 0;
-  std::int64_t first_stamp_ = AV_NOPTS_VALUE;
-  Owned<AVPacket> newest_{av_packet_alloc()};
-  std::thread thread_;  // the last member, because it uses all others
-};
 
 bool full_range(const AVFrame& frame) {
   switch (frame.format) {
@@ -279,24 +142,13 @@ struct Decoder {
   int scaler_width = 0, scaler_height = 0, scaler_format = -1, scaler_matrix = -1;
   bool scaler_full = false, at_end = false;
   int frames = 0;
-  std::int64_t first_stamp = AV_NOPTS_VALUE;  // time stamp of a camera's first frame
-  std::unique_ptr<NewestFrame> camera;        // null for a recording
 
-  double seconds(std::int64_t stamp) const {
-    if (stamp == AV_NOPTS_VALUE) return std::numeric_limits<double>::quiet_NaN();
-    return static_cast<double>(stamp) * av_q2d(input.video().time_base);
-  }
   bool decode();
-  void decode_newest();
   void convert(Image8& rgb);
 };
 
 // Decodes the next frame in display order into `frame`. Returns false at the end.
 bool Decoder::decode() {
-  if (camera) {
-    decode_newest();
-    return true;
-  }
   for (;;) {
     int code = avcodec_receive_frame(decoder.get(), frame.get());
     if (code >= 0) return true;
@@ -316,23 +168,6 @@ bool Decoder::decode() {
     if (code < 0)
       throw InputError(file.string() + ": frame " + std::to_string(frames),
                        "cannot be decoded (" + error_text(code) + ")", "write the video again");
-  }
-}
-
-// Decodes the newest frame of a camera into `frame`, waiting for the next one where it is damaged.
-void Decoder::decode_newest() {
-  for (;;) {
-    int code = camera->wait_for_newest(*packet, frames, first_stamp);
-    if (code < 0)
-      throw WorkError(file.string(),
-                      "gives no more frames after " + std::to_string(frames) + " (" +
-                          (code == AVERROR(ETIMEDOUT) ? "silent" : error_text(code)) + ")",
-                      "check the camera and its cable");
-    code = avcodec_send_packet(decoder.get(), packet.get());
-    av_packet_unref(packet.get());
-    if (code >= 0) code = avcodec_receive_frame(decoder.get(), frame.get());
-    if (code >= 0) return;
-    avcodec_flush_buffers(decoder.get());  // damaged in transmission
   }
 }
 
@@ -376,12 +211,12 @@ void Decoder::convert(Image8& rgb) {
 
 namespace {
 
-Decoder* open(const Path& file, int threads, const DeviceFormat& format, const Host& host) {
+Decoder* open(const Path& file, int threads) {
   // open the input and a decoder for it
   prepare();
   auto self = std::make_unique<Decoder>();
   self->file = file;
-  self->input = is_device(file) ? open_camera_as_asked(file, format, host) : open_recording(file);
+  self->input = open_recording(file);
   const AVCodecParameters& parameters = *self->input.video().codecpar;
   const AVCodec* codec = avcodec_find_decoder(parameters.codec_id);
   if (!codec)
@@ -394,15 +229,6 @@ Decoder* open(const Path& file, int threads, const DeviceFormat& format, const H
   self->decoder->pkt_timebase = self->input.video().time_base;
   const int code = avcodec_open2(self->decoder.get(), codec, nullptr);
   if (code < 0) throw InputError(file.string(), "cannot be decoded (" + error_text(code) + ")", "write it as H.264");
-  // a camera: skipping frames needs an encoding in which each can be read alone
-  if (!is_device(file)) return self.release();
-  const AVCodecDescriptor* kind = avcodec_descriptor_get(parameters.codec_id);
-  if (!kind || !(kind->props & AV_CODEC_PROP_INTRA_ONLY))
-    throw InputError(file.string(),
-                     std::string("sends ") + avcodec_get_name(parameters.codec_id) +
-                         ", whose frames cannot be read without the ones before",
-                     "set it to raw frames or MJPEG");
-  self->camera = std::make_unique<NewestFrame>(*self->input.format, host);
   return self.release();
 }
 
@@ -411,19 +237,19 @@ void close(Decoder* decoder) { delete decoder; }
 bool next(Decoder& decoder, Image8* rgb) {
   if (!decoder.decode()) return false;
   if (rgb) decoder.convert(*rgb);
-  if (!decoder.camera) ++decoder.frames;
+  ++decoder.frames;
   return true;
 }
-
-bool device(const Decoder& decoder) { return decoder.camera != nullptr; }
 
 int frames(const Decoder& decoder) { return decoder.frames; }
 
 double rate(const Decoder& decoder) { return claimed_rate(decoder.input.video()); }
 
-double time(const Decoder& decoder) { return decoder.seconds(decoder.frame->best_effort_timestamp); }
-
-double first_time(const Decoder& decoder) { return decoder.seconds(decoder.first_stamp); }
+double time(const Decoder& decoder) {
+  const std::int64_t stamp = decoder.frame->best_effort_timestamp;
+  if (stamp == AV_NOPTS_VALUE) return std::numeric_limits<double>::quiet_NaN();
+  return static_cast<double>(stamp) * av_q2d(decoder.input.video().time_base);
+}
 
 VideoFacts video_facts(const Path& file) {
   prepare();
@@ -612,11 +438,9 @@ const VideoLibrary chainsplat_videos = {.version = CHAINSPLAT_VERSION,
                                         .open = open,
                                         .close = close,
                                         .next = next,
-                                        .device = device,
                                         .frames = frames,
                                         .rate = rate,
                                         .time = time,
-                                        .first_time = first_time,
                                         .video_facts = video_facts,
                                         .create = create,
                                         .add = add,
