@@ -30,7 +30,7 @@ struct Rope {
   std::vector<math::Pose> motions = chain::link_motions(chain, math::VectorX::Zero(chain.angles()), {});
   // two cameras at 40 degrees to either side of the bending axis, 1 m away, whose masks show the rope everywhere
   std::vector<std::unique_ptr<capture::Camera>> cameras;
-  capture::View everywhere;
+  capture::PackedView everywhere;
   std::vector<recognition::Viewpoint> views;
 
   // Those that a camera could see (nearly) have the texture and lie at 0.85 of the radius, the others are gray at 0.75.
@@ -53,8 +53,10 @@ struct Rope {
       gaussians.opacity_logit[i] = 2.0f;
       gaussians.link_logits[gaussians.links * i + chain::link_at(chain, s)] = 12.0f;
     }
-    everywhere.width = everywhere.height = 64;
-    everywhere.rgba.assign(std::size_t{4} * 64 * 64, 255);
+    capture::View all;
+    all.width = all.height = 64;
+    all.rgba.assign(std::size_t{4} * 64 * 64, 255);
+    everywhere = capture::packed(all);
     for (const double side : {-1.0, 1.0}) look_from(side * 40.0 * std::numbers::pi / 180.0);
   }
   void look_from(double at) {

@@ -80,11 +80,10 @@ Place place_of(const Surface& surface, const splat::Gaussians& g, int i) {
   return {mean.dot(surface.chain.direction), angle < 0.0 ? angle + kTurn : angle, std::hypot(x, y)};
 }
 
-bool in_mask(const Viewpoint& from, const Vector3& world) {
-  const Vector3 point = from.camera->world_from_camera.inverse() * world;
+bool in_mask(const capture::Camera& camera, const capture::View& view, const Vector3& world) {
+  const Vector3 point = camera.world_from_camera.inverse() * world;
   if (point.z() < image_model::kNear) return false;
-  const math::Vector2 pixel = capture::project(*from.camera, point);
-  const capture::View& view = *from.view;
+  const math::Vector2 pixel = capture::project(camera, point);
   const int x = static_cast<int>(std::floor(pixel.x())) - view.x0,
             y = static_cast<int>(std::floor(pixel.y())) - view.y0;
   if (x < 0 || y < 0 || x >= view.width || y >= view.height) return false;
@@ -94,22 +93,23 @@ bool in_mask(const Viewpoint& from, const Vector3& world) {
 void look(std::span<const Viewpoint> views, Surface& surface) {
   constexpr double kWithin = 0.8;  // of the radius: masks are a pixel off at the outline
   const double radius = 0.5 * surface.chain.diameter;
-  core::parallel_for(surface.rows, [&](std::int64_t row) {
-    const double s = surface.arclength(static_cast<int>(row));
-    const int link = chain::link_at(surface.chain, s);
-    for (int column = 0; column < kColumns; ++column) {
-      const Vector3 normal = surface.normal(Surface::angle(column)), axis = s * surface.chain.direction;
-      const std::size_t cell = surface.cell(static_cast<int>(row), column);
-      double hidden = 0.0;
-      for (const Viewpoint& view : views) {
-        const math::Pose& motion = view.motions[link];
-        const Vector3 ray = view.camera->world_from_camera.translation - motion * Vector3(axis + radius * normal);
+  std::vector<double> hidden(surface.facing.size(), 0.0);
+  for (const Viewpoint& from : views) {
+    const capture::View view = capture::unpacked(*from.view);
+    core::parallel_for(surface.rows, [&](std::int64_t row) {
+      const double s = surface.arclength(static_cast<int>(row));
+      const math::Pose& motion = from.motions[chain::link_at(surface.chain, s)];
+      for (int column = 0; column < kColumns; ++column) {
+        const Vector3 normal = surface.normal(Surface::angle(column)), axis = s * surface.chain.direction;
+        const std::size_t cell = surface.cell(static_cast<int>(row), column);
+        const Vector3 ray = from.camera->world_from_camera.translation - motion * Vector3(axis + radius * normal);
         surface.facing[cell] = std::max(surface.facing[cell], (motion.rotation * normal).dot(ray.normalized()));
-        hidden += in_mask(view, motion * Vector3(axis + kWithin * radius * normal)) ? 0.0 : 1.0;
+        hidden[cell] += in_mask(*from.camera, view, motion * Vector3(axis + kWithin * radius * normal)) ? 0.0 : 1.0;
       }
-      surface.hidden[cell] = hidden > kHidden * static_cast<double>(views.size());
-    }
-  });
+    });
+  }
+  for (std::size_t cell = 0; cell < hidden.size(); ++cell)
+    surface.hidden[cell] = hidden[cell] > kHidden * static_cast<double>(views.size());
 }
 
 void color_trusted(const splat::Gaussians& g, const std::vector<Place>& places, double radius, Surface& surface) {
