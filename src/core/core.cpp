@@ -218,12 +218,15 @@ std::string read_file(const Path& path) {
   if (!file) throw InputError(path.string(), std::strerror(errno), "check the path and its permissions");
   std::string bytes;
   constexpr std::size_t kBlock = 1 << 16;
+  const std::uintmax_t size = std::filesystem::file_size(path, error);  // a pipe has none
+  if (!error) bytes.reserve(std::min<std::uintmax_t>(size, kLargestFile) + kBlock);
   while (file) {
     const std::size_t had = bytes.size();
     if (had > kLargestFile)
       throw InputError(path.string(), "is larger than 1 GiB",
                        "name the file that is meant; none that is read is so large");
-    bytes.resize(had + std::max(kBlock, had));  // doubling keeps the total time linear in the size
+    // doubling keeps the total time linear in the size, what is reserved the memory
+    bytes.resize(std::max(had + kBlock, std::min(2 * had, bytes.capacity())));
     file.read(bytes.data() + had, static_cast<std::streamsize>(bytes.size() - had));
     bytes.resize(had + static_cast<std::size_t>(file.gcount()));
   }

@@ -185,6 +185,10 @@ void save(const Job& job, splat::Engine& engine, int round, int step) {
   c.states = job.states;
   c.gaussians = job.gaussians;
   if (step > 0) c.snapshot = engine.snapshot();
+  std::size_t numbers = 0;  // so that they are there once, which for many angles is a large part of all memory
+  for (const math::VectorX& theta : job.coarse) numbers += static_cast<std::size_t>(theta.size());
+  for (const math::MatrixX& m : job.prior.information) numbers += static_cast<std::size_t>(m.size());
+  c.extra.reserve(numbers);
   for (const math::VectorX& theta : job.coarse)
     c.extra.insert(c.extra.end(), theta.data(), theta.data() + theta.size());
   for (const math::MatrixX& m : job.prior.information) c.extra.insert(c.extra.end(), m.data(), m.data() + m.size());
