@@ -1,7 +1,9 @@
 // What no camera saw of a rope: Gaussians there get a place and a color. Truth is a texture that is known everywhere.
 #include <doctest/doctest.h>
 
+#include <algorithm>
 #include <cmath>
+#include <functional>
 #include <memory>
 #include <numbers>
 #include <vector>
@@ -15,6 +17,9 @@ using namespace chainsplat;
 namespace {
 
 constexpr double kLength = 0.3, kDiameter = 0.02;
+constexpr int kWidth = 64, kHeight = 512;  // pixels of a picture
+constexpr double kFocal = 1500.0;          // pixels: at 1 m the rope is 30 pixels wide
+constexpr double kDegree = std::numbers::pi / 180.0;
 
 // Red, white and blue bands that wind about the rope, m of arclength per radian; 0: rings.
 math::Vector3 texture(double arclength, double angle, double slope) {
@@ -28,45 +33,61 @@ struct Rope {
                                          chain::Bending::spatial, false);
   splat::Gaussians gaussians;
   std::vector<math::Pose> motions = chain::link_motions(chain, math::VectorX::Zero(chain.angles()), {});
+  std::function<math::Vector3(double arclength, double angle)> color;
   // two cameras at 40 degrees to either side of the bending axis, 1 m away, whose masks show the rope everywhere
   std::vector<std::unique_ptr<capture::Camera>> cameras;
-  capture::PackedView everywhere;
+  std::vector<std::unique_ptr<capture::PackedView>> pictures;
   std::vector<recognition::Viewpoint> views;
 
   // Those that a camera could see (nearly) have the texture and lie at 0.85 of the radius, the others are gray at 0.75.
   // `light`: how much brighter the side of the bending axis is.
-  explicit Rope(double slope, double light = 0.0) {
+  explicit Rope(double slope, double light = 0.0)
+      : Rope([=](double s, double at) { return math::Vector3((1.0 + light * std::cos(at)) * texture(s, at, slope)); }) {
+  }
+  explicit Rope(std::function<math::Vector3(double, double)> looks) : color(std::move(looks)) {
     constexpr int kCount = 1500;
     core::Random random(3);
     gaussians.resize(kCount, chain.links(), 1);
     for (int i = 0; i < kCount; ++i) {
       const double s = kLength * (i + random.uniform()) / kCount, at = 2.0 * std::numbers::pi * random.uniform();
-      const bool seen = std::cos(at) > std::cos(130.0 * std::numbers::pi / 180.0);
-      const math::Vector3 color =
-          seen ? math::Vector3((1.0 + light * std::cos(at)) * texture(s, at, slope)) : math::Vector3(0.5, 0.5, 0.5);
+      const bool seen = std::cos(at) > std::cos(130.0 * kDegree);
       const math::Vector3 mean = s * chain.direction + (seen ? 0.85 : 0.75) * 0.5 * kDiameter * normal(at);
       for (int c = 0; c < 3; ++c) {
         gaussians.mean[3 * i + c] = static_cast<float>(mean[c]);
         gaussians.log_scale[3 * i + c] = std::log(0.002f);
-        gaussians.sh[12 * i + c] = static_cast<float>((color[c] - 0.5) / image_model::kSh0);
       }
+      splat::set_base_color(gaussians, i, seen ? color(s, at) : math::Vector3(0.5, 0.5, 0.5));
       gaussians.opacity_logit[i] = 2.0f;
       gaussians.link_logits[gaussians.links * i + chain::link_at(chain, s)] = 12.0f;
     }
-    capture::View all;
-    all.width = all.height = 64;
-    all.rgba.assign(std::size_t{4} * 64 * 64, 255);
-    everywhere = capture::packed(all);
-    for (const double side : {-1.0, 1.0}) look_from(side * 40.0 * std::numbers::pi / 180.0);
+    for (const double side : {-1.0, 1.0}) look_from(side * 40.0 * kDegree);
   }
   void look_from(double at) {
     auto camera = std::make_unique<capture::Camera>();
-    camera->width = camera->height = 64;
-    camera->fx = camera->fy = 64.0, camera->cx = camera->cy = 32.0;
-    camera->world_from_camera.rotation =
-        (math::Matrix3() << normal(at).cross(chain.direction), chain.direction, -normal(at)).finished();
+    camera->width = kWidth, camera->height = kHeight;
+    camera->fx = camera->fy = kFocal, camera->cx = 0.5 * kWidth, camera->cy = 0.5 * kHeight;
+    const math::Vector3 x = normal(at).cross(chain.direction);
+    camera->world_from_camera.rotation = (math::Matrix3() << x, chain.direction, -normal(at)).finished();
     camera->world_from_camera.translation = normal(at) + 0.5 * kLength * chain.direction;
-    views.push_back({camera.get(), &everywhere, motions});
+    capture::View picture;
+    picture.width = kWidth, picture.height = kHeight;
+    picture.rgba.assign(std::size_t{4} * kWidth * kHeight, 255);
+    for (int v = 0; v < kHeight; ++v)
+      for (int u = 0; u < kWidth; ++u) {
+        // where the ray (right, down, 1) from (0, 0, -1) meets the circle: |(right t, t - 1)| = radius
+        const double right = (u + 0.5 - camera->cx) / kFocal, down = (v + 0.5 - camera->cy) / kFocal;
+        const double a = right * right + 1.0, c = 1.0 - 0.25 * kDiameter * kDiameter;
+        if (1.0 < a * c) continue;
+        const double depth = (1.0 - std::sqrt(1.0 - a * c)) / a;
+        const math::Vector3 out = depth * right * x + (1.0 - depth) * normal(at);
+        const double angle = std::atan2(out.dot(normal(90.0 * kDegree)), out.dot(normal(0.0)));
+        const math::Vector3 rgb = color(0.5 * kLength + depth * down, angle);
+        for (int k = 0; k < 3; ++k)
+          picture.rgba[4 * (static_cast<std::size_t>(v) * kWidth + u) + k] =
+              static_cast<std::uint8_t>(std::lround(255.0 * std::clamp(rgb[k], 0.0, 1.0)));
+      }
+    pictures.push_back(std::make_unique<capture::PackedView>(capture::packed(picture)));
+    views.push_back({camera.get(), pictures.back().get(), motions});
     cameras.push_back(std::move(camera));
   }
   math::Vector3 normal(double at) const {
@@ -110,12 +131,12 @@ TEST_CASE("a texture that winds about the rope goes on where no camera saw it") 
   CHECK(count > 200);
   CHECK(count < 500);
   CHECK(rope.error_behind(kSlope) < 0.3 * gray);
-  // those that were seen stay, in their order, before the new ones
+  // those that were seen well stay, in their order, before the new ones
   int kept = 0;
   for (int i = 0; i < before.count; ++i) {
     const math::Vector3 mean(before.mean[3 * i], before.mean[3 * i + 1], before.mean[3 * i + 2]);
     const double at = std::atan2(mean.dot(rope.normal(0.5 * std::numbers::pi)), mean.dot(rope.normal(0.0)));
-    if (std::cos(at) < std::cos(120.0 * std::numbers::pi / 180.0)) continue;
+    if (std::cos(at) < std::cos(100.0 * kDegree)) continue;
     while (kept < rope.gaussians.count && rope.gaussians.mean[3 * kept] != before.mean[3 * i]) ++kept;
     REQUIRE(kept < rope.gaussians.count);
     CHECK(rope.gaussians.sh[12 * kept] == before.sh[12 * i]);
@@ -135,11 +156,11 @@ TEST_CASE("a texture of rings goes on as rings, and one color stays one color") 
   recognition::finish_unseen(rings.chain, rings.views, rings.gaussians);
   CHECK(rings.error_behind(0.0) < 0.3 * gray);
 
-  Rope plain(0.0);
-  for (int i = 0; i < plain.gaussians.count; ++i) splat::set_base_color(plain.gaussians, i, {0.78, 0.22, 0.22});
+  Rope plain([](double, double) { return math::Vector3(0.8, 0.2, 0.2); });
+  for (int i = 0; i < plain.gaussians.count; ++i) splat::set_base_color(plain.gaussians, i, {0.8, 0.2, 0.2});
   recognition::finish_unseen(plain.chain, plain.views, plain.gaussians);
   for (int i = 0; i < plain.gaussians.count; ++i)
-    CHECK((splat::base_color(plain.gaussians, i) - math::Vector3(0.78, 0.22, 0.22)).norm() < 1e-4);
+    CHECK((splat::base_color(plain.gaussians, i) - math::Vector3(0.8, 0.2, 0.2)).norm() < 1e-4);
 }
 
 TEST_CASE("the side that the light does not reach is guessed darker") {
@@ -150,11 +171,49 @@ TEST_CASE("the side that the light does not reach is guessed darker") {
   CHECK(rope.error_behind(kSlope) > 0.12);  // of the texture without its light
 }
 
+TEST_CASE("what was seen only at a slant stays in place and gets the texture's color") {
+  Rope rope(kSlope, 0.2);
+  const auto slanted = [&](int i) { return std::abs(std::abs(rope.angle(i)) - 126.5 * kDegree) < 3.0 * kDegree; };
+  const auto error = [&] {
+    double square = 0.0;
+    int count = 0;
+    for (int i = 0; i < rope.gaussians.count; ++i)
+      if (const double s = rope.arclength(i); slanted(i) && s > 0.06 && s < kLength - 0.06)
+        square += (splat::base_color(rope.gaussians, i) - rope.color(s, rope.angle(i))).squaredNorm() / 3.0, ++count;
+    REQUIRE(count > 20);
+    return std::sqrt(square / count);
+  };
+  // as bright as the texture in the mean, but without its bands, and from the side in another color
+  for (int i = 0; i < rope.gaussians.count; ++i) {
+    if (!slanted(i)) continue;
+    const double gray = (1.0 + 0.2 * std::cos(rope.angle(i))) * 0.5;
+    splat::set_base_color(rope.gaussians, i, {gray, gray, gray});
+    rope.gaussians.sh[12 * i + 3] = 0.3f;
+  }
+  const splat::Gaussians before = rope.gaussians;
+  const double gray = error();
+  CHECK(gray > 0.15);
+  recognition::finish_unseen(rope.chain, rope.views, rope.gaussians);
+  CHECK(error() < 0.6 * gray);
+  int moved = 0, colored = 0;
+  for (int i = 0, k = 0; i < before.count; ++i) {  // in their order, before the new ones
+    const bool there = k < rope.gaussians.count && rope.gaussians.mean[3 * k] == before.mean[3 * i];
+    if (before.sh[12 * i + 3] > 0.0f) {
+      moved += !there;
+      const bool side = rope.arclength(k) < kLength - 0.5 * kDiameter;  // and not the tip's face
+      colored += there && side && std::abs(rope.gaussians.sh[12 * k + 3]) > 0.2f;
+    }
+    k += there;
+  }
+  CHECK(moved == 0);
+  CHECK(colored == 0);
+}
+
 TEST_CASE("where masks show that something else is in front, nothing is guessed") {
   Rope rope(kSlope);
   const splat::Gaussians before = rope.gaussians;
-  for (int y = 0; y < 25; ++y)  // the picture's upper part, down to 0.04 m of the rope
-    for (int x = 0; x < 64; ++x) rope.everywhere.rgba[4 * (64 * y + x) + 3] = 0;
+  for (const auto& picture : rope.pictures)
+    for (int i = 0; i < 91 * kWidth; ++i) picture->rgba[4 * i + 3] = 0;  // the upper part, down to 0.04 m of the rope
   const int count = recognition::finish_unseen(rope.chain, rope.views, rope.gaussians);
   CHECK(count > 100);
   int above = 0, above_before = 0;

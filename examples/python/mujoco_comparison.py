@@ -24,8 +24,7 @@ with tempfile.TemporaryDirectory() as folder:
     sys.path.insert(0, folder)
     from rope_play import Rope
     rope = Rope(pathlib.Path(folder) / "rope.xml")
-start = rope.data.qpos[7:].copy(), rope.data.qvel[6:].copy()  # as the twin was identified to begin; ours does, too
-states = twin.rollout(base, start, times=np.arange(rope.start, base.end + 1e-6, 1 / 30))
+states = twin.rollout(base, times=np.arange(rope.start, base.end + 1e-6, 1 / 30))
 
 
 def mujocos_centerline(count):

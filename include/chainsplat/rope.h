@@ -32,6 +32,9 @@ const dynamics::Model& model_of(const Rope& rope);
 // The rope at rest at `time`, s, under a base at rest in `base`: in free space it hangs in its equilibrium, on a table
 // it lies as it was recognized first.
 dynamics::InitialState rest_state(const Rope& rope, const math::Pose& base, double time);
+// The same of an identified twin, whose model is given, without its folder.
+dynamics::InitialState rest_state(const twin::Twin& twin, const dynamics::Model& model, const math::Pose& base,
+                                  double time);
 // A rope in this state at `time`, s, under a base in `base`. Friction in bending is of the past, and is guessed: at
 // rest it has built up on the way from the equilibrium, in motion the joints have moved on at their present rates until
 // here.

@@ -174,7 +174,10 @@ void add_twin(py::module_& m) {
              const std::optional<Trajectory>& base, bool mesh) {
             const chain::States& own = t.rope.twin.rollout.time.empty() ? t.rope.twin.states : t.rope.twin.rollout;
             unlocked([&] {
-              exports::write(t.rope.twin, states ? *states : own, base_or_own(t, base), file,
+              twin::Twin twin = t.rope.twin;
+              if (base && twin.parameters)  // a simulator's model starts where `rollout` does
+                twin.initial = pipeline::rest_state(t.rope, base->pose(base->start()), base->start());
+              exports::write(twin, states ? *states : own, base_or_own(t, base), file,
                              {.mesh = mesh, .cameras = {}, .properties = {}});
             });
           },

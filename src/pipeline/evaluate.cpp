@@ -56,12 +56,8 @@ dynamics::InitialState start_of(const Path& run, const RolloutOptions& options, 
       throw InputError(run.string() + "/twin.json", "has no initial state",
                        "run 'chainsplat identify' or give `initial`");
     initial = *twin.initial;
-  } else if (twin.tabletop) {
-    if (!twin.initial && twin.states.theta.empty())
-      throw InputError(run.string(), "holds no state to start from on the table", "give `initial`");
-    initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
   } else {
-    initial.theta = dynamics::static_equilibrium(model, base.pose(base.start())).theta;
+    initial = rest_state(twin, model, base.pose(base.start()), base.start());
   }
   return initial;
 }
@@ -69,17 +65,13 @@ dynamics::InitialState start_of(const Path& run, const RolloutOptions& options, 
 // The twin set in motion by another capture's base, at the times of its first camera that the base covers.
 chain::States rollout_on(const twin::Twin& twin, const Path& run, const capture::Capture& capture) {
   const dynamics::Model model = model_of(twin, run);
-  dynamics::InitialState initial;
   std::vector<double> times;
   for (const double time : capture.times.front())
     if (time >= capture.base.start() && time <= capture.base.end()) times.push_back(time);
   if (times.empty())
     throw InputError(capture.folder.string(), "its base motion covers none of its frames", "correct base.tum");
-  initial.time = std::min(capture.base.start(), times.front());
-  initial.thetadot = math::VectorX::Zero(twin.chain.angles());
-  initial.theta = twin.tabletop ? (twin.initial ? twin.initial->theta : twin.states.theta.front())
-                                : dynamics::static_equilibrium(model, capture.base.pose(initial.time)).theta;
-  return dynamics::rollout(model, capture.base, initial, times);
+  const double start = std::min(capture.base.start(), times.front());
+  return dynamics::rollout(model, capture.base, rest_state(twin, model, capture.base.pose(start), start), times);
 }
 
 }  // namespace

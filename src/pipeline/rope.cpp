@@ -41,17 +41,6 @@ dynamics::Parameters assumed_parameters(const twin::Twin& twin) {
   return p;
 }
 
-dynamics::InitialState at_rest(const Rope& rope, const dynamics::Model& model, const math::Pose& base, double time) {
-  dynamics::InitialState initial;
-  initial.time = time;
-  initial.thetadot = math::VectorX::Zero(rope.twin.chain.angles());
-  if (rope.twin.tabletop)
-    initial.theta = rope.twin.initial ? rope.twin.initial->theta : rope.twin.states.theta.front();
-  else
-    initial.theta = dynamics::static_equilibrium(model, base).theta;
-  return initial;
-}
-
 void check_state(const Rope& rope, const dynamics::InitialState& initial) {
   const int angles = rope.twin.chain.angles();
   const Eigen::Index internal = initial.internal_state.size();
@@ -109,7 +98,21 @@ const dynamics::Model& model_of(const Rope& rope) {
 }
 
 dynamics::InitialState rest_state(const Rope& rope, const math::Pose& base, double time) {
-  return at_rest(rope, model_of(rope), base, time);
+  return rest_state(rope.twin, model_of(rope), base, time);
+}
+
+dynamics::InitialState rest_state(const twin::Twin& twin, const dynamics::Model& model, const math::Pose& base,
+                                  double time) {
+  dynamics::InitialState initial;
+  initial.time = time;
+  initial.thetadot = math::VectorX::Zero(twin.chain.angles());
+  if (!twin.tabletop)
+    initial.theta = dynamics::static_equilibrium(model, base).theta;
+  else if (twin.initial || !twin.states.theta.empty())
+    initial.theta = twin.initial ? twin.initial->theta : twin.states.theta.front();
+  else
+    throw InputError("the twin", "holds no state to start from on the table", "give `initial`");
+  return initial;
 }
 
 dynamics::InitialState state_at(const dynamics::Model& model, const math::Pose& base, double time,
@@ -223,7 +226,7 @@ planning::Problem planning_problem(const Rope& rope) {
   problem.table_point = rope.twin.table_point;
   problem.base = rope.base.pose(rope.base.start());
   problem.estimates = rope.twin.estimates;
-  problem.initial = at_rest(rope, problem.model, problem.base, 0.0);
+  problem.initial = rest_state(rope.twin, problem.model, problem.base, 0.0);
   return problem;
 }
 
@@ -257,7 +260,7 @@ excitation::Problem excitation_problem(const Rope& rope) {
   problem.tabletop = rope.twin.tabletop;
   problem.base = rope.base.pose(rope.base.start());
   problem.estimates = rope.twin.estimates;
-  problem.initial = at_rest(rope, problem.model, problem.base, 0.0);
+  problem.initial = rest_state(rope.twin, problem.model, problem.base, 0.0);
   problem.recorded = [base = rope.base](double time) { return base.at(time); };
   problem.recorded_start = rope.twin.states.time.front();
   problem.recorded_end = rope.twin.states.time.back();

@@ -20,8 +20,7 @@ constexpr int kColumns = 36;          // of cells around the tube
 constexpr double kCellLength = 0.15;  // diameters along it
 constexpr double kUnseen = -0.05;     // largest cosine between surface normal and view ray of what no camera saw: what
                                       // lies at the limb shapes the outline
-constexpr double kTrusted = 0.4;      // least cosine of a color that others are taken from
-constexpr double kReach = 0.12;       // diameters, over which colors are averaged
+constexpr double kTrusted = 0.4;      // least cosine of a color that others are taken from, and that stays
 constexpr double kInside = 0.4;       // of the radius: what is closer to the axis has no side
 constexpr double kThickness = 0.04;   // diameters, sigma across the surface
 constexpr double kCoverage = 0.5;     // sigma along the surface in units of the spacing
@@ -80,21 +79,31 @@ Place place_of(const Surface& surface, const splat::Gaussians& g, int i) {
   return {mean.dot(surface.chain.direction), angle < 0.0 ? angle + kTurn : angle, std::hypot(x, y)};
 }
 
-bool in_mask(const capture::Camera& camera, const capture::View& view, const Vector3& world) {
+// On the tube's side, and not at its axis or on the tip's face, which is seen from below.
+bool on_side(const Surface& surface, const Place& at) {
+  const double inside = kInside * 0.5 * surface.chain.diameter;
+  return at.radius >= inside && at.arclength >= 0.0 && at.arclength <= surface.chain.length - inside;
+}
+
+// The pixel of the rope that shows this point; null where something else is seen there.
+const std::uint8_t* pixel_of(const capture::Camera& camera, const capture::View& view, const Vector3& world) {
   const Vector3 point = camera.world_from_camera.inverse() * world;
-  if (point.z() < image_model::kNear) return false;
+  if (point.z() < image_model::kNear) return nullptr;
   const math::Vector2 pixel = capture::project(camera, point);
   const int x = static_cast<int>(std::floor(pixel.x())) - view.x0,
             y = static_cast<int>(std::floor(pixel.y())) - view.y0;
-  if (x < 0 || y < 0 || x >= view.width || y >= view.height) return false;
-  return view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] >= image_model::kObjectMask;
+  if (x < 0 || y < 0 || x >= view.width || y >= view.height) return nullptr;
+  const std::uint8_t* rgba = &view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x)];
+  return rgba[3] >= image_model::kObjectMask ? rgba : nullptr;
 }
 
 void look(std::span<const Viewpoint> views, Surface& surface) {
   constexpr double kWithin = 0.8;  // of the radius: masks are a pixel off at the outline
   const double radius = 0.5 * surface.chain.diameter;
-  std::vector<double> hidden(surface.facing.size(), 0.0);
+  std::vector<double> hidden(surface.facing.size(), 0.0), weights(surface.facing.size(), 0.0);
+  std::vector<Vector3> sums(surface.facing.size(), Vector3::Zero());
   for (const Viewpoint& from : views) {
+    const capture::Camera& camera = *from.camera;
     const capture::View view = capture::unpacked(*from.view);
     core::parallel_for(surface.rows, [&](std::int64_t row) {
       const double s = surface.arclength(static_cast<int>(row));
@@ -102,42 +111,23 @@ void look(std::span<const Viewpoint> views, Surface& surface) {
       for (int column = 0; column < kColumns; ++column) {
         const Vector3 normal = surface.normal(Surface::angle(column)), axis = s * surface.chain.direction;
         const std::size_t cell = surface.cell(static_cast<int>(row), column);
-        const Vector3 ray = from.camera->world_from_camera.translation - motion * Vector3(axis + radius * normal);
-        surface.facing[cell] = std::max(surface.facing[cell], (motion.rotation * normal).dot(ray.normalized()));
-        hidden[cell] += in_mask(*from.camera, view, motion * Vector3(axis + kWithin * radius * normal)) ? 0.0 : 1.0;
+        const Vector3 point = motion * Vector3(axis + radius * normal);
+        const Vector3 ray = camera.world_from_camera.translation - point;
+        const double facing = (motion.rotation * normal).dot(ray.normalized());
+        surface.facing[cell] = std::max(surface.facing[cell], facing);
+        hidden[cell] += pixel_of(camera, view, motion * Vector3(axis + kWithin * radius * normal)) ? 0.0 : 1.0;
+        const std::uint8_t* seen = facing >= kTrusted ? pixel_of(camera, view, point) : nullptr;
+        if (!seen) continue;
+        const double counts = facing * facing;  // the area that a pixel averages over grows as 1 / facing
+        sums[cell] += counts / 255.0 * Vector3(seen[0], seen[1], seen[2]);
+        weights[cell] += counts;
       }
     });
   }
-  for (std::size_t cell = 0; cell < hidden.size(); ++cell)
+  for (std::size_t cell = 0; cell < hidden.size(); ++cell) {
     surface.hidden[cell] = hidden[cell] > kHidden * static_cast<double>(views.size());
-}
-
-void color_trusted(const splat::Gaussians& g, const std::vector<Place>& places, double radius, Surface& surface) {
-  const double reach = kReach * surface.chain.diameter;
-  std::vector<Vector3> sums(surface.facing.size(), Vector3::Zero());
-  std::vector<double> weights(surface.facing.size(), 0.0);
-  const double row_length = surface.chain.length / surface.rows;
-  for (int i = 0; i < g.count; ++i) {
-    if (surface.facing[surface.cell_at(places[i].arclength, places[i].angle)] < kTrusted) continue;
-    const Vector3 mean(g.mean[3 * i], g.mean[3 * i + 1], g.mean[3 * i + 2]);
-    const Vector3 color = splat::base_color(g, i);
-    const double opacity = 1.0 / (1.0 + std::exp(-static_cast<double>(g.opacity_logit[i])));
-    const int near = static_cast<int>(places[i].arclength / row_length),
-              span = static_cast<int>(4.0 * reach / row_length) + 1;
-    for (int row = std::max(0, near - span); row <= std::min(surface.rows - 1, near + span); ++row)
-      for (int column = 0; column < kColumns; ++column) {
-        const std::size_t cell = surface.cell(row, column);
-        if (surface.facing[cell] < kTrusted) continue;
-        const Vector3 point =
-            surface.arclength(row) * surface.chain.direction + radius * surface.normal(Surface::angle(column));
-        const double weight = opacity * std::exp(-0.5 * (mean - point).squaredNorm() / (reach * reach));
-        sums[cell] += weight * color;
-        weights[cell] += weight;
-      }
+    if (weights[cell] > 0.0) surface.color[cell] = sums[cell] / weights[cell];
   }
-  constexpr double kLeast = 1e-3;  // weight: nothing is there
-  for (std::size_t cell = 0; cell < sums.size(); ++cell)
-    if (weights[cell] > kLeast) surface.color[cell] = sums[cell] / weights[cell];
 }
 
 // Correlation of the colors with those some columns further and `slope` times that angle along, m per rad.
@@ -173,17 +163,24 @@ double slope_of_texture(const Surface& surface) {
   return slope;
 }
 
-// How bright the same texture is on each side of the rope, to the first harmonic: of what lights a convex thing, that
-// is most, and it goes on to sides that were not seen without running away.
-struct Light {
-  double mean = 1.0, cosine = 0.0, sine = 0.0;  // of the angle about the axis; any unit
-  double at(double side) const {
-    return std::max(kDarkest * mean, mean + cosine * std::cos(side) + sine * std::sin(side));
-  }
-};
+// How bright the same texture is on each side of the rope, by column; any unit.
+using Light = std::vector<double>;
 
 // Along the rope a texture shows all that it has on every side, so that the means of columns differ by their light.
-Light light_of(const Surface& surface) {
+// Where no camera looked, the first harmonic of the brightness around the rope goes on: of what lights a convex thing,
+// that is most. Where the rope was seen only at a slant, the Gaussians there say where between that and the nearest
+// measured column the light is; alone they can be far too bright, where others hide them.
+Light light_of(const Surface& surface, const std::vector<Place>& places, const splat::Gaussians& g) {
+  constexpr double kEnough = 20.0;  // Gaussians in a column, for a mean over the texture
+  std::vector<double> sums(kColumns, 0.0), counts(kColumns, 0.0);
+  for (int i = 0; i < g.count; ++i) {
+    const std::size_t cell = surface.cell_at(places[i].arclength, places[i].angle);
+    if (!on_side(surface, places[i]) || surface.facing[cell] < kUnseen || surface.hidden[cell]) continue;
+    const double opacity = 1.0 / (1.0 + std::exp(-static_cast<double>(g.opacity_logit[i])));
+    sums[cell % kColumns] += opacity * splat::base_color(g, i).mean();
+    counts[cell % kColumns] += opacity;
+  }
+  Light light(kColumns, 0.0);
   math::MatrixX design(kColumns, 3);
   math::VectorX means(kColumns);
   Eigen::Index seen = 0;
@@ -193,18 +190,33 @@ Light light_of(const Surface& surface) {
     for (int row = 0; row < surface.rows; ++row)
       if (const std::optional<Vector3>& color = surface.color[surface.cell(row, column)]) sum += color->mean(), ++count;
     if (2 * count < surface.rows) continue;
+    light[column] = sum / count;
     const double side = Surface::angle(column);
     design.row(seen) << 1.0, std::cos(side), std::sin(side);
-    means[seen++] = sum / count;
+    means[seen++] = light[column];
   }
-  if (2 * seen < kColumns) return {};  // less than half of the rope tells nothing of the other
+  const Light even(kColumns, 1.0);
+  if (2 * seen < kColumns) return even;  // less than half of the rope tells nothing of the other
   const auto columns = design.topRows(seen);
   const auto brightness = means.head(seen);
   const Vector3 found = (columns.transpose() * columns).ldlt().solve(columns.transpose() * brightness);
   const double left = (columns * found - brightness).squaredNorm();
   const double differs = (brightness.array() - brightness.mean()).square().sum();
-  if (!(left < (1.0 - kLit) * differs) || !(found[0] > 0.0)) return {};
-  return {found[0], found[1], found[2]};
+  if (!(left < (1.0 - kLit) * differs) || !(found[0] > 0.0)) return even;
+  const Light measured = light;
+  for (int column = 0; column < kColumns; ++column) {
+    if (measured[column] > 0.0) continue;
+    const double side = Surface::angle(column);
+    double value = found[0] + found[1] * std::cos(side) + found[2] * std::sin(side);
+    if (counts[column] >= kEnough) {
+      double next = 0.0;
+      for (int apart = 1; next == 0.0; ++apart)
+        next = std::max(measured[(column + apart) % kColumns], measured[(column - apart + 2 * kColumns) % kColumns]);
+      value = std::clamp(sums[column] / counts[column], std::min(value, next), std::max(value, next));
+    }
+    light[column] = std::max(kDarkest * found[0], value);
+  }
+  return light;
 }
 
 // From the nearest colors along the helix in both directions, the nearer the more, in the light of this side.
@@ -220,7 +232,7 @@ std::optional<Vector3> guessed(const Surface& surface, const Light& light, doubl
       const std::optional<Vector3> color =
           s >= 0.0 && s <= surface.chain.length ? surface.color_at(s, there) : std::nullopt;
       if (!color) continue;
-      sum += light.at(angle) / light.at(Surface::angle(there)) * *color / (turn * turn);
+      sum += light[column] / light[there] * *color / (turn * turn);
       weight += 1.0 / (turn * turn);
       break;
     }
@@ -233,10 +245,8 @@ struct Guess {
   double arclength, angle;
   Vector3 color;
 };
-std::vector<Guess> guesses(const Surface& surface, double radius, double spacing) {
+std::vector<Guess> guesses(const Surface& surface, const Light& light, double slope, double radius, double spacing) {
   const chain::Chain& chain = surface.chain;
-  const double slope = slope_of_texture(surface);
-  const Light light = light_of(surface);
   const int rows = std::max(1, static_cast<int>(chain.length / spacing)),
             columns = std::max(3, static_cast<int>(kTurn * radius / spacing));
   std::vector<Guess> out;
@@ -274,12 +284,28 @@ void put(const Surface& surface, const Guess& guess, double radius, double spaci
   gaussians.guessed[i] = 1;
 }
 
+// What was seen only at a slant has the place and size that its outline asks for, but a color that one row of pixels
+// tells. It gets the texture's, the more the flatter it was seen, and that from every direction.
+void color_slanted(const Surface& surface, const Light& light, double slope, const std::vector<Place>& places,
+                   splat::Gaussians& g) {
+  const std::size_t size = 3 * static_cast<std::size_t>(g.sh_coefficients());
+  for (int i = 0; i < g.count; ++i) {
+    const Place& at = places[i];
+    const std::size_t cell = surface.cell_at(at.arclength, at.angle);
+    if (!on_side(surface, at) || surface.facing[cell] >= kTrusted || surface.hidden[cell]) continue;
+    const std::optional<Vector3> color = guessed(surface, light, at.arclength, at.angle, slope);
+    if (!color) continue;
+    const double own = std::sqrt(std::max(0.0, surface.facing[cell] / kTrusted));
+    splat::set_base_color(g, i, own * splat::base_color(g, i) + (1.0 - own) * *color);
+    for (std::size_t c = 3; c < size; ++c) g.sh[size * i + c] *= static_cast<float>(own);
+  }
+}
+
 }  // namespace
 
 int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, splat::Gaussians& gaussians) {
   Surface surface(chain);
   look(views, surface);
-  const double full = 0.5 * chain.diameter;
   std::vector<Place> places;
   std::vector<int> kept;
   std::vector<double> radii;
@@ -287,20 +313,21 @@ int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, s
     const Place at = place_of(surface, gaussians, i);
     places.push_back(at);
     const std::size_t cell = surface.cell_at(at.arclength, at.angle);
-    const bool side = at.radius >= kInside * full && at.arclength >= 0.0 && at.arclength <= chain.length;
-    const bool tip = at.arclength > chain.length - kInside * full;  // its face is seen from below
-    if (!side || tip || surface.facing[cell] >= kUnseen || surface.hidden[cell]) kept.push_back(i);
+    const bool side = on_side(surface, at);
+    if (!side || surface.facing[cell] >= kUnseen || surface.hidden[cell]) kept.push_back(i);
     if (side && surface.facing[cell] >= kTrusted) radii.push_back(at.radius);
   }
   if (radii.empty()) return 0;
   const double radius = math::median(radii);
-  color_trusted(gaussians, places, radius, surface);
+  const double slope = slope_of_texture(surface);
+  const Light light = light_of(surface, places, gaussians);
+  color_slanted(surface, light, slope, places, gaussians);
   // as dense as where it was seen
   const double cells = static_cast<double>(
       std::count_if(surface.facing.begin(), surface.facing.end(), [](double facing) { return facing >= kTrusted; }));
   const double area = cells / static_cast<double>(surface.facing.size()) * kTurn * radius * chain.length;
   const double spacing = std::sqrt(area / static_cast<double>(radii.size()));
-  const std::vector<Guess> found = guesses(surface, radius, spacing);
+  const std::vector<Guess> found = guesses(surface, light, slope, radius, spacing);
   if (found.empty()) return 0;
   gaussians = rows_of(gaussians, kept, static_cast<int>(found.size()));
   for (std::size_t i = 0; i < found.size(); ++i)

@@ -20,9 +20,10 @@ struct Viewpoint {
 // Adam moves them at random. Others take their place, in an even layer on the surface at the radius of those that were
 // seen, with the colors that the texture has around the axis there: ropes are laid or braided, so that what repeats
 // does so along a helix, whose slope is found from what was seen; where nothing repeats, the color at the same
-// arclength. The light of that side is found from how brightness changes around what was seen. Where masks show that
-// something hides the rope, as a gripper does, all stays. design.md, 'Recognition'. They are marked as guessed. Returns how
-// many these are.
+// arclength. The light of that side is found from how brightness changes around what was seen. What was seen only at a
+// slant keeps its shape and gets colors by the same rule, the more the flatter it was seen. Where masks show that
+// something hides the rope, as a gripper does, all stays. design.md, 'Recognition'. The new ones are marked as guessed.
+// Returns how many these are.
 int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, splat::Gaussians& gaussians);
 
 // Puts back, after more training, those of `before` that are guessed. Both have the same count and degree.

@@ -9,6 +9,7 @@
 #include "chainsplat/export.h"
 #include "chainsplat/json.h"
 #include "chainsplat/pipeline.h"
+#include "chainsplat/rope.h"
 #include "chainsplat/run_folder.h"
 #include "chainsplat/synth.h"
 #include "cli.h"
@@ -107,9 +108,12 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
                                                             : pipeline::own_base(request.run);
   exports::Options options;
   options.mesh = request.mesh;
-  if (twin.parameters)
-    options.properties =
-        twin::properties(dynamics::make_model(twin.chain, *twin.parameters), twin.estimates, twin.known_mass);
+  if (twin.parameters) {
+    const dynamics::Model model = dynamics::make_model(twin.chain, *twin.parameters);
+    options.properties = twin::properties(model, twin.estimates, twin.known_mass);
+    // a simulator's model starts where `rollout` does
+    if (!request.base.empty()) twin.initial = pipeline::rest_state(twin, model, base.pose(base.start()), base.start());
+  }
   if (exports::ending(request.out) == ".mcap" && !request.no_pictures) {
     if (const std::optional<capture::Capture> recording = pipeline::own_recording(twin, request.run))
       options.capture = recording->folder;
