@@ -60,9 +60,9 @@ void tell_fit(const std::string& stage, const solve::Summary& summary) {
 
 namespace {
 
-// Numbers of all frames' covariances beyond which identification leaves frames out: it holds for each frame some ten
-// times as many. 24 angles at 30 Hz reach it after a quarter of an hour, 128 after half a minute.
-constexpr std::size_t kMostCovariances = 1 << 24;
+// Numbers of all frames' covariances beyond which identification leaves frames out: it holds for each frame some
+// eighteen times as many. 24 angles at 30 Hz reach it after eight minutes, 128 after a quarter of a minute.
+constexpr std::size_t kMostCovariances = 1 << 23;
 
 chain::States every_nth(const chain::States& states, std::size_t every) {
   chain::States out;
