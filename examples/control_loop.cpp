@@ -33,7 +33,8 @@ int main(int count, char** arguments) {
     planning::Options options;
     options.horizon = 1.0;
     options.starts = 4;
-    for (const capture::View& view : recorded.views) {
+    for (const capture::PackedView& packed : recorded.views) {
+      const capture::View view = capture::unpacked(packed);
       const math::Pose pose = recorded.base.pose(view.time);
       if (view.frame > 0) gripper.add(view.time, pose);
       const estimation::Estimate found = tracker.update({&view, 1});

@@ -44,7 +44,7 @@ capture::Capture recording() {
   }
   for (int c = 0; c < 2; ++c)
     for (int f = 0; f < 4; ++f) {
-      capture::View view;
+      capture::PackedView view;
       view.camera = c;
       view.frame = f;
       view.time = 0.1 * f;

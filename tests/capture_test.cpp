@@ -24,6 +24,7 @@ using capture::Camera;
 using capture::Capture;
 using capture::Image8;
 using capture::LoadOptions;
+using capture::PackedView;
 using capture::View;
 using math::Vector2;
 using math::Vector3;
@@ -212,7 +213,8 @@ TEST_CASE("the demo: masks, crops and base agree with the truth of the simulatio
   REQUIRE(truth->points[0].cols() == 49);
 
   int points = 0, inside = 0, object = 0, bright_outside = 0;
-  for (const View& view : demo.views) {
+  for (const PackedView& packed : demo.views) {
+    const View view = capture::unpacked(packed);
     const Camera& camera = demo.cameras[view.camera];
     CHECK(view.time == doctest::Approx(truth->time[view.frame]).epsilon(1e-6));
     CHECK(view.rgba.size() == static_cast<std::size_t>(4) * view.width * view.height);
@@ -296,7 +298,8 @@ TEST_CASE("image folders, depth, crops") {
   options.margin = 3;
   const Capture loaded = made.load(options);
   REQUIRE(loaded.views.size() == 2 * kFrames);
-  for (const View& view : loaded.views) {
+  for (const PackedView& packed : loaded.views) {
+    const View view = capture::unpacked(packed);
     CHECK(view.time == doctest::Approx(0.1 * view.frame));
     // the disk covers the pixels whose centers are within 8 px of its center: [22, 38) x [14, 30) in frame 0
     CHECK(view.x0 == 22 + view.frame - 3);
@@ -312,7 +315,7 @@ TEST_CASE("image folders, depth, crops") {
         CHECK(p[1] == (inside ? 5 * y : 0));
         CHECK(p[2] == (inside ? 20 * view.frame : 0));
         CHECK(view.depth[static_cast<std::size_t>(y - view.y0) * view.width + x - view.x0] ==
-              doctest::Approx(0.9 + 0.001 * x).epsilon(1e-4));
+              doctest::Approx(inside ? 0.9 + 0.001 * x : 0.0).epsilon(1e-4));
       }
   }
   capture::FrameReader reader(made.path(), "cam0", {}, capture::Pixels::recorded);
@@ -345,7 +348,8 @@ TEST_CASE("undistortion: straight pixels, masks, and edges that are not darkened
   LoadOptions options;
   options.camera = "cam0";
   options.depth = true;
-  for (const View& view : made.load(options).views) {
+  for (const PackedView& packed : made.load(options).views) {
+    const View view = capture::unpacked(packed);
     int wrong = 0, object = 0;
     for (int y = view.y0; y < view.y0 + view.height; ++y)
       for (int x = view.x0; x < view.x0 + view.width; ++x) {
@@ -365,7 +369,7 @@ TEST_CASE("undistortion: straight pixels, masks, and edges that are not darkened
   const Image8 picture = capture::read_image8(made.path() / numbered("cam0", 1));
   const Image8 coverage = capture::read_image8(made.path() / numbered("masks/cam0", 1));
   const View from_memory = capture::view_of(straight.cameras[0], picture, coverage);
-  CHECK(from_memory.rgba == straight.views[1].rgba);
+  CHECK(from_memory.rgba == capture::unpacked(straight.views[1]).rgba);
   CHECK(from_memory.x0 == straight.views[1].x0);
   CHECK(from_memory.y0 == straight.views[1].y0);
   CHECK(capture::view_of(straight.cameras[0], picture, filled(1, [](int, int) { return std::array<double, 3>{}; })).width == 0);
@@ -374,7 +378,7 @@ TEST_CASE("undistortion: straight pixels, masks, and edges that are not darkened
   options.pixels = capture::Pixels::recorded;
   const Capture recorded = made.load(options);
   const Image8 image = capture::read_image8(made.path() / numbered("cam0", 1));
-  const View& view = recorded.views[1];
+  const View view = capture::unpacked(recorded.views[1]);
   for (int y = view.y0; y < view.y0 + view.height; ++y)
     for (int x = view.x0; x < view.x0 + view.width; ++x)
       if (pixel(view, x, y)[3] == 255) CHECK(pixel(view, x, y)[0] == image.pixels[3 * (y * kWidth + x)]);
@@ -389,7 +393,7 @@ TEST_CASE("undistortion: straight pixels, masks, and edges that are not darkened
   const std::optional<capture::Frame> frame = whole.next();
   REQUIRE(frame);
   CHECK(frame->frame == 1);
-  const View& seen = straight.views[1];
+  const View seen = capture::unpacked(straight.views[1]);
   for (int y = seen.y0; y < seen.y0 + seen.height; ++y)
     for (int x = seen.x0; x < seen.x0 + seen.width; ++x)
       if (pixel(seen, x, y)[3] == 255)
@@ -487,7 +491,7 @@ TEST_CASE("videos of images and masks, missing masks, timestamps, empty views") 
       made.json["cameras"][0]["masks"] = "mask0.mp4";
       const Capture loaded = made.load();
       for (int k = 0; k < kFrames; ++k) {
-        const View &view = loaded.views[k], &reference = by_file.views[k];
+        const View view = capture::unpacked(loaded.views[k]), reference = capture::unpacked(by_file.views[k]);
         int object = 0, different = 0;
         for (int y = 14; y < 30; ++y)
           for (int x = 22 + k; x < 38 + k; ++x) {
@@ -508,7 +512,7 @@ TEST_CASE("videos of images and masks, missing masks, timestamps, empty views") 
         CHECK(frame->frame == k);
         CHECK(frame->time == loaded.times[0][k]);
         REQUIRE(frame->picture.pixels.size() == 3u * kWidth * kHeight);
-        const View& view = loaded.views[k];
+        const View view = capture::unpacked(loaded.views[k]);
         for (int y = 14; y < 30; ++y)
           for (int x = 22 + k; x < 38 + k; ++x)
             if (const std::uint8_t* const p = pixel(view, x, y); p[3] == 255)

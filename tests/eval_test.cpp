@@ -275,11 +275,11 @@ TEST_CASE("a twin explains pictures of itself, and the metrics know by how much 
         view.rgba.push_back(in_mask ? 255 : 0);
       }
       view.depth = frame.picture.depth;
-      recorded.views.push_back(std::move(view));
+      recorded.views.push_back(capture::packed(view));
     }
   }
   // two views that no state covers
-  capture::View late = recorded.views.back();
+  capture::PackedView late = recorded.views.back();
   late.frame = 39;
   late.time = recorded.times[1][39];
   recorded.views.push_back(late);

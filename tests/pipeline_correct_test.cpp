@@ -67,13 +67,13 @@ TEST_CASE("a base that no camera sees is a problem, not a crash") {
 TEST_CASE("a darker camera is named, and its pictures stay as they are") {
   constexpr double kDark = 0.7;
   capture::Capture capture = demo();
-  for (capture::View& view : capture.views) {
+  for (capture::PackedView& view : capture.views) {
     if (view.camera != 1) continue;
     for (std::size_t i = 0; i < view.rgba.size(); i += 4)
       for (int c = 0; c < 3; ++c)
         view.rgba[i + c] = static_cast<std::uint8_t>(std::lround(kDark * view.rgba[i + c]));
   }
-  const std::vector<capture::View> recorded = capture.views;
+  const std::vector<capture::PackedView> recorded = capture.views;
   const pipeline::Corrected found = pipeline::correct(capture, {}, false);
   const capture::Finding* const said = finding(found.verdict, "camera-color", "cam1");
   REQUIRE(said);
@@ -82,7 +82,7 @@ TEST_CASE("a darker camera is named, and its pictures stay as they are") {
   const double others = 0.5 * (capture.cameras[0].gain.mean() + capture.cameras[2].gain.mean());
   CHECK(capture.cameras[1].gain.mean() / others == doctest::Approx(kDark).epsilon(0.05));
   CHECK(std::equal(recorded.begin(), recorded.end(), capture.views.begin(),
-                   [](const capture::View& a, const capture::View& b) { return a.rgba == b.rgba; }));
+                   [](const capture::PackedView& a, const capture::PackedView& b) { return a.rgba == b.rgba; }));
 
   capture::Capture held = demo();
   held.views = recorded;

@@ -93,7 +93,7 @@ TEST_CASE("too little device memory: fewer views in a submission, a warning, and
     g.link_logits[chain.links() * i + chain::link_at(chain, -g.mean[3 * i + 2])] = 12.0f;
   }
   std::vector<splat::ViewSpec> views;
-  for (const capture::View& view : demo().views)
+  for (const capture::ViewPlace& view : demo().views)
     views.push_back({&demo().cameras[view.camera], 0, 0, 320, 240,
                      chain::link_motions(chain, math::VectorX::Zero(3), demo().base.pose(view.time))});
   const gpu::DevicePtr whole_device = gpu::open_device();
@@ -132,7 +132,11 @@ TEST_CASE("gradients that are not finite move nothing and are counted") {
   const std::vector<splat::ViewSpec> views{{&camera, 0, 0, 32, 32, {math::Pose{}}}};
   std::vector<std::uint8_t> target(4 * 32 * 32, 0);
   for (int c = 0; c < 4; ++c) target[4 * (16 * 32 + 16) + c] = 255;  // means are then taken over one pixel
-  const std::vector<const std::vector<std::uint8_t>*> targets{&target};
+  capture::View wanted;
+  wanted.width = wanted.height = 32;
+  wanted.rgba = target;
+  const capture::PackedView packed = capture::packed(wanted);
+  const std::vector<const capture::PackedView*> targets{&packed};
   engine.set_views(views, targets);
   splat::AdamRates rates;
   rates.mean = rates.sh0 = rates.opacity = 0.01f;

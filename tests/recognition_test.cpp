@@ -117,7 +117,7 @@ TEST_CASE("refined angles come back to where the picture was drawn") {
     view.rgba.resize(4 * 200 * 240);
     for (std::size_t k = 0; k < view.rgba.size(); ++k)
       view.rgba[k] = static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(pictures[c].rgba[k], 0.0f, 1.0f)));
-    capture.views.push_back(view);
+    capture.views.push_back(capture::packed(view));
   }
   chain::States states;
   states.time = {0.0};
@@ -167,7 +167,7 @@ TEST_CASE("a job is another one when anything differs that its result depends on
     view.time = 0.1 * frame;
     view.width = view.height = 1;
     view.rgba = {9, 9, 9, 255};
-    capture.views.push_back(view);
+    capture.views.push_back(capture::packed(view));
   }
   const std::string job = job_text(capture, {});
   CHECK(job == job_text(capture, {}));
@@ -182,7 +182,7 @@ TEST_CASE("a job is another one when anything differs that its result depends on
   other_capture([](auto& c) { c.views[1].x0 = 1; });
   other_capture([](auto& c) { c.views[1].rgba[3] = 0; });
   other_capture([](auto& c) {
-    for (capture::View& view : c.views) view.frame += 10;
+    for (capture::PackedView& view : c.views) view.frame += 10;
   });
   const auto other_options = [&](const std::function<void(Options&)>& change) {
     Options changed;

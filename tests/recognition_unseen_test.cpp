@@ -36,7 +36,7 @@ struct Rope {
   std::function<math::Vector3(double arclength, double angle)> color;
   // two cameras at 40 degrees to either side of the bending axis, 1 m away, whose masks show the rope everywhere
   std::vector<std::unique_ptr<capture::Camera>> cameras;
-  std::vector<std::unique_ptr<capture::View>> pictures;
+  std::vector<std::unique_ptr<capture::PackedView>> pictures;
   std::vector<recognition::Viewpoint> views;
 
   // Those that a camera could see (nearly) have the texture and lie at 0.85 of the radius, the others are gray at 0.75.
@@ -69,9 +69,9 @@ struct Rope {
     const math::Vector3 x = normal(at).cross(chain.direction);
     camera->world_from_camera.rotation = (math::Matrix3() << x, chain.direction, -normal(at)).finished();
     camera->world_from_camera.translation = normal(at) + 0.5 * kLength * chain.direction;
-    auto picture = std::make_unique<capture::View>();
-    picture->width = kWidth, picture->height = kHeight;
-    picture->rgba.assign(std::size_t{4} * kWidth * kHeight, 255);
+    capture::View picture;
+    picture.width = kWidth, picture.height = kHeight;
+    picture.rgba.assign(std::size_t{4} * kWidth * kHeight, 255);
     for (int v = 0; v < kHeight; ++v)
       for (int u = 0; u < kWidth; ++u) {
         // where the ray (right, down, 1) from (0, 0, -1) meets the circle: |(right t, t - 1)| = radius
@@ -83,12 +83,12 @@ struct Rope {
         const double angle = std::atan2(out.dot(normal(90.0 * kDegree)), out.dot(normal(0.0)));
         const math::Vector3 rgb = color(0.5 * kLength + depth * down, angle);
         for (int k = 0; k < 3; ++k)
-          picture->rgba[4 * (static_cast<std::size_t>(v) * kWidth + u) + k] =
+          picture.rgba[4 * (static_cast<std::size_t>(v) * kWidth + u) + k] =
               static_cast<std::uint8_t>(std::lround(255.0 * std::clamp(rgb[k], 0.0, 1.0)));
       }
-    views.push_back({camera.get(), picture.get(), motions});
+    pictures.push_back(std::make_unique<capture::PackedView>(capture::packed(picture)));
+    views.push_back({camera.get(), pictures.back().get(), motions});
     cameras.push_back(std::move(camera));
-    pictures.push_back(std::move(picture));
   }
   math::Vector3 normal(double at) const {
     return std::cos(at) * chain.bending_axis + std::sin(at) * chain.direction.cross(chain.bending_axis);

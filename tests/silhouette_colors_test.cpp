@@ -36,7 +36,7 @@ const Recording& demo() {
 
 // Whole numbers, cut off at 0 and 255, as a camera's are.
 void expose(capture::Capture& capture, int camera, const Vector3& gain, const Vector3& bias) {
-  for (capture::View& view : capture.views) {
+  for (capture::PackedView& view : capture.views) {
     if (view.camera != camera) continue;
     for (std::size_t i = 0; i < view.rgba.size(); i += 4)
       for (int c = 0; c < 3; ++c)
@@ -82,7 +82,7 @@ TEST_CASE("gain and bias that were put in are what is found beyond the cameras' 
 TEST_CASE("one camera, and cameras that are exact by the capture, are taken as they are") {
   capture::Capture alone = demo().capture;
   alone.cameras.resize(1);
-  std::erase_if(alone.views, [](const capture::View& view) { return view.camera != 0; });
+  std::erase_if(alone.views, [](const capture::PackedView& view) { return view.camera != 0; });
   const silhouette::CameraColors one = silhouette::fit_camera_colors(demo().chain, alone, demo().states);
   CHECK(one.patches == 0);
   CHECK(one.gain.isOnes(1e-9));

@@ -102,7 +102,8 @@ TEST_CASE("where masks begin parts cameras that are all too low from a longer ro
 
   constexpr double kFingers = 0.008;  // m of the rope that they hide
   capture::Capture held = demo();
-  for (capture::View& view : held.views) {
+  for (capture::PackedView& packed : held.views) {
+    capture::View view = capture::unpacked(packed);
     const math::Pose base = held.base.pose(view.time);
     const math::Vector3 seen =
         held.cameras[view.camera].world_from_camera.inverse() * (base * Vector3(kFingers * held.direction));
@@ -110,6 +111,7 @@ TEST_CASE("where masks begin parts cameras that are all too low from a longer ro
     const int below = static_cast<int>(std::lround(camera.fy * seen.y() / seen.z() + camera.cy)) - view.y0;
     for (int y = 0; y < std::min(below, view.height); ++y)
       std::fill_n(view.rgba.begin() + 4 * static_cast<std::ptrdiff_t>(y) * view.width, 4 * view.width, std::uint8_t{0});
+    packed = capture::packed(view);
   }
   const silhouette::CorrectionFit found = fit(held);
   CHECK(capture::value_of(found.corrections, "cam0", "mask_start") == doctest::Approx(kFingers).epsilon(0.2));
@@ -128,7 +130,7 @@ TEST_CASE("a group that is held stays as given, and one camera alone tells clock
   capture::Capture alone = late;
   alone.cameras.resize(1);
   alone.times.resize(1);
-  std::erase_if(alone.views, [](const capture::View& view) { return view.camera != 0; });
+  std::erase_if(alone.views, [](const capture::PackedView& view) { return view.camera != 0; });
   const silhouette::CorrectionFit one = fit(alone);
   CHECK(capture::value_of(one.corrections, "base", "time") == doctest::Approx(0.02).epsilon(0.25));
   CHECK(capture::find(one.corrections, "cam0", "rotation")->state == capture::CorrectionState::held);

@@ -153,7 +153,7 @@ capture::Capture film(const Chain& chain, int frames, const Function& theta_at) 
     c.times.emplace_back();
     for (int f = 0; f < frames; ++f) {
       c.times[i].push_back(f / 30.0);
-      c.views.push_back(draw(chain, theta_at(f / 30.0), base_pose(), c.cameras[i], i, f, f / 30.0));
+      c.views.push_back(capture::packed(draw(chain, theta_at(f / 30.0), base_pose(), c.cameras[i], i, f, f / 30.0)));
     }
   }
   return c;
@@ -321,7 +321,7 @@ TEST_CASE("a sequence: velocity, frames without masks, bending") {
     return 1.2 * kRate * std::cos(kRate * t) * (bent(planar, 1.0) - bent(planar, 0.0));
   };
   capture::Capture flat = film(planar, kFrames, swing);
-  for (capture::View& view : flat.views)
+  for (capture::PackedView& view : flat.views)
     if (view.frame == 6) std::fill(view.rgba.begin(), view.rgba.end(), std::uint8_t{0});
   int warnings = 0;
   core::Listener listener;
@@ -350,7 +350,7 @@ TEST_CASE("a sequence: velocity, frames without masks, bending") {
   CHECK(other.bending == Bending::spatial);
   CHECK(other.out_of_plane_rms > 5.0 * other.deviation);
 
-  for (capture::View& view : flat.views) std::fill(view.rgba.begin(), view.rgba.end(), std::uint8_t{0});
+  for (capture::PackedView& view : flat.views) std::fill(view.rgba.begin(), view.rgba.end(), std::uint8_t{0});
   CHECK_THROWS_AS(silhouette::fit_sequence(planar, flat), InputError);
 }
 
@@ -419,7 +419,7 @@ TEST_CASE("of one camera a planar fit must be clearly worse before a rope is spa
   const Chain given = chain::make_chain(1.06 * kLength, kDiameter, -Vector3::UnitZ(), Vector3::UnitY(), 8,
                                         Bending::spatial, false);
   capture::Capture still = film(planar, 2, [&](double) { return bent(planar, 0.9); });
-  std::erase_if(still.views, [](const capture::View& view) { return view.camera != 0; });
+  std::erase_if(still.views, [](const capture::PackedView& view) { return view.camera != 0; });
   silhouette::SequenceFit fit = silhouette::fit_sequence(given, still);
   for (silhouette::FrameFit& frame : fit.frames) frame.covariance *= 0.01;  // as sure as no real outline allows
   const silhouette::BendingChoice choice = silhouette::choose_bending(given, still, fit);
@@ -428,7 +428,7 @@ TEST_CASE("of one camera a planar fit must be clearly worse before a rope is spa
   CHECK(choice.bending == Bending::planar);
   // a rope that leaves its plane sideways in the picture is spatial, whatever the number of cameras
   capture::Capture out = film(spatial, 2, [&](double) { return bent(spatial, 0.2, 1.2); });
-  std::erase_if(out.views, [](const capture::View& view) { return view.camera != 1; });
+  std::erase_if(out.views, [](const capture::PackedView& view) { return view.camera != 1; });
   CHECK(silhouette::choose_bending(spatial, out, silhouette::fit_sequence(spatial, out)).bending == Bending::spatial);
 }
 

@@ -83,6 +83,19 @@ struct Scene {
     for (const auto& t : targets) out.push_back(&t);
     return out;
   }
+  mutable std::vector<capture::PackedView> packed_targets;  // as packed_pointers() made them
+  std::vector<const capture::PackedView*> packed_pointers() const {
+    packed_targets.clear();
+    for (std::size_t v = 0; v < views.size(); ++v) {
+      capture::View whole;
+      whole.width = views[v].width, whole.height = views[v].height;
+      whole.rgba = targets[v];
+      packed_targets.push_back(capture::packed(whole));
+    }
+    std::vector<const capture::PackedView*> out;
+    for (const capture::PackedView& target : packed_targets) out.push_back(&target);
+    return out;
+  }
   std::vector<reference::Target> reference_targets() const {
     std::vector<reference::Target> out;
     for (const auto& t : targets) out.push_back(reference::target(t));
@@ -810,7 +823,7 @@ TEST_CASE("the same input gives the same bits: loss, gradients, 20 steps, and on
   for (int repeat = 0; repeat < 2; ++repeat) {
     Run run;
     run.losses = engine().loss(scene.gaussians, scene.views, scene.target_pointers(), kAllTerms, 0.0, &run.gradients);
-    engine().set_views(scene.views, scene.target_pointers());
+    engine().set_views(scene.views, scene.packed_pointers());
     engine().set_gaussians(scene.gaussians);
     for (int step = 0; step < kSteps; ++step) {
       if (step == kMiddle) middle = engine().snapshot();
@@ -850,7 +863,7 @@ TEST_CASE("step is Adam on the mean loss of the batch") {
   const double normalizer = object_pixels / 2.0;  // training takes means over the views' mean number of object pixels
   const std::array<float, 7> rate{3e-4f, 2e-3f, 4e-3f, 1e-2f, 5e-3f, 1e-3f, 3e-2f};
   const splat::AdamRates rates{rate[0], rate[1], rate[2], rate[3], rate[4], rate[5], rate[6]};
-  engine(false).set_views(scene.views, scene.target_pointers());
+  engine(false).set_views(scene.views, scene.packed_pointers());
   engine(false).set_gaussians(scene.gaussians);
 
   auto g = reference::parameters(scene.gaussians);
@@ -920,7 +933,7 @@ TEST_CASE("step is Adam on the mean loss of the batch") {
 
 TEST_CASE("host and device agree on where each kind of parameter stands: a rate moves those of its kind only") {
   const Scene scene = random_scene(63, 21, 3, 2, Logits::soft);
-  engine().set_views(scene.views, scene.target_pointers());
+  engine().set_views(scene.views, scene.packed_pointers());
   const auto before = reference::parameters(scene.gaussians);
   const std::array batch{0, 1, 2};
   for (int rated = 0; rated < 7; ++rated) {
@@ -952,7 +965,7 @@ TEST_CASE("the numbers of the image model are what defines them") {
 
 TEST_CASE("resets cap the opacity, even the links out, and forget their moments only") {
   const Scene scene = random_scene(71, 20, 3, 0, Logits::soft);
-  engine().set_views(scene.views, scene.target_pointers());
+  engine().set_views(scene.views, scene.packed_pointers());
   engine().set_gaussians(scene.gaussians);
   const splat::AdamRates rates{1e-4f, 1e-3f, 1e-3f, 1e-2f, 1e-3f, 1e-3f, 1e-2f};
   const std::array batch{0, 1, 2};
@@ -1006,7 +1019,7 @@ TEST_CASE("training draws and charges near the mask, or everywhere when asked") 
   const splat::AdamRates rates{0, 0, 0, 0, 1e-3f, 0, 0};
   for (const bool everywhere : {false, true}) {
     CAPTURE(everywhere);
-    engine().set_views(scene.views, scene.target_pointers(), everywhere);
+    engine().set_views(scene.views, scene.packed_pointers(), everywhere);
     engine().set_gaussians(g);
     const splat::Picture drawn = engine().draw_views(batch)[0];
     double left = 0.0, right = 0.0, left_wanted = 0.0, right_wanted = 0.0;
@@ -1135,7 +1148,7 @@ TEST_CASE("nothing to draw: no views, no Gaussians, views of size 0, everything 
   }
 
   // a step on black moves nothing
-  engine().set_views(behind.views, behind.target_pointers());
+  engine().set_views(behind.views, behind.packed_pointers());
   engine().set_gaussians(behind.gaussians);
   const std::array batch{0, 1, 2};
   const splat::AdamRates rates{1, 1, 1, 1, 1, 1, 1};

@@ -80,7 +80,8 @@ TEST_CASE("a synthesized capture loads and holds what was drawn") {
 
   // the loaded views equal the pictures, to 8 bits and 0.1 mm
   int solid = 0;
-  for (const capture::View& view : read.views) {
+  for (const capture::PackedView& packed : read.views) {
+    const capture::View view = capture::unpacked(packed);
     const capture::Camera& camera = read.cameras[view.camera];
     render::Options drawing;
     drawing.depth = true;
@@ -141,7 +142,7 @@ TEST_CASE("only frames that the states cover are written, numbered from 0; video
   CHECK(std::filesystem::exists(folder.path / "cam0.mp4"));
   REQUIRE(read.times[0].size() == 4);
   CHECK(read.times[0][0] == doctest::Approx(0.3));
-  for (const capture::View& view : read.views) CHECK(view.width > 20);
+  for (const capture::ViewPlace& view : read.views) CHECK(view.width > 20);
   CHECK_THROWS_AS(synth::write(engine(), twin, test::swing(twin.chain, 0.1, 5.0), source, folder.path / "none"),
                   InputError);
   CHECK(!std::filesystem::exists(folder.path / "none"));

@@ -38,15 +38,28 @@ math::Vector2 undistort(const Camera& camera, const math::Vector2& recorded_pixe
 // What the pixels of a picture are: with the lens distortion taken out, or as the camera recorded them.
 enum class Pixels { undistorted, recorded };
 
-// One image of one camera, cropped: pixel (0,0) of the crop is pixel (x0, y0) of the image.
-struct View {
+// Which image of which camera, and the crop of it: pixel (0,0) of the crop is pixel (x0, y0) of the image.
+struct ViewPlace {
   int camera = 0;     // index into Capture::cameras
   int frame = 0;      // the camera's frame number
   double time = 0.0;  // s
   int x0 = 0, y0 = 0, width = 0, height = 0;
+};
+
+struct View : ViewPlace {
   std::vector<std::uint8_t> rgba;  // 4 * width * height, row-major; RGB is 0 where A is 0; A = mask coverage, 0..255
   std::vector<float> depth;        // width * height, m along the camera's z, 0 = none; empty when not loaded
 };
+
+// A view as a capture keeps it: without the black pixels, which are nearly all of a long rope's crop.
+struct PackedView : ViewPlace {
+  std::vector<std::uint16_t> runs;  // row-major, by turns: how many pixels are black, how many follow that are not
+  std::vector<std::uint8_t> rgba;   // 4 a pixel, of those that are not black
+  std::vector<float> depth;         // of the same pixels; empty when not loaded
+};
+PackedView packed(const View& view);  // depth is lost where the view is black
+View unpacked(const PackedView& view);
+bool shows_object(const PackedView& view);  // whether its mask has a pixel
 
 struct Table {
   math::Vector3 point = math::Vector3::Zero();    // on the surface, world frame, m
@@ -78,7 +91,7 @@ struct Capture {
   std::optional<Table> table;
   std::vector<Camera> cameras;
   std::vector<std::vector<double>> times;  // s, frame times of each camera (of all frames, loaded or not)
-  std::vector<View> views;                 // sorted by camera, then frame; only the frames asked for
+  std::vector<PackedView> views;           // sorted by camera, then frame; only the frames asked for
   Pixels pixels = Pixels::undistorted;     // of the views
   trajectory::Trajectory base;
   std::vector<GivenSigma> sigma;  // where the capture says so; else what corrected_quantities() says

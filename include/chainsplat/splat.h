@@ -114,11 +114,12 @@ class Engine {
                   std::span<const std::vector<std::uint8_t>* const> targets, const LossWeights& weights,
                   double normalizer, Gradients* gradients, std::vector<Picture>* pictures = nullptr);
 
-  // --- training: parameters, moments and targets stay on the device --------------------------------------------------
-  // Loads the targets of all views of the training; step() and others refer to them by their index in `views`. Motions
-  // can be changed later. Only tiles near the mask are drawn and contribute to the loss; with `everywhere` the whole
+  // --- training: parameters and moments stay on the device -----------------------------------------------------------
+  // Names the targets of all views of the training; step() and others refer to them by their index in `views`. Motions
+  // can be changed later. `targets` are taken to the device when they are needed, since all of them together may not
+  // have room there: they must last as long as the training. Only tiles near the mask are drawn and contribute to the loss; with `everywhere` the whole
   // crop does, but D-SSIM is still taken near the mask only: elsewhere L1 is enough to charge stray splats.
-  void set_views(std::span<const ViewSpec> views, std::span<const std::vector<std::uint8_t>* const> targets,
+  void set_views(std::span<const ViewSpec> views, std::span<const capture::PackedView* const> targets,
                  bool everywhere = false);
   void set_motions(int view, const std::vector<math::Pose>& motions);
   void set_gaussians(const Gaussians& gaussians);  // resets Adam's moments and step count

@@ -47,18 +47,19 @@ chain::States make_states(const Numbers& time, const Numbers& theta, const std::
 
 // A frame that was loaded masked, as it was recorded: RGB, black outside of the mask, or the mask alone.
 py::array_t<std::uint8_t> picture(const capture::Capture& recorded, int camera, int frame, bool mask) {
-  const auto view = std::find_if(recorded.views.begin(), recorded.views.end(),
-                                 [&](const capture::View& v) { return v.camera == camera && v.frame == frame; });
-  if (view == recorded.views.end())
+  const auto found = std::find_if(recorded.views.begin(), recorded.views.end(),
+                                  [&](const capture::ViewPlace& v) { return v.camera == camera && v.frame == frame; });
+  if (found == recorded.views.end())
     throw InputError("`frame`", "camera " + std::to_string(camera) + " has no frame " + std::to_string(frame),
                      "load the capture with its images, and with this frame");
+  const capture::View view = capture::unpacked(*found);
   const capture::Camera& seen = recorded.cameras[static_cast<std::size_t>(camera)];
   const std::size_t channels = mask ? 1 : 3;
   std::vector<std::uint8_t> pixels(channels * seen.width * seen.height, 0);
-  for (int y = 0; y < view->height; ++y)
-    for (int x = 0; x < view->width; ++x) {
-      const std::uint8_t* const from = &view->rgba[4 * (static_cast<std::size_t>(y) * view->width + x)];
-      const std::size_t to = static_cast<std::size_t>(view->y0 + y) * seen.width + view->x0 + x;
+  for (int y = 0; y < view.height; ++y)
+    for (int x = 0; x < view.width; ++x) {
+      const std::uint8_t* const from = &view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x)];
+      const std::size_t to = static_cast<std::size_t>(view.y0 + y) * seen.width + view.x0 + x;
       std::copy_n(mask ? from + 3 : from, channels, &pixels[channels * to]);
     }
   std::vector<py::ssize_t> shape{seen.height, seen.width};
@@ -87,8 +88,11 @@ void add_types(py::module_& m) {
       .def(py::init(&make_trajectory), arg("time"), arg("poses"),
            "time: (T,), s, increasing. poses: (T, 4, 4), base to world, m. One pose: at rest.")
       .def_static(
-          "read", [](const Path& file) { return unlocked([&] { return trajectory::fit(trajectory::read_tum(file), file.string()); }); }, arg("file"),
-          "Reads 'timestamp tx ty tz qx qy qz qw' a line (TUM).")
+          "read",
+          [](const Path& file) {
+            return unlocked([&] { return trajectory::fit(trajectory::read_tum(file), file.string()); });
+          },
+          arg("file"), "Reads 'timestamp tx ty tz qx qy qz qw' a line (TUM).")
       .def(
           "write", [](const Trajectory& t, const Path& file) { core::write_file(file, write_tum(t.samples())); },
           arg("file"), "Writes its samples as TUM.")

@@ -176,7 +176,7 @@ struct CameraStatistics {
   std::vector<std::vector<double>> shifted;       // px, the grasp's distance from the mask per delay of the base
 };
 
-CameraStatistics statistics_of(const Manifest& manifest, const CameraSource& source, const View* views, int count) {
+CameraStatistics statistics_of(const Manifest& manifest, const CameraSource& source, const PackedView* views, int count) {
   const Camera& camera = source.camera;
   const trajectory::Trajectory& base = manifest.capture.base;
   const Pose camera_from_world = camera.world_from_camera.inverse();
@@ -184,7 +184,7 @@ CameraStatistics statistics_of(const Manifest& manifest, const CameraSource& sou
   out.frames = count;
   out.shifted.resize(2 * kMostLag + 1);
   for (int k = 0; k < count; ++k) {
-    const View& view = views[k];
+    const View view = unpacked(views[k]);
     const ViewFacts facts = facts_of(view, camera);
     if (facts.pixels == 0) continue;
     ++out.visible;
@@ -316,7 +316,7 @@ void check_depth(const Manifest& manifest, const CameraSource& source, const Cam
 }
 
 // `views` are all of the camera's, undistorted.
-void check_camera(const Manifest& manifest, const CameraSource& source, const View* views, int count,
+void check_camera(const Manifest& manifest, const CameraSource& source, const PackedView* views, int count,
                   CheckReport& report) {
   const CameraStatistics statistics = statistics_of(manifest, source, views, count);
   report.facts.push_back(facts_line(manifest, source, statistics));
@@ -390,7 +390,7 @@ CheckReport check(const Path& path) {
       continue;
     Manifest one = manifest;
     one.cameras = {source};
-    std::vector<View> views;
+    std::vector<PackedView> views;
     LoadOptions options;
     options.depth = true;
     options.margin = 0;

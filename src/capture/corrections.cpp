@@ -138,7 +138,7 @@ void apply(const Corrections& corrections, Capture& capture) {
     const double late = value_of(corrections, capture.cameras[c].name, "time");
     if (late != 0.0) {
       for (double& time : capture.times[c]) time -= late;
-      for (View& view : capture.views)
+      for (PackedView& view : capture.views)
         if (view.camera == static_cast<int>(c)) view.time -= late;
     }
     if (!capture.times[c].empty()) {

@@ -38,7 +38,7 @@ Capture load_from(const Source& source, const LoadOptions& options) {
   throw_first(findings);
   if (manifest.cameras.size() == 1 && options.camera.empty())
     findings.doubts.push_back(manifest.file.string() + ": cameras: only one; depth along its rays is hardly seen");
-  std::vector<View> views;
+  std::vector<PackedView> views;
   if (options.images) load_views(manifest, options, findings, views);
   for (const std::string& doubt : findings.doubts) core::warn(doubt);
   throw_first(findings);
@@ -60,7 +60,7 @@ Capture load_recorded_from(Capture loaded, const Source& source, LoadOptions opt
     recorded.base = loaded.base;
     recorded.length = loaded.length;
     recorded.diameter = loaded.diameter;
-    for (View& view : recorded.views) view.time = recorded.times[view.camera][view.frame];
+    for (PackedView& view : recorded.views) view.time = recorded.times[view.camera][view.frame];
     return recorded;
   }
   Findings findings;

@@ -62,9 +62,9 @@ void throw_first(const Findings& findings);
 
 // Loads the views of all cameras for the frames from options.first to options.last (src/capture/views.cpp).
 // Throws InputError for images that cannot be read.
-void load_views(const Manifest& manifest, const LoadOptions& options, Findings& findings, std::vector<View>& views);
+void load_views(const Manifest& manifest, const LoadOptions& options, Findings& findings, std::vector<PackedView>& views);
 
 // Adds recorded depth to views that were loaded without it; no camera may have lens distortion.
-void add_depth(const Manifest& manifest, std::vector<View>& views);
+void add_depth(const Manifest& manifest, std::vector<PackedView>& views);
 
 }  // namespace chainsplat::capture

@@ -6,6 +6,7 @@
 #include "chainsplat/rectangle.h"
 #include "image_files.h"
 #include "manifest.h"
+#include "packed_view.h"
 #include "pictures.h"
 
 namespace chainsplat::capture {
@@ -66,7 +67,7 @@ Rectangle undistorted_bounds(const Camera& camera, const Rectangle& bounds) {
 }
 
 // Sets the view's crop and alpha from the full mask in recorded pixels; an empty mask leaves the view empty.
-void cut_mask(View& view, const Camera& camera, const Bytes& mask, bool undistorting, int margin) {
+void cut_mask(PackedView& view, const Camera& camera, const Bytes& mask, bool undistorting, int margin) {
   Rectangle bounds = bounds_of(mask.data(), camera.width, camera.height);
   if (bounds.empty()) return;
   // undistort the mask where it may be inside
@@ -94,44 +95,40 @@ void cut_mask(View& view, const Camera& camera, const Bytes& mask, bool undistor
   view.y0 = crop.y0;
   view.width = crop.x1 - crop.x0;
   view.height = crop.y1 - crop.y0;
-  view.rgba.assign(static_cast<std::size_t>(4) * view.width * view.height, 0);
-  for (int y = bounds.y0; y < bounds.y1; ++y)
-    for (int x = bounds.x0; x < bounds.x1; ++x) {
-      const bool inside =
-          undistorting
-              ? straight[static_cast<std::size_t>(y - region.y0) * (region.x1 - region.x0) + x - region.x0] != 0
-              : mask[static_cast<std::size_t>(y) * camera.width + x] >= image_model::kObjectMask;
-      if (inside) view.rgba[4 * (static_cast<std::size_t>(y - crop.y0) * view.width + x - crop.x0) + 3] = 255;
-    }
+  set_runs(view, [&](int x, int y) {
+    x += crop.x0, y += crop.y0;
+    if (x < bounds.x0 || y < bounds.y0 || x >= bounds.x1 || y >= bounds.y1) return false;
+    return undistorting
+               ? straight[static_cast<std::size_t>(y - region.y0) * (region.x1 - region.x0) + x - region.x0] != 0
+               : mask[static_cast<std::size_t>(y) * camera.width + x] >= image_model::kObjectMask;
+  });
+  for (std::size_t i = 3; i < view.rgba.size(); i += 4) view.rgba[i] = 255;
 }
 
 // Sets the colors of the pixels inside the mask. They are sampled from the unmasked image, so that edges are not
 // darkened.
-void fill_color(View& view, const Camera& camera, const Bytes& rgb, bool undistorting) {
-  for (int y = 0; y < view.height; ++y)
-    for (int x = 0; x < view.width; ++x) {
-      std::uint8_t* const out = &view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x)];
-      if (out[3] == 0) continue;
-      if (undistorting) {
-        straight_color(camera, rgb, view.x0 + x, view.y0 + y, out);
-      } else {
-        std::copy_n(&rgb[3 * (static_cast<std::size_t>(view.y0 + y) * camera.width + view.x0 + x)], 3, out);
-      }
-    }
+void fill_color(PackedView& view, const Camera& camera, const Bytes& rgb, bool undistorting) {
+  std::uint8_t* out = view.rgba.data();
+  each_pixel(view, [&](int x, int y) {
+    if (undistorting)
+      straight_color(camera, rgb, view.x0 + x, view.y0 + y, out);
+    else
+      std::copy_n(&rgb[3 * (static_cast<std::size_t>(view.y0 + y) * camera.width + view.x0 + x)], 3, out);
+    out += 4;
+  });
 }
 
 // Sets the depth from the nearest recorded pixel, because depth must not be blended across edges.
-void fill_depth(View& view, const Camera& camera, const std::vector<float>& depth, bool undistorting) {
-  view.depth.assign(static_cast<std::size_t>(view.width) * view.height, 0.0f);
-  for (int y = 0; y < view.height; ++y)
-    for (int x = 0; x < view.width; ++x) {
-      Vector2 position = center(view.x0 + x, view.y0 + y);
-      if (undistorting) position = distort(camera, position);
-      const int column = static_cast<int>(std::floor(position.x())), row = static_cast<int>(std::floor(position.y()));
-      if (column < 0 || row < 0 || column >= camera.width || row >= camera.height) continue;
-      view.depth[static_cast<std::size_t>(y) * view.width + x] =
-          depth[static_cast<std::size_t>(row) * camera.width + column];
-    }
+void fill_depth(PackedView& view, const Camera& camera, const std::vector<float>& depth, bool undistorting) {
+  view.depth.assign(view.rgba.size() / 4, 0.0f);
+  float* out = view.depth.data();
+  each_pixel(view, [&](int x, int y) {
+    Vector2 position = center(view.x0 + x, view.y0 + y);
+    if (undistorting) position = distort(camera, position);
+    const int column = static_cast<int>(std::floor(position.x())), row = static_cast<int>(std::floor(position.y()));
+    const bool inside = column >= 0 && row >= 0 && column < camera.width && row < camera.height;
+    *out++ = inside ? depth[static_cast<std::size_t>(row) * camera.width + column] : 0.0f;
+  });
 }
 
 Bytes gray_of(const Image8& rgb) {
@@ -151,7 +148,7 @@ Bytes bright(const Bytes& rgb, std::uint8_t black) {
 // Loads the frames [first, last) of one camera whose images are a video into `views`. Where masks are image files, they
 // have been read before.
 void load_video_frames(const CameraSource& source, const LoadOptions& options, int first, int last, bool undistorting,
-                       int threads, View* views) {
+                       int threads, PackedView* views) {
   const Camera& camera = source.camera;
   VideoReader images(source.images.file, threads);
   skip_frames(source.images, first, images);
@@ -163,7 +160,7 @@ void load_video_frames(const CameraSource& source, const LoadOptions& options, i
   Image8 image, mask;
   for (int k = first; k < last; ++k) {
     next_frame(source, source.images, k, images, image);
-    View& view = views[k - first];
+    PackedView& view = views[k - first];
     if (masks) {
       next_frame(source, *source.masks, k, *masks, mask);
       cut_mask(view, camera, gray_of(mask), undistorting, options.margin);
@@ -176,7 +173,7 @@ void load_video_frames(const CameraSource& source, const LoadOptions& options, i
 
 // The same for the masks alone, where they are a video and the images are not.
 void load_mask_video(const CameraSource& source, const LoadOptions& options, int first, int last, bool undistorting,
-                     int threads, View* views) {
+                     int threads, PackedView* views) {
   VideoReader masks(source.masks->file, threads);
   skip_frames(*source.masks, first, masks);
   Image8 mask;
@@ -201,7 +198,7 @@ struct Range {
 };
 
 // The frames of all cameras that are asked for, with their views, which are empty yet.
-std::vector<Range> make_views(const Manifest& manifest, const LoadOptions& options, std::vector<View>& views) {
+std::vector<Range> make_views(const Manifest& manifest, const LoadOptions& options, std::vector<PackedView>& views) {
   std::vector<Range> ranges;
   views.clear();
   for (int c = 0; c < static_cast<int>(manifest.cameras.size()); ++c) {
@@ -213,7 +210,7 @@ std::vector<Range> make_views(const Manifest& manifest, const LoadOptions& optio
     range.undistorting = options.pixels == Pixels::undistorted && source.camera.distorted();
     ranges.push_back(range);
     for (int k = range.first; k < range.last; ++k) {
-      View view;
+      PackedView view;
       view.camera = c;
       view.frame = k;
       view.time = source.times[k];
@@ -224,7 +221,7 @@ std::vector<Range> make_views(const Manifest& manifest, const LoadOptions& optio
 }
 
 // Color, and the mask of images that are masked already, and depth of one view, as far as they are image files.
-void load_frame_files(const CameraSource& source, const LoadOptions& options, bool undistorting, View& view) {
+void load_frame_files(const CameraSource& source, const LoadOptions& options, bool undistorting, PackedView& view) {
   if (!source.images.video) {
     const Bytes rgb = rgb_of(source, view.frame);
     if (!source.masks)
@@ -241,14 +238,14 @@ void load_frame_files(const CameraSource& source, const LoadOptions& options, bo
 
 // Masks must neither be full nor all empty.
 void check_masks(const Manifest& manifest, const CameraSource& source, const Range& range,
-                 const std::vector<View>& views, Findings& findings) {
+                 const std::vector<PackedView>& views, Findings& findings) {
   if (range.first == range.last) return;
   int visible = 0;
   double covered = 0.0;
   for (int k = range.first; k < range.last; ++k) {
-    const View& view = views[range.offset + k - range.first];
+    const PackedView& view = views[range.offset + k - range.first];
     visible += view.width > 0;
-    for (std::size_t i = 3; i < view.rgba.size(); i += 4) covered += view.rgba[i] != 0;
+    covered += static_cast<double>(view.rgba.size() / 4);
   }
   covered /= static_cast<double>(range.last - range.first) * source.camera.width * source.camera.height;
   if (covered > kMostCovered)
@@ -270,7 +267,8 @@ void check_masks(const Manifest& manifest, const CameraSource& source, const Ran
 
 }  // namespace
 
-void load_views(const Manifest& manifest, const LoadOptions& options, Findings& findings, std::vector<View>& views) {
+void load_views(const Manifest& manifest, const LoadOptions& options, Findings& findings,
+                std::vector<PackedView>& views) {
   const std::vector<Range> ranges = make_views(manifest, options, views);
   const auto total = static_cast<std::int64_t>(views.size());
   for (const CameraSource& source : manifest.cameras)
@@ -280,7 +278,7 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
 
   // masks from image files come first, because they decide which part of an image is kept
   for_each_in_parallel(total, [&](std::int64_t i) {
-    View& view = views[i];
+    PackedView& view = views[i];
     const CameraSource& source = manifest.cameras[view.camera];
     if (!source.masks || source.masks->video) return;
     const Bytes mask = mask_of(source, view.frame);
@@ -295,22 +293,22 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
     const CameraSource& source = manifest.cameras[c];
     const Range& range = ranges[c];
     if (range.first == range.last) return;
-    View* const mine = views.data() + range.offset;
+    PackedView* const mine = views.data() + range.offset;
     if (source.images.video)
       load_video_frames(source, options, range.first, range.last, range.undistorting, decoder_threads, mine);
     else if (source.masks && source.masks->video)
       load_mask_video(source, options, range.first, range.last, range.undistorting, decoder_threads, mine);
   });
   for_each_in_parallel(total, [&](std::int64_t i) {
-    View& view = views[i];
+    PackedView& view = views[i];
     load_frame_files(manifest.cameras[view.camera], options, ranges[view.camera].undistorting, view);
   });
   for (int c = 0; c < cameras; ++c) check_masks(manifest, manifest.cameras[c], ranges[c], views, findings);
 }
 
-void add_depth(const Manifest& manifest, std::vector<View>& views) {
+void add_depth(const Manifest& manifest, std::vector<PackedView>& views) {
   for_each_in_parallel(static_cast<std::int64_t>(views.size()), [&](std::int64_t i) {
-    View& view = views[i];
+    PackedView& view = views[i];
     const CameraSource& source = manifest.cameras[view.camera];
     if (!source.depth || !view.depth.empty()) return;
     constexpr bool kUndistorting = false;
@@ -336,10 +334,10 @@ View view_of(const Camera& camera, const Image8& picture, const Image8& mask, in
   };
   check("`picture`", picture, 3);
   check("`mask`", mask, 1);
-  View view;
+  PackedView view;
   cut_mask(view, camera, mask.pixels, camera.distorted(), margin);
   fill_color(view, camera, picture.pixels, camera.distorted());
-  return view;
+  return unpacked(view);
 }
 
 Image8 rgb(const View& view) {

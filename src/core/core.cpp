@@ -20,6 +20,8 @@
 #include <thread>
 #include <utility>
 
+#include "src/core/write_parts.h"
+
 namespace chainsplat::core {
 
 namespace {
@@ -162,6 +164,10 @@ void parallel_for(std::int64_t count, const std::function<void(std::int64_t)>& b
 }
 
 void write_file(const Path& path, std::string_view bytes) {
+  write_parts(path, [&] { return std::exchange(bytes, {}); });
+}
+
+void write_parts(const Path& path, const std::function<std::string_view()>& next) {
   const Path temporary = path.string() + ".tmp" + std::to_string(::getpid());
   auto fail = [&](const char* what) {
     const std::string reason = std::strerror(errno);
@@ -172,17 +178,18 @@ void write_file(const Path& path, std::string_view bytes) {
   // write all bytes to the temporary file; closing it may change errno, which the message needs
   const int file = ::open(temporary.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0644);
   if (file < 0) fail("opening for writing");
-  std::size_t written = 0;
-  while (written < bytes.size()) {
-    const ssize_t n = ::write(file, bytes.data() + written, bytes.size() - written);
-    if (n < 0 && errno == EINTR) continue;
-    if (n <= 0) {
-      const int reason = errno;
-      ::close(file);
-      errno = reason;
-      fail("writing");
+  for (std::string_view bytes = next(); !bytes.empty(); bytes = next()) {
+    while (!bytes.empty()) {
+      const ssize_t n = ::write(file, bytes.data(), bytes.size());
+      if (n < 0 && errno == EINTR) continue;
+      if (n <= 0) {
+        const int reason = errno;
+        ::close(file);
+        errno = reason;
+        fail("writing");
+      }
+      bytes.remove_prefix(static_cast<std::size_t>(n));
     }
-    written += static_cast<std::size_t>(n);
   }
   // the bytes must be on the disk before the name refers to them
   if (::fsync(file) != 0) {
@@ -211,12 +218,15 @@ std::string read_file(const Path& path) {
   if (!file) throw InputError(path.string(), std::strerror(errno), "check the path and its permissions");
   std::string bytes;
   constexpr std::size_t kBlock = 1 << 16;
+  const std::uintmax_t size = std::filesystem::file_size(path, error);  // a pipe has none
+  if (!error) bytes.reserve(std::min<std::uintmax_t>(size, kLargestFile) + kBlock);
   while (file) {
     const std::size_t had = bytes.size();
     if (had > kLargestFile)
       throw InputError(path.string(), "is larger than 1 GiB",
                        "name the file that is meant; none that is read is so large");
-    bytes.resize(had + std::max(kBlock, had));  // doubling keeps the total time linear in the size
+    // doubling keeps the total time linear in the size, what is reserved the memory
+    bytes.resize(std::max(had + kBlock, std::min(2 * had, bytes.capacity())));
     file.read(bytes.data() + had, static_cast<std::streamsize>(bytes.size() - had));
     bytes.resize(had + static_cast<std::size_t>(file.gcount()));
   }

@@ -73,22 +73,22 @@ Image8 whole_image(const render::Frame& frame, const capture::Camera& camera) {
 Image8 comparison(splat::Engine& engine, const twin::Twin& twin, const capture::Capture& recorded) {
   const std::vector<double>& covered = twin.states.time.empty() ? twin.rollout.time : twin.states.time;
   struct Column {
-    std::vector<const capture::View*> views;        // one a moment
+    std::vector<const capture::PackedView*> views;  // one a moment
     std::vector<std::vector<render::Frame>> drawn;  // recognized, rollout
   };
   std::vector<Column> columns;
   int width = 0, height = 0, pictures = 0;  // of every window, px; windows beside each other
   std::size_t rows = 0;
   for (int c = 0; c < static_cast<int>(recorded.cameras.size()); ++c) {
-    std::vector<const capture::View*> views;
-    for (const capture::View& view : recorded.views)
+    std::vector<const capture::PackedView*> views;
+    for (const capture::PackedView& view : recorded.views)
       if (view.camera == c && view.time >= covered.front() && view.time <= covered.back() && view.width > 0)
         views.push_back(&view);
     if (views.empty()) continue;
     Column column;
     std::vector<double> times;
     for (int m = 0; m < kMoments; ++m) {
-      const capture::View* view = views[(2 * m + 1) * views.size() / (2 * kMoments)];
+      const capture::PackedView* view = views[(2 * m + 1) * views.size() / (2 * kMoments)];
       if (!column.views.empty() && column.views.back() == view) continue;  // fewer frames than moments
       column.views.push_back(view);
       times.push_back(view->time);
@@ -114,7 +114,7 @@ Image8 comparison(splat::Engine& engine, const twin::Twin& twin, const capture::
   int left = 0;
   for (const Column& column : columns) {
     for (std::size_t row = 0; row < column.views.size(); ++row) {
-      const capture::View& view = *column.views[row];
+      const capture::View view = capture::unpacked(*column.views[row]);
       const int top = static_cast<int>(row) * (height + kGap);
       const int x0 = view.x0 + (view.width - width) / 2, y0 = view.y0 + (view.height - height) / 2;
       const math::Rectangle window{x0, y0, x0 + width, y0 + height};

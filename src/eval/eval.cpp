@@ -221,10 +221,10 @@ Metrics evaluate(splat::Engine& engine, const splat::Gaussians& gaussians, const
   for (int c = 0; c < static_cast<int>(recorded.cameras.size()); ++c) {
     const capture::Camera& camera = recorded.cameras[c];
     metrics.camera_names.push_back(camera.name);
-    std::vector<const capture::View*> views;
+    std::vector<const capture::PackedView*> views;
     std::vector<double> times;
     render::Options options;
-    for (const capture::View& view : recorded.views) {
+    for (const capture::PackedView& view : recorded.views) {
       if (view.camera != c) continue;
       views.push_back(&view);
       times.push_back(view.time);
@@ -238,7 +238,7 @@ Metrics evaluate(splat::Engine& engine, const splat::Gaussians& gaussians, const
                           metrics.frames.resize(first + batch.size());
                           core::parallel_for(static_cast<std::int64_t>(batch.size()), [&](std::int64_t k) {
                             FrameMetrics& frame = metrics.frames[first + k];
-                            frame = compare(batch[k], *views[batch[k].frame], camera, trunk);
+                            frame = compare(batch[k], capture::unpacked(*views[batch[k].frame]), camera, trunk);
                             if (truth) compare_centerlines(frame, chain, states, recorded.base, *truth);
                             if (trunk) one_more();
                           });

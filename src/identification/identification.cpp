@@ -4,6 +4,7 @@
 #include <cmath>
 #include <functional>
 #include <limits>
+#include <memory>
 
 #include "chainsplat/dynamics/rod.h"
 #include "src/math/decompositions.h"
@@ -36,8 +37,9 @@ struct Part {
   std::vector<chain::MaterialPoint> points;  // that are compared
   std::vector<MatrixX> target;               // per frame: 3 x points, base frame
   std::vector<VectorX> theta;                // recognized
-  // a frame: of the angles, n x n, in the metric of the points; of markers, 3 x 3 blocks side by side
-  std::vector<MatrixX> whitening;
+  // a frame: of the angles, n x n, in the metric of the points; of markers, 3 x 3 blocks side by side. Copies of a part
+  // share them, since of many angles they are nearly all of it.
+  std::shared_ptr<const std::vector<MatrixX>> whitening;
   BaseGrid grids[2];                  // half the substeps, for the way to the minimum, and all of them
   std::vector<std::size_t> nodes[2];  // of the grid, up to and with each output
   bool has_markers = false;           // the points are markers; unseen ones have no weight
@@ -109,8 +111,10 @@ bool simulate_in_groups(const dynamics::Model& model, const BaseGrid& grid, cons
   for (std::size_t k = 0; k < states.theta.size(); ++k) {
     MatrixX& all = sensitivities.theta[k];
     all.resize(model.chain.angles(), static_cast<Eigen::Index>(unknowns.size()));
-    for (std::size_t i = 0; i < count; ++i)
+    for (std::size_t i = 0; i < count; ++i) {
       all.middleCols(static_cast<Eigen::Index>(first(i)), slopes[i].theta[k].cols()) = slopes[i].theta[k];
+      slopes[i].theta[k].resize(0, 0);  // or all derivatives were there twice
+    }
   }
   return true;
 }
@@ -151,13 +155,13 @@ void residuals(const Part& part, const chain::States& states, std::vector<Matrix
   MatrixX points;
   for (std::size_t k = 0; k < states.theta.size(); ++k) {
     if (!part.has_markers) {
-      out[k] = part.whitening[k] * (states.theta[k] - part.theta[k]);
+      out[k] = (*part.whitening)[k] * (states.theta[k] - part.theta[k]);
       continue;
     }
     place_points(part, states.theta[k], points, nullptr);
     out[k].resize(3, points.cols());
     for (Eigen::Index i = 0; i < points.cols(); ++i)
-      out[k].col(i) = part.whitening[k].middleCols<3>(3 * i) * (points.col(i) - part.target[k].col(i));
+      out[k].col(i) = (*part.whitening)[k].middleCols<3>(3 * i) * (points.col(i) - part.target[k].col(i));
   }
 }
 
@@ -203,9 +207,9 @@ void weighted_rows(const Part& part, const chain::States& states, const dynamics
     const double r = values[k].col(i).norm();
     const double weight = std::sqrt(r <= most ? 1.0 : most / r);
     if (part.has_markers)
-      by_angle.middleRows<3>(3 * i).noalias() = weight * part.whitening[k].middleCols<3>(3 * i) * jacobians[i];
+      by_angle.middleRows<3>(3 * i).noalias() = weight * (*part.whitening)[k].middleCols<3>(3 * i) * jacobians[i];
     else
-      by_angle = weight * part.whitening[k];
+      by_angle = weight * (*part.whitening)[k];
     out.right.segment(group * i, group) = weight * values[k].col(i);
   }
   out.slopes.noalias() = by_angle * slopes.theta[k];
@@ -217,20 +221,23 @@ solve::NormalEquations normal_equations(const Part& part, const chain::States& s
   const Eigen::Index size = part.unknowns.size();
   const std::size_t frames = values.size();
   // blocks of frames, summed in fixed order: the result does not depend on the number of threads
-  constexpr std::size_t kBlock = 10;
+  constexpr std::size_t kBlock = 10, kAtOnce = 32;  // frames; blocks whose sums are held
   const std::size_t blocks = (frames + kBlock - 1) / kBlock;
   const solve::NormalEquations zero{MatrixX::Zero(size, size), VectorX::Zero(size)};
-  std::vector<solve::NormalEquations> sums(blocks, zero);
-  core::parallel_for(static_cast<std::int64_t>(blocks), [&](std::int64_t block) {
-    Rows rows;
-    for (std::size_t k = block * kBlock; k < std::min(frames, (block + 1) * kBlock); ++k) {
-      weighted_rows(part, states, slopes, values, limit, k, rows);
-      sums[block].matrix.selfadjointView<Eigen::Lower>().rankUpdate(rows.slopes.transpose());
-      sums[block].gradient.noalias() += rows.slopes.transpose() * rows.right;
-    }
-  });
   solve::NormalEquations out = zero;
-  for (const solve::NormalEquations& sum : sums) out.matrix += sum.matrix, out.gradient += sum.gradient;
+  for (std::size_t first = 0; first < blocks; first += kAtOnce) {
+    std::vector<solve::NormalEquations> sums(std::min(kAtOnce, blocks - first), zero);
+    core::parallel_for(static_cast<std::int64_t>(sums.size()), [&](std::int64_t i) {
+      const std::size_t begin = (first + i) * kBlock;
+      Rows rows;
+      for (std::size_t k = begin; k < std::min(frames, begin + kBlock); ++k) {
+        weighted_rows(part, states, slopes, values, limit, k, rows);
+        sums[i].matrix.selfadjointView<Eigen::Lower>().rankUpdate(rows.slopes.transpose());
+        sums[i].gradient.noalias() += rows.slopes.transpose() * rows.right;
+      }
+    });
+    for (const solve::NormalEquations& sum : sums) out.matrix += sum.matrix, out.gradient += sum.gradient;
+  }
   out.matrix = out.matrix.selfadjointView<Eigen::Lower>();
   return out;
 }
@@ -422,7 +429,7 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
   for (std::size_t i = 0; markers && i < markers->arclengths.size(); ++i)
     part.points.push_back(chain::centerline_point(chain, markers->arclengths[i]));
   const std::size_t points = part.points.size();
-  std::vector<MatrixX> jacobians;
+  std::vector<MatrixX> jacobians, weights;
   for (std::size_t k = 0; k < frames; ++k) {
     if (markers) {
       MatrixX target = MatrixX::Zero(3, points), whitening = MatrixX::Zero(3, 3 * points);
@@ -436,7 +443,7 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
             std::sqrt(kCorrelated * (std::pow(markers->deviation, 2) + std::pow(kMarkerModelShare * chain.length, 2)));
       }
       part.target.push_back(target);
-      part.whitening.push_back(whitening);
+      weights.push_back(whitening);
       continue;
     }
     MatrixX target;
@@ -453,9 +460,10 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
                        "the covariance of the angles at " + core::exact(recognized.time[k]) + " s is not positive",
                        "recognize again, or leave the covariances out: the frames then count the same");
     part.target.push_back(target);
-    part.whitening.push_back(factor.matrixL().solve(unit));
+    weights.push_back(factor.matrixL().solve(unit));
   }
 
+  part.whitening = std::make_shared<const std::vector<MatrixX>>(std::move(weights));
   VectorX theta, thetadot, theta_sd = VectorX::Constant(chain.angles(), kThetaSd);
   const double thetadot_sd = initial_motion({part.times, part.theta, {}, {}}, theta, thetadot);
   if (!theta.allFinite() || !thetadot.allFinite() || !std::isfinite(thetadot_sd))
@@ -511,8 +519,8 @@ double rms_of(const Part& part, const chain::States& rollout) {
   for (std::size_t k = 0; k < part.times.size(); ++k) {
     place_points(part, rollout.theta[k], points, nullptr);
     const int stop = part.has_markers ? static_cast<int>(points.cols()) : 2 * (part.chain.links() - 1);
-    for (int i = part.has_markers ? 0 : 1; i < stop; i += part.has_markers ? 1 : 2) {        // odd: the links' ends
-      if (part.has_markers && part.whitening[k].middleCols<3>(3 * i).isZero(0.0)) continue;  // not seen
+    for (int i = part.has_markers ? 0 : 1; i < stop; i += part.has_markers ? 1 : 2) {           // odd: the links' ends
+      if (part.has_markers && (*part.whitening)[k].middleCols<3>(3 * i).isZero(0.0)) continue;  // not seen
       ++count;
       sum += (points.col(i) - part.target[k].col(i)).squaredNorm();
     }

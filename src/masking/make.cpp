@@ -14,6 +14,7 @@
 namespace chainsplat::masking {
 
 using capture::Frame;
+using capture::PackedView;
 using capture::View;
 
 namespace {
@@ -121,7 +122,7 @@ chain::States grown_states(const Recording& recording, const chain::Chain& chain
 // Learns a camera's appearance from its samples, with a chain for each and, where there are any, the masks of all
 // frames.
 Look learn(const Recording& recording, const chain::Chain& chain, int camera, const Samples& samples,
-           const chain::States& states, const std::vector<View>* masks) {
+           const chain::States& states, const std::vector<PackedView>* masks) {
   const capture::Camera& pinhole = recording.pinholes[camera];
   const auto base_at = [&](const Frame& frame) { return recording.capture.base.pose(frame.time); };
   const std::vector<Picture> pictures = samples.pictures();
@@ -132,12 +133,13 @@ Look learn(const Recording& recording, const chain::Chain& chain, int camera, co
   if (masks) look.marks = marks(pictures, tubes, chain);  // a grown chain is too inaccurate for marks
   for (std::size_t i = 0; i < tubes.size(); ++i) {
     const Frame& frame = samples.frames[i];
-    const View* mask = nullptr;
+    View mask;
     if (masks)
-      mask = &*std::find_if(masks->begin(), masks->end(),
-                            [&](const View& m) { return m.camera == camera && m.frame == frame.frame; });
+      mask = capture::unpacked(*std::find_if(masks->begin(), masks->end(), [&](const PackedView& m) {
+        return m.camera == camera && m.frame == frame.frame;
+      }));
     count_colors(look, pictures[i], tubes[i], reach(chain, base_at(frame), pinhole), chain,
-                 masks ? kFitMargin : kGrownMargin * tubes[i].radius, mask);
+                 masks ? kFitMargin : kGrownMargin * tubes[i].radius, masks ? &mask : nullptr);
   }
   settle(look);
   const capture::Image8* const empty = recording.help.empty_of(camera);
@@ -148,7 +150,7 @@ Look learn(const Recording& recording, const chain::Chain& chain, int camera, co
 }
 
 std::vector<Look> learn_all(const Recording& recording, const chain::Chain& chain, const std::vector<Samples>& samples,
-                            const chain::States& states, const std::vector<View>* masks) {
+                            const chain::States& states, const std::vector<PackedView>* masks) {
   std::vector<Look> looks;
   for (std::size_t c = 0; c < samples.size(); ++c)
     looks.push_back(learn(recording, chain, static_cast<int>(c), samples[c], states, masks));
@@ -183,7 +185,8 @@ void cut_all(const Recording& recording, const chain::Chain& chain, const chain:
 
 // Chains fitted to the masks. Throws InputError where too little of them lies in the masks.
 chain::States fit_chains(const Recording& recording, const chain::Chain& chain, const capture::Capture& masked) {
-  const bool anything = std::any_of(masked.views.begin(), masked.views.end(), [](const View& v) { return v.width; });
+  const bool anything =
+      std::any_of(masked.views.begin(), masked.views.end(), [](const PackedView& v) { return v.width; });
   if (!anything) throw_nothing(recording);
   const silhouette::SequenceFit fit = silhouette::fit_sequence(chain, masked);
   double inside = 0.0;
@@ -204,7 +207,7 @@ Summary make_video(const Recording& recording, const chain::Chain& chain, const 
     const auto tell = [&](std::size_t count) { progress.tell(round ? "cut" : "rough masks", count); };
     cut_all(recording, chain, states, looks, round ? 1.0 : kRoughPlace, tell,
             [&](std::vector<View>& views, const auto&) {
-              for (View& view : views) masked.views.push_back(std::move(view));
+              for (const View& view : views) masked.views.push_back(capture::packed(view));
             });
     states = fit_chains(recording, chain, masked);
     looks = learn_all(recording, chain, samples, states, &masked.views);

@@ -52,16 +52,16 @@ FrameSource open_capture(const SourceOptions& options) {
   source.masked = true;
   // the first camera sets the pace, the others' frames of the moment join
   std::vector<double> moments;
-  for (const capture::View& view : recorded->views)
+  for (const capture::ViewPlace& view : recorded->views)
     if (view.camera == 0) moments.push_back(view.time);
   source.next = [recorded, pictures, together = capture::views_at(*recorded, moments),
                  at = std::size_t{0}](LiveFrame& frame) mutable {
     if (at >= together.size()) return false;
-    const capture::View& leader = recorded->views[at];
+    const capture::ViewPlace& leader = recorded->views[at];
     frame.frame = leader.frame;
     frame.time = leader.time;
     frame.views.clear();
-    for (const int v : together[at]) frame.views.push_back(recorded->views[v]);
+    for (const int v : together[at]) frame.views.push_back(capture::unpacked(recorded->views[v]));
     if (!pictures->empty()) frame.picture = pictures->at(at);
     ++at;
     frame.arrived = core::seconds_now();

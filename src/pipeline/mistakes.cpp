@@ -40,7 +40,7 @@ struct Setup {
 
 struct Frame {
   double time = 0.0;
-  std::vector<const capture::View*> views;
+  std::vector<capture::View> views;
 };
 
 struct Mistake {
@@ -52,20 +52,18 @@ struct Mistake {
 // Frames that every camera sees the object in, where there are such, spread over the recording.
 std::vector<Frame> spread_frames(const Capture& capture) {
   std::vector<Frame> all;
-  for (const capture::View& view : capture.views) {
-    if (view.camera != capture.views.front().camera || !estimation::has_mask(view)) continue;
-    all.push_back({view.time, {}});
-  }
+  for (const capture::PackedView& view : capture.views)
+    if (view.camera == capture.views.front().camera && capture::shows_object(view)) all.push_back({view.time, {}});
   std::vector<Frame> out;
   for (int k = 0; k < kFrames && !all.empty(); ++k) {
     Frame frame = all[(2 * k + 1) * all.size() / (2 * kFrames)];
     for (int c = 0; c < static_cast<int>(capture.cameras.size()); ++c) {
-      const capture::View* nearest = nullptr;
-      for (const capture::View& view : capture.views)
-        if (view.camera == c && estimation::has_mask(view) &&
+      const capture::PackedView* nearest = nullptr;
+      for (const capture::PackedView& view : capture.views)
+        if (view.camera == c && capture::shows_object(view) &&
             (!nearest || std::abs(view.time - frame.time) < std::abs(nearest->time - frame.time)))
           nearest = &view;
-      if (nearest) frame.views.push_back(nearest);
+      if (nearest) frame.views.push_back(capture::unpacked(*nearest));
     }
     out.push_back(std::move(frame));
   }
@@ -80,12 +78,14 @@ double support(const Capture& capture, const std::vector<Frame>& frames, const S
       chain::make_chain(setup.length, setup.diameter, capture.direction, capture.bending_axis, kJoints, kind, false);
   std::vector<double> shares(setup.cameras.size(), 0.0);
   for (std::size_t f = 0; f < frames.size(); ++f) {
-    const silhouette::FrameFit fit = silhouette::fit_frame(chain, setup.base[f], frames[f].views, setup.cameras,
-                                                           math::VectorX::Zero(chain.angles()), false);
+    std::vector<const capture::View*> views;
+    for (const capture::View& view : frames[f].views) views.push_back(&view);
+    const silhouette::FrameFit fit =
+        silhouette::fit_frame(chain, setup.base[f], views, setup.cameras, math::VectorX::Zero(chain.angles()), false);
     double bend = 0.0;
     for (int k = 0; k < chain.angles() && chain.child_link[k] == 1; ++k) bend = std::hypot(bend, fit.theta[k]);
     const double straight = std::min(1.0, kClampBend / std::max(bend, 1e-9));
-    for (const capture::View* const view : frames[f].views)
+    for (const capture::View* const view : views)
       shares[view->camera] += straight / static_cast<double>(frames.size()) *
                               estimation::tube_iou(chain, setup.base[f], fit.theta, *view, setup.cameras[view->camera]);
   }

@@ -241,7 +241,7 @@ FirstSight start_as_seen(const Rope& rope, const Path& capture, const std::strin
     throw InputError("`state_from`", source + " names no single camera", "give CAPTURE:NAME, for example CAPTURE:cam0");
   if (seen.views.empty() || seen.views[0].width == 0)
     throw InputError("`state_from`", "the first frame of " + source + " does not show the rope", "name another camera");
-  const capture::View& view = seen.views[0];
+  const capture::View view = capture::unpacked(seen.views[0]);
   problem.base = seen.base.pose(view.time);
   estimation::Filter filter(
       rope.twin, seen.cameras, [&](double) { return dynamics::at_rest(problem.base); }, view.time);

@@ -16,6 +16,8 @@
 #include "chainsplat/json.h"
 #include "chainsplat/recognition.h"
 #include "chainsplat/text.h"
+#include "pipeline/stages.h"
+#include "src/core/write_parts.h"
 
 namespace chainsplat::pipeline {
 
@@ -164,21 +166,41 @@ dynamics::Model model_of(const twin::Twin& twin, const Path& run) {
   return dynamics::make_model(twin.chain, *twin.parameters);
 }
 
-std::string covariance_csv(const chain::States& states) {
+namespace {
+
+std::string covariance_head(Eigen::Index angles) {
   std::string text = "time";
-  const Eigen::Index angles = states.covariance.front().rows();
   for (Eigen::Index row = 0; row < angles; ++row)
     for (Eigen::Index column = 0; column <= row; ++column)
       text.append(",c_").append(std::to_string(row + 1)).append("_").append(std::to_string(column + 1));
-  text += "\n";
-  for (std::size_t k = 0; k < states.covariance.size(); ++k) {
-    text += core::exact(states.time[k]);
-    for (Eigen::Index row = 0; row < angles; ++row)
-      for (Eigen::Index column = 0; column <= row; ++column)
-        text.append(",").append(core::exact(states.covariance[k](row, column)));
-    text += "\n";
-  }
+  return text + "\n";
+}
+
+std::string covariance_row(double time, const math::MatrixX& covariance) {
+  std::string text = core::exact(time);
+  for (Eigen::Index row = 0; row < covariance.rows(); ++row)
+    for (Eigen::Index column = 0; column <= row; ++column)
+      text.append(",").append(core::exact(covariance(row, column)));
+  return text + "\n";
+}
+
+}  // namespace
+
+std::string covariance_csv(const chain::States& states) {
+  std::string text = covariance_head(states.covariance.front().rows());
+  for (std::size_t k = 0; k < states.covariance.size(); ++k)
+    text += covariance_row(states.time[k], states.covariance[k]);
   return text;
+}
+
+void write_covariances(const Path& file, const chain::States& states) {
+  std::string part = covariance_head(states.covariance.front().rows());
+  core::write_parts(file, [&, next = std::size_t{0}]() mutable {
+    if (next > 0)
+      part = next <= states.covariance.size() ? covariance_row(states.time[next - 1], states.covariance[next - 1]) : "";
+    ++next;
+    return std::string_view(part);
+  });
 }
 
 std::vector<math::MatrixX> read_covariances(const Path& file, const chain::States& states) {

@@ -48,6 +48,9 @@ void adopt(twin::Twin& twin, const trajectory::Trajectory& base, identification:
 // Tells the listener how a stage's fit ended: a record {"stage", "solver"} and a detail.
 void tell_fit(const std::string& stage, const solve::Summary& summary);
 
+// covariance_csv() into a file, row by row: of many angles over a long time all of it would fill the memory.
+void write_covariances(const Path& file, const chain::States& states);
+
 // Rolls the identified twin out over its recognized times. `run`: its folder, for messages.
 void roll_out(twin::Twin& twin, const trajectory::Trajectory& base, const Path& run);
 

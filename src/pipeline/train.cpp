@@ -103,7 +103,7 @@ void check_views(const Training& t) {
                      "'" + capture::frame_range_text(t.options.frames) + "' holds none of the capture's frames",
                      capture.cameras.front().name + " has " + std::to_string(capture.times.front().size()));
   for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
-    const auto sees = [&](const capture::View& view) {
+    const auto sees = [&](const capture::PackedView& view) {
       if (view.camera != static_cast<int>(c)) return false;
       for (std::size_t i = 3; i < view.rgba.size(); i += 4)
         if (view.rgba[i] != 0) return true;
@@ -167,7 +167,7 @@ void begin_or_continue(Training& t) {
 // Times of the first camera's frames that were asked for: those of the states.
 std::vector<double> times_of(const capture::Capture& capture) {
   std::vector<double> times;
-  for (const capture::View& view : capture.views)
+  for (const capture::ViewPlace& view : capture.views)
     if (view.camera == 0) times.push_back(view.time);
   return times;
 }
@@ -270,7 +270,7 @@ void save_and_go_on(Training& t) {
 }
 
 void write_covariances(const Training& t) {
-  if (!t.twin.states.covariance.empty()) core::write_file(t.run / kCovarianceFile, covariance_csv(t.twin.states));
+  if (!t.twin.states.covariance.empty()) pipeline::write_covariances(t.run / kCovarianceFile, t.twin.states);
 }
 
 // What the pictures' noise does not say: straight links stand for arcs, and what was corrected is not sure.

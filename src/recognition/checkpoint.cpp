@@ -1,9 +1,11 @@
 #include "src/recognition/checkpoint.h"
 
 #include <cstring>
+#include <deque>
 #include <sstream>
 
 #include "chainsplat/recognition.h"
+#include "src/core/write_parts.h"
 
 namespace chainsplat::recognition {
 
@@ -14,16 +16,28 @@ constexpr char kFile[] = "recognize.bin";
 constexpr char kFileBefore[] = "recognize.before.bin";
 constexpr const char* kFiles[] = {kFile, kFileBefore};  // the newest first
 
+// The bytes of a checkpoint in parts: those of long lists stay where they are, since they can be a large part of all
+// memory.
 struct Writer {
-  std::string bytes;
+  std::vector<std::string_view> parts;
+  std::deque<std::string> own;  // of the parts that lie nowhere else
+
   template <class T>
   void put(const T& value) {
-    bytes.append(reinterpret_cast<const char*>(&value), sizeof value);
+    parts.push_back(own.emplace_back(reinterpret_cast<const char*>(&value), sizeof value));
   }
   template <class T>
   void put_all(const std::vector<T>& values) {
     put<std::uint64_t>(values.size());
-    bytes.append(reinterpret_cast<const char*>(values.data()), values.size() * sizeof(T));
+    parts.emplace_back(reinterpret_cast<const char*>(values.data()), values.size() * sizeof(T));
+  }
+  // values of equal length, one after the other
+  void put_all(const std::vector<math::VectorX>& rows) {
+    std::uint64_t count = 0;
+    for (const math::VectorX& row : rows) count += static_cast<std::uint64_t>(row.size());
+    put(count);
+    for (const math::VectorX& row : rows)
+      parts.emplace_back(reinterpret_cast<const char*>(row.data()), row.size() * sizeof(double));
   }
 };
 
@@ -73,12 +87,6 @@ splat::Gaussians get_gaussians(Reader& r) {
       !holds(g.link_logits, static_cast<std::size_t>(g.links)))
     throw std::out_of_range("checkpoint");
   return g;
-}
-
-std::vector<double> flat(const std::vector<math::VectorX>& rows) {
-  std::vector<double> all;
-  for (const auto& row : rows) all.insert(all.end(), row.data(), row.data() + row.size());
-  return all;
 }
 
 std::vector<math::VectorX> rows_of(const std::vector<double>& all, std::size_t count) {
@@ -146,7 +154,8 @@ std::string difference(const std::string& had, const std::string& asked) {
 
 void save_checkpoint(const Checkpoint& c, const Path& folder) {
   Writer w;
-  w.put_all(std::vector<char>(c.job.begin(), c.job.end()));
+  w.put<std::uint64_t>(c.job.size());
+  w.parts.push_back(c.job);
   w.put(c.stage);
   w.put(c.step);
   w.put(c.watch.smooth_loss);
@@ -159,21 +168,28 @@ void save_checkpoint(const Checkpoint& c, const Path& folder) {
   w.put(c.out_of_plane_rms);
   w.put(c.deviation);
   w.put_all(c.states.time);
-  w.put_all(flat(c.states.theta));
-  w.put_all(flat(c.states.thetadot));
+  w.put_all(c.states.theta);
+  w.put_all(c.states.thetadot);
   put_gaussians(w, c.gaussians);
   put_gaussians(w, c.snapshot.gaussians);
   w.put_all(c.snapshot.first_moment);
   w.put_all(c.snapshot.second_moment);
   w.put(c.snapshot.step);
   w.put_all(c.extra);
+  std::uint64_t hash = core::fnv1a("");
+  for (const std::string_view part : w.parts) hash = core::fnv1a(part, hash);
   Writer head;
-  head.put(core::fnv1a(w.bytes));
+  head.parts.emplace_back(kMagic);
+  head.put(hash);
+  w.parts.insert(w.parts.begin(), head.parts.begin(), head.parts.end());
+  std::erase_if(w.parts, [](std::string_view part) { return part.empty(); });
   std::filesystem::create_directories(folder);
   // a kill between the two leaves the one before, which is as good
   std::error_code absent;
   std::filesystem::rename(folder / kFile, folder / kFileBefore, absent);
-  core::write_file(folder / kFile, kMagic + head.bytes + w.bytes);
+  core::write_parts(folder / kFile, [&, at = std::size_t{0}]() mutable {
+    return at < w.parts.size() ? w.parts[at++] : std::string_view();
+  });
 }
 
 std::optional<Checkpoint> load_checkpoint(const Path& folder, const std::string& job) {

@@ -54,10 +54,18 @@ struct TrainingViews {
 };
 
 TrainingViews training_views(const capture::Capture& capture, const std::vector<FrameViews>& frames, int every) {
+  constexpr std::size_t kMost = static_cast<std::size_t>(kBatch) * kTotalSteps;  // views: the steps draw no more
   TrainingViews t;
   t.index_of.assign(capture.views.size(), -1);
+  std::vector<int> shown;
+  std::size_t views = 0;
   for (int k = 0; k < static_cast<int>(frames.size()); k += every) {
     if (frames[k].views.empty()) continue;
+    shown.push_back(k);
+    views += frames[k].views.size();
+  }
+  for (std::size_t i = 0; i < shown.size(); i += (views + kMost - 1) / kMost) {
+    const int k = shown[i];
     t.frames.push_back(k);
     for (const int v : frames[k].views) {
       t.index_of[v] = static_cast<int>(t.views.size());
@@ -179,6 +187,10 @@ void save(const Job& job, splat::Engine& engine, int round, int step) {
   c.states = job.states;
   c.gaussians = job.gaussians;
   if (step > 0) c.snapshot = engine.snapshot();
+  std::size_t numbers = 0;  // so that they are there once, which for many angles is a large part of all memory
+  for (const math::VectorX& theta : job.coarse) numbers += static_cast<std::size_t>(theta.size());
+  for (const math::MatrixX& m : job.prior.information) numbers += static_cast<std::size_t>(m.size());
+  c.extra.reserve(numbers);
   for (const math::VectorX& theta : job.coarse)
     c.extra.insert(c.extra.end(), theta.data(), theta.data() + theta.size());
   for (const math::MatrixX& m : job.prior.information) c.extra.insert(c.extra.end(), m.data(), m.data() + m.size());
@@ -190,7 +202,7 @@ std::vector<splat::ViewSpec> posed_views(const Job& job) {
   std::vector<splat::ViewSpec> specs;
   for (std::size_t i = 0; i < job.training.views.size(); ++i) {
     const int k = job.training.frame_of[i];
-    const capture::View& view = job.capture.views[job.training.views[i]];
+    const capture::PackedView& view = job.capture.views[job.training.views[i]];
     specs.push_back(view_spec(
         job.capture, view,
         view_motions(job.result.chain, job.capture, job.states, job.frames[k], k, job.states.theta[k], view)));
@@ -261,16 +273,11 @@ core::Random train_round(Job& job, splat::Engine& engine, int round) {
   }
 }
 
-// What the angles' refinement drew last of every training view: it shows where Gaussians are missing, too.
-struct LastDrawn {
-  std::vector<math::Pose> motions;
-  splat::Picture picture;
-};
-
-// Gauss-Newton on the angles of the training frames, with the engine's Gaussians held. Returns what was drawn last, by
-// training view, if `keep`; else steps that cannot go far are trusted, and not drawn.
-std::vector<LastDrawn> refine_training(Job& job, splat::Engine& engine, bool keep) {
-  std::vector<LastDrawn> last(keep ? job.training.views.size() : 0);
+// Gauss-Newton on the angles of the training frames, with the engine's Gaussians held. Returns, by training view, what
+// the picture that was drawn last does not explain, if `keep`: Gaussians are missing there. Else steps that cannot go
+// far are trusted, and not drawn.
+std::vector<Unexplained> refine_training(Job& job, splat::Engine& engine, bool keep) {
+  std::vector<Unexplained> last(keep ? job.training.views.size() : 0);
   const Draw draw = [&](std::span<const int> views, std::span<const std::vector<math::Pose>> motions) {
     std::vector<int> batch;
     for (std::size_t v = 0; v < views.size(); ++v) {
@@ -278,23 +285,33 @@ std::vector<LastDrawn> refine_training(Job& job, splat::Engine& engine, bool kee
       engine.set_motions(batch.back(), motions[v]);
     }
     std::vector<splat::Picture> pictures = engine.draw_views(batch, true);
-    for (std::size_t v = 0; keep && v < views.size(); ++v)
-      last[batch[v]] = {motions[v], {pictures[v].width, pictures[v].height, pictures[v].rgba, {}}};
+    if (keep)
+      core::parallel_for(static_cast<std::int64_t>(views.size()), [&](std::int64_t v) {
+        last[batch[v]] = unexplained(job.capture.views[views[v]], pictures[v], motions[v]);
+      });
     return pictures;
   };
   RefineOptions refine;
   refine.iterations = kAngleIterations;
   refine.mask_weight = kAngleMaskWeight;
   if (!keep) refine.trusted = kTrustedStep;
-  refine_angles(job.result.chain, job.capture, job.frames, job.training.frames, draw, refine, job.prior, job.states);
+  const std::vector<int>& frames = job.training.frames;
+  for (std::size_t from = 0; from < frames.size();) {
+    std::size_t to = from, pixels = 0;
+    for (; to < frames.size() && pixels < kPartPixels; ++to)
+      for (const int v : job.frames[frames[to]].views)
+        pixels += static_cast<std::size_t>(job.capture.views[v].width) * job.capture.views[v].height;
+    refine_angles(job.result.chain, job.capture, job.frames, std::span(frames).subspan(from, to - from), draw, refine,
+                  job.prior, job.states);
+    from = to;
+  }
   return last;
 }
 
 // Gaussians go where the images ask for more of them.
-void add_gaussians(Job& job, const std::vector<LastDrawn>& last, int budget, int round, core::Random& random) {
+void add_gaussians(Job& job, const std::vector<Unexplained>& last, int budget, int round, core::Random& random) {
   std::vector<Drawn> drawn;
-  for (std::size_t i = 0; i < last.size(); ++i)
-    drawn.push_back({&job.capture.views[job.training.views[i]], &last[i].motions, &last[i].picture});
+  for (std::size_t i = 0; i < last.size(); ++i) drawn.push_back({&job.capture.views[job.training.views[i]], &last[i]});
   add_and_prune(job.gaussians, job.result.chain, job.capture, drawn, budget, std::max(1, budget / 10), random);
   if (round + 1 == kShRound && job.gaussians.degree == 0)
     job.gaussians.resize(job.gaussians.count, job.gaussians.links, 1);
@@ -322,7 +339,7 @@ void refine_all_frames(Job& job, splat::Engine& engine) {
   for (int k = 0; k < static_cast<int>(job.frames.size()); ++k) {
     if (job.frames[k].views.empty()) continue;
     all.push_back(k);
-    if (std::find(trained.begin(), trained.end(), k) == trained.end())
+    if (!std::binary_search(trained.begin(), trained.end(), k))
       job.states.theta[k] = job.coarse[k] + chain::interpolate(correction, job.states.time[k]);
   }
   job.result.summary = refine_all(engine, job.result.chain, job.capture, job.frames, job.gaussians, all,
@@ -349,8 +366,8 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
 
   splat::Engine engine(device);
   std::vector<splat::ViewSpec> specs = posed_views(job);
-  std::vector<const std::vector<std::uint8_t>*> targets;
-  for (const int v : job.training.views) targets.push_back(&capture.views[v].rgba);
+  std::vector<const capture::PackedView*> targets;
+  for (const int v : job.training.views) targets.push_back(&capture.views[v]);
   engine.set_views(specs, targets);
   const int budget = budget_of(capture, options);
   if (!resumed) {
@@ -362,7 +379,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   for (int round = job.first_round; round < kRounds; ++round) {
     core::Random random = train_round(job, engine, round);
     const bool adding = round + 1 < kRounds;
-    const std::vector<LastDrawn> last = refine_training(job, engine, adding);
+    const std::vector<Unexplained> last = refine_training(job, engine, adding);
     specs = posed_views(job);
     for (std::size_t i = 0; i < specs.size(); ++i) engine.set_motions(static_cast<int>(i), specs[i].motions);
     job.gaussians = engine.gaussians();

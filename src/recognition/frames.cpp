@@ -19,7 +19,7 @@ std::vector<FrameViews> assign_views(const capture::Capture& capture, const std:
 
 std::vector<math::Pose> view_motions(const chain::Chain& chain, const capture::Capture& capture,
                                      const chain::States& states, const FrameViews& frame, int frame_index,
-                                     const math::VectorX& theta, const capture::View& view) {
+                                     const math::VectorX& theta, const capture::ViewPlace& view) {
   constexpr double kSameTime = 1e-6;  // s
   math::VectorX at_view = theta;
   if (std::abs(view.time - frame.time) > kSameTime)
@@ -48,7 +48,8 @@ std::vector<int> draw_batch(ViewDeck& deck, int size, int count, core::Random& r
   return batch;
 }
 
-splat::ViewSpec view_spec(const capture::Capture& capture, const capture::View& view, std::vector<math::Pose> motions) {
+splat::ViewSpec view_spec(const capture::Capture& capture, const capture::ViewPlace& view,
+                          std::vector<math::Pose> motions) {
   return {&capture.cameras[view.camera], view.x0, view.y0, view.width, view.height, std::move(motions)};
 }
 

@@ -21,7 +21,7 @@ std::vector<FrameViews> assign_views(const capture::Capture& capture, const std:
 // Link motions of a view at its own time: cubic in theta where its camera is not synchronous with the first one.
 std::vector<math::Pose> view_motions(const chain::Chain& chain, const capture::Capture& capture,
                                      const chain::States& states, const FrameViews& frame, int frame_index,
-                                     const math::VectorX& theta, const capture::View& view);
+                                     const math::VectorX& theta, const capture::ViewPlace& view);
 
 void shuffle(std::vector<int>& order, core::Random& random);
 
@@ -33,6 +33,7 @@ struct ViewDeck {
 // `size` of `count` views; fewer where there are not so many.
 std::vector<int> draw_batch(ViewDeck& deck, int size, int count, core::Random& random);
 
-splat::ViewSpec view_spec(const capture::Capture& capture, const capture::View& view, std::vector<math::Pose> motions);
+splat::ViewSpec view_spec(const capture::Capture& capture, const capture::ViewPlace& view,
+                          std::vector<math::Pose> motions);
 
 }  // namespace chainsplat::recognition

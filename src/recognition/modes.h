@@ -16,6 +16,10 @@ constexpr double kAngleMaskWeight = 5.0;
 // steps on the dev captures, none longer than this, 9 were refused when they were checked.
 constexpr double kTrustedStep = 0.01;  // rad
 
+// Pixels of the views whose angles are refined together: their pictures and targets must fit the buffers of the
+// smallest device, and the memory.
+constexpr std::size_t kPartPixels = 2u << 20;
+
 // `fast` trains the Gaussians with these.
 constexpr int kBatch = 3;                                     // views per step
 constexpr splat::LossWeights kLossWeights{

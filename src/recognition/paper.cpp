@@ -21,7 +21,8 @@ constexpr int kLinkResets[] = {1500, 4500, 7500, 10500};
 constexpr float kMeanRateFirst = 1.6e-4f, kMeanRateLast = 1.6e-6f;  // of the scene's extent
 constexpr double kAngleRate = 0.01;                                 // rad
 
-capture::View padded(const capture::View& view, int x0, int y0, int width, int height) {
+capture::PackedView padded(const capture::PackedView& packed, int x0, int y0, int width, int height) {
+  const capture::View view = capture::unpacked(packed);
   capture::View out = view;
   out.x0 = x0;
   out.y0 = y0;
@@ -32,7 +33,7 @@ capture::View padded(const capture::View& view, int x0, int y0, int width, int h
   for (int y = 0; y < view.height; ++y)
     std::copy_n(view.rgba.begin() + 4 * static_cast<std::ptrdiff_t>(y) * view.width, 4 * view.width,
                 out.rgba.begin() + 4 * (static_cast<std::ptrdiff_t>(y + view.y0 - y0) * width + view.x0 - x0));
-  return out;
+  return capture::packed(out);
 }
 
 // Bounds of the visual hull in the base frame, over all training times: the cells of a grid around the grasp that every
@@ -44,12 +45,13 @@ void hull_bounds(const capture::Capture& capture, const std::vector<FrameViews>&
   high = -low;
   const double cell = 2.0 * capture.length / kCells;
   for (const int k : training) {
+    std::vector<capture::View> views;
+    for (const int v : frames[k].views) views.push_back(capture::unpacked(capture.views[v]));
     for (int n = 0; n < kCells * kCells * kCells; ++n) {
       const int column = n % kCells, row = n / kCells % kCells, layer = n / kCells / kCells;
       const math::Vector3 home = cell * (math::Vector3(column, row, layer).array() + 0.5 - 0.5 * kCells).matrix();
-      bool inside = !frames[k].views.empty();
-      for (const int v : frames[k].views) {
-        const capture::View& view = capture.views[v];
+      bool inside = !views.empty();
+      for (const capture::View& view : views) {
         const capture::Camera& camera = capture.cameras[view.camera];
         const math::Vector3 x = camera.world_from_camera.inverse() * (capture.base.pose(view.time) * home);
         if (x.z() <= 0) {
@@ -93,14 +95,14 @@ double scene_extent(const capture::Capture& capture) {
 
 // A training view on the union of its camera's crops.
 struct PaperView {
-  capture::View view;
+  capture::PackedView view;
   int frame = 0;
 };
 
 std::vector<PaperView> views_of(const capture::Capture& capture, const std::vector<FrameViews>& frames,
                                 const std::vector<int>& training) {
   std::vector<int> x0(capture.cameras.size(), 1 << 30), y0 = x0, x1(capture.cameras.size(), 0), y1 = x1;
-  for (const capture::View& view : capture.views) {
+  for (const capture::ViewPlace& view : capture.views) {
     if (view.width == 0) continue;
     x0[view.camera] = std::min(x0[view.camera], view.x0);
     y0[view.camera] = std::min(y0[view.camera], view.y0);
@@ -141,7 +143,7 @@ void begin(Job& job) {
   job.result.bending.bending = bending;
   job.result.chain = chain_of(job.capture, job.options, bending, job.options.joints.value_or(kJoints));
   const math::VectorX straight = math::VectorX::Zero(job.result.chain.angles());
-  for (const capture::View& view : job.capture.views)
+  for (const capture::ViewPlace& view : job.capture.views)
     if (view.camera == 0) job.states.time.push_back(view.time);
   job.states.theta.assign(job.states.time.size(), straight);
   job.frames = assign_views(job.capture, job.states.time);
@@ -286,10 +288,10 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
   Job job{capture, options};
   begin(job);
   std::vector<splat::ViewSpec> specs;
-  std::vector<const std::vector<std::uint8_t>*> targets;
+  std::vector<const capture::PackedView*> targets;
   for (const PaperView& view : job.views) {
     specs.push_back(view_spec(capture, view.view, motions_of(job, view)));
-    targets.push_back(&view.view.rgba);
+    targets.push_back(&view.view);
   }
   splat::Engine engine(device);
   engine.set_views(specs, targets, true);

@@ -52,56 +52,49 @@ splat::Gaussians place_along_chain(const chain::Chain& chain, const capture::Cap
   const double spacing = std::sqrt(2.0 * std::numbers::pi * radius * chain.length / count);
   const math::Vector3 side = chain.bending_axis, other = chain.direction.cross(chain.bending_axis);
 
-  // motions of every training view once
-  std::vector<const capture::View*> views;
-  std::vector<std::vector<math::Pose>> motions;
-  for (const int k : training) {
-    for (const int v : frames[k].views) {
-      views.push_back(&capture.views[v]);
-      motions.push_back(view_motions(chain, capture, states, frames[k], k, states.theta[k], capture.views[v]));
-    }
-  }
   math::Vector3 mean_color = math::Vector3::Constant(0.5);
-  std::vector<math::Vector3> colors(count);
-  std::vector<bool> colored(count, false);
-  std::vector<math::Vector3> means(count);
+  std::vector<math::Vector3> sums(count, math::Vector3::Zero());  // of the colors seen
+  std::vector<double> weights(count, 0.0);
+  std::vector<math::Vector3> means(count), normals(count);
   std::vector<int> links(count);
   // golden-angle spiral along the tube: even coverage; jitter breaks the pattern
   constexpr double kGoldenAngle = 2.399963229728653;
   for (int i = 0; i < count; ++i) {
     const double arclength = chain.length * (i + random.uniform()) / count;
     const double angle = kGoldenAngle * i + random.uniform(-0.3, 0.3);
-    const math::Vector3 normal = std::cos(angle) * side + std::sin(angle) * other;
-    means[i] = arclength * chain.direction + radius * normal;
+    normals[i] = std::cos(angle) * side + std::sin(angle) * other;
+    means[i] = arclength * chain.direction + radius * normals[i];
     links[i] = chain::link_at(chain, std::min(arclength, chain.length * (1.0 - 1e-9)));
-    math::Vector3 sum = math::Vector3::Zero();
-    double weight = 0.0;
-    for (std::size_t v = 0; v < views.size(); ++v) {
-      const capture::Camera& camera = capture.cameras[views[v]->camera];
-      const math::Pose& motion = motions[v][links[i]];
-      const math::Vector3 x = camera.world_from_camera.inverse() * (motion * means[i]);
-      const math::Vector3 n = camera.world_from_camera.rotation.transpose() * (motion.rotation * normal);
-      const double facing = -n.dot(x.normalized());
-      math::Vector3 color;
-      if (facing < kFacing || x.z() <= 0 || !sample(*views[v], capture::project(camera, x), color)) continue;
-      sum += facing * color;
-      weight += facing;
-    }
-    if (weight > 0.0) {
-      colors[i] = sum / weight;
-      colored[i] = true;
+  }
+  for (const int k : training) {
+    for (const int v : frames[k].views) {
+      const capture::View view = capture::unpacked(capture.views[v]);
+      const std::vector<math::Pose> motions = view_motions(chain, capture, states, frames[k], k, states.theta[k], view);
+      const capture::Camera& camera = capture.cameras[view.camera];
+      const math::Pose camera_from_world = camera.world_from_camera.inverse();
+      for (int i = 0; i < count; ++i) {
+        const math::Pose& motion = motions[links[i]];
+        const math::Vector3 x = camera_from_world * (motion * means[i]);
+        const math::Vector3 n = camera.world_from_camera.rotation.transpose() * (motion.rotation * normals[i]);
+        const double facing = -n.dot(x.normalized());
+        math::Vector3 color;
+        if (facing < kFacing || x.z() <= 0 || !sample(view, capture::project(camera, x), color)) continue;
+        sums[i] += facing * color;
+        weights[i] += facing;
+      }
     }
   }
   math::Vector3 sum = math::Vector3::Zero();
   int seen = 0;
   for (int i = 0; i < count; ++i) {
-    if (!colored[i]) continue;
-    sum += colors[i];
+    if (weights[i] <= 0.0) continue;
+    sums[i] /= weights[i];
+    sum += sums[i];
     ++seen;
   }
   if (seen > 0) mean_color = sum / seen;
   for (int i = 0; i < count; ++i)
-    set_gaussian(g, i, means[i], kCoverage * spacing, kStartOpacity, colored[i] ? colors[i] : mean_color, links[i]);
+    set_gaussian(g, i, means[i], kCoverage * spacing, kStartOpacity, weights[i] > 0.0 ? sums[i] : mean_color, links[i]);
   return g;
 }
 
@@ -127,6 +120,23 @@ splat::Gaussians rows_of(const splat::Gaussians& gaussians, std::span<const int>
   return out;
 }
 
+Unexplained unexplained(const capture::PackedView& packed, const splat::Picture& picture,
+                        const std::vector<math::Pose>& motions) {
+  // codec and sensor noise, squared, three channels: not worth a Gaussian
+  constexpr double kNoise = 0.03 * 0.03 * 3;
+  const capture::View view = capture::unpacked(packed);
+  Unexplained out{motions, {}, {}};
+  for (int k = 0; k < view.width * view.height; ++k) {
+    if (view.rgba[4 * k + 3] < image_model::kObjectMask) continue;
+    double error = std::pow(1.0 - picture.rgba[4 * k + 3], 2);
+    for (int c = 0; c < 3; ++c) error += std::pow(picture.rgba[4 * k + c] - view.rgba[4 * k + c] / 255.0, 2);
+    if (error < kNoise) continue;
+    out.pixels.push_back(k);
+    out.errors.push_back(error);
+  }
+  return out;
+}
+
 Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, const capture::Capture& capture,
                       std::span<const Drawn> drawn, int budget, int most_added, core::Random& random) {
   Changed changed;
@@ -143,45 +153,35 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
   const int room = std::min(most_added, budget - static_cast<int>(kept.size()));
 
   // candidates: pixels of all pictures, weighted by their squared error
-  struct Candidate {
-    std::size_t picture;
-    int pixel;
-  };
-  std::vector<Candidate> candidates;
+  std::vector<std::size_t> first;  // of each picture, among all
   std::vector<double> cumulative;
   double total = 0.0;
-  for (std::size_t d = 0; d < drawn.size(); ++d) {
-    const capture::View& view = *drawn[d].view;
-    const splat::Picture& picture = *drawn[d].picture;
-    for (int k = 0; k < view.width * view.height; ++k) {
-      if (view.rgba[4 * k + 3] < image_model::kObjectMask) continue;
-      double error = std::pow(1.0 - picture.rgba[4 * k + 3], 2);
-      for (int c = 0; c < 3; ++c) error += std::pow(picture.rgba[4 * k + c] - view.rgba[4 * k + c] / 255.0, 2);
-      constexpr double kNoise =
-          0.03 * 0.03 * 3;  // codec and sensor noise, squared, three channels: not worth a Gaussian
-      if (error < kNoise) continue;
+  for (const Drawn& one : drawn) {
+    first.push_back(cumulative.size());
+    for (const double error : one.left->errors) {
       total += error;
-      candidates.push_back({d, k});
       cumulative.push_back(total);
     }
   }
-  const int added = candidates.empty() ? 0 : std::max(0, room);
+  const int added = cumulative.empty() ? 0 : std::max(0, room);
   gaussians = rows_of(gaussians, kept, added);
   const double spacing = std::sqrt(std::numbers::pi * chain.diameter * chain.length / std::max(1, gaussians.count));
   int next = static_cast<int>(kept.size());
   for (int a = 0; a < added; ++a) {
     const auto at = std::lower_bound(cumulative.begin(), cumulative.end(), random.uniform() * total);
-    const Candidate& candidate = candidates[std::min<std::size_t>(at - cumulative.begin(), candidates.size() - 1)];
-    const Drawn& source = drawn[candidate.picture];
-    const capture::View& view = *source.view;
+    const auto candidate = std::min<std::size_t>(at - cumulative.begin(), cumulative.size() - 1);
+    const std::size_t which = std::upper_bound(first.begin(), first.end(), candidate) - first.begin() - 1;
+    const Drawn& source = drawn[which];
+    const int pixel = source.left->pixels[candidate - first[which]];
+    const capture::View view = capture::unpacked(*source.view);
     const capture::Camera& camera = capture.cameras[view.camera];
-    const int column = candidate.pixel % view.width, row = candidate.pixel / view.width;
+    const int column = pixel % view.width, row = pixel / view.width;
     const math::Vector3 ray((view.x0 + column + 0.5 - camera.cx) / camera.fx,
                             (view.y0 + row + 0.5 - camera.cy) / camera.fy, 1.0);
     const math::Vector3 origin = camera.world_from_camera.translation;
     const math::Vector3 along = (camera.world_from_camera.rotation * ray).normalized();
     // the point of the ray nearest to the centerline, moved to the tube's near side
-    const std::vector<math::Pose>& motions = *source.motions;
+    const std::vector<math::Pose>& motions = source.left->motions;
     double best = std::numeric_limits<double>::infinity();
     math::Vector3 point = origin;
     int link = 1;
@@ -204,7 +204,7 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
     }
     constexpr double kReach = 1.2;  // of the radius: farther from the chain it is not rope
     if (best > kReach * 0.5 * chain.diameter) continue;
-    const std::uint8_t* p = &view.rgba[4 * static_cast<std::size_t>(candidate.pixel)];
+    const std::uint8_t* p = &view.rgba[4 * static_cast<std::size_t>(pixel)];
     constexpr float kNewOpacity = 0.0f;  // logit: half
     set_gaussian(gaussians, next++, motions[link].inverse() * point, 0.5 * kCoverage * spacing, kNewOpacity,
                  math::Vector3(p[0], p[1], p[2]) / 255.0, link);

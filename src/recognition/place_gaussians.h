@@ -22,11 +22,19 @@ void copy_row(const splat::Gaussians& from, int i, splat::Gaussians& to, int k);
 // These Gaussians, in this order, and `more` new ones after them, as Gaussians::resize() makes them.
 splat::Gaussians rows_of(const splat::Gaussians& gaussians, std::span<const int> rows, int more);
 
-// One picture, its view and the link motions that drew it.
+// Pixels of a view that a picture of it, drawn with these link motions, does not explain.
+struct Unexplained {
+  std::vector<math::Pose> motions;
+  std::vector<int> pixels;     // of the crop, row-major
+  std::vector<double> errors;  // of each, squared
+};
+Unexplained unexplained(const capture::PackedView& view, const splat::Picture& picture,
+                        const std::vector<math::Pose>& motions);
+
+// A view, and what is not explained of it.
 struct Drawn {
-  const capture::View* view = nullptr;
-  const std::vector<math::Pose>* motions = nullptr;
-  const splat::Picture* picture = nullptr;
+  const capture::PackedView* view = nullptr;
+  const Unexplained* left = nullptr;
 };
 
 // Removes Gaussians whose opacity is below `least_opacity` or that are larger than the rope, then adds up to `budget`

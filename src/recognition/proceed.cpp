@@ -36,13 +36,13 @@ void polish(gpu::Device& device, const capture::Capture& capture, const chain::C
             const chain::States& states, int every, int steps, std::uint64_t seed, splat::Gaussians& gaussians) {
   const std::vector<FrameViews> frames = assign_views(capture, states.time);
   std::vector<splat::ViewSpec> specs;
-  std::vector<const std::vector<std::uint8_t>*> targets;
+  std::vector<const capture::PackedView*> targets;
   for (int k = 0; k < static_cast<int>(frames.size()); k += std::max(1, every)) {
     for (const int v : frames[k].views) {
-      const capture::View& view = capture.views[v];
+      const capture::PackedView& view = capture.views[v];
       specs.push_back(
           view_spec(capture, view, view_motions(chain, capture, states, frames[k], k, states.theta[k], view)));
-      targets.push_back(&view.rgba);
+      targets.push_back(&view);
     }
   }
   if (specs.empty()) return;

@@ -29,13 +29,14 @@ std::string job_text(const capture::Capture& capture, const Options& options) {
   };
   std::vector<std::uint64_t> pictures(capture.views.size());
   core::parallel_for(static_cast<std::int64_t>(pictures.size()), [&](std::int64_t v) {
-    const capture::View& view = capture.views[v];
-    pictures[v] = hashed(view.rgba, hashed(std::array{view.x0, view.y0, view.width, view.height}, core::fnv1a("")));
+    const capture::PackedView& view = capture.views[v];
+    const std::uint64_t crop = hashed(std::array{view.x0, view.y0, view.width, view.height}, core::fnv1a(""));
+    pictures[v] = hashed(view.rgba, hashed(view.runs, crop));
   });
   std::vector<double> times;
   std::vector<std::string> ranges;  // of each camera, as --frames names them
   for (std::size_t v = 0; v < capture.views.size(); ++v) {
-    const capture::View& view = capture.views[v];
+    const capture::ViewPlace& view = capture.views[v];
     times.push_back(view.time);
     if (v == 0 || capture.views[v - 1].camera != view.camera) ranges.push_back(std::to_string(view.frame));
     if (v + 1 == capture.views.size() || capture.views[v + 1].camera != view.camera)
@@ -92,26 +93,25 @@ solve::Summary refine_all(splat::Engine& engine, const chain::Chain& chain, cons
                           const std::vector<FrameViews>& frames, const splat::Gaussians& gaussians,
                           const std::vector<int>& selected, int iterations, const AnglePrior& prior,
                           chain::States& states) {
-  // the targets of one part must fit one buffer on the smallest device
-  constexpr std::size_t kPartPixels = 2u << 20;
   states.covariance.assign(states.time.size(), math::MatrixX::Identity(chain.angles(), chain.angles()));
   std::vector<solve::Summary> summaries;
   engine.set_gaussians(gaussians);
+  std::vector<int> index_of(capture.views.size(), -1);  // in the part that is drawn
   std::size_t from = 0;
   while (from < selected.size()) {
     if (core::stop_requested()) throw Interrupted(core::stop_requested());
-    std::vector<int> part, index_of(capture.views.size(), -1);
+    std::vector<int> part;
     std::vector<splat::ViewSpec> specs;
-    std::vector<const std::vector<std::uint8_t>*> targets;
+    std::vector<const capture::PackedView*> targets;
     std::size_t pixels = 0;
     while (from + part.size() < selected.size() && pixels < kPartPixels) {
       const int k = selected[from + part.size()];
       for (const int v : frames[k].views) {
-        const capture::View& view = capture.views[v];
+        const capture::PackedView& view = capture.views[v];
         index_of[v] = static_cast<int>(specs.size());
         specs.push_back(
             view_spec(capture, view, view_motions(chain, capture, states, frames[k], k, states.theta[k], view)));
-        targets.push_back(&view.rgba);
+        targets.push_back(&view);
         pixels += static_cast<std::size_t>(view.width) * view.height;
       }
       part.push_back(k);

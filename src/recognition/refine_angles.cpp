@@ -196,7 +196,7 @@ Refined refine_angles(const chain::Chain& chain, const capture::Capture& capture
     const std::vector<splat::Picture> pictures = draw(views, motions);
     std::vector<LinkEquations> equations(views.size());
     core::parallel_for(static_cast<std::int64_t>(views.size()), [&](std::int64_t s) {
-      const capture::View& view = capture.views[views[s]];
+      const capture::View view = capture::unpacked(capture.views[views[s]]);
       equations[s] =
           link_equations(chain, capture.cameras[view.camera], view, motions[s], pictures[s], options.mask_weight);
     });

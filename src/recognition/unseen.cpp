@@ -86,11 +86,10 @@ bool on_side(const Surface& surface, const Place& at) {
 }
 
 // The pixel of the rope that shows this point; null where something else is seen there.
-const std::uint8_t* pixel_of(const Viewpoint& from, const Vector3& world) {
-  const Vector3 point = from.camera->world_from_camera.inverse() * world;
+const std::uint8_t* pixel_of(const capture::Camera& camera, const capture::View& view, const Vector3& world) {
+  const Vector3 point = camera.world_from_camera.inverse() * world;
   if (point.z() < image_model::kNear) return nullptr;
-  const math::Vector2 pixel = capture::project(*from.camera, point);
-  const capture::View& view = *from.view;
+  const math::Vector2 pixel = capture::project(camera, point);
   const int x = static_cast<int>(std::floor(pixel.x())) - view.x0,
             y = static_cast<int>(std::floor(pixel.y())) - view.y0;
   if (x < 0 || y < 0 || x >= view.width || y >= view.height) return nullptr;
@@ -101,31 +100,34 @@ const std::uint8_t* pixel_of(const Viewpoint& from, const Vector3& world) {
 void look(std::span<const Viewpoint> views, Surface& surface) {
   constexpr double kWithin = 0.8;  // of the radius: masks are a pixel off at the outline
   const double radius = 0.5 * surface.chain.diameter;
-  core::parallel_for(surface.rows, [&](std::int64_t row) {
-    const double s = surface.arclength(static_cast<int>(row));
-    const int link = chain::link_at(surface.chain, s);
-    for (int column = 0; column < kColumns; ++column) {
-      const Vector3 normal = surface.normal(Surface::angle(column)), axis = s * surface.chain.direction;
-      const std::size_t cell = surface.cell(static_cast<int>(row), column);
-      double hidden = 0.0, weight = 0.0;
-      Vector3 sum = Vector3::Zero();
-      for (const Viewpoint& view : views) {
-        const math::Pose& motion = view.motions[link];
+  std::vector<double> hidden(surface.facing.size(), 0.0), weights(surface.facing.size(), 0.0);
+  std::vector<Vector3> sums(surface.facing.size(), Vector3::Zero());
+  for (const Viewpoint& from : views) {
+    const capture::Camera& camera = *from.camera;
+    const capture::View view = capture::unpacked(*from.view);
+    core::parallel_for(surface.rows, [&](std::int64_t row) {
+      const double s = surface.arclength(static_cast<int>(row));
+      const math::Pose& motion = from.motions[chain::link_at(surface.chain, s)];
+      for (int column = 0; column < kColumns; ++column) {
+        const Vector3 normal = surface.normal(Surface::angle(column)), axis = s * surface.chain.direction;
+        const std::size_t cell = surface.cell(static_cast<int>(row), column);
         const Vector3 point = motion * Vector3(axis + radius * normal);
-        const Vector3 ray = view.camera->world_from_camera.translation - point;
+        const Vector3 ray = camera.world_from_camera.translation - point;
         const double facing = (motion.rotation * normal).dot(ray.normalized());
         surface.facing[cell] = std::max(surface.facing[cell], facing);
-        hidden += pixel_of(view, motion * Vector3(axis + kWithin * radius * normal)) ? 0.0 : 1.0;
-        const std::uint8_t* seen = facing >= kTrusted ? pixel_of(view, point) : nullptr;
+        hidden[cell] += pixel_of(camera, view, motion * Vector3(axis + kWithin * radius * normal)) ? 0.0 : 1.0;
+        const std::uint8_t* seen = facing >= kTrusted ? pixel_of(camera, view, point) : nullptr;
         if (!seen) continue;
         const double counts = facing * facing;  // the area that a pixel averages over grows as 1 / facing
-        sum += counts / 255.0 * Vector3(seen[0], seen[1], seen[2]);
-        weight += counts;
+        sums[cell] += counts / 255.0 * Vector3(seen[0], seen[1], seen[2]);
+        weights[cell] += counts;
       }
-      surface.hidden[cell] = hidden > kHidden * static_cast<double>(views.size());
-      if (weight > 0.0) surface.color[cell] = sum / weight;
-    }
-  });
+    });
+  }
+  for (std::size_t cell = 0; cell < hidden.size(); ++cell) {
+    surface.hidden[cell] = hidden[cell] > kHidden * static_cast<double>(views.size());
+    if (weights[cell] > 0.0) surface.color[cell] = sums[cell] / weights[cell];
+  }
 }
 
 // Correlation of the colors with those some columns further and `slope` times that angle along, m per rad.

@@ -12,7 +12,7 @@ namespace chainsplat::recognition {
 // A picture, and the link motions of its moment.
 struct Viewpoint {
   const capture::Camera* camera = nullptr;
-  const capture::View* view = nullptr;
+  const capture::PackedView* view = nullptr;
   std::span<const math::Pose> motions;
 };
 

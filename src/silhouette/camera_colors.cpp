@@ -77,7 +77,7 @@ bool color_of(const capture::Camera& camera, const capture::View& view, const st
 // Views of one time, with the rope's pose at each view's own.
 struct Moment {
   struct Seen {
-    const capture::View* view;
+    const capture::PackedView* view;
     std::vector<Pose> motions;
   };
   std::vector<Seen> seen;
@@ -87,11 +87,14 @@ std::vector<Patch> patches_of(const chain::Chain& chain, const capture::Capture&
   std::vector<Patch> out;
   const double length = (1.0 - 2.0 * kEnd) * chain.length / kAlong, turn = 2.0 * std::numbers::pi / kAround;
   const Vector3 across = chain.bending_axis, beside = chain.direction.cross(across);
+  std::vector<capture::View> views;
+  for (const Moment::Seen& seen : moment.seen) views.push_back(capture::unpacked(*seen.view));
   std::vector<Vector3> points(kSamples * kSamples), normals(points.size());
   for (int i = 0; i < kAlong; ++i)
     for (int j = 0; j < kAround; ++j) {
       Patch patch{i * kStretches / kAlong, {}, {}};
-      for (const Moment::Seen& seen : moment.seen) {
+      for (std::size_t v = 0; v < views.size(); ++v) {
+        const Moment::Seen& seen = moment.seen[v];
         for (int a = 0; a < kSamples; ++a) {
           const double s = kEnd * chain.length + (i + (a + 0.5) / kSamples) * length;
           const int link = chain::link_at(chain, s);
@@ -104,7 +107,7 @@ std::vector<Patch> patches_of(const chain::Chain& chain, const capture::Capture&
           }
         }
         Vector3 color;
-        if (!color_of(capture.cameras[seen.view->camera], *seen.view, points, normals, color)) continue;
+        if (!color_of(capture.cameras[seen.view->camera], views[v], points, normals, color)) continue;
         patch.cameras.push_back(seen.view->camera);
         patch.colors.push_back(color);
       }
@@ -123,7 +126,7 @@ std::vector<Moment> moments_of(const chain::Chain& chain, const capture::Capture
   for (std::size_t f = 0; f < frames.times.size(); ++f) {
     Moment moment;
     for (const int v : frames.views[f]) {
-      const capture::View& view = capture.views[v];
+      const capture::PackedView& view = capture.views[v];
       const bool known = std::any_of(states.time.begin(), states.time.end(),
                                      [&](double time) { return std::abs(time - view.time) <= apart + 1e-9; });
       if (view.width == 0 || !known) continue;

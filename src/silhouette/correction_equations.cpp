@@ -33,10 +33,11 @@ struct PosedView {
   double mask_start = 0.0;   // m
 };
 
-void pose_view(const CorrectionProblem& fit, const CorrectedFrame& frame, int v,
+// `i`: which of the frame's views.
+void pose_view(const CorrectionProblem& fit, const CorrectedFrame& frame, std::size_t i,
                const capture::Corrections& corrections, const chain::Chain& chain, const VectorX& theta,
                PosedView& out) {
-  const capture::View& view = *fit.views[v];
+  const capture::ViewPlace& view = *fit.views[frame.views[i]];
   const capture::Camera& given = fit.cameras[view.camera];
   const double base_late = capture::value_of(corrections, "base", "time");
   const double first_late = capture::value_of(corrections, fit.cameras[0].name, "time");
@@ -47,7 +48,7 @@ void pose_view(const CorrectionProblem& fit, const CorrectedFrame& frame, int v,
   out.camera = capture::corrected(corrections, given);
   out.mask_offset = capture::value_of(corrections, given.name, "mask_offset");
   out.mask_start = capture::value_of(corrections, given.name, "mask_start");
-  out.frame = {&fit.masks[v], &out.camera, base.pose * capture::grasp_in_base(corrections)};
+  out.frame = {&frame.masks[i], &out.camera, base.pose * capture::grasp_in_base(corrections)};
   out.problem.chain = &chain;
   ViewWork work;
   work.view = &out.frame;
@@ -227,10 +228,10 @@ FrameEquations frame_equations(const CorrectionProblem& problem, const Corrected
   out.local.gradient = problem.prior * theta;
   out.cost = 0.5 * theta.dot(problem.prior * theta);
   out.sums.resize(problem.cameras.size());
-  for (const int v : frame.views) {
-    const int camera = problem.views[v]->camera;
+  for (std::size_t i = 0; i < frame.views.size(); ++i) {
+    const int camera = problem.views[frame.views[i]]->camera;
     PosedView view;
-    pose_view(problem, frame, v, corrections, chain, theta, view);
+    pose_view(problem, frame, i, corrections, chain, theta, view);
     scatter(view_equations(view, camera, problem, frame.thetadot, out), problem.places[camera], out);
   }
   hold(problem.held, out.local);
@@ -243,8 +244,7 @@ SetupEquations setup_equations(const chain::Chain& chain,
                                const std::vector<char>& posed, const VectorX& theta, const Options& options) {
   const int n = chain.angles();
   const MatrixX prior = kEvidence * options.prior.information;
-  CorrectionProblem problem{
-      {views.begin(), views.end()}, cameras, base, {}, 0, {}, {}, prior, {}, kLargestCut, kEndReach};
+  CorrectionProblem problem{{views.begin(), views.end()}, cameras, base, {}, 0, {}, prior, {}, kLargestCut, kEndReach};
   SharedPlaces places;
   places.at.fill(-1);
   problem.places.assign(cameras.size(), places);
@@ -266,9 +266,9 @@ SetupEquations setup_equations(const chain::Chain& chain,
   for (SharedPlaces& of : problem.places) vary(of, kMaskOffset, problem.shared++);
 
   for (int k = 0; k < n; ++k) problem.held.push_back(chain::is_twist(chain, k));
-  CorrectedFrame frame{views.front()->time, VectorX::Zero(n), {}};
+  CorrectedFrame frame{views.front()->time, VectorX::Zero(n), {}, {}};
   for (std::size_t v = 0; v < views.size(); ++v) {
-    problem.masks.push_back(mask_points(*views[v], cameras.at(views[v]->camera), Options{}.max_pixels));
+    frame.masks.push_back(mask_points(*views[v], cameras.at(views[v]->camera), Options{}.max_pixels));
     frame.views.push_back(static_cast<int>(v));
   }
   const FrameEquations equations = frame_equations(problem, frame, {}, chain, theta);

@@ -35,6 +35,7 @@ struct CorrectedFrame {
   double time = 0.0;       // s, as given
   math::VectorX thetadot;  // rad/s
   std::vector<int> views;
+  std::vector<MaskPoints> masks;  // by view
 };
 
 // Equations of one frame: shared x shared, own x shared, own x own.
@@ -55,17 +56,16 @@ struct FrameEquations {
 };
 
 struct CorrectionProblem {
-  std::vector<const capture::View*> views;
+  std::vector<const capture::ViewPlace*> views;
   const std::vector<capture::Camera>& cameras;
   std::function<trajectory::BaseMotion(double time)> base;
   std::vector<SharedPlaces> places;  // by camera
   int shared = 0;                    // number of shared unknowns
   std::vector<CorrectedFrame> frames;
-  std::vector<MaskPoints> masks;  // by view
-  math::MatrixX prior;            // of the angles
-  std::vector<char> held;         // by angle
-  double cut = 0.0;               // px, of Tukey's loss
-  double end_reach = kEndReach;   // half widths from the chain's ends within which those of the rope are sought
+  math::MatrixX prior;           // of the angles
+  std::vector<char> held;        // by angle
+  double cut = 0.0;              // px, of Tukey's loss
+  double end_reach = kEndReach;  // half widths from the chain's ends within which those of the rope are sought
 };
 
 // `corrections`: where the shared unknowns are now; `chain`: with the rope's size there.

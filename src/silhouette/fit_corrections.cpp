@@ -351,10 +351,15 @@ void choose_clock(const Layout& layout, MatrixX& covariance, capture::Correction
   covariance = MatrixX(change * covariance * change.transpose());
 }
 
-std::vector<const capture::View*> views_of(const capture::Capture& capture) {
-  std::vector<const capture::View*> views;
-  for (const capture::View& view : capture.views) views.push_back(&view);
+std::vector<const capture::ViewPlace*> views_of(const capture::Capture& capture) {
+  std::vector<const capture::ViewPlace*> views;
+  for (const capture::PackedView& view : capture.views) views.push_back(&view);
   return views;
+}
+
+MaskPoints mask_of(const capture::Capture& capture, int v) {
+  const capture::PackedView& view = capture.views[v];
+  return mask_points(capture::unpacked(view), capture.cameras[view.camera], Options{}.max_pixels);
 }
 
 // Frames that show something, evenly spread, with their masks; returns their angles.
@@ -368,17 +373,14 @@ std::vector<VectorX> choose_frames(const SequenceFit& sequence, int most, const 
   for (int f = 0; f < count; f += every) any = any || seen(f);
   if (!any) every = 1;
   std::vector<VectorX> theta;
-  std::vector<int> needed;
   for (int f = 0; f < count; f += every) {
     if (!seen(f)) continue;
-    problem.frames.push_back({all.times[f], sequence.states.thetadot[f], all.views[f]});
+    problem.frames.push_back({all.times[f], sequence.states.thetadot[f], all.views[f], {}});
     theta.push_back(sequence.states.theta[f]);
-    needed.insert(needed.end(), all.views[f].begin(), all.views[f].end());
   }
-  problem.masks.resize(capture.views.size());
-  core::parallel_for(static_cast<std::int64_t>(needed.size()), [&](std::int64_t i) {
-    const capture::View& view = capture.views[needed[i]];
-    problem.masks[needed[i]] = mask_points(view, capture.cameras[view.camera], Options{}.max_pixels);
+  core::parallel_for(static_cast<std::int64_t>(problem.frames.size()), [&](std::int64_t f) {
+    CorrectedFrame& frame = problem.frames[f];
+    for (const int v : frame.views) frame.masks.push_back(mask_of(capture, v));
   });
   return theta;
 }
@@ -447,7 +449,6 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
                             [&](double time) { return capture.base.at(time); },
                             places_of(layout, static_cast<int>(capture.cameras.size())),
                             layout.size,
-                            {},
                             {},
                             {},
                             {},
@@ -547,22 +548,20 @@ std::vector<MatrixX> covariances_by_corrections(const chain::Chain& chain, const
                             places_of(layout, cameras),
                             layout.size,
                             {},
-                            {},
                             joint_prior(chain, {}),
                             {},
                             kLargestCut,
                             kEndReach};
   for (int k = 0; k < n; ++k) problem.held.push_back(chain::is_twist(chain, k));
-  problem.masks.resize(capture.views.size());
-  core::parallel_for(static_cast<std::int64_t>(capture.views.size()), [&](std::int64_t v) {
-    problem.masks[v] = mask_points(capture.views[v], capture.cameras[capture.views[v].camera], Options{}.max_pixels);
-  });
   std::vector<MatrixX> out(states.time.size(), MatrixX::Zero(n, n));
   core::parallel_for(static_cast<std::int64_t>(out.size()), [&](std::int64_t k) {
-    const auto at = std::min_element(all.times.begin(), all.times.end(), [&](double a, double b) {
-      return std::abs(a - states.time[k]) < std::abs(b - states.time[k]);
-    });
-    const CorrectedFrame frame{*at, states.thetadot[k], all.views[at - all.times.begin()]};
+    const auto later = std::lower_bound(all.times.begin(), all.times.end(), states.time[k]);
+    const bool before =  // the nearest one; of two as near the earlier
+        later == all.times.end() ||
+        (later != all.times.begin() && states.time[k] - later[-1] <= *later - states.time[k]);
+    const auto at = later - (before ? 1 : 0) - all.times.begin();
+    CorrectedFrame frame{all.times[at], states.thetadot[k], all.views[at], {}};
+    for (const int v : frame.views) frame.masks.push_back(mask_of(capture, v));
     const FrameEquations equations = frame_equations(problem, frame, {}, chain, states.theta[k]);
     const MatrixX moved = equations.local.matrix.ldlt().solve(equations.local.coupling);
     out[k] = moved * shared * moved.transpose();

@@ -17,18 +17,18 @@ constexpr int kSpeckPixels = 4;         // px, the same for small masks
 constexpr std::size_t kMostBlobs = 64;  // a rope cut by fingers has a few; more are noise
 constexpr int kWindow = 3;              // px, reach of the window that gives an edge its normal
 
-struct Run {  // mask pixels [begin, end) of row y
+struct RowRun {  // mask pixels [begin, end) of row y
   int y, begin, end, parent;
 };
 
-int root(std::vector<Run>& runs, int i) {
+int root(std::vector<RowRun>& runs, int i) {
   while (runs[i].parent != i) i = runs[i].parent = runs[runs[i].parent].parent;
   return i;
 }
 
 // Runs of the rows, joined where they touch, also by a corner.
-std::vector<Run> connected_runs(const capture::View& view) {
-  std::vector<Run> runs;
+std::vector<RowRun> connected_runs(const capture::View& view) {
+  std::vector<RowRun> runs;
   std::size_t above = 0, above_end = 0;  // runs of the row before
   for (int y = 0; y < view.height; ++y) {
     const std::size_t row_begin = runs.size();
@@ -69,7 +69,12 @@ const std::vector<std::array<int, 2>>& window() {
 int MaskPoints::blob_at(const Vector2& pixel) const {
   const double x = std::floor(pixel.x()) - x0, y = std::floor(pixel.y()) - y0;
   if (!(x >= 0 && y >= 0 && x < width && y < height)) return -1;
-  return labels[static_cast<std::size_t>(y) * width + static_cast<std::size_t>(x)] - 1;
+  if (first_run.empty()) return -1;
+  const auto row = static_cast<std::size_t>(y);
+  const auto last = runs.begin() + first_run[row + 1];
+  const auto run =
+      std::partition_point(runs.begin() + first_run[row], last, [&](const Run& before) { return before.end <= x; });
+  return run != last && run->begin <= x ? run->blob : -1;
 }
 
 MaskPoints mask_points(const capture::View& view, const capture::Camera& camera, int max_pixels) {
@@ -78,7 +83,7 @@ MaskPoints mask_points(const capture::View& view, const capture::Camera& camera,
   out.y0 = view.y0;
   out.width = view.width;
   out.height = view.height;
-  std::vector<Run> runs = connected_runs(view);
+  std::vector<RowRun> runs = connected_runs(view);
   if (runs.empty()) return out;
 
   // areas by root, then the roots by area (ties by position, so that the order is the same everywhere)
@@ -97,23 +102,26 @@ MaskPoints mask_points(const capture::View& view, const capture::Camera& camera,
     out.area += area[roots[b]];
   }
 
-  out.labels.assign(static_cast<std::size_t>(view.width) * view.height, 0);
-  std::vector<std::vector<const Run*>> runs_of(roots.size());
+  std::vector<char> in_blob(static_cast<std::size_t>(view.width) * view.height, 0);
+  std::vector<std::vector<const RowRun*>> runs_of(roots.size());
+  out.first_run.assign(static_cast<std::size_t>(view.height) + 1, 0);
   for (int i = 0; i < run_count; ++i) {
     const int blob = blob_of[root(runs, i)];
     if (blob < 0) continue;
-    const Run& run = runs[i];
+    const RowRun& run = runs[i];
     runs_of[blob].push_back(&run);
-    std::fill_n(out.labels.begin() + static_cast<std::size_t>(run.y) * view.width + run.begin, run.end - run.begin,
-                static_cast<std::int16_t>(blob + 1));
+    out.runs.push_back({run.begin, run.end, blob});
+    ++out.first_run[static_cast<std::size_t>(run.y) + 1];
+    std::fill_n(in_blob.begin() + static_cast<std::ptrdiff_t>(run.y) * view.width + run.begin, run.end - run.begin, 1);
   }
+  std::partial_sum(out.first_run.begin(), out.first_run.end(), out.first_run.begin());
 
   const auto coverage = [&](int x, int y) {
     return static_cast<double>(view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3]);
   };
   const auto inside = [&](int x, int y) {
     return x >= 0 && y >= 0 && x < view.width && y < view.height &&
-           out.labels[static_cast<std::size_t>(y) * view.width + x] != 0;
+           in_blob[static_cast<std::size_t>(y) * view.width + x] != 0;
   };
   // Outline between pixel (x, y), inside, and its neighbor in direction (dx, dy).
   const auto add_edge = [&](int x, int y, int dx, int dy) {
@@ -148,7 +156,7 @@ MaskPoints mask_points(const capture::View& view, const capture::Camera& camera,
     blob.first_pixel = static_cast<int>(out.pixels.size());
     blob.first_edge = static_cast<int>(out.edges.size());
     double counted = 0.5;  // a pixel is taken whenever this passes a whole number
-    for (const Run* const run : runs_of[b]) {
+    for (const RowRun* const run : runs_of[b]) {
       for (int x = run->begin; x < run->end; ++x) {
         counted += share;
         if (counted >= 1.0) {

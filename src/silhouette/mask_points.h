@@ -28,9 +28,13 @@ struct MaskPoints {
   std::vector<Vector2> pixels;  // px, centers of evenly chosen mask pixels
   std::vector<Edge> edges;
   int area = 0;  // px, all blobs
-  // The crop, to look up single pixels: blob number + 1, 0 outside.
+  // The crop, to look up single pixels.
   int x0 = 0, y0 = 0, width = 0, height = 0;
-  std::vector<std::int16_t> labels;
+  struct Run {  // pixels [begin, end) of a row that belong to one blob
+    int begin = 0, end = 0, blob = 0;
+  };
+  std::vector<Run> runs;       // row by row, from left to right
+  std::vector<int> first_run;  // of every row, and of one more; empty without a mask
 
   // Blob number at an image position, -1 outside the mask or the crop.
   int blob_at(const Vector2& pixel) const;

@@ -136,7 +136,7 @@ Engine::Engine(Engine&&) noexcept = default;
 std::vector<Picture> Engine::draw(const Gaussians& gaussians, std::span<const ViewSpec> views, bool depth) {
   State& s = *state_;
   s.load_gaussians(s.scratch, gaussians);
-  s.load_views(s.scratch, views, {}, Active::everywhere);
+  s.load_views(s.scratch, views, {}, {}, Active::everywhere);
   return s.draw(s.scratch, everything(views.size()), depth);
 }
 
@@ -145,7 +145,7 @@ LossValues Engine::loss(const Gaussians& gaussians, std::span<const ViewSpec> vi
                         double normalizer, Gradients* gradients, std::vector<Picture>* pictures) {
   State& s = *state_;
   s.load_gaussians(s.scratch, gaussians);
-  s.load_views(s.scratch, views, targets, Active::everywhere);
+  s.load_views(s.scratch, views, targets, {}, Active::everywhere);
   LossValues values;
   if (gradients) gradients->link_twists.clear();
   // the means of crops of different sizes have different normalizers: one run per normalizer, summed here
@@ -182,9 +182,9 @@ LossValues Engine::loss(const Gaussians& gaussians, std::span<const ViewSpec> vi
   return values;
 }
 
-void Engine::set_views(std::span<const ViewSpec> views, std::span<const std::vector<std::uint8_t>* const> targets,
+void Engine::set_views(std::span<const ViewSpec> views, std::span<const capture::PackedView* const> targets,
                        bool everywhere) {
-  state_->load_views(state_->training, views, targets,
+  state_->load_views(state_->training, views, {}, targets,
                      everywhere ? Active::everywhere_dssim_near_mask : Active::near_mask);
 }
 
@@ -255,7 +255,7 @@ std::vector<ColorSums> Engine::color_sums(const chain::Chain& chain, std::span<c
   State& s = *state_;
   CHAINSPLAT_CHECK(chain.links() == s.training.links,
                    std::to_string(chain.links()) + " " + std::to_string(s.training.links));
-  s.load_views(s.training, views, observed, Active::in_mask);
+  s.load_views(s.training, views, observed, {}, Active::in_mask);
   RunOptions options;
   options.depth = true;
   options.chain = &chain;

@@ -73,7 +73,9 @@ struct SceneView {
   int width = 0, height = 0, tiles_x = 0, tiles_y = 0;
   math::Pose camera_from_world;
   std::vector<math::Pose> motions;
-  std::size_t target = 0;             // first pixel in the target buffer
+  // what it should show, of one of the two kinds: RGBA8 of the crop, or without its black pixels; neither: not known
+  const std::vector<std::uint8_t>* target = nullptr;
+  const capture::PackedView* packed_target = nullptr;
   std::vector<std::uint32_t> active;  // grid cells of the active tiles
   std::size_t near = 0;               // the first `near` of them also have the D-SSIM term
 };
@@ -179,8 +181,8 @@ struct Engine::State {
   X(tile_pixels) X(tile_summary) X(pixel_sums) X(link_sums)
 #define MEMBER(buffer) Buffer buffer;
   REPLICA_BUFFERS(MEMBER) VIEW_BUFFERS(MEMBER)
-  // clang-format on
-  ColorPush color_push{};
+      // clang-format on
+      ColorPush color_push{};
   std::size_t pixel_sum_bytes = 0, link_sum_bytes = 0;
   const std::byte *read_pixel_sums = nullptr, *read_link_sums = nullptr;  // of the last run
   Buffer list_starts, list_blocks;  // replace tile_prefix and tile_block where every list has a fixed place
@@ -212,14 +214,17 @@ struct Engine::State {
   // scene.cpp
   void load_gaussians(Scene& scene, const Gaussians& gaussians);
   void load_views(Scene& scene, std::span<const ViewSpec> specs,
-                  std::span<const std::vector<std::uint8_t>* const> targets, Active active);
+                  std::span<const std::vector<std::uint8_t>* const> targets,
+                  std::span<const capture::PackedView* const> packed_targets, Active active);
   // Splits a batch into chunks of one submission each, bounded by the device's buffer ranges and group counts.
   std::vector<std::vector<int>> chunks(const Scene& scene, std::span<const int> batch, bool dssim) const;
 
   // passes.cpp: the steps of one submission, in this order
   Submission lay_out(Scene& scene, std::span<const int> chunk, const RunOptions& options);
-  // Parts of lay_out(): cameras, link motions and places in the buffers; active tiles; axes of the links, for colors.
+  // Parts of lay_out(): cameras, link motions and places in the buffers; targets; active tiles; axes of the links, for
+  // colors.
   std::vector<SplatView> stage_views(Submission& submission, std::span<const int> chunk);
+  void stage_targets(const Submission& submission, std::span<const int> chunk);
   void stage_tiles(Submission& submission, std::span<const int> chunk, const std::vector<SplatView>& placed);
   void stage_axes(const Scene& scene, std::span<const int> chunk, const chain::Chain& chain);
   bool make_room(Submission& submission);             // false: too many views for one submission

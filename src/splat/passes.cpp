@@ -68,6 +68,7 @@ Submission Engine::State::lay_out(Scene& scene, std::span<const int> chunk, cons
   out.replicas = static_cast<std::size_t>(scene.count) * scene.links;
   out.dssim = options.loss && options.weights.dssim > 0.0f;
   stage_tiles(out, chunk, stage_views(out, chunk));
+  stage_targets(out, chunk);
   if (options.chain) stage_axes(scene, chunk, *options.chain);
   return out;
 }
@@ -95,7 +96,7 @@ std::vector<SplatView> Engine::State::stage_views(Submission& s, std::span<const
                       .tiles_y = narrow(view.tiles_y),
                       .tile_map = narrow(cells),
                       .pixel = narrow(s.pixels),
-                      .target = narrow(view.target),
+                      .target = narrow(s.pixels),
                       .motion = narrow(rows.size() / 3)});
     chunk_pixel.push_back(s.pixels);
     cells += static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
@@ -110,6 +111,21 @@ std::vector<SplatView> Engine::State::stage_views(Submission& s, std::span<const
   stage(views, bytes_of(placed), "views");
   stage(motions, bytes_of(rows), "motions");
   return placed;
+}
+
+void Engine::State::stage_targets(const Submission& s, std::span<const int> chunk) {
+  std::vector<std::uint8_t> all;  // none where they are not looked at
+  for (const int v : chunk) {
+    const SceneView& view = s.scene.views[v];
+    if (!s.options.loss && !s.options.chain) break;
+    if (view.packed_target) {
+      const capture::View whole = capture::unpacked(*view.packed_target);
+      all.insert(all.end(), whole.rgba.begin(), whole.rgba.end());
+    } else if (view.target) {
+      all.insert(all.end(), view.target->begin(), view.target->end());
+    }
+  }
+  stage(s.scene.target, bytes_of(all), "target");
 }
 
 void Engine::State::stage_tiles(Submission& s, std::span<const int> chunk, const std::vector<SplatView>& placed) {

@@ -9,7 +9,7 @@ namespace chainsplat::splat {
 
 namespace {
 
-constexpr int kActiveMargin = 16;            // px around the mask within which training has active tiles
+constexpr int kActiveMargin = 16;                          // px around the mask within which training has active tiles
 constexpr int kDssimMargin = 2 * image_model::kSsimReach;  // px around the mask with a D-SSIM term
 constexpr std::uint32_t kMostTiles = 60000;  // per submission; below every device's limit of work groups (65535)
 
@@ -104,10 +104,10 @@ double recorded_white(const capture::Camera& camera) {
 }
 
 void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
-                               std::span<const std::vector<std::uint8_t>* const> targets, Active active) {
+                               std::span<const std::vector<std::uint8_t>* const> targets,
+                               std::span<const capture::PackedView* const> packed_targets, Active active) {
   scene.views.clear();
   double object_pixels = 0.0;
-  std::vector<std::uint8_t> all_targets;
   for (std::size_t v = 0; v < specs.size(); ++v) {
     const ViewSpec& spec = specs[v];
     SceneView view;
@@ -128,23 +128,28 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
     view.tiles_y = (spec.height + static_cast<int>(tile_height) - 1) / static_cast<int>(tile_height);
     view.camera_from_world = spec.camera->world_from_camera.inverse();
     view.motions = spec.motions;
-    if (!targets.empty()) {
-      const std::vector<std::uint8_t>& target = *targets[v];
-      CHAINSPLAT_CHECK(target.size() == 4u * spec.width * spec.height, std::to_string(target.size()));
-      view.target = all_targets.size() / 4;
-      all_targets.insert(all_targets.end(), target.begin(), target.end());
+    std::vector<std::uint8_t> whole;  // of a packed target, only here
+    const std::vector<std::uint8_t>* target = nullptr;
+    if (!targets.empty()) target = view.target = targets[v];
+    if (!packed_targets.empty()) {
+      view.packed_target = packed_targets[v];
+      whole = capture::unpacked(*view.packed_target).rgba;
+      target = &whole;
+    }
+    if (target) {
+      CHAINSPLAT_CHECK(target->size() == 4u * spec.width * spec.height, std::to_string(target->size()));
       if (active != Active::in_mask)
-        for (std::size_t k = 3; k < target.size(); k += 4)
-          object_pixels += target[k] >= image_model::kObjectMask ? 1.0 : 0.0;
+        for (std::size_t k = 3; k < target->size(); k += 4)
+          object_pixels += (*target)[k] >= image_model::kObjectMask ? 1.0 : 0.0;
     }
 
     // active tiles, those with a D-SSIM term first
     const auto cells = static_cast<std::size_t>(view.tiles_x) * view.tiles_y;
     Nearness near{std::vector<bool>(cells, true), std::vector<bool>(cells, true)};
     if (active == Active::in_mask) {
-      near.inner = near.outer = in_mask(view, *targets[v], static_cast<int>(tile_width), static_cast<int>(tile_height));
-    } else if (!targets.empty() && active != Active::everywhere) {
-      near = near_mask(view, *targets[v], static_cast<int>(tile_width), static_cast<int>(tile_height), kDssimMargin,
+      near.inner = near.outer = in_mask(view, *target, static_cast<int>(tile_width), static_cast<int>(tile_height));
+    } else if (target && active != Active::everywhere) {
+      near = near_mask(view, *target, static_cast<int>(tile_width), static_cast<int>(tile_height), kDssimMargin,
                        kActiveMargin);
       if (active == Active::everywhere_dssim_near_mask) near.outer.assign(cells, true);
     }
@@ -156,10 +161,6 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
     scene.views.push_back(std::move(view));
   }
   scene.normalizer = std::max(1.0, object_pixels / std::max<std::size_t>(1, specs.size()));
-  if (active == Active::in_mask)
-    stage(scene.target, bytes_of(all_targets), "target");
-  else
-    write(scene.target, bytes_of(all_targets), "target");
 }
 
 std::vector<std::vector<int>> Engine::State::chunks(const Scene& scene, std::span<const int> batch, bool dssim) const {

@@ -12,7 +12,7 @@ void checkpoint(std::string_view bytes) {
   static const Path file = here / "recognize.bin";
   recognition::Writer sum;
   sum.put(core::fnv1a(bytes));
-  const std::string whole = recognition::kMagic + sum.bytes + std::string(bytes);
+  const std::string whole = recognition::kMagic + sum.own.front() + std::string(bytes);
   put(file, bytes.starts_with("raw") ? bytes.substr(3) : std::string_view(whole));
   std::error_code ignored;
   std::filesystem::remove(here / "recognize.before.bin", ignored);

@@ -211,18 +211,21 @@ Measured measure(const splat::Engine& engine, int repeats, Work&& work) {
 }
 
 // Pictures of the scene with other Gaussians as 8-bit targets, so that every term has a gradient.
-std::vector<std::vector<std::uint8_t>> make_targets(splat::Engine& engine, const Scene& scene, const Case& what,
-                                                    std::uint64_t seed) {
-  std::vector<std::vector<std::uint8_t>> targets;
+std::vector<capture::PackedView> make_targets(splat::Engine& engine, const Scene& scene, const Case& what,
+                                              std::uint64_t seed) {
+  std::vector<capture::PackedView> targets;
   for (const splat::Picture& picture : engine.draw(make_scene(what, seed).gaussians, scene.views)) {
-    targets.emplace_back(picture.rgba.size());
+    capture::View view;
+    view.width = picture.width, view.height = picture.height;
+    view.rgba.resize(picture.rgba.size());
     for (std::size_t k = 0; k < picture.rgba.size(); ++k)
-      targets.back()[k] = static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(picture.rgba[k], 0.0f, 1.0f)));
-    for (std::size_t k = 3; k < targets.back().size(); k += 4) {
-      const bool object = targets.back()[k] >= image_model::kObjectMask;
-      targets.back()[k] = object ? 255 : 0;
-      if (!object) std::fill_n(targets.back().begin() + static_cast<std::ptrdiff_t>(k) - 3, 3, 0);
+      view.rgba[k] = static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(picture.rgba[k], 0.0f, 1.0f)));
+    for (std::size_t k = 3; k < view.rgba.size(); k += 4) {
+      const bool object = view.rgba[k] >= image_model::kObjectMask;
+      view.rgba[k] = object ? 255 : 0;
+      if (!object) std::fill_n(view.rgba.begin() + static_cast<std::ptrdiff_t>(k) - 3, 3, 0);
     }
+    targets.push_back(capture::packed(view));
   }
   return targets;
 }
@@ -247,9 +250,9 @@ Json bench_case(gpu::Device& device, const Case& what, int repeats, std::uint64_
   const MachineRates machine = measure_machine();
   const Scene scene = make_scene(what, seed + 1);
   splat::Engine engine(device);
-  const auto targets = make_targets(engine, scene, what, seed + 2);
-  std::vector<const std::vector<std::uint8_t>*> pointers;
-  for (const auto& target : targets) pointers.push_back(&target);
+  const std::vector<capture::PackedView> targets = make_targets(engine, scene, what, seed + 2);
+  std::vector<const capture::PackedView*> pointers;
+  for (const capture::PackedView& target : targets) pointers.push_back(&target);
   engine.set_views(scene.views, pointers);
   engine.set_gaussians(scene.gaussians);
   std::vector<int> batch(what.views);
@@ -332,8 +335,9 @@ Json bench_capture(gpu::Device& device, const Path& folder, std::uint64_t seed) 
   estimation::Filter filter(
       twin, {capture.cameras.front()}, [&](double time) { return capture.base.at(time); }, capture.base.start());
   std::vector<double> latency;
-  for (const capture::View& view : capture.views) {
-    if (view.camera != 0) continue;
+  for (const capture::PackedView& packed : capture.views) {
+    if (packed.camera != 0) continue;
+    const capture::View view = capture::unpacked(packed);
     const std::array<const capture::View*, 1> one = {&view};
     const double begun = core::seconds_now();
     filter.update(one);
