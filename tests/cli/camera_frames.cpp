@@ -68,7 +68,8 @@ int main(int, char** argv) {
   std::ofstream raw(folder / "rgb", std::ios::binary), packed(folder / "yuyv", std::ios::binary),
       compressed(folder / "mjpg", std::ios::binary), stream(folder / "y4m", std::ios::binary);
   stream << "YUV4MPEG2 W" << recorded.cameras[0].width << " H" << recorded.cameras[0].height << " F30:1 C422\n";
-  for (const capture::View& view : recorded.views) {
+  for (const capture::PackedView& stored : recorded.views) {
+    const capture::View view = capture::unpacked(stored);
     capture::Image8 whole{recorded.cameras[0].width, recorded.cameras[0].height, 3, {}};
     whole.pixels.assign(static_cast<std::size_t>(3) * whole.width * whole.height, 0);
     for (int y = 0; y < view.height; ++y)
