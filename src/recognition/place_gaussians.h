@@ -1,4 +1,5 @@
-// place_gaussians.h - Gaussians where the rope is: at first along the links, later where the images are not explained.
+// place_gaussians.h - Gaussians where the rope is: at first along the links, later where the images are not explained,
+// and never far past the joints of their own link.
 #pragma once
 #include <span>
 #include <vector>
