@@ -372,7 +372,8 @@ TEST_CASE("undistortion: straight pixels, masks, and edges that are not darkened
   CHECK(from_memory.rgba == capture::unpacked(straight.views[1]).rgba);
   CHECK(from_memory.x0 == straight.views[1].x0);
   CHECK(from_memory.y0 == straight.views[1].y0);
-  CHECK(capture::view_of(straight.cameras[0], picture, filled(1, [](int, int) { return std::array<double, 3>{}; })).width == 0);
+  CHECK(capture::view_of(straight.cameras[0], picture, filled(1, [](int, int) { return std::array<double, 3>{}; }))
+            .width == 0);
   CHECK_THROWS_AS(capture::view_of(straight.cameras[0], coverage, coverage), InputError);
   // without undistortion the pixels are those of the files
   options.pixels = capture::Pixels::recorded;
@@ -594,6 +595,9 @@ TEST_CASE("everything that can be wrong with capture.json is refused in one line
   CHECK(contains(with("/object/length", infinity), "object.length: is not a number"));
   CHECK(contains(with("/object/diameter", 0.5), "object.diameter"));
   CHECK(contains(with("/object/mass", -1), "object.mass"));
+  CHECK(contains(with("/object/tip_mass", -1), "object.tip_mass: is no mass"));
+  CHECK(contains(with("/object/tip_length", 0.05), "object.tip_length: says nothing without a payload's mass"));
+  CHECK(contains(with("/object/tip_mass", {{"value", 0.1}, {"sigma", "x"}}), "object.tip_mass"));
   CHECK(contains(with("/grasp/direction", {0, 0, 0}), "grasp.direction: has no length"));
   CHECK(contains(with("/grasp/bending_axis", {0, 0, 0}), "grasp.bending_axis: has no length"));
   CHECK(contains(with("/grasp/bending_axis", {0, 1, 0.2}), "not perpendicular"));
@@ -644,7 +648,8 @@ TEST_CASE("numbers that memory and time follow are bounded, each with its reason
     made.json = before;
     return message;
   };
-  CHECK(contains(with("/cameras/0/rate", 1e-7), "cameras[0].rate: 1e-07 is not between 0.1 and 1000000 frames a second"));
+  CHECK(
+      contains(with("/cameras/0/rate", 1e-7), "cameras[0].rate: 1e-07 is not between 0.1 and 1000000 frames a second"));
   CHECK(contains(with("/cameras/0/rate", 1e300), "cameras[0].rate: 1e+300 is not between"));
   Json wide = made.json["cameras"][0];
   wide["width"] = wide["height"] = 32768;
@@ -763,7 +768,8 @@ TEST_CASE("a file that names other files is neither video nor image, whatever it
   capture::write_video(made.path() / "real.mp4", 10.0, frames);
   const std::string real = (made.path() / "real.mp4").string();
   made.json["cameras"][0]["images"] = "cam0.mp4";
-  const std::string playlist = "#EXTM3U\n#EXT-X-VERSION:3\n#EXT-X-TARGETDURATION:1\n#EXTINF:0.4,\nreal.mp4\n#EXT-X-ENDLIST\n";
+  const std::string playlist =
+      "#EXTM3U\n#EXT-X-VERSION:3\n#EXT-X-TARGETDURATION:1\n#EXTINF:0.4,\nreal.mp4\n#EXT-X-ENDLIST\n";
   made.write("cam0.mp4", playlist);
   CHECK(contains(made.refused(), "cam0.mp4: is not a readable video"));
   made.write("cam0.mp4", "ffconcat version 1.0\nfile 'real.mp4'\n");

@@ -16,9 +16,7 @@ struct Rope {
 
 // All numbers differ and none is 0, but what only a table or only the air has.
 Rope make_rope(const char* name, chain::Bending bending, bool twist, bool table) {
-  Rope rope{name,
-            chain::make_chain(0.3, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 4, bending, twist, 0.02),
-            {}};
+  Rope rope{name, chain::make_chain(0.3, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 4, bending, twist, 0.02), {}};
   core::Random random(3);
   const auto fill = [&](int count, double scale) {
     std::vector<double> values(count);
@@ -27,7 +25,7 @@ Rope make_rope(const char* name, chain::Bending bending, bool twist, bool table)
   };
   const int links = rope.chain.links() - 1, n = rope.chain.angles();
   Parameters& p = rope.parameters;
-  p.link_mass = fill(links, 0.015), p.tip_mass = table ? 0.0 : 0.003;
+  p.link_mass = fill(links, 0.015), p.tip_mass = table ? 0.0 : 0.003, p.tip_length = table ? 0.0 : 0.02;
   p.viscous_friction = fill(links, table ? 0.002 : 0.0), p.coulomb_friction = fill(links, table ? 0.3 : 0.0);
   p.air_linear = fill(links, table ? 0.0 : 5e-4), p.air_quadratic = fill(links, table ? 0.0 : 1e-3);
   p.stiffness = fill(n, 0.012), p.damping = fill(n, 4e-4), p.rest_angle = fill(n, 0.1);
@@ -78,7 +76,7 @@ TEST_CASE("names are read as they are written, and those of other chains and pro
     CAPTURE(rope.name);
     const std::vector<Unknown> all = all_unknowns(rope.chain);
     const int n = rope.chain.angles(), links = rope.chain.links() - 1;
-    CHECK(all.size() == static_cast<std::size_t>(10 + 5 * links + 5 * n));
+    CHECK(all.size() == static_cast<std::size_t>(11 + 5 * links + 5 * n));
     Estimates e;
     for (const Unknown& unknown : all) {
       e.names.push_back(name_of(unknown));
@@ -94,8 +92,9 @@ TEST_CASE("names are read as they are written, and those of other chains and pro
   CHECK(unknown_named("log_stiffness_joint_12") == Unknown{Quantity::joint_stiffness, 11});
   const chain::Chain chain = ropes()[0].chain;
   Estimates other;
-  other.names = {"log_mass_link_5", "log_mass_link_0", "log_mass_link_", "log_mass_link_1x", "rest_angle", "bending",
-                 "12",              "",                "theta_9999999",  "log_stiffness_1"};
+  other.names = {
+      "log_mass_link_5", "log_mass_link_0", "log_mass_link_", "log_mass_link_1x", "rest_angle", "bending", "12", "",
+      "theta_9999999",   "log_stiffness_1"};
   for (const Unknown& unknown : unknowns_of(chain, other)) CHECK(unknown == Unknown{});
   const Parameters p = ropes()[0].parameters;
   const Unknown nothing[] = {{}};
@@ -137,6 +136,7 @@ TEST_CASE("tangents agree with central differences of the moved parameters, for 
                   std::max((p.*values)[k], 1e-3));
       }
       compare((up.tip_mass - down.tip_mass) / (2.0 * kStep), found[i].tip_mass, std::max(p.tip_mass, 1e-3));
+      compare((up.tip_length - down.tip_length) / (2.0 * kStep), found[i].tip_length, std::max(p.tip_length, 1e-3));
       CHECK(std::abs(total_mass(up) - total_mass(rope.parameters)) < 1e-15);
       const InitialState moved_up = moved(zero, all, at + step), moved_down = moved(zero, all, at - step);
       for (const auto& [value, slope] : {std::pair{&InitialState::theta, &Tangent::theta},
@@ -173,9 +173,7 @@ TEST_CASE("changes add up, and do what the names say") {
     return moved(rope.chain, p, {&unknown, 1}, VectorX::Constant(1, by));
   };
   for (int k = 0; k < rope.chain.angles(); ++k) {
-    const auto factor = [&](Unknown unknown) {
-      return change(unknown, std::log(2.0)).stiffness[k] / p.stiffness[k];
-    };
+    const auto factor = [&](Unknown unknown) { return change(unknown, std::log(2.0)).stiffness[k] / p.stiffness[k]; };
     CHECK(factor({Quantity::stiffness}) == doctest::Approx(2.0));
     CHECK(factor({Quantity::grasp_stiffness}) == doctest::Approx(k == 1 ? 2.0 : 1.0));
     CHECK(factor({Quantity::twist_stiffness}) == doctest::Approx(k % 3 == 2 ? 2.0 : 1.0));

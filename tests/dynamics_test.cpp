@@ -108,7 +108,7 @@ Model rope(int joints, chain::Bending bending, bool twist = false) {
   p.air_linear = fill(joints, 0.0005), p.air_quadratic = fill(joints, 0.0144 * 0.3 / joints);
   p.stiffness = fill(chain.angles(), 0.012), p.rest_angle = fill(chain.angles(), 0.03);
   p.damping = fill(chain.angles(), 3.6e-4);
-  p.tip_mass = 0.002, p.radius = 0.01;
+  p.tip_mass = 0.002, p.tip_length = 0.03, p.radius = 0.01;
   p.table_normal = Vector3(0.1, 0.2, 1.0);
   p.coulomb_speed = 0.02;
   return make_model(chain, p);
@@ -345,7 +345,7 @@ TEST_CASE("sensitivities agree with differences of rollouts") {
   const auto grid = sample_base(base, 0.0, times, model.parameters.substeps);
   const VectorX theta = random_vector(random, n, 0.2), thetadot = random_vector(random, n, 0.3);
 
-  std::vector<Tangent> unknowns(10);
+  std::vector<Tangent> unknowns(11);
   const auto some = [&](int count, double scale) {
     std::vector<double> v(count);
     for (double& x : v) x = scale * random.uniform(0.5, 1.0);
@@ -361,6 +361,7 @@ TEST_CASE("sensitivities agree with differences of rollouts") {
   unknowns[7].air_linear = some(links, 0.0005), unknowns[7].air_quadratic = some(links, 0.0005);
   unknowns[8].theta = random_vector(random, n, 0.1);
   unknowns[9].thetadot = random_vector(random, n, 0.1);
+  unknowns[10].tip_length = 0.01;
   chain::States states;
   Sensitivities sensitivities;
   REQUIRE(simulate(model, grid, theta, thetadot, states, unknowns, &sensitivities));
@@ -377,7 +378,7 @@ TEST_CASE("sensitivities agree with differences of rollouts") {
       add(p.link_mass, d.link_mass), add(p.viscous_friction, d.viscous_friction);
       add(p.coulomb_friction, d.coulomb_friction), add(p.air_linear, d.air_linear);
       add(p.air_quadratic, d.air_quadratic);
-      p.tip_mass += step * d.tip_mass;
+      p.tip_mass += step * d.tip_mass, p.tip_length += step * d.tip_length;
       VectorX q = theta, v = thetadot;
       if (d.theta.size()) q += step * d.theta;
       if (d.thetadot.size()) v += step * d.thetadot;
@@ -393,6 +394,34 @@ TEST_CASE("sensitivities agree with differences of rollouts") {
       size += d.squaredNorm();
     }
     CHECK(std::sqrt(error / size) < 2e-3);  // the variational equation is solved to second order only
+  }
+}
+
+TEST_CASE("what hangs at the tip is a rod that goes on there: the same as a last link that is longer and heavier") {
+  core::Random random(9);
+  for (const chain::Bending bending : {chain::Bending::planar, chain::Bending::spatial}) {
+    Parameters p = without_losses(rope(3, bending)).parameters;
+    p.radius = 0.0, p.link_mass = {0.02, 0.03, 0.04};
+    chain::Chain chain = rope(3, bending).chain, longer = chain;
+    longer.length += 0.05;
+    Parameters whole = p;
+    p.tip_length = 0.05, p.tip_mass = 0.04 * 0.05 / 0.1;  // links are 10 cm long
+    whole.tip_length = whole.tip_mass = 0.0, whole.link_mass[2] += p.tip_mass;
+    const Model apart = make_model(chain, p), together = make_model(longer, whole);
+    const int n = chain.angles();
+    const VectorX theta = random_vector(random, n, 0.5), thetadot = random_vector(random, n, 2.0);
+    const trajectory::BaseMotion base = random_base(random);
+    const auto same = [](const MatrixX& a, const MatrixX& b) {
+      CHECK((a - b).cwiseAbs().maxCoeff() < 1e-12 * b.cwiseAbs().maxCoeff());
+    };
+    same(mass_matrix(apart, theta), mass_matrix(together, theta));
+    same(forward_dynamics(apart, base, theta, thetadot), forward_dynamics(together, base, theta, thetadot));
+    same(closed_form(apart, base, theta, thetadot).gravity, closed_form(together, base, theta, thetadot).gravity);
+    CHECK(potential_energy(apart, base.pose, theta) ==
+          doctest::Approx(potential_energy(together, base.pose, theta)).epsilon(1e-12));
+    p.tip_length = 0.0;  // as a point it is another rope
+    CHECK((mass_matrix(make_model(chain, p), theta) - mass_matrix(together, theta)).cwiseAbs().maxCoeff() >
+          0.03 * mass_matrix(together, theta).cwiseAbs().maxCoeff());
   }
 }
 
@@ -470,19 +499,20 @@ TEST_CASE("the planar equations agree with the spatial ones, the base moving and
       model = rolling(make_model(chain::make_chain(0.3, 0.02, d, a, 6, chain::Bending::planar, false, first_joint), p));
       REQUIRE(is_planar(model.chain));
       CHECK(!is_planar(rope(6, chain::Bending::spatial).chain));
-      std::vector<Tangent> unknowns(8);
+      std::vector<Tangent> unknowns(9);
       unknowns[0].link_mass = unknowns[1].viscous_friction = unknowns[2].coulomb_friction = unknowns[3].air_linear =
           unknowns[4].air_quadratic = {0.1, 0.2, 0.3, 0.2, 0.4, 0.1};
       unknowns[5].tip_mass = 1.0;
       unknowns[6].stiffness = unknowns[6].damping = unknowns[6].rest_angle = {0.1, 0.2, 0.3, 0.2, 0.4, 0.1};
       unknowns[7].roll_lever = {0.1, 0.2, 0.3, 0.2, 0.4, 0.1};
+      unknowns[8].tip_length = 1.0;
       for (int trial = 0; trial < 3; ++trial) {
         const trajectory::BaseMotion base = random_base(random);
         const Vector6 jerk = random_vector(random, 6, 5.0);
         const VectorX theta = random_vector(random, 6, 0.5), thetadot = random_vector(random, 6, 2.0);
         SpatialEngine general(model);
         PlanarEngine planar(model);
-        MatrixX forces(6, 8), planar_forces(6, 8);
+        MatrixX forces(6, 9), planar_forces(6, 9);
         for (Engine* engine : {static_cast<Engine*>(&general), static_cast<Engine*>(&planar)}) {
           engine->place(base, theta, thetadot, true);
           REQUIRE(engine->factor_mass());
@@ -557,6 +587,11 @@ TEST_CASE("derivatives by every parameter and by the base motion agree with cent
     Tangent tip;
     tip.tip_mass = 1.0;
     check(tip, up, down, 1e-6);
+    up = down = model.parameters;
+    up.tip_length += 1e-4, down.tip_length -= 1e-4;
+    Tangent reach;
+    reach.tip_length = 1.0;
+    check(reach, up, down, 1e-4);
 
     const BaseSlopes slopes = base_slopes(model, base, theta, thetadot);
     const double e = 1e-5;

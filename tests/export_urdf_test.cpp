@@ -205,7 +205,9 @@ TEST_CASE("URDF: links stand where the chain's do, and weigh as the twin does") 
   };
   twin::Twin rod = make(down, side, chain::Bending::spatial, false, 0.0);
   rod.parameters->radius = 0.0, rod.parameters->tip_mass = 0.0;
-  for (const twin::Twin& twin : {make(side, down, chain::Bending::planar, false, 0.013), rod,
+  twin::Twin loaded = make(down, side, chain::Bending::spatial, false, 0.0);
+  loaded.parameters->tip_mass = 0.02, loaded.parameters->tip_length = 0.04;
+  for (const twin::Twin& twin : {make(side, down, chain::Bending::planar, false, 0.013), rod, loaded,
                                  make(slanted, across, chain::Bending::spatial, false, 0.013),
                                  make(down, side, chain::Bending::spatial, true, 0.0)}) {
     const chain::Chain& chain = twin.chain;
@@ -226,7 +228,8 @@ TEST_CASE("URDF: links stand where the chain's do, and weigh as the twin does") 
     }
     CHECK(found.total == doctest::Approx(dynamics::total_mass(*twin.parameters)).epsilon(1e-14));
     // the base too: a rope that hangs on a robot's arm is felt by it
-    math::Vector3 moment = twin.parameters->tip_mass * (motions.back() * (chain.length * chain.direction));
+    const double end = chain.length + 0.5 * twin.parameters->tip_length;
+    math::Vector3 moment = twin.parameters->tip_mass * (motions.back() * (end * chain.direction));
     for (int j = 1; j < chain.links(); ++j)
       moment += twin.parameters->link_mass[j - 1] *
                 (motions[j] * (0.5 * (chain.link_start(j) + chain.link_end(j)) * chain.direction));

@@ -15,7 +15,7 @@ namespace {
 
 constexpr double kMass = 0.3, kLength = 0.5, kStiffness = 0.6;  // kg, rope alone; m; N m/rad
 constexpr double kMoment = 0.03, kAngle = 0.02;                 // N m, rad
-constexpr double kPayload = 0.2;                                // kg
+constexpr double kPayload = 0.2, kReach = 0.08;                 // kg, m
 constexpr double kNoise = 5e-4;                                 // m, of a marker's coordinate
 
 struct Scene {
@@ -29,7 +29,7 @@ Scene make_scene(double moment, double payload) {
   Scene s;
   s.chain = chain::make_chain(kLength, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 6, chain::Bending::planar, false);
   dynamics::Parameters p;
-  p.link_mass.assign(6, kMass / 6), p.tip_mass = payload;
+  p.link_mass.assign(6, kMass / 6), p.tip_mass = payload, p.tip_length = payload > 0.0 ? kReach : 0.0;
   for (auto* zeros : {&p.viscous_friction, &p.coulomb_friction, &p.air_linear, &p.air_quadratic}) zeros->assign(6, 0.0);
   p.stiffness.assign(6, kStiffness), p.damping.assign(6, 0.01), p.rest_angle.assign(6, 0.03);
   p.stiffness[0] *= 2.0, p.damping[0] *= 2.0;
@@ -121,6 +121,35 @@ TEST_CASE("a payload is believed where it was weighed, and found where it was no
   const Result unknown = identify(s.chain, s.base, s.markers, options);
   const auto [found_part, error] = found(unknown, "logit_tip_mass_fraction");
   CHECK(std::abs(found_part - logit(part)) < std::max(3.0 * error, 0.3));
+}
+
+TEST_CASE("how far a payload reaches is used where it is given, and doubted where it is not") {
+  const Scene s = make_scene(0.0, kPayload);
+  Options options = options_of(kPayload);
+  options.tip_mass = kPayload;
+  // log of the stiffness over the true one, and its standard error
+  const auto off = [&](const Result& result) {
+    const auto [value, error] = found(result, "log_stiffness");
+    return std::pair(value - std::log(kStiffness), error);
+  };
+  options.tip_length = kReach;
+  const Result given = identify(s.chain, s.base, s.markers, options);
+  CHECK(given.parameters.tip_length == kReach);
+  const auto [right, sure] = off(given);
+  options.tip_length.reset();
+  const Result free = identify(s.chain, s.base, s.markers, options);
+  const auto [about, unsure] = off(free);
+  const auto [reach, reach_error] = found(free, "log_tip_length");
+  options.tip_length = 0.0;
+  const auto [wrong, deceived] = off(identify(s.chain, s.base, s.markers, options));
+  MESSAGE("log stiffness off by " << right << " +- " << sure << " (given), " << about << " +- " << unsure
+                                  << " (not given), " << wrong << " +- " << deceived << " (taken for a point); length "
+                                  << std::exp(reach) << ", log +- " << reach_error);
+  CHECK(std::abs(right) < 3.0 * sure);
+  CHECK(std::abs(about) < 3.0 * unsure);
+  CHECK(std::abs(reach - std::log(kReach)) < 3.0 * reach_error);
+  CHECK(unsure > 1.15 * sure);
+  CHECK(wrong < -3.0 * deceived);  // too soft, and sure of it: what a point would have to be to swing as slowly
 }
 
 TEST_CASE("the initial state of a known rope is found from the first marks") {

@@ -159,9 +159,16 @@ TEST_CASE("torsion, friction in bending and a payload read back, in a file that 
   const int n = twin.chain.angles();
   for (int k = 0; k < n; ++k) p.bending_friction.push_back(0.01 / (k + 3)), p.bending_friction_angle.push_back(0.1 / 3);
   twin.initial->internal_state = math::VectorX::LinSpaced(n, -1.0, 0.7);
-  twin.provenance.payload = {0.1 / 3, 0.01 / 3};
+  twin.provenance.payload = {0.1 / 3, 0.01 / 3, 0.02 / 3};
   twin::save(twin, folder.path / "run");
   CHECK(format() == "chainsplat-twin/2");
+  dynamics::Parameters reaching;
+  std::swap(reaching, p);
+  p = full_twin().parameters.value();
+  p.tip_length = 0.02 / 3;
+  twin::save(twin, folder.path / "run");
+  CHECK(format() == "chainsplat-twin/2");
+  p = reaching, p.tip_length = 0.02 / 3;
   p.torsional_stiffness.assign(twin.chain.links() - 1, 0.01 / 3);
   twin::save(twin, folder.path / "run");
   const twin::Twin read = twin::load(folder.path / "run");
@@ -172,9 +179,13 @@ TEST_CASE("torsion, friction in bending and a payload read back, in a file that 
   REQUIRE(read.provenance.payload.has_value());
   CHECK(same(read.provenance.payload->mass, 0.1 / 3));
   CHECK(same(read.provenance.payload->sigma, 0.01 / 3));
+  REQUIRE(read.provenance.payload->length.has_value());
+  CHECK(same(*read.provenance.payload->length, 0.02 / 3));
+  CHECK(same(read.parameters->tip_length, 0.02 / 3));
   const auto properties = nlohmann::json::parse(core::read_file(folder.path / "run/twin.json"))["properties"];
   CHECK(properties["bending_stiffness"]["unit"] == "N m^2");
   CHECK(properties["tip_mass"]["value"] == p.tip_mass);
+  CHECK(properties["tip_length"]["value"] == p.tip_length);
   CHECK(properties["first_frequency"]["value"] > 0.5);
 }
 

@@ -74,9 +74,11 @@ struct GivenSigma {
   double deviation = 0.0;
 };
 
-// A weight at the free end, kg, and its standard deviation.
+// What hangs at the free end: kg, and its standard deviation; and how far it reaches on from there, m (none: not
+// known).
 struct Payload {
   double mass = 0.0, sigma = 0.0;
+  std::optional<double> length = {};
 };
 
 struct Capture {
@@ -122,7 +124,7 @@ FrameRange read_frame_range(const std::string& text, const std::string& where);
 std::string frame_range_text(const FrameRange& range);  // as it is read; empty: all
 
 struct LoadOptions {
-  bool images = true;     // false: read capture.json and the base only
+  bool images = true;                   // false: read capture.json and the base only
   Pixels pixels = Pixels::undistorted;  // recorded: for evaluation
   bool depth = false;
   int margin = 24;           // px around the mask's bounds
@@ -179,8 +181,8 @@ struct Image8 {
 Image8 read_image8(const Path& file);
 Image8 rgb(const View& view);  // of its crop
 // A frame that is in memory already, as a view: the undistorted crop of a recorded picture (RGB) about its mask (one
-// channel, 128 and more: the object). Where the mask is empty the view is (width 0). `margin`: as in LoadOptions. Throws
-// InputError for pictures that are not of the camera's size.
+// channel, 128 and more: the object). Where the mask is empty the view is (width 0). `margin`: as in LoadOptions.
+// Throws InputError for pictures that are not of the camera's size.
 View view_of(const Camera& camera, const Image8& picture, const Image8& mask, int margin = 24);
 void write_png(const Path& file, const Image8& image);
 void write_depth_exr(const Path& file, int width, int height, const std::vector<float>& meters);
@@ -198,15 +200,16 @@ struct DeviceFormat {
 };
 
 // Frames one by one in display order: of a video with libav (MP4, MOV, MKV, WebM, AVI, MPEG, Ogg, FLV, ASF, or a bare
-// stream of H.264, HEVC, AV1 or MJPEG, but nothing that names further files; swscale's bicubic default, matrix and range
-// from the stream's tags, else BT.601 limited), of Y4M or of a camera. Throws InputError where it is missing or damaged.
+// stream of H.264, HEVC, AV1 or MJPEG, but nothing that names further files; swscale's bicubic default, matrix and
+// range from the stream's tags, else BT.601 limited), of Y4M or of a camera. Throws InputError where it is missing or
+// damaged.
 class VideoReader {
  public:
-  // A file or pipe, which is Y4M by its first bytes, the camera behind a character device (V4L2), from which `format` is
-  // requested, or `-`, standard input: Y4M or bare RGB24 of the format's size. From a camera each call gets the newest
-  // frame: frames that arrived in between are skipped, and so are damaged ones. next() then throws WorkError when the
-  // camera disappears or has no good frame for 5 s. Of all but videos it throws Interrupted when a stop is requested
-  // while it waits. Y4M keeps chroma in blocks, by BT.601 in the range that it names, else limited.
+  // A file or pipe, which is Y4M by its first bytes, the camera behind a character device (V4L2), from which `format`
+  // is requested, or `-`, standard input: Y4M or bare RGB24 of the format's size. From a camera each call gets the
+  // newest frame: frames that arrived in between are skipped, and so are damaged ones. next() then throws WorkError
+  // when the camera disappears or has no good frame for 5 s. Of all but videos it throws Interrupted when a stop is
+  // requested while it waits. Y4M keeps chroma in blocks, by BT.601 in the range that it names, else limited.
   explicit VideoReader(const Path& file, int threads = 1, const DeviceFormat& format = {});
   ~VideoReader();
   VideoReader(VideoReader&&) noexcept;

@@ -41,16 +41,17 @@ struct Parameters {
   // the friction across link j (along bending axis x link), share_kj = min(s_k, middle of j) / L. It is k r L B/C for a
   // natural curvature k out of the plane, radius r, bending stiffness B and torsional stiffness C.
   std::vector<double> roll_lever;
-  // Dry friction in bending (mathematics.md 3.10), per angle; both empty: none. The moment of joints that slip, N m, and
-  // the bend over which it builds up after a change of direction, rad. Angles that twist the rope have none.
+  // Dry friction in bending (mathematics.md 3.10), per angle; both empty: none. The moment of joints that slip, N m,
+  // and the bend over which it builds up after a change of direction, rad. Angles that twist the rope have none.
   std::vector<double> bending_friction, bending_friction_angle;
   // N m/rad per joint of two bending angles; empty: what the rope is naturally bent keeps its place about the links.
   // Else the rope rolls within the links as its moments about itself ask, with the retardation time of its bending
   // (mathematics.md 3.11).
   std::vector<double> torsional_stiffness;
-  double tip_mass = 0.0;                // kg, point mass at the free end
-  double radius = 0.0;                  // m, of the cylinder that gives the links' inertia; 0 allowed
-  Vector3 gravity{0, 0, -9.81};         // m/s^2, world
+  double tip_mass = 0.0;         // kg, of what hangs at the free end: a thin rod that goes on where the last link ends
+  double tip_length = 0.0;       // m, of that rod; 0: a point at the free end
+  double radius = 0.0;           // m, of the cylinder that gives the links' inertia; 0 allowed
+  Vector3 gravity{0, 0, -9.81};  // m/s^2, world
   std::optional<Vector3> table_normal;  // unit, world; none: no table
   bool table_carries_weight = true;     // gravity has no part along table_normal: the table holds the rope up
   double coulomb_speed = 0.002;         // v_s, m/s
@@ -70,9 +71,10 @@ double total_mass(const Parameters& parameters);
 struct InitialState {
   double time = 0.0;
   VectorX theta, thetadot;  // rad, rad/s
-  // What else the rope remembers. First, with friction in bending, the share of its moment that each angle's bending has
-  // built up, from -1 to 1; then, with torsion, each joint's roll of the material in its link, rad. What is missing is
-  // that of a rope that has come to rest at theta by ever smaller swings: shares of 0, rolls of least elastic energy.
+  // What else the rope remembers. First, with friction in bending, the share of its moment that each angle's bending
+  // has built up, from -1 to 1; then, with torsion, each joint's roll of the material in its link, rad. What is missing
+  // is that of a rope that has come to rest at theta by ever smaller swings: shares of 0, rolls of least elastic
+  // energy.
   VectorX internal_state = {};
 };
 
@@ -103,7 +105,7 @@ struct Model {
   Parameters parameters;
   std::vector<Vector6> axis;           // A_i, in {i}; pure rotations through the origin of {i}
   std::vector<math::Pose> home;        // M_i, {i} in the base frame at theta = 0
-  std::vector<math::Matrix6> inertia;  // G_i, in {i}; 0 for massless bodies, the tip mass in the last one
+  std::vector<math::Matrix6> inertia;  // G_i, in {i}; 0 for massless bodies, what hangs at the tip in the last one
 };
 
 // Throws InputError where an array has the wrong length, a number is not finite or negative where it must not be, a
@@ -180,9 +182,9 @@ struct Equilibrium {
 };
 Equilibrium static_equilibrium(const Model& model, const math::Pose& base, const VectorX& start = {});
 
-// The internal states of InitialState along given motion, from `before` (empty: 0) at its first time: shares of friction
-// are exact where the angles of a joint go straight from one time to the next, rolls those of a rope at rest. Empty for
-// a rope without any.
+// The internal states of InitialState along given motion, from `before` (empty: 0) at its first time: shares of
+// friction are exact where the angles of a joint go straight from one time to the next, rolls those of a rope at rest.
+// Empty for a rope without any.
 std::vector<VectorX> internal_states(const Model& model, const std::vector<VectorX>& theta, const VectorX& before = {});
 // Where only one state is known: that of joints that have moved on at their present rates until here. Empty as above.
 VectorX internal_state_in_motion(const Model& model, const VectorX& theta, const VectorX& thetadot);
@@ -210,7 +212,7 @@ struct Tangent {
   std::vector<double> stiffness, rest_angle, damping, roll_lever;                                // per angle
   std::vector<double> bending_friction, bending_friction_angle;                                  // per angle
   std::vector<double> torsional_stiffness;                                                       // per joint
-  double tip_mass = 0.0;
+  double tip_mass = 0.0, tip_length = 0.0;
   VectorX theta, thetadot, internal_state;
 };
 // d(joint law - tau_ID) / d unknowns at fixed thetaddot = a, n x unknowns; M^-1 of it is da / d unknowns. The tangents'

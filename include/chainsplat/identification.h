@@ -45,13 +45,14 @@ struct Options {
   // end, or where the data ask for it a payload of unknown mass.
   std::optional<double> tip_mass;
   double tip_mass_deviation = 0.0;
+  std::optional<double> tip_length;  // m, how far that payload reaches; none: not known
   // Where a fit in free space leaves more than the errors of the data, friction in bending and a payload are tried, and
   // taken if the evidence is for them (mathematics.md 5.10).
   bool ask_for_more = true;
-  bool fit_stiffness = true;            // else 0
-  bool fit_torsion = true;              // in free space, of chains that bend in space (mathematics.md 3.11)
-  bool per_joint = true;                // stiffness, damping and mass vary smoothly along the rope
-  bool friction_per_link = true;        // else one Coulomb coefficient for the whole rope
+  bool fit_stiffness = true;      // else 0
+  bool fit_torsion = true;        // in free space, of chains that bend in space (mathematics.md 3.11)
+  bool per_joint = true;          // stiffness, damping and mass vary smoothly along the rope
+  bool friction_per_link = true;  // else one Coulomb coefficient for the whole rope
   std::vector<Prior> priors;
   bool paper = false;  // kappa = 0; d_j, m_j and viscous mu_j by Adam on the angles
   dynamics::Integrator integrator = dynamics::Integrator::rodas3;  // paper: implicit_velocity_euler, one step a frame

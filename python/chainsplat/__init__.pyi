@@ -84,6 +84,7 @@ class Parameters:
     bending_friction_angle: _Numbers
     torsional_stiffness: _Numbers
     tip_mass: float
+    tip_length: float
     gravity: _Numbers
     substeps: int
     total_mass: float

@@ -220,6 +220,7 @@ void add_types(py::module_& m) {
   add_list(parameters, "torsional_stiffness", &Parameters::torsional_stiffness,
            "N m/rad, by joint of two angles; (0,): the rope does not twist");
   parameters.def_readwrite("tip_mass", &Parameters::tip_mass, "kg")
+      .def_readwrite("tip_length", &Parameters::tip_length, "m, of what hangs at the tip; 0: a point")
       .def_readwrite("gravity", &Parameters::gravity, "(3,), m/s^2, world")
       .def_readwrite("substeps", &Parameters::substeps, "steps of the integrator in 1/30 s")
       .def_property_readonly("total_mass", &dynamics::total_mass, "kg, of all links and the tip");

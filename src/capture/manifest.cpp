@@ -24,6 +24,7 @@ constexpr std::size_t kMostCameras = 512;  // because the frames of all are in m
 constexpr double kLongestRope = 100.0;     // m
 constexpr double kThinnest = 1e-4;         // of the length, because masks are made in steps of a diameter
 constexpr double kHeaviest = 1e4;          // kg
+constexpr double kLongestPayload = 10.0;   // m
 constexpr double kMostGravity = 1e3;       // m/s^2
 constexpr double kPerpendicular = 1e-3;    // rad
 // s by which the base may begin after the frames or end before them: its clock may be late, which training finds
@@ -92,11 +93,20 @@ void read_sigma(const ObjectReader& reader, Capture& capture) {
   read(reader.child("object", false, "{ \"length\": 0.003 }"), "object", "object");
 }
 
-// object.tip_mass: a number, or { value, sigma }.
+// object.tip_mass: a number, or { value, sigma }; object.tip_length.
 std::optional<Payload> read_payload(const ObjectReader& object, bool known_mass) {
   constexpr const char* kExpected = "kilograms, as 0.2 or { \"value\": 0.2, \"sigma\": 0.01 }";
+  constexpr const char* kExpectedLength = "meters from the free end to the payload's, as 0.05";
   const Json* const given = object.find("tip_mass", false, kExpected);
-  if (!given) return {};
+  if (!given) {
+    if (object.find("tip_length", false, kExpectedLength))
+      object.problem("tip_length", "says nothing without a payload's mass", "give object.tip_mass, too");
+    return {};
+  }
+  const std::optional<double> length = object.number("tip_length", false, kExpectedLength);
+  if (length && !(*length >= 0.0 && *length <= kLongestPayload))
+    object.problem("tip_length", "is no length up to " + core::exact(kLongestPayload) + " m",
+                   std::string("write ") + kExpectedLength);
   const auto mass = [&](const Json* value) {
     return value && value->is_number() && value->get<double>() >= 0.0 && value->get<double>() <= kHeaviest;
   };
@@ -111,7 +121,7 @@ std::optional<Payload> read_payload(const ObjectReader& object, bool known_mass)
   else if (!known_mass)
     object.problem("tip_mass", "says nothing beside a rope of unknown mass", "give object.mass, too");
   else
-    return Payload{value->get<double>(), sigma ? sigma->get<double>() : 0.0};
+    return Payload{value->get<double>(), sigma ? sigma->get<double>() : 0.0, length};
   return {};
 }
 
@@ -176,7 +186,7 @@ void read_scene(const ObjectReader& top, Capture& capture) {
 void read_object(const ObjectReader& top, Capture& capture) {
   const ObjectReader object = top.child("object", true, "{ \"length\": 0.3, \"diameter\": 0.02, \"mass\": 0.06 }");
   if (!object.present()) return;
-  object.know({"length", "diameter", "mass", "tip_mass"});
+  object.know({"length", "diameter", "mass", "tip_mass", "tip_length"});
   capture.length = object.positive("length", "meters from the grasp to the free end", kLongestRope, " m");
   capture.diameter = object.positive("diameter", "meters");
   if (object.has("mass")) {

@@ -20,10 +20,12 @@ Engine::Engine(const Model& m) : model(m), angles(m.chain.angles()), link_count(
     LinkConstants link{};
     const double l = model.chain.link_end(j + 1) - model.chain.link_start(j + 1), r = p.radius, mass_j = p.link_mass[j];
     const double tip = j + 1 == link_count ? p.tip_mass : 0.0;
+    const Attached at_tip = attached(l, p.tip_length);
     link.length = l;
     link.mass = mass_j + tip;
-    link.center = link.mass > 0.0 ? (0.5 * mass_j * l + tip * l) / link.mass : 0.5 * l;
-    link.transverse = mass_j * (l * l / 3.0 + 0.25 * r * r) + tip * l * l - link.mass * link.center * link.center;
+    link.center = link.mass > 0.0 ? (0.5 * mass_j * l + tip * at_tip.center) / link.mass : 0.5 * l;
+    link.transverse =
+        mass_j * (l * l / 3.0 + 0.25 * r * r) + tip * at_tip.second - link.mass * link.center * link.center;
     link.axial = 0.5 * mass_j * r * r;
     link.viscous = table_ ? p.viscous_friction[j] : 0.0;
     link.coulomb_per_coefficient = mass_j * normal_gravity;

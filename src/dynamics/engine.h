@@ -17,7 +17,7 @@ inline constexpr double kGaussWeight[3] = {5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0};
 inline constexpr double kSingular = 1e-13;  // of an angle's own inertia: less is rounding
 
 struct LinkConstants {
-  double length, mass, center, transverse, axial;      // tip mass included; center along d, inertia about the center
+  double length, mass, center, transverse, axial;      // with the tip's; center along d, inertia about the center
   double viscous, coulomb, air_linear, air_quadratic;  // coulomb: mu^C m g_n, N
   double coulomb_per_coefficient, coulomb_per_mass;
   int first_angle, end_angle;
@@ -25,8 +25,17 @@ struct LinkConstants {
 
 // Whether a tangent changes the wrenches of links, not only the joint law.
 inline bool moves_links(const Tangent& d) {
-  return d.tip_mass != 0.0 || !d.link_mass.empty() || !d.viscous_friction.empty() || !d.coulomb_friction.empty() ||
-         !d.air_linear.empty() || !d.air_quadratic.empty();
+  return d.tip_mass != 0.0 || d.tip_length != 0.0 || !d.link_mass.empty() || !d.viscous_friction.empty() ||
+         !d.coulomb_friction.empty() || !d.air_linear.empty() || !d.air_quadratic.empty();
+}
+
+// A thin rod of mass 1 that goes on for `length` where a link of `start` ends: its center from where the link begins,
+// and its inertia about there. Both are polynomials in `length`, of which central differences are exact.
+struct Attached {
+  double center, second;
+};
+inline Attached attached(double start, double length) {
+  return {start + 0.5 * length, start * start + start * length + length * length / 3.0};
 }
 
 class Engine {

@@ -64,7 +64,7 @@ Model make_model(const chain::Chain& chain, const Parameters& p) {
               "torsional_stiffness is given for joints that bend about other axes than a and d x a", "leave it empty");
     }
   }
-  check_array({p.tip_mass, p.radius}, 2, "tip_mass or radius");
+  check_array({p.tip_mass, p.tip_length, p.radius}, 3, "tip_mass, tip_length or radius");
   check_array({p.coulomb_speed, p.drag_speed}, 2, "coulomb_speed or drag_speed");
   require(p.coulomb_speed > 0.0 && p.drag_speed > 0.0, "a regularization speed is 0", "give a number > 0");
   require(p.gravity.allFinite(), "gravity is not finite", "give three finite numbers");
@@ -95,7 +95,7 @@ Model make_model(const chain::Chain& chain, const Parameters& p) {
       };
       const double l = chain.link_end(link) - chain.link_start(link), m = p.link_mass[link - 1], r = p.radius;
       add(m, 0.5 * l, m * (l * l / 12.0 + 0.25 * r * r), 0.5 * m * r * r);
-      if (link == links) add(p.tip_mass, l, 0.0, 0.0);
+      if (link == links) add(p.tip_mass, l + 0.5 * p.tip_length, p.tip_mass * p.tip_length * p.tip_length / 12.0, 0.0);
     }
     model.inertia.push_back(inertia);
   }
@@ -294,7 +294,8 @@ double potential_energy(const Model& model, const math::Pose& base, const Vector
   for (int link = 1; link < chain.links(); ++link) {
     const double start = chain.link_start(link), end = chain.link_end(link);
     energy -= p.link_mass[link - 1] * gravity.dot(motions[link] * (0.5 * (start + end) * chain.direction));
-    if (link + 1 == chain.links()) energy -= p.tip_mass * gravity.dot(motions[link] * (end * chain.direction));
+    if (link + 1 == chain.links())
+      energy -= p.tip_mass * gravity.dot(motions[link] * ((end + 0.5 * p.tip_length) * chain.direction));
   }
   if (Torsion torsion(model); torsion.present) {
     torsion.settle(theta);

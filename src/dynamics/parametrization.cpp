@@ -13,7 +13,8 @@ enum class How {
   logarithm,  // of a factor; the logarithms of all unknowns that act on a number are added up first
   factor,     // the same, multiplied on its own: it acts within a joint, where the others act from joint to joint
   addition,
-  tip_logit  // on the logit of the tip's part of the total mass
+  tip_logit,  // on the logit of the tip's part of the total mass
+  tip_length  // a logarithm, of the one number that is no array
 };
 
 struct Array {
@@ -66,6 +67,7 @@ const Row kRows[] = {
     {Quantity::friction, "log_friction", "log", 1.0, Per::rope, How::logarithm, {kViscous, kCoulomb}, every},
     {Quantity::drag, "log_drag", "log(N s^2/m^3)", 1.0, Per::rope, How::logarithm, {kAirLinear, kAirQuadratic}, every},
     {Quantity::tip_mass, "logit_tip_mass_fraction", "logit", 1.0, Per::rope, How::tip_logit},
+    {Quantity::tip_length, "log_tip_length", "log(m)", 1.0, Per::rope, How::tip_length},
     {Quantity::rest_angle, "rest_angle", "rad", 0.2, Per::angle, How::addition, {kRestAngle}},
     {Quantity::roll_lever, "roll_lever", "m", 0.01, Per::angle, How::addition, {kRollLever}},
     {Quantity::bending_friction, "log_bending_friction", "log(N m)", 1.0, Per::rope, How::logarithm, {kBendingFriction}, every},
@@ -147,7 +149,8 @@ bool is_parameter(Quantity quantity) { return quantity != Quantity::none && !row
 
 bool has_effect(const chain::Chain& chain, const Parameters& parameters, const Unknown& unknown) {
   const How how = row_of(unknown.quantity).how;
-  bool effect = how == How::tip_logit && parameters.tip_mass > 0.0;
+  bool effect =
+      parameters.tip_mass > 0.0 && (how == How::tip_logit || (how == How::tip_length && parameters.tip_length > 0.0));
   for_each_element(chain, parameters, unknown, [&](const Array& array, std::size_t k) {
     effect |= how == How::addition || (parameters.*array.values)[k] != 0.0;
   });
@@ -182,6 +185,7 @@ Parameters moved(const chain::Chain& chain, const Parameters& reference, std::sp
     masses |= how == How::tip_logit || acts_on(quantity, kLinkMass);
     if (how == How::tip_logit && p.tip_mass > 0.0 && p.tip_mass < mass)
       p.tip_mass = mass / (1.0 + std::exp(-(std::log(p.tip_mass / (mass - p.tip_mass)) + by)));
+    if (how == How::tip_length) p.tip_length *= std::exp(by);
     for_each_element(chain, reference, unknowns[i], [&](const Array& array, std::size_t k) {
       if (how == How::logarithm)
         element(logarithms, array, reference, k) += by;
@@ -228,6 +232,7 @@ std::vector<Tangent> tangents(const chain::Chain& chain, const Parameters& p, st
       if (slope != 0.0) element(d, array, p, k) = slope;
     });
     if (row.state) d.*row.state_slope = VectorX::Unit(chain.angles(), unknowns[i].index);
+    if (row.how == How::tip_length) d.tip_length = p.tip_length;
     if (row.how == How::tip_logit) d.tip_mass = p.tip_mass * of_links / mass;
     // what a link or the tip gets, all links give in proportion to their masses
     double gained = d.tip_mass;

@@ -417,7 +417,14 @@ void PlanarEngine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& fo
       return out;
     };
     unit.mass = of(0.5 * l, l * l / 3.0, 0.25 * r * r);
-    if (j + 1 == angles) unit_tip_planar_ = of(l, l * l, 0.0);
+    if (j + 1 == angles) {
+      const auto tip = [&](double length) { return of(attached(l, length).center, attached(l, length).second, 0.0); };
+      unit_tip_planar_ = tip(parameters.tip_length);
+      unit_tip_length_ = tip(parameters.tip_length + l);
+      add(unit_tip_length_, tip(parameters.tip_length - l), -1.0);
+      for (double* part : {&unit_tip_length_.turn, &unit_tip_length_.x, &unit_tip_length_.y})
+        *part *= 0.5 * parameters.tip_mass / l;
+    }
     unit.viscous = unit.coulomb = unit.air_linear = unit.air_quadratic = {};
     if (rolls) roll_by_viscous[j] = roll_by_coulomb[j] = 0.0;
     for (int g = 0; g < 3; ++g) {
@@ -457,6 +464,7 @@ void PlanarEngine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& fo
     if (!moves_links(d)) continue;
     Planar sum;
     if (d.tip_mass != 0.0) add(sum, unit_tip_planar_, d.tip_mass);
+    if (d.tip_length != 0.0) add(sum, unit_tip_length_, d.tip_length);
     for (int j = angles - 1; j >= 0; --j) {
       if (!d.link_mass.empty()) add(sum, units_[j].mass, d.link_mass[j]);
       if (!d.viscous_friction.empty()) add(sum, units_[j].viscous, d.viscous_friction[j]);

@@ -64,7 +64,7 @@ class PlanarEngine : public Engine {
   std::vector<Slope> slope_sum_;
   std::vector<Planar> roll_slope_;  // of the friction across a link, by its twist
   std::vector<Unit> units_;
-  Planar unit_tip_planar_;
+  Planar unit_tip_planar_, unit_tip_length_;
   std::vector<double> lift_;  // a joint: the z velocity's change at the base origin where the fields turn back about it
 };
 

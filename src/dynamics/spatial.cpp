@@ -295,7 +295,15 @@ void SpatialEngine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& f
     };
     unit.mass =
         inertial(world_inertia(1.0, 0.5 * l, l * l / 12.0 + 0.25 * r * r, 0.5 * r * r, origin[j], direction[j]));
-    if (j + 1 == link_count) unit_tip_ = inertial(world_inertia(1.0, l, 0.0, 0.0, origin[j], direction[j]));
+    if (j + 1 == link_count) {
+      const auto tip = [&](double length) {
+        const Attached at = attached(l, length);
+        return inertial(world_inertia(1.0, at.center, at.second - at.center * at.center, 0.0, origin[j], direction[j]));
+      };
+      unit_tip_ = tip(parameters.tip_length);
+      unit_tip_length_ =
+          (0.5 * parameters.tip_mass / l) * (tip(parameters.tip_length + l) - tip(parameters.tip_length - l));
+    }
     for (Vector6* w : {&unit.viscous, &unit.coulomb, &unit.air_linear, &unit.air_quadratic}) w->setZero();
     if (rolls) roll_by_viscous[j] = roll_by_coulomb[j] = 0.0;
     for (int g = 0; g < 3; ++g) {
@@ -329,7 +337,9 @@ void SpatialEngine::unknown_forces(std::span<const Tangent> unknowns, MatrixX& f
     auto column = forces.col(static_cast<Eigen::Index>(p));
     joint_forces(d, column);
     if (!moves_links(d)) continue;
-    Vector6 sum = d.tip_mass != 0.0 ? Vector6(d.tip_mass * unit_tip_) : Vector6::Zero().eval();
+    Vector6 sum = Vector6::Zero();
+    if (d.tip_mass != 0.0) sum += d.tip_mass * unit_tip_;
+    if (d.tip_length != 0.0) sum += d.tip_length * unit_tip_length_;
     for (int j = link_count - 1; j >= 0; --j) {
       if (!d.link_mass.empty()) sum += d.link_mass[j] * unit_[j].mass;
       if (!d.viscous_friction.empty()) sum += d.viscous_friction[j] * unit_[j].viscous;

@@ -90,7 +90,7 @@ class SpatialEngine : public Engine {
   std::vector<Eigen::Matrix<double, 6, 3>> turning_;  // composite N
   std::vector<Vector6> weighted_axis_;                // I s_i
   std::vector<UnitWrenches> unit_;
-  Vector6 unit_tip_;
+  Vector6 unit_tip_, unit_tip_length_;
 };
 
 }  // namespace chainsplat::dynamics

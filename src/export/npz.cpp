@@ -185,6 +185,7 @@ void add_parameters(Arrays& arrays, const twin::Twin& twin) {
         std::pair("air_quadratic", &p.air_quadratic)})
     arrays.numbers(name, {links}, *values);
   arrays.number("tip_mass", p.tip_mass);
+  arrays.number("tip_length", p.tip_length);
   arrays.number("radius", p.radius);
   arrays.number("coulomb_speed", p.coulomb_speed);
   arrays.number("drag_speed", p.drag_speed);

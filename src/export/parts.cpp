@@ -34,8 +34,10 @@ Inertia inertia_of(const chain::Chain& chain, const dynamics::Parameters& p, int
   const double about_itself = std::max(0.5 * mass * p.radius * p.radius, kLeastInertia);
   Inertia out{mass, 0.5 * length * d, across * (Matrix3::Identity() - along) + about_itself * along};
   if (link + 1 < chain.links() || p.tip_mass <= 0.0) return out;
-  const Vector3 tip = length * d, center = (mass * out.center + p.tip_mass * tip) / (mass + p.tip_mass);
-  out.about += point_inertia(mass, out.center - center) + point_inertia(p.tip_mass, tip - center);
+  const Vector3 tip = (length + 0.5 * p.tip_length) * d,
+                center = (mass * out.center + p.tip_mass * tip) / (mass + p.tip_mass);
+  out.about += point_inertia(mass, out.center - center) + point_inertia(p.tip_mass, tip - center) +
+               p.tip_mass * p.tip_length * p.tip_length / 12.0 * (Matrix3::Identity() - along);
   out.mass += p.tip_mass;
   out.center = center;
   return out;

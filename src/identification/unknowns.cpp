@@ -40,6 +40,12 @@ constexpr double kInitialRateSd = 1.0;   // rad/s
 constexpr double kPayloadPart = 0.3;     // of the total mass: what grippers' ropes carry, 0.05 to 0.8 within two
 constexpr double kPayloadSd = 1.1;       // deviations
 constexpr double kLeastTipSd = 1e-3;     // logit, of a payload that was weighed
+// How far a payload reaches beyond the free end: a cube of this density, between plastics and steel, and what longer
+// and shorter things differ by. Where nothing has a known mass, a part of the rope's length instead.
+constexpr double kPayloadDensity = 4000.0;  // kg/m^3
+constexpr double kPayloadLengthSd = 0.7;
+constexpr double kPayloadLengthPart = 0.1;
+constexpr double kPayloadLengthPartSd = 1.0;
 
 // Of the tip's part of the total mass; the deviation is that of its logit.
 struct TipPrior {
@@ -182,7 +188,7 @@ void add_surroundings(Draft& d, const Extras& extras) {
   if (options.tabletop) {
     unit.coulomb_friction = all(d.links, 1.0);
     d.add_many(Quantity::coulomb_friction, d.links, std::log(kCoulombMean), kCoulombSd);
-    unit.tip_mass = options.tip_mass.value_or(0.0);
+    unit.tip_mass = options.tip_mass.value_or(0.0), unit.tip_length = options.tip_length.value_or(0.0);
     d.hold("tip_mass", options.tip_mass ? "given" : "0: not observable on a table beside the friction");
     d.hold("drag", "0 on a table");
     return;
@@ -193,6 +199,16 @@ void add_surroundings(Draft& d, const Extras& extras) {
   const TipPrior prior = tip_prior(options, extras, d.u.total_mass);
   unit.tip_mass = 0.5 * d.u.total_mass;  // where the logit is 0
   d.add(Quantity::tip_mass, 0, std::log(prior.part / (1.0 - prior.part)), prior.deviation);
+  if (!options.tip_mass && !extras.payload) return d.hold("tip_length", "0: a rope's bare end");
+  if (options.tip_length) {
+    unit.tip_length = *options.tip_length;
+    return d.hold("tip_length", "given");
+  }
+  unit.tip_length = 1.0;  // where the logarithm is 0
+  if (options.mass)
+    d.add(Quantity::tip_length, 0, std::log(prior.part * d.u.total_mass / kPayloadDensity) / 3.0, kPayloadLengthSd);
+  else
+    d.add(Quantity::tip_length, 0, std::log(kPayloadLengthPart * d.chain.length), kPayloadLengthPartSd);
 }
 
 void add_natural_shape(Draft& d) {

@@ -32,6 +32,7 @@ identification::Options identification_options(const twin::Twin& twin, bool pape
       throw InputError("tip_mass", "says nothing beside a rope of unknown mass", "give the rope's mass, too");
     *options.mass += payload->mass;
     options.tip_mass = payload->mass, options.tip_mass_deviation = payload->sigma;
+    options.tip_length = payload->length;
   }
   options.paper = paper;
   if (paper) {

@@ -72,6 +72,12 @@ void add_masses(const twin::Twin& twin, std::vector<Quantity>& out) {
     out.push_back(
         {"extra mass at the tip", "kg", text("%.1f %% of all", 100.0 * fraction, 0.0), p.tip_mass,
          times(total * fraction * (1.0 - fraction), deviation(twin.estimates, {{"logit_tip_mass_fraction", 1.0}}))});
+  if (p.tip_length > 0.0)
+    out.push_back({"which reaches beyond the rope by",
+                   "m",
+                   {},
+                   p.tip_length,
+                   times(p.tip_length, deviation(twin.estimates, {{"log_tip_length", 1.0}}))});
 }
 
 void add_bending(const twin::Twin& twin, const std::vector<twin::Property>& properties, std::vector<Quantity>& out) {

@@ -81,6 +81,7 @@ Json scene_json(const twin::Twin& twin, const capture::Capture& scene, const Opt
     const std::optional<capture::Payload>& payload = twin.provenance.payload;
     out["object"]["mass"] = dynamics::total_mass(*twin.parameters) - (payload ? twin.parameters->tip_mass : 0.0);
     if (payload) out["object"]["tip_mass"] = twin.parameters->tip_mass;
+    if (payload) out["object"]["tip_length"] = twin.parameters->tip_length;
   }
   if (twin.tabletop) {
     const capture::Table table = scene.table.value_or(capture::Table{});

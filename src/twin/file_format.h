@@ -10,7 +10,8 @@
 namespace chainsplat::twin {
 
 inline constexpr const char* kFormat = "chainsplat-twin/1";
-// Of twins that a program of format 1 would set in motion wrongly: with friction in bending or torsion.
+// Of twins that a program of format 1 would set in motion wrongly: with friction in bending, torsion or a payload that
+// is no point.
 inline constexpr const char* kNewFormat = "chainsplat-twin/2";
 
 inline const std::pair<dynamics::Integrator, const char*> kIntegrators[] = {

@@ -89,6 +89,7 @@ std::vector<Property> values(const dynamics::Model& model, bool known_mass, Vect
     out.push_back({"friction_coefficient", "1", mean, std::sqrt(square / mass)});
   }
   out.push_back({"tip_mass", known_mass ? "kg" : "1", p.tip_mass});
+  if (p.tip_length > 0.0) out.push_back({"tip_length", "m", p.tip_length});
   return out;
 }
 

@@ -156,6 +156,7 @@ dynamics::Parameters read_parameters(const Node& node, const Twin& twin) {
 
   p.radius = cylinder_radius(twin.chain, p.link_mass, links);
   p.tip_mass = node["tip_mass"].not_negative();
+  if (node.has("tip_length")) p.tip_length = node["tip_length"].not_negative();
   if (node.has("torsional_stiffness"))
     for (const Node& twist : node["torsional_stiffness"].entries()) p.torsional_stiffness.push_back(twist.positive());
   p.coulomb_speed = node["regularization"]["coulomb_speed"].positive();
@@ -278,7 +279,7 @@ void read_option(const std::string& name, const Node& node, Provenance& p) {
   if (name == "mass") {
     number(p.mass.emplace(), "not a positive number, the mass in kg");
   } else if (name == "tip_mass") {
-    p.payload.emplace();
+    if (!p.payload) p.payload.emplace();
     const std::size_t comma = text.find(',');
     const auto part = [&](const char* begin, const char* end, double& value) {
       const auto [after, error] = std::from_chars(begin, end, value);
@@ -288,6 +289,13 @@ void read_option(const std::string& name, const Node& node, Provenance& p) {
     const char* const end = text.data() + text.size();
     part(text.data(), comma == std::string::npos ? end : text.data() + comma, p.payload->mass);
     if (comma != std::string::npos) part(text.data() + comma + 1, end, p.payload->sigma);
+  } else if (name == "tip_length") {
+    if (!p.payload) p.payload.emplace();
+    const char* const end = text.data() + text.size();
+    double& length = p.payload->length.emplace();
+    const auto [after, error] = std::from_chars(text.data(), end, length);
+    if (error != std::errc() || after != end || !(length >= 0.0) || !std::isfinite(length))
+      refuse("no length of a payload in m");
   } else if (name == "every") {
     number(p.every.emplace(), "not a whole number >= 1");
   } else if (name == "mode") {

@@ -152,6 +152,7 @@ Json chain_json(const Twin& twin) {
     out["air_drag"] = {{"linear", drag_per_meter(chain, p->air_linear)},
                        {"quadratic", drag_per_meter(chain, p->air_quadratic)}};
     out["tip_mass"] = p->tip_mass;
+    if (p->tip_length > 0.0) out["tip_length"] = p->tip_length;
     if (!p->torsional_stiffness.empty()) out["torsional_stiffness"] = list(p->torsional_stiffness);
     out["regularization"] = {{"coulomb_speed", p->coulomb_speed}, {"drag_speed", p->drag_speed}};
     for (const auto& [integrator, name] : kIntegrators)
@@ -181,8 +182,9 @@ Json about_json(const Twin& twin) {
             "are the spline's"}};
   if (!twin.parameters) return out;
   if (!twin.known_mass) out["units"] = "m, s, rad; the total mass counts as 1 kg, forces are N per kg of rope";
-  Json laws{{"joint", "torque = -stiffness (theta - rest_angle) - damping thetadot"},
-            {"inertia", "links are uniform cylinders; tip_mass is a point at the free end"}};
+  Json laws{
+      {"joint", "torque = -stiffness (theta - rest_angle) - damping thetadot"},
+      {"inertia", "links are uniform cylinders; tip_mass is a thin rod of tip_length that goes on at the free end"}};
   if (!twin.parameters->torsional_stiffness.empty())
     laws["torsion"] =
         "the rope twists within its links with torsional_stiffness and the retardation time damping/stiffness "
@@ -251,6 +253,7 @@ std::map<std::string, std::string> option_texts(const Provenance& p) {
   if (p.payload) {
     texts["tip_mass"] = core::exact(p.payload->mass);
     if (p.payload->sigma > 0.0) texts["tip_mass"] += "," + core::exact(p.payload->sigma);
+    if (p.payload->length) texts["tip_length"] = core::exact(*p.payload->length);
   }
   if (p.frames) texts["frames"] = capture::frame_range_text(*p.frames);
   if (p.every) texts["every"] = std::to_string(*p.every);
@@ -265,8 +268,9 @@ void save(const Twin& twin, const Path& run) {
   std::filesystem::create_directories(run, error);
   if (error)
     throw WorkError(run.string(), "cannot be made (" + error.message() + ")", "choose a folder that can be written");
+  const dynamics::Parameters* const known = twin.parameters ? &*twin.parameters : nullptr;
   const bool plain =
-      !twin.parameters || (twin.parameters->bending_friction.empty() && twin.parameters->torsional_stiffness.empty());
+      !known || (known->bending_friction.empty() && known->torsional_stiffness.empty() && known->tip_length == 0.0);
   Json out{{"format", plain ? kFormat : kNewFormat},
            {"about", about_json(twin)},
            {"grasp", {{"direction", list(twin.chain.direction)}, {"bending_axis", list(twin.chain.bending_axis)}}},

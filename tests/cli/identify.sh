@@ -6,6 +6,9 @@ export VK_DRIVER_FILES=/nonexistent VK_ICD_FILENAMES=/nonexistent
 expect_error 2 'mass' new -o "$work/bad" --length 0.3 --mass 0
 expect_error 2 'mass' new -o "$work/bad" --length 0.3 --mass=-1
 expect_error 2 'length' new -o "$work/bad" --length 0
+expect_error 2 "tip-length: says nothing without a payload's mass" new -o "$work/bad" --length 0.3 --mass 0.06 --tip-length 0.05
+expect_error 2 'tip-length: -1 m is no length' new -o "$work/bad" --length 0.3 --mass 0.06 --tip-mass 0.02 --tip-length -1
+expect_error 2 'tip-length: nan m is no length' new -o "$work/bad" --length 0.3 --mass 0.06 --tip-mass 0.02 --tip-length nan
 expect_error 2 "length: 'nan' is not a number above 0" new -o "$work/bad" --length nan
 expect_error 2 'bending-axis' new -o "$work/bad" --length 0.3 --bending-axis 0,0,1
 expect_error 2 'bending-stiffness: .*mass' new -o "$work/bad" --length 0.3 --bending-stiffness 1e-3

@@ -81,9 +81,12 @@ void flush_output();
 // A text of the library, in which fields of options structs stand in backquotes, with the options of the command line
 // in their place: `frames` becomes --frames.
 std::string with_options(const std::string& text);
-// --tip-mass KG[,SIGMA] and what it says: nothing where `numbers` is empty. Throws InputError.
-void add_payload_option(Command command, std::vector<double>& numbers);
-std::optional<capture::Payload> payload_of(const std::vector<double>& numbers);
+// --tip-mass KG[,SIGMA] and --tip-length M, and what they say: nothing without a mass. Throws InputError.
+struct PayloadRequest {
+  std::vector<double> mass, length;  // kg, and its deviation; m; empty: unknown
+};
+void add_payload_options(Command command, PayloadRequest& request);
+std::optional<capture::Payload> payload_of(const PayloadRequest& request);
 
 // --- inspect.cpp --------------------------------------------------------------------------------
 // What `check` finds: as lines, and as the document of --json. `with_masks` false: of a capture whose masks are still

@@ -24,7 +24,7 @@ using Json = nlohmann::ordered_json;
 
 struct Request {
   std::vector<std::string> runs, markers;
-  std::vector<double> payload;
+  PayloadRequest payload;
   bool shape_only = false, joint = false;
 };
 
@@ -185,7 +185,7 @@ void add_identify_command(Command app, const Globals& globals, Job& job) {
           "Then refine angles, Gaussians and dynamics of one RUN together with the capture's images: helps where\n"
           "a single camera hardly sees depth")
       .excludes(markers);
-  add_payload_option(identifier, request->payload);
+  add_payload_options(identifier, request->payload);
   auto online = std::make_shared<OnlineRequest>();
   Option stream =
       identifier

@@ -23,9 +23,9 @@ struct Request {
   std::string out, bending;                            // empty: spatial, on a table planar
   double length = 0.0, diameter = 0.02, mass = 0.0;    // m, m, kg; mass 0: unknown
   double bending_stiffness = -1.0, retardation = 0.0;  // EI, N m^2, negative: not given; s
-  std::vector<double> payload;                         // kg, and its deviation; empty: unknown
-  std::vector<double> table;                           // m, a point of it; empty: the rope hangs free
-  double friction = -1.0;                              // its coefficient, negative: not given
+  PayloadRequest payload;
+  std::vector<double> table;  // m, a point of it; empty: the rope hangs free
+  double friction = -1.0;     // its coefficient, negative: not given
   int joints = 8;
   std::vector<double> direction, bending_axis, gravity{0, 0, -9.81};
   bool force = false;
@@ -53,7 +53,8 @@ dynamics::Parameters rod(const chain::Chain& chain, const Request& request, cons
   if (table_normal) rod.coulomb_friction.assign(links, request.friction);
   for (int j = 1; j <= links; ++j)
     rod.link_mass.push_back(request.mass * (chain.link_end(j) - chain.link_start(j)) / chain.length);
-  if (!request.payload.empty()) rod.tip_mass = request.payload[0];
+  if (const std::optional<capture::Payload> payload = payload_of(request.payload))
+    rod.tip_mass = payload->mass, rod.tip_length = payload->length.value_or(0.0);
   rod.rest_angle.assign(chain.angles(), 0.0);
   const auto stand_for_rod = [&](double tension) {
     rod.stiffness.clear(), rod.damping.clear();
@@ -189,7 +190,7 @@ void add_new_command(Command app, const Globals& globals, Job& job) {
   command.add_option("--mass", request->mass, "Of the rope, kg (default: unknown, forces are per kilogram)")
       .positive()
       .type_name("KG");
-  add_payload_option(command, request->payload);
+  add_payload_options(command, request->payload);
   command
       .add_option("--bending-stiffness", request->bending_stiffness,
                   "EI of a uniform straight rod, N m^2; with --mass the twin is then ready for rollout")

@@ -49,25 +49,40 @@ std::string with_options(const std::string& text) {
   return out;
 }
 
-void add_payload_option(Command command, std::vector<double>& numbers) {
+void add_payload_options(Command command, PayloadRequest& request) {
   command
       .add_option(
-          "--tip-mass", numbers,
+          "--tip-mass", request.mass,
           "kg, of what hangs at the free end beside the rope, and its standard deviation after a comma; 0: nothing\n"
           "(default: not known; found where the motion tells it)")
       .delimiter(',')
       .expected(1, 2)
       .type_name("KG");
+  command
+      .add_option("--tip-length", request.length,
+                  "m, how far that reaches beyond the rope's end, a rod that goes on there; 0: a point (default: not\n"
+                  "known; as long as things of its mass are, which leaves the stiffness less sure)")
+      .expected(1)
+      .type_name("M");
 }
 
-std::optional<capture::Payload> payload_of(const std::vector<double>& numbers) {
+std::optional<capture::Payload> payload_of(const PayloadRequest& request) {
+  constexpr double kHeaviest = 1e4, kLongest = 10.0;  // kg and m, as in capture.json
+  const std::vector<double>& numbers = request.mass;
+  const bool known = !request.length.empty();
+  if (numbers.empty() && known)
+    throw InputError("--tip-length", "says nothing without a payload's mass", "give --tip-mass, too");
   if (numbers.empty()) return {};
-  constexpr double kHeaviest = 1e4;  // kg, as in capture.json
+  if (known && !(request.length[0] >= 0.0 && request.length[0] <= kLongest))
+    throw InputError("--tip-length", core::exact(request.length[0]) + " m is no length of a payload",
+                     "give meters from 0 to " + core::exact(kLongest));
   for (const double number : numbers)
     if (!(number >= 0.0 && number <= kHeaviest))
       throw InputError("--tip-mass", core::exact(number) + " kg is no mass of a payload",
                        "give kilograms from 0 to " + core::exact(kHeaviest));
-  return capture::Payload{numbers[0], numbers.size() > 1 ? numbers[1] : 0.0};
+  capture::Payload payload{numbers[0], numbers.size() > 1 ? numbers[1] : 0.0};
+  if (known) payload.length = request.length[0];
+  return payload;
 }
 
 }  // namespace chainsplat::tools

@@ -2,7 +2,8 @@
 //
 // An unknown is a coordinate: the logarithm of a factor of stiffness, an angle that is added to a rest angle. One table
 // in src/dynamics/parametrization.cpp says of every quantity its name in files, its unit, on which numbers it acts and
-// how. Names, parameters and derivatives follow from that table alone: a new quantity is an entry of Quantity and a row.
+// how. Names, parameters and derivatives follow from that table alone: a new quantity is an entry of Quantity and a
+// row.
 #pragma once
 #include <optional>
 #include <span>
@@ -27,7 +28,8 @@ enum class Quantity {
   viscous_friction,
   friction,  // all links' friction against the table
   drag,
-  tip_mass,  // the tip's part of the total mass, which stays
+  tip_mass,    // the tip's part of the total mass, which stays
+  tip_length,  // of what hangs there; only where the parameters have one
   rest_angle,
   roll_lever,
   bending_friction,  // the moment of all joints; only where the parameters have some
