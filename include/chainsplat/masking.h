@@ -78,7 +78,7 @@ struct PreviewTile {
 capture::Image8 contact_sheet(const std::vector<PreviewTile>& tiles);
 
 // Masks of one camera's frames as they come, while the rope is followed. It learns the background where the rope is
-// not, and the colors of what is masked.
+// not, and the colors of what is masked, in a thread of its own, which the next call waits for.
 class LiveMasks {
  public:
   // `camera`: as recorded, with its lens distortion. `object_rgb`: colors of the rope, 0..255, three numbers per sample

@@ -136,6 +136,8 @@ class Engine {
   // Replaces the views of set_views().
   std::vector<ColorSums> color_sums(const chain::Chain& chain, std::span<const ViewSpec> views,
                                     std::span<const std::vector<std::uint8_t>* const> observed);
+  // Draws those Gaussians. Replaces the views of set_views(), too.
+  std::vector<Picture> draw_set(std::span<const ViewSpec> views, bool depth = false);
 
   // The paper's resets: of opacities to at most `largest`, of link probabilities to uniform. Both also zero Adam's
   // moments of these parameters.

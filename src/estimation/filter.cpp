@@ -79,7 +79,8 @@ struct Attempt {
 
 // Predicts and measures; where the model does not explain the frame, again with a force that may change, and then with
 // a blow; where the masks are not explained, or not all of them, from a wide belief.
-Attempt measure_frame(State& state, Belief predicted, std::span<const capture::View* const> views) {
+Attempt measure_frame(State& state, Belief predicted, const Motion& motion,
+                      std::span<const capture::View* const> views) {
   const double time = views.front()->time;
   const bool first = !state.belief, in_contact = time <= state.contact_until;
   const auto surprising = [](const Measured& m) { return m.surprise > kSurprise || !explains(m.fit); };
@@ -88,7 +89,7 @@ Attempt measure_frame(State& state, Belief predicted, std::span<const capture::V
   if (!first && surprising(out.measured)) {
     state.contact_until = time + kContactMemory;
     const auto try_with = [&](Contact contact) {
-      out.predicted = predict(state, *state.belief, time, contact);
+      out.predicted = predict(state, *state.belief, motion, contact);
       out.measured = measure(state, out.predicted, views, true);
     };
     if (!in_contact) try_with(Contact::touched);
@@ -165,8 +166,13 @@ Estimate update(State& state, std::span<const capture::View* const> views) {
   CHAINSPLAT_CHECK(!views.empty(), "no view");
   const capture::View& view = *views.front();
   const bool first = !state.belief;
+  Motion motion;
+  if (!first)
+    motion =
+        state.ahead && state.ahead->time == view.time ? std::move(*state.ahead) : move(state, *state.belief, view.time);
+  state.ahead.reset();
   Belief predicted = first ? first_belief(state, view.time)
-                           : predict(state, *state.belief, view.time,
+                           : predict(state, *state.belief, motion,
                                      view.time <= state.contact_until ? Contact::touched : Contact::none);
   if (first) state.last_seen = view.time;
 
@@ -176,7 +182,7 @@ Estimate update(State& state, std::span<const capture::View* const> views) {
   out.seen = std::any_of(views.begin(), views.end(), [](const capture::View* v) { return has_mask(*v); });
   bool believed = false;
   if (out.seen) {
-    Attempt attempt = measure_frame(state, predicted, views);
+    Attempt attempt = measure_frame(state, predicted, motion, views);
     // at first masks of cameras that are off bend the rope toward them; where they stand is learned from these, and
     // counts once
     for (int round = 0; first && round < kFirstRounds && explains(attempt.measured.fit); ++round) {
@@ -185,7 +191,7 @@ Estimate update(State& state, std::span<const capture::View* const> views) {
       state.setup.information = before.information;
       state.setup.right = before.right;
       state.setup.frames = before.frames;
-      attempt = measure_frame(state, predicted, views);
+      attempt = measure_frame(state, predicted, motion, views);
     }
     believed = judge(state, views, attempt, out);
     if (believed) learn(state, views, attempt, first, out);

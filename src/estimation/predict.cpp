@@ -49,52 +49,6 @@ VectorX expected_mask_shifts(const State& state, double time) {
   return out;
 }
 
-// The mean of a belief moved in time, and its derivatives with respect to the mean before.
-struct Motion {
-  VectorX theta, thetadot;
-  MatrixX theta_by_state, thetadot_by_state;  // n x 3 n
-};
-
-Motion move(const State& state, const Belief& belief, double time) {
-  const Given& given = state.given;
-  const int n = given.model.chain.angles();
-  const double h = time - belief.time;
-  Motion out;
-  // by the dynamics and their sensitivities
-  if (given.identified) {
-    dynamics::Model model = given.model;
-    for (int k = 0; k < n; ++k) model.parameters.rest_angle[k] += belief.mean[2 * n + k];
-    std::vector<dynamics::Unknown> unknowns = dynamics::initial_state_unknowns(model.chain);
-    for (int k = 0; given.shifts && k < n; ++k) unknowns.push_back({dynamics::Quantity::rest_angle, k});
-    const std::vector<dynamics::Tangent> tangents = dynamics::tangents(model.chain, model.parameters, unknowns);
-    const dynamics::BaseGrid grid = dynamics::sample_base([&](double t) { return base_at(state, t); }, belief.time,
-                                                          {time}, model.parameters.substeps);
-    chain::States states;
-    dynamics::Sensitivities sensitivities;
-    const VectorX theta = belief.mean.head(n), thetadot = belief.mean.segment(n, n);
-    const dynamics::InitialState now{belief.time, theta, thetadot,
-                                     dynamics::internal_state_in_motion(model, theta, thetadot)};
-    if (dynamics::simulate(model, grid, now, states, tangents, &sensitivities)) {
-      out.theta = states.theta.back();
-      out.thetadot = states.thetadot.back();
-      out.theta_by_state = MatrixX::Zero(n, 3 * n);
-      out.thetadot_by_state = MatrixX::Zero(n, 3 * n);
-      out.theta_by_state.leftCols(unknowns.size()) = sensitivities.theta.back();
-      out.thetadot_by_state.leftCols(unknowns.size()) = sensitivities.thetadot.back();
-      return out;
-    }
-  }
-  // at constant rate, without dynamics or where their integration failed
-  out.theta = belief.mean.head(n) + h * belief.mean.segment(n, n);
-  out.thetadot = belief.mean.segment(n, n);
-  out.theta_by_state = MatrixX::Zero(n, 3 * n);
-  out.theta_by_state.leftCols(n).setIdentity();
-  out.theta_by_state.middleCols(n, n) = h * MatrixX::Identity(n, n);
-  out.thetadot_by_state = MatrixX::Zero(n, 3 * n);
-  out.thetadot_by_state.middleCols(n, n).setIdentity();
-  return out;
-}
-
 }  // namespace
 
 std::pair<VectorX, VectorX> motion_from_rest(const Given& given, const dynamics::BaseFunction& base, double time) {
@@ -133,13 +87,53 @@ Belief first_belief(const State& state, double time) {
   return belief;
 }
 
-Belief predict(const State& state, const Belief& belief, double time, Contact contact) {
+Motion move(const State& state, const Belief& belief, double time) {
   const Given& given = state.given;
   const int n = given.model.chain.angles();
   const double h = time - belief.time;
+  Motion out;
+  out.time = time;
+  // by the dynamics and their sensitivities
+  if (given.identified) {
+    dynamics::Model model = given.model;
+    for (int k = 0; k < n; ++k) model.parameters.rest_angle[k] += belief.mean[2 * n + k];
+    std::vector<dynamics::Unknown> unknowns = dynamics::initial_state_unknowns(model.chain);
+    for (int k = 0; given.shifts && k < n; ++k) unknowns.push_back({dynamics::Quantity::rest_angle, k});
+    const std::vector<dynamics::Tangent> tangents = dynamics::tangents(model.chain, model.parameters, unknowns);
+    const dynamics::BaseGrid grid = dynamics::sample_base([&](double t) { return base_at(state, t); }, belief.time,
+                                                          {time}, model.parameters.substeps);
+    chain::States states;
+    dynamics::Sensitivities sensitivities;
+    const VectorX theta = belief.mean.head(n), thetadot = belief.mean.segment(n, n);
+    const dynamics::InitialState now{belief.time, theta, thetadot,
+                                     dynamics::internal_state_in_motion(model, theta, thetadot)};
+    if (dynamics::simulate(model, grid, now, states, tangents, &sensitivities)) {
+      out.theta = states.theta.back();
+      out.thetadot = states.thetadot.back();
+      out.theta_by_state = MatrixX::Zero(n, 3 * n);
+      out.thetadot_by_state = MatrixX::Zero(n, 3 * n);
+      out.theta_by_state.leftCols(unknowns.size()) = sensitivities.theta.back();
+      out.thetadot_by_state.leftCols(unknowns.size()) = sensitivities.thetadot.back();
+      return out;
+    }
+  }
+  // at constant rate, without dynamics or where their integration failed
+  out.theta = belief.mean.head(n) + h * belief.mean.segment(n, n);
+  out.thetadot = belief.mean.segment(n, n);
+  out.theta_by_state = MatrixX::Zero(n, 3 * n);
+  out.theta_by_state.leftCols(n).setIdentity();
+  out.theta_by_state.middleCols(n, n) = h * MatrixX::Identity(n, n);
+  out.thetadot_by_state = MatrixX::Zero(n, 3 * n);
+  out.thetadot_by_state.middleCols(n, n).setIdentity();
+  return out;
+}
+
+Belief predict(const State& state, const Belief& belief, const Motion& motion, Contact contact) {
+  const Given& given = state.given;
+  const int n = given.model.chain.angles();
+  const double time = motion.time, h = time - belief.time;
   const bool touched = contact != Contact::none;
   CHAINSPLAT_CHECK(h > 0.0, std::to_string(h));
-  const Motion motion = move(state, belief, time);
   const double keep = std::exp(-h / state.options.force_memory);
 
   const double keep_mask_shift = std::exp(-h / kMaskShiftMemory);
@@ -199,11 +193,12 @@ Belief predict(const State& state, const Belief& belief, double time, Contact co
   return out;
 }
 
-std::optional<VectorX> expected(const State& state, double time) {
+std::optional<VectorX> expected(State& state, double time) {
   if (!state.belief || state.lost) return std::nullopt;
   const int n = state.given.model.chain.angles();
   if (time <= state.belief->time) return state.belief->mean.head(n);
-  return move(state, *state.belief, time).theta;
+  if (!state.ahead || state.ahead->time != time) state.ahead = move(state, *state.belief, time);
+  return state.ahead->theta;
 }
 
 }  // namespace chainsplat::estimation

@@ -18,10 +18,13 @@ Belief first_belief(const State& state, double time);
 // a blow, when the rope runs into something or is released.
 enum class Contact { none, touched, struck };
 
-// Returns the belief at a later time, without a measurement.
-Belief predict(const State& state, const Belief& belief, double time, Contact contact);
+// Returns the mean of a belief at a later time, without a measurement. It is most of what a prediction costs, and does
+// not depend on what may have happened.
+Motion move(const State& state, const Belief& belief, double time);
+// Returns the belief at the time to which it was moved.
+Belief predict(const State& state, const Belief& belief, const Motion& motion, Contact contact);
 
-// As Filter::expected().
-std::optional<math::VectorX> expected(const State& state, double time);
+// As Filter::expected(). The motion is kept for the frame of that time.
+std::optional<math::VectorX> expected(State& state, double time);
 
 }  // namespace chainsplat::estimation

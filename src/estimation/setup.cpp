@@ -178,7 +178,10 @@ void learn_setup(State& state, std::span<const capture::View* const> views, cons
   if (!state.given.identified || !moving) leave_out(SetupEquations::kClock, 1);
   if (!bends_in_plane(chain)) leave_out(SetupEquations::kGrasp, 3);
 
-  if (setup.frames < kFrames) {
+  if (!state.options.learns_setup) {
+    frame.information.setZero();
+    frame.gradient.setZero();
+  } else if (setup.frames < kFrames) {
     ++setup.frames;
   } else if (moving) {
     setup.information -= (setup.information - setup.first_information) / kFrames;

@@ -25,6 +25,7 @@ bool identified_shifts(const dynamics::Parameters& parameters) {
 
 Options options_for_live_masks(bool tabletop) {
   Options options;
+  options.learns_setup = false;
   if (tabletop) return options;
   // with the usual shares a pushed rope in free space was lost
   options.new_share = 0.1;

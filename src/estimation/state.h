@@ -47,6 +47,13 @@ struct Belief {
   math::MatrixX covariance;
 };
 
+// The mean of a belief moved to a later time by the twin's dynamics, and its derivatives by the mean before, n x 3 n.
+struct Motion {
+  double time = 0.0;  // s
+  math::VectorX theta, thetadot;
+  math::MatrixX theta_by_state, thetadot_by_state;
+};
+
 // The filter between two frames.
 struct State {
   Given given;
@@ -55,6 +62,7 @@ struct State {
   std::vector<capture::Camera> cameras;  // as they are believed to be
   Setup setup;
   std::optional<Belief> belief;   // none before the first frame
+  std::optional<Motion> ahead;    // that belief's, where it was asked for before the frame came
   double contact_until = kNever;  // s, end of the time in which the motion is assumed to depart from the model
   math::VectorX place;            // shares of the links' ends in the unknown force, as learned in contact
   double last_seen = kNever;      // s, last frame in which the masks showed the rope

@@ -1,6 +1,8 @@
 // Masks of a stream: the same log odds, learned as the frames arrive.
 #include <algorithm>
+#include <array>
 #include <cmath>
+#include <future>
 #include <opencv2/core.hpp>
 #include <opencv2/imgproc.hpp>
 
@@ -12,8 +14,13 @@ namespace chainsplat::masking {
 
 namespace {
 
-constexpr double kForget = 0.02;          // share of the background forgotten per frame: some two seconds at 30 Hz
-constexpr int kLeastSeen = 8;             // number of frames before a background pixel is believed
+// Once it is known, a row of the background is learned in every fourth frame: it changes slowly, and learning it is
+// most of what the frames teach.
+constexpr int kRowsEvery = 4;
+constexpr double kForget = 0.08;          // share of it forgotten each time: some two seconds at 30 Hz
+constexpr int kMostSeen = 13;             // times that a pixel was seen; after so many only kForget counts
+constexpr int kLeastSeen = 8;             // before a background pixel is believed
+constexpr int kAllRows = 16;              // first frames that teach every row
 constexpr double kFirstNoise = 4.0;       // gray levels, assumed in the first frame
 constexpr double kGivenPixels = 3e4;      // weight of the colors that are given: the pixels of some ten frames
 constexpr double kLeastGiven = 0.1;       // share of that weight that is never forgotten
@@ -21,7 +28,8 @@ constexpr double kAboutPixels = 24.0;     // px around the tube whose colors cou
 constexpr double kDoubt = 2.0;            // for a prediction; with less, masks followed wrong ones of pushed ropes
 constexpr double kLeastEvidence = 0.1;    // nats per sample, below which nothing is a rope
 constexpr double kPredictedMargin = 0.7;  // px, by which the tube at a prediction may be off
-constexpr int kColorEvery = 5;            // frames between two updates of the colors
+constexpr int kColorEvery = 5;            // frames between two updates of the colors,
+constexpr int kColorFirst = 3;            // from this one on, not in those in which callers learn marks
 constexpr double kForgetColors = 0.1;     // share of the counted colors forgotten per update
 
 }  // namespace
@@ -36,13 +44,19 @@ struct LiveMasks::State {
   std::vector<float> mean, variance;   // of the background, per channel and per pixel
   std::vector<std::uint16_t> seen;     // number of frames in which the background was visible, per pixel
   std::vector<double> given;           // counts of the rope's colors that were given
-  std::vector<std::uint8_t> straight;  // work space: the frame without its lens distortion
+  std::vector<std::uint8_t> straight;  // the last frame without its lens distortion
   std::vector<std::int16_t> from;      // its source for cv::remap, per pixel: column and row of the recorded frame,
   std::vector<std::uint16_t> part;     // and the interpolation's index into OpenCV's table of weights
   int frames = 0;
+  // What the last frame teaches, beside what is done with its mask: the filter waits for the device, and the next frame
+  // for the camera. Declared last: it ends before what it works on.
+  std::future<void> learning;
 
   void map_straight();
   Picture straightened(const capture::Image8& recorded, const math::Rectangle& box);
+  void end_learning() {
+    if (learning.valid()) learning.get();
+  }
   void learn_first_frame(const Picture& picture, const math::Rectangle& box);
   std::optional<math::VectorX> grown_in(const Picture& picture, const math::Pose& base) const;
   void learn_background(const Picture& picture, const math::Rectangle& box, const Tube& around);
@@ -84,10 +98,13 @@ void LiveMasks::State::map_straight() {
   cv::convertMaps(wanted, cv::noArray(), whole, rest, CV_16SC2);
 }
 
-// The frame without its lens distortion, inside the box. It is seen as long as `recorded` and the work space are.
+// A copy of the frame without its lens distortion, inside the box. It is seen until the next one.
 Picture LiveMasks::State::straightened(const capture::Image8& recorded, const math::Rectangle& box) {
   const int width = camera.width, height = camera.height;
-  if (!camera.distorted()) return {recorded.pixels.data(), width, height, 3};
+  if (!camera.distorted()) {
+    straight = recorded.pixels;
+    return {straight.data(), width, height, 3};
+  }
   straight.resize(recorded.pixels.size());
   const cv::Rect rect(box.x0, box.y0, box.width(), box.height());
   const cv::Mat image(height, width, CV_8UC3, const_cast<std::uint8_t*>(recorded.pixels.data()));
@@ -117,25 +134,43 @@ std::optional<math::VectorX> LiveMasks::State::grown_in(const Picture& picture, 
 
 // Learns the background in the box where the tube is not.
 void LiveMasks::State::learn_background(const Picture& picture, const math::Rectangle& box, const Tube& around) {
+  static const std::array<float, kMostSeen + 1> share = [] {
+    std::array<float, kMostSeen + 1> of{};
+    for (int i = 1; i <= kMostSeen; ++i) of[i] = static_cast<float>(std::max(kForget, 1.0 / i));
+    return of;
+  }();
   Background& background = look.background;
-  for (int y = box.y0; y < box.y1; ++y)
-    for (int x = box.x0; x < box.x1; ++x) {
-      if (around.at(x, y) < around.radius) continue;
+  const auto learn = [&](int y, int x0, int x1) {
+    for (int x = x0; x < x1; ++x) {
       const std::size_t at = static_cast<std::size_t>(y) * picture.width + x;
-      if (seen[at] < UINT16_MAX) ++seen[at];
-      const float share = static_cast<float>(std::max(kForget, 1.0 / seen[at]));
+      if (seen[at] < kMostSeen) ++seen[at];
+      const float weight = share[seen[at]];
+      const std::uint8_t* const now = picture.pixels + 3 * at;
       float square = 0.0f;
       for (int c = 0; c < 3; ++c) {
         float& channel = mean[3 * at + c];
-        const float d = pixel(picture, x, y)[c] - channel;
-        channel += share * d;
+        const float d = now[c] - channel;
+        channel += weight * d;
         square += d * d / 3.0f;
         background.rgb[3 * at + c] = static_cast<std::uint8_t>(channel + 0.5f);
       }
       if (seen[at] == 1) square = static_cast<float>(kFirstNoise * kFirstNoise);
-      variance[at] += share * (square - variance[at]);
+      variance[at] += weight * (square - variance[at]);
       if (seen[at] >= kLeastSeen) background.noise[at] = noise_level(std::sqrt(variance[at]));
     }
+  };
+  const math::Rectangle tube = intersection(box, around.box);
+  for (int y = box.y0; y < box.y1; ++y) {
+    if (frames > kAllRows && (y + frames) % kRowsEvery != 0) continue;
+    if (tube.empty() || y < tube.y0 || y >= tube.y1) {
+      learn(y, box.x0, box.x1);
+      continue;
+    }
+    learn(y, box.x0, tube.x0);
+    for (int x = tube.x0; x < tube.x1; ++x)
+      if (!(around.at(x, y) < around.radius)) learn(y, x, x + 1);
+    learn(y, tube.x1, box.x1);
+  }
 }
 
 // Learns the colors on either side of the tube's outline.
@@ -157,12 +192,14 @@ LiveMasks::~LiveMasks() = default;
 
 void LiveMasks::learn_marks(const capture::View& drawn, const math::Pose& base, const math::VectorX& theta) {
   State& s = *state_;
+  s.end_learning();
   s.look.marks = marks(drawn, tube(s.chain, base, theta, s.pinhole, 0.0, s.chain.length, 0.0), s.chain);
 }
 
 capture::View LiveMasks::mask(const capture::Image8& recorded, const math::Pose& base,
                               const std::optional<math::VectorX>& theta) {
   State& s = *state_;
+  s.end_learning();
   const Reach where = reach(s.chain, base, s.pinhole);
   if (where.box.empty()) return {};
   const Picture picture = s.straightened(recorded, where.box);
@@ -171,9 +208,13 @@ capture::View LiveMasks::mask(const capture::Image8& recorded, const math::Pose&
   capture::View view = cut(s.look, picture, s.pinhole, s.chain, base, place, kDoubt);
   ++s.frames;
   if (!theta) return view;
-  const Tube around = tube(s.chain, base, *theta, s.pinhole, 0.0, s.chain.length, kAboutPixels);
-  s.learn_background(picture, where.box, around);
-  if (s.frames % kColorEvery == 1) s.learn_colors(picture, where, around, view);
+  const bool colors = s.frames % kColorEvery == kColorFirst;
+  s.learning = std::async(
+      std::launch::async, [&s, picture, where, base, angles = *theta, mask = colors ? view : capture::View{}, colors] {
+        const Tube around = tube(s.chain, base, angles, s.pinhole, 0.0, s.chain.length, kAboutPixels);
+        s.learn_background(picture, where.box, around);
+        if (colors) s.learn_colors(picture, where, around, mask);
+      });
   return view;
 }
 

@@ -17,8 +17,6 @@ constexpr double kUnheardOf = 0.003;  // prior share of either side's colors tha
 // log odds, the most that a color counts for and against the rope: colors that the rope never shows outweigh the place
 constexpr double kSurest = 3.0, kSurestNot = 9.0;
 // the difference from the background
-constexpr double kLeastNoise = 1.5;  // gray levels
-constexpr double kMostNoise = 25.0;
 constexpr double kTexture = 0.04;  // share of its brightness by which a background pixel may differ after lossy coding
 // the share of light that a shadow leaves, and the excess that automatic exposure adds
 constexpr double kDarkest = 0.25, kBrightest = 1.08;
@@ -267,10 +265,6 @@ capture::Image8 difference(const capture::Image8& empty, const Picture& now) {
       out.pixels[3 * i + c] = static_cast<std::uint8_t>(
           std::min(255, kMagnified * std::abs(now.pixels[now.channels * i + c] - background.rgb[3 * i + c])));
   return out;
-}
-
-std::uint8_t noise_level(double deviation) {
-  return static_cast<std::uint8_t>(std::clamp(deviation, kLeastNoise, kMostNoise) + 0.5);
 }
 
 double difference_odds(const Background& background, const Picture& picture, int x, int y) {

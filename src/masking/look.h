@@ -1,5 +1,7 @@
 // The colors, marks and background of one camera: learned from frames, evaluated per pixel.
 #pragma once
+#include <algorithm>
+#include <cstdint>
 #include <span>
 
 #include "chainsplat/capture.h"
@@ -92,7 +94,10 @@ Background empty_scene(const capture::Image8& empty, const Picture& now);
 capture::Image8 difference(const capture::Image8& empty, const Picture& now);
 
 // Returns a standard deviation in gray levels as Background stores it.
-std::uint8_t noise_level(double deviation);
+inline std::uint8_t noise_level(double deviation) {
+  constexpr double kLeast = 1.5, kMost = 25.0;  // gray levels
+  return static_cast<std::uint8_t>(std::clamp(deviation, kLeast, kMost) + 0.5);
+}
 
 // Returns a pixel's log odds for the rope from its difference from the background; 0 where the background is unknown.
 double difference_odds(const Background& background, const Picture& picture, int x, int y);

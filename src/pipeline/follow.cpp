@@ -44,7 +44,7 @@ capture::View drawn_view(splat::Engine& engine, const twin::Twin& twin, const ca
   if (crop[2] > 0 && crop[3] > 0) view.x0 = crop[0], view.y0 = crop[1], view.width = crop[2], view.height = crop[3];
   const splat::ViewSpec spec{&camera,    view.x0,     view.y0,
                              view.width, view.height, chain::link_motions(twin.chain, theta, base)};
-  const splat::Picture drawn = std::move(engine.draw(twin.gaussians, {&spec, 1}, false).front());
+  const splat::Picture drawn = std::move(engine.draw_set({&spec, 1}).front());
   for (const float value : drawn.rgba)
     view.rgba.push_back(static_cast<std::uint8_t>(std::lround(255.0f * std::clamp(value, 0.0f, 1.0f))));
   return view;
@@ -105,6 +105,7 @@ struct Tracker::Implementation {
   std::optional<bool> masked_before;                       // by the first picture
   std::optional<masking::LiveMasks> live;                  // masks made here
   std::array<int, 4> masked = {0, 0, 0, 0};                // crop of the last mask: x0, y0, width, height
+  int marked = -1;                                         // frames that were masked when marks were learned last
   double last = -std::numeric_limits<double>::infinity();  // s, of the last frame
 
   void open_engine();
@@ -112,6 +113,7 @@ struct Tracker::Implementation {
   estimation::CompareColors color_comparison();
   estimation::LinkGradient link_gradient();
   void look_at_first_picture(const capture::Image8& picture);
+  void learn_marks(const math::Pose& pose, const math::VectorX& theta);
 
   // What both kinds of followers tell.
   std::optional<math::VectorX> expected(double time) const {
@@ -201,6 +203,14 @@ void Tracker::Implementation::look_at_first_picture(const capture::Image8& pictu
     live.emplace(cameras()[0], twin.chain, colors);
 }
 
+// Every tenth frame: the rope shows nearly the same side.
+void Tracker::Implementation::learn_marks(const math::Pose& pose, const math::VectorX& theta) {
+  constexpr int kMarksEvery = 10;  // frames
+  if (!engine || !live || live->frames() % kMarksEvery != 0 || marked == live->frames()) return;
+  live->learn_marks(drawn_view(*engine, twin, cameras()[0], pose, theta, masked), pose, theta);
+  marked = live->frames();
+}
+
 Tracker::Tracker(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
                  double start, const TrackerOptions& options, const std::vector<char>& unverified)
     : implementation_(std::make_unique<Implementation>(twin, cameras, unverified, std::move(base), start, options)) {}
@@ -234,14 +244,16 @@ capture::View Tracker::mask(const capture::Image8& picture, double time) {
   if (!t.live) return marked(bright_view(picture, camera));
   const math::Pose pose = t.base(time).pose;
   const std::optional<math::VectorX> theta = t.expected(time);
-  constexpr int kMarksEvery = 10;  // frames; the rope shows nearly the same side
-  if (t.engine && t.live->frames() % kMarksEvery == 0) {
-    const math::VectorX near = theta.value_or(t.rest());  // marks stay on the rope wherever it lies
-    t.live->learn_marks(drawn_view(*t.engine, t.twin, camera, pose, near, t.masked), pose, near);
-  }
+  t.learn_marks(pose, theta.value_or(t.rest()));  // marks stay on the rope wherever it lies
   capture::View view = t.live->mask(picture, pose, theta);
   t.masked = {view.x0, view.y0, view.width, view.height};
   return marked(std::move(view));
+}
+
+void Tracker::between_frames() {
+  Implementation& t = *implementation_;
+  if (const std::optional<math::VectorX> theta = t.live ? t.expected(t.last) : std::nullopt)
+    t.learn_marks(t.base(t.last).pose, *theta);
 }
 
 const twin::Twin& Tracker::twin() const { return implementation_->twin; }
@@ -346,6 +358,7 @@ void Follower::follow(const std::function<void(const Followed&)>& each) {
     if (f.options.base.empty() && f.source.base)
       estimate.base = estimation::base_correction(f.options.source.corrections) * estimate.base;
     each({frame, views, estimate, core::seconds_now() - frame.arrived});
+    f.tracker->between_frames();
   }
 }
 

@@ -266,6 +266,12 @@ std::vector<ColorSums> Engine::color_sums(const chain::Chain& chain, std::span<c
   return out;
 }
 
+std::vector<Picture> Engine::draw_set(std::span<const ViewSpec> views, bool depth) {
+  State& s = *state_;
+  s.load_views(s.training, views, {}, {}, Active::everywhere);
+  return s.draw(s.training, everything(views.size()), depth);
+}
+
 Engine::Snapshot Engine::snapshot() const {
   const Scene& scene = state_->training;
   return {gaussians(), state_->trained(scene.first_moment), state_->trained(scene.second_moment), scene.step};
