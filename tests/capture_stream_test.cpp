@@ -88,7 +88,8 @@ TEST_CASE("Y4M has the colors that libav makes of it") {
         Case{" C420paldv", 2, 2, false, 3.0}, Case{" C422", 2, 1, false, 3.0}, Case{" C444", 1, 1, false, 1.0},
         Case{" Cmono", 1, 1, true, 0.0}})
     for (const std::string range : {"", " XCOLORRANGE=LIMITED", " XCOLORRANGE=FULL"})
-      for (const auto& [width, height] : {std::pair{32, 16}, std::pair{36, 10}}) {
+      for (const std::pair<int, int>& size : {std::pair{32, 16}, std::pair{36, 10}}) {
+        const int width = size.first, height = size.second;
         INFO("'", c.samples, range, "' ", width, "x", height);
         const std::string header =
             "W" + std::to_string(width) + " H" + std::to_string(height) + " F30000:1001 Ip A1:1" + c.samples + range;

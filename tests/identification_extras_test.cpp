@@ -142,9 +142,6 @@ TEST_CASE("how far a payload reaches is used where it is given, and doubted wher
   const auto [reach, reach_error] = found(free, "log_tip_length");
   options.tip_length = 0.0;
   const auto [wrong, deceived] = off(identify(s.chain, s.base, s.markers, options));
-  MESSAGE("log stiffness off by " << right << " +- " << sure << " (given), " << about << " +- " << unsure
-                                  << " (not given), " << wrong << " +- " << deceived << " (taken for a point); length "
-                                  << std::exp(reach) << ", log +- " << reach_error);
   CHECK(std::abs(right) < 3.0 * sure);
   CHECK(std::abs(about) < 3.0 * unsure);
   CHECK(std::abs(reach - std::log(kReach)) < 3.0 * reach_error);
