@@ -596,7 +596,8 @@ TEST_CASE("a line that no force can have is refused with its place and field") {
     }
   };
   CHECK_NOTHROW(force::from_json(sound.dump(), "line", two_links(), 0.0));
-  for (const auto& [field, value] : sound.items()) {
+  for (const auto& item : sound.items()) {
+    const std::string& field = item.key();
     CAPTURE(field);
     refused(field, std::nullopt, "is missing");
     refused(field, Json(), "is no");  // what is not finite is written as null
