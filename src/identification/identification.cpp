@@ -7,6 +7,7 @@
 #include <memory>
 
 #include "chainsplat/dynamics/rod.h"
+#include "coarse.h"
 #include "src/math/decompositions.h"
 #include "unknowns.h"
 
@@ -26,6 +27,7 @@ constexpr double kHuber = 1.75;      // times the usual root mean square of a gr
 constexpr double kLeastUsual = 0.1;  // of the standard deviation expected: a closer fit does not make outliers
 constexpr double kMedianRms = 0.9;   // median of the root mean square of a few unit normals
 constexpr int kLag = 10;             // frames over which residuals are taken to be correlated (mathematics.md 5)
+constexpr std::size_t kLeastTimes = 3;
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 constexpr double kUnknown = std::numeric_limits<double>::quiet_NaN();
 
@@ -55,12 +57,30 @@ struct Problem {
   int shared = 0;
   VectorX mean;
   MatrixX precision;
+  // Of a chain of many joints: what a fit may change the unknowns of a part by, unknowns x modes, the first ones the
+  // shared unknowns alone and the others its initial state; empty: everything.
+  MatrixX modes = {};
+  int shared_modes = 0;
 
   int own() const { return parts[0].unknowns.size() - shared; }
   // where the unknowns of a recording are among all: `shared` and then its own
   VectorX of_part(const VectorX& p, std::size_t part) const {
     VectorX out(shared + own());
     out << p.head(shared), p.segment(shared + part * own(), own());
+    return out;
+  }
+  auto modes_of_shared() const { return modes.topLeftCorner(shared, shared_modes); }
+  auto modes_of_own() const { return modes.bottomRightCorner(own(), modes.cols() - shared_modes); }
+  Eigen::Index coordinates() const {
+    return shared_modes + static_cast<Eigen::Index>(parts.size()) * (modes.cols() - shared_modes);
+  }
+  // p with all modes moved by x.
+  VectorX moved(const VectorX& p, const VectorX& x) const {
+    VectorX out = p;
+    out.head(shared) += modes_of_shared() * x.head(shared_modes);
+    const Eigen::Index each = modes.cols() - shared_modes;
+    for (Eigen::Index i = 0; i < static_cast<Eigen::Index>(parts.size()); ++i)
+      out.segment(shared + i * own(), own()) += modes_of_own() * x.segment(shared_modes + i * each, each);
     return out;
   }
 };
@@ -119,12 +139,14 @@ bool simulate_in_groups(const dynamics::Model& model, const BaseGrid& grid, cons
   return true;
 }
 
+// `modes`: the directions of the derivatives; empty: every unknown.
 bool simulate(const Part& part, const BaseGrid& grid, const VectorX& p, chain::States& states,
-              dynamics::Sensitivities* sensitivities = nullptr) {
+              dynamics::Sensitivities* sensitivities, const MatrixX& modes) {
   const State state = apply(part.chain, part.unknowns, p);
   const dynamics::Model model = dynamics::make_model(part.chain, state.parameters);
   if (!sensitivities) return dynamics::simulate(model, grid, state.initial, states);
-  const auto unknowns = tangents(part.chain, part.unknowns, p);
+  auto unknowns = tangents(part.chain, part.unknowns, p);
+  if (modes.size() > 0) unknowns = along(unknowns, modes);
   if (model.parameters.integrator == dynamics::Integrator::rodas3)
     return simulate_in_groups(model, grid, state.initial, unknowns, states, *sensitivities);
   // the Euler step has no variational equation: differences of rollouts
@@ -218,7 +240,7 @@ void weighted_rows(const Part& part, const chain::States& states, const dynamics
 solve::NormalEquations normal_equations(const Part& part, const chain::States& states,
                                         const dynamics::Sensitivities& slopes, const std::vector<MatrixX>& values,
                                         double limit) {
-  const Eigen::Index size = part.unknowns.size();
+  const Eigen::Index size = slopes.theta[0].cols();
   const std::size_t frames = values.size();
   // blocks of frames, summed in fixed order: the result does not depend on the number of threads
   constexpr std::size_t kBlock = 10, kAtOnce = 32;  // frames; blocks whose sums are held
@@ -289,7 +311,8 @@ struct Rollouts {
     std::vector<char> good(grids.size());
     core::parallel_for(static_cast<std::int64_t>(grids.size()), [&](std::int64_t i) {
       const Part& part = problem.parts[i];
-      good[i] = simulate(part, grids[i], problem.of_part(p, i), states[i], with_slopes ? &slopes[i] : nullptr);
+      good[i] =
+          simulate(part, grids[i], problem.of_part(p, i), states[i], with_slopes ? &slopes[i] : nullptr, problem.modes);
       if (good[i]) residuals(part, states[i], values[i]);
     });
     return std::all_of(good.begin(), good.end(), [](char g) { return g != 0; });
@@ -315,7 +338,9 @@ void add_part(const Problem& problem, std::size_t index, const MatrixX& part, Ma
 
 // Of all recordings, without the prior: an initial state is a local block.
 solve::ArrowEquations normal_equations(const Problem& problem, const Rollouts& rollouts, double limit) {
-  const int shared = problem.shared, own = problem.own();
+  const bool modes = problem.modes.size() > 0;
+  const Eigen::Index shared = modes ? problem.shared_modes : problem.shared;
+  const Eigen::Index own = modes ? problem.modes.cols() - shared : problem.own();
   solve::ArrowEquations out{MatrixX::Zero(shared, shared), VectorX::Zero(shared), {}};
   for (std::size_t i = 0; i < problem.parts.size(); ++i) {
     const solve::NormalEquations part =
@@ -333,12 +358,22 @@ solve::ArrowEquations normal_equations(const Problem& problem, const Rollouts& r
 void add_prior(const Problem& problem, const VectorX& p, solve::ArrowEquations& equations) {
   const Eigen::Index shared = problem.shared, own = problem.own();
   const VectorX pull = problem.precision * (p - problem.mean);
-  equations.shared += problem.precision.topLeftCorner(shared, shared);
-  equations.gradient += pull.head(shared);
+  const bool modes = problem.modes.size() > 0;
+  // about the modes: B^T Lambda B and B^T Lambda (p - mean)
+  const auto add = [&](Eigen::Index at, Eigen::Index size, const auto& basis, MatrixX& matrix, VectorX& gradient) {
+    const auto precision = problem.precision.block(at, at, size, size);
+    if (modes) {
+      matrix += basis.transpose() * (precision * basis).eval();
+      gradient += basis.transpose() * pull.segment(at, size);
+    } else {
+      matrix += precision;
+      gradient += pull.segment(at, size);
+    }
+  };
+  add(0, shared, problem.modes_of_shared(), equations.shared, equations.gradient);
   Eigen::Index at = shared;
   for (solve::ArrowEquations::Local& local : equations.local) {
-    local.matrix += problem.precision.block(at, at, own, own);
-    local.gradient += pull.segment(at, own);
+    add(at, own, problem.modes_of_own(), local.matrix, local.gradient);
     at += own;
   }
 }
@@ -353,8 +388,10 @@ struct Fit {
 // Levenberg-Marquardt over the first `horizon` seconds of every recording.
 void improve(const Problem& problem, double horizon, bool fine, int iterations, Fit& fit) {
   Rollouts rollouts(problem, horizon, fine);
+  const bool with_modes = problem.modes.size() > 0;
   bool first = true;
-  const auto evaluate = [&](const VectorX& p, solve::ArrowEquations* equations) {
+  const auto evaluate = [&](const VectorX& x, solve::ArrowEquations* equations) {
+    const VectorX p = with_modes ? problem.moved(fit.p, x) : x;
     if (!rollouts.run(problem, p, equations != nullptr)) return kInfinity;
     if (first) fit.limit = kHuber * std::max(median_rms(rollouts.values) / kMedianRms, kLeastUsual);
     first = false;
@@ -367,13 +404,15 @@ void improve(const Problem& problem, double horizon, bool fine, int iterations, 
   solve::Options options;
   options.steps = iterations;
   options.attempts = 6;
-  // on the way to the whole recording a start is enough
-  options.cost_tolerance = fine ? 1e-6 : 1e-4;
+  // on the way to the whole recording a start is enough, and steps of many joints are not worth a tenth of an error
+  options.cost_tolerance = fine && !with_modes ? 1e-6 : 1e-4;
   options.longest = 1.0;  // of a log or an angle or rad/s: beyond, the linearization is worthless
   options.cancellable = true;
   options.damping.least_raised = 1e-4;
   options.damping.least = 1e-9;
-  fit.summary = solve::least_squares(fit.p, evaluate, options);
+  VectorX x = with_modes ? VectorX::Zero(problem.coordinates()) : fit.p;
+  fit.summary = solve::least_squares(x, evaluate, options);
+  fit.p = with_modes ? problem.moved(fit.p, x) : x;
   if (fit.summary.reason == solve::Reason::cancelled) throw Interrupted(core::stop_requested());
   fit.cost = fit.summary.final_cost;
 }
@@ -410,7 +449,7 @@ Part make_part(const chain::Chain& chain, const trajectory::Trajectory& base, co
                const Options& options, const Markers* markers = nullptr) {
   const std::vector<MatrixX>& covariances = recognized.covariance;
   const std::size_t frames = recognized.time.size();
-  if (frames < 3 || recognized.theta.size() != frames)
+  if (frames < kLeastTimes || recognized.theta.size() != frames)
     throw InputError("identify", std::to_string(frames) + " recognized states", "give at least 3 with their times");
   for (const VectorX& theta : recognized.theta)
     if (theta.size() != chain.angles() || !theta.allFinite())
@@ -768,49 +807,62 @@ struct Candidate {
   double lack = kInfinity;  // of evidence
 };
 
-// Fits, and fits again about the rod that was found, until that no longer changes. `about` makes the problem about a
-// rod; `direction`: of the first link at rest.
-Candidate fit_about_rod(const Extras& extras, const std::function<Problem(const Rod&)>& about, const Vector3& direction,
-                        const Options& options) {
+// What a fit begins with; none: the usual starts.
+using StartOf = std::function<VectorX(const Problem&)>;
+
+// Fits, and fits again about the rod that was found, until that no longer changes.
+Candidate fit_about_rod(const chain::Chain& chain, const std::vector<Part>& parts, const Options& options,
+                        const Extras& extras, const StartOf& start = {}) {
   constexpr int kMost = 5;
   constexpr double kSame = 0.005;  // of log EI, whose standard errors are 0.05 and more
+  Vector3 direction = Vector3::Zero();
+  for (const Part& part : parts) direction += part.direction;
+  const auto about = [&](const Rod& rod) {
+    std::vector<Part> own = parts;
+    for (Part& part : own) part.unknowns = make_unknowns(chain, options, part.start, extras, rod);
+    return make_problem(chain, std::move(own));
+  };
   Candidate now{extras, about({}), {}};
   const auto rod_at = [&](const VectorX& p) {
     return rod_of(now.problem.chain, now.problem.parts[0].unknowns, now.problem.of_part(p, 0), direction);
   };
-  Rod rod = rod_at(now.problem.mean);
+  Rod rod = rod_at(start ? start(now.problem) : now.problem.mean);
   now.problem.parts = about(rod).parts;
-  now.fit = fit_centerline(now.problem, options);
+  if (start) {
+    now.problem.modes = smooth_modes(chain, now.problem.parts[0].unknowns);
+    const auto own = now.problem.modes.bottomRows(now.problem.own()).cwiseAbs().colwise().sum();
+    now.problem.shared_modes = static_cast<int>((own.array() == 0.0).count());
+    now.fit.p = start(now.problem);
+    for (int i = 0; i < 2; ++i)  // again with the threshold of the better fit
+      improve(now.problem, kInfinity, true, options.max_iterations, now.fit);
+  } else {
+    now.fit = fit_centerline(now.problem, options);
+  }
   for (int i = 0; i < kMost && now.fit.cost < kInfinity; ++i) {
     const Rod found = rod_at(now.fit.p);
     const bool slack = !(found.bending_stiffness > 0.0) || !(found.tension > 0.0);
     if (slack || std::abs(std::log(found.bending_stiffness / rod.bending_stiffness)) < kSame) break;
-    const Candidate before = now;
+    Candidate before = now;
     now.problem.parts = about(found).parts;
     improve(now.problem, kInfinity, true, options.max_iterations, now.fit);
-    if (now.fit.cost == kInfinity) return before;
+    if (now.fit.cost == kInfinity) {
+      before.problem.modes = {};
+      return before;
+    }
     rod = found;
   }
+  now.problem.modes = {};
   return now;
 }
 
 // The model of every rope, or one with friction in bending or a payload where the data ask for it.
-Candidate fit_candidates(const chain::Chain& chain, std::vector<Part> parts, const Options& options) {
+Candidate fit_candidates(const chain::Chain& chain, const std::vector<Part>& parts, const Options& options) {
   // Misfit that needs no further explanation. What is expected of markers is generous; of recognized angles it is a
   // millimeter, within which errors of calibration look like physics.
   const double within_errors = parts.front().has_markers ? 0.3 : 1.0;
   constexpr double kEvidence = 5.0;  // in favor of what a rope need not have, natural logarithm
-  Vector3 direction = Vector3::Zero();
-  for (const Part& part : parts) direction += part.direction;
   std::vector<Candidate> tried;
-  const auto attempt = [&](const Extras& extras) {
-    const auto about = [&](const Rod& rod) {
-      std::vector<Part> own = parts;
-      for (Part& part : own) part.unknowns = make_unknowns(chain, options, part.start, extras, rod);
-      return make_problem(chain, std::move(own));
-    };
-    tried.push_back(fit_about_rod(extras, about, direction, options));
-  };
+  const auto attempt = [&](const Extras& extras) { tried.push_back(fit_about_rod(chain, parts, options, extras)); };
   attempt({});
   const auto within = [&](const Candidate& one) {
     Rollouts rollouts(one.problem, kInfinity, true);
@@ -835,13 +887,37 @@ Candidate fit_candidates(const chain::Chain& chain, std::vector<Part> parts, con
   return std::move(tried[best]);
 }
 
-std::vector<Result> fit_parts(const chain::Chain& chain, std::vector<Part> parts, const Options& options) {
+// The chain's own fit. `rough`: the same recordings for a chain of few joints, whose parameters it begins with; or
+// none.
+Candidate fit_chain(const chain::Chain& chain, const std::vector<Part>& parts, const std::vector<Part>& rough,
+                    const Options& options) {
+  if (rough.empty()) return fit_candidates(chain, parts, options);
+  const chain::Chain& few = rough.front().chain;
+  const Candidate found = fit_candidates(few, rough, options);
+  if (found.fit.cost < kInfinity) {
+    core::say_more("identify: from the parameters of " + std::to_string(few.links() - 1) + " joints");
+    const auto start = [&](const Problem& problem) {
+      VectorX p = problem.mean;
+      const Unknowns& u = problem.parts[0].unknowns;
+      p.head(problem.shared) =
+          start_from(few, found.problem.parts[0].unknowns, found.problem.of_part(found.fit.p, 0), chain, u)
+              .head(problem.shared);
+      return p;
+    };
+    Candidate fine = fit_about_rod(chain, parts, options, found.extras, start);
+    if (fine.fit.cost < kInfinity) return fine;
+  }
+  return fit_candidates(chain, parts, options);
+}
+
+std::vector<Result> fit_parts(const chain::Chain& chain, std::vector<Part> parts, const std::vector<Part>& rough,
+                              const Options& options) {
   const auto paper = [&] {
     Candidate only{{}, make_problem(chain, std::move(parts)), {}};
     only.fit = fit_angles(only.problem, options);
     return only;
   };
-  const Candidate chosen = options.paper ? paper() : fit_candidates(chain, std::move(parts), options);
+  const Candidate chosen = options.paper ? paper() : fit_chain(chain, parts, rough, options);
   if (chosen.extras.friction) core::say_more("identify: the motion asks for friction in bending");
   if (chosen.extras.payload) core::say_more("identify: the motion asks for a payload at the free end");
   const Problem& problem = chosen.problem;
@@ -910,17 +986,28 @@ dynamics::InitialState fit_initial(const chain::Chain& chain, const dynamics::Pa
 }
 
 std::vector<Result> identify(const chain::Chain& chain, std::span<const Recording> recordings, const Options& options) {
-  std::vector<Part> parts;
-  for (const Recording& r : recordings) parts.push_back(make_part(chain, r.base, r.recognized, options));
-  return fit_parts(chain, std::move(parts), options);
+  const std::optional<chain::Chain> few = with_few_joints(chain, options);
+  std::vector<Part> parts, rough;
+  for (const Recording& r : recordings) {
+    parts.push_back(make_part(chain, r.base, r.recognized, options));
+    if (!few) continue;
+    const Markers markers = centerline_markers(chain, r.base, r.recognized, *few, options.model_error);
+    if (markers.time.size() >= kLeastTimes)
+      rough.push_back(make_part(*few, r.base, fit_markers(*few, r.base, markers).states, options, &markers));
+  }
+  if (rough.size() < parts.size()) rough.clear();
+  return fit_parts(chain, std::move(parts), rough, options);
 }
 
 std::vector<Result> identify(const chain::Chain& chain, std::span<const MarkerRecording> recordings,
                              const Options& options) {
-  std::vector<Part> parts;
-  for (const MarkerRecording& r : recordings)
+  const std::optional<chain::Chain> few = with_few_joints(chain, options);
+  std::vector<Part> parts, rough;
+  for (const MarkerRecording& r : recordings) {
     parts.push_back(make_part(chain, r.base, fit_markers(chain, r.base, r.markers).states, options, &r.markers));
-  return fit_parts(chain, std::move(parts), options);
+    if (few) rough.push_back(make_part(*few, r.base, fit_markers(*few, r.base, r.markers).states, options, &r.markers));
+  }
+  return fit_parts(chain, std::move(parts), rough, options);
 }
 
 Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, const chain::States& recognized,

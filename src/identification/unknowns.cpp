@@ -97,11 +97,6 @@ struct Draft {
   }
 };
 
-// m, of rope that a joint stands for in the mean
-double mean_bent_length(const chain::Chain& chain) {
-  return (chain.length - chain.joint_arclength[0]) / (chain.links() - 1);
-}
-
 Draft begin(const chain::Chain& chain, const Options& options, const Start& start) {
   Draft d{chain, options};
   d.u.total_mass = options.mass.value_or(1.0);
@@ -275,6 +270,10 @@ Unknowns finish(Draft d) {
 }
 
 }  // namespace
+
+double mean_bent_length(const chain::Chain& chain) {
+  return (chain.length - chain.joint_arclength[0]) / (chain.links() - 1);
+}
 
 Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const Start& start, const Extras& extras,
                        const Rod& rod) {

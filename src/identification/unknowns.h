@@ -53,6 +53,9 @@ struct Start {
 Unknowns make_unknowns(const chain::Chain& chain, const Options& options, const Start& start, const Extras& extras = {},
                        const Rod& rod = {});
 
+// m, of rope that a joint stands for in the mean: the unknowns `stiffness` and `damping` are of such a joint.
+double mean_bent_length(const chain::Chain& chain);
+
 // The rod that a fit found. `direction`: of the first link at rest, world axes.
 Rod rod_of(const chain::Chain& chain, const Unknowns& unknowns, const VectorX& p, const math::Vector3& direction);
 
