@@ -156,6 +156,10 @@ TEST_CASE("train by a call, stopped by the listener and gone on with, then evalu
   resume.every = 2;
   CHECK_THROWS_WITH_AS(pipeline::train(kDemo, stopped, resume), doctest::Contains("`every` 5, not 2"), InputError);
   resume.every = small().every;
+  // once more amid the last steps, beside Gaussians whose colors are guessed
+  stop = false;
+  impatient.progress = [&](const core::Progress& p) { stop = p.note == "settle"; };
+  CHECK_THROWS_AS(pipeline::train(kDemo, stopped, resume, impatient), Interrupted);
   pipeline::train(kDemo, stopped, resume);
   CHECK(files_of(stopped) == files_of(whole));
 

@@ -232,3 +232,26 @@ TEST_CASE("nothing is guessed of a rope that was seen from all around") {
   CHECK(rope.gaussians.mean == before.mean);
   CHECK(rope.gaussians.sh == before.sh);
 }
+
+TEST_CASE("more training leaves what was guessed, and the colors of what was seen at a slant") {
+  Rope rope(kSlope);
+  const int count = recognition::finish_unseen(rope.chain, rope.views, rope.gaussians);
+  const splat::Gaussians& before = rope.gaussians;
+  REQUIRE(count > 0);
+  CHECK(std::count(before.guessed.begin(), before.guessed.end(), recognition::kGuessed) == count);
+  CHECK(std::count(before.guessed.begin(), before.guessed.end(), recognition::kSlanted) > 50);
+  splat::Gaussians trained = before;
+  for (float& value : trained.mean) value += 1e-3f;
+  for (float& value : trained.sh) value += 0.1f;
+  std::fill(trained.guessed.begin(), trained.guessed.end(), 0);  // as the device gives them back
+  recognition::keep_guessed(before, trained);
+  const int size = 3 * before.sh_coefficients();
+  for (int i = 0; i < before.count; ++i) {
+    const bool guessed = before.guessed[i] == recognition::kGuessed,
+               slanted = before.guessed[i] == recognition::kSlanted;
+    CHECK((trained.guessed[i] == 1) == guessed);
+    CHECK((trained.guessed[i] == 0) == !guessed);
+    CHECK((trained.mean[3 * i] == before.mean[3 * i]) == guessed);
+    CHECK((trained.sh[size * i] == before.sh[size * i]) == (guessed || slanted));
+  }
+}

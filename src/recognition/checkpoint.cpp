@@ -11,7 +11,7 @@ namespace chainsplat::recognition {
 
 namespace {
 
-constexpr char kMagic[] = "chainsplat-checkpoint/5\n";
+constexpr char kMagic[] = "chainsplat-checkpoint/6\n";
 constexpr char kFile[] = "recognize.bin";
 constexpr char kFileBefore[] = "recognize.before.bin";
 constexpr const char* kFiles[] = {kFile, kFileBefore};  // the newest first
@@ -68,6 +68,7 @@ void put_gaussians(Writer& w, const splat::Gaussians& g) {
   w.put(g.degree);
   for (const auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
     w.put_all(*part);
+  w.put_all(g.guessed);
 }
 
 splat::Gaussians get_gaussians(Reader& r) {
@@ -77,6 +78,7 @@ splat::Gaussians get_gaussians(Reader& r) {
   g.degree = r.get<int>();
   for (auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
     *part = r.get_all<float>();
+  g.guessed = r.get_all<std::uint8_t>();
   constexpr int kHighestDegree = 3;
   const auto holds = [&](const std::vector<float>& part, std::size_t a_gaussian) {
     return part.size() == a_gaussian * static_cast<std::size_t>(g.count);
@@ -84,7 +86,7 @@ splat::Gaussians get_gaussians(Reader& r) {
   if (g.count < 0 || g.links < 0 || g.degree < 0 || g.degree > kHighestDegree || !holds(g.mean, 3) ||
       !holds(g.rotation, 4) || !holds(g.log_scale, 3) || !holds(g.opacity_logit, 1) ||
       !holds(g.sh, 3 * static_cast<std::size_t>(g.sh_coefficients())) ||
-      !holds(g.link_logits, static_cast<std::size_t>(g.links)))
+      !holds(g.link_logits, static_cast<std::size_t>(g.links)) || g.guessed.size() != static_cast<std::size_t>(g.count))
     throw std::out_of_range("checkpoint");
   return g;
 }

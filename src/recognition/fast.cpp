@@ -13,17 +13,20 @@ namespace chainsplat::recognition {
 
 namespace {
 
-// The schedule: rounds of Adam on the Gaussians, additions where the images ask, and Gauss-Newton on the angles.
+// The schedule: rounds of Adam on the Gaussians, each followed by additions where the images ask and by Gauss-Newton on
+// the angles; then a polish; then a last round, in which what was seen settles beside what was guessed and cut.
 constexpr int kRounds = 4;
-constexpr int kSteps = 100;  // Adam steps a round
+constexpr int kPolish = kRounds, kSettle = kRounds + 1, kDone = kRounds + 2;  // as rounds
+constexpr int kSteps = 100;                                                   // Adam steps a round
+constexpr int kPolishSteps = 120;
+constexpr int kSettleSteps = 100;
 constexpr double kGaussiansADiameter =
     100.0;  // of the rope's length, when no budget is given: more gain little (design.md, 'Recognition')
 constexpr double kFirstShare = 0.8;        // of the budget, placed at the start; the rest goes where the images ask
 constexpr int kAngleIterations = 1;        // Gauss-Newton steps a round and frame
 constexpr int kFinalIterations = 1;        // for every frame, at the end
-constexpr int kFinalSteps = 160;           // Adam steps after the last round, rates falling
 constexpr double kPastJoint = 0.1;         // diameters that Gaussians may reach past their joints before a round
-constexpr double kPastJointAtLast = 0.25;  // and at last: no step follows that would close the gaps
+constexpr double kPastJointAtLast = 0.25;  // and at last: few steps follow that would close the gaps
 constexpr int kMostRestarts = 3;           // of a round that runs away, each with smaller steps
 constexpr int kShRound = 1;  // from this round on colors depend on the view (SH degree 1): +0.7 dB in the object
 
@@ -44,7 +47,11 @@ splat::AdamRates rates(double fraction, double scale) {
 
 namespace {
 
-constexpr int kTotalSteps = kRounds * kSteps + kFinalSteps;
+constexpr int kTotalSteps = kRounds * kSteps + kPolishSteps + kSettleSteps;
+constexpr int steps_of(int round) { return round < kRounds ? kSteps : round == kPolish ? kPolishSteps : kSettleSteps; }
+constexpr int steps_before(int round) {
+  return std::min(round, kRounds) * kSteps + (round == kSettle ? kPolishSteps : 0);
+}
 
 struct TrainingViews {
   std::vector<int> frames;    // that train
@@ -198,26 +205,28 @@ void save(const Job& job, splat::Engine& engine, int round, int step) {
 }
 
 // The training views with the links where the states put them.
-std::vector<splat::ViewSpec> posed_views(const Job& job) {
+std::vector<splat::ViewSpec> posed_views(const Job& job, const chain::States& states) {
   std::vector<splat::ViewSpec> specs;
   for (std::size_t i = 0; i < job.training.views.size(); ++i) {
     const int k = job.training.frame_of[i];
     const capture::PackedView& view = job.capture.views[job.training.views[i]];
-    specs.push_back(view_spec(
-        job.capture, view,
-        view_motions(job.result.chain, job.capture, job.states, job.frames[k], k, job.states.theta[k], view)));
+    specs.push_back(
+        view_spec(job.capture, view,
+                  view_motions(job.result.chain, job.capture, states, job.frames[k], k, states.theta[k], view)));
   }
   return specs;
 }
 
-// Adam's steps of one round, from `first_step`; round kRounds is the last polish. Which views make a batch depends on
-// the round alone: a resumed one draws those of the steps before again. False: the optimization ran away.
+// Adam's steps of one round, from `first_step`. Which views make a batch depends on the round alone: a resumed one
+// draws those of the steps before again. False: the optimization ran away.
 bool train_gaussians(Job& job, splat::Engine& engine, int round, int first_step, core::Random& random) {
   constexpr int kReadEvery = 10;
-  const std::string note =
-      round < kRounds ? "round " + std::to_string(round + 1) + " of " + std::to_string(kRounds) : "last polish";
+  const std::string note = round < kRounds    ? "round " + std::to_string(round + 1) + " of " + std::to_string(kRounds)
+                           : round == kPolish ? "polish"
+                                              : "settle";
+  const int steps = steps_of(round), before = steps_before(round);
   ViewDeck deck;
-  for (int step = 0; step < (round < kRounds ? kSteps : kFinalSteps); ++step) {
+  for (int step = 0; step < steps; ++step) {
     const std::vector<int> batch = draw_batch(deck, kBatch, static_cast<int>(job.training.views.size()), random);
     if (step < first_step) continue;
     if (const int signal = core::stop_requested()) {
@@ -225,7 +234,7 @@ bool train_gaussians(Job& job, splat::Engine& engine, int round, int first_step,
       throw Interrupted(signal);
     }
     const bool read = step % kReadEvery == 0;
-    const int done = round * kSteps + step + 1;
+    const int done = before + step + 1;
     const splat::LossValues values =
         engine.step(batch, kLossWeights,
                     rates(static_cast<double>(done - 1) / kTotalSteps, job.options.step * step_scale(job.watch)), read);
@@ -258,9 +267,9 @@ void slow_down(StepWatch& watch, int round) {
 // One round of Adam, again where it runs away. Leaves what it began with in job.gaussians, the rest in the engine.
 // Returns the round's random numbers as the steps leave them.
 core::Random train_round(Job& job, splat::Engine& engine, int round) {
-  constexpr int kPolish = 999, kRound = 100;  // seeds of the rounds
+  constexpr int kFirstSeed = 100, kPolishSeed = 999;  // of the rounds
   for (bool resumed = round == job.first_round && job.first_step > 0;; resumed = false) {
-    core::Random random(job.options.seed * 1000003 + (round == kRounds ? kPolish : kRound + round));
+    core::Random random(job.options.seed * 1000003 + (round == kPolish ? kPolishSeed : kFirstSeed + round));
     if (resumed) {
       engine.restore(job.snapshot);
     } else {
@@ -317,11 +326,15 @@ void add_gaussians(Job& job, const std::vector<Unexplained>& last, int budget, i
     job.gaussians.resize(job.gaussians.count, job.gaussians.links, 1);
 }
 
-void guess_unseen(Job& job, const std::vector<splat::ViewSpec>& specs) {
+std::vector<Viewpoint> viewpoints_of(const Job& job, const std::vector<splat::ViewSpec>& specs) {
   std::vector<Viewpoint> viewpoints;
   for (std::size_t i = 0; i < specs.size(); ++i)
     viewpoints.push_back({specs[i].camera, &job.capture.views[job.training.views[i]], specs[i].motions});
-  const int unseen = finish_unseen(job.result.chain, viewpoints, job.gaussians);
+  return viewpoints;
+}
+
+void guess_unseen(Job& job, const std::vector<splat::ViewSpec>& specs) {
+  const int unseen = finish_unseen(job.result.chain, viewpoints_of(job, specs), job.gaussians);
   core::say_more("recognize: " + std::to_string(unseen) + " of " + std::to_string(job.gaussians.count) +
                  " Gaussians lie where no camera saw the rope; their colors are guessed");
 }
@@ -365,10 +378,13 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   job.empty = empty_losses(capture, job.training);
 
   splat::Engine engine(device);
-  std::vector<splat::ViewSpec> specs = posed_views(job);
+  std::vector<splat::ViewSpec> specs = posed_views(job, job.states);
   std::vector<const capture::PackedView*> targets;
   for (const int v : job.training.views) targets.push_back(&capture.views[v]);
   engine.set_views(specs, targets);
+  chain::States by_silhouettes = job.states;  // as they were when the job began, whether it is resumed or not
+  by_silhouettes.theta = job.coarse;
+  const Radii radii = radii_in(job.result.chain, viewpoints_of(job, posed_views(job, by_silhouettes)));
   const int budget = budget_of(capture, options);
   if (!resumed) {
     core::Random random(options.seed * 1000003 + 1);
@@ -380,22 +396,29 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     core::Random random = train_round(job, engine, round);
     const bool adding = round + 1 < kRounds;
     const std::vector<Unexplained> last = refine_training(job, engine, adding);
-    specs = posed_views(job);
+    specs = posed_views(job, job.states);
     for (std::size_t i = 0; i < specs.size(); ++i) engine.set_motions(static_cast<int>(i), specs[i].motions);
     job.gaussians = engine.gaussians();
-    bound_gaussians(job.result.chain, job.gaussians, kPastJoint * job.result.chain.diameter);
+    bound_gaussians(job.result.chain, job.gaussians, kPastJoint * job.result.chain.diameter, &radii);
     if (adding)
       add_gaussians(job, last, budget, round, random);
     else
       guess_unseen(job, specs);
   }
-  if (job.first_round <= kRounds) {
-    train_round(job, engine, kRounds);
+  if (job.first_round <= kPolish) {
+    train_round(job, engine, kPolish);
     job.gaussians = engine.gaussians();
-    bound_gaussians(job.result.chain, job.gaussians, kPastJointAtLast * job.result.chain.diameter);
-    save(job, engine, kRounds + 1, 0);
+    bound_gaussians(job.result.chain, job.gaussians, kPastJointAtLast * job.result.chain.diameter, &radii);
+    guess_unseen(job, specs);  // again: without a gradient Adam moves them, too
   }
-  guess_unseen(job, specs);  // again: without a gradient Adam moves them, too
+  if (job.first_round <= kSettle) {
+    train_round(job, engine, kSettle);
+    splat::Gaussians settled = engine.gaussians();
+    keep_guessed(job.gaussians, settled);
+    job.gaussians = std::move(settled);
+    bound_gaussians(job.result.chain, job.gaussians, kPastJointAtLast * job.result.chain.diameter, &radii);
+    save(job, engine, kDone, 0);
+  }
   refine_all_frames(job, engine);
   job.result.gaussians = std::move(job.gaussians);
   job.result.states = std::move(job.states);

@@ -214,8 +214,41 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
   return changed;
 }
 
-void bound_gaussians(const chain::Chain& chain, splat::Gaussians& gaussians, double past) {
-  constexpr double kWidths = 2.0;  // standard deviations that count as a Gaussian's reach
+namespace {
+
+math::Matrix3 root_of_covariance(const splat::Gaussians& gaussians, int i) {
+  const float* q = &gaussians.rotation[4 * i];
+  math::Matrix3 root = Eigen::Quaterniond(q[0], q[1], q[2], q[3]).normalized().toRotationMatrix();
+  for (int c = 0; c < 3; ++c) root.col(c) *= std::exp(static_cast<double>(gaussians.log_scale[3 * i + c]));
+  return root;
+}
+
+void set_covariance(splat::Gaussians& gaussians, int i, const math::Matrix3& root) {
+  const Eigen::SelfAdjointEigenSolver<math::MatrixX> found(math::MatrixX(root * root.transpose()));
+  math::Matrix3 axes = found.eigenvectors();
+  if (axes.determinant() < 0.0) axes.col(0) *= -1.0;
+  const Eigen::Quaterniond turn(axes);
+  const double wxyz[4] = {turn.w(), turn.x(), turn.y(), turn.z()};
+  for (int c = 0; c < 4; ++c) gaussians.rotation[4 * i + c] = static_cast<float>(wxyz[c]);
+  for (int c = 0; c < 3; ++c)
+    gaussians.log_scale[3 * i + c] = static_cast<float>(0.5 * std::log(std::max(found.eigenvalues()[c], 1e-12)));
+}
+
+// Compresses a Gaussian along a unit direction to this standard deviation; false where it has no more.
+bool compress(const math::Vector3& direction, double most, math::Matrix3& root) {
+  const double sigma = (root.transpose() * direction).norm();
+  if (sigma <= most) return false;
+  root += (most / sigma - 1.0) * direction * (direction.transpose() * root);
+  return true;
+}
+
+}  // namespace
+
+void bound_gaussians(const chain::Chain& chain, splat::Gaussians& gaussians, double past, const Radii* radii) {
+  constexpr double kWidths = 2.0;  // standard deviations that count as a Gaussian's reach along the rope,
+  constexpr double kAcross = 1.0;  // and across it, where it fades into the outline
+  constexpr double kWider = 1.1;   // of the rope's radius: how far it may reach, and
+  constexpr double kFlat = 0.15;   // what of that its deviation across may be, however far out it is
   for (int i = 0; i < gaussians.count; ++i) {
     splat::set_base_color(gaussians, i, splat::base_color(gaussians, i).cwiseMax(0.0).cwiseMin(1.0));
     const math::Vector3 mean(gaussians.mean[3 * i], gaussians.mean[3 * i + 1], gaussians.mean[3 * i + 2]);
@@ -225,24 +258,20 @@ void bound_gaussians(const chain::Chain& chain, splat::Gaussians& gaussians, dou
     const int link = std::clamp(chain::link_at(chain, s), 1, gaussians.links - 1);
     std::swap(logits[own], logits[link]);
 
-    math::Matrix3 root;  // of the covariance
-    const float* q = &gaussians.rotation[4 * i];
-    root = Eigen::Quaterniond(q[0], q[1], q[2], q[3]).normalized().toRotationMatrix();
-    for (int c = 0; c < 3; ++c) root.col(c) *= std::exp(static_cast<double>(gaussians.log_scale[3 * i + c]));
-    const double along = (root.transpose() * chain.direction).norm();
+    math::Matrix3 root = root_of_covariance(gaussians, i);
     const double before = link > 1 ? s - chain.link_start(link) : chain.length;
     const double after = link + 1 < gaussians.links ? chain.link_end(link) - s : chain.length;
-    const double room = past + std::min(before, after);
-    if (kWidths * along <= room) continue;
-    root += (room / (kWidths * along) - 1.0) * chain.direction * (chain.direction.transpose() * root);
-    const Eigen::SelfAdjointEigenSolver<math::MatrixX> found(math::MatrixX(root * root.transpose()));
-    math::Matrix3 axes = found.eigenvectors();
-    if (axes.determinant() < 0.0) axes.col(0) *= -1.0;
-    const Eigen::Quaterniond turn(axes);
-    const double wxyz[4] = {turn.w(), turn.x(), turn.y(), turn.z()};
-    for (int c = 0; c < 4; ++c) gaussians.rotation[4 * i + c] = static_cast<float>(wxyz[c]);
-    for (int c = 0; c < 3; ++c)
-      gaussians.log_scale[3 * i + c] = static_cast<float>(0.5 * std::log(std::max(found.eigenvalues()[c], 1e-12)));
+    bool changed = compress(chain.direction, (past + std::min(before, after)) / kWidths, root);
+    const math::Vector3 off = mean - s * chain.direction;
+    if (const double from_axis = off.norm(); radii && from_axis > 0.0) {
+      const math::Vector3 outward = off / from_axis;
+      const double most = kWider * radii->at(s);
+      changed |= compress(outward, std::max(kFlat * most, (most - from_axis) / kAcross), root);
+      const double inside = most - kAcross * (root.transpose() * outward).norm();
+      const math::Vector3 moved = s * chain.direction + std::min(from_axis, inside) * outward;
+      for (int c = 0; c < 3; ++c) gaussians.mean[3 * i + c] = static_cast<float>(moved[c]);
+    }
+    if (changed) set_covariance(gaussians, i, root);
   }
 }
 

@@ -9,6 +9,7 @@
 #include "chainsplat/core.h"
 #include "chainsplat/splat.h"
 #include "src/recognition/frames.h"
+#include "src/recognition/viewpoint.h"
 
 namespace chainsplat::recognition {
 
@@ -51,6 +52,8 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
 // colors leave what a picture can show, which other viewers cut. Base colors are cut to [0, 1]; a Gaussian becomes its
 // place's link's, and is compressed along the rope until it reaches at most `past`, m, beyond that link's joints, at
 // two standard deviations. The rope's ends are no joints. For Gaussians that are hard on one link.
-void bound_gaussians(const chain::Chain& chain, splat::Gaussians& gaussians, double past);
+// Few views also leave places beside the rope that all of their masks cover, where nothing pulls a Gaussian away: with
+// `radii` it is compressed across the rope and moved inward until it reaches not much farther than the rope is wide.
+void bound_gaussians(const chain::Chain& chain, splat::Gaussians& gaussians, double past, const Radii* radii = nullptr);
 
 }  // namespace chainsplat::recognition

@@ -85,18 +85,6 @@ bool on_side(const Surface& surface, const Place& at) {
   return at.radius >= inside && at.arclength >= 0.0 && at.arclength <= surface.chain.length - inside;
 }
 
-// The pixel of the rope that shows this point; null where something else is seen there.
-const std::uint8_t* pixel_of(const capture::Camera& camera, const capture::View& view, const Vector3& world) {
-  const Vector3 point = camera.world_from_camera.inverse() * world;
-  if (point.z() < image_model::kNear) return nullptr;
-  const math::Vector2 pixel = capture::project(camera, point);
-  const int x = static_cast<int>(std::floor(pixel.x())) - view.x0,
-            y = static_cast<int>(std::floor(pixel.y())) - view.y0;
-  if (x < 0 || y < 0 || x >= view.width || y >= view.height) return nullptr;
-  const std::uint8_t* rgba = &view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x)];
-  return rgba[3] >= image_model::kObjectMask ? rgba : nullptr;
-}
-
 void look(std::span<const Viewpoint> views, Surface& surface) {
   constexpr double kWithin = 0.8;  // of the radius: masks are a pixel off at the outline
   const double radius = 0.5 * surface.chain.diameter;
@@ -281,7 +269,7 @@ void put(const Surface& surface, const Guess& guess, double radius, double spaci
   gaussians.opacity_logit[i] = kOpaque;
   gaussians.link_logits[gaussians.links * i + chain::link_at(chain, guess.arclength)] = kHard;
   splat::set_base_color(gaussians, i, guess.color);
-  gaussians.guessed[i] = 1;
+  gaussians.guessed[i] = kGuessed;
 }
 
 // What was seen only at a slant has the place and size that its outline asks for, but a color that one row of pixels
@@ -296,6 +284,7 @@ void color_slanted(const Surface& surface, const Light& light, double slope, con
     const std::optional<Vector3> color = guessed(surface, light, at.arclength, at.angle, slope);
     if (!color) continue;
     const double own = std::sqrt(std::max(0.0, surface.facing[cell] / kTrusted));
+    g.guessed[i] = kSlanted;
     splat::set_base_color(g, i, own * splat::base_color(g, i) + (1.0 - own) * *color);
     for (std::size_t c = 3; c < size; ++c) g.sh[size * i + c] *= static_cast<float>(own);
   }
@@ -337,8 +326,11 @@ int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, s
 
 void keep_guessed(const splat::Gaussians& before, splat::Gaussians& trained) {
   CHAINSPLAT_CHECK(before.count == trained.count && before.degree == trained.degree, std::to_string(trained.count));
-  for (int i = 0; i < before.count; ++i)
-    if (before.guessed[i]) copy_row(before, i, trained, i);
+  const std::ptrdiff_t size = 3 * before.sh_coefficients();
+  for (int i = 0; i < before.count; ++i) {
+    if (before.guessed[i] == kGuessed) copy_row(before, i, trained, i);
+    if (before.guessed[i] == kSlanted) std::copy_n(before.sh.begin() + size * i, size, trained.sh.begin() + size * i);
+  }
 }
 
 }  // namespace chainsplat::recognition

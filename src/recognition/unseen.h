@@ -2,19 +2,11 @@
 #pragma once
 #include <span>
 
-#include "chainsplat/capture.h"
 #include "chainsplat/chain.h"
-#include "chainsplat/math.h"
 #include "chainsplat/splat.h"
+#include "src/recognition/viewpoint.h"
 
 namespace chainsplat::recognition {
-
-// A picture, and the link motions of its moment.
-struct Viewpoint {
-  const capture::Camera* camera = nullptr;
-  const capture::PackedView* view = nullptr;
-  std::span<const math::Pose> motions;
-};
 
 // Gaussians on the side of the tube that faces none of `views` have no gradient: they stay as they were placed, and
 // Adam moves them at random. Others take their place, in an even layer on the surface at the radius of those that were
@@ -22,11 +14,13 @@ struct Viewpoint {
 // does so along a helix, whose slope is found from what was seen; where nothing repeats, the color at the same
 // arclength. The light of that side is found from how brightness changes around what was seen. What was seen only at a
 // slant keeps its shape and gets colors by the same rule, the more the flatter it was seen. Where masks show that
-// something hides the rope, as a gripper does, all stays. design.md, 'Recognition'. The new ones are marked as guessed.
-// Returns how many these are.
+// something hides the rope, as a gripper does, all stays. design.md, 'Recognition'. The new ones are marked kGuessed in
+// Gaussians::guessed, those seen only at a slant kSlanted. Returns how many new ones there are.
+inline constexpr std::uint8_t kGuessed = 1, kSlanted = 2;
 int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, splat::Gaussians& gaussians);
 
-// Puts back, after more training, those of `before` that are guessed. Both have the same count and degree.
+// Puts back, after more training, those of `before` that are guessed, and the colors of those seen only at a slant,
+// whose mark ends here. Both have the same count and degree.
 void keep_guessed(const splat::Gaussians& before, splat::Gaussians& trained);
 
 }  // namespace chainsplat::recognition
