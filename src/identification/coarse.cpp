@@ -11,8 +11,8 @@ using math::Vector3;
 
 namespace {
 
-constexpr int kMany = 24;  // joints: more than twice the time of the 16 that recognition takes at most by itself
-constexpr int kFew = 16;
+constexpr int kMany = 24;  // joints, from where on a fit of all of them takes several times as long as one of 16
+constexpr int kFew = 16;   // joints, the most that recognition chooses by itself; places along the rope
 constexpr double kHardlyKnown = 0.01;  // of the length: deviation of a point that is left out
 
 // Values of one kind along the rope, which vary linearly between their arclengths and not beyond.

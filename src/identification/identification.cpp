@@ -404,7 +404,7 @@ void improve(const Problem& problem, double horizon, bool fine, int iterations, 
   solve::Options options;
   options.steps = iterations;
   options.attempts = 6;
-  // on the way to the whole recording a start is enough, and steps of many joints are not worth a tenth of an error
+  // on the way to the whole recording a start is enough; of many joints a step takes long and the last ones gain little
   options.cost_tolerance = fine && !with_modes ? 1e-6 : 1e-4;
   options.longest = 1.0;  // of a log or an angle or rad/s: beyond, the linearization is worthless
   options.cancellable = true;
@@ -904,9 +904,19 @@ Candidate fit_chain(const chain::Chain& chain, const std::vector<Part>& parts, c
               .head(problem.shared);
       return p;
     };
+    const std::string asked = found.extras.friction && found.extras.payload ? "friction in bending and a payload were"
+                              : found.extras.friction                       ? "friction in bending was"
+                                                                            : "a payload was";
+    if (found.extras.friction || found.extras.payload)
+      core::warn("identify: " + asked + " asked for by " + std::to_string(few.links() - 1) +
+                 " joints in the place of " + std::to_string(chain.links() - 1) +
+                 ", and may stand for what so few cannot follow; compare with a twin of fewer joints");
     Candidate fine = fit_about_rod(chain, parts, options, found.extras, start);
     if (fine.fit.cost < kInfinity) return fine;
   }
+  core::warn("identify: from the parameters of " + std::to_string(few.links() - 1) + " joints the motion of " +
+             std::to_string(chain.links() - 1) +
+             " does not stay finite; the usual starts take their place, which can take hours");
   return fit_candidates(chain, parts, options);
 }
 
