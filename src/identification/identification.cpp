@@ -855,29 +855,31 @@ Candidate fit_about_rod(const chain::Chain& chain, const std::vector<Part>& part
   return now;
 }
 
-// The model of every rope, or one with friction in bending or a payload where the data ask for it.
-Candidate fit_candidates(const chain::Chain& chain, const std::vector<Part>& parts, const Options& options) {
-  // Misfit that needs no further explanation. What is expected of markers is generous; of recognized angles it is a
-  // millimeter, within which errors of calibration look like physics.
-  const double within_errors = parts.front().has_markers ? 0.3 : 1.0;
+// Misfit that needs no further explanation. What is expected of markers is generous; of recognized angles it is a
+// millimeter, within which errors of calibration look like physics.
+double within_errors(const std::vector<Part>& parts) { return parts.front().has_markers ? 0.3 : 1.0; }
+
+// The model of every rope, or one with friction in bending or a payload where the data ask for it. `fit` fits the model
+// with these extras, after the one without; `extras` are those to try.
+using FitOf = std::function<Candidate(const Extras& extras)>;
+Candidate best_of_models(const FitOf& fit, std::span<const Extras> extras, const Options& options, double least) {
   constexpr double kEvidence = 5.0;  // in favor of what a rope need not have, natural logarithm
   std::vector<Candidate> tried;
-  const auto attempt = [&](const Extras& extras) { tried.push_back(fit_about_rod(chain, parts, options, extras)); };
-  attempt({});
+  tried.push_back(fit({}));
   const auto within = [&](const Candidate& one) {
     Rollouts rollouts(one.problem, kInfinity, true);
     return one.fit.cost < kInfinity && rollouts.run(one.problem, one.fit.p, false) &&
-           misfit_of(rollouts).scale <= within_errors;
+           misfit_of(rollouts).scale <= least;
   };
   if (!options.ask_for_more || options.tabletop || !options.fit_stiffness || within(tried[0]))
     return std::move(tried[0]);
-  for (const Extras& extras : {Extras{true, false}, Extras{false, true}, Extras{true, true}})
-    if (!extras.payload || !options.tip_mass) attempt(extras);
+  for (const Extras& more : extras)
+    if (!more.payload || !options.tip_mass) tried.push_back(fit(more));
   // what every rope has is the scale, and has to be beaten clearly
   std::size_t best = 0;
   for (std::size_t i = 0; i < tried.size(); ++i) {
     Candidate& now = tried[i];
-    now.lack = lack_of_evidence(now.problem, now.fit, within_errors);
+    now.lack = lack_of_evidence(now.problem, now.fit, least);
     const double parts_more = static_cast<int>(now.extras.friction) + static_cast<int>(now.extras.payload);
     core::say_more("identify: " + std::string(now.extras.friction ? "friction in bending, " : "") +
                    (now.extras.payload ? "a payload, " : "") + "log evidence " + core::exact(-now.lack));
@@ -887,35 +889,48 @@ Candidate fit_candidates(const chain::Chain& chain, const std::vector<Part>& par
   return std::move(tried[best]);
 }
 
+constexpr Extras kAllExtras[] = {{true, false}, {false, true}, {true, true}};
+
+Candidate fit_candidates(const chain::Chain& chain, const std::vector<Part>& parts, const Options& options) {
+  const auto fit = [&](const Extras& extras) { return fit_about_rod(chain, parts, options, extras); };
+  return best_of_models(fit, kAllExtras, options, within_errors(parts));
+}
+
 // The chain's own fit. `rough`: the same recordings for a chain of few joints, whose parameters it begins with; or
-// none.
+// none. What few joints ask for beside a rope's own is tried, and the many decide: straight links that are long cannot
+// follow what the rope does near the grasp, and friction or a payload would stand for that.
 Candidate fit_chain(const chain::Chain& chain, const std::vector<Part>& parts, const std::vector<Part>& rough,
                     const Options& options) {
   if (rough.empty()) return fit_candidates(chain, parts, options);
   const chain::Chain& few = rough.front().chain;
-  const Candidate found = fit_candidates(few, rough, options);
-  if (found.fit.cost < kInfinity) {
-    core::say_more("identify: from the parameters of " + std::to_string(few.links() - 1) + " joints");
+  const std::string from = "from the parameters of " + std::to_string(few.links() - 1) + " joints";
+  std::vector<Candidate> found;  // without extras, and the best one with them
+  const auto fit_few = [&](const Extras& extras) {
+    Candidate one = fit_about_rod(few, rough, options, extras);
+    if (found.empty()) found.push_back(one);
+    return one;
+  };
+  const Candidate chosen = best_of_models(fit_few, kAllExtras, options, within_errors(rough));
+  if (chosen.extras.friction || chosen.extras.payload) found.push_back(chosen);
+  const auto fit_many = [&](const Extras& extras) {
+    const bool plain = !extras.friction && !extras.payload;
+    const Candidate& like = plain ? found.front() : found.back();
     const auto start = [&](const Problem& problem) {
       VectorX p = problem.mean;
-      const Unknowns& u = problem.parts[0].unknowns;
-      p.head(problem.shared) =
-          start_from(few, found.problem.parts[0].unknowns, found.problem.of_part(found.fit.p, 0), chain, u)
-              .head(problem.shared);
+      p.head(problem.shared) = start_from(few, like.problem.parts[0].unknowns, like.problem.of_part(like.fit.p, 0),
+                                          chain, problem.parts[0].unknowns)
+                                   .head(problem.shared);
       return p;
     };
-    const std::string asked = found.extras.friction && found.extras.payload ? "friction in bending and a payload were"
-                              : found.extras.friction                       ? "friction in bending was"
-                                                                            : "a payload was";
-    if (found.extras.friction || found.extras.payload)
-      core::warn("identify: " + asked + " asked for by " + std::to_string(few.links() - 1) +
-                 " joints in the place of " + std::to_string(chain.links() - 1) +
-                 ", and may stand for what so few cannot follow; compare with a twin of fewer joints");
-    Candidate fine = fit_about_rod(chain, parts, options, found.extras, start);
+    core::say_more("identify: " + from);
+    return fit_about_rod(chain, parts, options, extras, start);
+  };
+  if (found.front().fit.cost < kInfinity) {
+    const std::span<const Extras> asked(&chosen.extras, found.size() - 1);
+    Candidate fine = best_of_models(fit_many, asked, options, within_errors(parts));
     if (fine.fit.cost < kInfinity) return fine;
   }
-  core::warn("identify: from the parameters of " + std::to_string(few.links() - 1) + " joints the motion of " +
-             std::to_string(chain.links() - 1) +
+  core::warn("identify: " + from + " the motion of " + std::to_string(chain.links() - 1) +
              " does not stay finite; the usual starts take their place, which can take hours");
   return fit_candidates(chain, parts, options);
 }
