@@ -155,11 +155,17 @@ double slope_of_texture(const Surface& surface) {
 using Light = std::vector<double>;
 
 // Along the rope a texture shows all that it has on every side, so that the means of columns differ by their light.
-// Where no camera looked, the first harmonic of the brightness around the rope goes on: of what lights a convex thing,
-// that is most. Where the rope was seen only at a slant, the Gaussians there say where between that and the nearest
-// measured column the light is; alone they can be far too bright, where others hide them.
+// Where no camera looked, the first two harmonics of the brightness around the rope go on: more of them is hardly in
+// the light of a convex, dull thing (Ramamoorthi and Hanrahan 2001). Where the rope was seen only at a slant, the
+// Gaussians there say where between that and the nearest measured column the light is; alone they can be far too
+// bright, where others hide them.
 Light light_of(const Surface& surface, const std::vector<Place>& places, const splat::Gaussians& g) {
   constexpr double kEnough = 20.0;  // Gaussians in a column, for a mean over the texture
+  constexpr double kSecond = 0.5;   // columns' worth of a second harmonic of zero: it must be told, not guessed
+  using Vector5 = Eigen::Matrix<double, 5, 1>;
+  const auto harmonics = [](double side) {
+    return Vector5(1.0, std::cos(side), std::sin(side), std::cos(2.0 * side), std::sin(2.0 * side));
+  };
   std::vector<double> sums(kColumns, 0.0), counts(kColumns, 0.0);
   for (int i = 0; i < g.count; ++i) {
     const std::size_t cell = surface.cell_at(places[i].arclength, places[i].angle);
@@ -169,7 +175,7 @@ Light light_of(const Surface& surface, const std::vector<Place>& places, const s
     counts[cell % kColumns] += opacity;
   }
   Light light(kColumns, 0.0);
-  math::MatrixX design(kColumns, 3);
+  math::MatrixX design(kColumns, 5);
   math::VectorX means(kColumns);
   Eigen::Index seen = 0;
   for (int column = 0; column < kColumns; ++column) {
@@ -179,23 +185,23 @@ Light light_of(const Surface& surface, const std::vector<Place>& places, const s
       if (const std::optional<Vector3>& color = surface.color[surface.cell(row, column)]) sum += color->mean(), ++count;
     if (2 * count < surface.rows) continue;
     light[column] = sum / count;
-    const double side = Surface::angle(column);
-    design.row(seen) << 1.0, std::cos(side), std::sin(side);
+    design.row(seen) = harmonics(Surface::angle(column));
     means[seen++] = light[column];
   }
   const Light even(kColumns, 1.0);
   if (2 * seen < kColumns) return even;  // less than half of the rope tells nothing of the other
   const auto columns = design.topRows(seen);
   const auto brightness = means.head(seen);
-  const Vector3 found = (columns.transpose() * columns).ldlt().solve(columns.transpose() * brightness);
+  math::MatrixX normal = columns.transpose() * columns;
+  normal.diagonal().tail<2>().array() += kSecond;
+  const Vector5 found = normal.ldlt().solve(columns.transpose() * brightness);
   const double left = (columns * found - brightness).squaredNorm();
   const double differs = (brightness.array() - brightness.mean()).square().sum();
   if (!(left < (1.0 - kLit) * differs) || !(found[0] > 0.0)) return even;
   const Light measured = light;
   for (int column = 0; column < kColumns; ++column) {
     if (measured[column] > 0.0) continue;
-    const double side = Surface::angle(column);
-    double value = found[0] + found[1] * std::cos(side) + found[2] * std::sin(side);
+    double value = found.dot(harmonics(Surface::angle(column)));
     if (counts[column] >= kEnough) {
       double next = 0.0;
       for (int apart = 1; next == 0.0; ++apart)
