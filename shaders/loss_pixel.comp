@@ -15,6 +15,8 @@ layout(std430) readonly buffer Image { vec4 image[]; };
 layout(std430) readonly buffer Target { uint target[]; };
 layout(std430) writeonly buffer TileLoss { vec4 tile_loss[]; };
 
+#include "inc/background.glsl"
+
 shared vec4 lane_sum[gl_WorkGroupSize.x];
 
 void main() {
@@ -27,10 +29,10 @@ void main() {
     if (x < view.width && y < view.height) {
       uint pixel = view.pixel + y * view.width + x;
       vec4 wanted = unpackUnorm4x8(target[view.target + y * view.width + x]);
-      vec4 error = image[pixel] - wanted;
       vec3 shown = clamp(image[pixel].xyz, 0.0, 1.0) - wanted.xyz;
       float object = wanted.w >= float(kObjectMask) / 255.0 ? 1.0 : 0.0;
-      sum += vec4(dot(abs(error.xyz), vec3(1.0)), abs(error.w), object * dot(shown, shown), object);
+      vec3 off = on_background(image[pixel]) - on_background(wanted);
+      sum += vec4(dot(abs(off), vec3(1.0)), abs(image[pixel].w - wanted.w), object * dot(shown, shown), object);
     }
   }
   lane_sum[lane] = sum;

@@ -28,10 +28,11 @@ layout(std430) readonly buffer Counters { uint counters[]; };
 layout(std430) readonly buffer Image { vec4 image[]; };
 layout(std430) readonly buffer TileUsed { uint tile_used[]; };
 layout(std430) readonly buffer Target { uint target[]; };
-layout(std430) readonly buffer PixelGradient { vec4 pixel_gradient[]; };  // of D-SSIM, by color
+layout(std430) readonly buffer PixelGradient { vec4 pixel_gradient[]; };  // of D-SSIM, by color and alpha
 layout(std430) writeonly buffer Partials { float partials[]; };  // kPartialRows vec4 per slot
 
 #include "inc/alpha.glsl"
+#include "inc/background.glsl"
 #include "inc/share.glsl"
 #include "inc/subgroup_sum.glsl"
 
@@ -59,8 +60,9 @@ void main() {
     gamma[k] = vec4(0.0);
     behind[k] = 0.0;
     if (inside) {
-      vec4 shown = image[view.pixel + offset], error = shown - unpackUnorm4x8(target[view.target + offset]);
-      gamma[k] = vec4(p.weight_l1 * sign(error.xyz), p.weight_mask * sign(error.w));
+      vec4 shown = image[view.pixel + offset], wanted = unpackUnorm4x8(target[view.target + offset]);
+      vec3 by_color = p.weight_l1 * sign(on_background(shown) - on_background(wanted));
+      gamma[k] = vec4(by_color, p.weight_mask * sign(shown.w - wanted.w) - p.background * dot(by_color, vec3(1.0)));
       if (dssim) gamma[k] += pixel_gradient[view.pixel + offset];
       behind[k] = dot(gamma[k], shown);
     }

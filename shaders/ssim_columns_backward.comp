@@ -1,6 +1,6 @@
 // ssim_columns_backward.comp - filters the output of ssim_rows_backward.comp by the window along y, one strip of a
-// column per lane, and forms the gradient of the D-SSIM term by the pixel's color: w*P + 2x (w*Q) + y (w*R)
-// (mathematics.md 2.7).
+// column per lane, and forms the gradient of the D-SSIM term by the pixel's color, w*P + 2x (w*Q) + y (w*R), and through
+// the background by its alpha (mathematics.md 2.7).
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -17,6 +17,7 @@ layout(std430) readonly buffer SsimRowSums { vec4 ssim_row_sums[]; };
 layout(std430) readonly buffer Image { vec4 image[]; };
 layout(std430) readonly buffer Target { uint target[]; };
 layout(std430) writeonly buffer PixelGradient { vec4 pixel_gradient[]; };
+#include "inc/background.glsl"
 #include "inc/ssim.glsl"
 
 void main() {
@@ -51,9 +52,11 @@ void main() {
     uint y = t.y * kTileHeight + first + k;
     if (x < view.width && y < view.height) {
       uint offset = y * view.width + x;
-      vec3 shown = image[view.pixel + offset].xyz, wanted = unpackUnorm4x8(target[view.target + offset]).xyz;
+      vec3 shown = on_background(image[view.pixel + offset]);
+      vec3 wanted = on_background(unpackUnorm4x8(target[view.target + offset]));
       vec3 mean = s0[k].xyz, square = vec3(s0[k].w, s1[k].xy), product = vec3(s1[k].zw, s2[k]);
-      pixel_gradient[view.pixel + offset] = vec4(mean + 2.0 * shown * square + wanted * product, 0.0);
+      vec3 by_color = mean + 2.0 * shown * square + wanted * product;
+      pixel_gradient[view.pixel + offset] = vec4(by_color, -p.background * dot(by_color, vec3(1.0)));
     }
   }
 }

@@ -15,6 +15,7 @@ layout(std430) readonly buffer TileMap { uint tile_map[]; };
 layout(std430) readonly buffer Image { vec4 image[]; };
 layout(std430) readonly buffer Target { uint target[]; };
 layout(std430) writeonly buffer SsimRowSums { vec4 ssim_row_sums[]; };
+#include "inc/background.glsl"
 #include "inc/ssim.glsl"
 
 void main() {
@@ -34,8 +35,8 @@ void main() {
     bool there = inside && x >= 0 && x < int(view.width);
     bool drawn = there && (column < 0 ? left : column < int(kTileWidth) || right);
     uint offset = there ? y * view.width + uint(x) : 0u;
-    vec3 shown = drawn ? image[view.pixel + offset].xyz : vec3(0.0);
-    vec3 wanted = there ? unpackUnorm4x8(target[view.target + offset]).xyz : vec3(0.0);
+    vec3 shown = drawn ? on_background(image[view.pixel + offset]) : vec3(there ? p.background : 0.0);
+    vec3 wanted = there ? on_background(unpackUnorm4x8(target[view.target + offset])) : vec3(0.0);
     vec3 square = shown * shown + wanted * wanted, product = shown * wanted;
     [[unroll]] for (int k = 0; k < int(kPixels); ++k) {
       if (abs(m - k) > kSsimReach) continue;

@@ -197,8 +197,12 @@ TEST_CASE("a job is another one when anything differs that its result depends on
   other_options([](Options& o) { o.seed = 1; });
   other_options([](Options& o) { o.budget = 100; });
   other_options([](Options& o) { o.step = 0.5; });
-  other_options([](Options& o) { o.paper_gaussians = 100; });
-  other_options([](Options& o) { o.paper_iterations = 100; });
+  other_options([](Options& o) { o.paper.gaussians = 100; });
+  other_options([](Options& o) { o.paper.iterations = 100; });
+  other_options([](Options& o) { o.paper.background = Background::white; });
+  other_options([](Options& o) { o.paper.growth = false; });
+  other_options([](Options& o) { o.paper.opacity_resets = false; });
+  other_options([](Options& o) { o.paper.link_resets = false; });
 }
 
 TEST_CASE("a damaged checkpoint gives way to the one before; one of another job is refused") {

@@ -464,7 +464,8 @@ struct ViewLoss {
 };
 // `rgba` is 4 x pixels. A normalizer of 0 means the number of pixels of the crop.
 template <class S>
-ViewLoss<S> view_loss(const std::vector<S>& rgba, const Target& wanted, int width, int height, double normalizer) {
+ViewLoss<S> view_loss(const std::vector<S>& rgba, const Target& wanted, int width, int height, double normalizer,
+                      double background = 0.0) {
   using std::abs;
   const std::size_t pixels = rgba.size() / 4;
   if (normalizer <= 0.0) normalizer = std::max<double>(1.0, static_cast<double>(pixels));
@@ -473,8 +474,8 @@ ViewLoss<S> view_loss(const std::vector<S>& rgba, const Target& wanted, int widt
     std::vector<S> x(pixels);
     std::vector<double> y(pixels);
     for (std::size_t k = 0; k < pixels; ++k) {
-      x[k] = rgba[4 * k + c];
-      y[k] = wanted.rgb[3 * k + c];
+      x[k] = rgba[4 * k + c] + background * (S(1.0) - rgba[4 * k + 3]);
+      y[k] = wanted.rgb[3 * k + c] + background * (1.0 - wanted.mask[k]);
       l1 += abs(x[k] - y[k]);
     }
     for (const S& s : ssim_map(x, y, width, height)) dissimilarity += 1.0 - s;
@@ -573,7 +574,8 @@ Evaluation evaluate(const Parameters<double>& g, std::span<const splat::ViewSpec
     std::vector<Variable> image;
     for (const double x : out.pictures.back().rgba) image.push_back(independent(x));
     const std::size_t image_end = t.size();
-    const ViewLoss<Variable> loss = view_loss(image, targets[k], view.width, view.height, normalizer);
+    const ViewLoss<Variable> loss =
+        view_loss(image, targets[k], view.width, view.height, normalizer, weights.background);
     const Variable total = static_cast<double>(weights.l1) * loss.l1 +
                            static_cast<double>(weights.dssim) * (1.0 - loss.ssim) +
                            static_cast<double>(weights.mask) * loss.mask;
@@ -624,7 +626,8 @@ inline double loss(const Parameters<double>& g, std::span<const splat::ViewSpec>
   double total = 0.0;
   for (std::size_t k = 0; k < views.size(); ++k) {
     const Picture drawn = draw(g, views[k], rules);
-    const ViewLoss<double> l = view_loss(drawn.rgba, targets[k], drawn.width, drawn.height, normalizer);
+    const ViewLoss<double> l =
+        view_loss(drawn.rgba, targets[k], drawn.width, drawn.height, normalizer, weights.background);
     total += weights.l1 * l.l1 + weights.dssim * (1.0 - l.ssim) + weights.mask * l.mask;
   }
   return total;

@@ -32,7 +32,8 @@ namespace {
 
 // Float rounding (6e-8) of pixel coordinates up to 50 px, through conics up to 1/0.3 px^-2, summed over the entries.
 constexpr double kImageTolerance = 2e-5;
-// Relative to the largest entry of a kind (design.md, 'Reference vectors'): the same rounding, through quotients and cancellation.
+// Relative to the largest entry of a kind (design.md, 'Reference vectors'): the same rounding, through quotients and
+// cancellation.
 constexpr double kGradientTolerance = 1e-3;
 // Relative to the largest entry of one Gaussian's row, so that an error of a weak Gaussian does not hide behind a
 // strong one; plus kRowFloor of the kind's largest entry, since cancellation leaves much smaller rows no digits.
@@ -293,7 +294,7 @@ bool same_bits(const Gaussians& a, const Gaussians& b) {
          same_bits(a.link_logits, b.link_logits);
 }
 
-constexpr LossWeights kAllTerms{0.8f, 0.2f, 0.3f};
+constexpr LossWeights kAllTerms{0.8f, 0.2f, 0.3f}, kOnGray{0.8f, 0.2f, 0.1f, 0.7f};
 
 }  // namespace
 
@@ -452,7 +453,8 @@ TEST_CASE("gradients and pictures equal the reference's without the rules") {
   for (const int degree : {0, 1, 3}) {
     CAPTURE(degree);
     const Scene scene = random_scene(50 + degree, 40, 3, degree, Logits::soft);
-    for (const LossWeights& weights : {LossWeights{1, 0, 0}, LossWeights{0, 1, 0}, LossWeights{0, 0, 1}, kAllTerms}) {
+    for (const LossWeights& weights :
+         {LossWeights{1, 0, 0}, LossWeights{0, 1, 0}, LossWeights{0, 0, 1}, kAllTerms, kOnGray}) {
       if (degree != 0 && weights.l1 != kAllTerms.l1) continue;  // single terms are tested for one degree only
       const auto wanted = reference::evaluate(reference::parameters(scene.gaussians), scene.views,
                                               scene.reference_targets(), weights, 0.0, reference::kNoCutoffs);
@@ -844,6 +846,31 @@ TEST_CASE("the same input gives the same bits: loss, gradients, 20 steps, and on
   engine().restore(middle);
   for (int step = kMiddle; step < kSteps; ++step) engine().step(batches[step % 3], kAllTerms, rates, false);
   CHECK(same_bits(engine().gaussians(), runs[0].after));
+  check_silent();
+}
+
+TEST_CASE("Gaussians that change keep their moments, those that are added begin without") {
+  const Scene scene = random_scene(43, 30, 3, 0, Logits::soft);
+  const splat::AdamRates rates{2e-4f, 1e-3f, 5e-3f, 2e-2f, 3e-3f, 2e-4f, 2e-2f};
+  const std::array<int, 2> batch{0, 1};
+  engine().set_views(scene.views, scene.packed_pointers());
+  engine().set_gaussians(scene.gaussians);
+  for (int step = 0; step < 5; ++step) engine().step(batch, kAllTerms, rates, false);
+  const Engine::Snapshot before = engine().snapshot();
+  engine().step(batch, kAllTerms, rates, false);
+  const Gaussians wanted = engine().gaussians(), gradient = engine().gradient();
+
+  // the same Gaussians in the same order, so that the picture is the same; the last one has lost its moments
+  std::vector<int> kept(before.gaussians.count - 1), last{before.gaussians.count - 1};
+  std::iota(kept.begin(), kept.end(), 0);
+  engine().restore(before);
+  engine().change_gaussians(kept, splat::rows_of(before.gaussians, last, 0));
+  CHECK(same_bits(engine().gaussians(), before.gaussians));
+  engine().step(batch, kAllTerms, rates, false);
+  CHECK(same_bits(engine().gradient(), gradient));
+  const Gaussians after = engine().gaussians();
+  CHECK(same_bits(splat::rows_of(after, kept, 0), splat::rows_of(wanted, kept, 0)));
+  CHECK_FALSE(same_bits(splat::rows_of(after, last, 0), splat::rows_of(wanted, last, 0)));
   check_silent();
 }
 

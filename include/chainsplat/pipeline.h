@@ -14,6 +14,7 @@
 #include <vector>
 
 #include "chainsplat/eval.h"
+#include "chainsplat/recognition.h"
 #include "chainsplat/solve.h"
 #include "chainsplat/twin.h"
 
@@ -48,7 +49,8 @@ struct TrainOptions {
   Path picture;               // PNG of observed beside rendered frames; empty: none
   // What is taken as given instead of estimated with the angles: groups of capture::corrected_quantities(), or "all".
   std::vector<std::string> fixed;
-  bool anyway = false;  // go on where the capture contradicts itself so that no twin of it is worth having
+  recognition::PaperChoices paper;  // of mode paper
+  bool anyway = false;              // go on where the capture contradicts itself so that no twin of it is worth having
   std::uint64_t seed = 0;
   std::string device;  // Vulkan device, its number or a part of its name; empty: chosen
 
@@ -108,7 +110,7 @@ IdentifyResult identify(const std::vector<Path>& runs, const IdentifyOptions& op
                         const core::Listener& listener = {});
 
 struct MarkerOptions {
-  bool shape_only = false;  // fit the states, identify nothing
+  bool shape_only = false;                  // fit the states, identify nothing
   std::optional<capture::Payload> payload;  // instead of what the twin knows of it
   std::uint64_t seed = 0;
 };

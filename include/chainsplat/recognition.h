@@ -16,6 +16,22 @@ namespace chainsplat::recognition {
 
 enum class Mode { fast, paper };
 
+enum class Background { black, white, random };  // random: another gray at every iteration
+
+// What `paper` takes from ScrewSplat and 3DGS where the paper prints nothing, and the paper's own resets: each can be
+// changed, to see what it does (figures.md, "The paper's own method").
+struct PaperChoices {
+  int gaussians = 2500;  // at first
+  int iterations = 30000;
+  Background background = Background::random;
+  bool growth = true;  // of Gaussians, and pruning
+  bool opacity_resets = true, link_resets = true;
+};
+// As `key=value,...`: background=black|white|random, growth=yes|no, resets=both|opacity|links|none, gaussians=N,
+// iterations=N. The text has what differs from the default. Throws InputError, which says by `where` whose text it is.
+PaperChoices read_paper_choices(const std::string& text, const std::string& where);
+std::string text_of(const PaperChoices& choices);
+
 struct Options {
   std::optional<int> joints;              // none: as many as the rope's bends ask for (silhouette::choose_joints)
   std::optional<chain::Bending> bending;  // none: auto (design.md, 'Recognition')
@@ -26,8 +42,7 @@ struct Options {
   // Most Gaussians that train (fast); 0: 100 a diameter of the rope's length (1,500 for 30 cm of 2 cm). What no camera
   // saw gets others, as dense.
   int budget = 0;
-  int paper_gaussians = 5000;
-  int paper_iterations = 30000;
+  PaperChoices paper;
   double step = 1.0;    // of Adam's usual step sizes (fast); lowered by itself where the optimization runs away
   Path checkpoint;      // folder for checkpoints; empty: none
   bool resume = false;  // continue from the checkpoint when one is there

@@ -33,6 +33,11 @@ struct Gaussians {
   void resize(int count, int links, int degree);  // keeps existing rows; new ones are zero, with rotation (1, 0, 0, 0)
 };
 
+// Makes Gaussian k of `to` Gaussian i of `from`; both have the same links and degree.
+void copy_row(const Gaussians& from, int i, Gaussians& to, int k);
+// These Gaussians, in this order, and `more` new ones after them, as Gaussians::resize() makes them.
+Gaussians rows_of(const Gaussians& gaussians, std::span<const int> rows, int more);
+
 // One picture to draw: a pinhole camera, the crop [x0, x0+width) x [y0, y0+height) of its image, and the link motions.
 struct ViewSpec {
   const capture::Camera* camera = nullptr;  // its distortion is ignored: crops are of undistorted images
@@ -58,9 +63,10 @@ struct Gradients {
 };
 
 struct LossWeights {
-  float l1 = 0.8f;     // weight of mean |I^ - I|
-  float dssim = 0.2f;  // weight of 1 - mean SSIM
-  float mask = 0.0f;   // weight of mean |alpha - mask|
+  float l1 = 0.8f;          // weight of mean |I^ - I|
+  float dssim = 0.2f;       // weight of 1 - mean SSIM
+  float mask = 0.0f;        // weight of mean |alpha - mask|
+  float background = 0.0f;  // gray, 0..1, that drawn and wanted colors are laid over; `psnr_object` is over black
 };
 
 struct LossValues {
@@ -117,13 +123,15 @@ class Engine {
   // --- training: parameters and moments stay on the device -----------------------------------------------------------
   // Names the targets of all views of the training; step() and others refer to them by their index in `views`. Motions
   // can be changed later. `targets` are taken to the device when they are needed, since all of them together may not
-  // have room there: they must last as long as the training. Only tiles near the mask are drawn and contribute to the loss; with `everywhere` the whole
-  // crop does, but D-SSIM is still taken near the mask only: elsewhere L1 is enough to charge stray splats.
+  // have room there: they must last as long as the training. Only tiles near the mask are drawn and contribute to the
+  // loss; with `everywhere` the whole crop does, but D-SSIM is still taken near the mask only: elsewhere L1 is enough
+  // to charge stray splats.
   void set_views(std::span<const ViewSpec> views, std::span<const capture::PackedView* const> targets,
                  bool everywhere = false);
   void set_motions(int view, const std::vector<math::Pose>& motions);
   void set_gaussians(const Gaussians& gaussians);  // resets Adam's moments and step count
   Gaussians gaussians() const;
+  Gaussians gradient() const;  // of the last step's mean loss
   // Takes one Adam step on the mean loss of the views in `batch`. `twists`, if not null, gets the gradient of the mean
   // loss with respect to each view's link motions (as Gradients::link_twists).
   LossValues step(std::span<const int> batch, const LossWeights& weights, const AdamRates& rates, bool read_losses,
@@ -143,6 +151,8 @@ class Engine {
   // moments of these parameters.
   void reset_opacity(float largest);
   void reset_links();
+  // Goes on with the rows `kept`, which keep Adam's moments, and then `added`, which begin without.
+  void change_gaussians(std::span<const int> kept, const Gaussians& added);
   // For checkpoints: everything that a later step depends on.
   struct Snapshot {
     Gaussians gaussians;

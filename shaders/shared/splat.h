@@ -37,7 +37,8 @@ struct SplatPush {
   uint tile_stride;    // work group g of a pass over all active tiles processes tile g * tile_stride % tiles
   uint tile_capacity;  // entries of each list at its fixed place, which splat_project.comp fills; 0: the lists are
                        // contiguous, laid out by prefix sums and filled by splat_bin.comp
-  uint padding0, padding1;
+  float background;    // gray, 0..1, that the loss lays drawn and wanted colors over
+  uint padding;
 };
 
 const uint kNoTile = 0xffffffffu;

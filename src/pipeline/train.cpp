@@ -45,6 +45,7 @@ recognition::Options recognition_options(const Training& t) {
   options.twist = t.options.twist;
   options.every = t.options.every;
   options.mode = t.options.mode == twin::Mode::paper ? recognition::Mode::paper : recognition::Mode::fast;
+  options.paper = t.options.paper;
   options.seed = t.options.seed;
   options.checkpoint = t.run / kCheckpointFolder;
   options.resume = t.options.resume;
@@ -66,6 +67,7 @@ twin::Provenance recognition_provenance(const TrainOptions& options) {
   std::string held;
   for (const std::string& group : options.fixed) held += (held.empty() ? "" : ",") + group;
   if (!held.empty()) p.options["fixed"] = held;
+  if (const std::string choices = recognition::text_of(options.paper); !choices.empty()) p.options["paper"] = choices;
   return p;
 }
 
@@ -140,11 +142,13 @@ void check_same_work(const Training& t) {
   const std::map<std::string, std::string> before = option_texts(had);
   for (const auto& [name, text] : option_texts(wanted))
     if (const auto at = before.find(name); at != before.end()) compare(name, at->second, text);
-  const auto held = [](const twin::Provenance& p) {
-    const auto at = p.options.find("fixed");
-    return at == p.options.end() ? std::string("nothing") : at->second;
-  };
-  compare("fixed", held(had), held(wanted));
+  for (const char* name : {"fixed", "paper"}) {
+    const auto named = [&](const twin::Provenance& p) {
+      const auto at = p.options.find(name);
+      return at == p.options.end() ? std::string("nothing") : at->second;
+    };
+    compare(name, named(had), named(wanted));
+  }
   compare("seed", std::to_string(had.seed), std::to_string(wanted.seed));
 }
 

@@ -42,12 +42,11 @@ void check_groups(const std::vector<std::string>& groups, const std::string& whe
                        "name some of cameras,focal,time,length,diameter,grasp,masks,colors, or all");
 }
 
-std::vector<std::string> read_groups(const std::string& text, const std::string& where) {
-  std::vector<std::string> groups;
+std::vector<std::string> split(const std::string& text) {
+  std::vector<std::string> all;
   std::istringstream words(text);
-  for (std::string word; std::getline(words, word, ',');) groups.push_back(word);
-  check_groups(groups, where);
-  return groups;
+  for (std::string word; std::getline(words, word, ',');) all.push_back(word);
+  return all;
 }
 
 }  // namespace
@@ -61,6 +60,8 @@ void TrainOptions::check() const {
     throw InputError("`frames`", "'" + capture::frame_range_text(frames) + "' is no range of frames",
                      "give A:B, for example 0:60 for the first 60");
   check_groups(fixed, "`fixed`");
+  if (!recognition::text_of(paper).empty() && mode != twin::Mode::paper)
+    throw InputError("`paper`", "goes with `mode` paper", "leave it out, or give that mode");
   if (force && resume) throw InputError("`force`, `resume`", "contradict each other", "give one of them");
 }
 
@@ -82,7 +83,7 @@ std::vector<Stage> read_stages(const std::string& text, const std::string& where
 const std::vector<Setting>& settings() {
   static const std::vector<Setting> all = {{"joints", false}, {"bending", false}, {"twist", true},   {"every", false},
                                            {"frames", false}, {"mode", false},    {"stages", false}, {"joint", true},
-                                           {"fixed", false},  {"anyway", true}};
+                                           {"fixed", false},  {"anyway", true},   {"paper", false}};
   return all;
 }
 
@@ -109,7 +110,10 @@ void set(TrainOptions& options, const std::string& name, const std::string& text
   } else if (name == "anyway") {
     options.anyway = truth(text, where);
   } else if (name == "fixed") {
-    options.fixed = read_groups(text, where);
+    options.fixed = split(text);
+    check_groups(options.fixed, where);
+  } else if (name == "paper") {
+    options.paper = recognition::read_paper_choices(text, where);
   } else {
     throw InputError(where, "there is no setting '" + name + "'", "give one of those of train");
   }

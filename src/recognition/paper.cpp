@@ -1,12 +1,17 @@
 // The paper's procedure, so that it can be compared with the fast one in one table: random Gaussians with uniform link
-// probabilities, all angles zero, Adam on one random view an iteration, two asynchronous resets. What the paper does
-// not print is 3DGS' and ScrewSplat's (design.md, 'Recognition', `--mode paper`). SH degree 0.
+// probabilities, all angles zero, Adam on one random view per iteration, two asynchronous resets. What the paper does
+// not print is 3DGS' and ScrewSplat's: rates, a background, growth (figures.md, "The paper's own method"). SH
+// degree 0.
 #include <algorithm>
+#include <array>
+#include <charconv>
 #include <cmath>
 #include <numeric>
+#include <sstream>
 
 #include "chainsplat/image_model.h"
 #include "src/recognition/checkpoint.h"
+#include "src/recognition/growth.h"
 #include "src/recognition/modes.h"
 #include "src/recognition/step_watch.h"
 
@@ -18,8 +23,9 @@ constexpr int kJoints = 8;
 constexpr int kOpacityReset = 3000, kLastOpacityReset = 12000;  // iterations
 constexpr float kResetOpacity = 0.01f;
 constexpr int kLinkResets[] = {1500, 4500, 7500, 10500};
-constexpr float kMeanRateFirst = 1.6e-4f, kMeanRateLast = 1.6e-6f;  // of the scene's extent
-constexpr double kAngleRate = 0.01;                                 // rad
+constexpr int kGrowthFrom = 500, kGrowthUntil = 15000, kGrowthEvery = 100;  // iterations
+constexpr float kMeanRateFirst = 1.6e-4f, kMeanRateLast = 1.6e-6f;          // of the scene's extent
+constexpr double kAngleRate = 0.01;                                         // rad
 
 capture::PackedView padded(const capture::PackedView& packed, int x0, int y0, int width, int height) {
   const capture::View view = capture::unpacked(packed);
@@ -130,7 +136,8 @@ struct Job {
   std::vector<PaperView> views = {};           // of these
   std::vector<solve::AdamState> moments = {};  // of each frame's angles; steps: its visits
   StepWatch watch = {};
-  int first = 0;  // iteration
+  Pull pull = {};  // since the Gaussians were changed
+  int first = 0;   // iteration
 };
 
 std::vector<math::Pose> motions_of(const Job& job, const PaperView& view) {
@@ -169,6 +176,9 @@ void resume(Job& job, Checkpoint before, splat::Engine& engine) {
     m.steps = static_cast<int>(from[2 * n]);
     from += 2 * n + 1;
   }
+  const auto count = static_cast<std::size_t>(before.extra.data() + before.extra.size() - from) / 2;
+  job.pull.sum.assign(from, from + count);
+  job.pull.steps.assign(from + count, from + 2 * count);
 }
 
 void save(const Job& job, splat::Engine& engine, int iteration) {
@@ -185,6 +195,8 @@ void save(const Job& job, splat::Engine& engine, int iteration) {
     c.extra.insert(c.extra.end(), m.second.data(), m.second.data() + m.second.size());
     c.extra.push_back(m.steps);
   }
+  c.extra.insert(c.extra.end(), job.pull.sum.begin(), job.pull.sum.end());
+  c.extra.insert(c.extra.end(), job.pull.steps.begin(), job.pull.steps.end());
   save_checkpoint(c, job.options.checkpoint);
 }
 
@@ -197,8 +209,8 @@ splat::Gaussians random_gaussians(const Job& job) {
     throw WorkError(job.capture.name, "the cameras' masks have no common volume",
                     "check the calibration with 'chainsplat check'");
   splat::Gaussians g;
-  g.resize(job.options.paper_gaussians, job.result.chain.links(), 0);
-  const double spacing = std::cbrt((high - low).prod() / job.options.paper_gaussians);
+  g.resize(job.options.paper.gaussians, job.result.chain.links(), 0);
+  const double spacing = std::cbrt((high - low).prod() / job.options.paper.gaussians);
   constexpr float kStartOpacityLogit = -2.1972246f;  // opacity 0.1
   for (int i = 0; i < g.count; ++i) {
     for (int c = 0; c < 3; ++c) {
@@ -235,16 +247,25 @@ splat::AdamRates rates_of_paper(double extent, double fraction) {
   return rates;
 }
 
+// Over black a Gaussian that is black costs nothing wherever it is, over white a white one; over a gray that changes
+// none is free. As draw_view(), a function of the iteration.
+float background_of(const Job& job, int iteration) {
+  if (job.options.paper.background != Background::random)
+    return job.options.paper.background == Background::white ? 1.0f : 0.0f;
+  core::Random random(job.options.seed * 1000003 + 23 + static_cast<std::uint64_t>(iteration) * 7919);
+  return static_cast<float>(random.uniform(0.0, 1.0));
+}
+
 // One step of Adam on the Gaussians and on the angles of one view's frame.
 void train_on(Job& job, splat::Engine& engine, std::size_t v, int iteration, const splat::AdamRates& rates) {
   constexpr int kReadEvery = 50;
-  constexpr splat::LossWeights kWeights{0.8f, 0.2f, 0.0f};
+  const splat::LossWeights weights{0.8f, 0.2f, 0.0f, background_of(job, iteration)};
   const PaperView& view = job.views[v];
   const bool read = iteration % kReadEvery == 0;
   engine.set_motions(static_cast<int>(v), motions_of(job, view));
   const int batch[] = {static_cast<int>(v)};
   std::vector<math::MatrixX> twists;
-  const splat::LossValues values = engine.step(batch, kWeights, rates, read, &twists);
+  const splat::LossValues values = engine.step(batch, weights, rates, read, &twists);
   // no restart with smaller steps: the paper's rates are what this mode is for
   if (watch_gradients(job.watch, values.not_finite, iteration + 1) == Course::diverged ||
       (read && !std::isfinite(values.total)))
@@ -252,7 +273,7 @@ void train_on(Job& job, splat::Engine& engine, std::size_t v, int iteration, con
                     "try `mode` fast or another `seed`");
   if (read)
     core::report(
-        {"recognize", iteration, job.options.paper_iterations, values.total, values.psnr_object[0], "paper mode"});
+        {"recognize", iteration, job.options.paper.iterations, values.total, values.psnr_object[0], "paper mode"});
   const chain::Chain& chain = job.result.chain;
   math::VectorX& theta = job.states.theta[view.frame];
   const math::VectorX gradient =
@@ -260,10 +281,45 @@ void train_on(Job& job, splat::Engine& engine, std::size_t v, int iteration, con
   if (gradient.allFinite()) solve::adam_step(job.moments[view.frame], gradient, {.rate = kAngleRate}, theta);
 }
 
+// Pixels of one meter at the grasp, seen by this view.
+double pixels_per_meter(const Job& job, const PaperView& view) {
+  const capture::Camera& camera = job.capture.cameras[view.view.camera];
+  const math::Vector3 grasp = job.capture.base.pose(view.view.time).translation;
+  return camera.fx / (camera.world_from_camera.inverse() * grasp).z();
+}
+
+// The engine's loss is a mean over the object's pixels; 3DGS' threshold is for one over the whole image.
+double of_whole_image(const Job& job) {
+  double object = 0.0, whole = 0.0;
+  for (const PaperView& view : job.views) {
+    const capture::View pixels = capture::unpacked(view.view);
+    for (std::size_t i = 3; i < pixels.rgba.size(); i += 4) object += pixels.rgba[i] >= image_model::kObjectMask;
+    const capture::Camera& camera = job.capture.cameras[view.view.camera];
+    whole += static_cast<double>(camera.width) * camera.height;
+  }
+  return object / whole;
+}
+
+void change_gaussians(Job& job, splat::Engine& engine, int done, double extent) {
+  constexpr int kMost = 4000;  // from where on none is added: a step takes as long as there are Gaussians
+  GrowthLimits limits;
+  limits.extent = extent;
+  limits.pixels_per_meter = pixels_per_meter(job, job.views.front());
+  limits.prune_large = done > kOpacityReset;
+  limits.most = kMost;
+  core::Random random(job.options.seed * 1000003 + 29 + static_cast<std::uint64_t>(done) * 7919);
+  const Grown grown = grow(engine.gaussians(), job.pull, limits, random);
+  job.pull = {};
+  if (grown.kept.empty() && grown.added.count == 0)
+    throw WorkError("recognize", "no Gaussian is left at iteration " + std::to_string(done),
+                    "try `mode` fast or another `seed`");
+  engine.change_gaussians(grown.kept, grown.added);
+}
+
 // The frames between: interpolated, then refined with the Gaussians held.
 void refine_others(Job& job, splat::Engine& engine) {
   constexpr int kIterations = 8;  // Gauss-Newton steps from the interpolated angles
-  core::report({"recognize", job.options.paper_iterations, job.options.paper_iterations, NAN, NAN, "all frames"});
+  core::report({"recognize", job.options.paper.iterations, job.options.paper.iterations, NAN, NAN, "all frames"});
   chain::States trained;
   for (const int k : job.training) {
     trained.time.push_back(job.states.time[k]);
@@ -281,7 +337,65 @@ void refine_others(Job& job, splat::Engine& engine) {
   differentiate(job.states);
 }
 
+std::string yes_or_no(bool value) { return value ? "yes" : "no"; }
+
+constexpr const char* kBackgrounds[] = {"black", "white", "random"};
+constexpr const char* kResets[] = {"none", "opacity", "links", "both"};  // by 1: of opacities, 2: of links
+
+int resets_of(const PaperChoices& c) { return (c.opacity_resets ? 1 : 0) + (c.link_resets ? 2 : 0); }
+
 }  // namespace
+
+PaperChoices read_paper_choices(const std::string& text, const std::string& where) {
+  PaperChoices out;
+  std::istringstream words(text);
+  for (std::string word; std::getline(words, word, ',');) {
+    const std::string key = word.substr(0, word.find('=')), value = word.substr(std::min(word.size(), key.size() + 1));
+    const auto one_of = [&](const auto& choices) {
+      const auto at = std::find(std::begin(choices), std::end(choices), value);
+      std::string all;
+      for (const char* choice : choices) all += (all.empty() ? "" : ", ") + std::string(choice);
+      if (at == std::end(choices))
+        throw InputError(where, "'" + word + "' is not there to choose", "give one of " + all);
+      return static_cast<int>(at - std::begin(choices));
+    };
+    const auto number = [&] {
+      int result = 0;
+      const auto [end, error] = std::from_chars(value.data(), value.data() + value.size(), result);
+      if (error != std::errc() || end != value.data() + value.size() || result < 1 || result > 1000000)
+        throw InputError(where, "'" + word + "' is no whole number from 1 to 1000000", "give for example 5000");
+      return result;
+    };
+    if (key == "background")
+      out.background = static_cast<Background>(one_of(kBackgrounds));
+    else if (key == "growth")
+      out.growth = one_of(std::array{"no", "yes"}) == 1;
+    else if (key == "resets")
+      out.opacity_resets = one_of(kResets) % 2 == 1, out.link_resets = one_of(kResets) >= 2;
+    else if (key == "gaussians")
+      out.gaussians = number();
+    else if (key == "iterations")
+      out.iterations = number();
+    else
+      throw InputError(where, "there is no choice '" + key + "'",
+                       "give some of background=, growth=, resets=, gaussians=, iterations=");
+  }
+  return out;
+}
+
+std::string text_of(const PaperChoices& c) {
+  const PaperChoices usual;
+  std::string text;
+  const auto add = [&](const char* key, const std::string& value, bool differs) {
+    if (differs) text += (text.empty() ? "" : ",") + std::string(key) + "=" + value;
+  };
+  add("background", kBackgrounds[static_cast<int>(c.background)], c.background != usual.background);
+  add("growth", yes_or_no(c.growth), c.growth != usual.growth);
+  add("resets", kResets[resets_of(c)], resets_of(c) != resets_of(usual));
+  add("gaussians", std::to_string(c.gaussians), c.gaussians != usual.gaussians);
+  add("iterations", std::to_string(c.iterations), c.iterations != usual.iterations);
+  return text;
+}
 
 Result recognize_paper(gpu::Device& device, const capture::Capture& capture, const Options& options) {
   constexpr int kCheckpointEvery = 1000;
@@ -302,18 +416,26 @@ Result recognize_paper(gpu::Device& device, const capture::Capture& capture, con
   else
     engine.set_gaussians(random_gaussians(job));
 
-  const double extent = scene_extent(capture);
+  const double extent = scene_extent(capture), loss_scale = of_whole_image(job);
   std::vector<int> order;
-  for (int iteration = job.first; iteration < options.paper_iterations; ++iteration) {
+  for (int iteration = job.first; iteration < options.paper.iterations; ++iteration) {
     if (const int signal = core::stop_requested()) {
       save(job, engine, iteration);
       throw Interrupted(signal);
     }
-    const double fraction = static_cast<double>(iteration) / options.paper_iterations;
-    train_on(job, engine, draw_view(job, iteration, order), iteration, rates_of_paper(extent, fraction));
+    const double fraction = static_cast<double>(iteration) / options.paper.iterations;
+    const std::size_t v = draw_view(job, iteration, order);
+    train_on(job, engine, v, iteration, rates_of_paper(extent, fraction));
     const int done = iteration + 1;
-    if (done % kOpacityReset == 0 && done <= kLastOpacityReset) engine.reset_opacity(kResetOpacity);
-    if (std::find(std::begin(kLinkResets), std::end(kLinkResets), done) != std::end(kLinkResets)) engine.reset_links();
+    if (options.paper.growth && done < kGrowthUntil) {
+      const double width = job.capture.cameras[job.views[v].view.camera].width;
+      add_step(engine.gradient(), loss_scale, pixels_per_meter(job, job.views[v]) / (0.5 * width), job.pull);
+      if (done % kGrowthEvery == 0 && done > kGrowthFrom) change_gaussians(job, engine, done, extent);
+    }
+    const bool resets_links = std::find(std::begin(kLinkResets), std::end(kLinkResets), done) != std::end(kLinkResets);
+    if (options.paper.opacity_resets && done % kOpacityReset == 0 && done <= kLastOpacityReset)
+      engine.reset_opacity(kResetOpacity);
+    if (options.paper.link_resets && resets_links) engine.reset_links();
     if (done % kCheckpointEvery == 0) save(job, engine, done);
   }
   job.result.gaussians = engine.gaussians();

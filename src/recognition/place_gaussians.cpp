@@ -98,28 +98,6 @@ splat::Gaussians place_along_chain(const chain::Chain& chain, const capture::Cap
   return g;
 }
 
-void copy_row(const splat::Gaussians& from, int i, splat::Gaussians& to, int k) {
-  const auto copy = [&](auto splat::Gaussians::*values, int width) {
-    std::copy_n((from.*values).begin() + static_cast<std::ptrdiff_t>(width) * i, width,
-                (to.*values).begin() + static_cast<std::ptrdiff_t>(width) * k);
-  };
-  copy(&splat::Gaussians::mean, 3);
-  copy(&splat::Gaussians::rotation, 4);
-  copy(&splat::Gaussians::log_scale, 3);
-  copy(&splat::Gaussians::opacity_logit, 1);
-  copy(&splat::Gaussians::sh, 3 * from.sh_coefficients());
-  copy(&splat::Gaussians::link_logits, from.links);
-  copy(&splat::Gaussians::guessed, 1);
-}
-
-splat::Gaussians rows_of(const splat::Gaussians& gaussians, std::span<const int> rows, int more) {
-  splat::Gaussians out;
-  const int count = static_cast<int>(rows.size());
-  out.resize(count + more, gaussians.links, gaussians.degree);
-  for (int k = 0; k < count; ++k) copy_row(gaussians, rows[k], out, k);
-  return out;
-}
-
 Unexplained unexplained(const capture::PackedView& packed, const splat::Picture& picture,
                         const std::vector<math::Pose>& motions) {
   // codec and sensor noise, squared, three channels: not worth a Gaussian

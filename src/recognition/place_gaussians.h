@@ -19,11 +19,6 @@ splat::Gaussians place_along_chain(const chain::Chain& chain, const capture::Cap
                                    const chain::States& states, const std::vector<FrameViews>& frames,
                                    std::span<const int> training, int count, core::Random& random);
 
-// Makes Gaussian k of `to` Gaussian i of `from`; both have the same links and degree.
-void copy_row(const splat::Gaussians& from, int i, splat::Gaussians& to, int k);
-// These Gaussians, in this order, and `more` new ones after them, as Gaussians::resize() makes them.
-splat::Gaussians rows_of(const splat::Gaussians& gaussians, std::span<const int> rows, int more);
-
 // Pixels of a view that a picture of it, drawn with these link motions, does not explain.
 struct Unexplained {
   std::vector<math::Pose> motions;

@@ -59,10 +59,9 @@ std::string job_text(const capture::Capture& capture, const Options& options) {
        << (options.joints ? std::to_string(*options.joints) : "auto") << "\n--bending " << bending << "\n--twist "
        << (options.twist ? "yes" : "no") << "\n--every " << options.every << "\n--mode "
        << (options.mode == Mode::paper ? "paper" : "fast") << "\n--seed " << options.seed << "\nbudget "
-       << options.budget << "\nstep " << core::exact(options.step) << "\npaper's Gaussians " << options.paper_gaussians
-       << "\npaper's iterations " << options.paper_iterations << "\ntimes of frames " << hashed(times, core::fnv1a(""))
-       << "\ncameras and size " << hashed(geometry, core::fnv1a("")) << "\nimages and masks "
-       << hashed(pictures, core::fnv1a("")) << "\n";
+       << options.budget << "\nstep " << core::exact(options.step) << "\n--paper " << text_of(options.paper)
+       << "\ntimes of frames " << hashed(times, core::fnv1a("")) << "\ncameras and size "
+       << hashed(geometry, core::fnv1a("")) << "\nimages and masks " << hashed(pictures, core::fnv1a("")) << "\n";
   return text.str();
 }
 

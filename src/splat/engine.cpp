@@ -202,6 +202,11 @@ Gaussians Engine::gaussians() const {
   return unpacked(state_->trained(scene.parameters), scene.count, scene.links, scene.degree);
 }
 
+Gaussians Engine::gradient() const {
+  const Scene& scene = state_->training;
+  return unpacked(state_->trained(scene.gradient), scene.count, scene.links, scene.degree);
+}
+
 LossValues Engine::step(std::span<const int> batch, const LossWeights& weights, const AdamRates& rates,
                         bool read_losses, std::vector<math::MatrixX>* twists) {
   State& s = *state_;
@@ -302,6 +307,20 @@ void Engine::reset_links() {
   std::fill(now.gaussians.link_logits.begin(), now.gaussians.link_logits.end(), 0.0f);
   for (auto* moment : {&now.first_moment, &now.second_moment})
     std::fill(moment->end() - static_cast<std::ptrdiff_t>(now.gaussians.link_logits.size()), moment->end(), 0.0f);
+  restore(now);
+}
+
+void Engine::change_gaussians(std::span<const int> kept, const Gaussians& added) {
+  Snapshot now = snapshot();
+  const int count = now.gaussians.count, links = now.gaussians.links, degree = now.gaussians.degree;
+  CHAINSPLAT_CHECK(added.links == links && added.degree == degree, std::to_string(added.links));
+  for (auto* moment : {&now.first_moment, &now.second_moment}) {
+    Gaussians values = rows_of(unpacked(*moment, count, links, degree), kept, added.count);
+    std::fill(values.rotation.end() - 4 * static_cast<std::ptrdiff_t>(added.count), values.rotation.end(), 0.0f);
+    *moment = packed(values);
+  }
+  now.gaussians = rows_of(now.gaussians, kept, added.count);
+  for (int i = 0; i < added.count; ++i) copy_row(added, i, now.gaussians, static_cast<int>(kept.size()) + i);
   restore(now);
 }
 

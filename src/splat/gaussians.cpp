@@ -29,6 +29,28 @@ void Gaussians::resize(int new_count, int new_links, int new_degree) {
   count = new_count;
 }
 
+void copy_row(const Gaussians& from, int i, Gaussians& to, int k) {
+  const auto copy = [&](auto Gaussians::*values, int width) {
+    std::copy_n((from.*values).begin() + static_cast<std::ptrdiff_t>(width) * i, width,
+                (to.*values).begin() + static_cast<std::ptrdiff_t>(width) * k);
+  };
+  copy(&Gaussians::mean, 3);
+  copy(&Gaussians::rotation, 4);
+  copy(&Gaussians::log_scale, 3);
+  copy(&Gaussians::opacity_logit, 1);
+  copy(&Gaussians::sh, 3 * from.sh_coefficients());
+  copy(&Gaussians::link_logits, from.links);
+  copy(&Gaussians::guessed, 1);
+}
+
+Gaussians rows_of(const Gaussians& gaussians, std::span<const int> rows, int more) {
+  Gaussians out;
+  const int count = static_cast<int>(rows.size());
+  out.resize(count + more, gaussians.links, gaussians.degree);
+  for (int k = 0; k < count; ++k) copy_row(gaussians, rows[k], out, k);
+  return out;
+}
+
 math::Vector3 sh_color(const Gaussians& gaussians, int index, const math::Vector3& r) {
   math::Vector3 color = math::Vector3::Constant(0.5);
   const int coefficients = gaussians.sh_coefficients();

@@ -267,6 +267,7 @@ bool Engine::State::make_room(Submission& s) {
   push.weight_l1 = static_cast<float>(options.weights.l1 * options.color_scale);
   push.weight_dssim = static_cast<float>(options.weights.dssim * options.color_scale);
   push.weight_mask = static_cast<float>(options.weights.mask * options.mask_scale);
+  push.background = options.weights.background;
   push.flags = (options.accumulate ? shared::kFlagAccumulate : 0) | (options.held_links ? shared::kFlagHeldLinks : 0);
   return true;
 }

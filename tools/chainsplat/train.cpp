@@ -21,7 +21,7 @@ using Json = nlohmann::ordered_json;
 struct Request {
   std::string capture, out, picture;
   std::string stages;  // empty: all
-  std::string joints = "auto", bending = "auto", mode = "fast", frames;
+  std::string joints = "auto", bending = "auto", mode = "fast", paper, frames;
   pipeline::TrainOptions options;
 };
 
@@ -30,6 +30,7 @@ pipeline::TrainOptions options_of(const Request& request, const Globals& globals
   pipeline::set(options, "joints", request.joints, "`joints`");
   pipeline::set(options, "bending", request.bending, "`bending`");
   pipeline::set(options, "mode", request.mode, "`mode`");
+  pipeline::set(options, "paper", request.paper, "`paper`");
   pipeline::set(options, "stages", request.stages, "`stages`");
   pipeline::set(options, "frames", request.frames, "`frames`");
   options.picture = request.picture;
@@ -109,6 +110,11 @@ void add_recognition_options(Command command, Request& request) {
       .add_option("--fixed", options.fixed,
                   "Take as given what is else corrected: cameras,focal,time,length,diameter,grasp,masks,colors, or all")
       .delimiter(',')
+      .type_name("LIST");
+  command
+      .add_option("--paper", request.paper,
+                  "Of --mode paper, to see what it does: background=black|white|random, growth=no,\n"
+                  "resets=none|opacity|links|both, gaussians=N, iterations=N")
       .type_name("LIST");
   command.add_flag("--anyway", options.anyway,
                    "Go on where check names a mistake in the capture; do not trust the twin");
