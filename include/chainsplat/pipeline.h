@@ -14,7 +14,6 @@
 #include <vector>
 
 #include "chainsplat/eval.h"
-#include "chainsplat/recognition.h"
 #include "chainsplat/solve.h"
 #include "chainsplat/twin.h"
 
@@ -49,8 +48,10 @@ struct TrainOptions {
   Path picture;               // PNG of observed beside rendered frames; empty: none
   // What is taken as given instead of estimated with the angles: groups of capture::corrected_quantities(), or "all".
   std::vector<std::string> fixed;
-  recognition::PaperChoices paper;  // of mode paper
-  bool anyway = false;              // go on where the capture contradicts itself so that no twin of it is worth having
+  // What mode paper changes, to see what it does: "background=black|white|random,growth=no,resets=none|opacity|links|both,
+  // gaussians=N,iterations=N" or some of these.
+  std::string paper;
+  bool anyway = false;  // go on where the capture contradicts itself so that no twin of it is worth having
   std::uint64_t seed = 0;
   std::string device;  // Vulkan device, its number or a part of its name; empty: chosen
 

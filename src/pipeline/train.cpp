@@ -45,7 +45,7 @@ recognition::Options recognition_options(const Training& t) {
   options.twist = t.options.twist;
   options.every = t.options.every;
   options.mode = t.options.mode == twin::Mode::paper ? recognition::Mode::paper : recognition::Mode::fast;
-  options.paper = t.options.paper;
+  options.paper = recognition::read_paper_choices(t.options.paper, "`paper`");
   options.seed = t.options.seed;
   options.checkpoint = t.run / kCheckpointFolder;
   options.resume = t.options.resume;
@@ -67,7 +67,8 @@ twin::Provenance recognition_provenance(const TrainOptions& options) {
   std::string held;
   for (const std::string& group : options.fixed) held += (held.empty() ? "" : ",") + group;
   if (!held.empty()) p.options["fixed"] = held;
-  if (const std::string choices = recognition::text_of(options.paper); !choices.empty()) p.options["paper"] = choices;
+  const std::string choices = recognition::text_of(recognition::read_paper_choices(options.paper, "`paper`"));
+  if (!choices.empty()) p.options["paper"] = choices;
   return p;
 }
 

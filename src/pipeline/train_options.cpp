@@ -5,6 +5,7 @@
 #include <sstream>
 
 #include "chainsplat/pipeline.h"
+#include "chainsplat/recognition.h"
 
 namespace chainsplat::pipeline {
 
@@ -60,7 +61,7 @@ void TrainOptions::check() const {
     throw InputError("`frames`", "'" + capture::frame_range_text(frames) + "' is no range of frames",
                      "give A:B, for example 0:60 for the first 60");
   check_groups(fixed, "`fixed`");
-  if (!recognition::text_of(paper).empty() && mode != twin::Mode::paper)
+  if (!recognition::text_of(recognition::read_paper_choices(paper, "`paper`")).empty() && mode != twin::Mode::paper)
     throw InputError("`paper`", "goes with `mode` paper", "leave it out, or give that mode");
   if (force && resume) throw InputError("`force`, `resume`", "contradict each other", "give one of them");
 }
@@ -113,7 +114,8 @@ void set(TrainOptions& options, const std::string& name, const std::string& text
     options.fixed = split(text);
     check_groups(options.fixed, where);
   } else if (name == "paper") {
-    options.paper = recognition::read_paper_choices(text, where);
+    recognition::read_paper_choices(text, where);
+    options.paper = text;
   } else {
     throw InputError(where, "there is no setting '" + name + "'", "give one of those of train");
   }
