@@ -48,8 +48,8 @@ struct TrainOptions {
   Path picture;               // PNG of observed beside rendered frames; empty: none
   // What is taken as given instead of estimated with the angles: groups of capture::corrected_quantities(), or "all".
   std::vector<std::string> fixed;
-  // What mode paper changes, to see what it does: "background=black|white|random,growth=no,resets=none|opacity|links|both,
-  // gaussians=N,iterations=N" or some of these.
+  // What mode paper changes, to see what it does, with commas between: background=black|white|random, growth=no,
+  // resets=none|opacity|links|both, gaussians=N, iterations=N.
   std::string paper;
   bool anyway = false;  // go on where the capture contradicts itself so that no twin of it is worth having
   std::uint64_t seed = 0;
