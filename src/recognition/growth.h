@@ -10,12 +10,12 @@ namespace chainsplat::recognition {
 
 // What the steps since the last change say of each Gaussian.
 struct Pull {
-  std::vector<double> sum;  // of the loss gradient by its place in the image, whose sides are 2
-  std::vector<int> steps;   // in which it was seen
+  std::vector<double> sum;  // norms of the loss gradient by the center in normalized device coordinates (-1 to 1)
+  std::vector<int> steps;   // in which a pixel showed it
 };
 
-// Adds one step: the gradient of a loss that is a mean over the whole image, by Gaussians whose place moves by
-// `per_meter` of half the image's width if they move by 1 m.
+// Adds the gradient of one step on one view. `loss_scale` turns the step's loss into a mean over the whole image, for
+// which the threshold is meant; `per_meter`: normalized device coordinates per meter across the view.
 void add_step(const splat::Gaussians& gradient, double loss_scale, double per_meter, Pull& pull);
 
 struct GrowthLimits {
