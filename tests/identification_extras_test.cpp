@@ -96,6 +96,11 @@ TEST_CASE("a rope with friction in bending gets it, and its numbers; one without
   const Result smooth = identify(braked.chain, braked.base, braked.markers, options);
   CHECK(smooth.parameters.bending_friction.empty());
   CHECK(smooth.node_rms > 3.0 * result.node_rms);
+  // what is expected of a marker's coordinate: its deviation, and half a hundredth of the length for what the chain
+  // lacks
+  const double expected = std::hypot(kNoise, 0.005 * kLength);
+  for (const Result& one : {result, smooth})
+    CHECK(one.estimates.misfit == doctest::Approx(one.node_rms / std::sqrt(3.0) / expected).epsilon(1e-6));
 
   const Scene free = make_scene(0.0, 0.0);
   options.ask_for_more = true;

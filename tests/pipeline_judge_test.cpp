@@ -75,6 +75,23 @@ TEST_CASE("a motion that misses what was recognized is doubted, and then not tru
   }
 }
 
+TEST_CASE("a fit that leaves more than the angles' errors is doubted, however little that is of the length") {
+  for (const double misfit : {0.9, 2.3, std::nan("")}) {
+    twin::Twin twin = make_twin(0.2, 0.0);
+    twin.estimates.misfit = misfit;
+    for (int time = 0; time < 2; ++time) {  // anew, not beside the old one
+      pipeline::judge_motion(twin, still_base());
+      const capture::Finding* const found = finding(twin, "unexplained");
+      REQUIRE((found != nullptr) == (misfit > 1.5));
+      CHECK(twin.verdict.size() == (found ? 2 : 1));  // "unexcited" beside it
+      if (!found) continue;
+      CHECK(found->value == misfit);
+      CHECK(found->trusted);
+      CHECK(found->text.find("2.3 times") != std::string::npos);
+    }
+  }
+}
+
 TEST_CASE("a plane that the views do not tell is told") {
   using chain::Bending;
   const auto judged = [](Bending bending, double out_of_plane, double deviation) {

@@ -45,6 +45,7 @@ twin::Twin full_twin() {
   twin.estimates.covariance(1, 0) = 1e-300;
   twin.estimates.weak = {{0.25, {{"rest_angle_3", 0.8}, {"log_stiffness", -0.6}}}};  // not in alphabetical order
   twin.estimates.held = {{"mass", "given by the capture"}, {"twist", "not observed, \"held\""}};
+  twin.estimates.misfit = 0.7;
   twin.estimates.solver = {solve::Reason::no_decrease, 7, std::numeric_limits<double>::quiet_NaN(), 2.0 / 3.0, 1e-300};
   twin::Provenance& p = twin.provenance;
   p.version = "1.2.3", p.capture = "free \xc3\xa4", p.capture_hash = "00ff", p.device = "llvmpipe", p.driver = "Mesa";
@@ -106,6 +107,7 @@ TEST_CASE("a twin reads back bit by bit") {
   REQUIRE(read.estimates.weak.size() == 1);
   CHECK(read.estimates.weak[0].singular_value == 0.25);
   CHECK(read.estimates.weak[0].parts == twin.estimates.weak[0].parts);
+  CHECK(read.estimates.misfit == 0.7);
   REQUIRE(read.estimates.solver);
   CHECK(read.estimates.solver->reason == solve::Reason::no_decrease);
   CHECK(read.estimates.solver->iterations == 7);
@@ -358,6 +360,7 @@ TEST_CASE("damage to twin.json is named by file and key") {
       {"/identification/covariance/0/0", -0.1, "identification.covariance"},
       {"/identification/covariance/0/1", 0.1, "identification.covariance"},
       {"/identification/held/0/reason", removed, "identification.held[0].reason"},
+      {"/identification/misfit", -1, "identification.misfit"},
       {"/identification/solver/reason", "tired", "identification.solver.reason"},
       {"/identification/solver/iterations", -1, "identification.solver.iterations"},
       {"/provenance/seed", -1, "provenance.seed"},

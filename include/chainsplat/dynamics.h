@@ -5,6 +5,7 @@
 // mathematics.md.
 #pragma once
 #include <functional>
+#include <limits>
 #include <memory>
 #include <optional>
 #include <span>
@@ -91,6 +92,10 @@ struct Estimates {
     std::vector<std::pair<std::string, double>> parts;  // name, large components of the unit vector
   };
   std::vector<Weak> weak;
+  // Root mean square of what the fit leaves, in units of what one residual alone is expected to be off (mathematics.md
+  // 5.10). Well above 1: something acts on the rope that the model lacks, and the numbers may stand for it. NaN: a
+  // filter's estimates, the paper's procedure, or an older twin's.
+  double misfit = std::numeric_limits<double>::quiet_NaN();
   // Of the fit over the whole recordings: whitened squares, halves, priors included; steps in the units of the names.
   // None: a filter's estimates, or an older twin's.
   std::optional<solve::Summary> solver;

@@ -956,6 +956,7 @@ std::vector<Result> fit_parts(const chain::Chain& chain, std::vector<Part> parts
   if (fit.summary.reason == solve::Reason::last_iteration && !options.paper)
     core::warn("identify: the fit " + solve::describe(fit.summary) + "; the parameters may not be the best ones yet");
   const Eigen::Index shared = problem.shared, own = problem.own();
+  const double misfit = misfit_of(rollouts).scale;
 
   std::vector<Result> results(problem.parts.size());
   const std::vector<dynamics::Estimates::Weak> weak = weak_directions(problem, data);
@@ -976,6 +977,7 @@ std::vector<Result> fit_parts(const chain::Chain& chain, std::vector<Part> parts
     e.held = part.unknowns.held;
     e.solver = fit.summary;
     e.weak = weak;
+    if (!options.paper) e.misfit = misfit;
     e.values.assign(p.begin(), p.end());
     const Eigen::Index first = shared + static_cast<Eigen::Index>(i) * own;
     e.covariance.resize(shared + own, shared + own);

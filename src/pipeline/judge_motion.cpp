@@ -12,10 +12,14 @@ namespace {
 
 using capture::Finding;
 
-constexpr const char *kMisfit = "identification-misfit", *kUnexcited = "unexcited", *kOutOfPlane = "out-of-plane";
+constexpr const char *kMisfit = "identification-misfit", *kUnexplainedCode = "unexplained", *kUnexcited = "unexcited",
+                     *kOutOfPlane = "out-of-plane";
 // Share of the length by which the identified motion misses the recognized one, RMS over nodes and frames. Ropes that
 // the model can follow leave 0.1 to 0.4 %; a base one frame late, taken as given, 3 %.
 constexpr double kDoubtful = 0.01, kUseless = 0.02;
+// What the fit leaves, in units of what is expected: ropes that the model can follow leave 0.1, measured cables up to
+// 0.9.
+constexpr double kUnexplained = 1.5;
 constexpr double kStill = 2.0;  // of an angle's variation over its noise; swings leave 4 and more at the free end
 constexpr std::size_t kFramesOfMotion = 15;  // half a second
 // Share of the length by which a rope may leave its plane unseen before that is told: what three cameras are off by.
@@ -55,6 +59,19 @@ void judge_misfit(twin::Twin& twin, const trajectory::Trajectory& base) {
                         : "its predictions are no better than that");
   twin.verdict.push_back({kMisfit, "object", kMillimeters * misfit.rms, 0.0, "mm", false, !useless, false,
                           static_cast<int>(misfit.worst), text});
+}
+
+// A fit may follow the motion within a share of the length and still leave more than the angles are off: then numbers
+// of the model have taken the place of what it lacks, and their standard errors do not know.
+void judge_unexplained(twin::Twin& twin) {
+  const double misfit = twin.estimates.misfit;
+  if (!(misfit > kUnexplained)) return;
+  char text[256];
+  std::snprintf(text, sizeof text,
+                "the identified motion misses the recognized one by %.1f times what its errors explain: something acts "
+                "on the rope that the model lacks, and what is identified may stand for it",
+                misfit);
+  twin.verdict.push_back({kUnexplainedCode, "object", misfit, 0.0, "1", false, true, false, -1, text});
 }
 
 // Joints that the motion hardly bends, from 1: their angles vary little more than their noise, which second differences
@@ -109,8 +126,11 @@ void judge_bending(twin::Twin& twin, const silhouette::BendingChoice& choice) {
 }
 
 void judge_motion(twin::Twin& twin, const trajectory::Trajectory& base) {
-  std::erase_if(twin.verdict, [](const Finding& f) { return f.code == kMisfit || f.code == kUnexcited; });
+  std::erase_if(twin.verdict, [](const Finding& f) {
+    return f.code == kMisfit || f.code == kUnexplainedCode || f.code == kUnexcited;
+  });
   judge_misfit(twin, base);
+  judge_unexplained(twin);
   judge_excitation(twin);
 }
 

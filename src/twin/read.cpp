@@ -200,6 +200,10 @@ dynamics::Estimates read_estimates(const Node& node) {
       for (const auto& [name, component] : weak["direction"].members())
         e.weak.back().parts.emplace_back(name, component.number());
     }
+  if (node.has("misfit")) {
+    e.misfit = node["misfit"].number();
+    if (e.misfit < 0.0) node["misfit"].fail("is negative", "restore it or identify again");
+  }
   if (node.has("solver")) {
     const Node solver = node["solver"];
     const auto reason = solve::reason_of(solver["reason"].text());

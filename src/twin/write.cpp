@@ -227,6 +227,7 @@ Json identification_json(const Twin& twin) {
     for (const auto& [name, component] : weak.parts) parts[name] = component;
     out["weak"].push_back({{"singular_value", weak.singular_value}, {"direction", parts}});
   }
+  if (std::isfinite(e.misfit)) out["misfit"] = e.misfit;
   if (e.solver) out["solver"] = *e.solver;
   return out;
 }

@@ -51,6 +51,7 @@ Json document_of(const twin::Twin& twin, const std::vector<std::string>& runs) {
     for (const auto& [name, component] : weak.parts) direction[name] = component;
     document["weak"].push_back({{"singular_value", weak.singular_value}, {"direction", direction}});
   }
+  if (std::isfinite(found.misfit)) document["misfit"] = found.misfit;
   if (found.solver) document["solver"] = *found.solver;
   return document;
 }
