@@ -10,6 +10,7 @@
 
 #include "chainsplat/core.h"
 #include "chainsplat/image_model.h"
+#include "src/recognition/hold_colors.h"
 #include "src/recognition/unseen.h"
 
 using namespace chainsplat;
@@ -254,4 +255,42 @@ TEST_CASE("more training leaves what was guessed, and the colors of what was see
     CHECK((trained.mean[3 * i] == before.mean[3 * i]) == guessed);
     CHECK((trained.sh[size * i] == before.sh[size * i]) == (guessed || slanted));
   }
+}
+
+TEST_CASE("colors stay beyond the directions from which they were seen, and are what they were at these") {
+  constexpr double kSlope = 0.4;  // of a color per unit of direction
+  constexpr int kWidest = 30;     // degrees to either side of the bending axis, from which cameras look
+  Rope rope(0.0);
+  rope.views.clear();
+  for (int at = -kWidest; at <= kWidest; at += 5) rope.look_from(at * kDegree);
+  splat::Gaussians& g = rope.gaussians;
+  for (int i = 0; i < g.count; ++i)
+    for (int c = 0; c < 3; ++c)
+      g.sh[12 * i + 3 + c] = static_cast<float>(kSlope / 0.4886025);  // with -y of the direction
+  g.guessed[0] = 1;
+  const splat::Gaussians before = g;
+  recognition::hold_colors(rope.chain, rope.views, g);
+  REQUIRE(g.degree == 2);
+  CHECK(splat::sh_color(g, 0, -rope.normal(1.0)) == splat::sh_color(before, 0, -rope.normal(1.0)));
+  // the bending axis is y: seen from `at` the color has kSlope cos(at) more, and the held ones those of 30 degrees
+  double seen = 0.0, held = 0.0, went_on = 0.0;
+  int count = 0;
+  for (int i = 1; i < g.count; ++i) {
+    if (std::cos(rope.angle(i)) < std::cos(40.0 * kDegree) || rope.arclength(i) > kLength - kDiameter) continue;
+    ++count;
+    for (int at = -90; at <= 90; at += 5) {
+      const math::Vector3 direction = -rope.normal(at * kDegree);
+      if (-direction.dot(rope.normal(rope.angle(i))) < 0.2) continue;
+      const math::Vector3 nearest = -rope.normal(std::clamp(at, -kWidest, kWidest) * kDegree);
+      const double wanted = splat::sh_color(before, i, nearest).x();
+      double& worst = std::abs(at) <= kWidest ? seen : held;
+      worst = std::max(worst, std::abs(splat::sh_color(g, i, direction).x() - wanted));
+      went_on = std::max(went_on, std::abs(splat::sh_color(before, i, direction).x() - wanted));
+    }
+  }
+  REQUIRE(count > 100);
+  MESSAGE("at most off: seen " << seen << ", held " << held << ", of those that would go on " << went_on);
+  CHECK(went_on > 0.3);
+  CHECK(seen < 0.05 * kSlope);
+  CHECK(held < 0.3 * went_on);
 }

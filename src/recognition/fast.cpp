@@ -4,6 +4,7 @@
 
 #include "chainsplat/image_model.h"
 #include "src/recognition/checkpoint.h"
+#include "src/recognition/hold_colors.h"
 #include "src/recognition/modes.h"
 #include "src/recognition/place_gaussians.h"
 #include "src/recognition/step_watch.h"
@@ -419,6 +420,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     bound_gaussians(job.result.chain, job.gaussians, kPastJointAtLast * job.result.chain.diameter, &radii);
     save(job, engine, kDone, 0);
   }
+  hold_colors(job.result.chain, viewpoints_of(job, specs), job.gaussians);
   refine_all_frames(job, engine);
   job.result.gaussians = std::move(job.gaussians);
   job.result.states = std::move(job.states);
