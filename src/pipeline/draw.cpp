@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstdio>
 #include <optional>
+#include <utility>
 
 #include "chainsplat/corrections.h"
 #include "chainsplat/encode.h"
@@ -117,6 +118,9 @@ class Files {
     else
       core::make_folder(stem_);
   }
+  // Those of a movie are to come in order.
+  bool in_order() const { return movie_.has_value(); }
+  // Several threads may add frames that need no order.
   void add(const render::Frame& frame, const capture::Image8& picture) {
     if (movie_) return movie_->add(picture);
     capture::write_png(file(frame, ".png"), picture);
@@ -156,11 +160,20 @@ int draw_camera(splat::Engine& engine, const Motion& motion, const Path& capture
   };
   int written = 0;
   const auto write = [&](std::vector<render::Frame>& batch) {
-    for (const render::Frame& frame : batch) {
-      const double share = static_cast<double>(frame.frame) / std::max<std::size_t>(1, times.size() - 1);
-      files.add(frame, render::laid_out(options.layout, frame, camera, recorded_at(frame.frame), share));
-      core::report({"write " + camera.name, ++written, count, NAN, NAN, ""});
+    std::vector<capture::Image8> recorded;
+    for (const render::Frame& frame : batch) recorded.push_back(recorded_at(frame.frame));
+    const auto picture = [&](std::size_t i) {
+      const double share = static_cast<double>(batch[i].frame) / std::max<std::size_t>(1, times.size() - 1);
+      return render::laid_out(options.layout, batch[i], camera, std::exchange(recorded[i], {}), share);
+    };
+    if (files.in_order()) {
+      for (std::size_t i = 0; i < batch.size(); ++i) files.add(batch[i], picture(i));
+    } else {  // compressing a picture takes ten times as long as drawing it
+      core::parallel_for(static_cast<std::int64_t>(batch.size()),
+                         [&](std::int64_t i) { files.add(batch[i], picture(i)); });
     }
+    written += static_cast<int>(batch.size());
+    core::report({"write " + camera.name, written, count, NAN, NAN, ""});
   };
   render::Options drawing;
   drawing.depth = options.depth;
