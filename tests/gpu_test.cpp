@@ -596,6 +596,11 @@ TEST_CASE("two threads share a device") {
   check_silent(*device);
 }
 
+TEST_CASE("a process opens the device as often as it likes") {
+  constexpr int kTimes = 40;  // NVIDIA's driver can be loaded 30 times
+  for (int time = 0; time < kTimes; ++time) CHECK(gpu::info(*gpu::open_device()).refused.empty());
+}
+
 TEST_CASE("the pipeline cache is kept, and a damaged or unwritable one is no trouble") {
   const Path folder = std::filesystem::temp_directory_path() / ("chainsplat_gpu_test_" + std::to_string(getpid()));
   std::filesystem::remove_all(folder);

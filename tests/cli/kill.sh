@@ -51,6 +51,7 @@ rm -rf "$work/killed"
 "$program" train "$demo" -o "$work/killed" "${options[@]}" >/dev/null 2>&1 </dev/null &
 pid=$!
 wait_for_file "$work/killed/checkpoint/recognize.before.bin" $pid
+kill -STOP $pid  # on a fast device it would else be done before the others have begun
 expect_error 2 'another process works in this folder' train "$demo" -o "$work/killed" "${options[@]}" --resume
 expect_error 2 'another process works in this folder' train "$demo" -o "$work/killed" "${options[@]}" --force
 

@@ -52,10 +52,10 @@ browse() {  # port pattern
 # Waits until the process has written a file with something in it, or has ended.
 wait_for_file() {  # file pid
   local look
-  for look in $(seq 1200); do
+  for look in $(seq 6000); do
     [ -s "$1" ] && return
     kill -0 "$2" 2>/dev/null || return
-    sleep 0.05
+    sleep 0.01
   done
 }
 

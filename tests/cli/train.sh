@@ -30,10 +30,10 @@ stop() {  # signal, exit code, further options
   before=$(cat "$work/stopped/log.jsonl" 2>/dev/null | wc -l)
   "$program" train "$demo" -o "$work/stopped" "${small[@]}" "$@" >"$work/stdout" 2>"$work/stderr" </dev/null &
   local pid=$!
-  for _ in $(seq 1200); do
+  for _ in $(seq 6000); do
     [ "$(cat "$work/stopped/log.jsonl" 2>/dev/null | wc -l)" -gt $((before + 1)) ] && break
     kill -0 $pid 2>/dev/null || break
-    sleep 0.05
+    sleep 0.01
   done
   kill -s "$signal" $pid
   wait $pid
