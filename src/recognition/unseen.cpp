@@ -289,7 +289,7 @@ void color_slanted(const Surface& surface, const Light& light, double slope, con
     if (!on_side(surface, at) || surface.facing[cell] >= kTrusted || surface.hidden[cell]) continue;
     const std::optional<Vector3> color = guessed(surface, light, at.arclength, at.angle, slope);
     if (!color) continue;
-    const double own = std::sqrt(std::max(0.0, surface.facing[cell] / kTrusted));
+    const double share = std::max(0.0, surface.facing[cell] / kTrusted), own = share * share;
     g.guessed[i] = kSlanted;
     splat::set_base_color(g, i, own * splat::base_color(g, i) + (1.0 - own) * *color);
     for (std::size_t c = 3; c < size; ++c) g.sh[size * i + c] *= static_cast<float>(own);
