@@ -253,11 +253,11 @@ Instance::~Instance() {
         vkGetInstanceProcAddr(handle, "vkDestroyDebugUtilsMessengerEXT"));
     destroy(handle, messenger, nullptr);
   }
-  // The first one stays until the process ends and keeps the drivers loaded: NVIDIA's (580.159) takes memory whenever
-  // it is loaded that it never gives back, and the 31st time in one process it finds none ("no Vulkan driver").
+  // The first one without layers stays until the process ends and keeps the drivers loaded: NVIDIA's (580.159) takes
+  // memory whenever it is loaded that it never gives back, and the 31st time in one process it finds none.
   static std::atomic<VkInstance> kept{VK_NULL_HANDLE};
   VkInstance none = VK_NULL_HANDLE;
-  if (!kept.compare_exchange_strong(none, handle)) vkDestroyInstance(handle, nullptr);
+  if (messenger || !kept.compare_exchange_strong(none, handle)) vkDestroyInstance(handle, nullptr);
 }
 
 bool validation_layer_present() {
