@@ -55,9 +55,6 @@ void write(const twin::Twin& twin, const chain::States& motion, const trajectory
 std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, const chain::States& motion,
                  const trajectory::Trajectory& base, bool binary, const Options& options = {});
 
-// The link with the largest probability of Gaussian `i`.
-int surest_link(const splat::Gaussians& gaussians, int i);
-
 // Gaussians that look in other viewers as they do here: their scales hold what the renderer adds on the image,
 // sqrt(0.3) px at the nearest that each comes to a camera in the motion.
 splat::Gaussians with_low_pass(const splat::Gaussians& gaussians, const chain::Chain& chain,

@@ -169,6 +169,8 @@ class Engine {
   std::unique_ptr<State> state_;
 };
 
+// The link with the largest probability, for where a Gaussian needs one (mathematics.md 2.4).
+int surest_link(const Gaussians& gaussians, int index);
 // Color of one Gaussian by its spherical harmonics (mathematics.md 2.4), seen along `direction` (unit, home frame).
 math::Vector3 sh_color(const Gaussians& gaussians, int index, const math::Vector3& direction);
 // The part of it that is the same from everywhere, RGB in 0..1; setting it leaves the higher degrees as they are.

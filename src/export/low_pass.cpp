@@ -39,9 +39,4 @@ splat::Gaussians with_low_pass(const splat::Gaussians& gaussians, const chain::C
   return out;
 }
 
-int surest_link(const splat::Gaussians& g, int i) {
-  const auto first = g.link_logits.begin() + static_cast<std::ptrdiff_t>(g.links) * i;
-  return static_cast<int>(std::max_element(first, first + g.links) - first);
-}
-
 }  // namespace chainsplat::exports

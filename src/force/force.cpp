@@ -371,8 +371,7 @@ Contact nearest_contact(const chain::Chain& chain, const splat::Gaussians& gauss
   };
   if (gaussians.count > 0 && gaussians.links == chain.links()) {
     for (int i = 0; i < gaussians.count; ++i) {
-      const float* const logits = &gaussians.link_logits[static_cast<std::size_t>(i) * gaussians.links];
-      const int link = static_cast<int>(std::max_element(logits, logits + gaussians.links) - logits);
+      const int link = splat::surest_link(gaussians, i);
       const Vector3 home(gaussians.mean[3 * i], gaussians.mean[3 * i + 1], gaussians.mean[3 * i + 2]);
       offer(link, std::clamp(home.dot(chain.direction), chain.link_start(link), chain.link_end(link)), home);
     }

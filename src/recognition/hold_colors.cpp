@@ -11,7 +11,6 @@ namespace chainsplat::recognition {
 
 namespace {
 
-using math::MatrixX;
 using math::Vector3;
 
 constexpr int kDegree = 2, kCoefficients = 9;
@@ -42,11 +41,6 @@ Basis basis(const Vector3& r) {
   return out;
 }
 
-int own_link(const splat::Gaussians& g, int i) {
-  const auto first = g.link_logits.begin() + static_cast<std::ptrdiff_t>(g.links) * i;
-  return static_cast<int>(std::max_element(first, first + g.links) - first);
-}
-
 // Where the surface faces at a Gaussian's place, home frame; zero near the axis. The tip is a half sphere.
 Vector3 normal_at(const chain::Chain& chain, const Vector3& mean) {
   const double radius = 0.5 * chain.diameter;
@@ -66,7 +60,7 @@ void hold_colors(const chain::Chain& chain, std::span<const Viewpoint> views, sp
     const Vector3 mean(gaussians.mean[3 * i], gaussians.mean[3 * i + 1], gaussians.mean[3 * i + 2]);
     const Vector3 normal = normal_at(chain, mean);
     if (gaussians.guessed[i] != 0 || normal.isZero(0.0)) return;
-    const int link = own_link(gaussians, i);
+    const int link = splat::surest_link(gaussians, i);
     std::vector<Vector3> seen;  // from camera to Gaussian, home frame
     for (const Viewpoint& view : views) {
       const math::Pose& motion = view.motions[link];

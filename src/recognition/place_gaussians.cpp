@@ -232,7 +232,7 @@ void bound_gaussians(const chain::Chain& chain, splat::Gaussians& gaussians, dou
     const math::Vector3 mean(gaussians.mean[3 * i], gaussians.mean[3 * i + 1], gaussians.mean[3 * i + 2]);
     const double s = mean.dot(chain.direction);
     float* logits = &gaussians.link_logits[static_cast<std::size_t>(gaussians.links) * i];
-    const auto own = std::max_element(logits, logits + gaussians.links) - logits;
+    const int own = splat::surest_link(gaussians, i);
     const int link = std::clamp(chain::link_at(chain, s), 1, gaussians.links - 1);
     std::swap(logits[own], logits[link]);
 

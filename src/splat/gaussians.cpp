@@ -51,6 +51,11 @@ Gaussians rows_of(const Gaussians& gaussians, std::span<const int> rows, int mor
   return out;
 }
 
+int surest_link(const Gaussians& gaussians, int index) {
+  const auto first = gaussians.link_logits.begin() + static_cast<std::ptrdiff_t>(gaussians.links) * index;
+  return static_cast<int>(std::max_element(first, first + gaussians.links) - first);
+}
+
 math::Vector3 sh_color(const Gaussians& gaussians, int index, const math::Vector3& r) {
   math::Vector3 color = math::Vector3::Constant(0.5);
   const int coefficients = gaussians.sh_coefficients();
