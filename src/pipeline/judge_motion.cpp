@@ -17,8 +17,8 @@ constexpr const char *kMisfit = "identification-misfit", *kUnexplainedCode = "un
 // Share of the length by which the identified motion misses the recognized one, RMS over nodes and frames. Ropes that
 // the model can follow leave 0.1 to 0.4 %; a base one frame late, taken as given, 3 %.
 constexpr double kDoubtful = 0.01, kUseless = 0.02;
-// What the fit leaves, in units of what is expected: ropes that the model can follow leave 0.1, measured cables up to
-// 0.9.
+// What the fit leaves, in units of what is expected: recognized ropes that the model can follow leave 0.1, markers on
+// measured cables, of which more is expected, up to 0.9.
 constexpr double kUnexplained = 1.5;
 constexpr double kStill = 2.0;  // of an angle's variation over its noise; swings leave 4 and more at the free end
 constexpr std::size_t kFramesOfMotion = 15;  // half a second

@@ -14,10 +14,11 @@ namespace {
 using math::Vector3;
 
 constexpr int kDegree = 2, kCoefficients = 9;
-constexpr int kLinear = 4;            // coefficients up to degree 1
-constexpr int kDirections = 300;      // over the sphere
-constexpr double kSeenFrom = -0.1;    // least cosine between normal and view ray of a view that counts: they are wide
-constexpr double kSeeable = 0.1;      // the same of the directions for which colors are held
+constexpr int kLinear = 4;        // coefficients up to degree 1
+constexpr int kDirections = 300;  // over the sphere
+// Least cosine between surface normal and view ray of a view that counts; below 0, as Gaussians reach around the limb.
+constexpr double kSeenFrom = -0.1;
+constexpr double kSeeable = 0.1;      // least cosine of the directions for which colors are held
 constexpr double kLeastShare = 0.1;   // of the views, that must have seen it
 constexpr double kSeenWeight = 50.0;  // of all colors that were seen, to all that are held
 constexpr double kRidge = 1e-6;       // toward the old coefficients

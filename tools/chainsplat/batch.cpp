@@ -40,10 +40,10 @@ struct Request {
   int warn_seconds = 60;  // before the time limit
 };
 
-// How many trainings share the device best, and the host threads of each. Measured, docs/figures.md: a training keeps two
-// threads busy for part of its time only, so that on a processor as many trainings as cores with one thread each do
-// more. On a GPU a training is host work for nine tenths of its time, and half as many as cores with two threads each do
-// more than a quarter as many with four.
+// How many trainings share the device best, and the host threads of each. Measured, docs/figures.md: a training keeps
+// two threads busy for part of its time only, so that on a processor as many trainings as cores with one thread each do
+// more. On a GPU a training is mostly host work, and half as many as cores with two threads each do more than a quarter
+// as many with four.
 int best_parallel(bool software) { return software ? core::threads() : std::max(2, core::threads() / 2); }
 
 std::string status_text(const BatchPlan& plan, const Path& folder) {
