@@ -111,6 +111,18 @@ Vector3 sagitta(const Segment& segment, const Vector3& curvature, const Vector3&
   return -0.5 * t * (1.0 - t) * link.squaredNorm() * curvature;
 }
 
+// How fast a point of the outline moves with the twist of its link, camera frame, then with what its view shares.
+constexpr int kPointSize = 6 + kSharedOfView;
+using PointRow = Eigen::Matrix<double, kPointSize, 1>;
+
+// Sums over the outline of one link. The angles move its points by its twist alone: what they ask of the angles follows
+// from these sums, at the end (mathematics.md 2.3).
+struct LinkSums {
+  Eigen::Matrix<double, kPointSize, kPointSize> normal = decltype(normal)::Zero();
+  PointRow right = PointRow::Zero(), slope = PointRow::Zero();  // of weights times residual times row, times row
+  double weight = 0.0, residual = 0.0;                          // of weights, times residual
+};
+
 // Normal equations of one view: its angles, then what it shares.
 struct ViewEquations {
   MatrixX normal;
@@ -118,17 +130,17 @@ struct ViewEquations {
 };
 
 // Its sums go into those of its camera in `frame`.
-ViewEquations view_equations(const PosedView& view, int camera, const CorrectionProblem& fit, const VectorX& thetadot,
-                             FrameEquations& frame) {
+std::vector<LinkSums> link_sums(const PosedView& view, int camera, const CorrectionProblem& fit,
+                                const VectorX& thetadot, FrameEquations& frame) {
   const SharedPlaces& places = fit.places[camera];
   FrameEquations::Sums& sums = frame.sums[camera];
   const chain::Chain& chain = *view.problem.chain;
-  const int n = chain.angles(), size = n + kSharedOfView, links = chain.links();
-  ViewEquations out{MatrixX::Zero(size, size), VectorX::Zero(size)};
-  // of each link's own offset in this view (observations.cpp), eliminated at the end
-  MatrixX coupling = MatrixX::Zero(size, links);
-  VectorX link_weight = VectorX::Constant(links, kEvidence / (kLinkOffsetDeviation * kLinkOffsetDeviation));
-  VectorX link_right = VectorX::Zero(links), row(size);
+  std::vector<LinkSums> out(chain.links());
+  MatrixX speeds = MatrixX::Zero(6, chain.links());  // twist of each link by the angles' rates
+  for (int link = 0; link < chain.links(); ++link) {
+    const int angles = chain.last_angle(link) + 1;
+    speeds.col(link) = view.twists.leftCols(angles) * thetadot.head(angles);
+  }
   const std::vector<Segment>& segments = view.problem.views[0].segments;
   const std::vector<Vector3> bends = curvatures(segments);
   const auto add = [&](const OutlinePoint& p) {
@@ -147,13 +159,11 @@ ViewEquations view_equations(const PosedView& view, int camera, const Correction
     sums.first += weight * residual;
     sums.second += weight * residual * residual;
     frame.cost += 0.5 * weight * residual * residual;
-    const Vector3 moment = p.x.cross(p.gradient);
     const int link = p.segment->link;
-    for (int k = 0; k < n; ++k)
-      row[k] = link < chain.child_link[k]
-                   ? 0.0
-                   : moment.dot(view.twists.col(k).head<3>()) + p.gradient.dot(view.twists.col(k).tail<3>());
-    const SharedRow shared = shared_row(view, p, row.head(n).dot(thetadot));
+    PointRow row;
+    row.head<3>() = p.x.cross(p.gradient);
+    row.segment<3>(3) = p.gradient;
+    const SharedRow shared = shared_row(view, p, row.head<6>().dot(speeds.col(link)));
     row.tail<kSharedOfView>() = places.unit.cwiseProduct(shared);
     if (p.part == OutlinePoint::Part::start) {
       sums.start_weight += weight;
@@ -162,19 +172,43 @@ ViewEquations view_equations(const PosedView& view, int camera, const Correction
       sums.start_speed += weight * std::abs(shared[kMaskStart]);
       sums.start_bulge += weight * p.half_width;
     }
-    out.normal.selfadjointView<Eigen::Lower>().rankUpdate(row, weight);
-    out.right += weight * residual * row;
-    coupling.col(link) += weight * row;
-    link_weight[link] += weight;
-    link_right[link] += weight * residual;
+    LinkSums& of = out[link];
+    const PointRow weighted = weight * row;
+    of.normal.noalias() += weighted * row.transpose();
+    of.right += residual * weighted;
+    of.slope += weighted;
+    of.weight += weight;
+    of.residual += weight * residual;
   };
   Ends ends{fit.end_reach, {}};
   if (places.at[kMaskStart] >= 0) ends.mask_start = view.mask_start;
   for_each_outline_point(
       chain, view.problem.views[0], [](const Edge&) {}, add, ends);
-  for (int link = 0; link < links; ++link) {
-    out.normal.selfadjointView<Eigen::Lower>().rankUpdate(coupling.col(link), -1.0 / link_weight[link]);
-    out.right -= coupling.col(link) * (link_right[link] / link_weight[link]);
+  return out;
+}
+
+ViewEquations view_equations(const PosedView& view, int camera, const CorrectionProblem& fit, const VectorX& thetadot,
+                             FrameEquations& frame) {
+  const chain::Chain& chain = *view.problem.chain;
+  const int n = chain.angles(), size = n + kSharedOfView;
+  ViewEquations out{MatrixX::Zero(size, size), VectorX::Zero(size)};
+  const std::vector<LinkSums> sums = link_sums(view, camera, fit, thetadot, frame);
+  for (int link = 0; link < chain.links(); ++link) {
+    LinkSums of = sums[link];
+    if (of.weight == 0.0) continue;
+    // each link's own offset in this view (observations.cpp) is eliminated
+    const double offset = of.weight + kEvidence / (kLinkOffsetDeviation * kLinkOffsetDeviation);
+    of.normal.noalias() -= of.slope * of.slope.transpose() / offset;
+    of.right -= of.slope * (of.residual / offset);
+    const int angles = chain.last_angle(link) + 1;
+    const auto twists = view.twists.leftCols(angles);
+    out.normal.topLeftCorner(angles, angles).noalias() += twists.transpose() * of.normal.topLeftCorner<6, 6>() * twists;
+    out.normal.bottomLeftCorner(kSharedOfView, angles).noalias() +=
+        of.normal.bottomLeftCorner<kSharedOfView, 6>() * twists;
+    out.normal.bottomRightCorner<kSharedOfView, kSharedOfView>() +=
+        of.normal.bottomRightCorner<kSharedOfView, kSharedOfView>();
+    out.right.head(angles).noalias() += twists.transpose() * of.right.head<6>();
+    out.right.tail<kSharedOfView>() += of.right.tail<kSharedOfView>();
   }
   out.normal.triangularView<Eigen::StrictlyUpper>() = out.normal.transpose();
   return out;
