@@ -86,8 +86,9 @@ const char* status(const Estimate& estimate);  // "following", "doubtful" or "lo
 class Filter {
  public:
   // `base`: as given, valid from `base_start` on, s; it is asked up to 0.2 s after a frame's own time, too, where it
-  // may be as at rest. `unverified`: by camera whether no training has compared its pose with the rope; empty: none.
-  // `compare_colors`: empty: outlines alone. Throws InputError where the twin's chain or parameters are unusable.
+  // may be as at rest, and from two threads at once. `unverified`: by camera whether no training has compared its pose
+  // with the rope; empty: none. `compare_colors`: empty: outlines alone. Throws InputError where the twin's chain or
+  // parameters are unusable.
   Filter(const twin::Twin& twin, const std::vector<capture::Camera>& cameras, dynamics::BaseFunction base,
          double base_start, const Options& options = {}, const std::vector<char>& unverified = {},
          CompareColors compare_colors = {});

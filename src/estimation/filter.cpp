@@ -1,6 +1,7 @@
 // filter.cpp - what the filter does with a frame: predict, measure, judge, learn, report.
 #include <algorithm>
 #include <cmath>
+#include <future>
 
 #include "src/estimation/color.h"
 #include "src/estimation/measure.h"
@@ -131,10 +132,14 @@ void learn(State& state, std::span<const capture::View* const> views, const Atte
            Estimate& out) {
   state.last_seen = out.time;
   state.belief = attempt.measured.belief;
+  // while the device draws, outlines are looked at for the setup
+  const VectorX& theta = attempt.measured.fit.theta;
+  auto looked = std::async(state.compare_colors ? std::launch::async : std::launch::deferred,
+                           [&] { return look_at_setup(state, views, attempt.predicted, theta); });
   if (state.compare_colors) look_at_colors(state, views, *state.belief, out);
   if (first || out.likeness.value_or(1.0) >= kUnlike) state.last_like = out.time;
   learn_force(state, out.time);
-  learn_setup(state, views, attempt.predicted, attempt.measured.fit.theta);
+  learn_setup(state, looked.get(), attempt.predicted, theta);
   const double gain = 1.0 / kOffsetFrames;
   state.edge_offset += gain * (attempt.measured.fit.edge_offset - state.edge_offset);
   state.edge_offset_variance =
@@ -187,7 +192,8 @@ Estimate update(State& state, std::span<const capture::View* const> views) {
     // counts once
     for (int round = 0; first && round < kFirstRounds && explains(attempt.measured.fit); ++round) {
       const Setup before = state.setup;
-      learn_setup(state, views, attempt.predicted, attempt.measured.fit.theta);
+      const VectorX& theta = attempt.measured.fit.theta;
+      learn_setup(state, look_at_setup(state, views, attempt.predicted, theta), attempt.predicted, theta);
       state.setup.information = before.information;
       state.setup.right = before.right;
       state.setup.frames = before.frames;

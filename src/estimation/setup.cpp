@@ -6,7 +6,6 @@
 #include <functional>
 #include <numbers>
 
-#include "chainsplat/silhouette.h"
 #include "src/math/decompositions.h"
 
 namespace chainsplat::estimation {
@@ -151,22 +150,31 @@ std::vector<capture::Finding> findings(const State& state) {
   return out;
 }
 
-void learn_setup(State& state, std::span<const capture::View* const> views, const Belief& predicted,
-                 const VectorX& theta) {
-  Setup& setup = state.setup;
+std::optional<SetupEquations> look_at_setup(const State& state, std::span<const capture::View* const> views,
+                                            const Belief& predicted, const VectorX& theta) {
   const chain::Chain& chain = state.given.model.chain;
   const int n = chain.angles();
   const Eigen::LLT<MatrixX> factor(MatrixX(predicted.covariance.topLeftCorner(n, n)));
-  if (!math::is_positive(factor)) return;
+  if (!math::is_positive(factor)) return {};
   silhouette::Options options = state.options.silhouette;
   options.prior.mean = predicted.mean.head(n);
   options.prior.information = factor.solve(MatrixX::Identity(n, n));
   options.edge_offset = state.edge_offset;
   options.edge_offset_deviation = kWidth;
   SetupEquations frame = silhouette::setup_equations(
-      chain, [&](double time) { return base_as_timed(state, time); }, views, state.cameras, setup.posed, theta,
+      chain, [&](double time) { return base_as_timed(state, time); }, views, state.cameras, state.setup.posed, theta,
       options);
-  if (!frame.information.allFinite() || !frame.gradient.allFinite()) return;
+  if (!frame.information.allFinite() || !frame.gradient.allFinite()) return {};
+  return frame;
+}
+
+void learn_setup(State& state, const std::optional<SetupEquations>& looked, const Belief& predicted,
+                 const VectorX& theta) {
+  if (!looked) return;
+  SetupEquations frame = *looked;
+  Setup& setup = state.setup;
+  const chain::Chain& chain = state.given.model.chain;
+  const int n = chain.angles();
   const auto leave_out = [&](int at, int size) {
     frame.information.middleRows(at, size).setZero();
     frame.information.middleCols(at, size).setZero();

@@ -1,6 +1,7 @@
 // setup.h - what is learned of the base's clock, the grasp and the cameras while a rope is followed
 // (mathematics.md 6.8).
 #pragma once
+#include "chainsplat/silhouette.h"
 #include "src/estimation/state.h"
 
 namespace chainsplat::estimation {
@@ -12,9 +13,12 @@ Setup first_setup(const Given& given, const std::vector<char>& unverified);
 // What of it the base is mended by.
 BaseCorrection base_correction(const Setup& setup);
 
-// Takes what a frame that is explained says of the setup. The belief before it was `predicted`, and its masks found the
-// angles `theta`. The state's cameras and its belief, if it has one, move with the setup.
-void learn_setup(State& state, std::span<const capture::View* const> views, const Belief& predicted,
+// What a frame that is explained says of the setup. The belief before it was `predicted`, and its masks found the
+// angles `theta`. None where it says nothing.
+std::optional<silhouette::SetupEquations> look_at_setup(const State& state, std::span<const capture::View* const> views,
+                                                        const Belief& predicted, const math::VectorX& theta);
+// Takes that. The state's cameras and its belief, if it has one, move with the setup.
+void learn_setup(State& state, const std::optional<silhouette::SetupEquations>& looked, const Belief& predicted,
                  const math::VectorX& theta);
 
 // As Filter::findings().
