@@ -234,6 +234,7 @@ Metrics evaluate(splat::Engine& engine, const splat::Gaussians& gaussians, const
     const std::size_t before = metrics.frames.size();
     render::for_batches(engine, gaussians, chain, states, recorded.base, camera, c, times, options,
                         [&](std::vector<render::Frame>& batch) {
+                          core::stop_if_requested();
                           const std::size_t first = metrics.frames.size();
                           metrics.frames.resize(first + batch.size());
                           core::parallel_for(static_cast<std::int64_t>(batch.size()), [&](std::int64_t k) {

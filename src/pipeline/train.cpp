@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <future>
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/comparison.h"
@@ -318,31 +319,54 @@ void recognize(Training& t) {
   t.result.fits.emplace_back("recognize", found.summary);
 }
 
-void evaluate(Training& t) {
+// What evaluation works on, and what it found of the recognized motion.
+struct Comparison {
+  capture::Capture recorded;
+  splat::Engine engine;
+  eval::Metrics recognized;
+};
+
+// Begins to compare the recognized motion with the recording, in a thread of its own: identification, which comes next,
+// keeps one core busy and the device not at all. Takes the capture's frames; the thread reads nothing that changes.
+std::future<Comparison> begin_comparison(Training& t) {
+  return std::async(std::launch::async, [&recording = t.recording, &path = t.capture_path, &load = t.load,
+                                         &device = *t.device, capture = std::move(t.capture), chain = t.twin.chain,
+                                         gaussians = t.twin.gaussians, states = t.twin.states]() mutable {
+    Comparison c{recording ? capture::load_recorded(std::move(capture), *recording, load)
+                           : capture::load_recorded(std::move(capture), path, load),
+                 splat::Engine(device),
+                 {}};
+    c.recognized = eval::evaluate(c.engine, gaussians, chain, states, c.recorded);
+    return c;
+  });
+}
+
+void evaluate(Training& t, std::future<Comparison> comparison) {
   const Stopwatch watch(t.twin, "evaluate");
   core::report({"evaluate", 0, 0, NAN, NAN, "drawing every frame and comparing"});
+  Comparison c = comparison.get();
   const twin::Twin& twin = t.twin;
-  const capture::Capture recorded = t.recording ? capture::load_recorded(std::move(t.capture), *t.recording, t.load)
-                                                : capture::load_recorded(std::move(t.capture), t.capture_path, t.load);
-  splat::Engine engine(*t.device);
   TrainResult& r = t.result;
-  r.recognized = eval::evaluate(engine, twin.gaussians, twin.chain, twin.states, recorded);
+  r.recognized = std::move(c.recognized);
   if (!twin.rollout.time.empty())
-    r.rollout = eval::evaluate(engine, twin.gaussians, twin.chain, twin.rollout, recorded);
+    r.rollout = eval::evaluate(c.engine, twin.gaussians, twin.chain, twin.rollout, c.recorded);
   core::write_file(t.run / kMetricsFile, metrics_json(&*r.recognized, r.rollout ? &*r.rollout : nullptr));
-  if (!t.options.picture.empty()) capture::write_png(t.options.picture, eval::comparison(engine, twin, recorded));
+  if (!t.options.picture.empty()) capture::write_png(t.options.picture, eval::comparison(c.engine, twin, c.recorded));
 }
 
 void run_stages(Training& t) {
-  core::write_file(t.run / kBaseFile, trajectory::write_tum(t.capture.base.samples()));
+  const trajectory::Trajectory base = t.capture.base;
+  core::write_file(t.run / kBaseFile, trajectory::write_tum(base.samples()));
   if (t.recognize) {
     recognize(t);
     core::trim_memory();  // or the next stage's need comes on top
     write_covariances(t);
     save_and_go_on(t);
   }
+  std::future<Comparison> comparison;
+  if (t.evaluate && !t.joint) comparison = begin_comparison(t);  // refinement by images changes what is compared
   if (t.identify) {
-    identify_states(t.twin, t.capture.base, t.options.mode == twin::Mode::paper, t.options.seed);
+    identify_states(t.twin, base, t.options.mode == twin::Mode::paper, t.options.seed);
     t.result.fits.emplace_back("identify", *t.twin.estimates.solver);
     save_and_go_on(t);
   }
@@ -352,10 +376,10 @@ void run_stages(Training& t) {
     save_and_go_on(t);
   }
   if (t.roll_out) {
-    roll_out(t.twin, t.capture.base, t.run);
+    roll_out(t.twin, base, t.run);
     save_and_go_on(t);
   }
-  if (t.evaluate) evaluate(t);
+  if (t.evaluate) evaluate(t, comparison.valid() ? std::move(comparison) : begin_comparison(t));
   save(t);  // with all durations
   write_report(t.run);
   remove_checkpoint_folder(t.run);
