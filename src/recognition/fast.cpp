@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cmath>
+#include <future>
 #include <numeric>
 
 #include "chainsplat/image_model.h"
@@ -18,9 +19,9 @@ namespace {
 // the angles; then a polish; then a last round, in which what was seen settles beside what was guessed and cut.
 constexpr int kRounds = 4;
 constexpr int kPolish = kRounds, kSettle = kRounds + 1, kDone = kRounds + 2;  // as rounds
-constexpr int kSteps = 100;                                                   // Adam steps a round
-constexpr int kPolishSteps = 120;
-constexpr int kSettleSteps = 100;
+constexpr int kSteps = 50;                                                    // Adam steps a round
+constexpr int kPolishSteps = 80;
+constexpr int kSettleSteps = 60;
 constexpr double kGaussiansADiameter =
     100.0;  // of the rope's length, when no budget is given: more gain little (design.md, 'Recognition')
 constexpr double kFirstShare = 0.8;        // of the budget, placed at the start; the rest goes where the images ask
@@ -36,12 +37,12 @@ constexpr int kShRound = 1;  // from this round on colors depend on the view (SH
 splat::AdamRates rates(double fraction, double scale) {
   const auto fall = static_cast<float>(scale * std::pow(0.1, fraction));
   splat::AdamRates r;
-  r.mean = 2.5e-4f * fall;  // m: a tenth of a Gaussian's spacing on the rope
-  r.rotation = 0.02f * fall;
-  r.log_scale = 0.03f * fall;
-  r.opacity = 0.08f * fall;
+  r.mean = 2e-4f * fall;  // m: a twelfth of a Gaussian's spacing on the rope
+  r.rotation = 0.03f * fall;
+  r.log_scale = 0.05f * fall;
+  r.opacity = 0.12f * fall;
   r.sh0 = 0.06f * fall;  // 0.017 in color
-  r.sh_rest = 0.01f * fall;
+  r.sh_rest = 0.03f * fall;
   r.link_logits = 0.0f;  // hard on their link: soft gained nothing (design.md, 'Recognition')
   return r;
 }
@@ -365,6 +366,8 @@ void refine_all_frames(Job& job, splat::Engine& engine) {
 
 Result recognize_fast(gpu::Device& device, const capture::Capture& capture, const Options& options) {
   Job job{capture, options};
+  // the kernels are made ready while the silhouettes are fitted on one core
+  std::future<splat::Engine> opening = std::async(std::launch::async, [&device] { return splat::Engine(device); });
   std::optional<Checkpoint> before;
   if (options.resume && !options.checkpoint.empty()) before = load_checkpoint(options.checkpoint, job.text);
   const bool resumed = before.has_value();
@@ -378,7 +381,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     throw WorkError(capture.name, "no training frame shows the object", "use `every` 1 or check the masks");
   job.empty = empty_losses(capture, job.training);
 
-  splat::Engine engine(device);
+  splat::Engine engine = opening.get();
   std::vector<splat::ViewSpec> specs = posed_views(job, job.states);
   std::vector<const capture::PackedView*> targets;
   for (const int v : job.training.views) targets.push_back(&capture.views[v]);
