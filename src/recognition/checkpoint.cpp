@@ -11,7 +11,7 @@ namespace chainsplat::recognition {
 
 namespace {
 
-constexpr char kMagic[] = "chainsplat-checkpoint/6\n";
+constexpr char kMagic[] = "chainsplat-checkpoint/7\n";
 constexpr char kFile[] = "recognize.bin";
 constexpr char kFileBefore[] = "recognize.before.bin";
 constexpr const char* kFiles[] = {kFile, kFileBefore};  // the newest first
