@@ -329,14 +329,17 @@ struct Comparison {
 // Begins to compare the recognized motion with the recording, in a thread of its own: identification, which comes next,
 // keeps one core busy and the device not at all. Takes the capture's frames; the thread reads nothing that changes.
 std::future<Comparison> begin_comparison(Training& t) {
+  chain::States shown;  // without covariances, which of many angles fill the memory
+  shown.time = t.twin.states.time;
+  shown.theta = t.twin.states.theta;
   return std::async(std::launch::async, [&recording = t.recording, &path = t.capture_path, &load = t.load,
                                          &device = *t.device, capture = std::move(t.capture), chain = t.twin.chain,
-                                         gaussians = t.twin.gaussians, states = t.twin.states]() mutable {
+                                         gaussians = t.twin.gaussians, shown = std::move(shown)]() mutable {
     Comparison c{recording ? capture::load_recorded(std::move(capture), *recording, load)
                            : capture::load_recorded(std::move(capture), path, load),
                  splat::Engine(device),
                  {}};
-    c.recognized = eval::evaluate(c.engine, gaussians, chain, states, c.recorded);
+    c.recognized = eval::evaluate(c.engine, gaussians, chain, shown, c.recorded);
     return c;
   });
 }
