@@ -132,7 +132,8 @@ void learn(State& state, std::span<const capture::View* const> views, const Atte
            Estimate& out) {
   state.last_seen = out.time;
   state.belief = attempt.measured.belief;
-  // while the device draws, outlines are looked at for the setup
+  // What the outlines say of the setup is computed while the device compares colors. It reads nothing that the colors
+  // change, so that the numbers are those of one after the other.
   const VectorX& theta = attempt.measured.fit.theta;
   auto looked = std::async(state.compare_colors ? std::launch::async : std::launch::deferred,
                            [&] { return look_at_setup(state, views, attempt.predicted, theta); });

@@ -111,16 +111,19 @@ Vector3 sagitta(const Segment& segment, const Vector3& curvature, const Vector3&
   return -0.5 * t * (1.0 - t) * link.squaredNorm() * curvature;
 }
 
-// How fast a point of the outline moves with the twist of its link, camera frame, then with what its view shares.
+// A row of the least squares: how fast the distance of a point from the outline changes with the twist of its link
+// (camera frame, angular part first), then with what the point's view depends on.
 constexpr int kPointSize = 6 + kSharedOfView;
 using PointRow = Eigen::Matrix<double, kPointSize, 1>;
 
-// Sums over the outline of one link. The angles move its points by its twist alone: what they ask of the angles follows
-// from these sums, at the end (mathematics.md 2.3).
+// Sums over the outline points of one link. The angles move them by the link's twist alone, so that the equations of
+// all angles follow from these sums, once per link (mathematics.md 2.3).
 struct LinkSums {
-  Eigen::Matrix<double, kPointSize, kPointSize> normal = decltype(normal)::Zero();
-  PointRow right = PointRow::Zero(), slope = PointRow::Zero();  // of weights times residual times row, times row
-  double weight = 0.0, residual = 0.0;                          // of weights, times residual
+  Eigen::Matrix<double, kPointSize, kPointSize> normal = decltype(normal)::Zero();  // sum of weight * row * row^T
+  PointRow right = PointRow::Zero();                                                // sum of weight * residual * row
+  PointRow slope = PointRow::Zero();                                                // sum of weight * row
+  double weight = 0.0;                                                              // sum of weights
+  double residual = 0.0;                                                            // sum of weight * residual
 };
 
 // Normal equations of one view: its angles, then what it shares.
