@@ -294,3 +294,30 @@ TEST_CASE("colors stay beyond the directions from which they were seen, and are 
   CHECK(seen < 0.05 * kSlope);
   CHECK(held < 0.3 * went_on);
 }
+
+TEST_CASE("what was seen flatly has the texture's color from where no camera was") {
+  Rope rope(kSlope);
+  // seen at 60 to 70 degrees from the normal by the nearer camera, and as bright as the texture but without its bands
+  const auto flat = [&](int i) { return std::abs(std::abs(rope.angle(i)) - 105.0 * kDegree) < 5.0 * kDegree; };
+  splat::Gaussians& g = rope.gaussians;
+  for (int i = 0; i < g.count; ++i)
+    if (flat(i)) splat::set_base_color(g, i, {0.5, 0.5, 0.5});
+  const splat::Gaussians before = g;
+  recognition::hold_colors(rope.chain, rope.views, g);
+  double error = 0.0, error_before = 0.0, changed = 0.0;
+  int count = 0;
+  for (int i = 0; i < g.count; ++i) {
+    const double s = rope.arclength(i), at = rope.angle(i);
+    if (!flat(i) || s < 0.06 || s > kLength - 0.06) continue;
+    const math::Vector3 wanted = texture(s, at, kSlope), from = -rope.normal(at);
+    error += (splat::sh_color(g, i, from) - wanted).squaredNorm();
+    error_before += (splat::sh_color(before, i, from) - wanted).squaredNorm();
+    const math::Vector3 seen = -rope.normal(std::copysign(40.0 * kDegree, at));
+    changed = std::max(changed, (splat::sh_color(g, i, seen) - splat::sh_color(before, i, seen)).cwiseAbs().maxCoeff());
+    ++count;
+  }
+  REQUIRE(count > 30);
+  MESSAGE("of the error " << std::sqrt(error / error_before) << " are left, seen colors change by " << changed);
+  CHECK(error < 0.25 * error_before);
+  CHECK(changed < 0.03);
+}

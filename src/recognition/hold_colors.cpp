@@ -3,9 +3,11 @@
 #include <algorithm>
 #include <cmath>
 #include <numbers>
+#include <optional>
 #include <vector>
 
 #include "shaders/shared/gaussian.h"
+#include "src/recognition/unseen.h"
 
 namespace chainsplat::recognition {
 
@@ -22,7 +24,9 @@ constexpr double kSeeable = 0.1;      // least cosine of the directions for whic
 constexpr double kLeastShare = 0.1;   // of the views, that must have seen it
 constexpr double kSeenWeight = 50.0;  // of all colors that were seen, to all that are held
 constexpr double kRidge = 1e-6;       // toward the old coefficients
-constexpr double kInside = 0.4;       // of the radius: what is closer to the axis has no side
+constexpr double kFaced = 0.85;       // least cosine at which a place was seen well enough for its own color to be held
+constexpr double kFar = 30.0 * std::numbers::pi / 180.0;  // rad from the nearest view; nearer than that it has a say
+constexpr double kInside = 0.4;                           // of the radius: what is closer to the axis has no side
 
 // Evenly over the sphere, along a spiral.
 std::vector<Vector3> directions() {
@@ -56,6 +60,7 @@ void hold_colors(const chain::Chain& chain, std::span<const Viewpoint> views, sp
   CHAINSPLAT_CHECK(gaussians.degree <= 1, std::to_string(gaussians.degree));
   gaussians.resize(gaussians.count, gaussians.links, kDegree);
   const std::vector<Vector3> sphere = directions();
+  const std::vector<std::optional<TextureColor>> textures = texture_colors(chain, views, gaussians);
   core::parallel_for(gaussians.count, [&](std::int64_t index) {
     const int i = static_cast<int>(index);
     const Vector3 mean(gaussians.mean[3 * i], gaussians.mean[3 * i + 1], gaussians.mean[3 * i + 2]);
@@ -76,20 +81,30 @@ void hold_colors(const chain::Chain& chain, std::span<const Viewpoint> views, sp
     Eigen::Matrix<double, kCoefficients, kCoefficients> matrix =
         kRidge * Eigen::Matrix<double, kCoefficients, kCoefficients>::Identity();
     Eigen::Matrix<double, kCoefficients, 3> right = kRidge * sh.cast<double>().transpose();
-    const auto add = [&](const Vector3& at, const Vector3& like, double weight) {
+    const auto add = [&](const Vector3& at, const Vector3& color, double weight) {
       const Basis row = basis(at);
       matrix += weight * row * row.transpose();
-      right += weight * row * (linear * basis(like).head<kLinear>()).transpose();
+      right += weight * row * color.transpose();
     };
-    for (const Vector3& direction : seen) add(direction, direction, kSeenWeight / static_cast<double>(seen.size()));
+    const auto linear_color = [&](const Vector3& from) { return Vector3(linear * basis(from).head<kLinear>()); };
+    for (const Vector3& direction : seen)
+      add(direction, linear_color(direction), kSeenWeight / static_cast<double>(seen.size()));
+    const std::optional<TextureColor>& around = textures[i];
+    const double own = around ? std::clamp(around->facing / kFaced, 0.0, 1.0) : 1.0;
+    const auto held_color = [&](const Vector3& direction) -> Vector3 {
+      const auto nearest = std::max_element(seen.begin(), seen.end(), [&](const Vector3& a, const Vector3& b) {
+        return a.dot(direction) < b.dot(direction);
+      });
+      const Vector3 color = linear_color(*nearest);
+      if (!around) return color;
+      const double apart = std::acos(std::clamp(nearest->dot(direction), -1.0, 1.0));
+      const double texture = (1.0 - own * own) * std::min(1.0, apart / kFar);
+      return (1.0 - texture) * color + texture * (around->color - Vector3::Constant(0.5));
+    };
     const auto seeable = [&](const Vector3& direction) { return -direction.dot(normal) > kSeeable; };
     const double held = 1.0 / static_cast<double>(std::count_if(sphere.begin(), sphere.end(), seeable));
     for (const Vector3& direction : sphere)
-      if (seeable(direction))
-        add(direction,
-            *std::max_element(seen.begin(), seen.end(),
-                              [&](const Vector3& a, const Vector3& b) { return a.dot(direction) < b.dot(direction); }),
-            held);
+      if (seeable(direction)) add(direction, held_color(direction), held);
     sh = matrix.ldlt().solve(right).transpose().cast<float>();
   });
 }

@@ -213,16 +213,33 @@ Light light_of(const Surface& surface, const std::vector<Place>& places, const s
   return light;
 }
 
+// What the seen surface tells of all of it.
+struct Texture {
+  Surface surface;
+  std::vector<Place> places;  // of the Gaussians
+  double slope = 0.0;         // of the helix along which colors repeat, m per rad
+  Light light;
+};
+Texture texture_of(const chain::Chain& chain, std::span<const Viewpoint> views, const splat::Gaussians& gaussians) {
+  Texture texture{Surface(chain), {}, 0.0, {}};
+  look(views, texture.surface);
+  for (int i = 0; i < gaussians.count; ++i) texture.places.push_back(place_of(texture.surface, gaussians, i));
+  texture.slope = slope_of_texture(texture.surface);
+  texture.light = light_of(texture.surface, texture.places, gaussians);
+  return texture;
+}
+
 // From the nearest colors along the helix in both directions, the nearer the more, in the light of this side.
-std::optional<Vector3> guessed(const Surface& surface, const Light& light, double arclength, double angle,
-                               double slope) {
+std::optional<Vector3> guessed(const Texture& texture, double arclength, double angle) {
+  const Surface& surface = texture.surface;
+  const Light& light = texture.light;
   const int column = static_cast<int>(angle / kTurn * kColumns);
   Vector3 sum = Vector3::Zero();
   double weight = 0.0;
   for (const int direction : {1, -1})
     for (int apart = 1; apart < kColumns; ++apart) {
       const int there = ((column + direction * apart) % kColumns + kColumns) % kColumns;
-      const double turn = direction * apart * kTurn / kColumns, s = arclength + slope * turn;
+      const double turn = direction * apart * kTurn / kColumns, s = arclength + texture.slope * turn;
       const std::optional<Vector3> color =
           s >= 0.0 && s <= surface.chain.length ? surface.color_at(s, there) : std::nullopt;
       if (!color) continue;
@@ -239,7 +256,8 @@ struct Guess {
   double arclength, angle;
   Vector3 color;
 };
-std::vector<Guess> guesses(const Surface& surface, const Light& light, double slope, double radius, double spacing) {
+std::vector<Guess> guesses(const Texture& texture, double radius, double spacing) {
+  const Surface& surface = texture.surface;
   const chain::Chain& chain = surface.chain;
   const int rows = std::max(1, static_cast<int>(chain.length / spacing)),
             columns = std::max(3, static_cast<int>(kTurn * radius / spacing));
@@ -250,8 +268,7 @@ std::vector<Guess> guesses(const Surface& surface, const Light& light, double sl
       const double angle = (column + (row % 2 ? 0.75 : 0.25)) * kTurn / columns;  // every other row between these
       const std::size_t cell = surface.cell_at(s, angle);
       if (surface.facing[cell] >= kUnseen || surface.hidden[cell]) continue;
-      if (const std::optional<Vector3> color = guessed(surface, light, s, angle, slope))
-        out.push_back({s, angle, *color});
+      if (const std::optional<Vector3> color = guessed(texture, s, angle)) out.push_back({s, angle, *color});
     }
   return out;
 }
@@ -280,14 +297,14 @@ void put(const Surface& surface, const Guess& guess, double radius, double spaci
 
 // What was seen only at a slant has the place and size that its outline asks for, but a color that one row of pixels
 // tells. It gets the texture's, the more the flatter it was seen, and that from every direction.
-void color_slanted(const Surface& surface, const Light& light, double slope, const std::vector<Place>& places,
-                   splat::Gaussians& g) {
+void color_slanted(const Texture& texture, splat::Gaussians& g) {
+  const Surface& surface = texture.surface;
   const std::size_t size = 3 * static_cast<std::size_t>(g.sh_coefficients());
   for (int i = 0; i < g.count; ++i) {
-    const Place& at = places[i];
+    const Place& at = texture.places[i];
     const std::size_t cell = surface.cell_at(at.arclength, at.angle);
     if (!on_side(surface, at) || surface.facing[cell] >= kTrusted || surface.hidden[cell]) continue;
-    const std::optional<Vector3> color = guessed(surface, light, at.arclength, at.angle, slope);
+    const std::optional<Vector3> color = guessed(texture, at.arclength, at.angle);
     if (!color) continue;
     const double share = std::max(0.0, surface.facing[cell] / kTrusted), own = share * share;
     g.guessed[i] = kSlanted;
@@ -299,14 +316,12 @@ void color_slanted(const Surface& surface, const Light& light, double slope, con
 }  // namespace
 
 int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, splat::Gaussians& gaussians) {
-  Surface surface(chain);
-  look(views, surface);
-  std::vector<Place> places;
+  const Texture texture = texture_of(chain, views, gaussians);
+  const Surface& surface = texture.surface;
   std::vector<int> kept;
   std::vector<double> radii;
   for (int i = 0; i < gaussians.count; ++i) {
-    const Place at = place_of(surface, gaussians, i);
-    places.push_back(at);
+    const Place& at = texture.places[i];
     const std::size_t cell = surface.cell_at(at.arclength, at.angle);
     const bool side = on_side(surface, at);
     if (!side || surface.facing[cell] >= kUnseen || surface.hidden[cell]) kept.push_back(i);
@@ -314,20 +329,32 @@ int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, s
   }
   if (radii.empty()) return 0;
   const double radius = math::median(radii);
-  const double slope = slope_of_texture(surface);
-  const Light light = light_of(surface, places, gaussians);
-  color_slanted(surface, light, slope, places, gaussians);
+  color_slanted(texture, gaussians);
   // as dense as where it was seen
   const double cells = static_cast<double>(
       std::count_if(surface.facing.begin(), surface.facing.end(), [](double facing) { return facing >= kTrusted; }));
   const double area = cells / static_cast<double>(surface.facing.size()) * kTurn * radius * chain.length;
   const double spacing = std::sqrt(area / static_cast<double>(radii.size()));
-  const std::vector<Guess> found = guesses(surface, light, slope, radius, spacing);
+  const std::vector<Guess> found = guesses(texture, radius, spacing);
   if (found.empty()) return 0;
   gaussians = rows_of(gaussians, kept, static_cast<int>(found.size()));
   for (std::size_t i = 0; i < found.size(); ++i)
     put(surface, found[i], radius, spacing, static_cast<int>(kept.size() + i), gaussians);
   return static_cast<int>(found.size());
+}
+
+std::vector<std::optional<TextureColor>> texture_colors(const chain::Chain& chain, std::span<const Viewpoint> views,
+                                                        const splat::Gaussians& gaussians) {
+  const Texture texture = texture_of(chain, views, gaussians);
+  std::vector<std::optional<TextureColor>> out(gaussians.count);
+  for (int i = 0; i < gaussians.count; ++i) {
+    const Place& at = texture.places[i];
+    const std::size_t cell = texture.surface.cell_at(at.arclength, at.angle);
+    if (!on_side(texture.surface, at) || texture.surface.hidden[cell]) continue;
+    if (const std::optional<Vector3> color = guessed(texture, at.arclength, at.angle))
+      out[i] = {*color, texture.surface.facing[cell]};
+  }
+  return out;
 }
 
 void keep_guessed(const splat::Gaussians& before, splat::Gaussians& trained) {

@@ -1,6 +1,8 @@
 // unseen.h - what no camera saw of a rope, so that it looks like a rope from there, too.
 #pragma once
+#include <optional>
 #include <span>
+#include <vector>
 
 #include "chainsplat/chain.h"
 #include "chainsplat/splat.h"
@@ -18,6 +20,15 @@ namespace chainsplat::recognition {
 // Gaussians::guessed, those seen only at a slant kSlanted. Returns how many new ones there are.
 inline constexpr std::uint8_t kGuessed = 1, kSlanted = 2;
 int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, splat::Gaussians& gaussians);
+
+// What the texture around it says of a Gaussian's color, and how flatly the cameras saw its place: the best cosine
+// between surface normal and view ray. None near the axis, behind what hides the rope and where no color is known.
+struct TextureColor {
+  math::Vector3 color;  // RGB, [0, 1]
+  double facing;
+};
+std::vector<std::optional<TextureColor>> texture_colors(const chain::Chain& chain, std::span<const Viewpoint> views,
+                                                        const splat::Gaussians& gaussians);
 
 // Puts back, after more training, those of `before` that are guessed, and the colors of those seen only at a slant,
 // whose mark ends here. Both have the same count and degree.
