@@ -186,3 +186,32 @@ TEST_CASE("what is no trunk is refused in one line") {
   core::write_file(file, spoiled);
   says(file, "not finite");
 }
+
+TEST_CASE("a damaged trunk is refused or read, and never ends the program") {
+  const test::TemporaryFolder folder("damaged");
+  const Path file = folder.path / "damaged.onnx";
+  const std::string whole = core::read_file(kData + "channels.onnx");  // small, so that most damage is to its frame
+  core::Random random(5);
+  constexpr int kTries = 400;
+  int refused = 0;
+  for (int i = 0; i < kTries; ++i) {
+    std::string bytes = whole;
+    const int changes = 1 + static_cast<int>(4.0 * random.uniform());
+    for (int k = 0; k < changes; ++k) {
+      const auto at = static_cast<std::size_t>(random.uniform() * static_cast<double>(bytes.size()));
+      const double what = random.uniform();
+      if (what < 0.6)
+        bytes[at] = static_cast<char>(256.0 * random.uniform());
+      else if (what < 0.8)
+        bytes.erase(at, 1 + static_cast<std::size_t>(8.0 * random.uniform()));
+      else
+        bytes.insert(at, bytes.substr(at, static_cast<std::size_t>(8.0 * random.uniform())));
+    }
+    core::write_file(file, bytes);
+    const std::string line = refusal(file);
+    CAPTURE(line);
+    CHECK(line.find('\n') == std::string::npos);
+    refused += line.find("can take (") != std::string::npos;
+  }
+  CHECK(refused > kTries / 2);
+}

@@ -10,6 +10,7 @@
 #include "src/core/own_library.h"
 #include "src/eval/lpips_weights.h"
 #include "src/eval/networks.h"
+#include "src/eval/onnx.h"
 
 namespace chainsplat::eval {
 
@@ -91,6 +92,7 @@ std::string listed(const std::vector<Map>& maps) {
 class LpipsTrunk {
  public:
   explicit LpipsTrunk(const Path& file) : file_(file), bytes_(core::read_file(file)) {
+    check_trunk(file_, bytes_);
     idle_.push_back(library().open(file_, bytes_));
   }
   ~LpipsTrunk() {
