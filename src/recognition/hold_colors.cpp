@@ -20,11 +20,10 @@ constexpr int kLinear = 4;        // coefficients up to degree 1
 constexpr int kDirections = 300;  // over the sphere
 // Least cosine between surface normal and view ray of a view that counts; below 0, as Gaussians reach around the limb.
 constexpr double kSeenFrom = -0.1;
-constexpr double kSeeable = 0.1;      // least cosine of the directions for which colors are held
-constexpr double kLeastShare = 0.1;   // of the views, that must have seen it
-constexpr double kSeenWeight = 50.0;  // of all colors that were seen, to all that are held
-constexpr double kRidge = 1e-6;       // toward the old coefficients
-constexpr double kFaced = 0.85;       // least cosine at which a place was seen well enough for its own color to be held
+constexpr double kSeeable = 0.1;                          // least cosine of the directions for which colors are held
+constexpr double kLeastShare = 0.1;                       // of the views, that must have seen it
+constexpr double kSeenWeight = 50.0;                      // of all colors that were seen, to all that are held
+constexpr double kRidge = 1e-6;                           // toward the old coefficients
 constexpr double kFar = 30.0 * std::numbers::pi / 180.0;  // rad from the nearest view; nearer than that it has a say
 constexpr double kInside = 0.4;                           // of the radius: what is closer to the axis has no side
 
@@ -90,7 +89,6 @@ void hold_colors(const chain::Chain& chain, std::span<const Viewpoint> views, sp
     for (const Vector3& direction : seen)
       add(direction, linear_color(direction), kSeenWeight / static_cast<double>(seen.size()));
     const std::optional<TextureColor>& around = textures[i];
-    const double own = around ? std::clamp(around->facing / kFaced, 0.0, 1.0) : 1.0;
     const auto held_color = [&](const Vector3& direction) -> Vector3 {
       const auto nearest = std::max_element(seen.begin(), seen.end(), [&](const Vector3& a, const Vector3& b) {
         return a.dot(direction) < b.dot(direction);
@@ -98,7 +96,8 @@ void hold_colors(const chain::Chain& chain, std::span<const Viewpoint> views, sp
       const Vector3 color = linear_color(*nearest);
       if (!around) return color;
       const double apart = std::acos(std::clamp(nearest->dot(direction), -1.0, 1.0));
-      const double texture = (1.0 - own * own) * std::min(1.0, apart / kFar);
+      const double facing = std::max(0.0, around->facing);
+      const double texture = (1.0 - facing * facing) * std::min(1.0, apart / kFar);
       return (1.0 - texture) * color + texture * (around->color - Vector3::Constant(0.5));
     };
     const auto seeable = [&](const Vector3& direction) { return -direction.dot(normal) > kSeeable; };
