@@ -381,6 +381,27 @@ TEST_CASE("a rope whose end goes behind the gripper is not turned back on itself
   }
 }
 
+TEST_CASE("of one camera that sees a rope's end hidden, a cold start believes what is known beforehand") {
+  const Chain planar = rope(Bending::planar);
+  const VectorX theta = VectorX::Constant(planar.angles(), 3.6 / planar.angles());
+  const Vector3 end = chain::link_motions(planar, theta, base_pose()).back() * (kLength * planar.direction);
+  silhouette::Options known;
+  known.prior.mean = VectorX::Constant(planar.angles(), 3.4 / planar.angles());
+  known.prior.information = MatrixX::Identity(planar.angles(), planar.angles()) / (0.1 * 0.1);
+  const MatrixX truth = points(planar, theta, base_pose());
+  for (int view = 0; view < 3; ++view)
+    for (const double gripper : {25.0, 30.0, 35.0, 40.0}) {  // px, radius of what hides
+      CAPTURE(view);
+      CAPTURE(gripper);
+      Scene scene(planar, theta);
+      const capture::Camera& c = scene.cameras[view];
+      const Vector3 x = c.world_from_camera.inverse() * end;
+      paint_disk(scene.views[view], c.fx * x.x() / x.z() + c.cx, c.fy * x.y() / x.z() + c.cy, gripper, 0);
+      const silhouette::FrameFit fit = scene.fit(planar, known.prior.mean, false, {view}, known);
+      CHECK(rms(points(planar, fit.theta, base_pose()), truth) < 8e-3);
+    }
+}
+
 TEST_CASE("a rope has as many joints as its bends ask for and its masks can tell") {
   constexpr int kJoints = 12;
   constexpr double kBend = 0.2;  // rad at every joint

@@ -44,6 +44,9 @@ constexpr double kFineVariance = 1.0;
 constexpr double kStartBend = 1.5;                  // rad, whole bend of the extra starts
 constexpr double kAlike = 1.5, kAlikePixels = 2.0;  // costs under this times the best, plus this (px^2), are alike
 
+constexpr double kClearly = 0.02;  // difference of shares covered and inside
+constexpr double kAllowed = 9.0;   // square deviations of the given prior per number, up to which it allows a fit
+
 // Index of the angle before k about the same axis, -1 for the first.
 int neighbor(const chain::Chain& chain, int k) {
   for (int l = k - 1; l >= 0; --l)
@@ -268,13 +271,23 @@ VectorX warm_angles(Work& work, const VectorX& start) {
   return work.unknowns.head(work.angles());
 }
 
-// The same where nothing is known: of the fits from bends to every side that cover the masks about as well as the best
-// one, the one whose outlines fit best.
+// Whether the given prior allows the unknowns. It does where there is none.
+bool allowed(const Work& work) {
+  if (!has_prior(work)) return true;
+  const VectorX off = work.unknowns.head(work.last()) - work.options.prior.mean;
+  return off.dot(work.options.prior.information * off) <= kAllowed * static_cast<double>(off.size());
+}
+
+// The same where nothing is known but perhaps a wide prior: of the fits from bends to every side that cover the masks
+// about as well as the best one, the one whose outlines fit best. Those do not count that explain less than another, or
+// cover no more than another that the prior allows while it does not allow them.
 VectorX cold_angles(Work& work, const VectorX& start) {
   Problem& problem = work.problem;
   const Options& options = work.options;
   std::vector<VectorX> found;
   std::vector<double> costs;
+  std::vector<FrameFit> fits;
+  std::vector<char> allowed_by_prior;
   for (const VectorX& cold : cold_starts(*problem.chain, start)) {
     // first what hangs together with the grasp, whatever its distance; then what lies near the rope found
     work.unknowns.head(work.angles()) = cold;
@@ -286,7 +299,14 @@ VectorX cold_angles(Work& work, const VectorX& start) {
     judge(problem, work.out);
     found.push_back(work.unknowns.head(work.angles()));
     costs.push_back(work.out.cost);
+    fits.push_back(work.out.fit);
+    allowed_by_prior.push_back(allowed(work));
   }
+  for (std::size_t i = 0; i < fits.size(); ++i)
+    for (std::size_t j = 0; j < fits.size(); ++j)
+      if (explains_less(fits[i], fits[j]) ||
+          (!allowed_by_prior[i] && allowed_by_prior[j] && fits[j].covered > fits[i].covered - kClearly))
+        costs[i] = std::numeric_limits<double>::infinity();
   const double best = *std::min_element(costs.begin(), costs.end());
   double best_edge_cost = std::numeric_limits<double>::infinity();
   VectorX theta = start;
@@ -334,6 +354,10 @@ MatrixX covariance_of(const Work& work) {
 }
 
 }  // namespace
+
+bool explains_less(const FrameFit& a, const FrameFit& b) {
+  return a.covered < b.covered - kClearly && a.inside < b.inside - kClearly;
+}
 
 FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView>& views, const VectorX& start,
                           bool warm, const Options& options) {

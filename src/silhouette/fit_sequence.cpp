@@ -144,14 +144,11 @@ void each_frame(const Sequence& s, const Fit& fit) {
   }
 }
 
-// Fits a frame once more, and keeps what is clearly better. Where something hides a part of the rope, the cost of the
-// right fit is high for that part, and a fit that turns back on itself in front of it may cost less: but it leaves more
-// of the masks uncovered and is less inside of them.
+// Fits a frame once more, and keeps what is clearly better.
 void try_again(Sequence& s, int f, const std::vector<FrameView>& views, const VectorX& from, bool warm) {
   FrameSolution again = solve_frame(s.chain, views, from, warm, s.each);
   FrameSolution& old = s.solutions[f];
-  const bool explains_less = again.fit.covered < old.fit.covered && again.fit.inside < old.fit.inside;
-  if (again.cost < kBetter * old.cost && !explains_less) old = std::move(again);
+  if (again.cost < kBetter * old.cost && !explains_less(again.fit, old.fit)) old = std::move(again);
 }
 
 // Frame after frame, each from the one before; from scratch at first and where the rope is lost.

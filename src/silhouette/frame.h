@@ -29,6 +29,11 @@ math::MatrixX joint_prior(const chain::Chain& chain, const Options& options);
 FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView>& views, const math::VectorX& start,
                           bool warm, const Options& options);
 
+// Whether `a` leaves more of the masks uncovered than `b` and is less inside of them, both clearly. Then its cost does
+// not count: where something hides a part of the rope, the right fit's is high for that part, and one that turns back
+// on itself in front of it may cost less.
+bool explains_less(const FrameFit& a, const FrameFit& b);
+
 // Times of the frames of the first camera and, for each, the views (by index) that belong to it.
 struct Frames {
   std::vector<double> times;
