@@ -1,11 +1,11 @@
 #include "src/eval/onnx.h"
 
 #include <cstdint>
-#include <cstring>
 #include <limits>
 #include <map>
 #include <optional>
 #include <string_view>
+#include <utility>
 #include <vector>
 
 namespace chainsplat::eval {
@@ -19,13 +19,13 @@ constexpr int kColors = 3;
 // Numbers of fields, of onnx.proto.
 constexpr std::uint32_t kModelGraph = 7;
 constexpr std::uint32_t kGraphNode = 1, kGraphInitializer = 5, kGraphInput = 11, kGraphOutput = 12;
-constexpr std::uint32_t kNodeInput = 1, kNodeOutput = 2, kNodeOperator = 4, kNodeAttribute = 5;
-constexpr std::uint32_t kAttributeName = 1, kAttributeInt = 3, kAttributeString = 4, kAttributeInts = 8,
-                        kAttributeType = 20;
+constexpr std::uint32_t kNodeInput = 1, kNodeOutput = 2, kNodeName = 3, kNodeOperator = 4, kNodeAttribute = 5,
+                        kNodeText = 6, kNodeDomain = 7;
+constexpr std::uint32_t kAttributeName = 1, kAttributeInt = 3, kAttributeInts = 8, kAttributeType = 20;
 constexpr std::uint32_t kTensorDims = 1, kTensorType = 2, kTensorName = 8, kTensorRaw = 9;
 constexpr std::uint32_t kValueName = 1;
-constexpr std::uint32_t kFloat = 1;                                    // of TensorProto.DataType
-constexpr std::uint32_t kTypeInt = 2, kTypeString = 3, kTypeInts = 7;  // of AttributeProto.AttributeType
+constexpr std::uint32_t kFloat = 1;                   // of TensorProto.DataType
+constexpr std::uint32_t kTypeInt = 2, kTypeInts = 7;  // of AttributeProto.AttributeType
 
 struct Damaged {
   std::string why;
@@ -137,7 +137,6 @@ Tensor tensor(std::string_view message) {
 struct Attribute {
   std::uint64_t type = 0;
   std::vector<std::int64_t> numbers;
-  std::string text;
 };
 
 struct Node {
@@ -145,6 +144,26 @@ struct Node {
   std::vector<std::string> inputs, outputs;
   std::map<std::string, Attribute> attributes;
 };
+
+// With its name.
+std::pair<std::string, Attribute> attribute(std::string_view message) {
+  std::pair<std::string, Attribute> out;
+  for (const Field& field : fields(message)) switch (field.number) {
+      case kAttributeName:
+        out.first = text(field);
+        break;
+      case kAttributeInt:
+      case kAttributeInts:
+        append(field, out.second.numbers);
+        break;
+      case kAttributeType:
+        out.second.type = field.value;
+        break;
+      default:
+        throw Damaged{"an attribute is no whole number"};
+    }
+  return out;
+}
 
 Node node(std::string_view message) {
   Node out;
@@ -158,63 +177,42 @@ Node node(std::string_view message) {
       case kNodeOperator:
         out.name = text(field);
         break;
-      case kNodeAttribute: {
-        std::string name;
-        Attribute attribute;
-        for (const Field& part : fields(field.bytes)) switch (part.number) {
-            case kAttributeName:
-              name = text(part);
-              break;
-            case kAttributeInt:
-            case kAttributeInts:
-              append(part, attribute.numbers);
-              break;
-            case kAttributeString:
-              attribute.text = text(part);
-              break;
-            case kAttributeType:
-              attribute.type = part.value;
-              break;
-            default:
-              throw Damaged{"an attribute is neither number nor text"};
-          }
-        if (!out.attributes.emplace(name, attribute).second) throw Damaged{"'" + name + "' is given twice"};
+      case kNodeAttribute:
+        if (!out.attributes.insert(attribute(field.bytes)).second) throw Damaged{"an attribute is given twice"};
         break;
-      }
-      case 3:
-      case 6:
-      case 7:
-        break;  // name, documentation and domain of the node
+      case kNodeName:
+      case kNodeText:
+      case kNodeDomain:
+        break;
       default:
         throw Damaged{"a node has a part that is none of a node"};
     }
   return out;
 }
 
-// What a convolution or pooling may say of itself.
+// What a convolution or pooling may say of itself: so many numbers, in these bounds.
+struct Limits {
+  std::size_t count;
+  std::uint64_t type;
+  std::int64_t least, most;
+};
+const std::map<std::string, Limits> kLimits = {
+    {"kernel_shape", {2, kTypeInts, 1, kMostKernel}}, {"pads", {4, kTypeInts, 0, kMostKernel}},
+    {"strides", {2, kTypeInts, 1, kMostStride}},      {"dilations", {2, kTypeInts, 1, 1}},
+    {"group", {1, kTypeInt, 1, kMostChannels}},       {"ceil_mode", {1, kTypeInt, 0, 0}},
+    {"storage_order", {1, kTypeInt, 0, 0}},
+};
+
 void check_attributes(const Node& node, const std::vector<std::int64_t>& kernel) {
-  for (const auto& [name, attribute] : node.attributes) {
-    std::size_t count = 2;
-    std::int64_t least = 1, most = kMostStride;
-    std::uint64_t type = kTypeInts;
-    if (name == "kernel_shape")
-      most = kMostKernel;
-    else if (name == "pads")
-      count = 4, least = 0;
-    else if (name == "strides")
-      most = kMostStride;
-    else if (name == "dilations")
-      most = 1;
-    else if (name == "group")
-      count = 1, most = kMostChannels, type = kTypeInt;
-    else if (name == "ceil_mode" || name == "storage_order")
-      count = 1, least = 0, most = 0, type = kTypeInt;
-    else
-      throw Damaged{"'" + name + "' is nothing that a " + node.name + " of a trunk has"};
-    if (attribute.type != type || attribute.numbers.size() != count || !attribute.text.empty())
-      throw Damaged{"'" + name + "' is not " + std::to_string(count) + (count == 1 ? " number" : " numbers")};
-    for (const std::int64_t number : attribute.numbers)
-      if (number < least || number > most) throw Damaged{"'" + name + "' has " + std::to_string(number)};
+  for (const auto& [name, given] : node.attributes) {
+    const auto found = kLimits.find(name);
+    if (found == kLimits.end()) throw Damaged{"'" + name + "' is nothing that a " + node.name + " of a trunk has"};
+    const Limits& limits = found->second;
+    if (given.type != limits.type || given.numbers.size() != limits.count)
+      throw Damaged{"'" + name + "' is not " + std::to_string(limits.count) +
+                    (limits.count == 1 ? " number" : " numbers")};
+    for (const std::int64_t number : given.numbers)
+      if (number < limits.least || number > limits.most) throw Damaged{"'" + name + "' has " + std::to_string(number)};
   }
   const auto shape = node.attributes.find("kernel_shape");
   if (shape == node.attributes.end()) throw Damaged{"a " + node.name + " has no 'kernel_shape'"};
