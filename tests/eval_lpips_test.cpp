@@ -201,7 +201,7 @@ TEST_CASE("a damaged trunk is refused or read, and never ends the program") {
       const auto at = static_cast<std::size_t>(random.uniform() * static_cast<double>(bytes.size()));
       const double what = random.uniform();
       if (what < 0.6)
-        bytes[at] = static_cast<char>(256.0 * random.uniform());
+        bytes[at] = static_cast<char>(static_cast<std::uint8_t>(256.0 * random.uniform()));
       else if (what < 0.8)
         bytes.erase(at, 1 + static_cast<std::size_t>(8.0 * random.uniform()));
       else
