@@ -284,10 +284,13 @@ bool allowed(const Work& work) {
 VectorX cold_angles(Work& work, const VectorX& start) {
   Problem& problem = work.problem;
   const Options& options = work.options;
-  std::vector<VectorX> found;
-  std::vector<double> costs;
-  std::vector<FrameFit> fits;
-  std::vector<char> allowed_by_prior;
+  struct Candidate {
+    VectorX theta;
+    FrameFit fit;
+    double cost = 0.0;
+    bool allowed = true;
+  };
+  std::vector<Candidate> found;
   for (const VectorX& cold : cold_starts(*problem.chain, start)) {
     // first what hangs together with the grasp, whatever its distance; then what lies near the rope found
     work.unknowns.head(work.angles()) = cold;
@@ -297,22 +300,23 @@ VectorX cold_angles(Work& work, const VectorX& start) {
     coarse_stage(problem, work.belief, std::max(1, options.iterations / 2), true, options, work.unknowns);
     place(problem, work.unknowns);
     judge(problem, work.out);
-    found.push_back(work.unknowns.head(work.angles()));
-    costs.push_back(work.out.cost);
-    fits.push_back(work.out.fit);
-    allowed_by_prior.push_back(allowed(work));
+    found.push_back({work.unknowns.head(work.angles()), work.out.fit, work.out.cost, allowed(work)});
   }
-  for (std::size_t i = 0; i < fits.size(); ++i)
-    for (std::size_t j = 0; j < fits.size(); ++j)
-      if (explains_less(fits[i], fits[j]) ||
-          (!allowed_by_prior[i] && allowed_by_prior[j] && fits[j].covered > fits[i].covered - kClearly))
-        costs[i] = std::numeric_limits<double>::infinity();
-  const double best = *std::min_element(costs.begin(), costs.end());
+  const auto beaten = [](const Candidate& one, const Candidate& other) {
+    const bool covers_as_much = other.fit.covered > one.fit.covered - kClearly;
+    return explains_less(one.fit, other.fit) || (!one.allowed && other.allowed && covers_as_much);
+  };
+  double best = std::numeric_limits<double>::infinity();
+  for (Candidate& one : found) {
+    if (std::any_of(found.begin(), found.end(), [&](const Candidate& other) { return beaten(one, other); }))
+      one.cost = std::numeric_limits<double>::infinity();
+    best = std::min(best, one.cost);
+  }
   double best_edge_cost = std::numeric_limits<double>::infinity();
   VectorX theta = start;
-  for (std::size_t i = 0; i < found.size(); ++i) {
-    if (costs[i] > kAlike * best + kAlikePixels) continue;
-    fine_stage(work, found[i]);
+  for (const Candidate& one : found) {
+    if (one.cost > kAlike * best + kAlikePixels) continue;
+    fine_stage(work, one.theta);
     if (edge_cost(work.total) < best_edge_cost) {
       best_edge_cost = edge_cost(work.total);
       theta = work.unknowns.head(work.angles());
