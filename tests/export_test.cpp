@@ -117,6 +117,25 @@ TEST_CASE("the animated nodes are where the chain's links are") {
   }
 }
 
+TEST_CASE("nodes turn with the material of a rope that rolls") {
+  const twin::Twin twin = test::small_twin(chain::Bending::planar, 60);
+  const trajectory::Trajectory base = test::moving_base(1.2);
+  chain::States motion = test::swing(twin.chain, 1.0, 0.1);
+  for (std::size_t k = 0; k < motion.time.size(); ++k)
+    motion.roll.push_back(0.04 * static_cast<double>(k) * math::VectorX::LinSpaced(twin.chain.links(), 0.0, 1.0));
+  const tinygltf::Model model = loaded(exports::gltf(twin.gaussians, twin.chain, motion, base, true), true);
+  for (const int key : {-1, 7, 30}) {
+    const std::vector<math::Pose> world = world_transforms(model, key);
+    const std::size_t k = static_cast<std::size_t>(std::max(0, key));
+    const auto motions = chain::link_motions(twin.chain, motion.theta[k], base.pose(motion.time[k]));
+    for (int j = 0; j < twin.chain.links(); ++j) {
+      const Eigen::AngleAxisd turn(motion.roll[k][j], twin.chain.direction);
+      const math::Pose home{turn.toRotationMatrix(), twin.chain.link_start(j) * twin.chain.direction};
+      CHECK(apart(world[link_node(model, j)], y_up() * motions[j] * home) < 2e-6);
+    }
+  }
+}
+
 TEST_CASE("the animation is what viewers need") {
   const twin::Twin twin = test::small_twin(chain::Bending::spatial, 60);
   chain::States motion = test::swing(twin.chain, 1.0);

@@ -12,22 +12,16 @@
 #include "chainsplat/image_model.h"
 #include "src/recognition/hold_colors.h"
 #include "src/recognition/unseen.h"
+#include "tests/straight_rope.h"
 
 using namespace chainsplat;
 
 namespace {
 
 constexpr double kLength = 0.3, kDiameter = 0.02;
-constexpr int kWidth = 64, kHeight = 512;  // pixels of a picture
-constexpr double kFocal = 1500.0;          // pixels: at 1 m the rope is 30 pixels wide
 constexpr double kDegree = std::numbers::pi / 180.0;
 
-// Red, white and blue bands that wind about the rope, m of arclength per radian; 0: rings.
-math::Vector3 texture(double arclength, double angle, double slope) {
-  const double phase = 2.0 * std::numbers::pi * (arclength - slope * angle) / 0.045;
-  const double third = 2.0 * std::numbers::pi / 3.0;
-  return {0.5 + 0.3 * std::cos(phase), 0.5 + 0.3 * std::cos(phase - third), 0.5 + 0.3 * std::cos(phase + third)};
-}
+using test::texture;
 
 struct Rope {
   chain::Chain chain = chain::make_chain(kLength, kDiameter, -math::Vector3::UnitZ(), math::Vector3::UnitY(), 8,
@@ -64,36 +58,12 @@ struct Rope {
     for (const double side : {-1.0, 1.0}) look_from(side * 40.0 * kDegree);
   }
   void look_from(double at) {
-    auto camera = std::make_unique<capture::Camera>();
-    camera->width = kWidth, camera->height = kHeight;
-    camera->fx = camera->fy = kFocal, camera->cx = 0.5 * kWidth, camera->cy = 0.5 * kHeight;
-    const math::Vector3 x = normal(at).cross(chain.direction);
-    camera->world_from_camera.rotation = (math::Matrix3() << x, chain.direction, -normal(at)).finished();
-    camera->world_from_camera.translation = normal(at) + 0.5 * kLength * chain.direction;
-    capture::View picture;
-    picture.width = kWidth, picture.height = kHeight;
-    picture.rgba.assign(std::size_t{4} * kWidth * kHeight, 255);
-    for (int v = 0; v < kHeight; ++v)
-      for (int u = 0; u < kWidth; ++u) {
-        // where the ray (right, down, 1) from (0, 0, -1) meets the circle: |(right t, t - 1)| = radius
-        const double right = (u + 0.5 - camera->cx) / kFocal, down = (v + 0.5 - camera->cy) / kFocal;
-        const double a = right * right + 1.0, c = 1.0 - 0.25 * kDiameter * kDiameter;
-        if (1.0 < a * c) continue;
-        const double depth = (1.0 - std::sqrt(1.0 - a * c)) / a;
-        const math::Vector3 out = depth * right * x + (1.0 - depth) * normal(at);
-        const double angle = std::atan2(out.dot(normal(90.0 * kDegree)), out.dot(normal(0.0)));
-        const math::Vector3 rgb = color(0.5 * kLength + depth * down, angle);
-        for (int k = 0; k < 3; ++k)
-          picture.rgba[4 * (static_cast<std::size_t>(v) * kWidth + u) + k] =
-              static_cast<std::uint8_t>(std::lround(255.0 * std::clamp(rgb[k], 0.0, 1.0)));
-      }
-    pictures.push_back(std::make_unique<capture::PackedView>(capture::packed(picture)));
-    views.push_back({camera.get(), pictures.back().get(), motions});
-    cameras.push_back(std::move(camera));
+    cameras.push_back(std::make_unique<capture::Camera>(test::camera_beside(chain, at)));
+    pictures.push_back(std::make_unique<capture::PackedView>(
+        capture::packed(test::picture_of_straight_rope(chain, *cameras.back(), color))));
+    views.push_back({cameras.back().get(), pictures.back().get(), motions});
   }
-  math::Vector3 normal(double at) const {
-    return std::cos(at) * chain.bending_axis + std::sin(at) * chain.direction.cross(chain.bending_axis);
-  }
+  math::Vector3 normal(double at) const { return test::side_of(chain, at); }
   double arclength(int i) const {
     return math::Vector3(gaussians.mean[3 * i], gaussians.mean[3 * i + 1], gaussians.mean[3 * i + 2])
         .dot(chain.direction);
@@ -214,7 +184,8 @@ TEST_CASE("where masks show that something else is in front, nothing is guessed"
   Rope rope(kSlope);
   const splat::Gaussians before = rope.gaussians;
   for (const auto& picture : rope.pictures)
-    for (int i = 0; i < 91 * kWidth; ++i) picture->rgba[4 * i + 3] = 0;  // the upper part, down to 0.04 m of the rope
+    for (int i = 0; i < 91 * picture->width; ++i)
+      picture->rgba[4 * i + 3] = 0;  // the upper part, down to 0.04 m of the rope
   const int count = recognition::finish_unseen(rope.chain, rope.views, rope.gaussians);
   CHECK(count > 100);
   int above = 0, above_before = 0;

@@ -34,6 +34,8 @@ void check_same_states(const chain::States& a, const chain::States& b) {
   CHECK(same_all(a.time, b.time));
   for (std::size_t i = 0; i < a.theta.size(); ++i) CHECK(same_all(a.theta[i], b.theta[i]));
   for (std::size_t i = 0; i < a.thetadot.size(); ++i) CHECK(same_all(a.thetadot[i], b.thetadot[i]));
+  REQUIRE(a.roll.size() == b.roll.size());
+  for (std::size_t i = 0; i < a.roll.size(); ++i) CHECK(same_all(a.roll[i], b.roll[i]));
 }
 
 twin::Twin full_twin() {
@@ -397,6 +399,40 @@ TEST_CASE("damage to twin.json is named by file and key") {
   CHECK(contains(error_of([&] { twin::load(folder.path / "absent"); }), "twin.json"));
 }
 
+TEST_CASE("how a rope rolls is kept, and refused of a chain that bends in space") {
+  const test::TemporaryFolder folder("rolling");
+  twin::Twin twin = test::small_twin(chain::Bending::planar, 20);
+  const int links = twin.chain.links();
+  twin.tabletop = true;
+  twin.table_point = math::Vector3::Zero(), twin.table_normal = math::Vector3::UnitZ();
+  twin.parameters->table_normal = twin.table_normal;
+  twin.rolling = dynamics::Rolling{
+      0.7, 1.0 / 3.0, 0.01, std::vector<double>(links - 1, -0.1), std::vector<double>(links, 0.2), 0.04};
+  twin::save(twin, folder.path);
+  const twin::Twin read = twin::load(folder.path);
+  REQUIRE(read.rolling);
+  CHECK(read.rolling->torsion == 0.7);
+  CHECK(read.rolling->friction == 1.0 / 3.0);
+  CHECK(read.rolling->speed == 0.01);
+  CHECK(read.rolling->set == twin.rolling->set);
+  CHECK(read.rolling->texture == twin.rolling->texture);
+  CHECK(read.rolling->deviation == 0.04);
+  const Path file = folder.path / "twin.json";
+  const std::string good = core::read_file(file);
+  for (const auto& [from, to, expected] : std::initializer_list<std::array<const char*, 3>>{
+           {"\"torsion\": 0.7", "\"torsion\": 0", "rolling.torsion: 0 is not positive"},
+           {"\"deviation\": 0.04", "\"deviation\": -1", "rolling.deviation: -1 is negative"}}) {
+    std::string text = good;
+    REQUIRE(text.find(from) != std::string::npos);
+    core::write_file(file, text.replace(text.find(from), std::string(from).size(), to));
+    CHECK(contains(error_of([&] { twin::load(folder.path); }), expected));
+  }
+  twin::Twin spatial = test::small_twin(chain::Bending::spatial, 20);
+  spatial.rolling = twin.rolling;
+  twin::save(spatial, folder.path);
+  CHECK(contains(error_of([&] { twin::load(folder.path); }), "rolling: is of no identified planar chain on a table"));
+}
+
 TEST_CASE("states keep their digits, and damage is named by line") {
   const test::TemporaryFolder folder("states");
   const Path file = folder.path / "states.csv";
@@ -405,12 +441,20 @@ TEST_CASE("states keep their digits, and damage is named by line") {
   states.theta[2][1] = 1e-310;
   CHECK(twin::states_csv(states).starts_with("time,theta_1,theta_2,theta_3,thetadot_1,thetadot_2,thetadot_3\n0,"));
   core::write_file(file, twin::states_csv(states));
-  check_same_states(twin::read_states(file, 3), states);
+  check_same_states(twin::read_states(file, chain), states);
   states.thetadot.clear();
   CHECK(twin::states_csv(states).starts_with("time,theta_1,theta_2,theta_3\n"));
   core::write_file(file, twin::states_csv(states));
-  check_same_states(twin::read_states(file, 3), states);
-  CHECK(contains(error_of([&] { twin::read_states(file, 8); }), "8 angles"));
+  check_same_states(twin::read_states(file, chain), states);
+  const auto planar = [](int joints) {
+    return chain::make_chain(0.3, 0.02, {0, 0, -1}, {0, 1, 0}, joints, chain::Bending::planar, false);
+  };
+  CHECK(contains(error_of([&] { twin::read_states(file, planar(8)); }), "8 angles"));
+  states.roll.assign(states.time.size(), Eigen::Vector4d(0.0, 0.1, -2e-300, 0.25));
+  CHECK(twin::states_csv(states).starts_with("time,theta_1,theta_2,theta_3,roll_0,roll_1,roll_2,roll_3\n"));
+  core::write_file(file, twin::states_csv(states));
+  check_same_states(twin::read_states(file, chain), states);
+  CHECK(contains(error_of([&] { twin::read_states(file, planar(4)); }), "5 links"));
 
   const std::string head = "time,theta_1\n";
   for (const auto& [text, expected] :
@@ -423,11 +467,11 @@ TEST_CASE("states keep their digits, and damage is named by line") {
                                                                   {head, "no state"},
                                                                   {"", "no state"}}) {
     core::write_file(file, text);
-    const std::string message = error_of([&] { twin::read_states(file, 1); });
+    const std::string message = error_of([&] { twin::read_states(file, planar(1)); });
     INFO(message);
     CHECK(contains(message, expected));
   }
-  CHECK(contains(error_of([&] { twin::read_states(folder.path / "absent.csv", 1); }), "absent.csv"));
+  CHECK(contains(error_of([&] { twin::read_states(folder.path / "absent.csv", planar(1)); }), "absent.csv"));
 }
 
 TEST_CASE("centerlines are the nodes in the world") {

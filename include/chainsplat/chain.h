@@ -37,8 +37,8 @@ struct Chain {
   int last_angle(int link) const;  // k(j): index of the last angle that moves `link`, -1 for link 0
 };
 
-// `joints` joints at s_j = (j - 1) L / joints (mathematics.md 2.1 [D]). Axes per joint: a; a, b = d x a; with twist also
-// d. `first_joint` moves the first one: s_j = first_joint + (j-1)(L - first_joint)/joints.
+// `joints` joints at s_j = (j - 1) L / joints (mathematics.md 2.1 [D]). Axes per joint: a; a, b = d x a; with twist
+// also d. `first_joint` moves the first one: s_j = first_joint + (j-1)(L - first_joint)/joints.
 Chain make_chain(double length, double diameter, const Vector3& direction, const Vector3& bending_axis, int joints,
                  Bending bending, bool twist, double first_joint = 0.0);
 
@@ -77,8 +77,9 @@ MatrixX displacement_metric(const std::vector<MatrixX>& jacobians, const VectorX
 // between 0 and 1 tells them apart.
 bool is_twist(const Chain& chain, int angle);
 bool has_twist(const Chain& chain);
-// A deviation of the difference of neighboring joints' angles, given for eight joints, for this chain: a rope's curvature
-// changes along it whatever the number of its joints, so that the difference goes with the square of a link's length.
+// A deviation of the difference of neighboring joints' angles, given for eight joints, for this chain: a rope's
+// curvature changes along it whatever the number of its joints, so that the difference goes with the square of a link's
+// length.
 double neighbor_difference(const Chain& chain, double of_eight);
 
 // What straight links and a tube of constant width cannot follow: the variance, m^2 per coordinate, of the position of
@@ -108,14 +109,24 @@ VectorX theta_gradient(const Chain& chain, const MatrixX& world_axes, const Matr
 
 // Angles along time. `thetadot` and `covariance` are empty or as long as `theta`.
 struct States {
-  std::vector<double> time;         // s
-  std::vector<VectorX> theta;       // rad, n each
-  std::vector<VectorX> thetadot;    // rad/s
-  std::vector<MatrixX> covariance;  // rad^2, n x n, of theta
+  std::vector<double> time;                  // s
+  std::vector<VectorX> theta;                // rad, n each
+  std::vector<VectorX> thetadot;             // rad/s
+  std::vector<MatrixX> covariance;           // rad^2, n x n, of theta
   std::vector<VectorX> internal_state = {};  // of ropes that have one, as in dynamics::InitialState
+  // How far the material has turned about each link's axis, rad, links() values each: a rope that rolls over a table
+  // carries its texture along. Empty: not at all.
+  std::vector<VectorX> roll = {};
 };
 // theta at any time: cubic (Catmull-Rom on the given times), clamped outside by linear extrapolation of at most one
 // interval.
 VectorX interpolate(const States& states, double time);
+// The roll at any time: linear, outside of the given times that of the nearest; empty where there is none.
+VectorX roll_at(const States& states, double time);
+
+// link_motions() of the material, turned about each link's axis by `roll` (links() values, rad; empty: none): what
+// carries Gaussians (mathematics.md 2.2).
+std::vector<Pose> material_motions(const Chain& chain, const VectorX& theta, const VectorX& roll, const Pose& base);
+std::vector<Pose> material_motions(const Chain& chain, const States& states, double time, const Pose& base);
 
 }  // namespace chainsplat::chain

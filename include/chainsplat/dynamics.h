@@ -79,6 +79,16 @@ struct InitialState {
   VectorX internal_state = {};
 };
 
+// How the material of a rope on a table rolls within its links (dynamics/rolling.h, mathematics.md 3.14).
+struct Rolling {
+  double torsion = 0.0;         // torsional over bending stiffness; above 0
+  double friction = 0.0;        // share of the links' Coulomb friction that rolls the rope; not negative
+  double speed = 0.0;           // m/s, of the underside, below which that friction is viscous; above 0
+  std::vector<double> set;      // 1/m per joint: natural curvature out of the table's plane, at a roll of 0
+  std::vector<double> texture;  // rad per link, base link first: the roll at which the texture lies as at home
+  double deviation = 0.0;       // rad, root mean square of the rolls that it was fitted to about it
+};
+
 // What identification says of its numbers; one entry per fitted number, in the order of the covariance. Names are those
 // of files and may be of another program; dynamics/parametrization.h says what they mean.
 struct Estimates {

@@ -36,8 +36,10 @@ class McapRecording {
 
   // Where the rope is at `time`, s. `thetadot` may be empty.
   void pose(double time, const math::Pose& base, const math::VectorX& theta, const math::VectorX& thetadot);
-  // The same rope's Gaussians, each on its most probable link.
-  void points(double time, const math::Pose& base, const math::VectorX& theta, const splat::Gaussians& gaussians);
+  // The same rope's Gaussians, each on its most probable link, whose material is turned by `roll` (chain::States; may
+  // be empty).
+  void points(double time, const math::Pose& base, const math::VectorX& theta, const math::VectorX& roll,
+              const splat::Gaussians& gaussians);
   // Moment, N m, and force, N, as dynamics::base_wrench() gives them; `known_mass`: else per kilogram of rope.
   void wrench(double time, const math::Vector6& wrench, bool known_mass);
   // N, at a point in the world, m; `sigma`: standard deviations.

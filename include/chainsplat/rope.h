@@ -35,6 +35,9 @@ dynamics::InitialState rest_state(const Rope& rope, const math::Pose& base, doub
 // The same of an identified twin, whose model is given, without its folder.
 dynamics::InitialState rest_state(const twin::Twin& twin, const dynamics::Model& model, const math::Pose& base,
                                   double time);
+// Sets the rolls of a motion of the twin under `base` that starts without torsion, where it is known how the rope
+// rolls.
+void add_rolls(const twin::Twin& twin, const trajectory::Trajectory& base, chain::States& states);
 // A rope in this state at `time`, s, under a base in `base`. Friction in bending is of the past, and is guessed: at
 // rest it has built up on the way from the equilibrium, in motion the joints have moved on at their present rates until
 // here.

@@ -21,14 +21,15 @@
 //                   weak* [ { singular_value, direction { name: component } } ]: combinations of parameters that the
 //                   data hardly determine;
 //                   solver* { reason, iterations, initial_cost, final_cost, worst_step }: how the fit ended (solve.h)
-//   properties*     what a rope is known by (properties.h); validity* acceleration, speed, curvature: each { value, unit },
+//   properties*     what a rope is known by (properties.h); validity* acceleration, speed, curvature: each { value,
+//   unit },
 //                   the largest that the dynamics were identified from (validity.h)
 //   corrections     cameras { name { rotation, translation, focal, time, mask_offset, mask_start, gain, bias;
 //                   calibration } }, base { time }, grasp { translation }, object { length, diameter }: each
 //                   { value, sigma, state } (corrections.h); absent where nothing was estimated
-//   verdict, trusted   [ { code, subject, value, sigma, unit, corrected, trusted, frame, text } ]; false: do not trust it
-//   gaussians, states, rollout   file names, each absent until the file exists
-//   provenance      version, capture, capture_hash, options, seed, device, driver, durations { stage: s }
+//   verdict, trusted   [ { code, subject, value, sigma, unit, corrected, trusted, frame, text } ]; false: do not trust
+//   it gaussians, states, rollout   file names, each absent until the file exists provenance      version, capture,
+//   capture_hash, options, seed, device, driver, durations { stage: s }
 #pragma once
 #include <map>
 #include <optional>
@@ -36,8 +37,8 @@
 #include <vector>
 #include "chainsplat/capture.h"
 #include "chainsplat/chain.h"
-#include "chainsplat/corrections.h"
 #include "chainsplat/core.h"
+#include "chainsplat/corrections.h"
 #include "chainsplat/dynamics.h"
 #include "chainsplat/splat.h"
 #include "chainsplat/validity.h"
@@ -73,14 +74,15 @@ struct Twin {
   std::optional<dynamics::Parameters> parameters;          // none before identification
   std::optional<dynamics::InitialState> initial;
   dynamics::Estimates estimates;
+  std::optional<dynamics::Rolling> rolling;  // none: a rope that was not seen to roll
   Provenance provenance;
   std::optional<Validity> validity;  // of all recordings that the dynamics were identified from; none: not known
   bool known_mass = false;
-  capture::Corrections corrections;        // of the recording, which everything later on the same cameras goes by
-  std::vector<capture::Finding> verdict;   // what was found wrong or doubtful; empty: nothing
-  bool trusted() const;                    // no finding says otherwise
-  splat::Gaussians gaussians;  // count 0 before recognition
-  chain::States states;        // recognized, at every frame
+  capture::Corrections corrections;       // of the recording, which everything later on the same cameras goes by
+  std::vector<capture::Finding> verdict;  // what was found wrong or doubtful; empty: nothing
+  bool trusted() const;                   // no finding says otherwise
+  splat::Gaussians gaussians;             // count 0 before recognition
+  chain::States states;                   // recognized, at every frame
   chain::States rollout;
 };
 
@@ -96,11 +98,12 @@ Twin load(const Path& run);
 // and key.
 Twin load_chain(const Path& file, const chain::Chain& held);
 
-// Columns 'time,theta_1,...,theta_n,thetadot_1,...,thetadot_n', without the rates if `thetadot` is empty.
+// Columns 'time,theta_1,...,theta_n,thetadot_1,...,thetadot_n,roll_0,...,roll_l', without rates or rolls where there
+// are none.
 std::string states_csv(const chain::States& states);
-// Throws InputError with file and line if the file is missing or damaged, if its times do not increase, or if it does
-// not have `angles` angles.
-chain::States read_states(const Path& file, int angles);
+// Throws InputError with file and line if the file is missing or damaged, if its times do not increase, or if it is of
+// a chain with other numbers of angles and links.
+chain::States read_states(const Path& file, const chain::Chain& chain);
 // Columns 'time,x_0,y_0,z_0,...': chain::nodes at every state, world frame, m.
 std::string centerline_csv(const chain::Chain& chain, const chain::States& states, const trajectory::Trajectory& base);
 // `base`: one pose per state.

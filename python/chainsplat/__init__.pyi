@@ -67,6 +67,7 @@ class States:
     time: _Numbers
     theta: _Numbers
     thetadot: _Numbers
+    roll: _Numbers
     covariance: _Numbers
     def at(self, time: float) -> _Numbers: ...
 

@@ -199,6 +199,9 @@ void add_types(py::module_& m) {
           "thetadot", [](const chain::States& s) { return array_of(s.thetadot); },
           "(T, n), rad/s; (0, 0) where they are not known")
       .def_property_readonly(
+          "roll", [](const chain::States& s) { return array_of(s.roll); },
+          "(T, links), rad, how far the material has turned about each link's axis; (0, 0) where it has not")
+      .def_property_readonly(
           "covariance", [](const chain::States& s) { return array_of(s.covariance); },
           "(T, n, n), rad^2, of theta; (0, 0, 0) where it is not known")
       .def(

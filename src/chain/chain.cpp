@@ -191,4 +191,28 @@ VectorX interpolate(const States& states, double time) {
          (u3 - u2) * m1;
 }
 
+VectorX roll_at(const States& states, double time) {
+  if (states.roll.empty()) return {};
+  CHAINSPLAT_CHECK(states.roll.size() == states.time.size(), std::to_string(states.roll.size()));
+  const auto above = std::upper_bound(states.time.begin(), states.time.end(), time);
+  if (above == states.time.begin()) return states.roll.front();
+  if (above == states.time.end()) return states.roll.back();
+  const auto i = above - states.time.begin();
+  const double u = (time - states.time[i - 1]) / (states.time[i] - states.time[i - 1]);
+  return (1.0 - u) * states.roll[i - 1] + u * states.roll[i];
+}
+
+std::vector<Pose> material_motions(const Chain& chain, const VectorX& theta, const VectorX& roll, const Pose& base) {
+  std::vector<Pose> motions = link_motions(chain, theta, base);
+  if (roll.size() == 0) return motions;
+  CHAINSPLAT_CHECK(roll.size() == chain.links(), std::to_string(roll.size()));
+  for (int link = 0; link < chain.links(); ++link)
+    motions[link].rotation = motions[link].rotation * math::exp_so3(roll[link] * chain.direction);
+  return motions;
+}
+
+std::vector<Pose> material_motions(const Chain& chain, const States& states, double time, const Pose& base) {
+  return material_motions(chain, interpolate(states, time), roll_at(states, time), base);
+}
+
 }  // namespace chainsplat::chain

@@ -79,7 +79,7 @@ void look_at_colors(const State& state, std::span<const capture::View* const> vi
     double weight = 0.0, square = 0.0;
     std::vector<std::vector<Pose>> motions;
     for (const capture::View* const view : shown)
-      motions.push_back(chain::link_motions(chain, theta, base_at(state, view->time).pose));
+      motions.push_back(chain::material_motions(chain, theta, state.roll, base_at(state, view->time).pose));
     const std::vector<splat::ColorSums> sums = state.compare_colors(shown, state.cameras, motions);
     for (std::size_t v = 0; v < shown.size(); ++v) {
       const ColorEquations e = color_equations(chain, base_at(state, shown[v]->time).pose, theta, sums[v]);

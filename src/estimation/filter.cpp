@@ -132,6 +132,9 @@ void learn(State& state, std::span<const capture::View* const> views, const Atte
            Estimate& out) {
   state.last_seen = out.time;
   state.belief = attempt.measured.belief;
+  if (state.roller)
+    state.roll = state.roller->advance(out.time, base_at(state, out.time).pose,
+                                       state.belief->mean.head(state.given.model.chain.angles()));
   // What the outlines say of the setup is computed while the device compares colors. It reads nothing that the colors
   // change, so that the numbers are those of one after the other.
   const VectorX& theta = attempt.measured.fit.theta;

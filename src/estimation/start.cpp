@@ -70,6 +70,7 @@ State start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras,
   state.cameras = cameras;
   state.setup = first_setup(state.given, unverified);
   state.place = state.given.everywhere;
+  if (twin.rolling) state.roller.emplace(state.given.model, *twin.rolling);
   state.edge_offset_variance = kOffsetDeviation * kOffsetDeviation;
   return state;
 }

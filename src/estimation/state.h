@@ -2,6 +2,7 @@
 #pragma once
 #include <limits>
 
+#include "chainsplat/dynamics/rolling.h"
 #include "chainsplat/estimation.h"
 
 namespace chainsplat::estimation {
@@ -61,15 +62,17 @@ struct State {
   CompareColors compare_colors;          // empty: silhouettes alone
   std::vector<capture::Camera> cameras;  // as they are believed to be
   Setup setup;
-  std::optional<Belief> belief;   // none before the first frame
-  std::optional<Motion> ahead;    // that belief's, where it was asked for before the frame came
-  double contact_until = kNever;  // s, end of the time in which the motion is assumed to depart from the model
-  math::VectorX place;            // shares of the links' ends in the unknown force, as learned in contact
-  double last_seen = kNever;      // s, last frame in which the masks showed the rope
-  double last_like = kNever;      // s, last frame in which the colors in the masks were like the twin's
-  bool lost = false;              // in the last frame
-  bool whole = false;             // the masks have shown the whole rope since it was found
-  double hidden_since = kNever;   // s, first frame since it was found
+  std::optional<Belief> belief;            // none before the first frame
+  std::optional<Motion> ahead;             // that belief's, where it was asked for before the frame came
+  double contact_until = kNever;           // s, end of the time in which the motion is assumed to depart from the model
+  math::VectorX place;                     // shares of the links' ends in the unknown force, as learned in contact
+  double last_seen = kNever;               // s, last frame in which the masks showed the rope
+  double last_like = kNever;               // s, last frame in which the colors in the masks were like the twin's
+  bool lost = false;                       // in the last frame
+  bool whole = false;                      // the masks have shown the whole rope since it was found
+  double hidden_since = kNever;            // s, first frame since it was found
+  std::optional<dynamics::Roller> roller;  // where the twin knows how the rope rolls on a table
+  math::VectorX roll;                      // rad, of the links' material in this frame; empty: not known
   double edge_offset = 0.0, edge_offset_variance = 0.0;  // px, px^2, of the masks' outline outside the tube's
 };
 

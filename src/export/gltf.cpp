@@ -246,7 +246,8 @@ std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, c
   model.nodes.push_back(root);
   std::vector<std::vector<int>> members(links);
   for (int i = 0; i < gaussians.count; ++i) members[surest_link(gaussians, i)].push_back(i);
-  const std::vector<math::Pose> first = local_poses(chain, moving ? motion.theta[0] : home, base_pose(start));
+  const std::vector<math::Pose> first =
+      moving ? local_poses(chain, motion, 0, base_pose(start)) : local_poses(chain, home, {}, base_pose(start));
   constexpr std::array<double, 4> kIdentity{0, 0, 0, 1};
   std::vector<std::array<double, 4>> turns;
   for (int j = 0; j < links; ++j) {
@@ -280,7 +281,7 @@ std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, c
       const auto time = static_cast<float>(motion.time[k] - start);
       if (!times.empty() && !(time > times.back())) continue;  // equal in float
       times.push_back(time);
-      const std::vector<math::Pose> local = local_poses(chain, motion.theta[k], base_pose(motion.time[k]));
+      const std::vector<math::Pose> local = local_poses(chain, motion, k, base_pose(motion.time[k]));
       for (const double x : local[0].translation) base_translation.push_back(static_cast<float>(x));
       for (int j = 0; j < links; ++j) {
         turns[j] = quaternion(local[j].rotation, turns[j]);

@@ -109,7 +109,7 @@ McapRecording::McapRecording(McapRecording&&) noexcept = default;
 void McapRecording::pose(double seconds, const Pose& base, const VectorX& theta, const VectorX& thetadot) {
   Implementation& i = *implementation_;
   const std::uint64_t time = nanoseconds(seconds);
-  const std::vector<Pose> local = local_poses(i.chain, theta, base);
+  const std::vector<Pose> local = local_poses(i.chain, theta, {}, base);
   Message transforms, links, joints, line, entity;
   if (!i.cameras_placed)
     for (const capture::Camera& camera : i.cameras)
@@ -141,10 +141,11 @@ void McapRecording::pose(double seconds, const Pose& base, const VectorX& theta,
   i.write("/rope/centerline", kSceneUpdate, time, Message().message(2, entity));
 }
 
-void McapRecording::points(double seconds, const Pose& base, const VectorX& theta, const splat::Gaussians& gaussians) {
+void McapRecording::points(double seconds, const Pose& base, const VectorX& theta, const VectorX& roll,
+                           const splat::Gaussians& gaussians) {
   constexpr std::uint64_t kUint8 = 1, kFloat32 = 7;  // of PackedElementField.NumericType
   const std::uint64_t time = nanoseconds(seconds);
-  const std::vector<Pose> motions = chain::link_motions(implementation_->chain, theta, base);
+  const std::vector<Pose> motions = chain::material_motions(implementation_->chain, theta, roll, base);
   std::string data;
   for (int i = 0; i < gaussians.count; ++i) {
     const Vector3 home(gaussians.mean[3 * i], gaussians.mean[3 * i + 1], gaussians.mean[3 * i + 2]);
@@ -262,7 +263,8 @@ void write_mcap(const twin::Twin& twin, const chain::States& motion, const traje
         const double t = motion.time[next];
         const math::Pose at = base.samples().empty() ? Pose{} : base.pose(t);
         recording.pose(t, at, motion.theta[next], motion.thetadot.empty() ? VectorX() : motion.thetadot[next]);
-        if (twin.gaussians.count > 0) recording.points(t, at, motion.theta[next], twin.gaussians);
+        if (twin.gaussians.count > 0)
+          recording.points(t, at, motion.theta[next], chain::roll_at(motion, t), twin.gaussians);
         if (!wrenches.empty()) recording.wrench(t, wrenches[next], twin.known_mass);
       }
     };

@@ -131,6 +131,7 @@ void add_motion(Arrays& arrays, const std::string& prefix, const chain::Chain& c
   arrays.numbers(prefix + "time", {frames}, states.time);
   arrays.numbers(prefix + "theta", {frames, angles}, flat(states.theta));
   if (!states.thetadot.empty()) arrays.numbers(prefix + "thetadot", {frames, angles}, flat(states.thetadot));
+  if (!states.roll.empty()) arrays.numbers(prefix + "roll", {frames, links}, flat(states.roll));
   if (!states.covariance.empty())
     arrays.numbers(prefix + "theta_covariance", {frames, angles, angles}, flat(states.covariance));
   std::vector<MatrixX> bases, poses;

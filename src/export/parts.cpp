@@ -11,8 +11,9 @@ namespace chainsplat::exports {
 using math::Matrix3;
 using math::Vector3;
 
-std::vector<math::Pose> local_poses(const chain::Chain& chain, const math::VectorX& theta, const math::Pose& base) {
-  const std::vector<math::Pose> motions = chain::link_motions(chain, theta, base);
+std::vector<math::Pose> local_poses(const chain::Chain& chain, const math::VectorX& theta, const math::VectorX& roll,
+                                    const math::Pose& base) {
+  const std::vector<math::Pose> motions = chain::material_motions(chain, theta, roll, base);
   std::vector<math::Pose> world, local;
   for (int j = 0; j < chain.links(); ++j) {
     const math::Pose home{math::Matrix3::Identity(), chain.link_start(j) * chain.direction};
@@ -20,6 +21,11 @@ std::vector<math::Pose> local_poses(const chain::Chain& chain, const math::Vecto
     local.push_back(j == 0 ? world[0] : world[j - 1].inverse() * world[j]);
   }
   return local;
+}
+
+std::vector<math::Pose> local_poses(const chain::Chain& chain, const chain::States& states, std::size_t k,
+                                    const math::Pose& base) {
+  return local_poses(chain, states.theta[k], states.roll.empty() ? math::VectorX() : states.roll[k], base);
 }
 
 Matrix3 point_inertia(double mass, const Vector3& arm) {

@@ -12,7 +12,11 @@
 namespace chainsplat::exports {
 
 // Poses of all link frames (mathematics.md 2.2) at one time, each in its parent's frame; of link 0 in the world.
-std::vector<math::Pose> local_poses(const chain::Chain& chain, const math::VectorX& theta, const math::Pose& base);
+std::vector<math::Pose> local_poses(const chain::Chain& chain, const math::VectorX& theta, const math::VectorX& roll,
+                                    const math::Pose& base);
+// Of the k-th of some states.
+std::vector<math::Pose> local_poses(const chain::Chain& chain, const chain::States& states, std::size_t k,
+                                    const math::Pose& base);
 
 constexpr double kLeastInertia = 1e-14;  // kg m^2; MuJoCo refuses less than 1e-15
 

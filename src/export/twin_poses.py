@@ -37,9 +37,14 @@ class Twin:
         link = np.searchsorted(self.link_start[1:], arclength, "right")
         return self.carry(link, arclength[:, None] * self.direction, theta, base_pose)
 
-    def gaussian_centers(self, theta, base_pose):
-        """Of every Gaussian on its most probable link, in the world."""
-        return self.carry(self.gaussian_link_probability.argmax(1), self.gaussian_mean, theta, base_pose)
+    def gaussian_centers(self, theta, base_pose, roll=None):
+        """Of every Gaussian on its most probable link, in the world; roll: how far the material is turned in each link."""
+        link, mean = self.gaussian_link_probability.argmax(1), self.gaussian_mean
+        if roll is not None:
+            along = (mean @ self.direction)[:, None] * self.direction
+            cosine, sine = np.cos(roll[link])[:, None], np.sin(roll[link])[:, None]
+            mean = along + cosine * (mean - along) + sine * np.cross(self.direction, mean)
+        return self.carry(link, mean, theta, base_pose)
 
     def carry(self, link, home, theta, base_pose):
         motion = self.link_motions(theta, base_pose)[link]

@@ -91,9 +91,9 @@ std::string usd(const twin::Twin& twin, const chain::States& motion, const traje
       times.push_back(core::exact(code));
       last = code;
     }
-    const std::vector<math::Pose> local =
-        local_poses(chain, frames > 0 ? motion.theta[k] : math::VectorX::Zero(chain.angles()),
-                    base.samples().empty() ? math::Pose() : base.pose(time));
+    const math::Pose at = base.samples().empty() ? math::Pose() : base.pose(time);
+    const std::vector<math::Pose> local = frames > 0 ? local_poses(chain, motion, k, at)
+                                                     : local_poses(chain, math::VectorX::Zero(chain.angles()), {}, at);
     for (int j = 0; j < links; ++j) {
       places[j].push_back(tuple(local[j].translation));
       turns[j].push_back(quaternion(local[j].rotation, previous[j]));

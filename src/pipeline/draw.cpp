@@ -63,8 +63,8 @@ Motion motion_of(const Path& run, const Path& capture, const DrawOptions& option
   Motion motion;
   motion.twin = load_twin(run);
   check_drawable(motion.twin, run);
-  motion.states = options.states.empty() ? motion.twin.states
-                                         : twin::read_states(input_path(options.states), motion.twin.chain.angles());
+  motion.states =
+      options.states.empty() ? motion.twin.states : twin::read_states(input_path(options.states), motion.twin.chain);
   capture::LoadOptions load;
   load.images = false;
   load.camera = options.camera;

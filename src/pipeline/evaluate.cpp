@@ -42,7 +42,7 @@ dynamics::InitialState start_of(const Path& run, const RolloutOptions& options, 
                        "begins at " + core::exact(initial.time) + " s, outside of the base motion",
                        "give marks and base motion of one recording");
   } else if (!options.initial.empty()) {
-    const chain::States states = twin::read_states(options.initial, angles);
+    const chain::States states = twin::read_states(options.initial, twin.chain);
     if (states.time.empty()) throw InputError(options.initial.string(), "has no rows", "give at least one");
     // the states of the twin's own motion keep their time
     if (options.base.empty() && states.time[0] >= base.start() && states.time[0] < base.end())
@@ -71,7 +71,10 @@ chain::States rollout_on(const twin::Twin& twin, const Path& run, const capture:
   if (times.empty())
     throw InputError(capture.folder.string(), "its base motion covers none of its frames", "correct base.tum");
   const double start = std::min(capture.base.start(), times.front());
-  return dynamics::rollout(model, capture.base, rest_state(twin, model, capture.base.pose(start), start), times);
+  chain::States states =
+      dynamics::rollout(model, capture.base, rest_state(twin, model, capture.base.pose(start), start), times);
+  add_rolls(twin, capture.base, states);
+  return states;
 }
 
 }  // namespace
@@ -91,6 +94,7 @@ RolloutResult rollout(const Path& run, const RolloutOptions& options, const core
     throw InputError((options.base.empty() ? run : options.base).string(), "the base motion ends before the start",
                      "give a base motion that goes on after it");
   result.states = dynamics::rollout(model, base, initial, times);
+  add_rolls(result.twin, base, result.states);
   twin::warn_beyond(result.twin.validity, twin::validity_of(result.twin.chain, base, result.states),
                     (options.base.empty() ? run : options.base).string());
   return result;

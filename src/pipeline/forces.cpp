@@ -46,7 +46,7 @@ struct State {
 // Gives every state to `take`, as soon as its line is there.
 void each_state(const ForceOptions& options, const chain::Chain& chain, const std::function<void(const State&)>& take) {
   if (options.estimate.empty()) {
-    const chain::States states = twin::read_states(input_path(options.states), chain.angles());
+    const chain::States states = twin::read_states(input_path(options.states), chain);
     for (std::size_t f = 0; f < states.time.size(); ++f) take({states.time[f], states.theta[f], {}});
     return;
   }

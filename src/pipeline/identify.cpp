@@ -5,6 +5,7 @@
 #include <nlohmann/json.hpp>
 
 #include "chainsplat/marker_files.h"
+#include "chainsplat/rope.h"
 #include "chainsplat/run_folder.h"
 #include "chainsplat/solve_json.h"
 #include "pipeline/stages.h"
@@ -51,6 +52,9 @@ void adopt(twin::Twin& twin, const trajectory::Trajectory& base, identification:
   twin.initial = std::move(found.initial);
   twin.estimates = std::move(found.estimates);
   twin.rollout = std::move(found.rollout);
+  if (!twin.states.roll.empty() && twin.parameters->table_normal && twin.chain.angles() + 1 == twin.chain.links())
+    twin.rolling = identification::fit_rolling(model_of(twin, {}), base, twin.states);
+  add_rolls(twin, base, twin.rollout);
   judge_motion(twin, base);
 }
 
@@ -72,6 +76,7 @@ chain::States every_nth(const chain::States& states, std::size_t every) {
     out.theta.push_back(states.theta[k]);
     if (!states.thetadot.empty()) out.thetadot.push_back(states.thetadot[k]);
     if (!states.covariance.empty()) out.covariance.push_back(states.covariance[k]);
+    if (!states.roll.empty()) out.roll.push_back(states.roll[k]);
   }
   return out;
 }
@@ -99,6 +104,7 @@ void roll_out(twin::Twin& twin, const trajectory::Trajectory& base, const Path& 
   const Stopwatch watch(twin, "rollout");
   if (!twin.initial) throw InputError((run / "twin.json").string(), "has no initial state", "add identify to `stages`");
   twin.rollout = dynamics::rollout(model_of(twin, run), base, *twin.initial, twin.states.time);
+  add_rolls(twin, base, twin.rollout);
 }
 
 namespace {

@@ -6,6 +6,7 @@
 
 #include "chainsplat/corrections.h"
 #include "chainsplat/estimation.h"
+#include "chainsplat/dynamics/rolling.h"
 #include "chainsplat/identification.h"
 #include "chainsplat/motion_files.h"
 #include "chainsplat/run_folder.h"
@@ -95,6 +96,11 @@ Rope load_rope(const Path& run) {
 const dynamics::Model& model_of(const Rope& rope) {
   if (!rope.model) model_of(rope.twin, rope.run);  // throws
   return *rope.model;
+}
+
+void add_rolls(const twin::Twin& twin, const trajectory::Trajectory& base, chain::States& states) {
+  if (!twin.rolling) return;
+  states.roll = dynamics::rolls_along(dynamics::make_model(twin.chain, *twin.parameters), *twin.rolling, base, states);
 }
 
 dynamics::InitialState rest_state(const Rope& rope, const math::Pose& base, double time) {

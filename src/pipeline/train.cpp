@@ -332,6 +332,7 @@ std::future<Comparison> begin_comparison(Training& t) {
   chain::States shown;  // without covariances, which of many angles fill the memory
   shown.time = t.twin.states.time;
   shown.theta = t.twin.states.theta;
+  shown.roll = t.twin.states.roll;
   return std::async(std::launch::async, [&recording = t.recording, &path = t.capture_path, &load = t.load,
                                          &device = *t.device, capture = std::move(t.capture), chain = t.twin.chain,
                                          gaussians = t.twin.gaussians, shown = std::move(shown)]() mutable {

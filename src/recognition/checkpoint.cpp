@@ -11,7 +11,7 @@ namespace chainsplat::recognition {
 
 namespace {
 
-constexpr char kMagic[] = "chainsplat-checkpoint/7\n";
+constexpr char kMagic[] = "chainsplat-checkpoint/8\n";
 constexpr char kFile[] = "recognize.bin";
 constexpr char kFileBefore[] = "recognize.before.bin";
 constexpr const char* kFiles[] = {kFile, kFileBefore};  // the newest first
@@ -125,6 +125,7 @@ std::optional<Checkpoint> parse(const std::string& bytes) {
     c.states.time = r.get_all<double>();
     c.states.theta = rows_of(r.get_all<double>(), c.states.time.size());
     c.states.thetadot = rows_of(r.get_all<double>(), c.states.time.size());
+    c.states.roll = rows_of(r.get_all<double>(), c.states.time.size());
     c.gaussians = get_gaussians(r);
     c.snapshot.gaussians = get_gaussians(r);
     c.snapshot.first_moment = r.get_all<float>();
@@ -172,6 +173,7 @@ void save_checkpoint(const Checkpoint& c, const Path& folder) {
   w.put_all(c.states.time);
   w.put_all(c.states.theta);
   w.put_all(c.states.thetadot);
+  w.put_all(c.states.roll);
   put_gaussians(w, c.gaussians);
   put_gaussians(w, c.snapshot.gaussians);
   w.put_all(c.snapshot.first_moment);

@@ -8,6 +8,7 @@
 #include "src/recognition/hold_colors.h"
 #include "src/recognition/modes.h"
 #include "src/recognition/place_gaussians.h"
+#include "src/recognition/rolls.h"
 #include "src/recognition/step_watch.h"
 #include "src/recognition/unseen.h"
 
@@ -376,6 +377,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   else
     begin(job);
   job.frames = assign_views(capture, job.states.time);
+  if (!resumed) job.states.roll = rolls_in(job.result.chain, capture, job.frames, job.states);
   job.training = training_views(capture, job.frames, std::max(1, options.every));
   if (job.training.views.empty())
     throw WorkError(capture.name, "no training frame shows the object", "use `every` 1 or check the masks");

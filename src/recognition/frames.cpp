@@ -24,7 +24,7 @@ std::vector<math::Pose> view_motions(const chain::Chain& chain, const capture::C
   math::VectorX at_view = theta;
   if (std::abs(view.time - frame.time) > kSameTime)
     at_view += chain::interpolate(states, view.time) - states.theta[frame_index];
-  return chain::link_motions(chain, at_view, capture.base.pose(view.time));
+  return chain::material_motions(chain, at_view, chain::roll_at(states, view.time), capture.base.pose(view.time));
 }
 
 void shuffle(std::vector<int>& order, core::Random& random) {

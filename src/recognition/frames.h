@@ -18,7 +18,8 @@ struct FrameViews {
 // One entry a state, in order.
 std::vector<FrameViews> assign_views(const capture::Capture& capture, const std::vector<double>& times);
 
-// Link motions of a view at its own time: cubic in theta where its camera is not synchronous with the first one.
+// Where the material of the links is in a view, at its own time: cubic in theta where its camera is not synchronous with
+// the first one.
 std::vector<math::Pose> view_motions(const chain::Chain& chain, const capture::Capture& capture,
                                      const chain::States& states, const FrameViews& frame, int frame_index,
                                      const math::VectorX& theta, const capture::ViewPlace& view);

@@ -139,7 +139,7 @@ void for_batches(splat::Engine& engine, const splat::Gaussians& gaussians, const
   }
   core::parallel_for(static_cast<std::int64_t>(plans.size()), [&](std::int64_t k) {
     Plan& plan = plans[k];
-    plan.motions = chain::link_motions(chain, chain::interpolate(states, plan.frame.time), base.pose(plan.frame.time));
+    plan.motions = chain::material_motions(chain, states, plan.frame.time, base.pose(plan.frame.time));
     const Rectangle content =
         intersection(reach(gaussians, plan.motions, camera), grown(lens.field_of_view, options.margin));
     if (content.empty()) return;
@@ -206,9 +206,8 @@ void paste_color(const Frame& frame, const capture::Camera& camera, std::uint8_t
 }
 
 void paste_mask(const Frame& frame, const capture::Camera& camera, std::uint8_t* mask) {
-  paste(frame, camera, [&](std::size_t from, std::size_t to) {
-    mask[to] = frame.picture.rgba[4 * from + 3] >= kSolid ? 255 : 0;
-  });
+  paste(frame, camera,
+        [&](std::size_t from, std::size_t to) { mask[to] = frame.picture.rgba[4 * from + 3] >= kSolid ? 255 : 0; });
 }
 
 void paste_depth(const Frame& frame, const capture::Camera& camera, float* depth) {

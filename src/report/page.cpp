@@ -155,6 +155,7 @@ Json motion_json(const std::string& name, const chain::States& states, const std
            {"theta", rows(states.theta)},
            {"base", binary<float>(poses)}};
   if (!sigma.empty()) out["sigma"] = rows(sigma);
+  if (!states.roll.empty()) out["roll"] = rows(states.roll);
   if (metrics.is_object()) {
     out["metrics"] = {{"mean", metrics["mean"]}, {"cameras", metrics["cameras"]}};
     out["overlap"] = overlap_json(metrics);

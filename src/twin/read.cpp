@@ -389,6 +389,15 @@ Twin load(const Path& run) {
     const auto value = [&](const char* key) { return validity[key]["value"].not_negative(); };
     twin.validity = Validity{value("acceleration"), value("speed"), value("curvature")};
   }
+  if (top.has("rolling")) {
+    const Node rolling = top["rolling"];
+    const int links = twin.chain.links();
+    if (!twin.parameters || !twin.parameters->table_normal || twin.chain.angles() + 1 != links)
+      rolling.fail("is of no identified planar chain on a table", "remove it or train again");
+    twin.rolling = dynamics::Rolling{rolling["torsion"].positive(),     rolling["friction"].not_negative(),
+                                     rolling["speed"].positive(),       rolling["set"].numbers(links - 1),
+                                     rolling["texture"].numbers(links), rolling["deviation"].not_negative()};
+  }
   if (top.has("corrections")) twin.corrections = read_corrections(top["corrections"]);
   if (top.has("verdict")) twin.verdict = read_verdict(top["verdict"]);
 
@@ -401,9 +410,10 @@ Twin load(const Path& run) {
                            std::to_string(twin.chain.links()) + " links",
                        "take the file of the same run");
   }
-  if (const Path states = named_file(top, "states", run); !states.empty()) twin.states = read_states(states, angles);
+  if (const Path states = named_file(top, "states", run); !states.empty())
+    twin.states = read_states(states, twin.chain);
   if (const Path rollout = named_file(top, "rollout", run); !rollout.empty())
-    twin.rollout = read_states(rollout, angles);
+    twin.rollout = read_states(rollout, twin.chain);
   return twin;
 }
 

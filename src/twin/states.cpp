@@ -1,5 +1,6 @@
 // States and centerlines as CSV.
-#include <algorithm>
+#include <optional>
+#include <string_view>
 
 #include "chainsplat/twin.h"
 
@@ -9,58 +10,98 @@ namespace {
 
 void append_number(std::string& text, double value) { text.append(1, ',').append(core::exact(value)); }
 
-std::string header(int angles, bool with_rates) {
+// A state's columns after its time.
+struct Columns {
+  int angles = 0;
+  bool rates = false;
+  int rolls = 0;  // links, or 0
+
+  std::size_t count() const { return static_cast<std::size_t>(angles) * (rates ? 2 : 1) + rolls; }
+};
+
+std::string header(const Columns& columns) {
   std::string text = "time";
-  for (int k = 1; k <= angles; ++k) text += ",theta_" + std::to_string(k);
-  for (int k = 1; with_rates && k <= angles; ++k) text += ",thetadot_" + std::to_string(k);
+  for (int k = 1; k <= columns.angles; ++k) text += ",theta_" + std::to_string(k);
+  for (int k = 1; columns.rates && k <= columns.angles; ++k) text += ",thetadot_" + std::to_string(k);
+  for (int j = 0; j < columns.rolls; ++j) text += ",roll_" + std::to_string(j);
   return text;
+}
+
+// Which of the forms that states have this head line is; none: of none for such a number of angles and links.
+std::optional<Columns> columns_of(std::string_view line, int angles, int links) {
+  for (const bool rates : {true, false})
+    for (const int rolls : {0, links})
+      if (const Columns columns{angles, rates, rolls}; line == header(columns)) return columns;
+  return std::nullopt;
+}
+
+// Is it the head line of another chain's states?
+bool of_another_chain(std::string_view line) {
+  const auto starting = [&](std::string_view name) {
+    int count = 0;
+    for (std::size_t at = line.find(name); at != line.npos; at = line.find(name, at + 1)) ++count;
+    return count;
+  };
+  const int angles = starting(",theta_");
+  return angles > 0 && columns_of(line, angles, starting(",roll_")).has_value();
 }
 
 }  // namespace
 
 std::string states_csv(const chain::States& states) {
-  const bool with_rates = !states.thetadot.empty();
-  CHAINSPLAT_CHECK(states.theta.size() == states.time.size(), std::to_string(states.theta.size()));
-  CHAINSPLAT_CHECK(!with_rates || states.thetadot.size() == states.time.size(), std::to_string(states.thetadot.size()));
-  std::string text = header(states.theta.empty() ? 0 : static_cast<int>(states.theta[0].size()), with_rates) + "\n";
-  for (std::size_t i = 0; i < states.time.size(); ++i) {
+  const std::size_t count = states.time.size();
+  CHAINSPLAT_CHECK(states.theta.size() == count, std::to_string(states.theta.size()));
+  CHAINSPLAT_CHECK(states.thetadot.empty() || states.thetadot.size() == count, std::to_string(states.thetadot.size()));
+  CHAINSPLAT_CHECK(states.roll.empty() || states.roll.size() == count, std::to_string(states.roll.size()));
+  Columns columns;
+  columns.angles = states.theta.empty() ? 0 : static_cast<int>(states.theta[0].size());
+  columns.rates = !states.thetadot.empty();
+  columns.rolls = states.roll.empty() ? 0 : static_cast<int>(states.roll[0].size());
+  std::string text = header(columns) + "\n";
+  for (std::size_t i = 0; i < count; ++i) {
     text += core::exact(states.time[i]);
     for (const double angle : states.theta[i]) append_number(text, angle);
-    if (with_rates)
+    if (columns.rates)
       for (const double rate : states.thetadot[i]) append_number(text, rate);
+    if (columns.rolls > 0)
+      for (const double roll : states.roll[i]) append_number(text, roll);
     text += '\n';
   }
   return text;
 }
 
-chain::States read_states(const Path& file, int angles) {
+chain::States read_states(const Path& file, const chain::Chain& chain) {
+  const int angles = chain.angles(), links = chain.links();
   const std::string text = core::read_file(file);
-  const std::string form = "write '" + header(angles, true) + "' (the second half may be missing)";
+  const std::string form = "write '" + header({angles, true, links}) + "' (thetadot and roll may be missing)";
   chain::States states;
-  std::size_t columns = 0;
+  std::optional<Columns> columns;
   for (const core::TableLine& line : core::table_lines(text)) {
     const auto fail = [&](const std::string& what, const std::string& mend) {
       throw InputError(file.string() + ":" + std::to_string(line.number), what, mend);
     };
-    if (columns == 0) {
-      columns = static_cast<std::size_t>(std::count(line.text.begin(), line.text.end(), ',')) + 1;
-      if (line.text != header(angles, true) && line.text != header(angles, false)) {
-        const bool other = line.text == header(static_cast<int>(columns) - 1, false) ||
-                           (columns % 2 == 1 && line.text == header(static_cast<int>(columns) / 2, true));
-        if (other)
-          fail("is not of this chain, which has " + std::to_string(angles) + " angles",
-               "take the states of the same twin");
-        fail("is not the header of states", form);
-      }
-      continue;
+    if (!columns) {
+      columns = columns_of(line.text, angles, links);
+      if (columns) continue;
+      if (of_another_chain(line.text))
+        fail("is not of this chain, which has " + std::to_string(angles) + " angles and " + std::to_string(links) +
+                 " links",
+             "take the states of the same twin");
+      fail("is not the header of states", form);
     }
-    const std::vector<double> numbers = core::table_numbers(file, line, columns, "mend the line or remove it");
+    const std::vector<double> numbers =
+        core::table_numbers(file, line, 1 + columns->count(), "mend the line or remove it");
     if (!states.time.empty() && !(numbers[0] > states.time.back()))
       fail("its time does not come after the one before it", "sort the rows by time");
     states.time.push_back(numbers[0]);
-    states.theta.emplace_back(Eigen::Map<const math::VectorX>(numbers.data() + 1, angles));
-    if (columns > 1 + static_cast<std::size_t>(angles))
-      states.thetadot.emplace_back(Eigen::Map<const math::VectorX>(numbers.data() + 1 + angles, angles));
+    const double* from = numbers.data() + 1;
+    const auto next = [&](std::vector<math::VectorX>& rows, int size) {
+      rows.emplace_back(Eigen::Map<const math::VectorX>(from, size));
+      from += size;
+    };
+    next(states.theta, angles);
+    if (columns->rates) next(states.thetadot, angles);
+    if (columns->rolls > 0) next(states.roll, links);
   }
   if (states.time.empty()) throw InputError(file.string(), "no state in it", form + " and a row a time");
   return states;

@@ -200,6 +200,10 @@ Json about_json(const Twin& twin) {
     laws["roll_lever"] =
         "torque = -roll_lever sum over links j of min(arclength of the joint, of the middle of j)/length times the "
         "friction across j: a rope that friction rolls";
+    if (twin.rolling)
+      laws["rolling"] =
+          "the material turns within the links as friction, torsion and its set out of the table's plane ask, and "
+          "carries the texture along (docs/mathematics.md 3.14)";
   } else {
     laws["air"] =
         "force on a link, spread evenly = -length (linear + quadratic sqrt(v_n^2 + drag_speed^2)) v_n, v_n across the "
@@ -282,6 +286,10 @@ void save(const Twin& twin, const Path& run) {
     out["validity"] = {{"acceleration", {{"value", twin.validity->acceleration}, {"unit", "m/s^2"}}},
                        {"speed", {{"value", twin.validity->speed}, {"unit", "m/s"}}},
                        {"curvature", {{"value", twin.validity->curvature}, {"unit", "1/m"}}}};
+  if (twin.rolling)
+    out["rolling"] = {{"torsion", twin.rolling->torsion}, {"friction", twin.rolling->friction},
+                      {"speed", twin.rolling->speed},     {"set", twin.rolling->set},
+                      {"texture", twin.rolling->texture}, {"deviation", twin.rolling->deviation}};
   if (!twin.corrections.empty()) out["corrections"] = to_json(twin.corrections);
   if (!twin.corrections.empty() || !twin.verdict.empty()) {
     out["verdict"] = to_json(twin.verdict);

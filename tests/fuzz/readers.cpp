@@ -211,7 +211,7 @@ void points(std::string_view bytes) {
   require(twin::read_points(file).allFinite(), "points are finite");
 }
 
-// Reads states with as many angles as the first line names.
+// Reads states of a chain with as many angles as the first line names.
 void states(std::string_view bytes) {
   static const Path file = folder() / "states.csv";
   constexpr int kMost = 12;
@@ -220,9 +220,11 @@ void states(std::string_view bytes) {
   const std::string_view head = bytes.substr(0, bytes.find('\n'));
   while (angles < kMost && (at = head.find("theta_", at)) != std::string_view::npos) ++angles, ++at;
   put(file, bytes);
-  const chain::States read = twin::read_states(file, std::max(1, angles));
+  const chain::Chain chain =
+      chain::make_chain(0.3, 0.02, {0, 0, -1}, {0, 1, 0}, std::max(1, angles), chain::Bending::planar, false);
+  const chain::States read = twin::read_states(file, chain);
   put(file, twin::states_csv(read));
-  require_same(read, twin::read_states(file, std::max(1, angles)));
+  require_same(read, twin::read_states(file, chain));
 }
 
 void covariance(std::string_view bytes) {

@@ -100,7 +100,7 @@ planning::Problem make_problem(const PlanRequest& request, const pipeline::Rope&
   planning::Problem problem = pipeline::planning_problem(rope);
   char text[160];
   if (!request.initial.empty()) {
-    const chain::States given = twin::read_states(pipeline::input_path(request.initial), rope.twin.chain.angles());
+    const chain::States given = twin::read_states(pipeline::input_path(request.initial), rope.twin.chain);
     if (given.time.empty()) throw InputError(request.initial, "has no rows", "give at least one");
     problem.initial.theta = given.theta[0];
     if (!given.thetadot.empty()) problem.initial.thetadot = given.thetadot[0];

@@ -101,7 +101,7 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
     twin.states.covariance = pipeline::read_covariances(Path(request.run) / pipeline::kCovarianceFile, twin.states);
   const chain::States motion = request.states.empty()
                                    ? twin.states
-                                   : twin::read_states(pipeline::input_path(request.states), twin.chain.angles());
+                                   : twin::read_states(pipeline::input_path(request.states), twin.chain);
   const Path beside = base_beside(request.states);
   const trajectory::Trajectory base = !request.base.empty() ? pipeline::read_base(pipeline::input_path(request.base))
                                       : !beside.empty()     ? pipeline::read_base(beside)
@@ -165,7 +165,7 @@ void synthesize(const Globals& globals, const SynthRequest& request) {
   if (const Path beside = base_beside(request.states); !request.base.empty() || !beside.empty())
     scene.base = pipeline::read_base(request.base.empty() ? beside : pipeline::input_path(request.base));
   const chain::States states = !request.states.empty()
-                                   ? twin::read_states(pipeline::input_path(request.states), twin.chain.angles())
+                                   ? twin::read_states(pipeline::input_path(request.states), twin.chain)
                                : twin.rollout.time.empty() ? twin.states
                                                            : twin.rollout;
   const gpu::DevicePtr device = gpu::open_device({.selector = globals.device});

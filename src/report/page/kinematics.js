@@ -82,6 +82,16 @@ function linkMotions(chain, motion, time) {
   return poses;
 }
 
+// Those of the material, which rolls about the links' axes (chain::material_motions); straight lines between the rows.
+function rolled(chain, motion, time, poses) {
+  if (!motion.roll) return poses;
+  const count = motion.time.length, links = poses.length, i = Math.max(0, Math.min(lastNotAfter(motion.time, time), count - 2));
+  const span = motion.time[i + 1] - motion.time[i], u = count > 1 ? Math.min(1, Math.max(0, (time - motion.time[i]) / span)) : 0;
+  const at = (row, link) => row < count ? motion.roll[row * links + link] : 0;
+  const axis = [...chain.direction, 0, 0, 0];
+  return poses.map((pose, link) => compose(pose, aboutAxis(axis, (1 - u) * at(i, link) + u * at(i + 1, link))));
+}
+
 // Grasp, joints and free end in the world.
 function nodesOf(chain, poses) {
   const at = (link, arclength) => move(poses[link], scaled(chain.direction, arclength));

@@ -15,7 +15,7 @@ function unpack() {
   }
   for (const motion of report.motions) {
     motion.time = doubles(motion.time), motion.theta = floats(motion.theta), motion.base = floats(motion.base);
-    motion.sigma = motion.sigma && floats(motion.sigma);
+    motion.sigma = motion.sigma && floats(motion.sigma), motion.roll = motion.roll && floats(motion.roll);
     motion.apart = motion.own === false;  // of another recording, with another clock
     for (const frames of Object.values(motion.overlap || {}))
       frames.values = floats(frames.values), frames.times = doubles(frames.times), frames.numbers = new Int32Array(bytes(frames.numbers));
@@ -119,7 +119,7 @@ function drawStage() {
   const canvas = at('overlay'), pen = canvas.getContext('2d'), chosen = report.cameras[state.camera];
   const camera = chosen || orbitCamera(state.orbit, up, canvas.width, canvas.height), scale = canvas.width / camera.width;
   const ratio = state.plain ? 1 : devicePixelRatio || 1, motion = motions[state.motion], poses = linkMotions(chain, motion, state.time);
-  if (paint) paint(camera, poses, state.links ? linkTints : null, state.guessed && !state.plain);
+  if (paint) paint(camera, rolled(chain, motion, state.time, poses), state.links ? linkTints : null, state.guessed && !state.plain);
   drawVideo();
   pen.clearRect(0, 0, canvas.width, canvas.height);
   if (state.plain) return;

@@ -1,0 +1,261 @@
+#include "src/recognition/rolls.h"
+
+#include <algorithm>
+#include <cmath>
+#include <numbers>
+
+#include "chainsplat/core.h"
+#include "chainsplat/image_model.h"
+#include "src/math/decompositions.h"
+
+namespace chainsplat::recognition {
+
+namespace {
+
+using Color = Eigen::Vector3f;
+
+constexpr double kTurn = 2.0 * std::numbers::pi;
+constexpr int kColumns = 36;          // of cells around the tube
+constexpr double kCellLength = 0.15;  // diameters along it
+constexpr double kFacing = 0.4;       // least cosine between surface normal and ray of a color that counts
+constexpr double kNoise = 0.1;        // of a cell's color, in units of the mean color: what neighbors share
+constexpr double kOutlier = 3.0;      // kNoise beyond which a residual counts less
+constexpr double kAlong = 0.15;       // rad per root of a diameter: turns of neighboring links differ by so much
+constexpr double kInTime = 1.0;       // rad per root of a second
+constexpr double kLeastLength = 0.1;  // diameters between middles of links, where the first joint is at the grasp
+constexpr double kLeastTime = 1e-3;   // s between frames
+constexpr int kPasses = 3;            // the first goes through the frames in time, and learns the texture on the way
+constexpr int kIterations = 4;        // Gauss-Newton steps a frame and pass
+constexpr std::size_t kCellsTogether = 4000000;  // that are laid out at once: 64 MB
+constexpr double kBelieved = 0.25;               // least share of what is left without rolls that they must explain
+
+// What one moment shows of the surface: row i of arclength, column j of angle about the axis in the link's frame.
+struct Layout {
+  std::vector<Color> color;
+  std::vector<float> weight;  // sum of squared cosines; 0: not seen
+};
+
+struct Grid {
+  const chain::Chain& chain;
+  int rows;
+  std::vector<int> link;  // a row
+  explicit Grid(const chain::Chain& of)
+      : chain(of), rows(std::max(2, static_cast<int>(std::ceil(of.length / (kCellLength * of.diameter))))) {
+    for (int row = 0; row < rows; ++row) link.push_back(chain::link_at(chain, arclength(row)));
+  }
+  double arclength(int row) const { return (row + 0.5) * chain.length / rows; }
+  std::size_t cell(int row, int column) const { return static_cast<std::size_t>(row) * kColumns + column; }
+  std::size_t size() const { return static_cast<std::size_t>(rows) * kColumns; }
+};
+
+Layout laid_out(const Grid& grid, const capture::Capture& capture, const FrameViews& frame, int index,
+                const chain::States& states) {
+  const chain::Chain& chain = grid.chain;
+  const double radius = 0.5 * chain.diameter;
+  Layout out{std::vector<Color>(grid.size(), Color::Zero()), std::vector<float>(grid.size(), 0.0f)};
+  math::Vector3 normals[kColumns];
+  for (int column = 0; column < kColumns; ++column) {
+    const double angle = (column + 0.5) * kTurn / kColumns;
+    normals[column] =
+        std::cos(angle) * chain.bending_axis + std::sin(angle) * chain.direction.cross(chain.bending_axis);
+  }
+  for (const int v : frame.views) {
+    const capture::View view = capture::unpacked(capture.views[v]);
+    const capture::Camera& camera = capture.cameras[view.camera];
+    std::vector<math::Pose> motions =
+        view_motions(chain, capture, states, frame, index, states.theta[index], capture.views[v]);
+    const math::Pose camera_from_world = camera.world_from_camera.inverse();
+    for (math::Pose& motion : motions) motion = camera_from_world * motion;
+    for (int row = 0; row < grid.rows; ++row) {
+      const math::Pose& motion = motions[grid.link[row]];
+      const math::Vector3 axis = motion * math::Vector3(grid.arclength(row) * chain.direction);
+      for (int column = 0; column < kColumns; ++column) {
+        const math::Vector3 normal = motion.rotation * normals[column], point = axis + radius * normal;
+        const double facing = -normal.dot(point) / point.norm();
+        if (facing < kFacing || point.z() < image_model::kNear) continue;
+        const math::Vector2 pixel = capture::project(camera, point);
+        const int x = static_cast<int>(std::floor(pixel.x())) - view.x0,
+                  y = static_cast<int>(std::floor(pixel.y())) - view.y0;
+        if (x < 0 || y < 0 || x >= view.width || y >= view.height) continue;
+        const std::uint8_t* rgba = &view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x)];
+        if (rgba[3] < image_model::kObjectMask) continue;
+        const std::size_t cell = grid.cell(row, column);
+        const float counts = static_cast<float>(facing * facing);
+        out.color[cell] += counts / 255.0f * Color(rgba[0], rgba[1], rgba[2]);
+        out.weight[cell] += counts;
+      }
+    }
+  }
+  for (std::size_t cell = 0; cell < grid.size(); ++cell)
+    if (out.weight[cell] > 0.0f) out.color[cell] /= out.weight[cell];
+  return out;
+}
+
+// The texture that the frames agree on, by the material's angle.
+struct Texture {
+  std::vector<Color> sum;
+  std::vector<float> weight;
+  explicit Texture(const Grid& grid) : sum(grid.size(), Color::Zero()), weight(grid.size(), 0.0f) {}
+};
+
+struct Column {
+  int first, second;
+  float share;  // of the second
+};
+// Columns between whose middles lies the material that a turn by `roll` brings to the middle of `column`.
+Column material_column(int column, double roll) {
+  const double at = column - roll * kColumns / kTurn, floor = std::floor(at);
+  const int first = ((static_cast<int>(floor) % kColumns) + kColumns) % kColumns;
+  return {first, (first + 1) % kColumns, static_cast<float>(at - floor)};
+}
+
+void add(const Grid& grid, const Layout& layout, const math::VectorX& roll, Texture& texture) {
+  for (int row = 0; row < grid.rows; ++row)
+    for (int column = 0; column < kColumns; ++column) {
+      const std::size_t from = grid.cell(row, column);
+      const float weight = layout.weight[from];
+      if (weight <= 0.0f) continue;
+      const Column at = material_column(column, roll[grid.link[row]]);
+      const auto put = [&](int to, float share) {
+        texture.sum[grid.cell(row, to)] += share * weight * layout.color[from];
+        texture.weight[grid.cell(row, to)] += share * weight;
+      };
+      put(at.first, 1.0f - at.share);
+      put(at.second, at.share);
+    }
+}
+
+// What is left of the colors of one frame: weighted squares and their weights.
+struct Left {
+  double square = 0.0, weight = 0.0;
+};
+
+Left left_of(const Grid& grid, const Layout& layout, const Texture& still) {
+  Left left;
+  for (std::size_t cell = 0; cell < grid.size(); ++cell) {
+    if (layout.weight[cell] <= 0.0f) continue;
+    left.square += layout.weight[cell] * (layout.color[cell] - still.sum[cell] / still.weight[cell]).squaredNorm();
+    left.weight += layout.weight[cell];
+  }
+  return left;
+}
+
+// Least squares over the turns of one frame's links, from `roll` on, which stay near `before`, `apart` seconds away.
+Left align(const Grid& grid, const Layout& layout, const Texture& texture, const math::VectorX* before, double apart,
+           math::VectorX& roll) {
+  constexpr float kKnown = 0.2f;  // least weight of a texture's cell
+  constexpr double kInverseVariance = 1.0 / (kNoise * kNoise);
+  const int links = grid.chain.links();
+  for (int iteration = 0;; ++iteration) {
+    math::MatrixX normal = math::MatrixX::Zero(links, links);
+    math::VectorX gradient = math::VectorX::Zero(links);
+    Left left;
+    for (int row = 0; row < grid.rows; ++row) {
+      const int link = grid.link[row];
+      for (int column = 0; column < kColumns; ++column) {
+        const std::size_t from = grid.cell(row, column);
+        if (layout.weight[from] <= 0.0f) continue;
+        const Column at = material_column(column, roll[link]);
+        const std::size_t a = grid.cell(row, at.first), b = grid.cell(row, at.second);
+        if (texture.weight[a] < kKnown || texture.weight[b] < kKnown) continue;
+        const Color first = texture.sum[a] / texture.weight[a], second = texture.sum[b] / texture.weight[b];
+        const Color residual = layout.color[from] - (1.0f - at.share) * first - at.share * second;
+        const Color slope = (second - first) * static_cast<float>(kColumns / kTurn);  // of the residual
+        const double square = residual.squaredNorm();
+        const double weight =
+            kInverseVariance * layout.weight[from] / (1.0 + square * kInverseVariance / (kOutlier * kOutlier));
+        normal(link, link) += weight * slope.squaredNorm();
+        gradient[link] += weight * slope.dot(residual);
+        left.square += layout.weight[from] * square;
+        left.weight += layout.weight[from];
+      }
+    }
+    if (iteration == kIterations) return left;
+    for (int link = 0; link < links; ++link) {
+      const double middles = 0.5 * (grid.chain.link_end(link) - grid.chain.link_start(std::max(0, link - 1)));
+      const double tie =
+          grid.chain.diameter / (kAlong * kAlong * std::max(middles, kLeastLength * grid.chain.diameter));
+      const double difference = roll[link] - (link > 0 ? roll[link - 1] : 0.0);  // the grasp holds the rope
+      normal(link, link) += tie;
+      gradient[link] += tie * difference;
+      if (link > 0) {
+        normal(link - 1, link - 1) += tie;
+        normal(link, link - 1) -= tie;
+        normal(link - 1, link) -= tie;
+        gradient[link - 1] -= tie * difference;
+      }
+      if (before) {
+        const double slow = 1.0 / (kInTime * kInTime * std::max(apart, kLeastTime));
+        normal(link, link) += slow;
+        gradient[link] += slow * (roll[link] - (*before)[link]);
+      }
+    }
+    roll -= normal.ldlt().solve(gradient);
+  }
+}
+
+// A part of the frames laid out, in the light that each side of the rope has on the mean.
+std::vector<Layout> laid_out(const Grid& grid, const capture::Capture& capture, const std::vector<FrameViews>& frames,
+                             std::size_t first, std::size_t count, const chain::States& states) {
+  constexpr float kDarkest = 0.02f;
+  std::vector<Layout> layouts(count);
+  core::parallel_for(static_cast<std::int64_t>(count), [&](std::int64_t k) {
+    layouts[k] = laid_out(grid, capture, frames[first + k], static_cast<int>(first + k), states);
+  });
+  std::vector<Color> light(kColumns, Color::Zero());
+  std::vector<float> weights(kColumns, 0.0f);
+  for (const Layout& layout : layouts)
+    for (std::size_t cell = 0; cell < grid.size(); ++cell) {
+      light[cell % kColumns] += layout.weight[cell] * layout.color[cell];
+      weights[cell % kColumns] += layout.weight[cell];
+    }
+  for (int column = 0; column < kColumns; ++column)
+    if (weights[column] > 0.0f) light[column] = (light[column] / weights[column]).cwiseMax(kDarkest);
+  for (Layout& layout : layouts)
+    for (std::size_t cell = 0; cell < grid.size(); ++cell)
+      if (layout.weight[cell] > 0.0f) layout.color[cell] = layout.color[cell].cwiseQuotient(light[cell % kColumns]);
+  return layouts;
+}
+
+}  // namespace
+
+std::vector<math::VectorX> rolls_in(const chain::Chain& chain, const capture::Capture& capture,
+                                    const std::vector<FrameViews>& frames, const chain::States& given) {
+  chain::States states;  // of links alone
+  states.time = given.time, states.theta = given.theta;
+  const Grid grid(chain);
+  const std::size_t count = frames.size(), part = std::max<std::size_t>(1, kCellsTogether / grid.size());
+  const math::VectorX none = math::VectorX::Zero(chain.links());
+  std::vector<math::VectorX> rolls(count, none);
+  const auto apart = [&](std::size_t k) { return frames[k].time - frames[k - 1].time; };
+  std::vector<Layout> layouts;
+  Texture texture(grid), still(grid);
+  Left turned, unturned;
+  for (int pass = 0; pass < kPasses; ++pass) {
+    Texture next(grid);
+    for (std::size_t first = 0; first < count; first += part) {
+      const std::size_t size = std::min(part, count - first);
+      if (pass == 0 || size < count) layouts = laid_out(grid, capture, frames, first, size, states);
+      for (std::size_t i = 0; i < size; ++i) {
+        const std::size_t k = first + i;
+        const math::VectorX* before = k > 0 ? &rolls[k - 1] : nullptr;
+        if (pass == 0 && before) rolls[k] = *before;
+        const Left left = align(grid, layouts[i], pass == 0 ? next : texture, before, k > 0 ? apart(k) : 0.0, rolls[k]);
+        add(grid, layouts[i], rolls[k], next);
+        if (pass == 0) add(grid, layouts[i], none, still);
+        if (pass + 1 < kPasses) continue;
+        turned.square += left.square, turned.weight += left.weight;
+        const Left l0 = left_of(grid, layouts[i], still);
+        unturned.square += l0.square, unturned.weight += l0.weight;
+      }
+    }
+    texture = std::move(next);
+  }
+  if (!(turned.square * unturned.weight < (1.0 - kBelieved) * unturned.square * turned.weight)) return {};
+  math::VectorX mean = none;
+  for (const math::VectorX& roll : rolls) mean += roll / static_cast<double>(count);
+  for (math::VectorX& roll : rolls) roll -= mean;
+  return rolls;
+}
+
+}  // namespace chainsplat::recognition

@@ -1,0 +1,20 @@
+// rolls.h - how far a rope's material has turned about its own axis in each frame.
+#pragma once
+#include <vector>
+
+#include "chainsplat/capture.h"
+#include "chainsplat/chain.h"
+#include "src/recognition/frames.h"
+
+namespace chainsplat::recognition {
+
+// A rope that is pushed over a table rolls, and carries its texture along; the chain's links do not. This finds every
+// frame's turn of the material about each link's axis, rad, links() values, from the colors of the surface: what the
+// cameras show of it is laid out flat, by arclength and angle about the axis, and moved around until it fits to what
+// the other frames show. `states` need angles only, as outlines give them. The turns about their mean over time, which
+// no picture can tell from a twisted texture; zero where nothing shows them. All are zero where they explain too little
+// of the colors to be believed. design.md, 'Recognition'.
+std::vector<math::VectorX> rolls_in(const chain::Chain& chain, const capture::Capture& capture,
+                                    const std::vector<FrameViews>& frames, const chain::States& states);
+
+}  // namespace chainsplat::recognition

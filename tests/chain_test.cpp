@@ -1,0 +1,35 @@
+// What the material of a chain does beside its links.
+#include "chainsplat/chain.h"
+
+#include <doctest/doctest.h>
+
+using namespace chainsplat;
+
+TEST_CASE("material turns about its link's axis, and nowhere else") {
+  const chain::Chain chain = chain::make_chain(0.3, 0.02, {0, 0.6, -0.8}, {1, 0, 0}, 4, chain::Bending::planar, false);
+  const math::VectorX theta = math::VectorX::LinSpaced(4, -0.4, 0.5), roll = math::VectorX::LinSpaced(5, 0.0, 1.2);
+  const math::Pose base{math::exp_so3({0.3, -0.2, 0.5}), {0.1, 0.2, 0.3}};
+  const auto links = chain::link_motions(chain, theta, base),
+             material = chain::material_motions(chain, theta, roll, base);
+  for (int j = 0; j < chain.links(); ++j) {
+    const math::Vector3 on_axis = 0.07 * chain.direction, beside = on_axis + 0.01 * chain.bending_axis;
+    CHECK((material[j] * on_axis - links[j] * on_axis).norm() < 1e-15);
+    const math::Vector3 turned = on_axis + 0.01 * (Eigen::AngleAxisd(roll[j], chain.direction) * chain.bending_axis);
+    CHECK((material[j] * beside - links[j] * turned).norm() < 1e-15);
+  }
+  const auto none = chain::material_motions(chain, theta, {}, base);
+  for (int j = 0; j < chain.links(); ++j)
+    CHECK((none[j] * math::Vector3::Ones() - links[j] * math::Vector3::Ones()).norm() == 0.0);
+}
+
+TEST_CASE("rolls are interpolated by straight lines and stay at their ends") {
+  chain::States states;
+  states.time = {1.0, 1.5, 3.5};
+  CHECK(chain::roll_at(states, 1.2).size() == 0);
+  states.roll = {Eigen::Vector2d(0, 1), Eigen::Vector2d(0, 2), Eigen::Vector2d(0, -2)};
+  CHECK(chain::roll_at(states, 0.0)[1] == 1.0);
+  CHECK(chain::roll_at(states, 1.25)[1] == doctest::Approx(1.5));
+  CHECK(chain::roll_at(states, 1.5)[1] == 2.0);
+  CHECK(chain::roll_at(states, 2.0)[1] == doctest::Approx(1.0));
+  CHECK(chain::roll_at(states, 9.0)[1] == -2.0);
+}
