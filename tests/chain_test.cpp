@@ -33,3 +33,29 @@ TEST_CASE("rolls are interpolated by straight lines and stay at their ends") {
   CHECK(chain::roll_at(states, 2.0)[1] == doctest::Approx(1.0));
   CHECK(chain::roll_at(states, 9.0)[1] == -2.0);
 }
+
+TEST_CASE("a chain that lies beside its grasp's plane moves by the same axes") {
+  chain::Chain chain = chain::make_chain(0.3, 0.02, {1, 0, 0}, {0, 0, 1}, 4, chain::Bending::planar, false);
+  chain.lift = {0.0, -0.001, -0.003, -0.004, -0.004};
+  const math::VectorX theta = math::VectorX::LinSpaced(4, -0.4, 0.5);
+  const math::Pose base{math::exp_so3({0.3, -0.2, 0.5}), {0.1, 0.2, 0.3}};
+  chain::Chain flat = chain;
+  flat.lift.clear();
+  const auto lifted = chain::link_motions(chain, theta, base), level = chain::link_motions(flat, theta, base);
+  for (int j = 0; j < chain.links(); ++j) {
+    const math::Vector3 home(0.1, 0.02, 0.03);
+    CHECK((lifted[j] * home - level[j] * math::Vector3(home + chain.lift[j] * chain.bending_axis)).norm() < 1e-15);
+    // derivatives by the chain's own axes against central differences
+    const math::Vector3 point = lifted[j] * home;
+    const math::MatrixX jacobian = chain::point_jacobian(chain, chain::world_axes(chain, theta, base), j, point);
+    for (int k = 0; k < 4; ++k) {
+      constexpr double kStep = 1e-6;
+      math::VectorX more = theta, less = theta;
+      more[k] += kStep, less[k] -= kStep;
+      const math::Vector3 slope =
+          (chain::link_motions(chain, more, base)[j] * home - chain::link_motions(chain, less, base)[j] * home) /
+          (2.0 * kStep);
+      CHECK((slope - jacobian.col(k)).norm() < 1e-9);
+    }
+  }
+}

@@ -19,6 +19,7 @@ twin::Twin table_twin() {
   twin::Twin twin = test::small_twin(chain::Bending::planar);
   twin.chain = chain::make_chain(0.3, 0.02, {0, 1, 0}, {0, 0, 1}, 5, chain::Bending::planar, false, 0.013);
   twin.gaussians = test::spiral_gaussians(twin.chain, 300);
+  for (int j = 0; j < twin.chain.links(); ++j) twin.chain.lift.push_back(-2e-4 * j);
   twin.tabletop = true;
   twin.table_point = math::Vector3(0, 0, 0.54);
   twin.table_normal = math::Vector3::UnitZ();

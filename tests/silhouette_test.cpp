@@ -522,3 +522,35 @@ TEST_CASE("the demo capture is recognized to a fraction of a millimeter, whateve
   CHECK(choice.out_of_plane_rms == doctest::Approx(3.3e-3).epsilon(0.1));
   CHECK(error(planar, silhouette::fit_sequence(planar, demo).states) < 3.5e-3);
 }
+
+TEST_CASE("how far a rope lies beside the plane of its grasp is found from outlines of several cameras") {
+  const Chain flat = rope(Bending::planar);
+  const auto theta_at = [&](double time) { return VectorX(std::sin(4.0 * time) * bent(flat, 1.0)); };
+  for (const double height : {0.0, -0.0012, 0.003}) {  // m; a pixel is 2 mm
+    CAPTURE(height);
+    Chain lying = flat;
+    lying.lift = silhouette::lying_down(flat, height);
+    const capture::Capture recording = film(lying, 12, theta_at);
+    const silhouette::SequenceFit fit = silhouette::fit_sequence(flat, recording);
+    const double found = silhouette::fit_height(flat, recording, fit);
+    CHECK(std::abs(found - height) < 0.0003);
+    Chain as_found = flat;
+    as_found.lift = silhouette::lying_down(flat, found);
+    const silhouette::SequenceFit again = silhouette::fit_sequence(as_found, recording);
+    double square = 0.0, square_flat = 0.0;
+    for (std::size_t f = 0; f < again.states.theta.size(); ++f) {
+      const MatrixX truth = points(lying, theta_at(again.states.time[f]), base_pose());
+      square += std::pow(rms(points(as_found, again.states.theta[f], base_pose()), truth), 2) / 12.0;
+      square_flat += std::pow(rms(points(flat, fit.states.theta[f], base_pose()), truth), 2) / 12.0;
+    }
+    if (height != 0.0) CHECK(std::sqrt(square) < 0.5 * std::sqrt(square_flat));
+  }
+  // the rope leaves its grasp level and lies level
+  const std::vector<double> lift =
+      silhouette::lying_down(chain::make_chain(0.3, 0.02, {1, 0, 0}, {0, 0, 1}, 60, Bending::planar, false), -0.001);
+  CHECK(lift[0] == 0.0);
+  CHECK(std::abs(lift[1]) < 1e-5);
+  CHECK(lift.back() == -0.001);
+  CHECK(std::is_sorted(lift.rbegin(), lift.rend()));
+  CHECK(silhouette::lying_down(flat, 0.0).empty());
+}

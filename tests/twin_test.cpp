@@ -408,8 +408,10 @@ TEST_CASE("how a rope rolls is kept, and refused of a chain that bends in space"
   twin.parameters->table_normal = twin.table_normal;
   twin.rolling = dynamics::Rolling{
       0.7, 1.0 / 3.0, 0.01, std::vector<double>(links - 1, -0.1), std::vector<double>(links, 0.2), 0.04};
+  for (int j = 0; j < links; ++j) twin.chain.lift.push_back(-1e-3 / (1.0 + j));
   twin::save(twin, folder.path);
   const twin::Twin read = twin::load(folder.path);
+  CHECK(read.chain.lift == twin.chain.lift);
   REQUIRE(read.rolling);
   CHECK(read.rolling->torsion == 0.7);
   CHECK(read.rolling->friction == 1.0 / 3.0);
@@ -431,6 +433,11 @@ TEST_CASE("how a rope rolls is kept, and refused of a chain that bends in space"
   spatial.rolling = twin.rolling;
   twin::save(spatial, folder.path);
   CHECK(contains(error_of([&] { twin::load(folder.path); }), "rolling: is of no identified planar chain on a table"));
+  spatial.rolling.reset();
+  spatial.chain.lift.assign(spatial.chain.links(), 0.001);
+  twin::save(spatial, folder.path);
+  CHECK(
+      contains(error_of([&] { twin::load(folder.path); }), "lift: is given of a chain that does not bend in a plane"));
 }
 
 TEST_CASE("states keep their digits, and damage is named by line") {

@@ -28,12 +28,16 @@ struct Chain {
   std::vector<Vector6> axes;                // S_k, one an angle, base frame at home (space form)
   std::vector<int> child_link;              // link moved by angle k, 1..links-1; its parent is child_link - 1
   std::vector<double> joint_arclength;      // s_j of joint j = link j, m; size links() - 1, increasing, s_1 >= 0
+  // m per link, base link first, along the bending axis: a rope that is held above a table lies lower than in its
+  // grasp. Of planar chains only, whose axes it does not move; empty: 0.
+  std::vector<double> lift;
 
   int angles() const { return static_cast<int>(axes.size()); }                // n
   int links() const { return static_cast<int>(joint_arclength.size()) + 1; }  // n_l + 1, with the base link
   // Arclength range of link j: [start, end]. Link 0 is [0, s_1].
   double link_start(int link) const { return link == 0 ? 0.0 : joint_arclength[link - 1]; }
   double link_end(int link) const { return link + 1 == links() ? length : joint_arclength[link]; }
+  double link_lift(int link) const { return lift.empty() ? 0.0 : lift[link]; }
   int last_angle(int link) const;  // k(j): index of the last angle that moves `link`, -1 for link 0
 };
 
@@ -42,8 +46,8 @@ struct Chain {
 Chain make_chain(double length, double diameter, const Vector3& direction, const Vector3& bending_axis, int joints,
                  Bending bending, bool twist, double first_joint = 0.0);
 
-// E_j for j = 0..n_l: world pose that carries home coordinates (base frame) of link j to the world. E_0 = base.
-// mathematics.md 2.2.
+// E_j for j = 0..n_l: world pose that carries home coordinates (base frame) of link j to the world, lift included. E_0
+// = base. mathematics.md 2.2.
 std::vector<Pose> link_motions(const Chain& chain, const VectorX& theta, const Pose& base);
 
 // s_k, world-frame screw axes at theta, 6 x n (columns). mathematics.md 2.3.

@@ -53,6 +53,7 @@ std::vector<Pose> link_motions(const Chain& chain, const VectorX& theta, const P
     for (; k < chain.angles() && chain.child_link[k] == link; ++k)
       motion = motion * math::exp_se3(chain.axes[k] * theta[k]);
     motions[link] = motion;
+    if (!chain.lift.empty()) motions[link].translation += chain.lift[link] * (motion.rotation * chain.bending_axis);
   }
   return motions;
 }

@@ -53,10 +53,11 @@ std::string body_of(const twin::Twin& twin, int link, const std::string& indent)
   const dynamics::Parameters& p = *twin.parameters;
   const double length = chain.link_end(link) - chain.link_start(link);
   const double before = link == 1 ? 0.0 : chain.link_start(link - 1);
+  const Vector3 lift = (chain.link_lift(link) - chain.link_lift(link - 1)) * chain.bending_axis;
   const Inertia inertia = inertia_of(chain, p, link);
   const Matrix3& about = inertia.about;
   std::string out = indent + "<body" + attribute("name", "link_" + std::to_string(link)) +
-                    attribute("pos", Vector3((chain.link_start(link) - before) * chain.direction)) + ">\n";
+                    attribute("pos", Vector3((chain.link_start(link) - before) * chain.direction + lift)) + ">\n";
   const std::string inner = indent + "  ";
   out += joints_of(chain, p, link, inner);
   out += inner + "<inertial" + attribute("pos", inertia.center) + attribute("mass", inertia.mass) +

@@ -159,6 +159,7 @@ void add_chain(Arrays& arrays, const twin::Twin& twin) {
   arrays.numbers("axes", {angles, 6}, flat(chain.axes));
   arrays.add<std::int64_t>("child_link", {angles}, chain.child_link, "<i8");
   arrays.numbers("link_start", {links}, starts);
+  if (!chain.lift.empty()) arrays.numbers("link_lift", {links}, chain.lift);
   arrays.numbers("gravity", {3}, twin.gravity);
   if (twin.tabletop) {
     arrays.numbers("table_point", {3}, twin.table_point.value_or(math::Vector3::Zero()));

@@ -24,7 +24,10 @@ class Twin:
             turn[:3, 3] = (np.eye(3) - turn[:3, :3]) @ np.cross(w, v)  # w x v is a point of the axis
             before = motions[child - 1] if motions[child] is None else motions[child]
             motions[child] = before @ turn
-        return np.array(motions)
+        motions = np.array(motions)
+        if hasattr(self, "link_lift"):
+            motions[:, :3, 3] += (motions[:, :3, :3] @ self.bending_axis) * self.link_lift[:, None]
+        return motions
 
     def link_poses(self, theta, base_pose):
         """4 x 4 world poses of the link frames: origin at the link's joint, axes parallel to the base's at home."""

@@ -98,7 +98,8 @@ std::string joint_and_link(const twin::Twin& twin, int link) {
   const dynamics::Parameters& p = *twin.parameters;
   const std::vector<int> angles = angles_of(chain, link);
   std::string out, parent = name_of("link_", link - 1);
-  Vector3 place = (chain.link_start(link) - chain.link_start(link - 1)) * chain.direction;
+  Vector3 place = (chain.link_start(link) - chain.link_start(link - 1)) * chain.direction +
+                  (chain.link_lift(link) - chain.link_lift(link - 1)) * chain.bending_axis;
   for (const int k : angles) {
     const bool last = k == angles.back();
     const std::string child = last ? name_of("link_", link) : name_of("cross_", k + 1);

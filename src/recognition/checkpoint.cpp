@@ -122,6 +122,7 @@ std::optional<Checkpoint> parse(const std::string& bytes) {
     c.spatial = r.get<std::uint8_t>() != 0;
     c.out_of_plane_rms = r.get<double>();
     c.deviation = r.get<double>();
+    c.lift = r.get_all<double>();
     c.states.time = r.get_all<double>();
     c.states.theta = rows_of(r.get_all<double>(), c.states.time.size());
     c.states.thetadot = rows_of(r.get_all<double>(), c.states.time.size());
@@ -170,6 +171,7 @@ void save_checkpoint(const Checkpoint& c, const Path& folder) {
   w.put(c.spatial);
   w.put(c.out_of_plane_rms);
   w.put(c.deviation);
+  w.put_all(c.lift);
   w.put_all(c.states.time);
   w.put_all(c.states.theta);
   w.put_all(c.states.thetadot);

@@ -16,6 +16,7 @@ struct Checkpoint {
   int step = 0;          // Adam steps done of the round under way (fast); 0: none, and the snapshot is empty
   bool spatial = false;  // the bending that was chosen
   double out_of_plane_rms = 0.0, deviation = 0.0;
+  std::vector<double> lift;  // of the chain
   StepWatch watch;
   chain::States states;
   splat::Gaussians gaussians;  // at the round's start (fast)

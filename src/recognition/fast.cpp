@@ -153,10 +153,13 @@ void begin(Job& job) {
     result.joints = silhouette::choose_joints(result.chain, fit);
     joints = result.joints.joints;
   }
-  if (result.bending.bending != first || joints != result.chain.links() - 1) {
+  const chain::Chain fitted = result.chain;
+  if (result.bending.bending != first || joints != result.chain.links() - 1)
     result.chain = chain_of(capture, options, result.bending.bending, joints);
+  if (capture.tabletop && result.bending.bending == chain::Bending::planar && !options.twist)
+    result.chain.lift = silhouette::lying_down(result.chain, silhouette::fit_height(fitted, capture, fit));
+  if (result.chain.links() != fitted.links() || result.chain.angles() != fitted.angles() || !result.chain.lift.empty())
     fit = silhouette::fit_sequence(result.chain, capture);
-  }
   job.states = fit.states;
   job.coarse = job.states.theta;
   job.prior = prior_of(fit);
@@ -169,6 +172,7 @@ void resume(Job& job, Checkpoint before) {
   const chain::Chain joint = chain_of(job.capture, job.options, result.bending.bending, 1);
   const Eigen::Index n = before.states.theta.at(0).size();
   result.chain = chain_of(job.capture, job.options, result.bending.bending, static_cast<int>(n) / joint.angles());
+  result.chain.lift = std::move(before.lift);
   job.states = std::move(before.states);
   job.gaussians = std::move(before.gaussians);
   job.first_round = before.stage;
@@ -194,6 +198,7 @@ void save(const Job& job, splat::Engine& engine, int round, int step) {
   c.spatial = job.result.bending.bending == chain::Bending::spatial;
   c.out_of_plane_rms = job.result.bending.out_of_plane_rms;
   c.deviation = job.result.bending.deviation;
+  c.lift = job.result.chain.lift;
   c.states = job.states;
   c.gaussians = job.gaussians;
   if (step > 0) c.snapshot = engine.snapshot();

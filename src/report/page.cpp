@@ -57,7 +57,8 @@ Json pose_json(const math::Pose& pose) {
 }
 
 Json chain_json(const chain::Chain& chain) {
-  Json screws = Json::array(), child = Json::array(), names = Json::array(), starts = Json::array();
+  Json screws = Json::array(), child = Json::array(), names = Json::array(), starts = Json::array(),
+       lifts = Json::array();  // base frame, m
   int rank = 0;
   for (int k = 0; k < chain.angles(); ++k) {
     for (const double x : chain.axes[k]) screws.push_back(x);
@@ -68,14 +69,18 @@ Json chain_json(const chain::Chain& chain) {
                      : rank == 0               ? ""
                                                : ", second axis"));
   }
-  for (int j = 0; j < chain.links(); ++j) starts.push_back(chain.link_start(j));
+  for (int j = 0; j < chain.links(); ++j) {
+    starts.push_back(chain.link_start(j));
+    lifts.push_back(list(Vector3(chain.link_lift(j) * chain.bending_axis)));
+  }
   return {{"length", chain.length},
           {"diameter", chain.diameter},
           {"direction", list(chain.direction)},
           {"screws", screws},
           {"child", child},
           {"angles", names},
-          {"starts", starts}};
+          {"starts", starts},
+          {"lifts", lifts}};
 }
 
 // A Gaussian on a link, as the page draws it: center 3, covariance xx xy xz yy yz zz, opacity, colors. What can never

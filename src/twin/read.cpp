@@ -74,6 +74,12 @@ chain::Chain read_chain(const Node& node, const Node& grasp) {
   }
   if (std::abs(end + links.back()["length"].positive() - chain.length) > kLengthTolerance)
     node["links"].fail("their lengths do not add up to chain.length", "correct the lengths");
+  if (node.has("lift")) {
+    chain.lift = node["lift"].numbers(chain.links());
+    for (const Vector6& axis : chain.axes)
+      if (axis.head<3>().cross(chain.bending_axis).norm() > kLengthTolerance)
+        node["lift"].fail("is given of a chain that does not bend in a plane", "remove it");
+  }
   return chain;
 }
 

@@ -132,6 +132,7 @@ Json chain_json(const Twin& twin) {
     out["joints"].push_back(std::move(joint));
   }
 
+  if (!chain.lift.empty()) out["lift"] = chain.lift;
   out["links"] = Json::array();
   for (int j = 0; j < chain.links(); ++j) {
     const double length = chain.link_end(j) - chain.link_start(j);

@@ -79,7 +79,7 @@ function linkMotions(chain, motion, time) {
     const link = chain.child[k];
     poses[link] = compose(poses[link] || poses[link - 1], aboutAxis(axis, theta[k]));
   });
-  return poses;
+  return poses.map((pose, link) => pose.slice(0, 9).concat(move(pose, chain.lifts[link])));
 }
 
 // Those of the material, which rolls about the links' axes (chain::material_motions); straight lines between the rows.

@@ -1,0 +1,80 @@
+// How far a rope on a table lies beside the plane in which its grasp moves.
+#include <algorithm>
+#include <cmath>
+
+#include "src/silhouette/frame.h"
+
+namespace chainsplat::silhouette {
+
+using math::VectorX;
+
+namespace {
+
+constexpr std::size_t kMostFrames = 16;
+constexpr int kMostSteps = 6;
+constexpr double kTried = 0.05;                      // diameters to either side of the best height so far
+constexpr double kFarthest = 0.1, kNearest = 0.005;  // diameters: of one step, and of the last one
+// Bending stiffness over weight per length times the cube of the length: where between the grasp and the table a rope
+// lies down depends on its fourth root only.
+constexpr double kSoftness = 0.01;
+
+}  // namespace
+
+std::vector<double> lying_down(const chain::Chain& chain, double height) {
+  if (height == 0.0) return {};
+  const double until = std::pow(72.0 * kSoftness * std::pow(chain.length, 3) * std::abs(height), 0.25);
+  std::vector<double> out;
+  for (int link = 0; link < chain.links(); ++link) {
+    const double middle = 0.5 * (chain.link_start(link) + chain.link_end(link));
+    const double x = std::min(1.0, middle / until);
+    out.push_back(link == 0 ? 0.0 : height * x * x * (6.0 - 8.0 * x + 3.0 * x * x));
+  }
+  return out;
+}
+
+double fit_height(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& fit) {
+  const Frames frames = frames_of(capture);
+  std::vector<std::size_t> seen;
+  for (std::size_t f = 0; f < fit.frames.size(); ++f)
+    if (fit.frames[f].residual_pixels > 0.0 && frames.views[f].size() > 1) seen.push_back(f);
+  if (seen.empty()) return 0.0;  // one camera alone sees it as a turn of the joints
+  std::vector<std::size_t> chosen;
+  const std::size_t count = std::min(kMostFrames, seen.size());
+  for (std::size_t i = 0; i < count; ++i) chosen.push_back(seen[i * seen.size() / count]);
+
+  // mean square distance of the outlines, px^2, of a rope that lies so far beside its grasp
+  const auto misfit = [&](double height) {
+    chain::Chain lying = chain;
+    lying.lift = lying_down(chain, height);
+    std::vector<double> squares(count);
+    core::parallel_for(static_cast<std::int64_t>(count), [&](std::int64_t i) {
+      const std::size_t f = chosen[i];
+      std::vector<capture::View> views;
+      for (const int v : frames.views[f]) views.push_back(capture::unpacked(capture.views[v]));
+      std::vector<const capture::View*> pointers;
+      for (const capture::View& view : views) pointers.push_back(&view);
+      const FrameFit found =
+          fit_frame(lying, capture.base.pose(frames.times[f]), pointers, capture.cameras, fit.states.theta[f], true);
+      squares[i] = found.residual_pixels * found.residual_pixels;
+    });
+    double sum = 0.0;
+    for (const double square : squares) sum += square;
+    return sum / static_cast<double>(count);
+  };
+  const double tried = kTried * chain.diameter;
+  double height = 0.0;
+  for (int step = 0; step < kMostSteps; ++step) {
+    const double below = misfit(height - tried), here = misfit(height), above = misfit(height + tried);
+    const double slope = above - below, curvature = below - 2.0 * here + above;
+    const double farthest = kFarthest * chain.diameter;
+    const double move = curvature > 0.0 ? std::clamp(-0.5 * tried * slope / curvature, -farthest, farthest)
+                                        : std::copysign(farthest, -slope);
+    height += move;
+    if (std::getenv("LIFT"))
+      std::fprintf(stderr, "lift %g mm (move %g) cost %g %g %g\n", 1e3 * height, 1e3 * move, below, here, above);
+    if (std::abs(move) < kNearest * chain.diameter) break;
+  }
+  return std::abs(height) < kNearest * chain.diameter ? 0.0 : height;
+}
+
+}  // namespace chainsplat::silhouette
