@@ -44,6 +44,9 @@ recognition::Options recognition_options(const Training& t) {
   options.joints = t.options.joints;
   options.bending = t.options.bending;
   options.twist = t.options.twist;
+  options.height = std::none_of(t.options.fixed.begin(), t.options.fixed.end(), [](const std::string& group) {
+    return group == "all" || group == "grasp";  // the rope lies where the grasp says
+  });
   options.every = t.options.every;
   options.mode = t.options.mode == twin::Mode::paper ? recognition::Mode::paper : recognition::Mode::fast;
   options.paper = recognition::read_paper_choices(t.options.paper, "`paper`");

@@ -156,7 +156,7 @@ void begin(Job& job) {
   const chain::Chain fitted = result.chain;
   if (result.bending.bending != first || joints != result.chain.links() - 1)
     result.chain = chain_of(capture, options, result.bending.bending, joints);
-  if (capture.tabletop && result.bending.bending == chain::Bending::planar && !options.twist)
+  if (capture.tabletop && result.bending.bending == chain::Bending::planar && options.height && !options.twist)
     result.chain.lift = silhouette::lying_down(result.chain, silhouette::fit_height(fitted, capture, fit));
   if (result.chain.links() != fitted.links() || result.chain.angles() != fitted.angles() || !result.chain.lift.empty())
     fit = silhouette::fit_sequence(result.chain, capture);

@@ -57,10 +57,10 @@ std::string job_text(const capture::Capture& capture, const Options& options) {
   std::ostringstream text;
   text << "capture " << capture.hash << "\nframes " << frames << "\n--joints "
        << (options.joints ? std::to_string(*options.joints) : "auto") << "\n--bending " << bending << "\n--twist "
-       << (options.twist ? "yes" : "no") << "\n--every " << options.every << "\n--mode "
-       << (options.mode == Mode::paper ? "paper" : "fast") << "\n--seed " << options.seed << "\nbudget "
-       << options.budget << "\nstep " << core::exact(options.step) << "\n--paper " << text_of(options.paper)
-       << "\ntimes of frames " << hashed(times, core::fnv1a("")) << "\ncameras and size "
+       << (options.twist ? "yes" : "no") << "\nheight " << (options.height ? "yes" : "no") << "\n--every "
+       << options.every << "\n--mode " << (options.mode == Mode::paper ? "paper" : "fast") << "\n--seed "
+       << options.seed << "\nbudget " << options.budget << "\nstep " << core::exact(options.step) << "\n--paper "
+       << text_of(options.paper) << "\ntimes of frames " << hashed(times, core::fnv1a("")) << "\ncameras and size "
        << hashed(geometry, core::fnv1a("")) << "\nimages and masks " << hashed(pictures, core::fnv1a("")) << "\n";
   return text.str();
 }
