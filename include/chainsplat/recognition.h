@@ -36,7 +36,7 @@ struct Options {
   std::optional<int> joints;              // none: as many as the rope's bends ask for (silhouette::choose_joints)
   std::optional<chain::Bending> bending;  // none: auto (design.md, 'Recognition')
   bool twist = false;
-  bool height = true;  // a rope on a table may lie lower than it is held (silhouette::fit_height); else as high
+  bool height = true;  // how low a rope on a table lies is fitted (silhouette::fit_height); else as its table says
   int every = 5;  // frames that train the Gaussians
   Mode mode = Mode::fast;
   std::uint64_t seed = 0;

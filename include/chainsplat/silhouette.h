@@ -89,9 +89,13 @@ struct JointChoice {
 JointChoice choose_joints(const chain::Chain& chain, const SequenceFit& fit);
 
 // How far, m along the bending axis, a rope on a table lies beside the plane in which its grasp moves, from the
-// outlines of up to 16 frames of several cameras; 0 where that is less than a two hundredth of the diameter, or one
-// camera alone sees the rope. `fit` is that of `chain`, which is planar. Mathematics.md 6.13.
-double fit_height(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& fit);
+// outlines of up to 16 frames of several cameras, beginning with `first`, which stays where it is right to a hundredth
+// of the diameter, or where one camera alone sees the rope. `fit` is that of `chain`, which is planar.
+// Mathematics.md 6.13.
+double fit_height(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& fit, double first);
+// The same as the table tells that the capture gives; 0 where it gives none, or none that is below the grasp and near
+// it.
+double height_by_table(const capture::Capture& capture);
 // Chain::lift of a chain that lies so far beside it: it goes there as a heavy rod does.
 std::vector<double> lying_down(const chain::Chain& chain, double height);
 

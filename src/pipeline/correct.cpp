@@ -311,6 +311,7 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
                              false);
   };
   chain::Chain chain = chain_of(capture.tabletop ? chain::Bending::planar : chain::Bending::spatial);
+  chain.lift = silhouette::lying_down(chain, silhouette::height_by_table(capture));
   silhouette::SequenceFit sequence = silhouette::fit_sequence(chain, capture);
   // one camera does not see depth, into which a chain that bends in space would fold
   if (!capture.tabletop && capture.cameras.size() == 1 &&

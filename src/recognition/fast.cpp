@@ -147,19 +147,22 @@ void begin(Job& job) {
   result.bending.bending = first;
   int joints = options.joints.value_or(kFirstJoints);
   result.chain = chain_of(capture, options, first, joints);
+  const bool lies = capture.tabletop && first == chain::Bending::planar && !options.twist;
+  double height = lies ? silhouette::height_by_table(capture) : 0.0;
+  result.chain.lift = silhouette::lying_down(result.chain, height);
   silhouette::SequenceFit fit = silhouette::fit_sequence(result.chain, capture);
   if (decide) result.bending = silhouette::choose_bending(result.chain, capture, fit);
   if (!options.joints) {
     result.joints = silhouette::choose_joints(result.chain, fit);
     joints = result.joints.joints;
   }
-  const chain::Chain fitted = result.chain;
-  if (result.bending.bending != first || joints != result.chain.links() - 1)
+  const double before = height;
+  if (lies && options.height) height = silhouette::fit_height(result.chain, capture, fit, height);
+  if (result.bending.bending != first || joints != result.chain.links() - 1 || height != before) {
     result.chain = chain_of(capture, options, result.bending.bending, joints);
-  if (capture.tabletop && result.bending.bending == chain::Bending::planar && options.height && !options.twist)
-    result.chain.lift = silhouette::lying_down(result.chain, silhouette::fit_height(fitted, capture, fit));
-  if (result.chain.links() != fitted.links() || result.chain.angles() != fitted.angles() || !result.chain.lift.empty())
+    result.chain.lift = silhouette::lying_down(result.chain, height);
     fit = silhouette::fit_sequence(result.chain, capture);
+  }
   job.states = fit.states;
   job.coarse = job.states.theta;
   job.prior = prior_of(fit);

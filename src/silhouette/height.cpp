@@ -16,7 +16,7 @@ constexpr double kTried = 0.05;                      // diameters to either side
 constexpr double kFarthest = 0.1, kNearest = 0.005;  // diameters: of one step, and of the last one
 // Bending stiffness over weight per length times the cube of the length: where between the grasp and the table a rope
 // lies down depends on its fourth root only.
-constexpr double kSoftness = 0.01;
+constexpr double kSoftness = 0.006;
 
 }  // namespace
 
@@ -32,12 +32,22 @@ std::vector<double> lying_down(const chain::Chain& chain, double height) {
   return out;
 }
 
-double fit_height(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& fit) {
+double height_by_table(const capture::Capture& capture) {
+  constexpr double kHighest = 0.3;  // lengths of rope above the table: a rope that is held higher hangs
+  constexpr double kAbove = 1.0;    // diameters that a table may be given too high
+  if (!capture.tabletop || !capture.table || capture.base.samples().empty()) return 0.0;
+  const math::Pose grasp = capture.base.pose(capture.base.start());
+  const double above = capture.table->normal.dot(grasp.translation - capture.table->point) - 0.5 * capture.diameter;
+  if (above > kHighest * capture.length || above < -kAbove * capture.diameter) return 0.0;
+  return -above * (grasp.rotation * capture.bending_axis).dot(capture.table->normal);
+}
+
+double fit_height(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& fit, double first) {
   const Frames frames = frames_of(capture);
   std::vector<std::size_t> seen;
   for (std::size_t f = 0; f < fit.frames.size(); ++f)
     if (fit.frames[f].residual_pixels > 0.0 && frames.views[f].size() > 1) seen.push_back(f);
-  if (seen.empty()) return 0.0;  // one camera alone sees it as a turn of the joints
+  if (seen.empty()) return first;  // one camera alone sees it as turns of the joints
   std::vector<std::size_t> chosen;
   const std::size_t count = std::min(kMostFrames, seen.size());
   for (std::size_t i = 0; i < count; ++i) chosen.push_back(seen[i * seen.size() / count]);
@@ -62,7 +72,7 @@ double fit_height(const chain::Chain& chain, const capture::Capture& capture, co
     return sum / static_cast<double>(count);
   };
   const double tried = kTried * chain.diameter;
-  double height = 0.0;
+  double height = first;
   for (int step = 0; step < kMostSteps; ++step) {
     const double below = misfit(height - tried), here = misfit(height), above = misfit(height + tried);
     const double slope = above - below, curvature = below - 2.0 * here + above;
@@ -70,11 +80,10 @@ double fit_height(const chain::Chain& chain, const capture::Capture& capture, co
     const double move = curvature > 0.0 ? std::clamp(-0.5 * tried * slope / curvature, -farthest, farthest)
                                         : std::copysign(farthest, -slope);
     height += move;
-    if (std::getenv("LIFT"))
-      std::fprintf(stderr, "lift %g mm (move %g) cost %g %g %g\n", 1e3 * height, 1e3 * move, below, here, above);
     if (std::abs(move) < kNearest * chain.diameter) break;
   }
-  return std::abs(height) < kNearest * chain.diameter ? 0.0 : height;
+  // what is known already stays, and costs no further fit
+  return std::abs(height - first) < 2.0 * kNearest * chain.diameter ? first : height;
 }
 
 }  // namespace chainsplat::silhouette
