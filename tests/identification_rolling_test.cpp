@@ -70,10 +70,25 @@ TEST_CASE("how a rope rolls is found again through noise, and carries over to an
   for (VectorX& roll : recorded.states.roll)
     for (double& value : roll) value += noise(random);
 
-  const dynamics::Rolling found = identification::fit_rolling(model, recorded.base, recorded.states);
+  const identification::RollingFit fit = identification::fit_rolling(model, recorded.base, recorded.states);
+  CHECK(solve::converged(fit.summary));
+  REQUIRE(fit.rolling);
+  const dynamics::Rolling& found = *fit.rolling;
   CHECK(found.deviation == doctest::Approx(0.04).epsilon(0.15));
   const std::vector<VectorX> wanted = dynamics::rolls_along(model, truth, other.base, other.states);
   std::vector<VectorX> none(wanted.size(), VectorX::Zero(links));
   CHECK(rms(wanted, none) > 0.2);
   CHECK(rms(wanted, dynamics::rolls_along(model, found, other.base, other.states)) < 0.04);
+}
+
+TEST_CASE("rolls that have nothing to do with the motion get no law") {
+  const dynamics::Model model = rope_on_table();
+  Motion recorded(model.chain, 0.4, 0.02);
+  std::mt19937 random(7);
+  std::normal_distribution<double> noise(0.0, 0.3);
+  for (std::size_t k = 0; k < recorded.states.time.size(); ++k) {
+    recorded.states.roll.push_back(VectorX(model.chain.links()));
+    for (double& value : recorded.states.roll.back()) value = noise(random);
+  }
+  CHECK_FALSE(identification::fit_rolling(model, recorded.base, recorded.states).rolling);
 }

@@ -423,7 +423,9 @@ TEST_CASE("how a rope rolls is kept, and refused of a chain that bends in space"
   const std::string good = core::read_file(file);
   for (const auto& [from, to, expected] : std::initializer_list<std::array<const char*, 3>>{
            {"\"torsion\": 0.7", "\"torsion\": 0", "rolling.torsion: 0 is not positive"},
-           {"\"deviation\": 0.04", "\"deviation\": -1", "rolling.deviation: -1 is negative"}}) {
+           {"\"deviation\": 0.04", "\"deviation\": -1", "rolling.deviation: -1 is negative"},
+           {"\"torsion\": 0.7", "\"torsion\": 1e300", "rolling.torsion: is more than any rope has"},
+           {"\"lift\": [-0.001", "\"lift\": [-9", "chain.lift: holds -9, which no rope has"}}) {
     std::string text = good;
     REQUIRE(text.find(from) != std::string::npos);
     core::write_file(file, text.replace(text.find(from), std::string(from).size(), to));

@@ -112,9 +112,12 @@ Result identify(const chain::Chain& chain, const trajectory::Trajectory& base, c
                 const Options& options);
 
 // How a rope rolls on a table, from recognized states with rolls, of a planar chain whose dynamics are known
-// (mathematics.md 5.12).
-dynamics::Rolling fit_rolling(const dynamics::Model& model, const trajectory::Trajectory& base,
-                              const chain::States& states);
+// (mathematics.md 5.12). None where the law leaves more of the rolls than it explains.
+struct RollingFit {
+  std::optional<dynamics::Rolling> rolling;
+  solve::Summary summary;  // unknowns in deviations of their priors
+};
+RollingFit fit_rolling(const dynamics::Model& model, const trajectory::Trajectory& base, const chain::States& states);
 
 // Several recordings of one rope: one set of parameters, an initial state each. A result a recording: its own initial
 // state and rollout, and the estimates of the shared parameters followed by those of its initial state.

@@ -4,11 +4,25 @@
 #include <cmath>
 
 #include "chainsplat/core.h"
+#include "src/math/tridiagonal.h"
 
 namespace chainsplat::dynamics {
 
+namespace {
+
+constexpr double kLeastSpeed = 1e-6;   // m/s; its square must not vanish
+constexpr double kLeastPivot = 1e-15;  // N m s: a rope without stiffness and friction stays as it is
+
+}  // namespace
+
+// Of the rates: the gradient, and the positive parts of the second derivative.
+struct Roller::System {
+  VectorX gradient;
+  math::Tridiagonal curvature;
+};
+
 Roller::Roller(const Model& model, const Rolling& rolling)
-    : chain_(model.chain), parameters_(model.parameters), speed_(rolling.speed) {
+    : chain_(model.chain), parameters_(model.parameters), speed_(std::max(rolling.speed, kLeastSpeed)) {
   const int joints = chain_.links() - 1;
   CHAINSPLAT_CHECK(parameters_.table_normal && chain_.angles() == joints, std::to_string(chain_.angles()));
   CHAINSPLAT_CHECK(static_cast<int>(rolling.set.size()) == joints, std::to_string(rolling.set.size()));
@@ -48,7 +62,7 @@ double Roller::potential(const VectorX& rate, double step, System* system) const
   const Parameters& p = parameters_;
   const Eigen::Index count = rate.size();
   double sum = 0.0;
-  if (system) *system = {VectorX::Zero(count), VectorX::Zero(count), VectorX::Zero(count)};
+  if (system) *system = {VectorX::Zero(count), {kLeastPivot, VectorX::Zero(count), VectorX::Zero(count)}};
   for (Eigen::Index i = 0; i < count; ++i) {
     // friction at the underside
     const Vector3 slip = velocity_[i] + p.radius * rate[i] * side_[i];
@@ -69,12 +83,12 @@ double Roller::potential(const VectorX& rate, double step, System* system) const
     const double half = 0.5 * (drag * mean_rate - moment * out_of_plane);
     const double curved = 0.25 * (drag + std::max(0.0, moment * in_plane * step));
     system->gradient[i] += friction_[i] * p.radius * across / size + turning + half;
-    system->diagonal[i] +=
+    system->curvature.diagonal[i] +=
         friction_[i] * p.radius * p.radius * (1.0 - across * across / (size * size)) / size + stiff + curved;
     if (i == 0) continue;
     system->gradient[i - 1] += half - turning;
-    system->diagonal[i - 1] += stiff + curved;
-    system->above[i - 1] += curved - stiff;
+    system->curvature.diagonal[i - 1] += stiff + curved;
+    system->curvature.beside[i] = curved - stiff;
   }
   return sum;
 }
@@ -94,15 +108,9 @@ void Roller::step(const Place& to, double from, double until) {
   System system;
   for (int iteration = 0; iteration < kIterations; ++iteration) {
     const double now = potential(rate_, step, &system);
-    // Thomas' algorithm
+    system.curvature.factor();
     VectorX move = -system.gradient;
-    for (Eigen::Index i = 1; i < count; ++i) {
-      const double factor = system.above[i - 1] / system.diagonal[i - 1];
-      system.diagonal[i] -= factor * system.above[i - 1];
-      move[i] -= factor * move[i - 1];
-    }
-    for (Eigen::Index i = count; i-- > 0;)
-      move[i] = (move[i] - (i + 1 < count ? system.above[i] * move[i + 1] : 0.0)) / system.diagonal[i];
+    system.curvature.solve(move);
     double share = 1.0;
     for (int halving = 0; halving < kHalvings && !(potential(rate_ + share * move, step, nullptr) <= now); ++halving)
       share *= 0.5;

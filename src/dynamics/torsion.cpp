@@ -40,24 +40,6 @@ Torsion::Torsion(const Model& model) {
   rate_by_roll_.setZero(rolls, rolls);
 }
 
-void Torsion::Tridiagonal::factor() {
-  pivot.resize(diagonal.size());
-  for (Eigen::Index j = 0; j < diagonal.size(); ++j) {
-    const double own = j > 0 ? diagonal[j] - beside[j] * beside[j] / pivot[j - 1] : diagonal[j];
-    pivot[j] = std::max(own, least);
-  }
-}
-
-template <class X>
-void Torsion::Tridiagonal::solve(X&& x) const {
-  const Eigen::Index count = x.rows();
-  for (Eigen::Index j = 1; j < count; ++j) x.row(j) -= (beside[j] / pivot[j - 1]) * x.row(j - 1);
-  for (Eigen::Index j = count - 1; j >= 0; --j) {
-    if (j + 1 < count) x.row(j) -= beside[j + 1] * x.row(j + 1);
-    x.row(j) /= pivot[j];
-  }
-}
-
 void Torsion::gather(double (Joint::*of)[4][4], Tridiagonal& to) const {
   to.diagonal.setZero(rolls), to.beside.resize(rolls);
   for (Eigen::Index j = 0; j < rolls; ++j) {

@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "chainsplat/dynamics.h"
+#include "src/math/tridiagonal.h"
 
 namespace chainsplat::dynamics {
 
@@ -58,14 +59,9 @@ class Torsion {
     double along[2] = {}, turning = 0.0, twisting = 0.0;  // (alpha' + chi' beta, beta' - chi' alpha), chi', tau'
     double force[4] = {}, slope[4][4] = {}, viscous[4][4] = {};
   };
-  // A symmetric matrix over the rolls: its diagonal, and what is beside it, each roll's with the one before.
-  struct Tridiagonal {
-    double least = 0.0;  // pivot: where the rolls have no least energy nearby (a rope about to flip) steps only lead on
-    VectorX diagonal, beside, pivot;
-    void factor();
-    template <class X>
-    void solve(X&& x) const;
-  };
+  // Over the rolls. Where they have no least energy nearby (a rope about to flip) its least pivot lets steps only lead
+  // on.
+  using Tridiagonal = math::Tridiagonal;
   void bend(const VectorX& theta);                                // what the angles say
   void turn(const VectorX& roll);                                 // what the rolls say, with the elastic slopes
   void balance(VectorX& to) const;                                // the forces over the rolls

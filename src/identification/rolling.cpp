@@ -21,7 +21,8 @@ constexpr double kTorsion = 0.75, kTorsionDeviation = 1.0;
 constexpr double kFriction = 0.5, kFrictionDeviation = 1.0;
 constexpr double kSpeed = 0.02, kSpeedDeviation = 1.5;
 constexpr double kSetDeviation = 5.0;
-constexpr double kLongest = 60.0;  // s: a longer recording's beginning says enough
+constexpr double kExplained = 0.5;  // largest share of the squares that a law may leave that is worth having
+constexpr double kLongest = 60.0;   // s: a longer recording's beginning says enough
 
 Rolling rolling_of(const chain::Chain& chain, const VectorX& x) {
   Rolling out;
@@ -39,7 +40,7 @@ Rolling rolling_of(const chain::Chain& chain, const VectorX& x) {
 
 }  // namespace
 
-Rolling fit_rolling(const dynamics::Model& model, const trajectory::Trajectory& base, const chain::States& states) {
+RollingFit fit_rolling(const dynamics::Model& model, const trajectory::Trajectory& base, const chain::States& states) {
   CHAINSPLAT_CHECK(!states.roll.empty() && states.roll.size() == states.time.size(),
                    std::to_string(states.roll.size()));
   const chain::Chain& chain = model.chain;
@@ -79,12 +80,18 @@ Rolling fit_rolling(const dynamics::Model& model, const trajectory::Trajectory& 
   options.longest = 1.0;  // deviation of a prior
   options.cost_tolerance = 1e-3;
   VectorX x = VectorX::Zero(kUnknowns);
-  solve::least_squares(x, std::function<double(const VectorX&, solve::NormalEquations*)>(evaluate), options);
-  Rolling out = rolling_of(chain, x);
+  RollingFit out;
+  out.summary =
+      solve::least_squares(x, std::function<double(const VectorX&, solve::NormalEquations*)>(evaluate), options);
   VectorX texture;
   const MatrixX left = differences(x, &texture);
-  out.texture.assign(texture.begin(), texture.end());
-  out.deviation = std::sqrt(left.squaredNorm() / static_cast<double>(left.size()));
+  MatrixX measured(links, frames);
+  for (Eigen::Index k = 0; k < frames; ++k) measured.col(k) = states.roll[k];
+  measured.colwise() -= VectorX(measured.rowwise().mean());
+  if (!(left.squaredNorm() < kExplained * measured.squaredNorm())) return out;
+  out.rolling = rolling_of(chain, x);
+  out.rolling->texture.assign(texture.begin(), texture.end());
+  out.rolling->deviation = std::sqrt(left.squaredNorm() / static_cast<double>(left.size()));
   return out;
 }
 

@@ -52,8 +52,11 @@ void adopt(twin::Twin& twin, const trajectory::Trajectory& base, identification:
   twin.initial = std::move(found.initial);
   twin.estimates = std::move(found.estimates);
   twin.rollout = std::move(found.rollout);
-  if (!twin.states.roll.empty() && twin.parameters->table_normal && twin.chain.angles() + 1 == twin.chain.links())
-    twin.rolling = identification::fit_rolling(model_of(twin, {}), base, twin.states);
+  if (!twin.states.roll.empty() && twin.parameters->table_normal && twin.chain.angles() + 1 == twin.chain.links()) {
+    identification::RollingFit fit = identification::fit_rolling(model_of(twin, {}), base, twin.states);
+    tell_fit("rolling", fit.summary);
+    twin.rolling = std::move(fit.rolling);
+  }
   add_rolls(twin, base, twin.rollout);
   judge_motion(twin, base);
 }

@@ -5,8 +5,8 @@
 #include <cmath>
 
 #include "chainsplat/corrections.h"
-#include "chainsplat/estimation.h"
 #include "chainsplat/dynamics/rolling.h"
+#include "chainsplat/estimation.h"
 #include "chainsplat/identification.h"
 #include "chainsplat/motion_files.h"
 #include "chainsplat/run_folder.h"

@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cmath>
+#include <cstdio>
 #include <future>
 #include <numeric>
 
@@ -134,6 +135,23 @@ int budget_of(const capture::Capture& capture, const Options& options) {
       std::lround(std::clamp(kGaussiansADiameter * capture.length / capture.diameter, kLeast, kMost)));
 }
 
+// What the table and the grasp say of where the rope lies is not what cameras see: one of them is given wrongly.
+constexpr double kTableOff = 0.1;  // diameters
+void warn_of_height(const capture::Capture& capture, double off) {
+  char text[200];
+  const bool lower =
+      off * (capture.base.pose(capture.base.start()).rotation * capture.bending_axis).dot(capture.table->normal) < 0.0;
+  std::snprintf(text, sizeof text,
+                "the rope lies %.1f mm %s than table, grasp and diameter say: it is taken as the cameras see it",
+                1e3 * std::abs(off), lower ? "lower" : "higher");
+  core::warn(capture.name + ": " + text);
+}
+
+// A rope that lies on a table, and bends in its plane alone: it may lie lower than its grasp, and roll.
+bool lies_flat(const Job& job, chain::Bending bending) {
+  return job.capture.tabletop && bending == chain::Bending::planar && !job.options.twist;
+}
+
 // The chain that the silhouettes ask for, and the angles that they show.
 void begin(Job& job) {
   constexpr int kFirstJoints = 12;  // which most ropes end with
@@ -147,8 +165,8 @@ void begin(Job& job) {
   result.bending.bending = first;
   int joints = options.joints.value_or(kFirstJoints);
   result.chain = chain_of(capture, options, first, joints);
-  const bool lies = capture.tabletop && first == chain::Bending::planar && !options.twist;
-  double height = lies ? silhouette::height_by_table(capture) : 0.0;
+  const double given = lies_flat(job, first) ? silhouette::height_by_table(capture) : 0.0;
+  double height = given;
   result.chain.lift = silhouette::lying_down(result.chain, height);
   silhouette::SequenceFit fit = silhouette::fit_sequence(result.chain, capture);
   if (decide) result.bending = silhouette::choose_bending(result.chain, capture, fit);
@@ -156,9 +174,9 @@ void begin(Job& job) {
     result.joints = silhouette::choose_joints(result.chain, fit);
     joints = result.joints.joints;
   }
-  const double before = height;
-  if (lies && options.height) height = silhouette::fit_height(result.chain, capture, fit, height);
-  if (result.bending.bending != first || joints != result.chain.links() - 1 || height != before) {
+  if (lies_flat(job, first) && options.height) height = silhouette::fit_height(result.chain, capture, fit, given);
+  if (capture.table && std::abs(height - given) > kTableOff * capture.diameter) warn_of_height(capture, height - given);
+  if (result.bending.bending != first || joints != result.chain.links() - 1 || height != given) {
     result.chain = chain_of(capture, options, result.bending.bending, joints);
     result.chain.lift = silhouette::lying_down(result.chain, height);
     fit = silhouette::fit_sequence(result.chain, capture);
@@ -385,7 +403,8 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   else
     begin(job);
   job.frames = assign_views(capture, job.states.time);
-  if (!resumed) job.states.roll = rolls_in(job.result.chain, capture, job.frames, job.states);
+  if (!resumed && lies_flat(job, job.result.bending.bending))
+    job.states.roll = rolls_in(job.result.chain, capture, job.frames, job.states);
   job.training = training_views(capture, job.frames, std::max(1, options.every));
   if (job.training.views.empty())
     throw WorkError(capture.name, "no training frame shows the object", "use `every` 1 or check the masks");

@@ -2,11 +2,11 @@
 
 #include <algorithm>
 #include <cmath>
-#include <numbers>
 
 #include "chainsplat/core.h"
 #include "chainsplat/image_model.h"
-#include "src/math/decompositions.h"
+#include "src/math/tridiagonal.h"
+#include "src/recognition/surface.h"
 
 namespace chainsplat::recognition {
 
@@ -14,10 +14,6 @@ namespace {
 
 using Color = Eigen::Vector3f;
 
-constexpr double kTurn = 2.0 * std::numbers::pi;
-constexpr int kColumns = 36;          // of cells around the tube
-constexpr double kCellLength = 0.15;  // diameters along it
-constexpr double kFacing = 0.4;       // least cosine between surface normal and ray of a color that counts
 constexpr double kNoise = 0.1;        // of a cell's color, in units of the mean color: what neighbors share
 constexpr double kOutlier = 3.0;      // kNoise beyond which a residual counts less
 constexpr double kAlong = 0.15;       // rad per root of a diameter: turns of neighboring links differ by so much
@@ -35,17 +31,12 @@ struct Layout {
   std::vector<float> weight;  // sum of squared cosines; 0: not seen
 };
 
-struct Grid {
-  const chain::Chain& chain;
-  int rows;
-  std::vector<int> link;  // a row
-  explicit Grid(const chain::Chain& of)
-      : chain(of), rows(std::max(2, static_cast<int>(std::ceil(of.length / (kCellLength * of.diameter))))) {
+// The cells, and on which link each row lies.
+struct Grid : Cells {
+  std::vector<int> link;
+  explicit Grid(const chain::Chain& of) : Cells(of) {
     for (int row = 0; row < rows; ++row) link.push_back(chain::link_at(chain, arclength(row)));
   }
-  double arclength(int row) const { return (row + 0.5) * chain.length / rows; }
-  std::size_t cell(int row, int column) const { return static_cast<std::size_t>(row) * kColumns + column; }
-  std::size_t size() const { return static_cast<std::size_t>(rows) * kColumns; }
 };
 
 Layout laid_out(const Grid& grid, const capture::Capture& capture, const FrameViews& frame, int index,
@@ -54,11 +45,7 @@ Layout laid_out(const Grid& grid, const capture::Capture& capture, const FrameVi
   const double radius = 0.5 * chain.diameter;
   Layout out{std::vector<Color>(grid.size(), Color::Zero()), std::vector<float>(grid.size(), 0.0f)};
   math::Vector3 normals[kColumns];
-  for (int column = 0; column < kColumns; ++column) {
-    const double angle = (column + 0.5) * kTurn / kColumns;
-    normals[column] =
-        std::cos(angle) * chain.bending_axis + std::sin(angle) * chain.direction.cross(chain.bending_axis);
-  }
+  for (int column = 0; column < kColumns; ++column) normals[column] = grid.normal(Grid::angle(column));
   for (const int v : frame.views) {
     const capture::View view = capture::unpacked(capture.views[v]);
     const capture::Camera& camera = capture.cameras[view.camera];
@@ -72,7 +59,7 @@ Layout laid_out(const Grid& grid, const capture::Capture& capture, const FrameVi
       for (int column = 0; column < kColumns; ++column) {
         const math::Vector3 normal = motion.rotation * normals[column], point = axis + radius * normal;
         const double facing = -normal.dot(point) / point.norm();
-        if (facing < kFacing || point.z() < image_model::kNear) continue;
+        if (facing < kTrusted || point.z() < image_model::kNear) continue;
         const math::Vector2 pixel = capture::project(camera, point);
         const int x = static_cast<int>(std::floor(pixel.x())) - view.x0,
                   y = static_cast<int>(std::floor(pixel.y())) - view.y0;
@@ -147,7 +134,7 @@ Left align(const Grid& grid, const Layout& layout, const Texture& texture, const
   constexpr double kInverseVariance = 1.0 / (kNoise * kNoise);
   const int links = grid.chain.links();
   for (int iteration = 0;; ++iteration) {
-    math::MatrixX normal = math::MatrixX::Zero(links, links);
+    math::Tridiagonal normal{0.0, math::VectorX::Zero(links), math::VectorX::Zero(links)};
     math::VectorX gradient = math::VectorX::Zero(links);
     Left left;
     for (int row = 0; row < grid.rows; ++row) {
@@ -164,7 +151,7 @@ Left align(const Grid& grid, const Layout& layout, const Texture& texture, const
         const double square = residual.squaredNorm();
         const double weight =
             kInverseVariance * layout.weight[from] / (1.0 + square * kInverseVariance / (kOutlier * kOutlier));
-        normal(link, link) += weight * slope.squaredNorm();
+        normal.diagonal[link] += weight * slope.squaredNorm();
         gradient[link] += weight * slope.dot(residual);
         left.square += layout.weight[from] * square;
         left.weight += layout.weight[from];
@@ -176,21 +163,22 @@ Left align(const Grid& grid, const Layout& layout, const Texture& texture, const
       const double tie =
           grid.chain.diameter / (kAlong * kAlong * std::max(middles, kLeastLength * grid.chain.diameter));
       const double difference = roll[link] - (link > 0 ? roll[link - 1] : 0.0);  // the grasp holds the rope
-      normal(link, link) += tie;
+      normal.diagonal[link] += tie;
       gradient[link] += tie * difference;
       if (link > 0) {
-        normal(link - 1, link - 1) += tie;
-        normal(link, link - 1) -= tie;
-        normal(link - 1, link) -= tie;
+        normal.diagonal[link - 1] += tie;
+        normal.beside[link] -= tie;
         gradient[link - 1] -= tie * difference;
       }
       if (before) {
         const double slow = 1.0 / (kInTime * kInTime * std::max(apart, kLeastTime));
-        normal(link, link) += slow;
+        normal.diagonal[link] += slow;
         gradient[link] += slow * (roll[link] - (*before)[link]);
       }
     }
-    roll -= normal.ldlt().solve(gradient);
+    normal.factor();
+    normal.solve(gradient);
+    roll -= gradient;
   }
 }
 
@@ -245,8 +233,8 @@ std::vector<math::VectorX> rolls_in(const chain::Chain& chain, const capture::Ca
         if (pass == 0) add(grid, layouts[i], none, still);
         if (pass + 1 < kPasses) continue;
         turned.square += left.square, turned.weight += left.weight;
-        const Left l0 = left_of(grid, layouts[i], still);
-        unturned.square += l0.square, unturned.weight += l0.weight;
+        const Left without = left_of(grid, layouts[i], still);
+        unturned.square += without.square, unturned.weight += without.weight;
       }
     }
     texture = std::move(next);

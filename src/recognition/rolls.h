@@ -10,10 +10,10 @@ namespace chainsplat::recognition {
 
 // A rope that is pushed over a table rolls, and carries its texture along; the chain's links do not. This finds every
 // frame's turn of the material about each link's axis, rad, links() values, from the colors of the surface: what the
-// cameras show of it is laid out flat, by arclength and angle about the axis, and moved around until it fits to what
-// the other frames show. `states` need angles only, as outlines give them. The turns about their mean over time, which
-// no picture can tell from a twisted texture; zero where nothing shows them. All are zero where they explain too little
-// of the colors to be believed. design.md, 'Recognition'.
+// cameras show of it is laid out flat, by arclength and angle about the axis, and moved around until it fits what the
+// other frames show. `states` need angles only, as outlines give them. The mean over time is taken off, since no
+// picture tells it from a twisted texture. Empty where turns explain too little of the colors to be believed.
+// Mathematics.md 2.9.
 std::vector<math::VectorX> rolls_in(const chain::Chain& chain, const capture::Capture& capture,
                                     const std::vector<FrameViews>& frames, const chain::States& states);
 

@@ -2,12 +2,12 @@
 
 #include <algorithm>
 #include <cmath>
-#include <numbers>
 #include <optional>
 #include <vector>
 
 #include "chainsplat/image_model.h"
 #include "src/recognition/place_gaussians.h"
+#include "src/recognition/surface.h"
 
 namespace chainsplat::recognition {
 
@@ -15,49 +15,27 @@ namespace {
 
 using math::Vector3;
 
-constexpr double kTurn = 2.0 * std::numbers::pi;
-constexpr int kColumns = 36;          // of cells around the tube
-constexpr double kCellLength = 0.15;  // diameters along it
-constexpr double kUnseen = -0.05;     // largest cosine between surface normal and view ray of what no camera saw: what
-                                      // lies at the limb shapes the outline
-constexpr double kTrusted = 0.4;      // least cosine of a color that others are taken from, and that stays
-constexpr double kInside = 0.4;       // of the radius: what is closer to the axis has no side
-constexpr double kThickness = 0.04;   // diameters, sigma across the surface
-constexpr double kCoverage = 0.5;     // sigma along the surface in units of the spacing
-constexpr float kOpaque = 3.0f;       // logit, 0.95
-constexpr float kHard = 12.0f;        // logit of the own link
-constexpr double kHidden = 0.2;       // least share of the pictures that show something else where the rope must be
-constexpr double kSteepest = 4.0;     // radii per radian, of a helix
-constexpr int kSlopes = 161;          // that are tried
-constexpr double kRepeats = 0.3;      // least correlation of a texture with itself along a helix
-constexpr double kLit = 0.5;          // least share of what differs around the rope that its light must explain
-constexpr double kDarkest = 0.2;      // of the mean light: what lies around a rope reaches every side of it
+constexpr double kUnseen = -0.05;    // largest cosine between surface normal and view ray of what no camera saw: what
+                                     // lies at the limb shapes the outline
+constexpr double kInside = 0.4;      // of the radius: what is closer to the axis has no side
+constexpr double kThickness = 0.04;  // diameters, sigma across the surface
+constexpr double kCoverage = 0.5;    // sigma along the surface in units of the spacing
+constexpr float kOpaque = 3.0f;      // logit, 0.95
+constexpr float kHard = 12.0f;       // logit of the own link
+constexpr double kHidden = 0.2;      // least share of the pictures that show something else where the rope must be
+constexpr double kSteepest = 4.0;    // radii per radian, of a helix
+constexpr int kSlopes = 161;         // that are tried
+constexpr double kRepeats = 0.3;     // least correlation of a texture with itself along a helix
+constexpr double kLit = 0.5;         // least share of what differs around the rope that its light must explain
+constexpr double kDarkest = 0.2;     // of the mean light: what lies around a rope reaches every side of it
 
-// Cells of the surface at home: row i of arclength, column j of angle about the axis, from the bending axis on.
-struct Surface {
-  const chain::Chain& chain;
-  int rows = 1;
+// What was seen of each cell.
+struct Surface : Cells {
   std::vector<double> facing;                 // best cosine of any view
   std::vector<char> hidden;                   // by something that is no rope
   std::vector<std::optional<Vector3>> color;  // of trusted cells
 
-  explicit Surface(const chain::Chain& of)
-      : chain(of), rows(std::max(2, static_cast<int>(std::ceil(of.length / (kCellLength * of.diameter))))) {
-    facing.assign(static_cast<std::size_t>(rows) * kColumns, -1.0);
-    hidden.resize(facing.size());
-    color.resize(facing.size());
-  }
-  double arclength(int row) const { return (row + 0.5) * chain.length / rows; }
-  static double angle(int column) { return (column + 0.5) * kTurn / kColumns; }
-  Vector3 normal(double at) const {
-    return std::cos(at) * chain.bending_axis + std::sin(at) * chain.direction.cross(chain.bending_axis);
-  }
-  std::size_t cell(int row, int column) const { return static_cast<std::size_t>(row) * kColumns + column; }
-  std::size_t cell_at(double arclength, double angle) const {
-    const int row = static_cast<int>(std::floor(arclength / chain.length * rows));
-    const int column = static_cast<int>(std::floor(angle / kTurn * kColumns));
-    return cell(std::clamp(row, 0, rows - 1), ((column % kColumns) + kColumns) % kColumns);
-  }
+  explicit Surface(const chain::Chain& of) : Cells(of), facing(size(), -1.0), hidden(size()), color(size()) {}
   // Between two rows; none where neither has a color.
   std::optional<Vector3> color_at(double arclength, int column) const {
     const double at = std::clamp(arclength / chain.length * rows - 0.5, 0.0, rows - 1.001);

@@ -81,6 +81,13 @@ class Node {
       fail("has " + std::to_string(out.size()) + " entries instead of " + std::to_string(count), "correct it");
     return out;
   }
+  // None larger than `most` in size.
+  std::vector<double> numbers_within(int count, double most) const {
+    const std::vector<double> out = numbers(count);
+    for (const double value : out)
+      if (std::abs(value) > most) fail("holds " + core::exact(value) + ", which no rope has", "correct it");
+    return out;
+  }
   math::VectorX vector(int count) const {
     const std::vector<double> values = numbers(count);
     return Eigen::Map<const math::VectorX>(values.data(), count);

@@ -75,7 +75,7 @@ chain::Chain read_chain(const Node& node, const Node& grasp) {
   if (std::abs(end + links.back()["length"].positive() - chain.length) > kLengthTolerance)
     node["links"].fail("their lengths do not add up to chain.length", "correct the lengths");
   if (node.has("lift")) {
-    chain.lift = node["lift"].numbers(chain.links());
+    chain.lift = node["lift"].numbers_within(chain.links(), chain.length);
     for (const Vector6& axis : chain.axes)
       if (axis.head<3>().cross(chain.bending_axis).norm() > kLengthTolerance)
         node["lift"].fail("is given of a chain that does not bend in a plane", "remove it");
@@ -400,9 +400,15 @@ Twin load(const Path& run) {
     const int links = twin.chain.links();
     if (!twin.parameters || !twin.parameters->table_normal || twin.chain.angles() + 1 != links)
       rolling.fail("is of no identified planar chain on a table", "remove it or train again");
-    twin.rolling = dynamics::Rolling{rolling["torsion"].positive(),     rolling["friction"].not_negative(),
-                                     rolling["speed"].positive(),       rolling["set"].numbers(links - 1),
-                                     rolling["texture"].numbers(links), rolling["deviation"].not_negative()};
+    constexpr double kMost = 1e3, kSharpest = 1e4, kTurns = 1e3;  // ratios, and m/s; 1/m; rad
+    for (const char* const key : {"torsion", "friction", "speed"})
+      if (rolling[key].number() > kMost) rolling[key].fail("is more than any rope has", "train again");
+    twin.rolling = dynamics::Rolling{rolling["torsion"].positive(),
+                                     rolling["friction"].not_negative(),
+                                     rolling["speed"].positive(),
+                                     rolling["set"].numbers_within(links - 1, kSharpest),
+                                     rolling["texture"].numbers_within(links, kTurns),
+                                     rolling["deviation"].not_negative()};
   }
   if (top.has("corrections")) twin.corrections = read_corrections(top["corrections"]);
   if (top.has("verdict")) twin.verdict = read_verdict(top["verdict"]);

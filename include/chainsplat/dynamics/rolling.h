@@ -25,10 +25,7 @@ class Roller {
     VectorX theta;
     std::vector<Vector3> middle, side;
   };
-  // Of the rates: gradient, and the positive parts of the tridiagonal second derivative.
-  struct System {
-    VectorX gradient, diagonal, above;
-  };
+  struct System;  // of the rates
   Place place_of(double time, const math::Pose& base, const VectorX& theta) const;
   double potential(const VectorX& rate, double step, System* system) const;
   void step(const Place& to, double from, double until);
