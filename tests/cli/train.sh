@@ -47,7 +47,8 @@ expect_error 2 'not empty' train "$demo" -o "$work/stopped" "${small[@]}"
 # a checkpoint of other frames or options is refused, and so is a finished recognition; nothing is touched
 files() { (cd "$1" && find . -type f -exec sha256sum {} + | sort); }
 other() {  # pattern for the checkpoint, pattern for the twin, further options
-  expect_error 2 "$1" train "$demo" -o "$work/stopped" "${small[@]}" "${@:3}" --resume
+  # a fast device may be done with recognition before it is stopped: what is left is then the twin's
+  expect_error 2 "$1|$2" train "$demo" -o "$work/stopped" "${small[@]}" "${@:3}" --resume
   expect_error 2 "$2" train "$demo" -o "$work/whole" "${small[@]}" "${@:3}" --resume
 }
 small_before=("${small[@]}") stopped_before=$(files "$work/stopped") whole_before=$(files "$work/whole")
