@@ -108,6 +108,26 @@ TEST_CASE("the parameters of few joints and those that follow for many are one r
   }
 }
 
+TEST_CASE("about another rod the same motion has other unknowns") {
+  for (const auto bending : {chain::Bending::planar, chain::Bending::spatial}) {
+    const chain::Chain chain = hanging(12, bending);
+    Options options;
+    options.mass = kMass;
+    const Rod soft{1e-4, 0.3}, stiff{5e-3, 0.3};
+    const Unknowns before = make_unknowns(chain, options, at_rest(chain), {}, soft),
+                   now = make_unknowns(chain, options, at_rest(chain), {}, stiff);
+    VectorX p = before.mean, moved = p;
+    keep_grasp(before, now, moved);
+    CHECK((moved - p).cwiseAbs().maxCoeff() > 0.1);
+    const dynamics::Parameters a = apply(chain, before, p).parameters, b = apply(chain, now, moved).parameters;
+    for (int k = 0; k < chain.angles(); ++k) {
+      CHECK(b.stiffness[k] == doctest::Approx(a.stiffness[k]).epsilon(1e-12));
+      CHECK(b.damping[k] == doctest::Approx(a.damping[k]).epsilon(1e-12));
+    }
+    CHECK(b.link_mass == a.link_mass);
+  }
+}
+
 TEST_CASE("derivatives along smooth modes are those of the parameters") {
   const chain::Chain chain = hanging(40, chain::Bending::spatial);
   Options options;

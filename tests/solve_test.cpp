@@ -184,6 +184,30 @@ TEST_CASE("singular equations: what shows no unknown leaves it where it is") {
   CHECK(x[0] > 1.0);
 }
 
+TEST_CASE("a step that lowers the cost by less than the tolerance is the last, by whichever of both is the larger") {
+  // f = sum of r^2/2 with r = x^3 + 10: steps get smaller by a third from one to the next
+  const auto slow = [](const VectorX& x, NormalEquations* equations) {
+    const double r = std::pow(x[0], 3), slope = 3.0 * x[0] * x[0];
+    if (equations) *equations = {MatrixX::Constant(1, 1, slope * slope), VectorX::Constant(1, slope * r)};
+    return 0.5 * r * r + 10.0;
+  };
+  const auto taken = [&](double cost, double decrease) {
+    VectorX x = VectorX::Constant(1, 2.0);
+    const Summary summary = least_squares(x, slow, {.cost_tolerance = cost, .decrease_tolerance = decrease});
+    CHECK(summary.reason == Reason::cost);
+    return std::pair(summary.iterations, summary.final_cost);
+  };
+  const auto [few, high] = taken(1e-12, 1.0);
+  const auto [many, low] = taken(1e-12, 1e-4);
+  CHECK(few < many);
+  CHECK(high > low);
+  CHECK(high < 12.0);  // each step leaves (2/3)^6 of what is above 10
+  CHECK(taken(1e-1, 1e-4).first == few);
+  Options wrong;
+  wrong.decrease_tolerance = -1.0;
+  CHECK_THROWS_WITH_AS(check(wrong), doctest::Contains("decrease_tolerance"), InputError);
+}
+
 TEST_CASE("what is not finite ends the fit at the last good place, without an exception") {
   const Linear problem{MatrixX::Identity(2, 2), Eigen::Vector2d(3.0, 0.0)};
   const auto bounded = [&](const VectorX& x, NormalEquations* equations) {

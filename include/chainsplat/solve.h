@@ -76,6 +76,7 @@ struct Options {
   bool ties = false;    // a step that leaves the cost as it is may be taken too,
   double rounding = 0.0;            // or one that raises it by less than this
   double cost_tolerance = 0.0;      // relative: a step that lowers the cost by less is the last
+  double decrease_tolerance = 0.0;  // the same, absolute; of half a sum of squared whitened residuals, a likelihood's
   double gradient_tolerance = 0.0;  // of the gradient's Euclidean norm
   double step_tolerance = 0.0;      // a shorter step is the last, taken or not
   double trusted = 0.0;             // the first step from a place, no longer than this, is taken unchecked and the last

@@ -26,7 +26,9 @@ constexpr double kCorrelated = 9.0;  // model errors of neighbors in space and t
 constexpr double kHuber = 1.75;      // times the usual root mean square of a group of residuals
 constexpr double kLeastUsual = 0.1;  // of the standard deviation expected: a closer fit does not make outliers
 constexpr double kMedianRms = 0.9;   // median of the root mean square of a few unit normals
-constexpr int kLag = 10;             // frames over which residuals are taken to be correlated (mathematics.md 5)
+// A fit's last step lowers its cost by less: half the square of a step in standard errors, of which that is a twelfth.
+constexpr double kLeastGain = 3e-3;
+constexpr int kLag = 10;  // frames over which residuals are taken to be correlated (mathematics.md 5)
 constexpr std::size_t kLeastTimes = 3;
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 constexpr double kUnknown = std::numeric_limits<double>::quiet_NaN();
@@ -61,6 +63,7 @@ struct Problem {
   // shared unknowns alone and the others its initial state; empty: everything.
   MatrixX modes = {};
   int shared_modes = 0;
+  Rod rod = {};  // that the unknowns of the parts are about
 
   int own() const { return parts[0].unknowns.size() - shared; }
   // where the unknowns of a recording are among all: `shared` and then its own
@@ -211,13 +214,14 @@ double loss_of(const std::vector<MatrixX>& values, double limit) {
   return loss;
 }
 
-// Whitened residuals of frame k and their derivatives by the unknowns, with the roots of Huber's weights.
+// Whitened residuals of frame k and, where asked for, their derivatives by the unknowns, with the roots of Huber's
+// weights.
 struct Rows {
   VectorX right;
   MatrixX slopes;  // residuals x unknowns
 };
 
-void weighted_rows(const Part& part, const chain::States& states, const dynamics::Sensitivities& slopes,
+void weighted_rows(const Part& part, const chain::States& states, const dynamics::Sensitivities* slopes,
                    const std::vector<MatrixX>& values, double limit, std::size_t k, Rows& out) {
   const Eigen::Index group = values[k].rows(), groups = values[k].cols();
   const double most = limit * std::sqrt(static_cast<double>(group));
@@ -234,7 +238,7 @@ void weighted_rows(const Part& part, const chain::States& states, const dynamics
       by_angle = weight * (*part.whitening)[k];
     out.right.segment(group * i, group) = weight * values[k].col(i);
   }
-  out.slopes.noalias() = by_angle * slopes.theta[k];
+  if (slopes) out.slopes.noalias() = by_angle * slopes->theta[k];
 }
 
 solve::NormalEquations normal_equations(const Part& part, const chain::States& states,
@@ -253,7 +257,7 @@ solve::NormalEquations normal_equations(const Part& part, const chain::States& s
       const std::size_t begin = (first + i) * kBlock;
       Rows rows;
       for (std::size_t k = begin; k < std::min(frames, begin + kBlock); ++k) {
-        weighted_rows(part, states, slopes, values, limit, k, rows);
+        weighted_rows(part, states, &slopes, values, limit, k, rows);
         sums[i].matrix.selfadjointView<Eigen::Lower>().rankUpdate(rows.slopes.transpose());
         sums[i].gradient.noalias() += rows.slopes.transpose() * rows.right;
       }
@@ -272,26 +276,26 @@ MatrixX covariance_of_scores(const Part& part, const chain::States& states, cons
   const std::size_t frames = values.size();
   const std::size_t window = std::min<std::size_t>(kLag + 1, frames);
   std::vector<double> sums(window, 0.0);
-  std::vector<Rows> last(window);  // frame k at k % window
   double seen = 0.0;
-  const Eigen::Index size = part.unknowns.size();
-  std::vector<MatrixX> products(window, MatrixX::Zero(size, size));
+  std::vector<Rows> last(window);  // frame k at k % window
   for (std::size_t k = 0; k < frames; ++k) {
-    Rows& now = last[k % window];
-    weighted_rows(part, states, slopes, values, limit, k, now);
-    seen += static_cast<double>((now.right.array() != 0.0).count());  // no weight where a marker is not seen
-    for (std::size_t lag = 0; lag < window && lag <= k; ++lag) {
-      const Rows& before = last[(k - lag) % window];
-      sums[lag] += now.right.dot(before.right);
-      products[lag].noalias() += now.slopes.transpose() * before.slopes;
-    }
+    VectorX& now = last[k % window].right;
+    weighted_rows(part, states, nullptr, values, limit, k, last[k % window]);
+    seen += static_cast<double>((now.array() != 0.0).count());  // no weight where a marker is not seen
+    for (std::size_t lag = 0; lag < window && lag <= k; ++lag) sums[lag] += now.dot(last[(k - lag) % window].right);
   }
-  MatrixX out = MatrixX::Zero(size, size);
-  for (std::size_t lag = 0; lag < window; ++lag) {
-    const double weight = (lag == 0 ? 0.5 : 1.0 - lag / (kLag + 1.0)) * sums[lag] / std::max(seen, 1.0);  // Bartlett's
-    out += weight * (products[lag] + products[lag].transpose());
+  // one product per frame: with those before it together, each with its weight, Bartlett's
+  const Eigen::Index size = part.unknowns.size();
+  MatrixX half = MatrixX::Zero(size, size), before;
+  for (std::size_t k = 0; k < frames; ++k) {
+    const Rows& now = last[k % window];
+    weighted_rows(part, states, &slopes, values, limit, k, last[k % window]);
+    before = 0.5 * sums[0] * now.slopes;
+    for (std::size_t lag = 1; lag < window && lag <= k; ++lag)
+      before += (1.0 - lag / (kLag + 1.0)) * sums[lag] * last[(k - lag) % window].slopes;
+    half.noalias() += now.slopes.transpose() * before;
   }
-  return out;
+  return (half + half.transpose()) / std::max(seen, 1.0);
 }
 
 // All recordings up to a horizon.
@@ -406,8 +410,11 @@ void improve(const Problem& problem, double horizon, bool fine, int iterations, 
   options.attempts = 6;
   // on the way to the whole recording a start is enough; of many joints a step takes long and the last ones gain little
   options.cost_tolerance = fine && !with_modes ? 1e-6 : 1e-4;
+  options.decrease_tolerance = kLeastGain;
   options.longest = 1.0;  // of a log or an angle or rad/s: beyond, the linearization is worthless
   options.cancellable = true;
+  // lowered slowly: on a table, where friction turns, the damping that a step needs is much the same as before
+  options.damping.lower = 0.3;
   options.damping.least_raised = 1e-4;
   options.damping.least = 1e-9;
   VectorX x = with_modes ? VectorX::Zero(problem.coordinates()) : fit.p;
@@ -567,8 +574,9 @@ double rms_of(const Part& part, const chain::States& rollout) {
   return std::sqrt(sum / static_cast<double>(count));
 }
 
-// Best of several starts: stiffness and damping scaled together, then random ones where all fit poorly.
-Fit fit_centerline(const Problem& problem, const Options& options) {
+// Best of several starts: stiffness and damping scaled together, then random ones where all fit poorly. `follow` puts
+// the problem about the rod of a fit, on the way to the whole recording: else it would be fitted again and again.
+Fit fit_centerline(Problem& problem, const Options& options, const std::function<bool(Problem&, VectorX&)>& follow) {
   const Unknowns& u = problem.parts[0].unknowns;
   constexpr double kScales[] = {1.0, 0.2, 5.0};
   constexpr int kRandomStarts = 3;
@@ -615,6 +623,7 @@ Fit fit_centerline(const Problem& problem, const Options& options) {
     horizons.insert(horizons.end(), 2, kInfinity);
     for (std::size_t i = 0; i < horizons.size(); ++i) {
       const double horizon = horizons[i];
+      if (fit.cost < kInfinity) follow(problem, fit.p);
       improve(problem, horizon, i + 1 == horizons.size(), options.max_iterations, fit);
       std::int64_t frames = 0;
       for (const Part& part : problem.parts) frames += static_cast<std::int64_t>(frames_within(part, horizon));
@@ -649,8 +658,14 @@ Fit fit_centerline(const Problem& problem, const Options& options) {
     return false;
   };
   if (poor(best)) {
+    const double lowest = score(best, kInfinity);
+    std::vector<Part> parts = problem.parts;
+    const Rod rod = problem.rod;
     const Fit other = best_of(3, kRandomStarts);
-    if (score(other, kInfinity) < score(best, kInfinity)) best = other;
+    if (score(other, kInfinity) < lowest)
+      best = other;
+    else
+      problem.parts = std::move(parts), problem.rod = rod;
   }
   return best;
 }
@@ -817,39 +832,46 @@ Candidate fit_about_rod(const chain::Chain& chain, const std::vector<Part>& part
   constexpr double kSame = 0.005;  // of log EI, whose standard errors are 0.05 and more
   Vector3 direction = Vector3::Zero();
   for (const Part& part : parts) direction += part.direction;
-  const auto about = [&](const Rod& rod) {
-    std::vector<Part> own = parts;
-    for (Part& part : own) part.unknowns = make_unknowns(chain, options, part.start, extras, rod);
-    return make_problem(chain, std::move(own));
+  const auto unknowns_about = [&](const Part& part, const Rod& rod) {
+    return make_unknowns(chain, options, part.start, extras, rod);
   };
-  Candidate now{extras, about({}), {}};
-  const auto rod_at = [&](const VectorX& p) {
-    return rod_of(now.problem.chain, now.problem.parts[0].unknowns, now.problem.of_part(p, 0), direction);
+  std::vector<Part> own = parts;
+  for (Part& part : own) part.unknowns = unknowns_about(part, {});
+  Candidate now{extras, make_problem(chain, std::move(own)), {}};
+  const auto rod_at = [&](const Problem& problem, const VectorX& p) {
+    return rod_of(problem.chain, problem.parts[0].unknowns, problem.of_part(p, 0), direction);
   };
-  Rod rod = rod_at(start ? start(now.problem) : now.problem.mean);
-  now.problem.parts = about(rod).parts;
+  // False where the rod at p is the problem's. The motion at p stays as it is.
+  const auto follow = [&](Problem& problem, VectorX& p) {
+    const Rod found = rod_at(problem, p);
+    const bool slack = !(found.bending_stiffness > 0.0) || !(found.tension > 0.0);
+    if (slack || std::abs(std::log(found.bending_stiffness / problem.rod.bending_stiffness)) < kSame) return false;
+    const Unknowns before = problem.parts[0].unknowns;
+    for (Part& part : problem.parts) part.unknowns = unknowns_about(part, found);
+    problem.rod = found;
+    if (problem.modes.size() == 0) keep_grasp(before, problem.parts[0].unknowns, p);
+    return true;
+  };
+  now.problem.rod = rod_at(now.problem, start ? start(now.problem) : now.problem.mean);
+  for (Part& part : now.problem.parts) part.unknowns = unknowns_about(part, now.problem.rod);
   if (start) {
     now.problem.modes = smooth_modes(chain, now.problem.parts[0].unknowns);
-    const auto own = now.problem.modes.bottomRows(now.problem.own()).cwiseAbs().colwise().sum();
-    now.problem.shared_modes = static_cast<int>((own.array() == 0.0).count());
+    const auto of_own = now.problem.modes.bottomRows(now.problem.own()).cwiseAbs().colwise().sum();
+    now.problem.shared_modes = static_cast<int>((of_own.array() == 0.0).count());
     now.fit.p = start(now.problem);
     for (int i = 0; i < 2; ++i)  // again with the threshold of the better fit
       improve(now.problem, kInfinity, true, options.max_iterations, now.fit);
   } else {
-    now.fit = fit_centerline(now.problem, options);
+    now.fit = fit_centerline(now.problem, options, follow);
   }
   for (int i = 0; i < kMost && now.fit.cost < kInfinity; ++i) {
-    const Rod found = rod_at(now.fit.p);
-    const bool slack = !(found.bending_stiffness > 0.0) || !(found.tension > 0.0);
-    if (slack || std::abs(std::log(found.bending_stiffness / rod.bending_stiffness)) < kSame) break;
     Candidate before = now;
-    now.problem.parts = about(found).parts;
+    if (!follow(now.problem, now.fit.p)) break;
     improve(now.problem, kInfinity, true, options.max_iterations, now.fit);
     if (now.fit.cost == kInfinity) {
       before.problem.modes = {};
       return before;
     }
-    rod = found;
   }
   now.problem.modes = {};
   return now;

@@ -333,6 +333,15 @@ Rod rod_of(const chain::Chain& chain, const Unknowns& u, const VectorX& p, const
           dynamics::grasp_tension(apply(chain, u, p).parameters, direction)};
 }
 
+void keep_grasp(const Unknowns& before, const Unknowns& now, VectorX& p) {
+  const auto keep = [&](Quantity quantity, std::vector<double> dynamics::Parameters::*values) {
+    const int first = now.first(quantity);
+    if (first >= 0) p[first] += std::log((before.reference.*values)[0] / (now.reference.*values)[0]);
+  };
+  keep(Quantity::joint_stiffness, &dynamics::Parameters::stiffness);
+  keep(Quantity::joint_damping, &dynamics::Parameters::damping);
+}
+
 std::vector<dynamics::Tangent> tangents(const chain::Chain& chain, const Unknowns& u, const VectorX& p) {
   return dynamics::tangents(chain, apply(chain, u, p).parameters, u.list, u.total_mass);
 }

@@ -58,6 +58,9 @@ double mean_bent_length(const chain::Chain& chain);
 
 // The rod that a fit found. `direction`: of the first link at rest, world axes.
 Rod rod_of(const chain::Chain& chain, const Unknowns& unknowns, const VectorX& p, const math::Vector3& direction);
+// Moves p, of unknowns about one rod, to those about another: the joint at the grasp stays as stiff and as damped, where
+// it has unknowns of its own.
+void keep_grasp(const Unknowns& before, const Unknowns& now, VectorX& p);
 
 // The initial state alone, of a rope of these parameters.
 Unknowns make_state_unknowns(const chain::Chain& chain, const dynamics::Parameters& parameters, const Start& start);

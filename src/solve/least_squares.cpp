@@ -70,6 +70,7 @@ void check(const Options& options) {
   count("steps", options.steps), count("trials", options.trials), count("measured", options.measured);
   if (options.attempts < 1) refuse("attempts", options.attempts, "give a number >= 1");
   size("rounding", options.rounding), size("cost_tolerance", options.cost_tolerance);
+  size("decrease_tolerance", options.decrease_tolerance);
   size("gradient_tolerance", options.gradient_tolerance), size("step_tolerance", options.step_tolerance);
   size("trusted", options.trusted), size("negligible", options.negligible);
   if (!(options.longest > 0.0)) refuse("longest", options.longest, "give a number > 0");
@@ -110,8 +111,8 @@ bool judge(Descent& descent, double cost, const Options& options) {
     descent.attempt = 0;
     lower(descent, options.damping);
     // without a tolerance a step within `rounding`, which may raise the cost, is no end
-    if (options.cost_tolerance > 0.0 && descent.decrease < options.cost_tolerance * std::abs(cost))
-      end(descent, Reason::cost);
+    const double least = std::max(options.cost_tolerance * std::abs(cost), options.decrease_tolerance);
+    if (least > 0.0 && descent.decrease < least) end(descent, Reason::cost);
   } else {
     raise(descent, options.damping);
     if (++descent.attempt >= options.attempts || !adapts(options.damping)) end(descent, Reason::no_decrease);
