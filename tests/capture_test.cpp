@@ -8,6 +8,7 @@
 #include <zlib.h>
 
 #include <cmath>
+#include <cstring>
 #include <filesystem>
 #include <fstream>
 #include <functional>
@@ -18,6 +19,7 @@
 #include "chainsplat/encode.h"
 #include "chainsplat/in_memory.h"
 #include "error_of.h"
+#include "src/capture/image_files.h"
 
 using namespace chainsplat;
 using capture::Camera;
@@ -1120,6 +1122,66 @@ TEST_CASE("the truth of a capture: refused when it is not one, absent without it
   made.write("truth/centreline.csv", "frame,time,x0,y0,z0\n0,77,1,2,3\n1,78,1,2,3\n");
   CHECK(any_contains(capture::check(made.path()).doubts, "says nothing of the times of"));
   CHECK(capture::check(made.path()).problems.empty());
+}
+
+TEST_CASE("PNG files of every kind are read as OpenImageIO reads them, damaged ones are refused") {
+  const Folder folder;
+  core::Random random(3);
+  constexpr int kWide = 37, kHigh = 23;
+  const Path file = folder.path / "a.png";
+  const auto write = [&](int channels, OIIO::TypeDesc type, bool interlaced) {
+    const std::size_t size = std::size_t{kWide} * kHigh * channels * type.size();
+    std::vector<std::uint8_t> pixels(size);
+    for (std::uint8_t& p : pixels) p = static_cast<std::uint8_t>(random.next());
+    const auto output = OIIO::ImageOutput::create("png");
+    OIIO::ImageSpec spec(kWide, kHigh, channels, type);
+    spec.attribute("oiio:UnassociatedAlpha", 1);
+    if (interlaced) spec.attribute("png:interlaced", 1);
+    REQUIRE(output->open(file.string(), spec));
+    REQUIRE(output->write_image(type, pixels.data()));
+    REQUIRE(output->close());
+  };
+  const auto other = [&](int channels, OIIO::TypeDesc type) {
+    OIIO::ImageSpec options;
+    options.attribute("oiio:UnassociatedAlpha", 1);
+    const auto input = OIIO::ImageInput::open(file.string(), &options);
+    std::vector<std::uint8_t> pixels(std::size_t{kWide} * kHigh * channels * type.size());
+    REQUIRE(input->read_image(0, 0, 0, channels, type, pixels.data()));
+    return pixels;
+  };
+  for (const OIIO::TypeDesc& type : {OIIO::TypeDesc(OIIO::TypeDesc::UINT8), OIIO::TypeDesc(OIIO::TypeDesc::UINT16)})
+    for (const int channels : {1, 2, 3, 4})
+      for (const bool interlaced : {false, true}) {
+        CAPTURE(channels);
+        write(channels, type, interlaced);
+        CHECK(capture::read_mask(file, kWide, kHigh) == other(1, OIIO::TypeDesc::UINT8));
+        if (channels >= 3) CHECK(capture::read_rgb(file, kWide, kHigh) == other(3, OIIO::TypeDesc::UINT8));
+        if (type.basetype == OIIO::TypeDesc::UINT16) {
+          const std::vector<std::uint8_t> bytes = other(1, type);
+          const std::vector<float> all = capture::read_depth(file, kWide, kHigh, kHigh, 0.5),
+                                   top = capture::read_depth(file, kWide, kHigh, 5, 0.5);
+          for (int i = 0; i < kWide * kHigh; ++i) {
+            std::uint16_t raw = 0;
+            std::memcpy(&raw, &bytes[2 * static_cast<std::size_t>(i)], 2);
+            CHECK(all[i] == 0.5f * raw);
+            if (i < 5 * kWide) CHECK(top[i] == all[i]);
+          }
+        } else {
+          CHECK_THROWS_WITH_AS(capture::read_depth(file, kWide, kHigh, kHigh, 1.0),
+                               doctest::Contains("does not have 16 bits a pixel"), InputError);
+        }
+      }
+  write(1, OIIO::TypeDesc::UINT8, false);
+  const std::string whole = core::read_file(file);
+  CHECK_THROWS_WITH_AS(capture::read_mask(file, kHigh, kWide), doctest::Contains("is 37x23 pixels"), InputError);
+  for (std::size_t i = 8; i < whole.size(); i += 7) {  // behind the signature every byte is under a checksum
+    std::string damaged = whole;
+    damaged[i] = static_cast<char>(damaged[i] ^ 0x10);
+    core::write_file(file, damaged);
+    CHECK_THROWS_AS(capture::read_mask(file, kWide, kHigh), InputError);
+    core::write_file(file, whole.substr(0, i));
+    CHECK_THROWS_AS(capture::read_mask(file, kWide, kHigh), InputError);
+  }
 }
 
 TEST_CASE("written images and videos come back") {

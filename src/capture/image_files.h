@@ -12,7 +12,8 @@ namespace chainsplat::capture {
 std::vector<std::uint8_t> read_mask(const Path& file, int width, int height);
 // Returns red, green and blue in 8 bits each; gray is repeated and alpha dropped.
 std::vector<std::uint8_t> read_rgb(const Path& file, int width, int height);
-// Returns the 16-bit values times `scale`, in m; 0 stands for none.
-std::vector<float> read_depth(const Path& file, int width, int height, double scale);
+// Returns the 16-bit values times `scale`, in m; 0 stands for none. Only the first `rows` of the `height` are needed:
+// below them may be anything.
+std::vector<float> read_depth(const Path& file, int width, int height, int rows, double scale);
 
 }  // namespace chainsplat::capture

@@ -23,6 +23,11 @@ const media::ImageLibrary& images() {
   return library;
 }
 
+const media::PngLibrary& pngs() {
+  static const media::PngLibrary& library = core::own_library<media::PngLibrary>("chainsplat_pngs", kMend);
+  return library;
+}
+
 const media::VideoLibrary& videos() {
   static const media::VideoLibrary& library = core::own_library<media::VideoLibrary>("chainsplat_videos", kMend);
   return library;
@@ -31,15 +36,25 @@ const media::VideoLibrary& videos() {
 }  // namespace
 
 std::vector<std::uint8_t> read_mask(const Path& file, int width, int height) {
-  return images().read_mask(file, width, height);
+  std::vector<std::uint8_t> mask(static_cast<std::size_t>(width) * height);
+  const media::PlainPng plain{.width = width, .height = height, .channels = 1, .bytes = 1, .rows = height};
+  return pngs().read(file, plain, mask.data()) ? mask : images().read_mask(file, width, height);
 }
 
 std::vector<std::uint8_t> read_rgb(const Path& file, int width, int height) {
-  return images().read_rgb(file, width, height);
+  std::vector<std::uint8_t> rgb(std::size_t{3} * width * height);
+  const media::PlainPng plain{.width = width, .height = height, .channels = 3, .bytes = 1, .rows = height};
+  return pngs().read(file, plain, rgb.data()) ? rgb : images().read_rgb(file, width, height);
 }
 
-std::vector<float> read_depth(const Path& file, int width, int height, double scale) {
-  return images().read_depth(file, width, height, scale);
+std::vector<float> read_depth(const Path& file, int width, int height, int rows, double scale) {
+  std::vector<std::uint16_t> raw(static_cast<std::size_t>(width) * rows);
+  const media::PlainPng plain{.width = width, .height = height, .channels = 1, .bytes = 2, .rows = rows};
+  if (!pngs().read(file, plain, reinterpret_cast<std::uint8_t*>(raw.data())))
+    return images().read_depth(file, width, height, scale);
+  std::vector<float> depth(static_cast<std::size_t>(width) * height, 0.0f);
+  for (std::size_t i = 0; i < raw.size(); ++i) depth[i] = static_cast<float>(raw[i] * scale);
+  return depth;
 }
 
 Image8 read_image8(const Path& file) { return images().read_image8(file); }

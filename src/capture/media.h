@@ -1,9 +1,9 @@
-// src/capture/media.h - image files and compressed videos are read and written by two shared libraries of the program's
-// own, loaded at first use: OpenImageIO and libav bring some 330 further libraries, and most commands need none of them.
+// src/capture/media.h - image files and compressed videos are read and written by shared libraries of the program's own,
+// loaded at first use: OpenImageIO and libav bring some 330 further libraries, and most commands need none of them.
 //
-// chainsplat_images.so is src/capture/media/images.cpp, chainsplat_videos.so is src/capture/media/videos.cpp
-// (src/core/own_library.h). The functions of their tables do what those of capture.h and image_files.h do that are
-// named like them.
+// chainsplat_images.so is src/capture/media/images.cpp, chainsplat_videos.so is src/capture/media/videos.cpp,
+// chainsplat_pngs.so src/capture/media/pngs.cpp (src/core/own_library.h). The functions of their tables do what those of
+// capture.h and image_files.h do that are named like them.
 #pragma once
 #include "chainsplat/capture.h"
 
@@ -18,6 +18,22 @@ struct ImageLibrary {
   void (*write_png)(const Path& file, const Image8& image);
   void (*write_depth_png)(const Path& file, int width, int height, const std::vector<float>& meters, double scale);
   void (*write_depth_exr)(const Path& file, int width, int height, const std::vector<float>& meters);
+};
+
+// The masks and depths of nearly every capture are PNG files of gray. Loading OpenImageIO for them takes longer (0.25 s)
+// than reading all those of a short capture.
+struct PlainPng {
+  int width, height;
+  int channels;  // 1: gray, 3: RGB
+  int bytes;     // per channel: 1, or 2 in this machine's order
+  int rows;      // the first ones, which are read
+};
+
+struct PngLibrary {
+  const char* version;
+  // False where the file is missing, damaged or anything but such a PNG without transparency or interlacing: the images'
+  // library reads it then, or tells what is wrong. `pixels` has room for the rows.
+  bool (*read)(const Path& file, const PlainPng& wanted, std::uint8_t* pixels);
 };
 
 struct Decoder;  // an opened video
@@ -40,6 +56,7 @@ struct VideoLibrary {
 
 extern "C" {
 extern const ImageLibrary chainsplat_images;
+extern const PngLibrary chainsplat_pngs;
 extern const VideoLibrary chainsplat_videos;
 }
 

@@ -220,6 +220,13 @@ std::vector<Range> make_views(const Manifest& manifest, const LoadOptions& optio
   return ranges;
 }
 
+// The recorded depth, m, as far down as the view reaches.
+std::vector<float> depth_of(const CameraSource& source, const PackedView& view, bool undistorting) {
+  const Camera& camera = source.camera;
+  const int rows = undistorting ? camera.height : std::min(camera.height, view.y0 + view.height);
+  return read_depth(source.depth->frame_file(view.frame), camera.width, camera.height, rows, source.depth_scale);
+}
+
 // Color, and the mask of images that are masked already, and depth of one view, as far as they are image files.
 void load_frame_files(const CameraSource& source, const LoadOptions& options, bool undistorting, PackedView& view) {
   if (!source.images.video) {
@@ -230,10 +237,7 @@ void load_frame_files(const CameraSource& source, const LoadOptions& options, bo
     fill_color(view, source.camera, rgb, undistorting);
   }
   if (options.depth && source.depth)
-    fill_depth(
-        view, source.camera,
-        read_depth(source.depth->frame_file(view.frame), source.camera.width, source.camera.height, source.depth_scale),
-        undistorting);
+    fill_depth(view, source.camera, depth_of(source, view, undistorting), undistorting);
 }
 
 // Masks must neither be full nor all empty.
@@ -312,10 +316,7 @@ void add_depth(const Manifest& manifest, std::vector<PackedView>& views) {
     const CameraSource& source = manifest.cameras[view.camera];
     if (!source.depth || !view.depth.empty()) return;
     constexpr bool kUndistorting = false;
-    fill_depth(
-        view, source.camera,
-        read_depth(source.depth->frame_file(view.frame), source.camera.width, source.camera.height, source.depth_scale),
-        kUndistorting);
+    fill_depth(view, source.camera, depth_of(source, view, kUndistorting), kUndistorting);
   });
 }
 

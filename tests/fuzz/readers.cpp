@@ -305,7 +305,7 @@ void image(std::string_view bytes) {
           "as many pixels as the size says");
   capture::read_mask(file, read.width, read.height);
   capture::read_rgb(file, read.width, read.height);
-  capture::read_depth(file, read.width, read.height, 1e-4);
+  capture::read_depth(file, read.width, read.height, read.height, 1e-4);
 }
 
 void video(std::string_view bytes) {
