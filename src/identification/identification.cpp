@@ -72,8 +72,10 @@ struct Problem {
     out << p.head(shared), p.segment(shared + part * own(), own());
     return out;
   }
-  auto modes_of_shared() const { return modes.topLeftCorner(shared, shared_modes); }
-  auto modes_of_own() const { return modes.bottomRightCorner(own(), modes.cols() - shared_modes); }
+  auto modes_of_shared() const { return modes.topLeftCorner(modes.size() > 0 ? shared : 0, shared_modes); }
+  auto modes_of_own() const {
+    return modes.bottomRightCorner(modes.size() > 0 ? own() : 0, modes.cols() - shared_modes);
+  }
   Eigen::Index coordinates() const {
     return shared_modes + static_cast<Eigen::Index>(parts.size()) * (modes.cols() - shared_modes);
   }
