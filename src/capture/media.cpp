@@ -2,6 +2,7 @@
 
 #include <fcntl.h>
 
+#include <cstring>
 #include <limits>
 #include <variant>
 
@@ -36,24 +37,27 @@ const media::VideoLibrary& videos() {
 }  // namespace
 
 std::vector<std::uint8_t> read_mask(const Path& file, int width, int height) {
-  std::vector<std::uint8_t> mask(static_cast<std::size_t>(width) * height);
+  std::vector<std::uint8_t> mask;
   const media::PlainPng plain{.width = width, .height = height, .channels = 1, .bytes = 1, .rows = height};
-  return pngs().read(file, plain, mask.data()) ? mask : images().read_mask(file, width, height);
+  return pngs().read(file, plain, mask) ? mask : images().read_mask(file, width, height);
 }
 
 std::vector<std::uint8_t> read_rgb(const Path& file, int width, int height) {
-  std::vector<std::uint8_t> rgb(std::size_t{3} * width * height);
+  std::vector<std::uint8_t> rgb;
   const media::PlainPng plain{.width = width, .height = height, .channels = 3, .bytes = 1, .rows = height};
-  return pngs().read(file, plain, rgb.data()) ? rgb : images().read_rgb(file, width, height);
+  return pngs().read(file, plain, rgb) ? rgb : images().read_rgb(file, width, height);
 }
 
 std::vector<float> read_depth(const Path& file, int width, int height, int rows, double scale) {
-  std::vector<std::uint16_t> raw(static_cast<std::size_t>(width) * rows);
+  std::vector<std::uint8_t> bytes;
   const media::PlainPng plain{.width = width, .height = height, .channels = 1, .bytes = 2, .rows = rows};
-  if (!pngs().read(file, plain, reinterpret_cast<std::uint8_t*>(raw.data())))
-    return images().read_depth(file, width, height, scale);
+  if (!pngs().read(file, plain, bytes)) return images().read_depth(file, width, height, scale);
   std::vector<float> depth(static_cast<std::size_t>(width) * height, 0.0f);
-  for (std::size_t i = 0; i < raw.size(); ++i) depth[i] = static_cast<float>(raw[i] * scale);
+  for (std::size_t i = 0; 2 * i < bytes.size(); ++i) {
+    std::uint16_t raw = 0;
+    std::memcpy(&raw, &bytes[2 * i], sizeof raw);
+    depth[i] = static_cast<float>(raw * scale);
+  }
   return depth;
 }
 

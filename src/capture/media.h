@@ -32,8 +32,8 @@ struct PlainPng {
 struct PngLibrary {
   const char* version;
   // False where the file is missing, damaged or anything but such a PNG without transparency or interlacing: the images'
-  // library reads it then, or tells what is wrong. `pixels` has room for the rows.
-  bool (*read)(const Path& file, const PlainPng& wanted, std::uint8_t* pixels);
+  // library reads it then, or tells what is wrong. `pixels` gets the bytes of the rows.
+  bool (*read)(const Path& file, const PlainPng& wanted, std::vector<std::uint8_t>& pixels);
 };
 
 struct Decoder;  // an opened video

@@ -36,23 +36,24 @@ bool is_plain(png_structp png, png_infop info, const PlainPng& wanted) {
          png_get_interlace_type(png, info) == PNG_INTERLACE_NONE && png_get_valid(png, info, PNG_INFO_tRNS) == 0;
 }
 
-// An error goes to the jump: between it and libpng lies nothing that would have to be destroyed.
-bool decode(Reader& reader, std::FILE* file, const PlainPng& wanted, std::uint8_t* pixels) {
+// An error in libpng jumps back to setjmp: nothing in between may need to be destroyed.
+bool decode(Reader& reader, std::FILE* file, const PlainPng& wanted, std::vector<std::uint8_t>& pixels) {
   if (setjmp(png_jmpbuf(reader.png)) != 0) return false;  // NOLINT: libpng's way
   png_init_io(reader.png, file);
-  // every chunk has its own checksum, which is compared; that of all data together is a third of the time
+  // Every chunk has a checksum of its own, which is compared; the one of all data together adds nothing but time.
   png_set_crc_action(reader.png, PNG_CRC_ERROR_QUIT, PNG_CRC_ERROR_QUIT);
   png_set_option(reader.png, PNG_IGNORE_ADLER32, PNG_OPTION_ON);
   png_read_info(reader.png, reader.info);
   if (!is_plain(reader.png, reader.info, wanted)) return false;
   if (wanted.bytes == 2) png_set_swap(reader.png);  // to this machine's order
   const std::size_t row = static_cast<std::size_t>(wanted.width) * wanted.channels * wanted.bytes;
-  for (int y = 0; y < wanted.rows; ++y) png_read_row(reader.png, pixels + y * row, nullptr);
+  pixels.resize(row * wanted.rows);  // not earlier: what a capture claims of its images may be far too large
+  for (int y = 0; y < wanted.rows; ++y) png_read_row(reader.png, pixels.data() + y * row, nullptr);
   if (wanted.rows == wanted.height) png_read_end(reader.png, nullptr);  // or a file that is cut off would pass
   return true;
 }
 
-bool read(const Path& path, const PlainPng& wanted, std::uint8_t* pixels) {
+bool read(const Path& path, const PlainPng& wanted, std::vector<std::uint8_t>& pixels) {
   std::error_code error;
   if (!std::filesystem::is_regular_file(path, error)) return false;  // reading a pipe might never end
   const std::unique_ptr<std::FILE, Close> file(std::fopen(path.c_str(), "rb"));
