@@ -102,6 +102,7 @@ void main() {
   for (uint l = 0u; l < p.coefficients; ++l) {
     color += sh_basis(l, direction) * vec3(parameters[sh + 3u * l], parameters[sh + 3u * l + 1u], parameters[sh + 3u * l + 2u]);
   }
+  color *= side_of(view, n, i, a.link).brightness;
   splats[kSplatRows * out_index] = vec4(u, opacity, a.x.z);
   splats[kSplatRows * out_index + 1u] =
       vec4(conic, uintBitsToFloat(t0.x | t1.x << 16u));

@@ -47,8 +47,13 @@ void main() {
 
   // color: no gradient where the camera cuts it off
   vec3 splat_color = splats[kSplatRows * s + 2u].xyz;
-  vec3 grad_color = vec3(sum0.w, sum1.w, blue) * view.gain.xyz * vec3(greaterThan(splat_color, vec3(0.0))) *
-                    vec3(lessThan(splat_color, vec3(view.gain.w)));
+  vec3 grad_lit = vec3(sum0.w, sum1.w, blue) * view.gain.xyz * vec3(greaterThan(splat_color, vec3(0.0))) *
+                  vec3(lessThan(splat_color, vec3(view.gain.w)));
+  // in the light of the side that it is on, which changes where the Gaussian goes around the rope and as the link turns
+  Side side = side_of(view, n, i, a.link);
+  vec3 grad_color = grad_lit * side.brightness;
+  vec3 unlit = (splat_color - view.bias.xyz) / (view.gain.xyz * side.brightness);
+  vec3 grad_normal = side.slope * dot(grad_lit, unlit);
   // Sigma' = T T^T, T = J M
   vec3 h = 0.5 * sum1.xyz;  // dL/dSigma': xx, xy, yy
   vec3 grad_t0 = 2.0 * (h.x * a.t0 + h.y * a.t1);
@@ -82,8 +87,8 @@ void main() {
   vec3 grad_scale = vec3(dot(a.local[0], grad_m[0]), dot(a.local[1], grad_m[1]), dot(a.local[2], grad_m[2])) * a.scale;
   mat3 grad_r = transpose(a.link) * mat3(grad_m[0] * a.scale.x, grad_m[1] * a.scale.y, grad_m[2] * a.scale.z);
   vec3 moment = cross(a.x - view.moment_point.xyz, grad_x) + turn + cross(a.m[0], grad_m[0]) +
-                cross(a.m[1], grad_m[1]) + cross(a.m[2], grad_m[2]);
-  records[record] = vec4(grad_x * a.link, sum0.z);
+                cross(a.m[1], grad_m[1]) + cross(a.m[2], grad_m[2]) + cross(side.normal, grad_normal);
+  records[record] = vec4((grad_x + side.around * (dot(side.around, grad_normal) / side.radius)) * a.link, sum0.z);
   records[record + 1u] = rotation_matrix_backward(a.q, a.q_size, grad_r);
   records[record + 2u] = vec4(grad_scale, 0.0);
   records[record + 3u] = vec4(grad_color, 0.0);

@@ -4,6 +4,7 @@
 
 #include <cmath>
 #include <cstdlib>
+#include <numbers>
 
 #include "chainsplat/export.h"
 #include "small_twin.h"
@@ -108,6 +109,32 @@ TEST_CASE("a twin that is not identified has no dynamics to export") {
   CHECK(std::filesystem::is_empty(folder.path));
   exports::write(twin, twin.states, {}, folder.path / "twin.npz");
   CHECK(std::filesystem::exists(folder.path / "twin.py"));
+}
+
+TEST_CASE("exported colors hold the mean light of the motion") {
+  twin::Twin twin = test::small_twin(chain::Bending::planar, 40);
+  const chain::Chain& chain = twin.chain;
+  splat::Gaussians& g = twin.gaussians;
+  CHECK(exports::in_mean_light(g, chain, twin.states, {}).sh == g.sh);  // as there is none
+  g.light = {chain.direction, 0.6, 0.3 * chain.bending_axis, math::Matrix3::Zero()};
+  const trajectory::Trajectory rest = trajectory::fit({trajectory::Sample{}}, "rest");
+  chain::States rolling;  // there and turned over: what is above once is below once
+  for (const double turn : {0.0, std::numbers::pi}) {
+    rolling.time.push_back(turn);
+    rolling.theta.push_back(math::VectorX::Zero(chain.angles()));
+    rolling.roll.push_back(math::VectorX::Constant(chain.links(), turn));
+  }
+  const splat::Gaussians mean = exports::in_mean_light(g, chain, rolling, rest),
+                         home = exports::in_mean_light(g, chain, {}, {});
+  CHECK_FALSE(mean.light.known());
+  const math::Vector3 from(0.6, 0.0, -0.8);
+  for (int i = 0; i < g.count; ++i) {
+    const math::Vector3 at(g.mean[3 * i], g.mean[3 * i + 1], g.mean[3 * i + 2]),
+        off = at - at.dot(chain.direction) * chain.direction;
+    const double side = off.normalized().dot(chain.bending_axis);
+    CHECK((splat::sh_color(mean, i, from) - 0.6 * splat::sh_color(g, i, from)).norm() < 1e-6);
+    CHECK((splat::sh_color(home, i, from) - (0.6 + 0.3 * side) * splat::sh_color(g, i, from)).norm() < 1e-6);
+  }
 }
 
 TEST_CASE("exported scales hold what the renderer adds at the nearest that a Gaussian comes to a camera") {

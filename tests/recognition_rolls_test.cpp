@@ -6,6 +6,7 @@
 #include <numbers>
 #include <vector>
 
+#include "src/recognition/light.h"
 #include "src/recognition/rolls.h"
 #include "tests/straight_rope.h"
 
@@ -74,6 +75,35 @@ TEST_CASE("rolls are found from the colors of the surface, about their mean over
   CHECK(size > 0.3);
   CHECK(left < 0.06);  // rad; links are stiff, and a link's ends differ by up to 0.1
   CHECK(found[0][0] == doctest::Approx(0.0).epsilon(1e-3));
+}
+
+TEST_CASE("the light is told from the texture that turns in it") {
+  const auto looks = [](double s, double at, double time) { return test::texture(s, at - roll_at(s, time), kSlope); };
+  Recording recording(looks);
+  const chain::Chain& chain = recording.chain;
+  for (const double time : recording.states.time) {
+    math::VectorX roll(chain.links());
+    for (int link = 0; link < chain.links(); ++link)
+      roll[link] = roll_at(0.5 * (chain.link_start(link) + chain.link_end(link)), time);
+    recording.states.roll.push_back(roll);
+  }
+  const splat::Light light = recognition::light_on(chain, recording.capture, recording.frames, recording.states);
+  REQUIRE(light.known());
+  CHECK(light.axis == chain.direction);
+  for (int degrees = -40; degrees <= 160; degrees += 10) {  // that a camera sees
+    const double at = degrees * std::numbers::pi / 180.0;
+    const math::Vector3 normal =
+        std::cos(at) * chain.bending_axis + std::sin(at) * chain.direction.cross(chain.bending_axis);
+    CAPTURE(degrees);
+    CHECK(splat::brightness(light, normal) == doctest::Approx((1.0 + 0.3 * std::cos(at)) / 1.3).epsilon(0.03));
+  }
+
+  // nothing is lit where the texture alone explains what is seen
+  Recording even([](double s, double at, double time) {
+    return math::Vector3(test::texture(s, at - roll_at(s, time), kSlope) / (1.0 + 0.3 * std::cos(at)));
+  });
+  even.states.roll = recording.states.roll;
+  CHECK_FALSE(recognition::light_on(chain, even.capture, even.frames, even.states).known());
 }
 
 TEST_CASE("a rope that does not roll, and one without marks, get no rolls") {

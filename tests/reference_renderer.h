@@ -11,6 +11,7 @@
 #include <utility>
 #include <vector>
 
+#include "chainsplat/image_model.h"
 #include "chainsplat/splat.h"
 
 namespace chainsplat::reference {
@@ -158,6 +159,7 @@ template <class S>
 struct Parameters {
   int count = 0, links = 0, degree = 0;
   std::vector<S> mean, rotation, log_scale, opacity_logit, sh, link_logits;
+  splat::Light light = {};
   int coefficients() const { return (degree + 1) * (degree + 1); }
   std::array<std::vector<S>*, 6> kinds() { return {&mean, &rotation, &log_scale, &opacity_logit, &sh, &link_logits}; }
   std::array<const std::vector<S>*, 6> kinds() const {
@@ -176,7 +178,8 @@ inline Parameters<double> parameters(const splat::Gaussians& g) {
           wide(g.log_scale),
           wide(g.opacity_logit),
           wide(g.sh),
-          wide(g.link_logits)};
+          wide(g.link_logits),
+          g.light};
 }
 
 // The discrete rules of mathematics.md 2.5 and 2.6, each of which can be switched off.
@@ -212,6 +215,25 @@ std::vector<Motion<S>> link_motions(const std::vector<math::Vector6>& axes, cons
 }
 
 // --- forward ---------------------------------------------------------------------------------------------------------
+
+// Of the side of the rope that Gaussian i is on (mathematics.md 2.4).
+template <class S>
+S brightness(const Parameters<S>& g, int i, const Motion<S>& motion) {
+  using std::sqrt;
+  if (!g.light.known()) return S(1.0);
+  const math::Vector3& axis = g.light.axis;
+  const S along = g.mean[3 * i] * axis[0] + g.mean[3 * i + 1] * axis[1] + g.mean[3 * i + 2] * axis[2];
+  Vec3<S> off;
+  for (int k = 0; k < 3; ++k) off[k] = g.mean[3 * i + k] - along * axis[k];
+  const S radius = sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2]);
+  const Vec3<S> n = motion.rotation * Vec3<S>{off[0] / radius, off[1] / radius, off[2] / radius};
+  S light(g.light.constant);
+  for (int r = 0; r < 3; ++r) {
+    light += n[r] * g.light.linear[r];
+    for (int k = 0; k < 3; ++k) light += n[r] * n[k] * g.light.quadratic(r, k);
+  }
+  return value(light) > image_model::kLeastBrightness ? light : S(image_model::kLeastBrightness);
+}
 
 // Real spherical harmonics in the order and signs of 3DGS (design.md, 'Reference vectors'); r is a unit vector.
 template <class S>
@@ -305,10 +327,11 @@ std::vector<Splat<S>> project(const Parameters<S>& g, const splat::ViewSpec& vie
       const Vec3<S> direction =
           transposed(from_home.rotation) * Vec3<S>{p[0] / distance, p[1] / distance, p[2] / distance};
       const std::vector<S> basis = sh_basis(g.degree, direction);
+      const S light = brightness(g, i, motions[j]);
       for (int c = 0; c < 3; ++c) {
         S color(0.5);
         for (int l = 0; l < g.coefficients(); ++l) color += basis[l] * g.sh[3 * (g.coefficients() * i + l) + c];
-        color = color * camera.gain[c] + S(camera.bias[c]);
+        color = color * light * camera.gain[c] + S(camera.bias[c]);
         s.color[c] = value(color) > 0.0 ? color : S(0.0);
         if (value(color) > splat::recorded_white(camera)) s.color[c] = S(1.0);
       }
@@ -547,7 +570,7 @@ Evaluation evaluate(const Parameters<double>& g, std::span<const splat::ViewSpec
                     const Rules& rules, MakeMotions own_motions) {
   Tape& t = tape();
   const std::size_t bottom = t.size();
-  Parameters<Variable> v{g.count, g.links, g.degree, {}, {}, {}, {}, {}, {}};
+  Parameters<Variable> v{g.count, g.links, g.degree, {}, {}, {}, {}, {}, {}, g.light};
   for (int kind = 0; kind < 6; ++kind)
     for (const double x : *g.kinds()[kind]) v.kinds()[kind]->push_back(independent(x));
   Evaluation out;

@@ -171,11 +171,18 @@ std::vector<std::uint8_t> random_target(core::Random& random, int width, int hei
   return rgba;
 }
 
+math::Matrix3 quadratic_light() {
+  math::Matrix3 q;
+  q << 0.1, -0.04, 0.06, -0.04, 0.12, 0.05, 0.06, 0.05, -0.15;
+  return q;
+}
+
 // Three views with different sizes and cameras, of two poses of the rope: a whole image, a crop, and a tall image.
 Scene random_scene(std::uint64_t seed, int count, int links, int degree, Logits logits, double size = 0.006) {
   core::Random random(seed);
   Scene s;
   s.gaussians = random_gaussians(random, count, links, degree, logits, size);
+  if (seed % 2) s.gaussians.light = {math::Vector3::UnitX(), 0.7, {0.1, -0.2, 0.15}, quadratic_light()};
   s.cameras = {make_camera(52, 36, 70.0, {}), make_camera(60, 41, 66.0, pose(0.05, -0.2, 0.3, 0.06, 0.01, -0.02)),
                make_camera(21, 45, 60.0, pose(0.0, 0.1, 1.4, -0.02, 0.0, 0.03))};
   // one whose pictures are otherwise exposed, so that some colors are cut off at black and at white

@@ -94,6 +94,7 @@ struct Capture {
   std::vector<Camera> cameras;
   std::vector<std::vector<double>> times;  // s, frame times of each camera (of all frames, loaded or not)
   std::vector<PackedView> views;           // sorted by camera, then frame; only the frames asked for
+  std::vector<PackedView> recorded;        // LoadOptions::recorded_too; empty: not kept
   Pixels pixels = Pixels::undistorted;     // of the views
   trajectory::Trajectory base;
   std::vector<GivenSigma> sigma;  // where the capture says so; else what corrected_quantities() says
@@ -127,6 +128,10 @@ struct LoadOptions {
   bool images = true;                   // false: read capture.json and the base only
   Pixels pixels = Pixels::undistorted;  // recorded: for evaluation
   bool depth = false;
+  // Undistorted views without depth, and beside them, in Capture::recorded, the same frames as they were recorded, with
+  // depth: what training and its evaluation need, read once. Not of so many pixels that memory would be the worse
+  // price.
+  bool recorded_too = false;
   int margin = 24;           // px around the mask's bounds
   int first = 0, last = -1;  // frames [first, last) of each camera, by its own numbering; last < 0: to the end
   std::string camera;        // load only this one (`cameras` then holds it alone, at index 0); empty: all
@@ -154,7 +159,8 @@ struct Calibration {
 Calibration read_calibration(const Path& file);
 
 // Returns the views for evaluation: recorded pixels, and depth where the capture has it. `loaded` must come from the
-// same path and options; where no camera has lens distortion it shows these pixels already, and only depth is read.
+// same path and options; where it holds the recorded views, nothing is read, and where no camera has lens distortion,
+// only depth.
 Capture load_recorded(Capture loaded, const Path& path, LoadOptions options = {});
 
 // The findings of `chainsplat check`: `problems` would make load() throw, `doubts` are warnings.

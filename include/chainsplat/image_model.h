@@ -23,6 +23,10 @@ REAL kLeastTransmittance = 1e-4;  // what would lie behind less than this is not
 // Least coverage, 0..255, of a pixel of the object in a mask (formats.md 1.5).
 const int kObjectMask = 128;
 
+// Least brightness of a side of the rope (mathematics.md 2.4): what lies around it reaches every side, and where no
+// picture shows a side, what is known of the light must not make it black.
+REAL kLeastBrightness = 0.2;
+
 // Spherical harmonic of degree 0, 1 / (2 sqrt(pi)): without higher degrees a color is 0.5 + kSh0 * coefficient.
 REAL kSh0 = 0.28209479177387814;
 

@@ -16,6 +16,20 @@
 
 namespace chainsplat::splat {
 
+// How bright the light around a rope makes each of its sides. A rope that rolls carries its texture along, and not the
+// light on it: what is drawn of a Gaussian is its color times the brightness of the side that it is on, which is
+// constant + linear . n + n^T quadratic n for the direction n from the rope's axis to the Gaussian in the world. A dull
+// convex body in any light has little more than that (mathematics.md 2.4). It is 1 on the brightest side that was seen.
+struct Light {
+  math::Vector3 axis = math::Vector3::Zero();  // of the rope at home, unit; zero: every side has the brightness 1
+  double constant = 1.0;
+  math::Vector3 linear = math::Vector3::Zero();     // world axes, as is
+  math::Matrix3 quadratic = math::Matrix3::Zero();  // symmetric
+  bool known() const { return !axis.isZero(0.0); }
+};
+// At a unit normal in world axes; at least kLeastBrightness of image_model.h.
+double brightness(const Light& light, const math::Vector3& normal);
+
 // Gaussians in the home configuration (all angles 0), base frame. Row i of every array belongs to Gaussian i.
 struct Gaussians {
   int count = 0;
@@ -29,6 +43,7 @@ struct Gaussians {
   std::vector<float> link_logits;    // count x links
   // count; 1: no camera saw it, its place and color are guessed. What trained or drew them does not give it back.
   std::vector<std::uint8_t> guessed;
+  Light light;
   int sh_coefficients() const { return (degree + 1) * (degree + 1); }
   void resize(int count, int links, int degree);  // keeps existing rows; new ones are zero, with rotation (1, 0, 0, 0)
 };
@@ -176,5 +191,7 @@ math::Vector3 sh_color(const Gaussians& gaussians, int index, const math::Vector
 // The part of it that is the same from everywhere, RGB in 0..1; setting it leaves the higher degrees as they are.
 math::Vector3 base_color(const Gaussians& gaussians, int index);
 void set_base_color(Gaussians& gaussians, int index, const math::Vector3& color);
+// Of the side that it is on where its link has this rotation, from home to world.
+double brightness(const Gaussians& gaussians, int index, const math::Matrix3& rotation);
 
 }  // namespace chainsplat::splat

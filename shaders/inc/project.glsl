@@ -3,6 +3,8 @@
 
 #include "chainsplat/image_model.h"
 
+const float kLeastRadius = 1e-5;  // m; what lies nearer to the axis has no side
+
 struct Projection {
   vec3 x;            // camera frame, m
   mat3 link;         // rotation of camera_from_home
@@ -16,6 +18,33 @@ struct Projection {
   vec3 t0, t1;       // rows of J m
   vec3 cov;          // xx, xy, yy of Sigma', px^2
 };
+
+// The side of the rope that Gaussian i of n is on, and the light there (mathematics.md 2.4).
+struct Side {
+  vec3 normal;      // from the rope's axis to the Gaussian, camera frame
+  float radius;     // m from the axis
+  float brightness;
+  vec3 around;      // unit; the way in which the normal turns as the Gaussian goes around the rope
+  vec3 slope;       // of the brightness by the normal; 0 where it is cut
+};
+
+Side side_of(SplatView view, uint n, uint i, mat3 link) {
+  Side side = Side(vec3(0.0), 1.0, 1.0, vec3(0.0), vec3(0.0));
+  if (view.axis.w == 0.0) return side;
+  uint at = at_mean(n, i);
+  vec3 mean = vec3(parameters[at], parameters[at + 1u], parameters[at + 2u]);
+  vec3 off = mean - dot(mean, view.axis.xyz) * view.axis.xyz;
+  side.radius = max(length(off), kLeastRadius);
+  side.normal = link * off / side.radius;
+  vec3 p = view.light_products.xyz;
+  vec3 half_slope = mat3(view.light_squares.x, p.x, p.y, p.x, view.light_squares.y, p.z, p.y, p.z,
+                         view.light_squares.z) * side.normal;
+  float uncut = view.light.w + dot(view.light.xyz + half_slope, side.normal);
+  side.brightness = max(uncut, kLeastBrightness);
+  side.around = cross(link * view.axis.xyz, side.normal);
+  if (uncut > kLeastBrightness) side.slope = view.light.xyz + 2.0 * half_slope;
+  return side;
+}
 
 // Gaussian i of n on a link.
 Projection project(SplatView view, uint n, uint i, uint of_link) {

@@ -15,6 +15,9 @@ struct SplatView {
   vec4 moment_point; // xyz: base origin in the camera frame (m), about which link moments are summed; w unused
   vec4 gain;         // xyz: recorded = gain * color + bias; w: recorded white, what is brighter is cut off
   vec4 bias;         // xyz; w unused
+  vec4 axis;         // xyz: the rope's at home; w: 0 if every side of it has the brightness 1
+  vec4 light;        // xyz: the linear part in camera axes; w: the constant one
+  vec4 light_squares, light_products;  // xx, yy, zz and xy, xz, yz of the quadratic part in camera axes; w unused
   uint width, height;            // px of the crop
   uint tiles_x, tiles_y;
   uint tile_map;                 // first entry in the tile map (grid cell -> active tile or kNoTile)
@@ -78,6 +81,6 @@ const uint kGradientRows = 6u;
 const uint kPartialRows = 3u;
 
 #ifdef __cplusplus
-static_assert(sizeof(SplatView) == 112 && sizeof(SplatTile) == 16 && sizeof(SplatPush) == 80);
+static_assert(sizeof(SplatView) == 176 && sizeof(SplatTile) == 16 && sizeof(SplatPush) == 80);
 }  // namespace chainsplat::shared
 #endif

@@ -176,7 +176,8 @@ struct CameraStatistics {
   std::vector<std::vector<double>> shifted;       // px, the grasp's distance from the mask per delay of the base
 };
 
-CameraStatistics statistics_of(const Manifest& manifest, const CameraSource& source, const PackedView* views, int count) {
+CameraStatistics statistics_of(const Manifest& manifest, const CameraSource& source, const PackedView* views,
+                               int count) {
   const Camera& camera = source.camera;
   const trajectory::Trajectory& base = manifest.capture.base;
   const Pose camera_from_world = camera.world_from_camera.inverse();
@@ -390,12 +391,12 @@ CheckReport check(const Path& path) {
       continue;
     Manifest one = manifest;
     one.cameras = {source};
-    std::vector<PackedView> views;
+    std::vector<PackedView> views, recorded;
     LoadOptions options;
     options.depth = true;
     options.margin = 0;
     try {
-      load_views(one, options, findings, views);
+      load_views(one, options, findings, views, recorded);
     } catch (const InputError& error) {
       report.problems.push_back(error.what());
       continue;

@@ -38,13 +38,14 @@ Capture load_from(const Source& source, const LoadOptions& options) {
   throw_first(findings);
   if (manifest.cameras.size() == 1 && options.camera.empty())
     findings.doubts.push_back(manifest.file.string() + ": cameras: only one; depth along its rays is hardly seen");
-  std::vector<PackedView> views;
-  if (options.images) load_views(manifest, options, findings, views);
+  std::vector<PackedView> views, recorded;
+  if (options.images) load_views(manifest, options, findings, views, recorded);
   for (const std::string& doubt : findings.doubts) core::warn(doubt);
   throw_first(findings);
   Capture capture = std::move(manifest.capture);
   capture.pixels = options.pixels;
   capture.views = std::move(views);
+  capture.recorded = std::move(recorded);
   return capture;
 }
 
@@ -52,6 +53,14 @@ template <class Source>
 Capture load_recorded_from(Capture loaded, const Source& source, LoadOptions options) {
   options.pixels = Pixels::recorded;
   options.depth = true;
+  options.recorded_too = false;
+  if (!loaded.recorded.empty()) {
+    loaded.views = std::move(loaded.recorded);
+    loaded.recorded.clear();
+    loaded.pixels = Pixels::recorded;
+    for (PackedView& view : loaded.views) view.time = loaded.times[view.camera][view.frame];
+    return loaded;
+  }
   if (has_lens(loaded)) {
     // as recorded, but poses, clocks and base are those of `loaded`, which may have been corrected
     Capture recorded = load(source, options);

@@ -60,9 +60,10 @@ Manifest read_manifest(const InMemory& recording, const std::string& camera, boo
 // Throws the first problem, if there is one, with the number of the others.
 void throw_first(const Findings& findings);
 
-// Loads the views of all cameras for the frames from options.first to options.last (src/capture/views.cpp).
-// Throws InputError for images that cannot be read.
-void load_views(const Manifest& manifest, const LoadOptions& options, Findings& findings, std::vector<PackedView>& views);
+// Loads the views of all cameras for the frames from options.first to options.last (src/capture/views.cpp); `recorded`
+// is left empty unless LoadOptions::recorded_too. Throws InputError for images that cannot be read.
+void load_views(const Manifest& manifest, const LoadOptions& options, Findings& findings,
+                std::vector<PackedView>& views, std::vector<PackedView>& recorded);
 
 // Adds recorded depth to views that were loaded without it; no camera may have lens distortion.
 void add_depth(const Manifest& manifest, std::vector<PackedView>& views);

@@ -1,6 +1,8 @@
 // Decoding, masking, undistorting and cropping: from the files of a capture to its views.
 #include <algorithm>
 #include <cmath>
+#include <tuple>
+#include <utility>
 
 #include "chainsplat/image_model.h"
 #include "chainsplat/rectangle.h"
@@ -20,7 +22,17 @@ namespace {
 constexpr std::uint8_t kBlackLossless = 0, kBlackLossy = 16;
 constexpr double kMostCovered = 0.5;  // share of an image; more means that nothing was masked
 
+// Pixels of all frames together up to which they are kept both undistorted and as recorded: beyond, a rope that covers
+// a fiftieth of them takes 160 MB.
+constexpr double kMostKept = 1e9;
+
 using Bytes = std::vector<std::uint8_t>;
+
+// First and last frame, [first, last), of a camera that are asked for.
+std::pair<int, int> frames_of(const CameraSource& source, const LoadOptions& options) {
+  const int last = options.last < 0 ? source.images.frames : std::min(options.last, source.images.frames);
+  return {std::clamp(options.first, 0, last), last};
+}
 
 // Returns the bounds of the mask's inside pixels; empty where there are none.
 Rectangle bounds_of(const std::uint8_t* mask, int width, int height) {
@@ -145,11 +157,34 @@ Bytes bright(const Bytes& rgb, std::uint8_t black) {
   return mask;
 }
 
-// Loads the frames [first, last) of one camera whose images are a video into `views`. Where masks are image files, they
-// have been read before.
-void load_video_frames(const CameraSource& source, const LoadOptions& options, int first, int last, bool undistorting,
-                       int threads, PackedView* views) {
+// The views that are made of the frames [first, last) of a camera.
+struct Range {
+  int first = 0, last = 0;
+  bool undistorting = false;
+  PackedView* views = nullptr;
+  PackedView* recorded = nullptr;  // the same without undistorting; null: not asked for
+};
+
+// Calls `set(view, undistorting)` for each view that is made of a frame.
+template <class Set>
+void for_views(const Range& range, int frame, Set&& set) {
+  set(range.views[frame - range.first], range.undistorting);
+  if (range.recorded) set(range.recorded[frame - range.first], false);
+}
+
+void cut_masks(const Range& range, int frame, const Camera& camera, const Bytes& mask, int margin) {
+  for_views(range, frame,
+            [&](PackedView& view, bool undistorting) { cut_mask(view, camera, mask, undistorting, margin); });
+}
+
+void fill_colors(const Range& range, int frame, const Camera& camera, const Bytes& rgb) {
+  for_views(range, frame, [&](PackedView& view, bool undistorting) { fill_color(view, camera, rgb, undistorting); });
+}
+
+// Loads the frames of one camera whose images are a video. Where masks are image files, they have been read before.
+void load_video_frames(const CameraSource& source, const LoadOptions& options, const Range& range, int threads) {
   const Camera& camera = source.camera;
+  const int first = range.first;
   VideoReader images(source.images.file, threads);
   skip_frames(source.images, first, images);
   std::optional<VideoReader> masks;
@@ -158,28 +193,26 @@ void load_video_frames(const CameraSource& source, const LoadOptions& options, i
     skip_frames(*source.masks, first, *masks);
   }
   Image8 image, mask;
-  for (int k = first; k < last; ++k) {
+  for (int k = first; k < range.last; ++k) {
     next_frame(source, source.images, k, images, image);
-    PackedView& view = views[k - first];
     if (masks) {
       next_frame(source, *source.masks, k, *masks, mask);
-      cut_mask(view, camera, gray_of(mask), undistorting, options.margin);
+      cut_masks(range, k, camera, gray_of(mask), options.margin);
     } else if (!source.masks) {
-      cut_mask(view, camera, bright(image.pixels, kBlackLossy), undistorting, options.margin);
+      cut_masks(range, k, camera, bright(image.pixels, kBlackLossy), options.margin);
     }
-    fill_color(view, camera, image.pixels, undistorting);
+    fill_colors(range, k, camera, image.pixels);
   }
 }
 
 // The same for the masks alone, where they are a video and the images are not.
-void load_mask_video(const CameraSource& source, const LoadOptions& options, int first, int last, bool undistorting,
-                     int threads, PackedView* views) {
+void load_mask_video(const CameraSource& source, const LoadOptions& options, const Range& range, int threads) {
   VideoReader masks(source.masks->file, threads);
-  skip_frames(*source.masks, first, masks);
+  skip_frames(*source.masks, range.first, masks);
   Image8 mask;
-  for (int k = first; k < last; ++k) {
+  for (int k = range.first; k < range.last; ++k) {
     next_frame(source, *source.masks, k, masks, mask);
-    cut_mask(views[k - first], source.camera, gray_of(mask), undistorting, options.margin);
+    cut_masks(range, k, source.camera, gray_of(mask), options.margin);
   }
 }
 
@@ -190,32 +223,35 @@ bool lossless(const ImageSource& images) {
          ending.ends_with(".tiff");
 }
 
-// Frames [first, last) of a camera; their views begin at `offset`.
-struct Range {
-  int first = 0, last = 0;
-  std::size_t offset = 0;
-  bool undistorting = false;
-};
-
-// The frames of all cameras that are asked for, with their views, which are empty yet.
-std::vector<Range> make_views(const Manifest& manifest, const LoadOptions& options, std::vector<PackedView>& views) {
-  std::vector<Range> ranges;
-  views.clear();
+// Views of the frames of all cameras that are asked for, which are empty yet.
+std::vector<PackedView> empty_views(const Manifest& manifest, const LoadOptions& options) {
+  std::vector<PackedView> views;
   for (int c = 0; c < static_cast<int>(manifest.cameras.size()); ++c) {
-    const CameraSource& source = manifest.cameras[c];
-    Range range;
-    range.last = options.last < 0 ? source.images.frames : std::min(options.last, source.images.frames);
-    range.first = std::clamp(options.first, 0, range.last);
-    range.offset = views.size();
-    range.undistorting = options.pixels == Pixels::undistorted && source.camera.distorted();
-    ranges.push_back(range);
-    for (int k = range.first; k < range.last; ++k) {
+    const auto [first, last] = frames_of(manifest.cameras[c], options);
+    for (int k = first; k < last; ++k) {
       PackedView view;
       view.camera = c;
       view.frame = k;
-      view.time = source.times[k];
+      view.time = manifest.cameras[c].times[k];
       views.push_back(std::move(view));
     }
+  }
+  return views;
+}
+
+// By camera; `recorded` is empty where it is not asked for.
+std::vector<Range> ranges_in(const Manifest& manifest, const LoadOptions& options, std::vector<PackedView>& views,
+                             std::vector<PackedView>& recorded) {
+  std::vector<Range> ranges;
+  std::size_t offset = 0;
+  for (const CameraSource& source : manifest.cameras) {
+    Range range;
+    std::tie(range.first, range.last) = frames_of(source, options);
+    range.undistorting = options.pixels == Pixels::undistorted && source.camera.distorted();
+    range.views = views.data() + offset;
+    if (!recorded.empty()) range.recorded = recorded.data() + offset;
+    offset += static_cast<std::size_t>(range.last - range.first);
+    ranges.push_back(range);
   }
   return ranges;
 }
@@ -227,27 +263,28 @@ std::vector<float> depth_of(const CameraSource& source, const PackedView& view, 
   return read_depth(source.depth->frame_file(view.frame), camera.width, camera.height, rows, source.depth_scale);
 }
 
-// Color, and the mask of images that are masked already, and depth of one view, as far as they are image files.
-void load_frame_files(const CameraSource& source, const LoadOptions& options, bool undistorting, PackedView& view) {
+// Color, and the mask of images that are masked already, and depth of one frame, as far as they are image files.
+void load_frame_files(const CameraSource& source, const LoadOptions& options, const Range& range, int frame) {
   if (!source.images.video) {
-    const Bytes rgb = rgb_of(source, view.frame);
+    const Bytes rgb = rgb_of(source, frame);
     if (!source.masks)
-      cut_mask(view, source.camera, bright(rgb, lossless(source.images) ? kBlackLossless : kBlackLossy), undistorting,
-               options.margin);
-    fill_color(view, source.camera, rgb, undistorting);
+      cut_masks(range, frame, source.camera, bright(rgb, lossless(source.images) ? kBlackLossless : kBlackLossy),
+                options.margin);
+    fill_colors(range, frame, source.camera, rgb);
   }
-  if (options.depth && source.depth)
-    fill_depth(view, source.camera, depth_of(source, view, undistorting), undistorting);
+  if (!options.depth || !source.depth) return;
+  const bool undistorting = range.undistorting && !range.recorded;  // of both, the recorded one has it
+  PackedView& view = (range.recorded ? range.recorded : range.views)[frame - range.first];
+  fill_depth(view, source.camera, depth_of(source, view, undistorting), undistorting);
 }
 
 // Masks must neither be full nor all empty.
-void check_masks(const Manifest& manifest, const CameraSource& source, const Range& range,
-                 const std::vector<PackedView>& views, Findings& findings) {
+void check_masks(const Manifest& manifest, const CameraSource& source, const Range& range, Findings& findings) {
   if (range.first == range.last) return;
   int visible = 0;
   double covered = 0.0;
   for (int k = range.first; k < range.last; ++k) {
-    const PackedView& view = views[range.offset + k - range.first];
+    const PackedView& view = range.views[k - range.first];
     visible += view.width > 0;
     covered += static_cast<double>(view.rgba.size() / 4);
   }
@@ -272,8 +309,19 @@ void check_masks(const Manifest& manifest, const CameraSource& source, const Ran
 }  // namespace
 
 void load_views(const Manifest& manifest, const LoadOptions& options, Findings& findings,
-                std::vector<PackedView>& views) {
-  const std::vector<Range> ranges = make_views(manifest, options, views);
+                std::vector<PackedView>& views, std::vector<PackedView>& recorded) {
+  views = empty_views(manifest, options);
+  recorded.clear();
+  double pixels = 0.0;
+  bool distorted = false;
+  for (const PackedView& view : views) {
+    const Camera& camera = manifest.cameras[view.camera].camera;
+    pixels += static_cast<double>(camera.width) * camera.height;
+    distorted |= camera.distorted();
+  }
+  if (options.recorded_too && distorted && options.pixels == Pixels::undistorted && pixels <= kMostKept)
+    recorded = empty_views(manifest, options);
+  const std::vector<Range> ranges = ranges_in(manifest, options, views, recorded);
   const auto total = static_cast<std::int64_t>(views.size());
   for (const CameraSource& source : manifest.cameras)
     if (!source.masks)
@@ -282,11 +330,10 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
 
   // masks from image files come first, because they decide which part of an image is kept
   for_each_in_parallel(total, [&](std::int64_t i) {
-    PackedView& view = views[i];
-    const CameraSource& source = manifest.cameras[view.camera];
+    const int camera = views[i].camera, frame = views[i].frame;
+    const CameraSource& source = manifest.cameras[camera];
     if (!source.masks || source.masks->video) return;
-    const Bytes mask = mask_of(source, view.frame);
-    cut_mask(view, source.camera, mask, ranges[view.camera].undistorting, options.margin);
+    cut_masks(ranges[camera], frame, source.camera, mask_of(source, frame), options.margin);
   });
   // videos, with one task per camera; where the cameras do not fill the threads evenly, the decoders use more threads
   // (their output does not depend on the number)
@@ -297,17 +344,16 @@ void load_views(const Manifest& manifest, const LoadOptions& options, Findings& 
     const CameraSource& source = manifest.cameras[c];
     const Range& range = ranges[c];
     if (range.first == range.last) return;
-    PackedView* const mine = views.data() + range.offset;
     if (source.images.video)
-      load_video_frames(source, options, range.first, range.last, range.undistorting, decoder_threads, mine);
+      load_video_frames(source, options, range, decoder_threads);
     else if (source.masks && source.masks->video)
-      load_mask_video(source, options, range.first, range.last, range.undistorting, decoder_threads, mine);
+      load_mask_video(source, options, range, decoder_threads);
   });
   for_each_in_parallel(total, [&](std::int64_t i) {
-    PackedView& view = views[i];
-    load_frame_files(manifest.cameras[view.camera], options, ranges[view.camera].undistorting, view);
+    const int camera = views[i].camera;
+    load_frame_files(manifest.cameras[camera], options, ranges[camera], views[i].frame);
   });
-  for (int c = 0; c < cameras; ++c) check_masks(manifest, manifest.cameras[c], ranges[c], views, findings);
+  for (int c = 0; c < cameras; ++c) check_masks(manifest, manifest.cameras[c], ranges[c], findings);
 }
 
 void add_depth(const Manifest& manifest, std::vector<PackedView>& views) {

@@ -84,75 +84,102 @@ double mean_distance(const MatrixX& from, const Tree& to) {
 
 constexpr int kFarRings = 12;  // px; if the nearest point is farther away in the image, the tree finds it sooner
 
-// The points of a depth image, in the camera frame.
+// The points of a depth image in the camera frame, by the pixels of a camera without distortion that show them: those
+// of cell k are [first[k], first[k + 1]).
 struct PixelCloud {
-  int width = 0, height = 0;
-  std::vector<Vector3> points;  // one per pixel; z = 0: none
-  MatrixX columns;              // those with a depth
+  int x0 = 0, y0 = 0, width = 0, height = 0;  // of the cells, px
+  std::vector<int> first{0};
+  std::vector<Vector3> points;
+  std::vector<Vector2> pixels;  // where that camera would show them
 
-  PixelCloud(const DepthImage& image, const capture::Camera& camera)
-      : width(image.width), height(image.height), points(image.depth.size(), Vector3::Zero()) {
-    const auto there = std::count_if(image.depth.begin(), image.depth.end(), [](float z) { return z > 0.0f; });
-    columns.resize(3, there);
-    Eigen::Index next = 0;
+  PixelCloud(const DepthImage& image, const capture::Camera& camera) {
+    std::vector<Vector3> found;
+    std::vector<Vector2> at;
+    Vector2 low = Vector2::Constant(std::numeric_limits<double>::infinity()), high = -low;
     for (std::size_t k = 0; k < image.depth.size(); ++k) {
       const double z = image.depth[k];
       if (!(z > 0.0)) continue;
-      const int column = static_cast<int>(k) % width, row = static_cast<int>(k) / width;
+      const int column = static_cast<int>(k) % image.width, row = static_cast<int>(k) / image.width;
       Vector2 pixel(image.x0 + column + 0.5, image.y0 + row + 0.5);
       if (camera.distorted()) pixel = capture::undistort(camera, pixel);
-      points[k] = {(pixel.x() - camera.cx) / camera.fx * z, (pixel.y() - camera.cy) / camera.fy * z, z};
-      columns.col(next++) = points[k];
+      at.push_back(pixel);
+      found.push_back({(pixel.x() - camera.cx) / camera.fx * z, (pixel.y() - camera.cy) / camera.fy * z, z});
+      low = low.cwiseMin(pixel), high = high.cwiseMax(pixel);
     }
+    if (found.empty()) return;
+    x0 = static_cast<int>(std::floor(low.x())), y0 = static_cast<int>(std::floor(low.y()));
+    width = static_cast<int>(std::floor(high.x())) + 1 - x0, height = static_cast<int>(std::floor(high.y())) + 1 - y0;
+    const auto cell = [&](const Vector2& pixel) {
+      return static_cast<std::size_t>(width) * (static_cast<int>(std::floor(pixel.y())) - y0) +
+             (static_cast<int>(std::floor(pixel.x())) - x0);
+    };
+    first.assign(static_cast<std::size_t>(width) * height + 1, 0);
+    for (const Vector2& pixel : at) ++first[cell(pixel) + 1];
+    std::partial_sum(first.begin(), first.end(), first.begin());
+    std::vector<int> next(first.begin(), first.end() - 1);
+    points.resize(found.size()), pixels.resize(found.size());
+    for (std::size_t i = 0; i < found.size(); ++i) {
+      const int place = next[cell(at[i])]++;
+      points[place] = found[i], pixels[place] = at[i];
+    }
+  }
+  MatrixX columns() const {
+    MatrixX out(3, static_cast<Eigen::Index>(points.size()));
+    for (std::size_t i = 0; i < points.size(); ++i) out.col(static_cast<Eigen::Index>(i)) = points[i];
+    return out;
   }
 };
 
-// The nearest point usually lies on the ray of a nearby pixel: the search visits pixels in growing rings, until no ray
-// farther out can come closer than the best point so far. This is exact for a camera without distortion; the rays of a
-// distorted one form no regular grid, and the tree is used.
+// The nearest point usually lies on the ray of a nearby pixel: the search visits cells in growing rings, until no ray
+// farther out can come closer than the best point so far.
 double mean_distance(const PixelCloud& from, const PixelCloud& to, const capture::Camera& camera) {
   std::optional<Tree> tree;
   int hint = 0;
   const auto by_tree = [&](const Vector3& x) {
-    if (!tree) tree.emplace(to.columns);
+    if (!tree) tree.emplace(to.columns());
     return tree->nearest(x, hint);
   };
-  // squared lower bound of the distance from x to the rays of pixels at least `ring` columns or rows away: the distance
-  // to the planes through the nearest of these columns and rows
-  const auto beyond = [&](const Vector3& x, int ring) {
-    const double u = ring / camera.fx, v = ring / camera.fy;
+  // squared distance from x to the planes through all rays that are this many columns or rows away
+  const auto beyond = [&](const Vector3& x, double columns, double rows) {
+    const double u = columns / camera.fx, v = rows / camera.fy;
     const double far_u = std::abs(x.x()) / x.z() + u, far_v = std::abs(x.y()) / x.z() + v;
     return x.z() * x.z() * std::min(u * u / (1.0 + far_u * far_u), v * v / (1.0 + far_v * far_v));
   };
+  const auto to_border = [](double at) { return std::min(at - std::floor(at), std::floor(at) + 1.0 - at); };
   double sum = 0.0;
-  for (int py = 0; py < from.height; ++py) {
-    for (int px = 0; px < from.width; ++px) {
-      const Vector3& x = from.points[static_cast<std::size_t>(py) * from.width + px];
-      if (!(x.z() > 0.0)) continue;
-      double best = std::numeric_limits<double>::infinity();
-      int ring = camera.distorted() ? kFarRings : 0;
-      for (; ring < kFarRings && best > beyond(x, ring); ++ring) {
-        for (int y = std::max(0, py - ring); y <= std::min(to.height - 1, py + ring); ++y) {
-          const bool whole_row = std::abs(y - py) == ring;
-          for (int column = px - ring; column <= px + ring; column += whole_row || ring == 0 ? 1 : 2 * ring) {
-            if (column < 0 || column >= to.width) continue;
-            const Vector3& candidate = to.points[static_cast<std::size_t>(y) * to.width + column];
-            if (candidate.z() > 0.0) best = std::min(best, (candidate - x).squaredNorm());
-          }
+  for (std::size_t i = 0; i < from.points.size(); ++i) {
+    const Vector3& x = from.points[i];
+    const Vector2& pixel = from.pixels[i];
+    const int px = static_cast<int>(std::floor(pixel.x())) - to.x0,
+              py = static_cast<int>(std::floor(pixel.y())) - to.y0;
+    const double border_x = to_border(pixel.x()), border_y = to_border(pixel.y());
+    double best = std::numeric_limits<double>::infinity();
+    const auto nearer_than = [&](int ring) {  // what lies in this ring or farther out
+      return ring > 0 && best <= beyond(x, ring - 1 + border_x, ring - 1 + border_y);
+    };
+    int ring = 0;
+    for (; ring < kFarRings && !nearer_than(ring); ++ring) {
+      for (int y = std::max(0, py - ring); y <= std::min(to.height - 1, py + ring); ++y) {
+        const bool whole_row = std::abs(y - py) == ring;
+        for (int column = px - ring; column <= px + ring; column += whole_row || ring == 0 ? 1 : 2 * ring) {
+          if (column < 0 || column >= to.width) continue;
+          const std::size_t cell = static_cast<std::size_t>(y) * to.width + column;
+          for (int k = to.first[cell]; k < to.first[cell + 1]; ++k)
+            best = std::min(best, (to.points[k] - x).squaredNorm());
         }
       }
-      if (ring == kFarRings && best > beyond(x, ring)) best = by_tree(x);
-      sum += std::sqrt(best);
     }
+    if (ring == kFarRings && !nearer_than(ring)) best = by_tree(x);
+    sum += std::sqrt(best);
   }
-  return sum / static_cast<double>(from.columns.cols());
+  return sum / static_cast<double>(from.points.size());
 }
 
 }  // namespace
 
 double chamfer(const DepthImage& p, const DepthImage& q, const capture::Camera& camera) {
   const PixelCloud a(p, camera), b(q, camera);
-  if (a.columns.cols() == 0 || b.columns.cols() == 0) return std::numeric_limits<double>::quiet_NaN();
+  if (a.points.empty() || b.points.empty()) return std::numeric_limits<double>::quiet_NaN();
   return 0.5 * (mean_distance(a, b, camera) + mean_distance(b, a, camera));
 }
 

@@ -50,11 +50,13 @@ bool for_viewers(const Path& file) {
   return kind == ".glb" || kind == ".gltf" || kind == ".ply";
 }
 
-void write(const twin::Twin& twin, const chain::States& motion, const trajectory::Trajectory& base, const Path& file,
+void write(const twin::Twin& given, const chain::States& motion, const trajectory::Trajectory& base, const Path& file,
            const Options& options) {
   const std::string kind = ending(file);
   const std::vector<Path> names = files(file);
   std::vector<std::string> bytes;
+  twin::Twin twin = given;
+  if (kind != ".npz") twin.gaussians = in_mean_light(twin.gaussians, twin.chain, motion, base);
   if (kind == ".mcap") {
     require(!motion.time.empty(), file, "the twin has no motion yet", "train it, or give one with `states`");
     write_mcap(twin, motion, base, file, options.capture);

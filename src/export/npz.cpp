@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "chainsplat/export.h"
+#include "chainsplat/image_model.h"
 #include "little_endian.h"
 #include "scripts.h"
 
@@ -221,6 +222,12 @@ void add_gaussians(Arrays& arrays, const splat::Gaussians& g) {
   arrays.floats("gaussian_opacity", {count}, opacity);
   arrays.floats("gaussian_sh", {count, terms, 3}, g.sh);
   arrays.floats("gaussian_link_probability", {count, links}, probability);
+  if (g.light.known()) {
+    arrays.numbers("light_constant", {1}, std::vector<double>{g.light.constant});
+    arrays.numbers("light_least", {1}, std::vector<double>{image_model::kLeastBrightness});
+    arrays.numbers("light_linear", {3}, g.light.linear);
+    arrays.numbers("light_quadratic", {3, 3}, g.light.quadratic.reshaped());
+  }
   arrays.floats("gaussian_guessed", {count}, {g.guessed.begin(), g.guessed.end()});
 }
 

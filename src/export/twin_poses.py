@@ -42,12 +42,28 @@ class Twin:
 
     def gaussian_centers(self, theta, base_pose, roll=None):
         """Of every Gaussian on its most probable link, in the world; roll: how far the material is turned in each link."""
-        link, mean = self.gaussian_link_probability.argmax(1), self.gaussian_mean
-        if roll is not None:
-            along = (mean @ self.direction)[:, None] * self.direction
-            cosine, sine = np.cos(roll[link])[:, None], np.sin(roll[link])[:, None]
-            mean = along + cosine * (mean - along) + sine * np.cross(self.direction, mean)
-        return self.carry(link, mean, theta, base_pose)
+        link = self.gaussian_link_probability.argmax(1)
+        return self.carry(link, self.rolled(link, roll), theta, base_pose)
+
+    def gaussian_brightness(self, theta, base_pose, roll=None):
+        """By which every Gaussian's color, 0.5 + SH, is multiplied: what the light that stays in the world does to it."""
+        if not hasattr(self, "light_linear"):
+            return np.ones(len(self.gaussian_mean))
+        link = self.gaussian_link_probability.argmax(1)
+        home = self.rolled(link, roll)
+        home = home - (home @ self.direction)[:, None] * self.direction
+        normal = self.carry(link, home, theta, base_pose) - self.carry(link, 0 * home, theta, base_pose)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        squares = np.einsum("ni,ij,nj->n", normal, self.light_quadratic, normal)
+        return np.maximum(self.light_least, self.light_constant + normal @ self.light_linear + squares)
+
+    def rolled(self, link, roll):
+        mean = self.gaussian_mean
+        if roll is None:
+            return mean
+        along = (mean @ self.direction)[:, None] * self.direction
+        cosine, sine = np.cos(roll[link])[:, None], np.sin(roll[link])[:, None]
+        return along + cosine * (mean - along) + sine * np.cross(self.direction, mean)
 
     def carry(self, link, home, theta, base_pose):
         motion = self.link_motions(theta, base_pose)[link]

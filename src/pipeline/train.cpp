@@ -125,7 +125,7 @@ void check_views(const Training& t) {
 void load_capture(Training& t) {
   t.load.first = t.options.frames.first, t.load.last = t.options.frames.last;
   // read now, because a file that is wrong must not end a work that is done
-  t.load.depth = asked_for(t, Stage::evaluate);
+  t.load.depth = t.load.recorded_too = asked_for(t, Stage::evaluate);
   t.capture = t.recording ? capture::load(*t.recording, t.load) : capture::load(t.capture_path, t.load);
   check_not_capture(t.run, t.capture.folder);
   if (asked_for(t, Stage::recognize)) check_views(t);

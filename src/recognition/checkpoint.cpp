@@ -11,7 +11,7 @@ namespace chainsplat::recognition {
 
 namespace {
 
-constexpr char kMagic[] = "chainsplat-checkpoint/8\n";
+constexpr char kMagic[] = "chainsplat-checkpoint/9\n";
 constexpr char kFile[] = "recognize.bin";
 constexpr char kFileBefore[] = "recognize.before.bin";
 constexpr const char* kFiles[] = {kFile, kFileBefore};  // the newest first
@@ -69,6 +69,10 @@ void put_gaussians(Writer& w, const splat::Gaussians& g) {
   for (const auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
     w.put_all(*part);
   w.put_all(g.guessed);
+  w.put(g.light.constant);
+  for (const math::Vector3* part : {&g.light.axis, &g.light.linear})
+    for (const double x : *part) w.put(x);
+  for (const double x : g.light.quadratic.reshaped()) w.put(x);
 }
 
 splat::Gaussians get_gaussians(Reader& r) {
@@ -79,6 +83,10 @@ splat::Gaussians get_gaussians(Reader& r) {
   for (auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
     *part = r.get_all<float>();
   g.guessed = r.get_all<std::uint8_t>();
+  g.light.constant = r.get<double>();
+  for (math::Vector3* part : {&g.light.axis, &g.light.linear})
+    for (double& x : *part) x = r.get<double>();
+  for (double& x : g.light.quadratic.reshaped()) x = r.get<double>();
   constexpr int kHighestDegree = 3;
   const auto holds = [&](const std::vector<float>& part, std::size_t a_gaussian) {
     return part.size() == a_gaussian * static_cast<std::size_t>(g.count);

@@ -7,6 +7,7 @@
 #include "chainsplat/image_model.h"
 #include "src/recognition/checkpoint.h"
 #include "src/recognition/hold_colors.h"
+#include "src/recognition/light.h"
 #include "src/recognition/modes.h"
 #include "src/recognition/place_gaussians.h"
 #include "src/recognition/rolls.h"
@@ -26,8 +27,10 @@ constexpr int kPolishSteps = 80;
 constexpr int kSettleSteps = 60;
 constexpr double kGaussiansADiameter =
     100.0;  // of the rope's length, when no budget is given: more gain little (design.md, 'Recognition')
-constexpr double kFirstShare = 0.8;        // of the budget, placed at the start; the rest goes where the images ask
-constexpr int kAngleIterations = 1;        // Gauss-Newton steps a round and frame
+constexpr double kFirstShare = 0.8;  // of the budget, placed at the start; the rest goes where the images ask
+constexpr int kAngleIterations = 1;  // Gauss-Newton steps a round and frame
+constexpr int kAngleRound =
+    2;  // the first with such steps: before, colors know less of the angles than the outlines do
 constexpr int kFinalIterations = 1;        // for every frame, at the end
 constexpr double kPastJoint = 0.1;         // diameters that Gaussians may reach past their joints before a round
 constexpr double kPastJointAtLast = 0.25;  // and at last: few steps follow that would close the gaps
@@ -311,10 +314,24 @@ core::Random train_round(Job& job, splat::Engine& engine, int round) {
   }
 }
 
-// Gauss-Newton on the angles of the training frames, with the engine's Gaussians held. Returns, by training view, what
-// the picture that was drawn last does not explain, if `keep`: Gaussians are missing there. Else steps that cannot go
-// far are trusted, and not drawn.
-std::vector<Unexplained> refine_training(Job& job, splat::Engine& engine, bool keep) {
+// Calls `part` with the training frames, so many at a time as are drawn together.
+template <class Part>
+void for_training_parts(const Job& job, Part&& part) {
+  const std::vector<int>& frames = job.training.frames;
+  for (std::size_t from = 0; from < frames.size();) {
+    std::size_t to = from, pixels = 0;
+    for (; to < frames.size() && pixels < kPartPixels; ++to)
+      for (const int v : job.frames[frames[to]].views)
+        pixels += static_cast<std::size_t>(job.capture.views[v].width) * job.capture.views[v].height;
+    part(std::span(frames).subspan(from, to - from));
+    from = to;
+  }
+}
+
+// Draws the training frames, and moves their angles by Gauss-Newton, with the engine's Gaussians held, if `move`.
+// Returns, by training view, what the picture that was drawn last does not explain, if `keep`: Gaussians are missing
+// there. Else steps that cannot go far are trusted, and not drawn.
+std::vector<Unexplained> refine_training(Job& job, splat::Engine& engine, bool move, bool keep) {
   std::vector<Unexplained> last(keep ? job.training.views.size() : 0);
   const Draw draw = [&](std::span<const int> views, std::span<const std::vector<math::Pose>> motions) {
     std::vector<int> batch;
@@ -333,16 +350,21 @@ std::vector<Unexplained> refine_training(Job& job, splat::Engine& engine, bool k
   refine.iterations = kAngleIterations;
   refine.mask_weight = kAngleMaskWeight;
   if (!keep) refine.trusted = kTrustedStep;
-  const std::vector<int>& frames = job.training.frames;
-  for (std::size_t from = 0; from < frames.size();) {
-    std::size_t to = from, pixels = 0;
-    for (; to < frames.size() && pixels < kPartPixels; ++to)
-      for (const int v : job.frames[frames[to]].views)
-        pixels += static_cast<std::size_t>(job.capture.views[v].width) * job.capture.views[v].height;
-    refine_angles(job.result.chain, job.capture, job.frames, std::span(frames).subspan(from, to - from), draw, refine,
-                  job.prior, job.states);
-    from = to;
-  }
+  for_training_parts(job, [&](std::span<const int> part) {
+    if (move) {
+      refine_angles(job.result.chain, job.capture, job.frames, part, draw, refine, job.prior, job.states);
+      return;
+    }
+    std::vector<int> views;
+    std::vector<std::vector<math::Pose>> motions;
+    for (const int k : part)
+      for (const int v : job.frames[k].views) {
+        views.push_back(v);
+        motions.push_back(view_motions(job.result.chain, job.capture, job.states, job.frames[k], k, job.states.theta[k],
+                                       job.capture.views[v]));
+      }
+    draw(views, motions);
+  });
   return last;
 }
 
@@ -403,8 +425,11 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   else
     begin(job);
   job.frames = assign_views(capture, job.states.time);
-  if (!resumed && lies_flat(job, job.result.bending.bending))
+  splat::Light light;
+  if (!resumed && lies_flat(job, job.result.bending.bending)) {
     job.states.roll = rolls_in(job.result.chain, capture, job.frames, job.states);
+    if (!job.states.roll.empty()) light = light_on(job.result.chain, capture, job.frames, job.states);
+  }
   job.training = training_views(capture, job.frames, std::max(1, options.every));
   if (job.training.views.empty())
     throw WorkError(capture.name, "no training frame shows the object", "use `every` 1 or check the masks");
@@ -421,14 +446,14 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   const int budget = budget_of(capture, options);
   if (!resumed) {
     core::Random random(options.seed * 1000003 + 1);
-    job.gaussians = place_along_chain(job.result.chain, capture, job.states, job.frames, job.training.frames,
+    job.gaussians = place_along_chain(job.result.chain, capture, job.states, job.frames, job.training.frames, light,
                                       static_cast<int>(kFirstShare * budget), random);
   }
 
   for (int round = job.first_round; round < kRounds; ++round) {
     core::Random random = train_round(job, engine, round);
     const bool adding = round + 1 < kRounds;
-    const std::vector<Unexplained> last = refine_training(job, engine, adding);
+    const std::vector<Unexplained> last = refine_training(job, engine, round >= kAngleRound, adding);
     specs = posed_views(job, job.states);
     for (std::size_t i = 0; i < specs.size(); ++i) engine.set_motions(static_cast<int>(i), specs[i].motions);
     job.gaussians = engine.gaussians();

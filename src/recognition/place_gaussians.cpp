@@ -45,9 +45,11 @@ bool sample(const capture::View& view, const math::Vector2& image_pixel, math::V
 
 splat::Gaussians place_along_chain(const chain::Chain& chain, const capture::Capture& capture,
                                    const chain::States& states, const std::vector<FrameViews>& frames,
-                                   std::span<const int> training, int count, core::Random& random) {
+                                   std::span<const int> training, const splat::Light& light, int count,
+                                   core::Random& random) {
   splat::Gaussians g;
   g.resize(count, chain.links(), 0);
+  g.light = light;
   const double radius = 0.5 * chain.diameter * kShell;
   const double spacing = std::sqrt(2.0 * std::numbers::pi * radius * chain.length / count);
   const math::Vector3 side = chain.bending_axis, other = chain.direction.cross(chain.bending_axis);
@@ -79,7 +81,7 @@ splat::Gaussians place_along_chain(const chain::Chain& chain, const capture::Cap
         const double facing = -n.dot(x.normalized());
         math::Vector3 color;
         if (facing < kFacing || x.z() <= 0 || !sample(view, capture::project(camera, x), color)) continue;
-        sums[i] += facing * color;
+        sums[i] += facing / splat::brightness(light, motion.rotation * normals[i]) * color;
         weights[i] += facing;
       }
     }
@@ -184,8 +186,10 @@ Changed add_and_prune(splat::Gaussians& gaussians, const chain::Chain& chain, co
     if (best > kReach * 0.5 * chain.diameter) continue;
     const std::uint8_t* p = &view.rgba[4 * static_cast<std::size_t>(pixel)];
     constexpr float kNewOpacity = 0.0f;  // logit: half
-    set_gaussian(gaussians, next++, motions[link].inverse() * point, 0.5 * kCoverage * spacing, kNewOpacity,
-                 math::Vector3(p[0], p[1], p[2]) / 255.0, link);
+    const math::Vector3 color = math::Vector3(p[0], p[1], p[2]) / 255.0;
+    set_gaussian(gaussians, next, motions[link].inverse() * point, 0.5 * kCoverage * spacing, kNewOpacity, color, link);
+    splat::set_base_color(gaussians, next, color / splat::brightness(gaussians, next, motions[link].rotation));
+    ++next;
   }
   changed.added = next - static_cast<int>(kept.size());
   gaussians.resize(next, gaussians.links, gaussians.degree);

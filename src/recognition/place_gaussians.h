@@ -14,10 +14,11 @@
 namespace chainsplat::recognition {
 
 // `count` Gaussians in the shell of the rope's tube (home configuration), hard on their own link, colored by the views
-// that see their side. Deterministic for one `random`.
+// that see their side, as it is in `light`. Deterministic for one `random`.
 splat::Gaussians place_along_chain(const chain::Chain& chain, const capture::Capture& capture,
                                    const chain::States& states, const std::vector<FrameViews>& frames,
-                                   std::span<const int> training, int count, core::Random& random);
+                                   std::span<const int> training, const splat::Light& light, int count,
+                                   core::Random& random);
 
 // Pixels of a view that a picture of it, drawn with these link motions, does not explain.
 struct Unexplained {

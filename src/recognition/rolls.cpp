@@ -4,15 +4,12 @@
 #include <cmath>
 
 #include "chainsplat/core.h"
-#include "chainsplat/image_model.h"
 #include "src/math/tridiagonal.h"
-#include "src/recognition/surface.h"
+#include "src/recognition/layout.h"
 
 namespace chainsplat::recognition {
 
 namespace {
-
-using Color = Eigen::Vector3f;
 
 constexpr double kNoise = 0.1;        // of a cell's color, in units of the mean color: what neighbors share
 constexpr double kOutlier = 3.0;      // kNoise beyond which a residual counts less
@@ -22,61 +19,7 @@ constexpr double kLeastLength = 0.1;  // diameters between middles of links, whe
 constexpr double kLeastTime = 1e-3;   // s between frames
 constexpr int kPasses = 3;            // the first goes through the frames in time, and learns the texture on the way
 constexpr int kIterations = 4;        // Gauss-Newton steps a frame and pass
-constexpr std::size_t kCellsTogether = 4000000;  // that are laid out at once: 64 MB
-constexpr double kBelieved = 0.25;               // least share of what is left without rolls that they must explain
-
-// What one moment shows of the surface: row i of arclength, column j of angle about the axis in the link's frame.
-struct Layout {
-  std::vector<Color> color;
-  std::vector<float> weight;  // sum of squared cosines; 0: not seen
-};
-
-// The cells, and on which link each row lies.
-struct Grid : Cells {
-  std::vector<int> link;
-  explicit Grid(const chain::Chain& of) : Cells(of) {
-    for (int row = 0; row < rows; ++row) link.push_back(chain::link_at(chain, arclength(row)));
-  }
-};
-
-Layout laid_out(const Grid& grid, const capture::Capture& capture, const FrameViews& frame, int index,
-                const chain::States& states) {
-  const chain::Chain& chain = grid.chain;
-  const double radius = 0.5 * chain.diameter;
-  Layout out{std::vector<Color>(grid.size(), Color::Zero()), std::vector<float>(grid.size(), 0.0f)};
-  math::Vector3 normals[kColumns];
-  for (int column = 0; column < kColumns; ++column) normals[column] = grid.normal(Grid::angle(column));
-  for (const int v : frame.views) {
-    const capture::View view = capture::unpacked(capture.views[v]);
-    const capture::Camera& camera = capture.cameras[view.camera];
-    std::vector<math::Pose> motions =
-        view_motions(chain, capture, states, frame, index, states.theta[index], capture.views[v]);
-    const math::Pose camera_from_world = camera.world_from_camera.inverse();
-    for (math::Pose& motion : motions) motion = camera_from_world * motion;
-    for (int row = 0; row < grid.rows; ++row) {
-      const math::Pose& motion = motions[grid.link[row]];
-      const math::Vector3 axis = motion * math::Vector3(grid.arclength(row) * chain.direction);
-      for (int column = 0; column < kColumns; ++column) {
-        const math::Vector3 normal = motion.rotation * normals[column], point = axis + radius * normal;
-        const double facing = -normal.dot(point) / point.norm();
-        if (facing < kTrusted || point.z() < image_model::kNear) continue;
-        const math::Vector2 pixel = capture::project(camera, point);
-        const int x = static_cast<int>(std::floor(pixel.x())) - view.x0,
-                  y = static_cast<int>(std::floor(pixel.y())) - view.y0;
-        if (x < 0 || y < 0 || x >= view.width || y >= view.height) continue;
-        const std::uint8_t* rgba = &view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x)];
-        if (rgba[3] < image_model::kObjectMask) continue;
-        const std::size_t cell = grid.cell(row, column);
-        const float counts = static_cast<float>(facing * facing);
-        out.color[cell] += counts / 255.0f * Color(rgba[0], rgba[1], rgba[2]);
-        out.weight[cell] += counts;
-      }
-    }
-  }
-  for (std::size_t cell = 0; cell < grid.size(); ++cell)
-    if (out.weight[cell] > 0.0f) out.color[cell] /= out.weight[cell];
-  return out;
-}
+constexpr double kBelieved = 0.25;    // least share of what is left without rolls that they must explain
 
 // The texture that the frames agree on, by the material's angle.
 struct Texture {
@@ -85,24 +28,13 @@ struct Texture {
   explicit Texture(const Grid& grid) : sum(grid.size(), Color::Zero()), weight(grid.size(), 0.0f) {}
 };
 
-struct Column {
-  int first, second;
-  float share;  // of the second
-};
-// Columns between whose middles lies the material that a turn by `roll` brings to the middle of `column`.
-Column material_column(int column, double roll) {
-  const double at = column - roll * kColumns / kTurn, floor = std::floor(at);
-  const int first = ((static_cast<int>(floor) % kColumns) + kColumns) % kColumns;
-  return {first, (first + 1) % kColumns, static_cast<float>(at - floor)};
-}
-
 void add(const Grid& grid, const Layout& layout, const math::VectorX& roll, Texture& texture) {
   for (int row = 0; row < grid.rows; ++row)
     for (int column = 0; column < kColumns; ++column) {
       const std::size_t from = grid.cell(row, column);
       const float weight = layout.weight[from];
       if (weight <= 0.0f) continue;
-      const Column at = material_column(column, roll[grid.link[row]]);
+      const MaterialColumn at = material_column(column, roll[grid.link[row]]);
       const auto put = [&](int to, float share) {
         texture.sum[grid.cell(row, to)] += share * weight * layout.color[from];
         texture.weight[grid.cell(row, to)] += share * weight;
@@ -142,7 +74,7 @@ Left align(const Grid& grid, const Layout& layout, const Texture& texture, const
       for (int column = 0; column < kColumns; ++column) {
         const std::size_t from = grid.cell(row, column);
         if (layout.weight[from] <= 0.0f) continue;
-        const Column at = material_column(column, roll[link]);
+        const MaterialColumn at = material_column(column, roll[link]);
         const std::size_t a = grid.cell(row, at.first), b = grid.cell(row, at.second);
         if (texture.weight[a] < kKnown || texture.weight[b] < kKnown) continue;
         const Color first = texture.sum[a] / texture.weight[a], second = texture.sum[b] / texture.weight[b];

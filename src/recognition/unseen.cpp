@@ -63,7 +63,8 @@ bool on_side(const Surface& surface, const Place& at) {
   return at.radius >= inside && at.arclength >= 0.0 && at.arclength <= surface.chain.length - inside;
 }
 
-void look(std::span<const Viewpoint> views, Surface& surface) {
+// Colors are those of the texture, without the light.
+void look(std::span<const Viewpoint> views, const splat::Light& light, Surface& surface) {
   constexpr double kWithin = 0.8;  // of the radius: masks are a pixel off at the outline
   const double radius = 0.5 * surface.chain.diameter;
   std::vector<double> hidden(surface.facing.size(), 0.0), weights(surface.facing.size(), 0.0);
@@ -85,7 +86,8 @@ void look(std::span<const Viewpoint> views, Surface& surface) {
         const std::uint8_t* seen = facing >= kTrusted ? pixel_of(camera, view, point) : nullptr;
         if (!seen) continue;
         const double counts = facing * facing;  // the area that a pixel averages over grows as 1 / facing
-        sums[cell] += counts / 255.0 * Vector3(seen[0], seen[1], seen[2]);
+        const double brightness = splat::brightness(light, motion.rotation * normal);
+        sums[cell] += counts / (255.0 * brightness) * Vector3(seen[0], seen[1], seen[2]);
         weights[cell] += counts;
       }
     });
@@ -200,7 +202,7 @@ struct Texture {
 };
 Texture texture_of(const chain::Chain& chain, std::span<const Viewpoint> views, const splat::Gaussians& gaussians) {
   Texture texture{Surface(chain), {}, 0.0, {}};
-  look(views, texture.surface);
+  look(views, gaussians.light, texture.surface);
   for (int i = 0; i < gaussians.count; ++i) texture.places.push_back(place_of(texture.surface, gaussians, i));
   texture.slope = slope_of_texture(texture.surface);
   texture.light = light_of(texture.surface, texture.places, gaussians);

@@ -112,7 +112,14 @@ Json splats_json(const splat::Gaussians& g) {
         values.push_back(g.sh[3 * static_cast<std::size_t>(coefficients) * i + c]);
     }
   }
+  Json light = nullptr;
+  if (g.light.known())
+    light = {{"axis", list(g.light.axis)},
+             {"constant", g.light.constant},
+             {"linear", list(g.light.linear)},
+             {"quadratic", std::vector<double>(g.light.quadratic.data(), g.light.quadratic.data() + 9)}};
   return {{"count", link.size()},
+          {"light", light},
           {"gaussians", g.count},
           {"degree", g.degree},
           {"stride", 10 + 3 * coefficients},
@@ -332,6 +339,7 @@ Json document(const Contents& contents) {
              {"lowPass", image_model::kLowPass},
              {"clampMargin", image_model::kClampMargin},
              {"leastAlpha", image_model::kLeastAlpha},
+             {"leastBrightness", image_model::kLeastBrightness},
              {"mostAlpha", image_model::kMostAlpha}}},
            {"chain", chain_json(twin.chain)},
            {"motions", motions_json(contents)},

@@ -199,7 +199,9 @@ void Engine::set_gaussians(const Gaussians& gaussians) {
 
 Gaussians Engine::gaussians() const {
   const Scene& scene = state_->training;
-  return unpacked(state_->trained(scene.parameters), scene.count, scene.links, scene.degree);
+  Gaussians out = unpacked(state_->trained(scene.parameters), scene.count, scene.links, scene.degree);
+  out.light = scene.light;
+  return out;
 }
 
 Gaussians Engine::gradient() const {

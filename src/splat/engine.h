@@ -83,6 +83,7 @@ struct SceneView {
 // Parameters and views that belong together: those of the training, or those of one call.
 struct Scene {
   int count = 0, links = 0, degree = 0;
+  Light light;
   Buffer parameters, gradient, first_moment, second_moment, target;
   std::vector<SceneView> views;
   std::size_t parameter_count = 0;

@@ -7,6 +7,12 @@
 
 namespace chainsplat::splat {
 
+double brightness(const Light& light, const math::Vector3& normal) {
+  if (!light.known()) return 1.0;
+  return std::max(image_model::kLeastBrightness,
+                  light.constant + light.linear.dot(normal) + normal.dot(light.quadratic * normal));
+}
+
 void Gaussians::resize(int new_count, int new_links, int new_degree) {
   CHAINSPLAT_CHECK(links == 0 || links == new_links, std::to_string(links));
   const int old_coefficients = sh_coefficients(), old_count = std::min(count, new_count);
@@ -47,6 +53,7 @@ Gaussians rows_of(const Gaussians& gaussians, std::span<const int> rows, int mor
   Gaussians out;
   const int count = static_cast<int>(rows.size());
   out.resize(count + more, gaussians.links, gaussians.degree);
+  out.light = gaussians.light;
   for (int k = 0; k < count; ++k) copy_row(gaussians, rows[k], out, k);
   return out;
 }
@@ -76,6 +83,13 @@ math::Vector3 base_color(const Gaussians& gaussians, int index) {
 void set_base_color(Gaussians& gaussians, int index, const math::Vector3& color) {
   float* const sh = &gaussians.sh[3 * static_cast<std::size_t>(gaussians.sh_coefficients()) * index];
   for (int c = 0; c < 3; ++c) sh[c] = static_cast<float>((color[c] - 0.5) / image_model::kSh0);
+}
+
+double brightness(const Gaussians& gaussians, int index, const math::Matrix3& rotation) {
+  const math::Vector3& axis = gaussians.light.axis;
+  const float* const mean = &gaussians.mean[3 * static_cast<std::size_t>(index)];
+  const math::Vector3 at(mean[0], mean[1], mean[2]), off = at - at.dot(axis) * axis;
+  return brightness(gaussians.light, rotation * off.normalized());
 }
 
 }  // namespace chainsplat::splat

@@ -77,6 +77,7 @@ std::vector<SplatView> Engine::State::stage_views(Submission& s, std::span<const
   std::vector<SplatView> placed;
   std::vector<glm::vec4> rows;  // three of camera_from_home for every link
   std::size_t cells = 0;        // in the tile map
+  const Light& light = s.scene.light;
   chunk_pixel.clear();
   for (const int v : chunk) {
     const SceneView& view = s.scene.views[v];
@@ -85,11 +86,19 @@ std::vector<SplatView> Engine::State::stage_views(Submission& s, std::span<const
                      std::to_string(view.motions.size()));
     const math::Vector3 base =
         view.motions.empty() ? math::Vector3::Zero() : view.camera_from_world * view.motions[0].translation;
+    // in the axes of the camera frame
+    const math::Matrix3& turn = view.camera_from_world.rotation;
+    const math::Vector3 linear = turn * light.linear;
+    const math::Matrix3 quadratic = turn * light.quadratic * turn.transpose();
     placed.push_back({.intrinsics = {view.fx, view.fy, view.cx, view.cy},
                       .limits = {view.limit_x, view.limit_y, 0, 0},
                       .moment_point = {base.x(), base.y(), base.z(), 0},
                       .gain = {view.gain.x(), view.gain.y(), view.gain.z(), view.white},
                       .bias = {view.bias.x(), view.bias.y(), view.bias.z(), 0},
+                      .axis = {light.axis.x(), light.axis.y(), light.axis.z(), light.known() ? 1.0 : 0.0},
+                      .light = {linear.x(), linear.y(), linear.z(), light.constant},
+                      .light_squares = {quadratic(0, 0), quadratic(1, 1), quadratic(2, 2), 0},
+                      .light_products = {quadratic(0, 1), quadratic(0, 2), quadratic(1, 2), 0},
                       .width = narrow(view.width),
                       .height = narrow(view.height),
                       .tiles_x = narrow(view.tiles_x),

@@ -90,6 +90,7 @@ void Engine::State::load_gaussians(Scene& scene, const Gaussians& gaussians) {
   scene.count = gaussians.count;
   scene.links = gaussians.links;
   scene.degree = gaussians.degree;
+  scene.light = gaussians.light;
   const std::vector<float> all = packed(gaussians);
   scene.parameter_count = all.size();
   scene.step = 0;

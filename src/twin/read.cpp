@@ -358,6 +358,17 @@ void read_rope(const Node& node, const Node& grasp, Twin& twin) {
   if (node["links"].entries().back().has("mass")) twin.parameters = read_parameters(node, twin);
 }
 
+splat::Light read_light(const Node& node, const math::Vector3& axis) {
+  constexpr double kMost = 1e3;  // times the brightest side that was seen
+  const std::vector<double> linear = node["linear"].numbers_within(3, kMost),
+                            q = node["quadratic"].numbers_within(6, kMost);
+  const double constant = node["constant"].number();
+  if (std::abs(constant) > kMost) node["constant"].fail("is more than any light has", "train again");
+  splat::Light light{axis, constant, math::Vector3(linear.data()), {}};
+  light.quadratic << q[0], q[1], q[2], q[1], q[3], q[4], q[2], q[4], q[5];
+  return light;
+}
+
 }  // namespace
 
 Twin load(const Path& run) {
@@ -421,6 +432,7 @@ Twin load(const Path& run) {
                        "has " + std::to_string(twin.gaussians.links) + " properties link_*, the chain has " +
                            std::to_string(twin.chain.links()) + " links",
                        "take the file of the same run");
+    if (top.has("light")) twin.gaussians.light = read_light(top["light"], twin.chain.direction);
   }
   if (const Path states = named_file(top, "states", run); !states.empty())
     twin.states = read_states(states, twin.chain);

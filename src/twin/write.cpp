@@ -275,8 +275,10 @@ void save(const Twin& twin, const Path& run) {
   if (error)
     throw WorkError(run.string(), "cannot be made (" + error.message() + ")", "choose a folder that can be written");
   const dynamics::Parameters* const known = twin.parameters ? &*twin.parameters : nullptr;
+  const splat::Light& light = twin.gaussians.light;
   const bool plain =
-      !known || (known->bending_friction.empty() && known->torsional_stiffness.empty() && known->tip_length == 0.0);
+      !light.known() &&
+      (!known || (known->bending_friction.empty() && known->torsional_stiffness.empty() && known->tip_length == 0.0));
   Json out{{"format", plain ? kFormat : kNewFormat},
            {"about", about_json(twin)},
            {"grasp", {{"direction", list(twin.chain.direction)}, {"bending_axis", list(twin.chain.bending_axis)}}},
@@ -291,6 +293,12 @@ void save(const Twin& twin, const Path& run) {
     out["rolling"] = {{"torsion", twin.rolling->torsion}, {"friction", twin.rolling->friction},
                       {"speed", twin.rolling->speed},     {"set", twin.rolling->set},
                       {"texture", twin.rolling->texture}, {"deviation", twin.rolling->deviation}};
+  if (light.known()) {
+    const math::Matrix3& q = light.quadratic;
+    out["light"] = {{"constant", light.constant},
+                    {"linear", list(light.linear)},
+                    {"quadratic", {q(0, 0), q(0, 1), q(0, 2), q(1, 1), q(1, 2), q(2, 2)}}};
+  }
   if (!twin.corrections.empty()) out["corrections"] = to_json(twin.corrections);
   if (!twin.corrections.empty() || !twin.verdict.empty()) {
     out["verdict"] = to_json(twin.verdict);

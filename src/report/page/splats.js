@@ -113,6 +113,18 @@ function makePainter(canvas, splats, model) {
   };
 }
 
+// How bright the side of the rope is that a Gaussian at `home` is on: a function of its link's pose.
+function brightnessOf(light, least) {
+  if (!light) return () => 1;
+  const {axis, constant, linear, quadratic: q} = light;
+  return (pose, home) => {
+    const along = dot(home, axis), off = unit(home.map((x, k) => x - along * axis[k]));
+    const n = minus(move(pose, off), pose.slice(9));
+    const rows = [0, 3, 6].map(k => dot(q.slice(k, k + 3), n));
+    return Math.max(least, constant + dot(linear, n) + dot(rows, n));
+  };
+}
+
 // Fills `out` and `depth` with the splats in front of the camera and returns their number. Rows of J R_cw R_link are the
 // image's axes seen in the home configuration, where the covariances are given.
 function project(splats, camera, scale, poses, tint, hatched, model, out, depth) {
@@ -123,9 +135,10 @@ function project(splats, camera, scale, poses, tint, hatched, model, out, depth)
   const product = (o, a, b) => a[0] * (s[o] * b[0] + s[o + 1] * b[1] + s[o + 2] * b[2]) +
                                a[1] * (s[o + 1] * b[0] + s[o + 3] * b[1] + s[o + 4] * b[2]) +
                                a[2] * (s[o + 2] * b[0] + s[o + 4] * b[1] + s[o + 5] * b[2]);
+  const brightness = brightnessOf(splats.light, model.leastBrightness);
   let n = 0;
   for (let i = 0; i < count; ++i) {
-    const o = i * stride, pose = poses[link[i]], away = minus(move(pose, [s[o], s[o + 1], s[o + 2]]), eye);
+    const o = i * stride, pose = poses[link[i]], home = [s[o], s[o + 1], s[o + 2]], away = minus(move(pose, home), eye);
     const [x, y, z] = turnBack(view, away);
     if (z < model.near) continue;
     const bound = (v, limit) => Math.min(limit, Math.max(-limit, v));
@@ -138,10 +151,11 @@ function project(splats, camera, scale, poses, tint, hatched, model, out, depth)
     const c = Math.cos(angle), e = Math.sin(angle), at = n * floatsPerSplat;
     out[at] = c * long, out[at + 1] = e * long, out[at + 2] = -e * short, out[at + 3] = c * short;
     out[at + 4] = fx * x / z + cx, out[at + 5] = fy * y / z + cy;
-    const seen = harmonics(degree, ...unit(turnBack(pose, away)));
+    const seen = harmonics(degree, ...unit(turnBack(pose, away))), lit = brightness(pose, home);
     for (let channel = 0; channel < 3; ++channel) {
       let tone = 0.5;
       for (let t = 0; t < terms; ++t) tone += seen[t] * s[o + 10 + 3 * t + channel];
+      tone *= lit;
       out[at + 6 + channel] = tint ? 0.35 * Math.max(0, tone) + 0.65 * tint[link[i] % tint.length][channel] : Math.max(0, tone);
     }
     out[at + 9] = hatched && guessed[i] ? -s[o + 9] : s[o + 9];
