@@ -111,11 +111,11 @@ TEST_CASE("a twin that is not identified has no dynamics to export") {
   CHECK(std::filesystem::exists(folder.path / "twin.py"));
 }
 
-TEST_CASE("exported colors hold the mean light of the motion") {
+TEST_CASE("exported colors hold the light of the motion: its mean, and what cameras see of it") {
   twin::Twin twin = test::small_twin(chain::Bending::planar, 40);
   const chain::Chain& chain = twin.chain;
   splat::Gaussians& g = twin.gaussians;
-  CHECK(exports::in_mean_light(g, chain, twin.states, {}).sh == g.sh);  // as there is none
+  CHECK(exports::with_baked_light(g, chain, twin.states, {}, {}).sh == g.sh);  // as there is none
   g.light = {chain.direction, 0.6, 0.3 * chain.bending_axis, math::Matrix3::Zero()};
   const trajectory::Trajectory rest = trajectory::fit({trajectory::Sample{}}, "rest");
   chain::States rolling;  // there and turned over: what is above once is below once
@@ -124,8 +124,8 @@ TEST_CASE("exported colors hold the mean light of the motion") {
     rolling.theta.push_back(math::VectorX::Zero(chain.angles()));
     rolling.roll.push_back(math::VectorX::Constant(chain.links(), turn));
   }
-  const splat::Gaussians mean = exports::in_mean_light(g, chain, rolling, rest),
-                         home = exports::in_mean_light(g, chain, {}, {});
+  const splat::Gaussians mean = exports::with_baked_light(g, chain, rolling, rest, {}),
+                         home = exports::with_baked_light(g, chain, {}, {}, {});
   CHECK_FALSE(mean.light.known());
   const math::Vector3 from(0.6, 0.0, -0.8);
   for (int i = 0; i < g.count; ++i) {
@@ -135,6 +135,38 @@ TEST_CASE("exported colors hold the mean light of the motion") {
     CHECK((splat::sh_color(mean, i, from) - 0.6 * splat::sh_color(g, i, from)).norm() < 1e-6);
     CHECK((splat::sh_color(home, i, from) - (0.6 + 0.3 * side) * splat::sh_color(g, i, from)).norm() < 1e-6);
   }
+
+  // a camera that sees the rope turn, from above it at first
+  chain::States turning;
+  for (int k = 0; k <= 20; ++k) {
+    turning.time.push_back(0.05 * k);
+    turning.theta.push_back(math::VectorX::Zero(chain.angles()));
+    turning.roll.push_back(math::VectorX::Constant(chain.links(), 0.06 * k));
+  }
+  capture::Camera camera;
+  const math::Vector3 middle = 0.5 * chain.length * chain.direction;
+  camera.world_from_camera.translation = middle + 2.0 * chain.bending_axis;
+  const splat::Gaussians baked = exports::with_baked_light(g, chain, turning, rest, {camera});
+  const splat::Gaussians flat = exports::with_baked_light(g, chain, turning, rest, {});
+  double wrong = 0.0, wrong_by_mean = 0.0, count = 0.0;
+  for (std::size_t k = 0; k < turning.time.size(); ++k) {
+    const auto motions = chain::material_motions(chain, turning, turning.time[k], rest.pose(0.0));
+    for (int i = 0; i < g.count; ++i) {
+      const math::Pose& pose = motions[splat::surest_link(g, i)];
+      const math::Vector3 at(g.mean[3 * i], g.mean[3 * i + 1], g.mean[3 * i + 2]);
+      const math::Vector3 ray = pose * at - camera.world_from_camera.translation,
+                          from = pose.rotation.transpose() * ray.normalized();
+      const math::Vector3 off = at - at.dot(chain.direction) * chain.direction;
+      if (-from.dot(off.normalized()) < 0.3) continue;  // on the far side
+      const math::Vector3 lit = splat::brightness(g, i, pose.rotation) * splat::sh_color(g, i, from);
+      wrong += (splat::sh_color(baked, i, from) - lit).squaredNorm();
+      wrong_by_mean += (splat::sh_color(flat, i, from) - lit).squaredNorm();
+      count += 1.0;
+    }
+  }
+  CHECK(count > 200);
+  CHECK(std::sqrt(wrong / count) < 0.01);
+  CHECK(std::sqrt(wrong_by_mean / count) > 0.04);
 }
 
 TEST_CASE("exported scales hold what the renderer adds at the nearest that a Gaussian comes to a camera") {

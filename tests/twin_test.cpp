@@ -6,6 +6,7 @@
 #include <limits>
 #include <nlohmann/json.hpp>
 
+#include "chainsplat/properties.h"
 #include "error_of.h"
 #include "small_twin.h"
 
@@ -399,6 +400,17 @@ TEST_CASE("damage to twin.json is named by file and key") {
   CHECK(contains(error_of([&] { twin::load(folder.path / "absent"); }), "twin.json"));
 }
 
+TEST_CASE("what a rope is known by is printed with its error, or as what was held") {
+  const std::string text = twin::describe({{"mass_per_length", "kg/m", 0.2, 4e-14},
+                                           {"tip_mass", "kg", 0.0, 0.0},
+                                           {"friction_coefficient", "1", 0.28, 0.21},
+                                           {"first_frequency", "Hz", 1.5, std::numeric_limits<double>::quiet_NaN()}});
+  CHECK(contains(text, "mass_per_length       0.2 (held)                kg/m\n"));
+  CHECK(contains(text, "tip_mass              0 (held)                  kg\n"));
+  CHECK(contains(text, "friction_coefficient  0.28 +- 0.21\n"));
+  CHECK(contains(text, "first_frequency       1.5 +- nan                Hz\n"));
+}
+
 TEST_CASE("how a rope rolls is kept, and refused of a chain that bends in space") {
   const test::TemporaryFolder folder("rolling");
   twin::Twin twin = test::small_twin(chain::Bending::planar, 20);
@@ -409,6 +421,9 @@ TEST_CASE("how a rope rolls is kept, and refused of a chain that bends in space"
   twin.rolling = dynamics::Rolling{
       0.7, 1.0 / 3.0, 0.01, std::vector<double>(links - 1, -0.1), std::vector<double>(links, 0.2), 0.04};
   for (int j = 0; j < links; ++j) twin.chain.lift.push_back(-1e-3 / (1.0 + j));
+  splat::Light& light = twin.gaussians.light;
+  light = {twin.chain.direction, 0.625, {0.1, -1.0 / 3.0, 0.25}, {}};
+  light.quadratic << 0.1, 0.2, 0.3, 0.2, 0.4, 0.5, 0.3, 0.5, -0.6;
   twin::save(twin, folder.path);
   const twin::Twin read = twin::load(folder.path);
   CHECK(read.chain.lift == twin.chain.lift);
@@ -419,12 +434,18 @@ TEST_CASE("how a rope rolls is kept, and refused of a chain that bends in space"
   CHECK(read.rolling->set == twin.rolling->set);
   CHECK(read.rolling->texture == twin.rolling->texture);
   CHECK(read.rolling->deviation == 0.04);
+  CHECK(read.gaussians.light.axis == light.axis);
+  CHECK(read.gaussians.light.constant == light.constant);
+  CHECK(read.gaussians.light.linear == light.linear);
+  CHECK(read.gaussians.light.quadratic == light.quadratic);
   const Path file = folder.path / "twin.json";
   const std::string good = core::read_file(file);
   for (const auto& [from, to, expected] : std::initializer_list<std::array<const char*, 3>>{
            {"\"torsion\": 0.7", "\"torsion\": 0", "rolling.torsion: 0 is not positive"},
            {"\"deviation\": 0.04", "\"deviation\": -1", "rolling.deviation: -1 is negative"},
            {"\"torsion\": 0.7", "\"torsion\": 1e300", "rolling.torsion: is more than any rope has"},
+           {"\"constant\": 0.625", "\"constant\": 1e4", "light.constant: is more than any light has"},
+           {"\"constant\": 0.625", "\"constants\": 1", "light.constant: is missing"},
            {"\"lift\": [-0.001", "\"lift\": [-9", "chain.lift: holds -9, which no rope has"}}) {
     std::string text = good;
     REQUIRE(text.find(from) != std::string::npos);

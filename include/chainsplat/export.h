@@ -61,9 +61,11 @@ splat::Gaussians with_low_pass(const splat::Gaussians& gaussians, const chain::C
                                const chain::States& motion, const trajectory::Trajectory& base,
                                const std::vector<capture::Camera>& cameras);
 
-// The same without their light, in the mean of what each Gaussian has of it in the motion (empty: at home).
-splat::Gaussians in_mean_light(const splat::Gaussians& gaussians, const chain::Chain& chain,
-                               const chain::States& motion, const trajectory::Trajectory& base);
+// Gaussians without a light of their own: to these cameras they look in this motion (empty: at home) as they do in it,
+// as far as spherical harmonics of degree 2 can, and from elsewhere they have the mean of what each has of it.
+splat::Gaussians with_baked_light(const splat::Gaussians& gaussians, const chain::Chain& chain,
+                                  const chain::States& motion, const trajectory::Trajectory& base,
+                                  const std::vector<capture::Camera>& cameras);
 
 // A zip archive of .npy arrays (formats.md 5.5), and the text of the module that reads it.
 std::string npz(const twin::Twin& twin, const chain::States& motion, const trajectory::Trajectory& base);

@@ -18,7 +18,7 @@ struct Property {
 // Of a rope; those that it does not have are left out: damping ratio and first frequency of ropes on a table, a
 // friction coefficient in free space. `known_mass`: else stiffnesses, moments and masses are per kilogram of rope.
 std::vector<Property> properties(const dynamics::Model& model, const dynamics::Estimates& estimates, bool known_mass);
-// A line each, as programs print them.
+// A line each, as programs print them: value and standard deviation, or "(held)" where it was given and not estimated.
 std::string describe(const std::vector<Property>& properties);
 
 }  // namespace chainsplat::twin

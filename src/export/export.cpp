@@ -56,7 +56,7 @@ void write(const twin::Twin& given, const chain::States& motion, const trajector
   const std::vector<Path> names = files(file);
   std::vector<std::string> bytes;
   twin::Twin twin = given;
-  if (kind != ".npz") twin.gaussians = in_mean_light(twin.gaussians, twin.chain, motion, base);
+  if (kind != ".npz") twin.gaussians = with_baked_light(twin.gaussians, twin.chain, motion, base, options.cameras);
   if (kind == ".mcap") {
     require(!motion.time.empty(), file, "the twin has no motion yet", "train it, or give one with `states`");
     write_mcap(twin, motion, base, file, options.capture);

@@ -426,10 +426,9 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     begin(job);
   job.frames = assign_views(capture, job.states.time);
   splat::Light light;
-  if (!resumed && lies_flat(job, job.result.bending.bending)) {
+  if (!resumed && lies_flat(job, job.result.bending.bending))
     job.states.roll = rolls_in(job.result.chain, capture, job.frames, job.states);
-    if (!job.states.roll.empty()) light = light_on(job.result.chain, capture, job.frames, job.states);
-  }
+  if (!resumed) light = light_on(job.result.chain, capture, job.frames, job.states);
   job.training = training_views(capture, job.frames, std::max(1, options.every));
   if (job.training.views.empty())
     throw WorkError(capture.name, "no training frame shows the object", "use `every` 1 or check the masks");

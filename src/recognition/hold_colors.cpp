@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "shaders/shared/gaussian.h"
+#include "src/math/sphere.h"
 #include "src/recognition/unseen.h"
 
 namespace chainsplat::recognition {
@@ -26,17 +27,6 @@ constexpr double kSeenWeight = 50.0;                      // of all colors that 
 constexpr double kRidge = 1e-6;                           // toward the old coefficients
 constexpr double kFar = 30.0 * std::numbers::pi / 180.0;  // rad from the nearest view; nearer than that it has a say
 constexpr double kInside = 0.4;                           // of the radius: what is closer to the axis has no side
-
-// Evenly over the sphere, along a spiral.
-std::vector<Vector3> directions() {
-  std::vector<Vector3> out;
-  for (int i = 0; i < kDirections; ++i) {
-    const double z = 1.0 - (2.0 * i + 1.0) / kDirections, turn = std::numbers::pi * (1.0 + std::sqrt(5.0)) * i;
-    const double reach = std::sqrt(1.0 - z * z);
-    out.push_back({reach * std::cos(turn), reach * std::sin(turn), z});
-  }
-  return out;
-}
 
 using Basis = Eigen::Matrix<double, kCoefficients, 1>;
 Basis basis(const Vector3& r) {
@@ -58,7 +48,7 @@ Vector3 normal_at(const chain::Chain& chain, const Vector3& mean) {
 void hold_colors(const chain::Chain& chain, std::span<const Viewpoint> views, splat::Gaussians& gaussians) {
   CHAINSPLAT_CHECK(gaussians.degree <= 1, std::to_string(gaussians.degree));
   gaussians.resize(gaussians.count, gaussians.links, kDegree);
-  const std::vector<Vector3> sphere = directions();
+  const std::vector<Vector3> sphere = math::directions(kDirections);
   const std::vector<std::optional<TextureColor>> textures = texture_colors(chain, views, gaussians);
   core::parallel_for(gaussians.count, [&](std::int64_t index) {
     const int i = static_cast<int>(index);

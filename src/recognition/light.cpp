@@ -73,7 +73,7 @@ Samples samples_of(const Grid& grid, const capture::Capture& capture, const std:
         const std::size_t cell = grid.cell(row, column);
         if (layout.weight[cell] <= 0.0f) continue;
         const int link = grid.link[row];
-        const MaterialColumn at = material_column(column, states.roll[k][link]);
+        const MaterialColumn at = material_column(column, states.roll.empty() ? 0.0 : states.roll[k][link]);
         parts[i].all.push_back({layout.color[cell], layout.weight[cell], grid.cell(row, at.first),
                                 grid.cell(row, at.second), at.share, kColumns * link + column});
       }

@@ -131,11 +131,13 @@ std::vector<Property> properties(const dynamics::Model& model, const dynamics::E
 
 std::string describe(const std::vector<Property>& properties) {
   constexpr int kNames = 22, kNumbers = 26;  // columns
+  constexpr double kRounding = 1e-9;         // relative: what is known so well was given, and no data tell of it
   std::string out;
   for (const Property& p : properties) {
     std::string line = p.name;
     line.append(std::max<int>(1, kNames - static_cast<int>(line.size())), ' ');
-    line += core::with_error(p.value, p.sigma);
+    line += p.sigma <= kRounding * std::abs(p.value) ? core::brief(p.value) + " (held)"
+                                                     : core::with_error(p.value, p.sigma);
     if (p.unit != "1") {
       line.append(std::max<int>(1, kNames + kNumbers - static_cast<int>(line.size())), ' ');
       line += p.unit;

@@ -49,7 +49,7 @@ function forceText({largest, unit}) {
 
 // The error with two significant digits, the value with as many decimals.
 function withError(value, error) {
-  if (!(error > 0) || !isFinite(error)) return figure(value);
+  if (!(error > 1e-9 * Math.abs(value)) || !isFinite(error)) return figure(value);  // what was given is as exact
   const decimals = Math.max(0, Math.min(9, 1 - Math.floor(Math.log10(error))));
   return value.toFixed(decimals) + ' \u00b1 ' + error.toFixed(decimals);
 }
