@@ -114,3 +114,54 @@ TEST_CASE("a plane that the views do not tell is told") {
     CHECK(found->trusted);
   }
 }
+
+TEST_CASE("a rope that no camera sees in a part is told, with the frame, and its corrections are not trusted") {
+  twin::Twin twin = make_twin(0.1, 0.0);
+  capture::Capture capture;
+  capture.base = still_base();
+  capture::Camera camera;
+  camera.name = "cam0", camera.width = 200, camera.height = 200, camera.fx = camera.fy = 300, camera.cx = 100,
+  camera.cy = 40;
+  camera.world_from_camera = {math::Matrix3{{1, 0, 0}, {0, 0, 1}, {0, -1, 0}},
+                              {0, -1, 0}};  // z is down in its pictures
+  capture.cameras = {camera};
+  capture.times = {twin.states.time};
+  const auto show = [&](int frames,
+                        int rows) {  // in the first `frames` only the pictures' upper `rows` are in the mask
+    capture.views.clear();
+    for (int k = 0; k < kFrames; ++k) {
+      capture::View view;
+      view.frame = k, view.time = twin.states.time[k], view.width = view.height = 200;
+      view.rgba.assign(4 * 200 * 200, 0);
+      for (int y = 0; y < (k < frames ? rows : 200); ++y)
+        for (int x = 0; x < 200; ++x)
+          for (int c = 0; c < 4; ++c) view.rgba[4 * (200 * y + x) + c] = 255;
+      capture.views.push_back(capture::packed(view));
+    }
+    twin.verdict.clear();
+  };
+  // the rope of 0.4 m reaches 120 pixels down from row 40
+  show(kFrames, 200);
+  pipeline::judge_hidden(twin, capture);
+  CHECK(twin.verdict.empty());
+  show(2, 100);
+  pipeline::judge_hidden(twin, capture);
+  CHECK(twin.verdict.empty());  // single masks fail
+  show(5, 100);
+  pipeline::judge_hidden(twin, capture);
+  REQUIRE(finding(twin, "hidden"));
+  CHECK(finding(twin, "hidden")->value == doctest::Approx(0.5).epsilon(0.05));
+  CHECK(finding(twin, "hidden")->frame < 5);
+  CHECK(finding(twin, "hidden")->trusted);
+  show(20, 100);
+  pipeline::judge_hidden(twin, capture);
+  CHECK(finding(twin, "hidden")->trusted);
+  show(20, 100);
+  twin.verdict.push_back({"length", "object", 1.0, 0.1, "%", true, true, false, -1, "the rope is longer"});
+  pipeline::judge_hidden(twin, capture);
+  CHECK_FALSE(finding(twin, "hidden")->trusted);
+  // nor is an empty mask one that hides something
+  show(20, 0);
+  pipeline::judge_hidden(twin, capture);
+  CHECK(twin.verdict.empty());
+}

@@ -2,8 +2,11 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <span>
 #include <string>
 #include <vector>
+
+#include "chainsplat/image_model.h"
 
 #include "pipeline/stages.h"
 
@@ -13,7 +16,7 @@ namespace {
 using capture::Finding;
 
 constexpr const char *kMisfit = "identification-misfit", *kUnexplainedCode = "unexplained", *kUnexcited = "unexcited",
-                     *kOutOfPlane = "out-of-plane";
+                     *kOutOfPlane = "out-of-plane", *kHidden = "hidden";
 // Share of the length by which the identified motion misses the recognized one, RMS over nodes and frames. Ropes that
 // the model can follow leave 0.1 to 0.4 %; a base one frame late, taken as given, 3 %.
 constexpr double kDoubtful = 0.01, kUseless = 0.02;
@@ -24,6 +27,12 @@ constexpr double kStill = 2.0;  // of an angle's variation over its noise; swing
 constexpr std::size_t kFramesOfMotion = 15;  // half a second
 // Share of the length by which a rope may leave its plane unseen before that is told: what three cameras are off by.
 constexpr double kUnseen = 0.005;
+// Share of a rope's points that no camera shows in a frame which is told. Simulated ropes whose end is to be seen leave
+// up to 0.06; those whose end or middle goes behind the gripper in all cameras, 0.2.
+constexpr double kOutOfSight = 0.1;
+constexpr int kPointsAlong = 97;
+constexpr int kFramesHidden = 3;       // least number of such frames; single masks may fail
+constexpr double kMostlyHidden = 0.2;  // share of the frames beyond which the twin is not to be trusted
 constexpr double kMillimeters = 1e3;
 
 struct Misfit {
@@ -109,7 +118,57 @@ void judge_excitation(twin::Twin& twin) {
                               ": stiffness and damping there are guesses; `chainsplat excite` proposes a motion"});
 }
 
+// Share of the rope's points that lie in none of these views' masks.
+double hidden_share(const twin::Twin& twin, const capture::Capture& capture, std::span<const int> views,
+                    const math::VectorX& theta) {
+  const std::vector<double> along = chain::equal_arclengths(twin.chain, kPointsAlong);
+  std::vector<char> seen(along.size(), 0);
+  for (const int v : views) {
+    const capture::View view = capture::unpacked(capture.views[v]);
+    const capture::Camera& camera = capture.cameras[view.camera];
+    const auto motions = chain::link_motions(twin.chain, theta, capture.base.pose(view.time));
+    const math::MatrixX points = chain::centerline(twin.chain, motions, along);
+    const math::Pose camera_from_world = camera.world_from_camera.inverse();
+    for (std::size_t i = 0; i < along.size(); ++i) {
+      const math::Vector3 point = camera_from_world * math::Vector3(points.col(static_cast<Eigen::Index>(i)));
+      if (point.z() < image_model::kNear) continue;
+      const math::Vector2 pixel = capture::project(camera, point);
+      const int x = static_cast<int>(std::floor(pixel.x())) - view.x0,
+                y = static_cast<int>(std::floor(pixel.y())) - view.y0;
+      if (x < 0 || y < 0 || x >= view.width || y >= view.height) continue;
+      seen[i] |= view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] >= image_model::kObjectMask;
+    }
+  }
+  return static_cast<double>(std::count(seen.begin(), seen.end(), 0)) / static_cast<double>(along.size());
+}
+
 }  // namespace
+
+void judge_hidden(twin::Twin& twin, const capture::Capture& capture) {
+  const std::vector<std::vector<int>> views = capture::views_at(capture, twin.states.time);
+  std::vector<double> hidden(views.size(), 0.0);
+  core::parallel_for(static_cast<std::int64_t>(views.size()), [&](std::int64_t k) {
+    std::vector<int> shown = views[k];  // empty masks tell of nothing that hides a part
+    std::erase_if(shown, [&](int v) { return !capture::shows_object(capture.views[v]); });
+    if (!shown.empty()) hidden[k] = hidden_share(twin, capture, shown, twin.states.theta[k]);
+  });
+  const auto frames = std::count_if(hidden.begin(), hidden.end(), [](double share) { return share > kOutOfSight; });
+  if (frames < kFramesHidden) return;
+  const auto worst = std::max_element(hidden.begin(), hidden.end());
+  // corrections may stand for what is hidden; without any, ropes with a quarter hidden were found as well as whole ones
+  const bool corrected =
+      std::any_of(twin.verdict.begin(), twin.verdict.end(), [](const Finding& f) { return f.corrected; });
+  const bool doubtful = corrected && static_cast<double>(frames) > kMostlyHidden * static_cast<double>(hidden.size());
+  char text[320];
+  std::snprintf(
+      text, sizeof text,
+      "up to %.0f %% of the rope is out of sight of all cameras, most at %.2f s, and more than %.0f %% in %d of "
+      "%zu frames: what is recognized there is a guess%s",
+      100.0 * *worst, twin.states.time[worst - hidden.begin()], 100.0 * kOutOfSight, static_cast<int>(frames),
+      hidden.size(), doubtful ? ", and what was corrected may be one, too: do not trust this twin" : "");
+  twin.verdict.push_back({kHidden, "object", *worst, 0.0, "share", false, !doubtful, false,
+                          static_cast<int>(worst - hidden.begin()), text});
+}
 
 void judge_bending(twin::Twin& twin, const silhouette::BendingChoice& choice) {
   const double unseen = std::hypot(choice.out_of_plane_rms, choice.deviation);  // m

@@ -39,6 +39,9 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
 identification::Options identification_options(const twin::Twin& twin, bool paper, std::uint64_t seed);
 // Adds to the verdict what the views left open about the plane that a planar twin bends in, where that is much.
 void judge_bending(twin::Twin& twin, const silhouette::BendingChoice& choice);
+// Adds to the verdict where the recognized rope is in no camera's mask, as behind a gripper: what is recognized there is a
+// guess. `capture`: its views.
+void judge_hidden(twin::Twin& twin, const capture::Capture& capture);
 // What the verdict says of the identified motion (twin.rollout) beside the recognized one (twin.states), anew.
 void judge_motion(twin::Twin& twin, const trajectory::Trajectory& base);
 

@@ -305,6 +305,7 @@ void recognize(Training& t) {
   // exactly symmetric, as they are read back
   for (math::MatrixX& covariance : t.twin.states.covariance)
     covariance = math::MatrixX(covariance.selfadjointView<Eigen::Lower>());
+  if (t.options.mode == twin::Mode::fast) judge_hidden(t.twin, t.capture);
   if (!t.options.bending && t.options.mode == twin::Mode::fast) {
     char text[96];
     std::snprintf(text, sizeof text, " bending (out of plane: %.2f mm)", 1e3 * found.bending.out_of_plane_rms);
