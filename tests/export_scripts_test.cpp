@@ -155,12 +155,12 @@ TEST_CASE("exported colors hold the light of the motion: its mean, and what came
       const math::Pose& pose = motions[splat::surest_link(g, i)];
       const math::Vector3 at(g.mean[3 * i], g.mean[3 * i + 1], g.mean[3 * i + 2]);
       const math::Vector3 ray = pose * at - camera.world_from_camera.translation,
-                          from = pose.rotation.transpose() * ray.normalized();
+                          direction = pose.rotation.transpose() * ray.normalized();
       const math::Vector3 off = at - at.dot(chain.direction) * chain.direction;
-      if (-from.dot(off.normalized()) < 0.3) continue;  // on the far side
-      const math::Vector3 lit = splat::brightness(g, i, pose.rotation) * splat::sh_color(g, i, from);
-      wrong += (splat::sh_color(baked, i, from) - lit).squaredNorm();
-      wrong_by_mean += (splat::sh_color(flat, i, from) - lit).squaredNorm();
+      if (-direction.dot(off.normalized()) < 0.3) continue;  // on the far side
+      const math::Vector3 lit = splat::brightness(g, i, pose.rotation) * splat::sh_color(g, i, direction);
+      wrong += (splat::sh_color(baked, i, direction) - lit).squaredNorm();
+      wrong_by_mean += (splat::sh_color(flat, i, direction) - lit).squaredNorm();
       count += 1.0;
     }
   }
