@@ -39,8 +39,10 @@ bool for_viewers(const Path& file);  // whether it is a format in which others d
 
 // What a file holds beside the rope and its motion.
 struct Options {
-  bool mesh = false;                     // glTF: the rope as a skinned tube
-  std::vector<capture::Camera> cameras;  // glTF: what its cameras lack (lens, principal point) stands in their extras
+  bool mesh = false;  // glTF: the rope as a skinned tube
+  // That colors are to hold the light for (with_baked_light); glTF: what its cameras lack (lens, principal point)
+  // stands in their extras.
+  std::vector<capture::Camera> cameras;
   std::vector<twin::Property> properties = {};  // glTF: in the extras of the root node
   Path capture = {};                            // MCAP: whose pictures it shows; empty: none
 };

@@ -27,19 +27,16 @@ Basis basis(const Vector3& r) {
   return out;
 }
 
-// A moment of the motion.
-struct Moment {
-  std::vector<math::Pose> motions;  // of the links
-};
+// The links' motions at moments of the motion.
+using Moments = std::vector<std::vector<math::Pose>>;
 
-std::vector<Moment> moments_of(const chain::Chain& chain, const chain::States& motion,
-                               const trajectory::Trajectory& base) {
-  if (motion.time.empty()) return {{chain::link_motions(chain, math::VectorX::Zero(chain.angles()), math::Pose())}};
-  std::vector<Moment> out;
+Moments moments_of(const chain::Chain& chain, const chain::States& motion, const trajectory::Trajectory& base) {
+  if (motion.time.empty()) return {chain::link_motions(chain, math::VectorX::Zero(chain.angles()), math::Pose())};
+  Moments out;
   const std::size_t every = (motion.time.size() + kMostMoments - 1) / kMostMoments;
   for (std::size_t k = 0; k < motion.time.size(); k += every) {
     const math::Pose at = base.samples().empty() ? math::Pose() : base.pose(motion.time[k]);
-    out.push_back({chain::material_motions(chain, motion, motion.time[k], at)});
+    out.push_back(chain::material_motions(chain, motion, motion.time[k], at));
   }
   return out;
 }
@@ -50,7 +47,7 @@ splat::Gaussians with_baked_light(const splat::Gaussians& gaussians, const chain
                                   const chain::States& motion, const trajectory::Trajectory& base,
                                   const std::vector<capture::Camera>& cameras) {
   if (!gaussians.light.known()) return gaussians;
-  const std::vector<Moment> moments = moments_of(chain, motion, base);
+  const Moments moments = moments_of(chain, motion, base);
   splat::Gaussians out = gaussians;
   out.light = {};
   out.resize(out.count, out.links, std::max(out.degree, kDegree));
@@ -64,8 +61,8 @@ splat::Gaussians with_baked_light(const splat::Gaussians& gaussians, const chain
     };
     std::vector<Seen> seen;
     double brightness = 0.0;
-    for (const Moment& moment : moments) {
-      const math::Pose& pose = moment.motions[link];
+    for (const std::vector<math::Pose>& motions : moments) {
+      const math::Pose& pose = motions[link];
       const double now = splat::brightness(gaussians, i, pose.rotation);
       brightness += now / static_cast<double>(moments.size());
       for (const capture::Camera& camera : cameras) {

@@ -50,13 +50,17 @@ bool for_viewers(const Path& file) {
   return kind == ".glb" || kind == ".gltf" || kind == ".ply";
 }
 
-void write(const twin::Twin& given, const chain::States& motion, const trajectory::Trajectory& base, const Path& file,
+void write(const twin::Twin& twin, const chain::States& motion, const trajectory::Trajectory& base, const Path& file,
            const Options& options) {
   const std::string kind = ending(file);
+  if (twin.gaussians.light.known() && kind != ".npz") {
+    twin::Twin baked = twin;
+    baked.gaussians = with_baked_light(twin.gaussians, twin.chain, motion, base, options.cameras);
+    write(baked, motion, base, file, options);
+    return;
+  }
   const std::vector<Path> names = files(file);
   std::vector<std::string> bytes;
-  twin::Twin twin = given;
-  if (kind != ".npz") twin.gaussians = with_baked_light(twin.gaussians, twin.chain, motion, base, options.cameras);
   if (kind == ".mcap") {
     require(!motion.time.empty(), file, "the twin has no motion yet", "train it, or give one with `states`");
     write_mcap(twin, motion, base, file, options.capture);

@@ -6,9 +6,8 @@
 #include <string>
 #include <vector>
 
-#include "chainsplat/image_model.h"
-
 #include "pipeline/stages.h"
+#include "recognition/viewpoint.h"
 
 namespace chainsplat::pipeline {
 namespace {
@@ -128,15 +127,9 @@ double hidden_share(const twin::Twin& twin, const capture::Capture& capture, std
     const capture::Camera& camera = capture.cameras[view.camera];
     const auto motions = chain::link_motions(twin.chain, theta, capture.base.pose(view.time));
     const math::MatrixX points = chain::centerline(twin.chain, motions, along);
-    const math::Pose camera_from_world = camera.world_from_camera.inverse();
     for (std::size_t i = 0; i < along.size(); ++i) {
-      const math::Vector3 point = camera_from_world * math::Vector3(points.col(static_cast<Eigen::Index>(i)));
-      if (point.z() < image_model::kNear) continue;
-      const math::Vector2 pixel = capture::project(camera, point);
-      const int x = static_cast<int>(std::floor(pixel.x())) - view.x0,
-                y = static_cast<int>(std::floor(pixel.y())) - view.y0;
-      if (x < 0 || y < 0 || x >= view.width || y >= view.height) continue;
-      seen[i] |= view.rgba[4 * (static_cast<std::size_t>(y) * view.width + x) + 3] >= image_model::kObjectMask;
+      const math::Vector3 point = points.col(static_cast<Eigen::Index>(i));
+      seen[i] |= recognition::pixel_of(camera, view, point) != nullptr;
     }
   }
   return static_cast<double>(std::count(seen.begin(), seen.end(), 0)) / static_cast<double>(along.size());

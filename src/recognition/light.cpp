@@ -21,7 +21,7 @@ constexpr double kBrightest = 0.99;       // quantile of the brightness that was
 constexpr float kDarkest = 0.05f;         // of the same unit as the mean color's light, while it is being found
 constexpr double kBelieved = 0.1;         // least share of what is left without a light that it must explain
 
-// 1 and the polynomials of first and second order that are even over the sphere.
+// 1, and the polynomials of first and second order whose mean over the sphere is 0.
 constexpr int kTerms = 9;
 using Terms = Eigen::Matrix<double, kTerms, 1>;
 Terms terms(const Vector3& n) {
