@@ -579,6 +579,25 @@ TEST_CASE("first masks that end half-way down the rope are not believed, and sai
   CHECK(rms(chain, found[25].theta, shared_truth().theta[25]) < 5e-3);
 }
 
+TEST_CASE("masks of a motion that no rope makes are doubtful after a while, and not when it ends") {
+  constexpr int kFirst = 20, kLast = 32;  // frames in which what is seen shakes by more than a rope can
+  const chain::Chain& chain = shared_twin().chain;
+  std::vector<capture::View> views(shared_views().begin(), shared_views().begin() + 45);
+  for (int f = kFirst; f < kLast; ++f) {
+    VectorX theta = shared_truth().theta[f];
+    for (int k = 0; k < theta.size(); k += 2) theta[k] += 0.25 * std::sin(3.1 * f * f + k);
+    views[f] = draw(chain, theta, f * kInterval, f, front_camera());
+  }
+  estimation::Filter filter(shared_twin(), {front_camera()}, moving_base, 0.0);
+  const auto found = follow(filter, views);
+  for (int f = 12; f < kFirst + 3; ++f) CHECK_FALSE(found[f].doubtful);
+  for (int f = kFirst + 8; f < kLast; ++f) {
+    CHECK(std::string(estimation::status(found[f])) == "doubtful");
+    CHECK(deviation(chain, found[f]) > 10.0 * deviation(chain, found[kFirst - 1]));
+  }
+  for (int f = kLast + 8; f < 45; ++f) CHECK_FALSE(found[f].doubtful);
+}
+
 TEST_CASE("a base whose stamps are late is found to be so while it moves") {
   constexpr double kLate = 0.02;
   const auto late_base = [](double time) { return moving_base(time - kLate); };

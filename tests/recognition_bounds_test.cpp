@@ -115,6 +115,13 @@ TEST_CASE("the radius that masks show: a connector is wider, what hides the rope
   const recognition::Radii radii = recognition::radii_in(chain, views);
   CHECK(radii.at(0.1) == doctest::Approx(0.5 * kDiameter).epsilon(0.08));
   CHECK(radii.at(kLength - 0.5 * kConnectorLength) == doctest::Approx(kConnector).epsilon(0.08));
+  // what the mask does not show of the rope is hidden
+  const std::vector<double> along{0.1 * kLength, 0.45 * kLength, 0.55 * kLength, 0.9 * kLength};
+  const auto shown = [&](const capture::PackedView& packed) {
+    return recognition::shown(chain, camera, capture::unpacked(packed), motions, along);
+  };
+  CHECK(shown(whole) == std::vector<char>{1, 1, 1, 1});
+  CHECK(shown(half) == std::vector<char>{1, 1, 0, 0});
   // of masks that show nothing the given radius is left
   const capture::PackedView none = picture(-1.0);
   const recognition::Radii unknown =

@@ -4,6 +4,7 @@
 
 #include <doctest/doctest.h>
 
+#include <algorithm>
 #include <cmath>
 
 namespace {
@@ -354,6 +355,18 @@ TEST_CASE("a sequence: velocity, frames without masks, bending") {
   CHECK_THROWS_AS(silhouette::fit_sequence(planar, flat), InputError);
 }
 
+// Paints over what these cameras see within `radius` px of a point of the world.
+void hide(capture::Capture& capture, const Vector3& point, double radius, const std::vector<int>& cameras) {
+  for (capture::PackedView& packed : capture.views) {
+    if (std::find(cameras.begin(), cameras.end(), packed.camera) == cameras.end()) continue;
+    capture::View view = capture::unpacked(packed);
+    const capture::Camera& c = capture.cameras[view.camera];
+    const Vector3 x = c.world_from_camera.inverse() * point;
+    paint_disk(view, c.fx * x.x() / x.z() + c.cx, c.fy * x.y() / x.z() + c.cy, radius, 0);
+    packed = capture::packed(view);
+  }
+}
+
 TEST_CASE("a rope whose end goes behind the gripper is not turned back on itself in front of it") {
   const Chain planar = rope(Bending::planar);
   constexpr int kFrames = 40;
@@ -366,19 +379,36 @@ TEST_CASE("a rope whose end goes behind the gripper is not turned back on itself
   capture::Capture film_of_curl = film(planar, kFrames, curl);
   const VectorX most = curl(0.5 * (kFrames - 1) / 30.0);
   const Vector3 behind = chain::link_motions(planar, most, base_pose()).back() * (kLength * planar.direction);
-  for (capture::PackedView& packed : film_of_curl.views) {
-    if (packed.camera == 0) continue;  // the only one that sees all of the rope
-    capture::View view = capture::unpacked(packed);
-    const capture::Camera& c = film_of_curl.cameras[view.camera];
-    const Vector3 x = c.world_from_camera.inverse() * behind;
-    paint_disk(view, c.fx * x.x() / x.z() + c.cx, c.fy * x.y() / x.z() + c.cy, kGripper, 0);
-    packed = capture::packed(view);
-  }
+  hide(film_of_curl, behind, kGripper, {1, 2});  // camera 0 is the only one that sees all of the rope
   const silhouette::SequenceFit fit = silhouette::fit_sequence(planar, film_of_curl);
   for (int f = 0; f < kFrames; ++f) {
     CAPTURE(f);
     CHECK(rms(points(planar, fit.states.theta[f], base_pose()), points(planar, curl(f / 30.0), base_pose())) < 3e-3);
   }
+}
+
+TEST_CASE("what no camera sees of a rope goes on as it did, and makes the rope neither shorter nor longer") {
+  const Chain planar = rope(Bending::planar);
+  constexpr int kFrames = 60;
+  constexpr double kGripper = 22.0;            // px, radius of what hides
+  constexpr double kLeast = 1.2, kMost = 6.6;  // rad, whole bend: its end passes by the gripper
+  const auto curl = [&](double t) -> VectorX {
+    const double share = std::min(1.0, 1.1 - 1.1 * std::cos(2.0 * kPi * 30.0 * t / (kFrames - 1)));
+    const auto along = VectorX::LinSpaced(planar.angles(), 1.0, 0.0);  // no moment bends the free end
+    return (kLeast + (kMost - kLeast) * share) / along.sum() * along;
+  };
+  capture::Capture hidden = film(planar, kFrames, curl);
+  hide(hidden, base_pose() * (0.03 * planar.direction), kGripper, {0, 1, 2});
+  const silhouette::SequenceFit fit = silhouette::fit_sequence(planar, hidden);
+  double most_hidden = 0.0;
+  for (int f = 0; f < kFrames; ++f) {
+    CAPTURE(f);
+    most_hidden = std::max(most_hidden, 1.0 - fit.frames[f].inside);
+    CHECK(rms(points(planar, fit.states.theta[f], base_pose()), points(planar, curl(f / 30.0), base_pose())) < 2e-3);
+  }
+  CHECK(most_hidden > 0.3);
+  const silhouette::CorrectionFit corrected = silhouette::fit_corrections(planar, hidden, fit);
+  CHECK(std::abs(capture::value_of(corrected.corrections, "object", "length")) < 0.005 * kLength);
 }
 
 TEST_CASE("of one camera that sees a rope's end hidden, a cold start believes what is known beforehand") {

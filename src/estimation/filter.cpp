@@ -26,6 +26,11 @@ namespace {
 // motion that one camera sees determines the motion along its rays, which it does not see.
 constexpr double kSurprise = 1.5;
 
+// Share of the last frames, fading over a time, s, and five frames at least, that nothing explains, from which on it is
+// not the rope that moves so: what is seen is laid double, or is something else. A pushed rope explains itself after
+// two frames, at most six at 30 Hz.
+constexpr double kMostSurprising = 0.6, kSurpriseTime = 0.25, kSurpriseFrames = 5.0;
+
 constexpr double kLongUnseen = 0.5;  // s without a mask, after which the rope counts as lost
 // Standard deviations that are added for the search of a lost rope.
 constexpr double kLostAngle = 0.5;  // rad
@@ -121,7 +126,9 @@ bool judge(State& state, std::span<const capture::View* const> views, const Atte
     state.whole = shown_share(state, views, attempt.predicted.mean.head(n), state.edge_offset) > kShown;
   if (!state.whole && state.hidden_since == kNever) state.hidden_since = out.time;
   const bool hidden = !state.whole && out.time - state.hidden_since < kLongHidden;
-  out.doubtful = !state.whole || folded || has_more(fit);
+  const double fresh = std::min(1.0 / kSurpriseFrames, (out.time - state.setup.last) / kSurpriseTime);
+  state.surprising += fresh * ((out.surprise > kSurprise && !out.lost ? 1.0 : 0.0) - state.surprising);
+  out.doubtful = !state.whole || folded || has_more(fit) || state.surprising > kMostSurprising;
   const bool believed = !out.lost && !folded && !hidden;
   if (!out.lost && !believed) state.last_like = state.last_seen = out.time;  // something of the rope is there
   return believed;

@@ -71,6 +71,7 @@ struct State {
   bool lost = false;                       // in the last frame
   bool whole = false;                      // the masks have shown the whole rope since it was found
   double hidden_since = kNever;            // s, first frame since it was found
+  double surprising = 0.0;                 // share of the last frames whose innovation nothing explains, fading
   std::optional<dynamics::Roller> roller;  // where the twin knows how the rope rolls on a table
   math::VectorX roll;                      // rad, of the links' material in this frame; empty: not known
   double edge_offset = 0.0, edge_offset_variance = 0.0;  // px, px^2, of the masks' outline outside the tube's

@@ -126,11 +126,8 @@ double hidden_share(const twin::Twin& twin, const capture::Capture& capture, std
     const capture::View view = capture::unpacked(capture.views[v]);
     const capture::Camera& camera = capture.cameras[view.camera];
     const auto motions = chain::link_motions(twin.chain, theta, capture.base.pose(view.time));
-    const math::MatrixX points = chain::centerline(twin.chain, motions, along);
-    for (std::size_t i = 0; i < along.size(); ++i) {
-      const math::Vector3 point = points.col(static_cast<Eigen::Index>(i));
-      seen[i] |= recognition::pixel_of(camera, view, point) != nullptr;
-    }
+    const std::vector<char> here = recognition::shown(twin.chain, camera, view, motions, along);
+    for (std::size_t i = 0; i < along.size(); ++i) seen[i] |= here[i];
   }
   return static_cast<double>(std::count(seen.begin(), seen.end(), 0)) / static_cast<double>(along.size());
 }

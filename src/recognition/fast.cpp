@@ -67,19 +67,49 @@ struct TrainingViews {
   std::vector<int> index_of;  // capture view -> training view or -1
 };
 
-TrainingViews training_views(const capture::Capture& capture, const std::vector<FrameViews>& frames, int every) {
+// Of these frames those in which no more of the rope is hidden than in most: Gaussians become transparent where
+// something is in front of them. All where there are too few. `states` by silhouettes.
+std::vector<int> unhidden(const chain::Chain& chain, const capture::Capture& capture,
+                          const std::vector<FrameViews>& frames, const chain::States& states,
+                          const std::vector<int>& candidates) {
+  constexpr int kPoints = 97;          // along the rope
+  constexpr double kUsual = 0.2;       // quantile of the share that is hidden,
+  constexpr double kMore = 0.05;       // share more than that which is much
+  constexpr double kLeastShare = 0.3;  // of the frames
+  const std::vector<double> along = chain::equal_arclengths(chain, kPoints);
+  std::vector<double> hidden(candidates.size(), 0.0);  // mean over the views
+  core::parallel_for(static_cast<std::int64_t>(candidates.size()), [&](std::int64_t i) {
+    const int k = candidates[i];
+    for (const int v : frames[k].views) {
+      const capture::View view = capture::unpacked(capture.views[v]);
+      const auto motions = view_motions(chain, capture, states, frames[k], k, states.theta[k], view);
+      const std::vector<char> seen = shown(chain, capture.cameras[view.camera], view, motions, along);
+      hidden[i] += static_cast<double>(std::count(seen.begin(), seen.end(), 0)) /
+                   static_cast<double>(seen.size() * frames[k].views.size());
+    }
+  });
+  std::vector<double> sorted = hidden;
+  std::sort(sorted.begin(), sorted.end());
+  std::vector<int> out;
+  for (std::size_t i = 0; i < candidates.size(); ++i)
+    if (hidden[i] <= sorted[static_cast<std::size_t>(kUsual * static_cast<double>(sorted.size()))] + kMore)
+      out.push_back(candidates[i]);
+  return static_cast<double>(out.size()) < kLeastShare * static_cast<double>(candidates.size()) ? candidates : out;
+}
+
+TrainingViews training_views(const chain::Chain& chain, const capture::Capture& capture,
+                             const std::vector<FrameViews>& frames, const chain::States& states, int every) {
   constexpr std::size_t kMost = static_cast<std::size_t>(kBatch) * kTotalSteps;  // views: the steps draw no more
   TrainingViews t;
   t.index_of.assign(capture.views.size(), -1);
-  std::vector<int> shown;
+  std::vector<int> used;
+  for (int k = 0; k < static_cast<int>(frames.size()); k += every)
+    if (!frames[k].views.empty()) used.push_back(k);
+  used = used.empty() ? used : unhidden(chain, capture, frames, states, used);
   std::size_t views = 0;
-  for (int k = 0; k < static_cast<int>(frames.size()); k += every) {
-    if (frames[k].views.empty()) continue;
-    shown.push_back(k);
-    views += frames[k].views.size();
-  }
-  for (std::size_t i = 0; i < shown.size(); i += (views + kMost - 1) / kMost) {
-    const int k = shown[i];
+  for (const int k : used) views += frames[k].views.size();
+  for (std::size_t i = 0; i < used.size(); i += (views + kMost - 1) / kMost) {
+    const int k = used[i];
     t.frames.push_back(k);
     for (const int v : frames[k].views) {
       t.index_of[v] = static_cast<int>(t.views.size());
@@ -429,7 +459,9 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   if (!resumed && lies_flat(job, job.result.bending.bending))
     job.states.roll = rolls_in(job.result.chain, capture, job.frames, job.states);
   if (!resumed) light = light_on(job.result.chain, capture, job.frames, job.states);
-  job.training = training_views(capture, job.frames, std::max(1, options.every));
+  chain::States by_silhouettes = job.states;  // as they were when the job began, whether it is resumed or not
+  by_silhouettes.theta = job.coarse;
+  job.training = training_views(job.result.chain, capture, job.frames, by_silhouettes, std::max(1, options.every));
   if (job.training.views.empty())
     throw WorkError(capture.name, "no training frame shows the object", "use `every` 1 or check the masks");
   job.empty = empty_losses(capture, job.training);
@@ -439,8 +471,6 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
   std::vector<const capture::PackedView*> targets;
   for (const int v : job.training.views) targets.push_back(&capture.views[v]);
   engine.set_views(specs, targets);
-  chain::States by_silhouettes = job.states;  // as they were when the job began, whether it is resumed or not
-  by_silhouettes.theta = job.coarse;
   const Radii radii = radii_in(job.result.chain, viewpoints_of(job, posed_views(job, by_silhouettes)));
   const int budget = budget_of(capture, options);
   if (!resumed) {

@@ -21,6 +21,14 @@ const std::uint8_t* pixel_of(const capture::Camera& camera, const capture::View&
   return rgba[3] >= image_model::kObjectMask ? rgba : nullptr;
 }
 
+std::vector<char> shown(const chain::Chain& chain, const capture::Camera& camera, const capture::View& view,
+                        std::span<const math::Pose> motions, std::span<const double> arclengths) {
+  std::vector<char> out;
+  for (const double s : arclengths)
+    out.push_back(pixel_of(camera, view, motions[chain::link_at(chain, s)] * Vector3(s * chain.direction)) != nullptr);
+  return out;
+}
+
 double Radii::at(double arclength) const {
   const int nearest = static_cast<int>(std::floor(arclength / spacing)), last = static_cast<int>(radius.size()) - 1;
   double most = 0.0;

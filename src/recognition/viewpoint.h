@@ -18,6 +18,10 @@ struct Viewpoint {
 // The pixel (r, g, b, mask) of the rope that shows this point of the world; null where something else is seen there.
 const std::uint8_t* pixel_of(const capture::Camera& camera, const capture::View& view, const math::Vector3& world);
 
+// Of places along the posed rope, by arclength, m: which lie in the view's mask. Something hides the others.
+std::vector<char> shown(const chain::Chain& chain, const capture::Camera& camera, const capture::View& view,
+                        std::span<const math::Pose> motions, std::span<const double> arclengths);
+
 // The radius that masks show along the rope, which a connector at the tip or a knot makes larger than the given one.
 struct Radii {
   double spacing = 0.0;               // m of arclength between values, from half of it on

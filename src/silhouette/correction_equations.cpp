@@ -62,6 +62,7 @@ void pose_view(const CorrectionProblem& fit, const CorrectedFrame& frame, std::s
   out.base_twist = math::transform_twist(camera_from_recorded, base.velocity);
   pose(out.problem, theta + after * frame.thetadot);
   choose_blobs(out.problem, kBlobReach);
+  find_hidden(out.problem, kHiddenReach, fit.cut);
   for (int k = 0; k < chain.angles(); ++k)
     out.twists.col(k) = math::transform_twist(out.problem.views[0].camera_from_base, out.problem.axes.col(k));
 }

@@ -362,19 +362,37 @@ MaskPoints mask_of(const capture::Capture& capture, int v) {
   return mask_points(capture::unpacked(view), capture.cameras[view.camera], Options{}.max_pixels);
 }
 
-// Frames that show something, evenly spread, with their masks; returns their angles.
+// Frames that show the rope: those in which as much of it is in the masks as in most. What is hidden follows from the
+// prior alone, which prefers straight ropes and would have shorter ones. All that show something where most hide a
+// part.
+std::vector<int> telling_frames(const SequenceFit& sequence, const Frames& all) {
+  constexpr double kUsual = 0.8;       // quantile of the share that is in the masks
+  constexpr double kLessInside = 0.1;  // share less than that which is not told from what usual masks leave out
+  constexpr double kLeastShare = 0.3;  // of the frames that show something
+  std::vector<int> shown, telling;
+  std::vector<double> inside;
+  for (int f = 0; f < static_cast<int>(all.times.size()); ++f) {
+    if (all.views[f].empty() || !(sequence.frames[f].residual_pixels > 0.0)) continue;
+    shown.push_back(f);
+    inside.push_back(sequence.frames[f].inside);
+  }
+  if (shown.empty()) return shown;
+  std::sort(inside.begin(), inside.end());
+  const double least = inside[static_cast<std::size_t>(kUsual * static_cast<double>(inside.size()))] - kLessInside;
+  for (const int f : shown)
+    if (sequence.frames[f].inside >= least) telling.push_back(f);
+  return telling.size() < kLeastShare * static_cast<double>(shown.size()) ? shown : telling;
+}
+
+// Up to `most` telling frames, evenly spread, with their masks; returns their angles.
 std::vector<VectorX> choose_frames(const SequenceFit& sequence, int most, const capture::Capture& capture,
                                    CorrectionProblem& problem) {
   const Frames all = frames_of(capture);
-  const auto seen = [&](int f) { return !all.views[f].empty() && sequence.frames[f].residual_pixels > 0.0; };
-  const int count = static_cast<int>(all.times.size());
-  int every = std::max(1, (count + most - 1) / most);
-  bool any = false;
-  for (int f = 0; f < count; f += every) any = any || seen(f);
-  if (!any) every = 1;
+  const std::vector<int> telling = telling_frames(sequence, all);
+  const std::size_t count = std::min<std::size_t>(most, telling.size());
   std::vector<VectorX> theta;
-  for (int f = 0; f < count; f += every) {
-    if (!seen(f)) continue;
+  for (std::size_t i = 0; i < count; ++i) {
+    const int f = telling[i * telling.size() / count];
     problem.frames.push_back({all.times[f], sequence.states.thetadot[f], all.views[f], {}});
     theta.push_back(sequence.states.theta[f]);
   }

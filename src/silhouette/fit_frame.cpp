@@ -44,8 +44,9 @@ constexpr double kFineVariance = 1.0;
 constexpr double kStartBend = 1.5;                  // rad, whole bend of the extra starts
 constexpr double kAlike = 1.5, kAlikePixels = 2.0;  // costs under this times the best, plus this (px^2), are alike
 
-constexpr double kClearly = 0.02;  // difference of shares covered and inside
-constexpr double kAllowed = 9.0;   // square deviations of the given prior per number, up to which it allows a fit
+constexpr double kClearly = 0.02;    // difference of shares covered and inside
+constexpr double kExplained = 0.97;  // share of the masks; where less is, what was taken for hidden may be there
+constexpr double kAllowed = 9.0;     // square deviations of the given prior per number, up to which it allows a fit
 
 // Index of the angle before k about the same axis, -1 for the first.
 int neighbor(const chain::Chain& chain, int k) {
@@ -168,6 +169,9 @@ MatrixX joint_prior(const chain::Chain& chain, const Options& options) {
     information(k, l) -= difference;
     information(l, k) -= difference;
   }
+  // no moment bends the free end
+  for (int k = 0; k < n; ++k)
+    if (chain.child_link[k] + 1 == chain.links()) information(k, k) += difference;
   return information;
 }
 
@@ -181,6 +185,7 @@ struct Work {
   OffsetBelief offset = {};
   VectorX unknowns = {};  // angles, masks' shifts where they are unknown, edge offset
   FineSums total = {};    // of the last fine equations
+  bool hiding = false;    // a part may be hidden
   FrameSolution out = {};
 
   int angles() const { return problem.chain->angles(); }
@@ -249,6 +254,7 @@ void fine_stage(Work& work, const VectorX& theta) {
   work.unknowns[last] = work.offset.mean;
   place(problem, work.unknowns);
   choose_blobs(problem, kLastReach);
+  if (work.hiding) find_hidden(problem, kHiddenReach, kFirstCut);
   double cut = kFirstCut;
   const auto equations = [&](const VectorX& at) {
     place(problem, at);
@@ -267,6 +273,11 @@ void fine_stage(Work& work, const VectorX& theta) {
 // The angles from which the fine stage starts where the frame before is known.
 VectorX warm_angles(Work& work, const VectorX& start) {
   work.unknowns.head(work.angles()) = start;
+  if (work.hiding) {
+    place(work.problem, work.unknowns);
+    choose_blobs(work.problem, kReach);
+    find_hidden(work.problem, kHiddenReach, 0.0);
+  }
   coarse_stage(work.problem, work.belief, std::max(1, work.options.iterations / 2), true, work.options, work.unknowns);
   return work.unknowns.head(work.angles());
 }
@@ -363,15 +374,21 @@ bool explains_less(const FrameFit& a, const FrameFit& b) {
   return a.covered < b.covered - kClearly && a.inside < b.inside - kClearly;
 }
 
-FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView>& views, const VectorX& start,
-                          bool warm, const Options& options) {
+namespace {
+
+// `hiding`: a part of the rope may be hidden where `start` is near.
+FrameSolution solve_once(const chain::Chain& chain, const std::vector<FrameView>& views, const VectorX& start,
+                         bool warm, bool hiding, const Options& options) {
   Work work{options, make_problem(chain, views, options)};
   work.offset = {options.edge_offset, 1.0 / (options.edge_offset_deviation * options.edge_offset_deviation)};
   work.belief = make_belief(work, start, warm);
   work.unknowns = VectorX::Zero(work.problem.unknowns());
+  work.hiding = warm && hiding;
   reset_shifts(work);
 
-  fine_stage(work, warm ? warm_angles(work, start) : cold_angles(work, start));
+  const VectorX near = warm ? warm_angles(work, start) : cold_angles(work, start);
+  work.hiding = hiding;
+  fine_stage(work, near);
 
   take_information(work);
   FrameFit& fit = work.out.fit;
@@ -383,6 +400,16 @@ FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView
   fit.residual_pixels = work.total.weight > 0 ? std::sqrt(work.total.weighted_square / work.total.weight) : 0.0;
   judge(work.problem, work.out);
   return std::move(work.out);
+}
+
+}  // namespace
+
+FrameSolution solve_frame(const chain::Chain& chain, const std::vector<FrameView>& views, const VectorX& start,
+                          bool warm, const Options& options) {
+  FrameSolution out = solve_once(chain, views, start, warm, true, options);
+  if (!warm || out.fit.covered + out.fit.foreign > kExplained) return out;
+  FrameSolution seen = solve_once(chain, views, start, warm, false, options);
+  return seen.fit.covered > out.fit.covered + kClearly ? std::move(seen) : std::move(out);
 }
 
 FrameFit fit_frame(const chain::Chain& chain, const Pose& base, std::span<const capture::View* const> views,

@@ -158,8 +158,7 @@ void fit_forward(Sequence& s) {
   each_frame(s, [&](int f, const std::vector<FrameView>& views) {
     s.solutions[f] = solve_frame(s.chain, views, start, f > first, s.each);
     const FrameFit& fit = s.solutions[f].fit;
-    if (f > first && s.seen[f] && (fit.covered < kLost || fit.inside < kLost))
-      try_again(s, f, views, s.straight(), false);
+    if (f > first && s.seen[f] && fit.covered < kLost) try_again(s, f, views, s.straight(), false);
     if (s.seen[f]) start = s.solutions[f].fit.theta;
   });
 }
@@ -175,16 +174,20 @@ void repair(Sequence& s) {
   }
   const double usual_covered = math::median(covered), usual_inside = math::median(inside),
                usual_residual = math::median(residual);
-  const auto bad = [&](int f) {
+  const auto unexplained = [&](int f) {
     const FrameFit& fit = s.solutions[f].fit;
-    return s.seen[f] && (fit.covered < usual_covered - kLessCovered || fit.inside < usual_inside - kLessInside ||
+    return s.seen[f] && (fit.covered < usual_covered - kLessCovered ||
                          fit.residual_pixels > kMoreResidual * usual_residual + kMoreResidualPixels);
+  };
+  const auto bad = [&](int f) {
+    return unexplained(f) || (s.seen[f] && s.solutions[f].fit.inside < usual_inside - kLessInside);
   };
   for (int f = s.count() - 1; f >= 0; --f) {
     if (!bad(f)) continue;
     const FrameMasks masks = std::move(masks_of(s, f, f + 1)[0]);
     if (f + 1 < s.count()) try_again(s, f, masks.views, s.solutions[f + 1].fit.theta, true);
-    if (bad(f)) try_again(s, f, masks.views, s.straight(), false);
+    // from scratch a part that is hidden would be found where the rope is seen
+    if (unexplained(f)) try_again(s, f, masks.views, s.straight(), false);
   }
   for (int f = 1; f < s.count(); ++f)
     if (bad(f)) try_again(s, f, masks_of(s, f, f + 1)[0].views, s.solutions[f - 1].fit.theta, true);

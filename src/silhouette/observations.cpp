@@ -115,7 +115,7 @@ bool in_mask(const ViewWork& work, const Vector2& pixel) {
   return blob >= 0 && work.active[blob];
 }
 
-void add_coarse(ViewWork& work, double cut) {
+void add_coarse(ViewWork& work, double cut, bool problem_settled) {
   const capture::Camera& camera = *work.view->camera;
   const MaskPoints& mask = *work.view->mask;
   int count = 0;
@@ -137,6 +137,7 @@ void add_coarse(ViewWork& work, double cut) {
   }
   if (count == 0) return;
   const double share = kReverseWeight * count / (kReverseSamples * static_cast<double>(work.segments.size()));
+  if (problem_settled) return;
   for_each_sample(work, [&](const Segment& s, double t, const Vector2& pixel) {
     if (in_mask(work, pixel)) return;
     const Vector2 offset = nearest_pixel(work, pixel) - pixel;
@@ -236,6 +237,7 @@ void pose(Problem& problem, const VectorX& theta) {
       s.per_length2 = 1.0 / length2;
       s.tangent = s.step / std::sqrt(length2);
       s.normal = Vector2(-s.tangent.y(), s.tangent.x());
+      s.hidden = !work.hidden.empty() && work.hidden[link];
       work.segments.push_back(s);
     }
   }
@@ -262,10 +264,71 @@ void choose_blobs(Problem& problem, double reach) {
   }
 }
 
+namespace {
+
+// Share of the active blobs' pixels that lie within `distance` px of the projected chain.
+double covered_share(const ViewWork& work, double distance) {
+  const MaskPoints& mask = *work.view->mask;
+  int near = 0, all = 0;
+  for (std::size_t b = 0; b < mask.blobs.size(); ++b) {
+    if (!work.active[b]) continue;
+    for (int i = mask.blobs[b].first_pixel; i < mask.blobs[b].last_pixel; ++i, ++all)
+      near += nearest(work.segments, mask.pixels[i]).distance2 <= distance * distance;
+  }
+  return all > 0 ? static_cast<double>(near) / all : 0.0;
+}
+
+// Whether a mask lies on a segment or within `distance` px on either side, as far as no link apart from it explains it.
+bool shows(const ViewWork& work, const Segment& s, double distance) {
+  const double spacing = std::max(1.0, 0.25 * work.diameter);  // px, finer than what is left of a rope's mask
+  const int across = static_cast<int>(std::ceil(distance / spacing));
+  const int along = std::max(1, static_cast<int>(std::ceil(s.step.norm() / spacing)));
+  const double half_width2 = 0.25 * work.diameter * work.diameter;
+  const auto distance2 = [&](const Segment& from, const Vector2& pixel) {
+    const Vector2 offset = pixel - from.from;
+    return (offset - std::clamp(offset.dot(from.step) * from.per_length2, 0.0, 1.0) * from.step).squaredNorm();
+  };
+  const auto explained = [&](const Vector2& pixel) {
+    const double own = distance2(s, pixel);
+    return std::any_of(work.segments.begin(), work.segments.end(), [&](const Segment& other) {
+      return std::abs(other.link - s.link) > 1 && distance2(other, pixel) < std::min(own, half_width2);
+    });
+  };
+  for (int i = 0; i <= along; ++i)
+    for (int j = -across; j <= across; ++j) {
+      const Vector2 pixel = s.from + static_cast<double>(i) / along * s.step + j * distance / across * s.normal;
+      if (in_mask(work, pixel) && !explained(pixel)) return true;
+    }
+  return false;
+}
+
+}  // namespace
+
+bool find_hidden(Problem& problem, double reach, double least) {
+  constexpr double kNearlyAll = 0.97;  // share of a mask's pixels
+  bool all = true;
+  for (ViewWork& work : problem.views) {
+    work.hidden.clear();
+    for (Segment& s : work.segments) s.hidden = false;
+    const double distance = std::max(reach * work.diameter, least);
+    if (covered_share(work, distance) < kNearlyAll) {
+      all = false;
+      continue;
+    }
+    work.hidden.assign(problem.chain->links(), 0);
+    for (Segment& s : work.segments) work.hidden[s.link] = s.hidden = !shows(work, s, distance);
+    if (std::any_of(work.segments.begin(), work.segments.end(), [](const Segment& s) { return !s.hidden; })) continue;
+    work.hidden.clear();  // what is in the mask is beyond the chain's ends
+    for (Segment& s : work.segments) s.hidden = false;
+    all = false;
+  }
+  return all;
+}
+
 void coarse_equations(Problem& problem, double cut) {
   for (ViewWork& work : problem.views) {
     clear(work.sums);
-    add_coarse(work, cut);
+    add_coarse(work, cut, !work.hidden.empty());
   }
   assemble(problem);
 }

@@ -11,6 +11,7 @@ using image_model::kNear;
 
 constexpr double kLeastCut = 2.5;             // px, Tukey's cut-off is this at least,
 constexpr double kLargestCut = 12.0;          // px, and this at most: no outline point farther from the tube counts
+constexpr double kHiddenReach = 1.5;          // diameters beside a link within which some of it is seen, if it is
 constexpr double kLinkOffsetDeviation = 0.2;  // px, of a link's outline in one view about the common offset
 
 // Tukey's cut-off that residuals of these absolute sizes call for (reorders them): 95 % efficient on Gaussian ones.
@@ -30,6 +31,7 @@ struct Segment {
   Vector2 from, step;        // px: image of a, and from there to the image of b
   Vector2 tangent, normal;   // unit
   double per_length2 = 0.0;  // 1 / |step|^2
+  bool hidden = false;       // ViewWork::hidden
 };
 
 // Normal equations of one view by link, in camera coordinates: a row is (x cross g, g, derivatives by the edge offset
@@ -45,6 +47,7 @@ struct ViewWork {
   std::vector<Segment> segments;
   LinkSums sums;
   std::vector<char> active;         // by blob
+  std::vector<char> hidden;         // by link: no mask shows it, so that no outline is its own; empty: none is hidden
   Vector2 shift = Vector2::Zero();  // px, by which the mask is thought to be shifted
   double diameter = 0.0;            // px, at the depth of the base
 };
@@ -72,6 +75,11 @@ void pose(Problem& problem, const math::VectorX& theta);
 
 // Keeps the blobs whose median pixel is within `reach` diameters of the posed chain; without any, those at the grasp.
 void choose_blobs(Problem& problem, double reach);
+
+// Finds the links that something hides from each view: where the posed chain covers nearly all of a mask to `reach`
+// diameters or `least` px, whichever is more, no mask lies within that beside a hidden link. Elsewhere the chain may be
+// off, and none is taken for hidden. Returns whether all views are covered.
+bool find_hidden(Problem& problem, double reach, double least);
 
 // Equations of the posed chain in `problem.normal` and `.right`. Coarse: mask pixels and centerline samples, Huber cut.
 void coarse_equations(Problem& problem, double cut);

@@ -15,7 +15,7 @@ constexpr double kAligned = 0.7;   // least cosine between outline and tube norm
 constexpr double kLeastArm = 1.0;  // px, from a joint, to tell a direction from it
 constexpr double kEndReach = 2.0;  // half widths from an end of the rope within which an outline may be the end's
 
-struct Nearest {  // place on the projected centerline nearest to a pixel
+struct Nearest {  // place on the projected centerline nearest to a pixel, of what is not hidden
   int segment = -1;
   double t = 0.0;  // along the segment in the image, 0 to 1
   double distance2 = 1e300;
@@ -35,6 +35,7 @@ inline Nearest nearest(const std::vector<Segment>& segments, const Vector2& pixe
   Nearest best;
   for (int i = 0; i < static_cast<int>(segments.size()); ++i) {
     const Segment& s = segments[i];
+    if (s.hidden) continue;
     const Vector2 offset = pixel - s.from;
     const double t = std::clamp(offset.dot(s.step) * s.per_length2, 0.0, 1.0);
     const double distance2 = (offset - t * s.step).squaredNorm();
@@ -102,8 +103,8 @@ void for_each_outline_point(const chain::Chain& chain, const ViewWork& work, con
   if (work.segments.empty()) return;
   const Segment &first = work.segments.front(), &last = work.segments.back();
   std::optional<EndDisk> end, start;
-  if (last.link + 1 == chain.links()) end = end_disk(camera, last, last.b, 1.0, radius);
-  if (ends.mask_start && chain.link_start(first.link) <= 0.0)
+  if (last.link + 1 == chain.links() && !last.hidden) end = end_disk(camera, last, last.b, 1.0, radius);
+  if (ends.mask_start && chain.link_start(first.link) <= 0.0 && !first.hidden)
     start = end_disk(camera, first, first.a + *ends.mask_start * (first.b - first.a).normalized(), -1.0, radius);
   // whether a piece of outline shows the disk; visits it
   const auto shows = [&](const Edge& edge, const EndDisk& disk, const Segment& segment, OutlinePoint::Part part) {
