@@ -575,7 +575,7 @@ TEST_CASE("first masks that end half-way down the rope are not believed, and sai
     CHECK(std::string(estimation::status(found[f])) == "doubtful");
     CHECK(rms(chain, found[f].theta, shared_truth().theta[f]) < 3.0 * deviation(chain, found[f]));
   }
-  for (int f = 12; f < 30; ++f) CHECK(std::string(estimation::status(found[f])) == "following");
+  for (int f = 15; f < 30; ++f) CHECK(std::string(estimation::status(found[f])) == "following");
   CHECK(rms(chain, found[25].theta, shared_truth().theta[25]) < 5e-3);
 }
 

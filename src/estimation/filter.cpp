@@ -49,8 +49,9 @@ constexpr int kFirstRounds = 3;      // of masks and setup in turn, in the first
 // Share of the masks that the rope covers, below which something else is in them, and the rope is sought elsewhere,
 // too; there it must cover so much more.
 constexpr double kUnexplained = 0.8, kBetter = 0.1;
-constexpr double kDoubtAngle = 0.15;  // rad, added to the deviations of a doubtful rope's angles
-constexpr double kLongUnlike = 0.2;   // s of such frames, after which the rope counts as lost
+constexpr double kDoubtAngle = 0.2;    // rad, added to the deviations of a doubtful rope's angles
+constexpr double kDoubtMemory = 0.15;  // s without a reason to doubt, after which a rope is not doubtful any more
+constexpr double kLongUnlike = 0.2;    // s of such frames, after which the rope counts as lost
 
 // The share of the masks that is not the rope's: what lies apart from a rope that is seen nearly whole.
 double foreign_share(const silhouette::FrameFit& fit) { return fit.inside >= kUnexplained ? fit.foreign : 0.0; }
@@ -128,7 +129,11 @@ bool judge(State& state, std::span<const capture::View* const> views, const Atte
   const bool hidden = !state.whole && out.time - state.hidden_since < kLongHidden;
   const double fresh = std::min(1.0 / kSurpriseFrames, (out.time - state.setup.last) / kSurpriseTime);
   state.surprising += fresh * ((out.surprise > kSurprise && !out.lost ? 1.0 : 0.0) - state.surprising);
-  out.doubtful = !state.whole || folded || has_more(fit) || state.surprising > kMostSurprising;
+  const bool doubt = !state.whole || folded || has_more(fit) || state.surprising > kMostSurprising ||
+                     state.frames < state.options.doubtful_frames;
+  if (doubt) state.last_doubt = out.time;
+  out.doubtful = out.time - state.last_doubt < kDoubtMemory;
+  ++state.frames;
   const bool believed = !out.lost && !folded && !hidden;
   if (!out.lost && !believed) state.last_like = state.last_seen = out.time;  // something of the rope is there
   return believed;
@@ -150,7 +155,9 @@ void learn(State& state, std::span<const capture::View* const> views, const Atte
   if (state.compare_colors) look_at_colors(state, views, *state.belief, out);
   if (first || out.likeness.value_or(1.0) >= kUnlike) state.last_like = out.time;
   learn_force(state, out.time);
-  learn_setup(state, looked.get(), attempt.predicted, theta);
+  // where the fit may be wrong, a camera that is moved would make it right
+  if (const std::optional<silhouette::SetupEquations> seen = looked.get(); !out.doubtful)
+    learn_setup(state, seen, attempt.predicted, theta);
   const double gain = 1.0 / kOffsetFrames;
   state.edge_offset += gain * (attempt.measured.fit.edge_offset - state.edge_offset);
   state.edge_offset_variance =
@@ -201,6 +208,8 @@ Estimate update(State& state, std::span<const capture::View* const> views) {
     Attempt attempt = measure_frame(state, predicted, motion, views);
     // at first masks of cameras that are off bend the rope toward them; where they stand is learned from these, and
     // counts once
+    const Setup given = state.setup;
+    const std::vector<capture::Camera> given_cameras = state.cameras;
     for (int round = 0; first && round < kFirstRounds && explains(attempt.measured.fit); ++round) {
       const Setup before = state.setup;
       const VectorX& theta = attempt.measured.fit.theta;
@@ -212,6 +221,7 @@ Estimate update(State& state, std::span<const capture::View* const> views) {
     }
     believed = judge(state, views, attempt, out);
     if (believed) learn(state, views, attempt, first, out);
+    if (first && !believed) state.setup = given, state.cameras = given_cameras;  // nothing is learned of such masks
     predicted = attempt.predicted;
   }
   if (!believed) {
@@ -221,7 +231,8 @@ Estimate update(State& state, std::span<const capture::View* const> views) {
     state.belief = first_belief(state, view.time);
     out.lost = true;
   }
-  out.doubtful = !out.lost && (out.doubtful || out.likeness.value_or(1.0) < kUnlike);
+  if (out.likeness.value_or(1.0) < kUnlike) state.last_doubt = out.time;
+  out.doubtful = !out.lost && out.time - state.last_doubt < kDoubtMemory;
   out.settling = view.time < state.setup.settling_until;
   state.setup.last = view.time;
   if (out.lost) state.whole = false, state.hidden_since = kNever;

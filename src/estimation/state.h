@@ -68,6 +68,8 @@ struct State {
   math::VectorX place;                     // shares of the links' ends in the unknown force, as learned in contact
   double last_seen = kNever;               // s, last frame in which the masks showed the rope
   double last_like = kNever;               // s, last frame in which the colors in the masks were like the twin's
+  double last_doubt = kNever;              // s, last frame that gave reason to doubt
+  int frames = 0;                          // in which something was seen
   bool lost = false;                       // in the last frame
   bool whole = false;                      // the masks have shown the whole rope since it was found
   double hidden_since = kNever;            // s, first frame since it was found
