@@ -303,12 +303,14 @@ void correct_colors(const silhouette::CorrectionFit& fit, const std::vector<std:
 bool held_high(const capture::Capture& capture, std::vector<Finding>& verdict) {
   // m: held 15 mm above it, cameras were found to be off by 10 degrees; faults of base, grasp and table alone are less
   const double high = std::max(0.25 * capture.diameter, 0.005);
+  const double too_high = 0.4 * capture.diameter;  // m, beyond which the errors that are stated are too small
   const double above = std::abs(silhouette::height_by_table(capture));
   if (above < high) return false;
-  verdict.push_back({"held-high", "object", kMeters * above, 0.0, "mm", false, false, false, -1,
+  const bool trusted = above < too_high;
+  verdict.push_back({"held-high", "object", kMeters * above, 0.0, "mm", false, trusted, false, -1,
                      text("the rope is held %.0f mm above where it lies on the table: how it comes down is assumed, and "
-                          "nothing is corrected, which would make up for that: do not trust it to a few millimeters",
-                          kMeters * above)});
+                          "nothing is corrected, which would make up for that%s",
+                          kMeters * above, trusted ? "" : ": do not trust it to a few millimeters")});
   return true;
 }
 
