@@ -2,6 +2,8 @@
 #include <algorithm>
 #include <cmath>
 #include <future>
+#include <tuple>
+#include <utility>
 
 #include "src/estimation/color.h"
 #include "src/estimation/measure.h"
@@ -208,8 +210,7 @@ Estimate update(State& state, std::span<const capture::View* const> views) {
     Attempt attempt = measure_frame(state, predicted, motion, views);
     // at first masks of cameras that are off bend the rope toward them; where they stand is learned from these, and
     // counts once
-    const Setup given = state.setup;
-    const std::vector<capture::Camera> given_cameras = state.cameras;
+    const auto given = first ? std::optional(std::pair(state.setup, state.cameras)) : std::nullopt;
     for (int round = 0; first && round < kFirstRounds && explains(attempt.measured.fit); ++round) {
       const Setup before = state.setup;
       const VectorX& theta = attempt.measured.fit.theta;
@@ -221,7 +222,7 @@ Estimate update(State& state, std::span<const capture::View* const> views) {
     }
     believed = judge(state, views, attempt, out);
     if (believed) learn(state, views, attempt, first, out);
-    if (first && !believed) state.setup = given, state.cameras = given_cameras;  // nothing is learned of such masks
+    if (given && !believed) std::tie(state.setup, state.cameras) = *given;  // nothing is learned of such masks
     predicted = attempt.predicted;
   }
   if (!believed) {

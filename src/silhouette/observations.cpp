@@ -115,7 +115,7 @@ bool in_mask(const ViewWork& work, const Vector2& pixel) {
   return blob >= 0 && work.active[blob];
 }
 
-void add_coarse(ViewWork& work, double cut, bool problem_settled) {
+void add_coarse(ViewWork& work, double cut) {
   const capture::Camera& camera = *work.view->camera;
   const MaskPoints& mask = *work.view->mask;
   int count = 0;
@@ -135,9 +135,9 @@ void add_coarse(ViewWork& work, double cut, bool problem_settled) {
             weight);
     }
   }
-  if (count == 0) return;
+  // where it is known what is hidden, the rest of the mask is not where that should be
+  if (count == 0 || !work.hidden.empty()) return;
   const double share = kReverseWeight * count / (kReverseSamples * static_cast<double>(work.segments.size()));
-  if (problem_settled) return;
   for_each_sample(work, [&](const Segment& s, double t, const Vector2& pixel) {
     if (in_mask(work, pixel)) return;
     const Vector2 offset = nearest_pixel(work, pixel) - pixel;
@@ -280,9 +280,10 @@ double covered_share(const ViewWork& work, double distance) {
 
 // Whether a mask lies on a segment or within `distance` px on either side, as far as no link apart from it explains it.
 bool shows(const ViewWork& work, const Segment& s, double distance) {
+  constexpr double kMostAlong = 400.0;  // places: a link that comes near the camera's plane is endless in the image
   const double spacing = std::max(1.0, 0.25 * work.diameter);  // px, finer than what is left of a rope's mask
   const int across = static_cast<int>(std::ceil(distance / spacing));
-  const int along = std::max(1, static_cast<int>(std::ceil(s.step.norm() / spacing)));
+  const int along = static_cast<int>(std::clamp(std::ceil(s.step.norm() / spacing), 1.0, kMostAlong));
   const double half_width2 = 0.25 * work.diameter * work.diameter;
   const auto distance2 = [&](const Segment& from, const Vector2& pixel) {
     const Vector2 offset = pixel - from.from;
@@ -304,31 +305,25 @@ bool shows(const ViewWork& work, const Segment& s, double distance) {
 
 }  // namespace
 
-bool find_hidden(Problem& problem, double reach, double least) {
+void find_hidden(Problem& problem, double reach, double least) {
   constexpr double kNearlyAll = 0.97;  // share of a mask's pixels
-  bool all = true;
   for (ViewWork& work : problem.views) {
     work.hidden.clear();
     for (Segment& s : work.segments) s.hidden = false;
     const double distance = std::max(reach * work.diameter, least);
-    if (covered_share(work, distance) < kNearlyAll) {
-      all = false;
-      continue;
-    }
+    if (covered_share(work, distance) < kNearlyAll) continue;
     work.hidden.assign(problem.chain->links(), 0);
     for (Segment& s : work.segments) work.hidden[s.link] = s.hidden = !shows(work, s, distance);
     if (std::any_of(work.segments.begin(), work.segments.end(), [](const Segment& s) { return !s.hidden; })) continue;
     work.hidden.clear();  // what is in the mask is beyond the chain's ends
     for (Segment& s : work.segments) s.hidden = false;
-    all = false;
   }
-  return all;
 }
 
 void coarse_equations(Problem& problem, double cut) {
   for (ViewWork& work : problem.views) {
     clear(work.sums);
-    add_coarse(work, cut, !work.hidden.empty());
+    add_coarse(work, cut);
   }
   assemble(problem);
 }

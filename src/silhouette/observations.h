@@ -47,7 +47,7 @@ struct ViewWork {
   std::vector<Segment> segments;
   LinkSums sums;
   std::vector<char> active;         // by blob
-  std::vector<char> hidden;         // by link: no mask shows it, so that no outline is its own; empty: none is hidden
+  std::vector<char> hidden;         // by link: no mask shows it, so that no outline is its own; empty: not known
   Vector2 shift = Vector2::Zero();  // px, by which the mask is thought to be shifted
   double diameter = 0.0;            // px, at the depth of the base
 };
@@ -78,8 +78,8 @@ void choose_blobs(Problem& problem, double reach);
 
 // Finds the links that something hides from each view: where the posed chain covers nearly all of a mask to `reach`
 // diameters or `least` px, whichever is more, no mask lies within that beside a hidden link. Elsewhere the chain may be
-// off, and none is taken for hidden. Returns whether all views are covered.
-bool find_hidden(Problem& problem, double reach, double least);
+// off, and nothing is known of what is hidden.
+void find_hidden(Problem& problem, double reach, double least);
 
 // Equations of the posed chain in `problem.normal` and `.right`. Coarse: mask pixels and centerline samples, Huber cut.
 void coarse_equations(Problem& problem, double cut);
