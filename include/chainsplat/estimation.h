@@ -50,8 +50,7 @@ struct Options {
 // Returns the options for masks that are made while the rope is followed. In free space the error of their outline
 // persists (a hand's edge, the rope's dark side), so that less of it is independent in each frame and colors count for
 // more. On a table the persistent part, the masks' shift, is in the belief instead. Such masks are cut where the rope
-// is expected: they say back what the setup is believed to be, so that nothing of it is learned. The first ones are
-// made without a background, by colors alone, and what is found from them is doubtful.
+// is expected: they say back what the setup is believed to be, so that nothing of it is learned.
 Options options_for_live_masks(bool tabletop);
 
 // Compares the twin, with its links at `motions` (one list per view), with the colors inside the views' masks.

@@ -81,6 +81,7 @@ capture::Image8 contact_sheet(const std::vector<PreviewTile>& tiles);
 // not, and the colors of what is masked, in a thread of its own, which the next call waits for.
 class LiveMasks {
  public:
+  static constexpr int kBackgroundFrames = 8;  // before a background pixel is believed; until then colors alone decide
   // `camera`: as recorded, with its lens distortion. `object_rgb`: colors of the rope, 0..255, three numbers per sample
   // (those of a twin's Gaussians, or of a capture's masks).
   LiveMasks(const capture::Camera& camera, const chain::Chain& chain, const std::vector<std::uint8_t>& object_rgb);

@@ -25,9 +25,7 @@ bool identified_shifts(const dynamics::Parameters& parameters) {
 
 Options options_for_live_masks(bool tabletop) {
   Options options;
-  constexpr int kNoBackground = 8;  // frames, as masking::LiveMasks needs before it believes a background
   options.learns_setup = false;
-  options.doubtful_frames = kNoBackground;
   if (tabletop) return options;
   // with the usual shares a pushed rope in free space was lost
   options.new_share = 0.1;

@@ -19,7 +19,6 @@ namespace {
 constexpr int kRowsEvery = 4;
 constexpr double kForget = 0.08;          // share of it forgotten each time: some two seconds at 30 Hz
 constexpr int kMostSeen = 13;             // times that a pixel was seen; after so many only kForget counts
-constexpr int kLeastSeen = 8;             // before a background pixel is believed
 constexpr int kAllRows = 16;              // first frames that teach every row
 constexpr double kFirstNoise = 4.0;       // gray levels, assumed in the first frame
 constexpr double kGivenPixels = 3e4;      // weight of the colors that are given: the pixels of some ten frames
@@ -156,7 +155,7 @@ void LiveMasks::State::learn_background(const Picture& picture, const math::Rect
       }
       if (seen[at] == 1) square = static_cast<float>(kFirstNoise * kFirstNoise);
       variance[at] += weight * (square - variance[at]);
-      if (seen[at] >= kLeastSeen) background.noise[at] = noise_level(std::sqrt(variance[at]));
+      if (seen[at] >= kBackgroundFrames) background.noise[at] = noise_level(std::sqrt(variance[at]));
     }
   };
   const math::Rectangle tube = intersection(box, around.box);

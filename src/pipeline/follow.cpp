@@ -193,8 +193,11 @@ estimation::LinkGradient Tracker::Implementation::link_gradient() {
 void Tracker::Implementation::look_at_first_picture(const capture::Image8& picture) {
   masked_before = black_about(picture);
   if (*masked_before) return;
-  if (auto* filter = std::get_if<estimation::Filter>(&follower))
-    filter->set_options(estimation::options_for_live_masks(twin.tabletop));
+  if (auto* filter = std::get_if<estimation::Filter>(&follower)) {
+    estimation::Options live_masks = estimation::options_for_live_masks(twin.tabletop);
+    live_masks.doubtful_frames = masking::LiveMasks::kBackgroundFrames;
+    filter->set_options(live_masks);
+  }
   const std::vector<std::uint8_t> colors = twin_colors(twin);
   if (colors.empty())
     core::warn(options.name + ": is not masked, and the twin has no colors to find the rope by; what is " +

@@ -5,6 +5,7 @@
 #include <numeric>
 
 #include "chainsplat/image_model.h"
+#include "src/math/usual.h"
 #include "src/recognition/checkpoint.h"
 #include "src/recognition/hold_colors.h"
 #include "src/recognition/light.h"
@@ -72,10 +73,8 @@ struct TrainingViews {
 std::vector<int> unhidden(const chain::Chain& chain, const capture::Capture& capture,
                           const std::vector<FrameViews>& frames, const chain::States& states,
                           const std::vector<int>& candidates) {
-  constexpr int kPoints = 97;          // along the rope
-  constexpr double kUsual = 0.2;       // quantile of the share that is hidden,
-  constexpr double kMore = 0.05;       // share more than that which is much
-  constexpr double kLeastShare = 0.3;  // of the frames
+  constexpr int kPoints = 97;           // along the rope
+  constexpr double kMoreHidden = 0.05;  // share of them, above what is usual
   const std::vector<double> along = chain::equal_arclengths(chain, kPoints);
   std::vector<double> hidden(candidates.size(), 0.0);  // mean over the views
   core::parallel_for(static_cast<std::int64_t>(candidates.size()), [&](std::int64_t i) {
@@ -88,13 +87,9 @@ std::vector<int> unhidden(const chain::Chain& chain, const capture::Capture& cap
                    static_cast<double>(seen.size() * frames[k].views.size());
     }
   });
-  std::vector<double> sorted = hidden;
-  std::sort(sorted.begin(), sorted.end());
   std::vector<int> out;
-  for (std::size_t i = 0; i < candidates.size(); ++i)
-    if (hidden[i] <= sorted[static_cast<std::size_t>(kUsual * static_cast<double>(sorted.size()))] + kMore)
-      out.push_back(candidates[i]);
-  return static_cast<double>(out.size()) < kLeastShare * static_cast<double>(candidates.size()) ? candidates : out;
+  for (const int i : math::usual_ones(hidden, kMoreHidden)) out.push_back(candidates[i]);
+  return out;
 }
 
 TrainingViews training_views(const chain::Chain& chain, const capture::Capture& capture,
@@ -105,7 +100,7 @@ TrainingViews training_views(const chain::Chain& chain, const capture::Capture& 
   std::vector<int> used;
   for (int k = 0; k < static_cast<int>(frames.size()); k += every)
     if (!frames[k].views.empty()) used.push_back(k);
-  used = used.empty() ? used : unhidden(chain, capture, frames, states, used);
+  used = unhidden(chain, capture, frames, states, used);
   std::size_t views = 0;
   for (const int k : used) views += frames[k].views.size();
   for (std::size_t i = 0; i < used.size(); i += (views + kMost - 1) / kMost) {

@@ -4,6 +4,7 @@
 
 #include "chainsplat/core.h"
 #include "src/math/decompositions.h"
+#include "src/math/usual.h"
 #include "src/silhouette/correction_equations.h"
 
 namespace chainsplat::silhouette {
@@ -366,22 +367,16 @@ MaskPoints mask_of(const capture::Capture& capture, int v) {
 // prior alone, which prefers straight ropes and would have shorter ones. All that show something where most hide a
 // part.
 std::vector<int> telling_frames(const SequenceFit& sequence, const Frames& all) {
-  constexpr double kUsual = 0.8;       // quantile of the share that is in the masks
-  constexpr double kLessInside = 0.1;  // share less than that which is not told from what usual masks leave out
-  constexpr double kLeastShare = 0.3;  // of the frames that show something
+  constexpr double kMoreHidden = 0.1;  // share of the rope, above what usual masks leave out
   std::vector<int> shown, telling;
-  std::vector<double> inside;
+  std::vector<double> hidden;
   for (int f = 0; f < static_cast<int>(all.times.size()); ++f) {
     if (all.views[f].empty() || !(sequence.frames[f].residual_pixels > 0.0)) continue;
     shown.push_back(f);
-    inside.push_back(sequence.frames[f].inside);
+    hidden.push_back(1.0 - sequence.frames[f].inside);
   }
-  if (shown.empty()) return shown;
-  std::sort(inside.begin(), inside.end());
-  const double least = inside[static_cast<std::size_t>(kUsual * static_cast<double>(inside.size()))] - kLessInside;
-  for (const int f : shown)
-    if (sequence.frames[f].inside >= least) telling.push_back(f);
-  return telling.size() < kLeastShare * static_cast<double>(shown.size()) ? shown : telling;
+  for (const int i : math::usual_ones(hidden, kMoreHidden)) telling.push_back(shown[i]);
+  return telling;
 }
 
 // Up to `most` telling frames, evenly spread, with their masks; returns their angles.

@@ -285,14 +285,10 @@ bool shows(const ViewWork& work, const Segment& s, double distance) {
   const int across = static_cast<int>(std::ceil(distance / spacing));
   const int along = static_cast<int>(std::clamp(std::ceil(s.step.norm() / spacing), 1.0, kMostAlong));
   const double half_width2 = 0.25 * work.diameter * work.diameter;
-  const auto distance2 = [&](const Segment& from, const Vector2& pixel) {
-    const Vector2 offset = pixel - from.from;
-    return (offset - std::clamp(offset.dot(from.step) * from.per_length2, 0.0, 1.0) * from.step).squaredNorm();
-  };
   const auto explained = [&](const Vector2& pixel) {
-    const double own = distance2(s, pixel);
+    const double nearer = std::min(half_width2, nearest_on(s, pixel).distance2);
     return std::any_of(work.segments.begin(), work.segments.end(), [&](const Segment& other) {
-      return std::abs(other.link - s.link) > 1 && distance2(other, pixel) < std::min(own, half_width2);
+      return std::abs(other.link - s.link) > 1 && nearest_on(other, pixel).distance2 < nearer;
     });
   };
   for (int i = 0; i <= along; ++i)

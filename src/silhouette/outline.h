@@ -31,15 +31,18 @@ inline Vector3 projected_gradient(const capture::Camera& camera, const Vector3& 
   return {gx, gy, -(gx * x.x() + gy * x.y()) / x.z()};
 }
 
+inline Nearest nearest_on(const Segment& s, const Vector2& pixel) {
+  const Vector2 offset = pixel - s.from;
+  const double t = std::clamp(offset.dot(s.step) * s.per_length2, 0.0, 1.0);
+  return {-1, t, (offset - t * s.step).squaredNorm()};
+}
+
 inline Nearest nearest(const std::vector<Segment>& segments, const Vector2& pixel) {
   Nearest best;
   for (int i = 0; i < static_cast<int>(segments.size()); ++i) {
-    const Segment& s = segments[i];
-    if (s.hidden) continue;
-    const Vector2 offset = pixel - s.from;
-    const double t = std::clamp(offset.dot(s.step) * s.per_length2, 0.0, 1.0);
-    const double distance2 = (offset - t * s.step).squaredNorm();
-    if (distance2 < best.distance2) best = {i, t, distance2};
+    if (segments[i].hidden) continue;
+    const Nearest here = nearest_on(segments[i], pixel);
+    if (here.distance2 < best.distance2) best = {i, here.t, here.distance2};
   }
   return best;
 }
