@@ -64,25 +64,35 @@ TEST_CASE("a base that no camera sees is a problem, not a crash") {
   }
 }
 
-TEST_CASE("of a rope that is held high above its table nothing is corrected, and that is said") {
-  capture::Capture capture = demo();
-  for (capture::Camera& camera : capture.cameras) camera.world_from_camera.translation.x() += 0.01;
-  const std::vector<capture::Camera> given = capture.cameras;
+TEST_CASE(
+    "of a rope that is held high above its table nothing is corrected; a table that is given too low is not that") {
   constexpr double kAbove = 0.015;  // m
-  // of the demo, which hangs, the plane in which it swings most as a table
-  const math::Pose grasp = capture.base.pose(capture.base.start());
-  const math::Vector3 normal = grasp.rotation * capture.bending_axis;
-  capture.tabletop = true;
-  capture.table = capture::Table{grasp.translation - (kAbove + 0.5 * capture.diameter) * normal, normal};
-  const pipeline::Corrected found = pipeline::correct(capture, {}, false);
-  const capture::Finding* const said = finding(found.verdict, "held-high", "object");
-  REQUIRE(said);
-  CHECK(said->value == doctest::Approx(1e3 * kAbove));
-  CHECK(!said->corrected);
-  CHECK(!said->trusted);
-  CHECK(found.corrections.empty());
-  for (std::size_t c = 0; c < given.size(); ++c)
-    CHECK(capture.cameras[c].world_from_camera.translation == given[c].world_from_camera.translation);
+  for (const bool held : {true, false}) {
+    capture::Capture capture = demo();
+    // of the demo, which hangs, the plane in which it swings as a table: 15 mm below it, or below a grasp that is given
+    // 15 mm above the rope
+    const math::Pose grasp = capture.base.pose(capture.base.start());
+    const math::Vector3 normal = grasp.rotation * capture.bending_axis;
+    if (held) {
+      std::vector<trajectory::Sample> samples = capture.base.samples();
+      for (trajectory::Sample& sample : samples) sample.pose.translation += kAbove * normal;
+      capture.base = trajectory::fit(samples, "base.tum");
+    }
+    capture.tabletop = true;
+    const double below = 0.5 * capture.diameter + (held ? 0.0 : kAbove);
+    capture.table = capture::Table{grasp.translation - below * normal, normal};
+    const std::vector<capture::Camera> given = capture.cameras;
+    const pipeline::Corrected found = pipeline::correct(capture, {}, false);
+    const capture::Finding* const said = finding(found.verdict, "held-high", "object");
+    CHECK((said != nullptr) == held);
+    if (!said) continue;
+    CHECK(said->value == doctest::Approx(1e3 * kAbove).epsilon(0.2));
+    CHECK(!said->corrected);
+    CHECK(!said->trusted);
+    CHECK(found.corrections.empty());
+    for (std::size_t c = 0; c < given.size(); ++c)
+      CHECK(capture.cameras[c].world_from_camera.translation == given[c].world_from_camera.translation);
+  }
 }
 
 TEST_CASE("a darker camera is named, and its pictures stay as they are") {

@@ -299,19 +299,15 @@ void correct_colors(const silhouette::CorrectionFit& fit, const std::vector<std:
   out.corrections.insert(out.corrections.end(), found.begin(), found.end());
 }
 
-// Whether the rope is held so high above its table that corrections would make up for how it is assumed to come down.
-bool held_high(const capture::Capture& capture, std::vector<Finding>& verdict) {
-  // m: held 15 mm above it, cameras were found to be off by 10 degrees; faults of base, grasp and table alone are less
-  const double high = std::max(0.25 * capture.diameter, 0.005);
-  const double too_high = 0.4 * capture.diameter;  // m, beyond which the errors that are stated are too small
-  const double above = std::abs(silhouette::height_by_table(capture));
-  if (above < high) return false;
-  const bool trusted = above < too_high;
-  verdict.push_back({"held-high", "object", kMeters * above, 0.0, "mm", false, trusted, false, -1,
-                     text("the rope is held %.0f mm above where it lies on the table: how it comes down is assumed, and "
-                          "nothing is corrected, which would make up for that%s",
-                          kMeters * above, trusted ? "" : ": do not trust it to a few millimeters")});
-  return true;
+// m above where it lies on the table, from which on corrections make up for how a rope is assumed to come down: held 15 mm
+// above it, cameras were found to be off by 10 degrees. Faults of base and grasp alone are less.
+double high(const capture::Capture& capture) { return std::max(0.25 * capture.diameter, 0.005); }
+
+Finding held_high(double above) {
+  return {"held-high", "object", kMeters * above, 0.0, "mm", false, false, false, -1,
+          text("the rope is held %.0f mm above where it lies on the table: how it comes down is assumed, and nothing that "
+               "was given could be checked: do not trust it to a few millimeters",
+               kMeters * above)};
 }
 
 }  // namespace
@@ -341,7 +337,15 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
                            "cameras are not in one world, or not all in meters"});
     return out;
   }
-  if (held_high(capture, out.verdict)) return out;
+  if (const double table = silhouette::height_by_table(capture); std::abs(table) > high(capture)) {
+    const double seen = silhouette::fit_height(chain, capture, sequence, table);
+    if (std::abs(seen) > high(capture)) {
+      out.verdict.push_back(held_high(std::abs(seen)));
+      return out;
+    }
+    chain.lift = silhouette::lying_down(chain, seen);  // the table is given too low
+    sequence = silhouette::fit_sequence(chain, capture);
+  }
   silhouette::CorrectionOptions options;
   options.held = fixed;
   for (const double shift : kShifts) options.mistakes.push_back(shifted_images(capture, shift));

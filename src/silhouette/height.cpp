@@ -14,6 +14,7 @@ constexpr std::size_t kMostFrames = 16;
 constexpr int kMostSteps = 6;
 constexpr double kTried = 0.05;                      // diameters to either side of the best height so far
 constexpr double kFarthest = 0.1, kNearest = 0.005;  // diameters: of one step, and of the last one
+constexpr double kFar = 0.25;                        // diameters, from which on the first height is not the only start
 // Bending stiffness over weight per length times the cube of the length: where between the grasp and the table a rope
 // lies down depends on its fourth root only.
 constexpr double kSoftness = 0.006;
@@ -72,16 +73,22 @@ double fit_height(const chain::Chain& chain, const capture::Capture& capture, co
     return sum / static_cast<double>(count);
   };
   const double tried = kTried * chain.diameter;
-  double height = first;
-  for (int step = 0; step < kMostSteps; ++step) {
-    const double below = misfit(height - tried), here = misfit(height), above = misfit(height + tried);
-    const double slope = above - below, curvature = below - 2.0 * here + above;
-    const double farthest = kFarthest * chain.diameter;
-    const double move = curvature > 0.0 ? std::clamp(-0.5 * tried * slope / curvature, -farthest, farthest)
-                                        : std::copysign(farthest, -slope);
-    height += move;
-    if (std::abs(move) < kNearest * chain.diameter) break;
-  }
+  const auto best_from = [&](double height) {
+    for (int step = 0; step < kMostSteps; ++step) {
+      const double below = misfit(height - tried), here = misfit(height), above = misfit(height + tried);
+      const double slope = above - below, curvature = below - 2.0 * here + above;
+      const double farthest = kFarthest * chain.diameter;
+      const double move = curvature > 0.0 ? std::clamp(-0.5 * tried * slope / curvature, -farthest, farthest)
+                                          : std::copysign(farthest, -slope);
+      height += move;
+      if (std::abs(move) < kNearest * chain.diameter) break;
+    }
+    return height;
+  };
+  double height = best_from(first);
+  // a table that is given too low by much is as likely as a rope that is held so high
+  if (std::abs(first) > kFar * chain.diameter)
+    if (const double flat = best_from(0.0); misfit(flat) < misfit(height)) height = flat;
   // what is known already stays, and costs no further fit
   return std::abs(height - first) < 2.0 * kNearest * chain.diameter ? first : height;
 }
