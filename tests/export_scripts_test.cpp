@@ -189,6 +189,14 @@ TEST_CASE("exported scales hold what the renderer adds at the nearest that a Gau
       CHECK(std::exp(after.log_scale[3 * i + c]) ==
             doctest::Approx(std::sqrt(scale * scale + 0.3 * pixel * pixel)).epsilon(1e-5));
     }
+  // fitted to pictures of known distance, they are as blurred as those
+  splat::Gaussians coarse = before;
+  coarse.pixel_footprint = 0.01;
+  const splat::Gaussians blurred = exports::with_low_pass(coarse, twin.chain, straight, rest, {far, camera});
+  for (std::size_t k = 0; k < before.log_scale.size(); ++k) {
+    const double scale = std::exp(before.log_scale[k]);
+    CHECK(std::exp(blurred.log_scale[k]) == doctest::Approx(std::sqrt(scale * scale + 0.3 * 1e-4)).epsilon(1e-5));
+  }
   // a camera that the rope is behind sees nothing of it
   camera.world_from_camera.translation.z() = 1;
   CHECK(exports::with_low_pass(before, twin.chain, straight, rest, {camera}).log_scale == before.log_scale);

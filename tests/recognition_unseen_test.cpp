@@ -121,6 +121,18 @@ TEST_CASE("a texture that winds about the rope goes on where no camera saw it") 
   }
 }
 
+TEST_CASE("a side that hardly any picture shows is guessed as one that none shows") {
+  Rope unseen(kSlope), rarely(kSlope), often(kSlope);
+  for (Rope* rope : {&unseen, &rarely, &often})
+    for (int k = 0; k < 38; ++k) rope->look_from((k % 2 ? -40.0 : 40.0) * kDegree);
+  rarely.look_from(180.0 * kDegree);
+  for (int k = 0; k < 8; ++k) often.look_from(180.0 * kDegree);
+  const int guessed = recognition::finish_unseen(unseen.chain, unseen.views, unseen.gaussians);
+  CHECK(guessed > 200);
+  CHECK(recognition::finish_unseen(rarely.chain, rarely.views, rarely.gaussians) == guessed);
+  CHECK(recognition::finish_unseen(often.chain, often.views, often.gaussians) < guessed / 4);
+}
+
 TEST_CASE("a texture of rings goes on as rings, and one color stays one color") {
   Rope rings(0.0);
   const double gray = rings.error_behind(0.0);

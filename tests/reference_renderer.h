@@ -160,6 +160,7 @@ struct Parameters {
   int count = 0, links = 0, degree = 0;
   std::vector<S> mean, rotation, log_scale, opacity_logit, sh, link_logits;
   splat::Light light = {};
+  double pixel_footprint = 0.0;  // m
   int coefficients() const { return (degree + 1) * (degree + 1); }
   std::array<std::vector<S>*, 6> kinds() { return {&mean, &rotation, &log_scale, &opacity_logit, &sh, &link_logits}; }
   std::array<const std::vector<S>*, 6> kinds() const {
@@ -179,7 +180,8 @@ inline Parameters<double> parameters(const splat::Gaussians& g) {
           wide(g.opacity_logit),
           wide(g.sh),
           wide(g.link_logits),
-          g.light};
+          g.light,
+          g.pixel_footprint};
 }
 
 // The discrete rules of mathematics.md 2.5 and 2.6, each of which can be switched off.
@@ -278,6 +280,7 @@ std::vector<Splat<S>> project(const Parameters<S>& g, const splat::ViewSpec& vie
   using std::exp;
   using std::sqrt;
   constexpr double kNear = 0.01, kLowPass = 0.3, kClamp = 1.3;  // m, px^2, half images (mathematics.md 2.5)
+  constexpr double kLeastFootprint = 0.6;                       // px
   const capture::Camera& camera = *view.camera;
   const Motion<S> camera_from_world = motion<S>(camera.world_from_camera.inverse());
   const double limit_x = kClamp * 0.5 * camera.width / camera.fx, limit_y = kClamp * 0.5 * camera.height / camera.fy;
@@ -319,7 +322,13 @@ std::vector<Splat<S>> project(const Parameters<S>& g, const splat::ViewSpec& vie
       const Vec3<S> row_y{S(0.0), camera.fy / p[2], -camera.fy * slope_y / p[2]};
       const Vec3<S> cx = covariance * row_x, cy = covariance * row_y;
       const auto dot = [](const Vec3<S>& a, const Vec3<S>& b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; };
-      s.covariance = {dot(row_x, cx) + kLowPass, dot(row_x, cy), dot(row_y, cy) + kLowPass};
+      const auto low_pass = [&](double focal) {
+        if (g.pixel_footprint == 0.0) return S(kLowPass);
+        const S footprint = g.pixel_footprint * focal / p[2];
+        return kLowPass *
+               (value(footprint) > kLeastFootprint ? footprint * footprint : S(kLeastFootprint * kLeastFootprint));
+      };
+      s.covariance = {dot(row_x, cx) + low_pass(camera.fx), dot(row_x, cy), dot(row_y, cy) + low_pass(camera.fy)};
       const S determinant = s.covariance[0] * s.covariance[2] - s.covariance[1] * s.covariance[1];
       s.conic = {s.covariance[2] / determinant, -s.covariance[1] / determinant, s.covariance[0] / determinant};
       // color in the direction from the camera center, in the home frame
@@ -570,7 +579,7 @@ Evaluation evaluate(const Parameters<double>& g, std::span<const splat::ViewSpec
                     const Rules& rules, MakeMotions own_motions) {
   Tape& t = tape();
   const std::size_t bottom = t.size();
-  Parameters<Variable> v{g.count, g.links, g.degree, {}, {}, {}, {}, {}, {}, g.light};
+  Parameters<Variable> v{g.count, g.links, g.degree, {}, {}, {}, {}, {}, {}, g.light, g.pixel_footprint};
   for (int kind = 0; kind < 6; ++kind)
     for (const double x : *g.kinds()[kind]) v.kinds()[kind]->push_back(independent(x));
   Evaluation out;

@@ -107,8 +107,36 @@ TEST_CASE("a ball appears in the recorded pixel where its center projects") {
   }
 }
 
+TEST_CASE("a rope is as wide from near and from far as from where it was fitted") {
+  twin::Twin twin = test::small_twin();
+  const std::vector<math::Pose> motions = chain::link_motions(twin.chain, math::VectorX::Zero(twin.chain.angles()), {});
+  const math::Vector3 middle = motions[0] * math::Vector3(0.5 * twin.chain.length * twin.chain.direction);
+  constexpr double kFocal = 760.0;
+  // m^2 of the rope's outline as it is drawn from a distance
+  const auto area = [&](double distance) {
+    capture::Camera camera = front_camera(false);
+    camera.world_from_camera.translation =
+        middle - distance * (camera.world_from_camera.rotation * math::Vector3::UnitZ());
+    camera.width = 800, camera.height = 600, camera.fx = camera.fy = kFocal, camera.cx = 400, camera.cy = 300;
+    const splat::ViewSpec view{&camera, 0, 0, camera.width, camera.height, motions};
+    const splat::Picture picture = engine().draw(twin.gaussians, {&view, 1})[0];
+    double pixels = 0.0;
+    for (std::size_t k = 3; k < picture.rgba.size(); k += 4) pixels += picture.rgba[k] >= 0.5f ? 1.0 : 0.0;
+    return pixels * distance * distance / (kFocal * kFocal);
+  };
+  constexpr double kFitted = 1.6, kNear = 0.8, kFar = 2.4;
+  const double fitted = area(kFitted);
+  CHECK(area(kNear) < 0.97 * fitted);
+  CHECK(area(kFar) > 1.03 * fitted);
+  twin.gaussians.pixel_footprint = kFitted / kFocal;
+  CHECK(area(kFitted) == doctest::Approx(fitted).epsilon(1e-3));
+  CHECK(area(kNear) == doctest::Approx(fitted).epsilon(0.01));
+  CHECK(area(kFar) == doctest::Approx(fitted).epsilon(0.015));
+}
+
 TEST_CASE("the crop holds all of the full image") {
-  const twin::Twin twin = test::small_twin();
+  twin::Twin twin = test::small_twin();
+  twin.gaussians.pixel_footprint = 0.004;  // larger than a pixel's here
   const trajectory::Trajectory base = test::moving_base(1.0);
   const capture::Camera camera = front_camera(false);
   const std::vector<double> times{0.0, 0.4, 0.77};

@@ -183,6 +183,7 @@ Scene random_scene(std::uint64_t seed, int count, int links, int degree, Logits 
   Scene s;
   s.gaussians = random_gaussians(random, count, links, degree, logits, size);
   if (seed % 2) s.gaussians.light = {math::Vector3::UnitX(), 0.7, {0.1, -0.2, 0.15}, quadratic_light()};
+  if (seed % 3 == 0) s.gaussians.pixel_footprint = 0.006;  // between those of the nearest and the farthest splats
   s.cameras = {make_camera(52, 36, 70.0, {}), make_camera(60, 41, 66.0, pose(0.05, -0.2, 0.3, 0.06, 0.01, -0.02)),
                make_camera(21, 45, 60.0, pose(0.0, 0.1, 1.4, -0.02, 0.0, 0.03))};
   // one whose pictures are otherwise exposed, so that some colors are cut off at black and at white

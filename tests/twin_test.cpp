@@ -424,6 +424,7 @@ TEST_CASE("how a rope rolls is kept, and refused of a chain that bends in space"
   splat::Light& light = twin.gaussians.light;
   light = {twin.chain.direction, 0.625, {0.1, -1.0 / 3.0, 0.25}, {}};
   light.quadratic << 0.1, 0.2, 0.3, 0.2, 0.4, 0.5, 0.3, 0.5, -0.6;
+  twin.gaussians.pixel_footprint = 0.00125;
   twin::save(twin, folder.path);
   const twin::Twin read = twin::load(folder.path);
   CHECK(read.chain.lift == twin.chain.lift);
@@ -438,6 +439,7 @@ TEST_CASE("how a rope rolls is kept, and refused of a chain that bends in space"
   CHECK(read.gaussians.light.constant == light.constant);
   CHECK(read.gaussians.light.linear == light.linear);
   CHECK(read.gaussians.light.quadratic == light.quadratic);
+  CHECK(read.gaussians.pixel_footprint == 0.00125);
   const Path file = folder.path / "twin.json";
   const std::string good = core::read_file(file);
   for (const auto& [from, to, expected] : std::initializer_list<std::array<const char*, 3>>{
@@ -446,6 +448,7 @@ TEST_CASE("how a rope rolls is kept, and refused of a chain that bends in space"
            {"\"torsion\": 0.7", "\"torsion\": 1e300", "rolling.torsion: is more than any rope has"},
            {"\"constant\": 0.625", "\"constant\": 1e4", "light.constant: is more than any light has"},
            {"\"constant\": 0.625", "\"constants\": 1", "light.constant: is missing"},
+           {"\"pixel_footprint\": 0.00125", "\"pixel_footprint\": 0", "pixel_footprint: 0 is not positive"},
            {"\"lift\": [-0.001", "\"lift\": [-9", "chain.lift: holds -9, which no rope has"}}) {
     std::string text = good;
     REQUIRE(text.find(from) != std::string::npos);

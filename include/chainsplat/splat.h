@@ -44,6 +44,10 @@ struct Gaussians {
   // count; 1: no camera saw it, its place and color are guessed. What trained or drew them does not give it back.
   std::vector<std::uint8_t> guessed;
   Light light;
+  // What a pixel of the nearest pictures that these were fitted to covered of the rope, m: the splats' low pass is that
+  // wide on the rope, from wherever it is drawn. 0: not known, and it is as wide as a pixel is, so that a rope becomes
+  // thinner as a camera comes nearer (mathematics.md 2.5).
+  double pixel_footprint = 0.0;
   int sh_coefficients() const { return (degree + 1) * (degree + 1); }
   void resize(int count, int links, int degree);  // keeps existing rows; new ones are zero, with rotation (1, 0, 0, 0)
 };

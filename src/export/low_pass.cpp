@@ -30,7 +30,9 @@ splat::Gaussians with_low_pass(const splat::Gaussians& gaussians, const chain::C
   }
   for (int i = 0; i < gaussians.count; ++i) {
     if (!std::isfinite(least[i])) continue;
-    const double variance = image_model::kLowPass * least[i] * least[i];
+    const double fitted = gaussians.pixel_footprint;
+    const double pixel = fitted > 0.0 ? std::max(image_model::kLeastFootprint * least[i], fitted) : least[i];
+    const double variance = image_model::kLowPass * pixel * pixel;
     for (int c = 0; c < 3; ++c) {
       float& scale = out.log_scale[3 * i + c];
       scale = static_cast<float>(0.5 * std::log(std::exp(2.0 * scale) + variance));

@@ -222,6 +222,7 @@ void add_gaussians(Arrays& arrays, const splat::Gaussians& g) {
   arrays.floats("gaussian_opacity", {count}, opacity);
   arrays.floats("gaussian_sh", {count, terms, 3}, g.sh);
   arrays.floats("gaussian_link_probability", {count, links}, probability);
+  arrays.number("gaussian_pixel_footprint", g.pixel_footprint);
   if (g.light.known()) {
     arrays.numbers("light_constant", {1}, std::vector<double>{g.light.constant});
     arrays.numbers("light_least", {1}, std::vector<double>{image_model::kLeastBrightness});

@@ -11,7 +11,7 @@ namespace chainsplat::recognition {
 
 namespace {
 
-constexpr char kMagic[] = "chainsplat-checkpoint/9\n";
+constexpr char kMagic[] = "chainsplat-checkpoint/10\n";
 constexpr char kFile[] = "recognize.bin";
 constexpr char kFileBefore[] = "recognize.before.bin";
 constexpr const char* kFiles[] = {kFile, kFileBefore};  // the newest first
@@ -69,6 +69,7 @@ void put_gaussians(Writer& w, const splat::Gaussians& g) {
   for (const auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
     w.put_all(*part);
   w.put_all(g.guessed);
+  w.put(g.pixel_footprint);
   w.put(g.light.constant);
   for (const math::Vector3* part : {&g.light.axis, &g.light.linear})
     for (const double x : *part) w.put(x);
@@ -83,6 +84,7 @@ splat::Gaussians get_gaussians(Reader& r) {
   for (auto* part : {&g.mean, &g.rotation, &g.log_scale, &g.opacity_logit, &g.sh, &g.link_logits})
     *part = r.get_all<float>();
   g.guessed = r.get_all<std::uint8_t>();
+  g.pixel_footprint = r.get<double>();
   g.light.constant = r.get<double>();
   for (math::Vector3* part : {&g.light.axis, &g.light.linear})
     for (double& x : *part) x = r.get<double>();

@@ -472,6 +472,7 @@ Result recognize_fast(gpu::Device& device, const capture::Capture& capture, cons
     core::Random random(options.seed * 1000003 + 1);
     job.gaussians = place_along_chain(job.result.chain, capture, job.states, job.frames, job.training.frames, light,
                                       static_cast<int>(kFirstShare * budget), random);
+    job.gaussians.pixel_footprint = pixel_footprint(job.result.chain, viewpoints_of(job, specs));
   }
 
   for (int round = job.first_round; round < kRounds; ++round) {

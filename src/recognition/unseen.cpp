@@ -28,10 +28,12 @@ constexpr int kSlopes = 161;         // that are tried
 constexpr double kRepeats = 0.3;     // least correlation of a texture with itself along a helix
 constexpr double kLit = 0.5;         // least share of what differs around the rope that its light must explain
 constexpr double kDarkest = 0.2;     // of the mean light: what lies around a rope reaches every side of it
+constexpr double kFew = 0.05;  // of the pictures: a side that no more of them show is as good as unseen, since few
+                               // gradients move what lies there
 
 // What was seen of each cell.
 struct Surface : Cells {
-  std::vector<double> facing;                 // best cosine of any view
+  std::vector<double> facing;                 // best cosine, but for a few views; what hides it shows nothing
   std::vector<char> hidden;                   // by something that is no rope
   std::vector<std::optional<Vector3>> color;  // of trusted cells
 
@@ -69,6 +71,7 @@ void look(std::span<const Viewpoint> views, const splat::Light& light, Surface& 
   const double radius = 0.5 * surface.chain.diameter;
   std::vector<double> hidden(surface.facing.size(), 0.0), weights(surface.facing.size(), 0.0);
   std::vector<Vector3> sums(surface.facing.size(), Vector3::Zero());
+  std::vector<std::vector<float>> facings(surface.facing.size());
   for (const Viewpoint& from : views) {
     const capture::Camera& camera = *from.camera;
     const capture::View view = capture::unpacked(*from.view);
@@ -81,8 +84,10 @@ void look(std::span<const Viewpoint> views, const splat::Light& light, Surface& 
         const Vector3 point = motion * Vector3(axis + radius * normal);
         const Vector3 ray = camera.world_from_camera.translation - point;
         const double facing = (motion.rotation * normal).dot(ray.normalized());
-        surface.facing[cell] = std::max(surface.facing[cell], facing);
-        hidden[cell] += pixel_of(camera, view, motion * Vector3(axis + kWithin * radius * normal)) ? 0.0 : 1.0;
+        if (pixel_of(camera, view, motion * Vector3(axis + kWithin * radius * normal)))
+          facings[cell].push_back(static_cast<float>(facing));
+        else
+          hidden[cell] += 1.0;
         const std::uint8_t* seen = facing >= kTrusted ? pixel_of(camera, view, point) : nullptr;
         if (!seen) continue;
         const double counts = facing * facing;  // the area that a pixel averages over grows as 1 / facing
@@ -92,7 +97,12 @@ void look(std::span<const Viewpoint> views, const splat::Light& light, Surface& 
       }
     });
   }
+  const auto few = static_cast<std::size_t>(kFew * static_cast<double>(views.size()));
   for (std::size_t cell = 0; cell < hidden.size(); ++cell) {
+    if (std::vector<float>& all = facings[cell]; few < all.size()) {
+      std::nth_element(all.begin(), all.begin() + few, all.end(), std::greater<>());
+      surface.facing[cell] = all[few];
+    }
     surface.hidden[cell] = hidden[cell] > kHidden * static_cast<double>(views.size());
     if (weights[cell] > 0.0) surface.color[cell] = sums[cell] / weights[cell];
   }

@@ -29,6 +29,22 @@ std::vector<char> shown(const chain::Chain& chain, const capture::Camera& camera
   return out;
 }
 
+double pixel_footprint(const chain::Chain& chain, std::span<const Viewpoint> views) {
+  constexpr double kNearest = 0.05;  // share of the pictures and links that may be nearer: single ones do not decide
+  std::vector<double> all;
+  for (const Viewpoint& from : views) {
+    const math::Pose camera_from_world = from.camera->world_from_camera.inverse();
+    for (int j = 0; j < chain.links(); ++j) {
+      const double z = (camera_from_world * (from.motions[j] * Vector3(chain.link_start(j) * chain.direction))).z();
+      if (z > image_model::kNear) all.push_back(z / std::sqrt(from.camera->fx * from.camera->fy));
+    }
+  }
+  if (all.empty()) return 0.0;
+  const auto at = all.begin() + static_cast<std::ptrdiff_t>(kNearest * static_cast<double>(all.size() - 1));
+  std::nth_element(all.begin(), at, all.end());
+  return *at;
+}
+
 double Radii::at(double arclength) const {
   const int nearest = static_cast<int>(std::floor(arclength / spacing)), last = static_cast<int>(radius.size()) - 1;
   double most = 0.0;

@@ -22,6 +22,9 @@ const std::uint8_t* pixel_of(const capture::Camera& camera, const capture::View&
 std::vector<char> shown(const chain::Chain& chain, const capture::Camera& camera, const capture::View& view,
                         std::span<const math::Pose> motions, std::span<const double> arclengths);
 
+// What a pixel of the nearest of these pictures covers of the rope, m; 0 where none has the rope before its camera.
+double pixel_footprint(const chain::Chain& chain, std::span<const Viewpoint> views);
+
 // The radius that masks show along the rope, which a connector at the tip or a knot makes larger than the given one.
 struct Radii {
   double spacing = 0.0;               // m of arclength between values, from half of it on

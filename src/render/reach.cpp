@@ -58,7 +58,10 @@ math::Rectangle reach(const splat::Gaussians& g, const std::vector<math::Pose>& 
                                std::clamp(x.y() / x.z(), -limit_y, limit_y)};
       const double focal[2] = {camera.fx, camera.fy}, center[2] = {camera.cx, camera.cy};
       for (int c = 0; c < 2; ++c) {
-        const double variance = (focal[c] / x.z() * (axes.row(c) - slope[c] * axes.row(2))).squaredNorm() + kLowPass;
+        const double scale = focal[c] / x.z(),
+                     footprint = g.pixel_footprint > 0.0 ? std::max(kLeastFootprint, scale * g.pixel_footprint) : 1.0;
+        const double variance =
+            (scale * (axes.row(c) - slope[c] * axes.row(2))).squaredNorm() + kLowPass * footprint * footprint;
         const double middle = focal[c] * x[c] / x.z() + center[c], half = reach_in_sigma * std::sqrt(variance);
         low[c] = std::min(low[c], middle - half);
         high[c] = std::max(high[c], middle + half);

@@ -120,6 +120,7 @@ Json splats_json(const splat::Gaussians& g) {
              {"quadratic", std::vector<double>(g.light.quadratic.data(), g.light.quadratic.data() + 9)}};
   return {{"count", link.size()},
           {"light", light},
+          {"pixelFootprint", g.pixel_footprint},
           {"gaussians", g.count},
           {"degree", g.degree},
           {"stride", 10 + 3 * coefficients},
@@ -337,6 +338,7 @@ Json document(const Contents& contents) {
            {"model",
             {{"near", image_model::kNear},
              {"lowPass", image_model::kLowPass},
+             {"leastFootprint", image_model::kLeastFootprint},
              {"clampMargin", image_model::kClampMargin},
              {"leastAlpha", image_model::kLeastAlpha},
              {"leastBrightness", image_model::kLeastBrightness},

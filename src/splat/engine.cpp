@@ -201,6 +201,7 @@ Gaussians Engine::gaussians() const {
   const Scene& scene = state_->training;
   Gaussians out = unpacked(state_->trained(scene.parameters), scene.count, scene.links, scene.degree);
   out.light = scene.light;
+  out.pixel_footprint = scene.pixel_footprint;
   return out;
 }
 

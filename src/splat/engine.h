@@ -84,6 +84,7 @@ struct SceneView {
 struct Scene {
   int count = 0, links = 0, degree = 0;
   Light light;
+  double pixel_footprint = 0.0;
   Buffer parameters, gradient, first_moment, second_moment, target;
   std::vector<SceneView> views;
   std::size_t parameter_count = 0;

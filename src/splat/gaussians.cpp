@@ -54,6 +54,7 @@ Gaussians rows_of(const Gaussians& gaussians, std::span<const int> rows, int mor
   const int count = static_cast<int>(rows.size());
   out.resize(count + more, gaussians.links, gaussians.degree);
   out.light = gaussians.light;
+  out.pixel_footprint = gaussians.pixel_footprint;
   for (int k = 0; k < count; ++k) copy_row(gaussians, rows[k], out, k);
   return out;
 }

@@ -91,7 +91,7 @@ std::vector<SplatView> Engine::State::stage_views(Submission& s, std::span<const
     const math::Vector3 linear = turn * light.linear;
     const math::Matrix3 quadratic = turn * light.quadratic * turn.transpose();
     placed.push_back({.intrinsics = {view.fx, view.fy, view.cx, view.cy},
-                      .limits = {view.limit_x, view.limit_y, 0, 0},
+                      .limits = {view.limit_x, view.limit_y, s.scene.pixel_footprint, 0},
                       .moment_point = {base.x(), base.y(), base.z(), 0},
                       .gain = {view.gain.x(), view.gain.y(), view.gain.z(), view.white},
                       .bias = {view.bias.x(), view.bias.y(), view.bias.z(), 0},

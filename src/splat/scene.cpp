@@ -91,6 +91,7 @@ void Engine::State::load_gaussians(Scene& scene, const Gaussians& gaussians) {
   scene.links = gaussians.links;
   scene.degree = gaussians.degree;
   scene.light = gaussians.light;
+  scene.pixel_footprint = gaussians.pixel_footprint;
   const std::vector<float> all = packed(gaussians);
   scene.parameter_count = all.size();
   scene.step = 0;

@@ -432,6 +432,7 @@ Twin load(const Path& run) {
                        "has " + std::to_string(twin.gaussians.links) + " properties link_*, the chain has " +
                            std::to_string(twin.chain.links()) + " links",
                        "take the file of the same run");
+    if (top.has("pixel_footprint")) twin.gaussians.pixel_footprint = top["pixel_footprint"].positive();
     if (top.has("light")) twin.gaussians.light = read_light(top["light"], twin.chain.direction);
   }
   if (const Path states = named_file(top, "states", run); !states.empty())

@@ -299,6 +299,7 @@ void save(const Twin& twin, const Path& run) {
                     {"linear", list(light.linear)},
                     {"quadratic", {q(0, 0), q(0, 1), q(0, 2), q(1, 1), q(1, 2), q(2, 2)}}};
   }
+  if (twin.gaussians.pixel_footprint > 0.0) out["pixel_footprint"] = twin.gaussians.pixel_footprint;
   if (!twin.corrections.empty()) out["corrections"] = to_json(twin.corrections);
   if (!twin.corrections.empty() || !twin.verdict.empty()) {
     out["verdict"] = to_json(twin.verdict);

@@ -130,7 +130,7 @@ function brightnessOf(light, least) {
 function project(splats, camera, scale, poses, tint, hatched, model, out, depth) {
   const {values: s, stride, link, guessed, count, degree} = splats, view = camera.pose, terms = (degree + 1) ** 2;
   const fx = camera.fx * scale, fy = camera.fy * scale, cx = camera.cx * scale, cy = camera.cy * scale;
-  const lowPass = model.lowPass * scale * scale, eye = view.slice(9);
+  const eye = view.slice(9), p = splats.pixelFootprint;
   const most = [model.clampMargin * 0.5 * camera.width / camera.fx, model.clampMargin * 0.5 * camera.height / camera.fy];
   const product = (o, a, b) => a[0] * (s[o] * b[0] + s[o + 1] * b[1] + s[o + 2] * b[2]) +
                                a[1] * (s[o + 1] * b[0] + s[o + 3] * b[1] + s[o + 4] * b[2]) +
@@ -145,7 +145,8 @@ function project(splats, camera, scale, poses, tint, hatched, model, out, depth)
     const jx = fx / z, jy = fy / z, kx = -jx * bound(x / z, most[0]), ky = -jy * bound(y / z, most[1]);
     const u = turnBack(pose, [jx * view[0] + kx * view[2], jx * view[3] + kx * view[5], jx * view[6] + kx * view[8]]);
     const v = turnBack(pose, [jy * view[1] + ky * view[2], jy * view[4] + ky * view[5], jy * view[7] + ky * view[8]]);
-    const a = product(o + 3, u, u) + lowPass, b = product(o + 3, u, v), d = product(o + 3, v, v) + lowPass;
+    const lowPass = j => model.lowPass * (p > 0 ? Math.max(model.leastFootprint * scale, p * j) : scale) ** 2;
+    const a = product(o + 3, u, u) + lowPass(jx), b = product(o + 3, u, v), d = product(o + 3, v, v) + lowPass(jy);
     const middle = (a + d) / 2, radius = Math.hypot((a - d) / 2, b), angle = 0.5 * Math.atan2(2 * b, a - d);
     const long = Math.sqrt(middle + radius), short = Math.sqrt(Math.max(middle - radius, 1e-9));
     const c = Math.cos(angle), e = Math.sin(angle), at = n * floatsPerSplat;
