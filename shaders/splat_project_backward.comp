@@ -67,7 +67,7 @@ void main() {
   grad_x.x -= a.clamped.x ? 0.0 : fx * inverse_z * grad_j0.z;
   grad_x.y -= a.clamped.y ? 0.0 : fy * inverse_z * grad_j1.z;
   grad_x.z -= inverse_z * ((a.clamped.x ? 1.0 : 2.0) * a.j0.z * grad_j0.z + (a.clamped.y ? 1.0 : 2.0) * a.j1.z * grad_j1.z);
-  grad_x.z -= 2.0 * inverse_z * dot(h.xz, a.low_pass * vec2(a.of_footprint));
+  grad_x.z -= 2.0 * inverse_z * dot(h.xz, a.low_pass * vec2(a.by_depth));
   // view direction of the spherical harmonics: by position, and as the link turns
   vec3 turn = vec3(0.0);
   if (p.coefficients > 1u) {

@@ -449,6 +449,7 @@ TEST_CASE("how a rope rolls is kept, and refused of a chain that bends in space"
            {"\"constant\": 0.625", "\"constant\": 1e4", "light.constant: is more than any light has"},
            {"\"constant\": 0.625", "\"constants\": 1", "light.constant: is missing"},
            {"\"pixel_footprint\": 0.00125", "\"pixel_footprint\": 0", "pixel_footprint: 0 is not positive"},
+           {"\"pixel_footprint\": 0.00125", "\"pixel_footprint\": 1e300", "pixel_footprint: is more than a pixel"},
            {"\"lift\": [-0.001", "\"lift\": [-9", "chain.lift: holds -9, which no rope has"}}) {
     std::string text = good;
     REQUIRE(text.find(from) != std::string::npos);

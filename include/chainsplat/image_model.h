@@ -12,9 +12,8 @@ namespace chainsplat::image_model {
 // Projection: EWA splatting with the numbers of 3DGS, except for the nearest depth.
 REAL kNear = 0.01;        // m; what is nearer than this is not in front of a camera
 REAL kLowPass = 0.3;      // px^2; added to a projected variance, so that no splat falls between the pixels' centers
-REAL kLeastFootprint = 0.6;  // px; of the pictures that the Gaussians were fitted to (splat::Gaussians::pixel_footprint)
-                             // the low pass that is kept where a picture is drawn from farther away: a splat is never
-                             // narrower than a third of a pixel (sigma)
+REAL kLeastFootprint = 0.6;  // px that splat::Gaussians::pixel_footprint counts for at least: however far away the rope
+                             // is, the low pass keeps 0.36 of that variance, a third of a pixel as standard deviation
 REAL kClampMargin = 1.3;  // half images; bound of x/z and y/z in the projection's Jacobian, which is linear in them and
                           // would make splats far outside the image very large
 

@@ -16,8 +16,8 @@ struct Projection {
   vec3 j0, j1;       // rows of the projection's Jacobian
   bvec2 clamped;
   vec3 t0, t1;       // rows of J m
-  vec2 low_pass;     // px^2, along x and y
-  bvec2 of_footprint;  // whether it follows from the pictures that the Gaussians were fitted to
+  vec2 low_pass;     // px^2, along x and y,
+  bvec2 by_depth;    // and whether it depends on the depth
   vec3 cov;          // xx, xy, yy of Sigma', px^2
 };
 
@@ -73,7 +73,7 @@ Projection project(SplatView view, uint n, uint i, uint of_link) {
   a.t1 = a.j1 * a.m;
   vec2 footprint = view.limits.z * inverse_z * view.intrinsics.xy;
   float least = view.limits.z > 0.0 ? kLeastFootprint : 1.0;
-  a.of_footprint = greaterThan(footprint, vec2(least));
+  a.by_depth = greaterThan(footprint, vec2(least));
   footprint = max(vec2(least), footprint);
   a.low_pass = kLowPass * footprint * footprint;
   a.cov = vec3(dot(a.t0, a.t0) + a.low_pass.x, dot(a.t0, a.t1), dot(a.t1, a.t1) + a.low_pass.y);

@@ -11,7 +11,8 @@ using uint = unsigned;
 // One view of the batch. The camera frame has OpenCV axes and its origin at the camera center; pixels are the crop's.
 struct SplatView {
   vec4 intrinsics;   // fx, fy, cx - x0, cy - y0 (px)
-  vec4 limits;       // x, y: largest |x/z|, |y/z| in the projection's Jacobian (mathematics.md 2.5); z: Gaussians::pixel_footprint; w unused
+  vec4 limits;       // x, y: largest |x/z|, |y/z| in the projection's Jacobian (mathematics.md 2.5)
+                     // z: Gaussians::pixel_footprint, m; w unused
   vec4 moment_point; // xyz: base origin in the camera frame (m), about which link moments are summed; w unused
   vec4 gain;         // xyz: recorded = gain * color + bias; w: recorded white, what is brighter is cut off
   vec4 bias;         // xyz; w unused

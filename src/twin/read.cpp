@@ -358,6 +358,13 @@ void read_rope(const Node& node, const Node& grasp, Twin& twin) {
   if (node["links"].entries().back().has("mass")) twin.parameters = read_parameters(node, twin);
 }
 
+double read_pixel_footprint(const Node& node) {
+  constexpr double kMost = 0.1;  // m: a picture with such pixels shows no rope
+  const double value = node.positive();
+  if (value > kMost) node.fail("is more than a pixel of any picture that shows a rope", "train again");
+  return value;
+}
+
 splat::Light read_light(const Node& node, const math::Vector3& axis) {
   constexpr double kMost = 1e3;  // times the brightest side that was seen
   const std::vector<double> linear = node["linear"].numbers_within(3, kMost),
@@ -432,7 +439,7 @@ Twin load(const Path& run) {
                        "has " + std::to_string(twin.gaussians.links) + " properties link_*, the chain has " +
                            std::to_string(twin.chain.links()) + " links",
                        "take the file of the same run");
-    if (top.has("pixel_footprint")) twin.gaussians.pixel_footprint = top["pixel_footprint"].positive();
+    if (top.has("pixel_footprint")) twin.gaussians.pixel_footprint = read_pixel_footprint(top["pixel_footprint"]);
     if (top.has("light")) twin.gaussians.light = read_light(top["light"], twin.chain.direction);
   }
   if (const Path states = named_file(top, "states", run); !states.empty())
