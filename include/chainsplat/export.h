@@ -58,7 +58,8 @@ std::string gltf(const splat::Gaussians& gaussians, const chain::Chain& chain, c
                  const trajectory::Trajectory& base, bool binary, const Options& options = {});
 
 // Gaussians that look in other viewers as they do here: their scales hold what the renderer adds on the image,
-// sqrt(0.3) px at the nearest that each comes to a camera in the motion.
+// sqrt(0.3) of Gaussians::pixel_footprint. Only where that is not known, motion and cameras say what it is: a pixel at
+// the nearest that each Gaussian comes to a camera in the motion.
 splat::Gaussians with_low_pass(const splat::Gaussians& gaussians, const chain::Chain& chain,
                                const chain::States& motion, const trajectory::Trajectory& base,
                                const std::vector<capture::Camera>& cameras);

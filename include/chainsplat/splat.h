@@ -41,7 +41,8 @@ struct Gaussians {
   std::vector<float> opacity_logit;  // count
   std::vector<float> sh;             // count x (degree+1)^2 x 3: RGB of one coefficient after the other
   std::vector<float> link_logits;    // count x links
-  // count; 1: no camera saw it, its place and color are guessed. What trained or drew them does not give it back.
+  // count; 1: no camera saw it, or hardly any picture, its place and color are guessed. What trained or drew them does
+  // not give it back.
   std::vector<std::uint8_t> guessed;
   Light light;
   // What a pixel of the nearest pictures that these were fitted to covered of the rope, m: the splats' low pass is that

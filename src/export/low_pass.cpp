@@ -9,12 +9,14 @@
 
 namespace chainsplat::exports {
 
-splat::Gaussians with_low_pass(const splat::Gaussians& gaussians, const chain::Chain& chain,
-                               const chain::States& motion, const trajectory::Trajectory& base,
-                               const std::vector<capture::Camera>& cameras) {
-  splat::Gaussians out = gaussians;
-  std::vector<double> least(gaussians.count,
-                            std::numeric_limits<double>::infinity());  // z/f: m of a pixel, at the nearest
+namespace {
+
+// What a pixel covers of each Gaussian at the nearest that it comes to a camera, m; infinite where no camera has it in
+// front.
+std::vector<double> nearest_pixels(const splat::Gaussians& gaussians, const chain::Chain& chain,
+                                   const chain::States& motion, const trajectory::Trajectory& base,
+                                   const std::vector<capture::Camera>& cameras) {
+  std::vector<double> least(gaussians.count, std::numeric_limits<double>::infinity());
   for (std::size_t k = 0; k < motion.time.size(); ++k) {
     const math::Pose at = base.samples().empty() ? math::Pose() : base.pose(motion.time[k]);
     const std::vector<math::Pose> motions = chain::link_motions(chain, motion.theta[k], at);
@@ -28,11 +30,21 @@ splat::Gaussians with_low_pass(const splat::Gaussians& gaussians, const chain::C
       }
     }
   }
+  return least;
+}
+
+}  // namespace
+
+splat::Gaussians with_low_pass(const splat::Gaussians& gaussians, const chain::Chain& chain,
+                               const chain::States& motion, const trajectory::Trajectory& base,
+                               const std::vector<capture::Camera>& cameras) {
+  splat::Gaussians out = gaussians;
+  const std::vector<double> pixels = gaussians.pixel_footprint > 0.0
+                                         ? std::vector<double>(gaussians.count, gaussians.pixel_footprint)
+                                         : nearest_pixels(gaussians, chain, motion, base, cameras);
   for (int i = 0; i < gaussians.count; ++i) {
-    if (!std::isfinite(least[i])) continue;
-    const double fitted = gaussians.pixel_footprint;
-    const double pixel = fitted > 0.0 ? std::max(image_model::kLeastFootprint * least[i], fitted) : least[i];
-    const double variance = image_model::kLowPass * pixel * pixel;
+    if (!std::isfinite(pixels[i])) continue;
+    const double variance = image_model::kLowPass * pixels[i] * pixels[i];
     for (int c = 0; c < 3; ++c) {
       float& scale = out.log_scale[3 * i + c];
       scale = static_cast<float>(0.5 * std::log(std::exp(2.0 * scale) + variance));

@@ -10,19 +10,20 @@
 
 namespace chainsplat::recognition {
 
-// Gaussians on the side of the tube that faces none of `views` have no gradient: they stay as they were placed, and
-// Adam moves them at random. Others take their place, in an even layer on the surface at the radius of those that were
-// seen, with the colors that the texture has around the axis there: ropes are laid or braided, so that what repeats
-// does so along a helix, whose slope is found from what was seen; where nothing repeats, the color at the same
-// arclength. The light of that side is found from how brightness changes around what was seen. What was seen only at a
-// slant keeps its shape and gets colors by the same rule, the more the flatter it was seen. Where masks show that
-// something hides the rope, as a gripper does, all stays. design.md, 'Recognition'. The new ones are marked kGuessed in
-// Gaussians::guessed, those seen only at a slant kSlanted. Returns how many new ones there are.
+// Gaussians on the side of the tube that faces none of `views`, or few of them, have hardly a gradient: they stay as
+// they were placed, and Adam moves them at random. Others take their place, in an even layer on the surface at the
+// radius of those that were seen, with the colors that the texture has around the axis there: ropes are laid or
+// braided, so that what repeats does so along a helix, whose slope is found from what was seen; where nothing repeats,
+// the color at the same arclength. The light of that side is found from how brightness changes around what was seen.
+// What was seen only at a slant keeps its shape and gets colors by the same rule, the more the flatter it was seen.
+// Where masks show that something hides the rope, as a gripper does, all stays. design.md, 'Recognition'. The new ones
+// are marked kGuessed in Gaussians::guessed, those seen only at a slant kSlanted. Returns how many new ones there are.
 inline constexpr std::uint8_t kGuessed = 1, kSlanted = 2;
 int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, splat::Gaussians& gaussians);
 
 // What the texture around it says of a Gaussian's color, and how flatly the cameras saw its place: the best cosine
-// between surface normal and view ray. None near the axis, behind what hides the rope and where no color is known.
+// between surface normal and view ray, but for a few views. None near the axis, behind what hides the rope and where no
+// color is known.
 struct TextureColor {
   math::Vector3 color;  // RGB, [0, 1]
   double facing;

@@ -277,7 +277,7 @@ void save(const Twin& twin, const Path& run) {
   const dynamics::Parameters* const known = twin.parameters ? &*twin.parameters : nullptr;
   const splat::Light& light = twin.gaussians.light;
   const bool plain =
-      !light.known() &&
+      !light.known() && twin.gaussians.pixel_footprint == 0.0 &&
       (!known || (known->bending_friction.empty() && known->torsional_stiffness.empty() && known->tip_length == 0.0));
   Json out{{"format", plain ? kFormat : kNewFormat},
            {"about", about_json(twin)},

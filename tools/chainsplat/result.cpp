@@ -99,9 +99,8 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
   twin::Twin twin = pipeline::load_twin(request.run);
   if (exports::ending(request.out) == ".npz")
     twin.states.covariance = pipeline::read_covariances(Path(request.run) / pipeline::kCovarianceFile, twin.states);
-  const chain::States motion = request.states.empty()
-                                   ? twin.states
-                                   : twin::read_states(pipeline::input_path(request.states), twin.chain);
+  const chain::States motion =
+      request.states.empty() ? twin.states : twin::read_states(pipeline::input_path(request.states), twin.chain);
   const Path beside = base_beside(request.states);
   const trajectory::Trajectory base = !request.base.empty() ? pipeline::read_base(pipeline::input_path(request.base))
                                       : !beside.empty()     ? pipeline::read_base(beside)
@@ -123,9 +122,9 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
   if (twin.gaussians.count > 0 && exports::for_viewers(request.out)) {
     const std::optional<capture::Capture> recording = pipeline::own_recording(twin, request.run);
     if (recording) options.cameras = recording->cameras;
-    if (recording && !request.raw)
-      twin.gaussians =
-          exports::with_low_pass(twin.gaussians, twin.chain, twin.states, recording->base, recording->cameras);
+    if (!request.raw && (recording || twin.gaussians.pixel_footprint > 0.0))
+      twin.gaussians = exports::with_low_pass(twin.gaussians, twin.chain, twin.states,
+                                              recording ? recording->base : base, options.cameras);
     else if (!request.raw)
       core::warn(request.run +
                  ": its capture is not there any more; the Gaussians are as trained, thin in other viewers");
