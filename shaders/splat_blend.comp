@@ -22,7 +22,7 @@ layout(std430) readonly buffer Views { SplatView views[]; };
 layout(std430) readonly buffer TilePrefix { uint tile_prefix[]; };
 layout(std430) readonly buffer TileBlock { uint tile_block[]; };
 layout(std430) readonly buffer TileCount { uint tile_count[]; };
-layout(std430) readonly buffer Sorted { uvec2 sorted[]; };
+layout(std430) readonly buffer Sorted { uint sorted[]; };
 layout(std430) readonly buffer Splats { vec4 splats[]; };
 layout(std430) readonly buffer Counters { uint counters[]; };
 layout(std430) writeonly buffer Image { vec4 image[]; };
@@ -32,8 +32,8 @@ layout(std430) writeonly buffer DepthImage { float depth_image[]; };
 // entries per iteration: the values that a loop carries from one iteration to the next cost a fifth of an entry's time
 const uint kTurns = kShare > 1u ? 2u : 1u;
 
-#include "inc/alpha.glsl"
 #include "inc/share.glsl"
+#include "inc/alpha.glsl"
 
 void main() {
   uint tile = gl_WorkGroupID.x * p.tile_stride % p.tiles, lane = gl_LocalInvocationID.x;
@@ -58,7 +58,7 @@ void main() {
   while (used < n && any_open) {
     // load one splat per sharing lane, then blend them in turn
     uint turns = kShare > 1u ? min(kShare, n - used) : 1u, own_turn = gl_SubgroupInvocationID % kShare;
-    uint own = kSplatRows * sorted[start + used + min(own_turn, turns - 1u)].x;
+    uint own = kSplatRows * sorted[start + used + min(own_turn, turns - 1u)];
     vec4 own_a = splats[own], own_b = splats[own + 1u], own_c = splats[own + 2u];
     Falloff own_falloff = falloff_of(own_b.xyz);
     if (own_turn >= turns) own_a.z = 0.0;

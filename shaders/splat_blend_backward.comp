@@ -1,8 +1,9 @@
 // splat_blend_backward.comp - one work group per active tile, laid out as in splat_blend.comp: the gradient of each
 // entry by the pixels of the tile (mathematics.md 2.8). It walks front to back: the color behind entry k is that of the
 // whole pixel minus that up to k, and only its product with the pixel's gradient is carried along. Each cluster of
-// kSubgroup lanes stores its sum in a slot of its own (no atomics). A subgroup is one cluster, or several where it
-// turns out wider than the least size that the device guarantees.
+// kSubgroup lanes stores its sum in a slot of its own (no atomics), in the order of the list: stores that are scattered
+// wait for the caches longer than the loads of splat_project_backward.comp do. A subgroup is one cluster, or several
+// where it turns out wider than the least size that the device guarantees.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -22,18 +23,18 @@ layout(std430) readonly buffer Views { SplatView views[]; };
 layout(std430) readonly buffer TilePrefix { uint tile_prefix[]; };
 layout(std430) readonly buffer TileBlock { uint tile_block[]; };
 layout(std430) readonly buffer TileCount { uint tile_count[]; };
-layout(std430) readonly buffer Sorted { uvec2 sorted[]; };
+layout(std430) readonly buffer Sorted { uint sorted[]; };
 layout(std430) readonly buffer Splats { vec4 splats[]; };
 layout(std430) readonly buffer Counters { uint counters[]; };
 layout(std430) readonly buffer Image { vec4 image[]; };
 layout(std430) readonly buffer TileUsed { uint tile_used[]; };
 layout(std430) readonly buffer Target { uint target[]; };
 layout(std430) readonly buffer PixelGradient { vec4 pixel_gradient[]; };  // of D-SSIM, by color and alpha
-layout(std430) writeonly buffer Partials { float partials[]; };  // kPartialRows vec4 per slot
+layout(std430) writeonly buffer Partials { float partials[]; };  // kPartial per slot
 
+#include "inc/share.glsl"
 #include "inc/alpha.glsl"
 #include "inc/background.glsl"
-#include "inc/share.glsl"
 #include "inc/subgroup_sum.glsl"
 
 void main() {
@@ -48,7 +49,7 @@ void main() {
   uint used = min(tile_used[tile], n);
 
   uint cluster = gl_SubgroupID * (gl_SubgroupSize / kSubgroup) + gl_SubgroupInvocationID / kSubgroup;
-  uint cluster_lane = gl_SubgroupInvocationID % kSubgroup, cluster_slot = 4u * kPartialRows * cluster;
+  uint cluster_lane = gl_SubgroupInvocationID % kSubgroup, cluster_slot = kPartial * cluster;
 
   // gradient of the loss by the pixels
   bool dssim = p.weight_dssim > 0.0 && tile < p.near_tiles;
@@ -72,8 +73,8 @@ void main() {
   // entries front to back: the gradient by color, opacity, center and covariance
   for (uint begin = 0u; begin < used; begin += kShare) {
     uint turns = kShare > 1u ? min(kShare, used - begin) : 1u, own_turn = gl_SubgroupInvocationID % kShare;
-    uvec2 own = sorted[start + begin + min(own_turn, turns - 1u)];
-    uint own_slot = 4u * kPartialRows * p.slots * own.y, s = kSplatRows * own.x;
+    uint own_place = start + begin + min(own_turn, turns - 1u), s = kSplatRows * sorted[own_place];
+    uint own_slot = kPartial * p.slots * own_place;
     vec4 own_a = splats[s], own_b = splats[s + 1u], own_c = splats[s + 2u];
     float own_inverse = own_a.z > 1e-30 ? 1.0 / own_a.z : 0.0, own_blue = 0.0;
     Falloff own_falloff = falloff_of(own_b.xyz);
@@ -120,7 +121,7 @@ void main() {
   }
   // entries behind the last one that a pixel used have no gradient
   for (uint k = used + lane; k < n; k += gl_WorkGroupSize.x) {
-    uint slot = 4u * kPartialRows * p.slots * sorted[start + k].y;
-    for (uint m = 0u; m < 4u * kPartialRows * p.slots; ++m) partials[slot + m] = 0.0;
+    uint slot = kPartial * p.slots * (start + k);
+    for (uint m = 0u; m < kPartial * p.slots; ++m) partials[slot + m] = 0.0;
   }
 }

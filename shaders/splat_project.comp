@@ -4,17 +4,21 @@
 // sums and splat_bin.comp.
 #version 460
 #extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
+#extension GL_KHR_shader_subgroup_basic : require
+#extension GL_KHR_shader_subgroup_shuffle : require
 #include "shared/splat.h"
 #include "inc/gaussian.glsl"
 layout(local_size_x = 64) in;
 layout(constant_id = 0) const uint kCutoffs = 1u;
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
+layout(constant_id = 3) const uint kShare = 1u;  // as in splat_blend.comp
 layout(push_constant) uniform Push { SplatPush p; };
 layout(std430) readonly buffer Parameters { float parameters[]; };
-layout(std430) readonly buffer ReplicaOpacity { float replica_opacity[]; };
+layout(std430) readonly buffer ReplicaShare { float replica_share[]; };
 layout(std430) readonly buffer Live { uint live[]; };
-layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer Views { vec4 views[]; };
 layout(std430) readonly buffer Motions { vec4 motions[]; };
 layout(std430) readonly buffer TileMap { uint tile_map[]; };
 layout(std430) readonly buffer Counters { uint counters[]; };
@@ -25,6 +29,8 @@ layout(std430) writeonly buffer TileHits { uint tile_hits[]; };
 layout(std430) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica number, splat, -
 
 #include "inc/project.glsl"
+#include "inc/share.glsl"
+#include "inc/view.glsl"
 
 // -exponent at which a Gaussian is about 0 in float: the extent when there is no 1/255 cut
 const float kFullReach = 80.0;
@@ -40,17 +46,17 @@ float least_in(vec3 conic, vec2 low, vec2 high) {
 }
 
 void main() {
-  uint r = gl_GlobalInvocationID.x, v = gl_GlobalInvocationID.y;
+  uint r = gl_GlobalInvocationID.x, v = gl_WorkGroupID.y;
+  SplatView view = view_at(v);  // here, where all lanes are still active
   uint live_count = counters[kCounterLive];
   if (r >= live_count) return;
   uint e = live[r], n = p.gaussians, i = e % n, link = e / n;
   uint replica = i * p.links + link;  // number of replica (i, j) of mathematics.md 2.4, which breaks ties of depth
   uint out_index = v * live_count + r;
-  SplatView view = views[v];
 
   // project the replica
   Projection a = project(view, n, i, link);
-  float opacity = replica_opacity[e];
+  float opacity = opacity_of(parameters[at_opacity(n, i)]) * replica_share[e];
   float determinant = a.cov.x * a.cov.z - a.cov.y * a.cov.y;
   vec2 u = view.intrinsics.xy * a.x.xy / a.x.z + view.intrinsics.zw;
 
@@ -99,10 +105,8 @@ void main() {
   vec3 direction = normalize(a.x) * a.link;
   vec3 color = vec3(0.5);
   uint sh = at_sh(n, p.coefficients, i);
-  for (uint l = 0u; l < p.coefficients; ++l) {
-    color += sh_basis(l, direction) * vec3(parameters[sh + 3u * l], parameters[sh + 3u * l + 1u], parameters[sh + 3u * l + 2u]);
-  }
-  color *= side_of(view, n, i, a.link).brightness;
+  for (uint l = 0u; l < p.coefficients; ++l) color += sh_basis(l, direction) * coefficient(sh, l);
+  color *= side_of(view, a.mean, a.link).brightness;
   splats[kSplatRows * out_index] = vec4(u, opacity, a.x.z);
   splats[kSplatRows * out_index + 1u] =
       vec4(conic, uintBitsToFloat(t0.x | t1.x << 16u));

@@ -4,26 +4,34 @@
 // world frame.
 #version 460
 #extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
+#extension GL_KHR_shader_subgroup_basic : require
+#extension GL_KHR_shader_subgroup_shuffle : require
 #include "shared/splat.h"
 #include "inc/gaussian.glsl"
 layout(local_size_x = 64) in;
+layout(constant_id = 0) const uint kShare = 1u;  // as in splat_blend.comp
 layout(push_constant) uniform Push { SplatPush p; };
 layout(std430) readonly buffer Parameters { float parameters[]; };
 layout(std430) readonly buffer Live { uint live[]; };
-layout(std430) readonly buffer Views { SplatView views[]; };
+layout(std430) readonly buffer Views { vec4 views[]; };
 layout(std430) readonly buffer Motions { vec4 motions[]; };
 layout(std430) readonly buffer Counters { uint counters[]; };
 layout(std430) readonly buffer Splats { vec4 splats[]; };
 layout(std430) readonly buffer InstanceCount { uint instance_count[]; };
 layout(std430) readonly buffer InstancePrefix { uint instance_prefix[]; };
 layout(std430) readonly buffer InstanceBlock { uint instance_block[]; };
-layout(std430) readonly buffer Partials { vec4 partials[]; };
+layout(std430) readonly buffer InstancePlace { uint instance_place[]; };
+layout(std430) readonly buffer Partials { float partials[]; };
 layout(std430) writeonly buffer Records { vec4 records[]; };
 
 #include "inc/project.glsl"
+#include "inc/share.glsl"
+#include "inc/view.glsl"
 
 void main() {
-  uint r = gl_GlobalInvocationID.x, v = gl_GlobalInvocationID.y;
+  uint r = gl_GlobalInvocationID.x, v = gl_WorkGroupID.y;
+  SplatView view = view_at(v);  // here, where all lanes are still active
   uint live_count = counters[kCounterLive];
   if (r >= live_count) return;
   uint s = v * live_count + r;
@@ -31,18 +39,21 @@ void main() {
   uint count = counters[kCounterOverflow] != 0u ? 0u : instance_count[s];
   vec4 sum0 = vec4(0.0), sum1 = vec4(0.0);
   float blue = 0.0;
-  uint first = kPartialRows * p.slots * (instance_prefix[s] + instance_block[s / kScanBlock]);
-  for (uint k = 0u; k < count * p.slots; ++k) {
-    sum0 += partials[first + kPartialRows * k];
-    sum1 += partials[first + kPartialRows * k + 1u];
-    blue += partials[first + kPartialRows * k + 2u].x;
+  uint first = instance_prefix[s] + instance_block[s / kScanBlock];
+  for (uint k = 0u; k < count; ++k) {
+    uint partial = kPartial * p.slots * instance_place[first + k];
+    for (uint slot = 0u; slot < p.slots; ++slot) {
+      sum0 += vec4(partials[partial], partials[partial + 1u], partials[partial + 2u], partials[partial + 3u]);
+      sum1 += vec4(partials[partial + 4u], partials[partial + 5u], partials[partial + 6u], partials[partial + 7u]);
+      blue += partials[partial + 8u];
+      partial += kPartial;
+    }
   }
   if (count == 0u) {
     for (uint k = 0u; k < kGradientRows; ++k) records[record + k] = vec4(0.0);
     return;
   }
   uint e = live[r], n = p.gaussians, i = e % n, link = e / n;
-  SplatView view = views[v];
   Projection a = project(view, n, i, link);
 
   // color: no gradient where the camera cuts it off
@@ -50,7 +61,7 @@ void main() {
   vec3 grad_lit = vec3(sum0.w, sum1.w, blue) * view.gain.xyz * vec3(greaterThan(splat_color, vec3(0.0))) *
                   vec3(lessThan(splat_color, vec3(view.gain.w)));
   // in the light of the side that it is on, which changes where the Gaussian goes around the rope and as the link turns
-  Side side = side_of(view, n, i, a.link);
+  Side side = side_of(view, a.mean, a.link);
   vec3 grad_color = grad_lit * side.brightness;
   vec3 unlit = (splat_color - view.bias.xyz) / (view.gain.xyz * side.brightness);
   vec3 grad_normal = side.slope * dot(grad_lit, unlit);
@@ -70,29 +81,29 @@ void main() {
   grad_x.z -= 2.0 * inverse_z * dot(h.xz, a.low_pass * vec2(a.by_depth));
   // view direction of the spherical harmonics: by position, and as the link turns
   vec3 turn = vec3(0.0);
+  vec2 packed_direction = vec2(0.0);
   if (p.coefficients > 1u) {
     float distance = length(a.x);
     vec3 camera_direction = a.x / distance;
     vec3 direction = camera_direction * a.link;
+    packed_direction = packed(direction);
     vec3 grad_direction = vec3(0.0);
     uint sh = at_sh(n, p.coefficients, i);
-    for (uint l = 1u; l < p.coefficients; ++l) {
-      vec3 coefficient = vec3(parameters[sh + 3u * l], parameters[sh + 3u * l + 1u], parameters[sh + 3u * l + 2u]);
-      grad_direction += dot(coefficient, grad_color) * sh_basis_gradient(l, direction);
-    }
+    for (uint l = 1u; l < p.coefficients; ++l)
+      grad_direction += dot(coefficient(sh, l), grad_color) * sh_basis_gradient(l, direction);
     vec3 grad_camera_direction = a.link * grad_direction;
     grad_x += (grad_camera_direction - camera_direction * dot(camera_direction, grad_camera_direction)) / distance;
     turn = -cross(camera_direction, grad_camera_direction);
   }
-  // scale, rotation, and the moment that the position and the covariance exert on the link
+  // scale and rotation; then the moment that the position and the covariance exert on the link
   vec3 grad_scale = vec3(dot(a.local[0], grad_m[0]), dot(a.local[1], grad_m[1]), dot(a.local[2], grad_m[2])) * a.scale;
   mat3 grad_r = transpose(a.link) * mat3(grad_m[0] * a.scale.x, grad_m[1] * a.scale.y, grad_m[2] * a.scale.z);
-  vec3 moment = cross(a.x - view.moment_point.xyz, grad_x) + turn + cross(a.m[0], grad_m[0]) +
-                cross(a.m[1], grad_m[1]) + cross(a.m[2], grad_m[2]) + cross(side.normal, grad_normal);
   records[record] = vec4((grad_x + side.around * (dot(side.around, grad_normal) / side.radius)) * a.link, sum0.z);
   records[record + 1u] = rotation_matrix_backward(a.q, a.q_size, grad_r);
-  records[record + 2u] = vec4(grad_scale, 0.0);
-  records[record + 3u] = vec4(grad_color, 0.0);
+  records[record + 2u] = vec4(grad_scale, packed_direction.x);
+  records[record + 3u] = vec4(grad_color, packed_direction.y);
+  vec3 moment = cross(a.x - view.moment_point.xyz, grad_x) + turn + cross(a.m[0], grad_m[0]) +
+                cross(a.m[1], grad_m[1]) + cross(a.m[2], grad_m[2]) + cross(side.normal, grad_normal);
   records[record + 4u] = vec4(moment, 0.0);
   records[record + 5u] = vec4(grad_x, 0.0);
 }

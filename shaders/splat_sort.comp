@@ -16,7 +16,8 @@ layout(std430) readonly buffer TileBlock { uint tile_block[]; };
 layout(std430) readonly buffer TileCount { uint tile_count[]; };
 layout(std430) readonly buffer Entries { uvec4 entries[]; };  // depth bits, replica, splat, instance
 layout(std430) writeonly buffer LongTiles { uint long_tiles[]; };
-layout(std430) writeonly buffer Sorted { uvec2 sorted[]; };   // splat, instance
+layout(std430) writeonly buffer Sorted { uint sorted[]; };    // splat
+layout(std430) writeonly buffer InstancePlace { uint instance_place[]; };  // in sorted[]; not of lists at fixed places
 layout(std430) buffer Counters { uint counters[]; };
 
 void main() {
@@ -60,7 +61,10 @@ void main() {
       uvec2 other = entries[start + m].xy;
       nearer += ivec2(other.x == a.x && other.y < a.y, other.x == b.x && other.y < b.y);
     }
-    if (k.x < n) sorted[start + uint(nearer.x)] = a.zw;
-    if (k.y < n) sorted[start + uint(nearer.y)] = b.zw;
+    uvec2 place = start + uvec2(nearer);
+    if (k.x < n) sorted[place.x] = a.z;
+    if (k.y < n) sorted[place.y] = b.z;
+    if (k.x < n && !own_places) instance_place[a.w] = place.x;
+    if (k.y < n && !own_places) instance_place[b.w] = place.y;
   }
 }

@@ -12,7 +12,8 @@ layout(std430) readonly buffer TileCount { uint tile_count[]; };
 layout(std430) readonly buffer Entries { uvec4 entries[]; };  // depth bits, replica, splat, instance
 layout(std430) readonly buffer LongTiles { uint long_tiles[]; };
 layout(std430) coherent buffer SortScratch { uvec2 sort_scratch[]; };  // two per entry: key, number in the list
-layout(std430) writeonly buffer Sorted { uvec2 sorted[]; };   // splat, instance
+layout(std430) writeonly buffer Sorted { uint sorted[]; };     // splat
+layout(std430) writeonly buffer InstancePlace { uint instance_place[]; };  // as in splat_sort.comp
 
 const uint kDigitBits = 5u, kDigits = 1u << kDigitBits;
 const uint kLongRun = 8u;  // more equal depths in a row than this are sorted by radix, not one against the other
@@ -21,6 +22,11 @@ const uint kUnroll = 4u;   // fewer, longer iterations: lavapipe ends an invocat
 shared uint place[kDigits * gl_WorkGroupSize.x];  // [digit][lane]: number of keys, then place of the next one
 shared uint lane_total[gl_WorkGroupSize.x];
 shared uint least, most, long_run;
+
+void put(uvec4 entry, uint at) {
+  sorted[at] = entry.z;
+  if (p.tile_capacity == 0u) instance_place[entry.w] = at;
+}
 
 void everyone_sees() {
   memoryBarrierBuffer();
@@ -132,14 +138,14 @@ void main() {
     bool equal_before = k > 0u && sort_scratch[at + k - 1u].x == item.x;
     bool equal_after = k + 1u < n && sort_scratch[at + k + 1u].x == item.x;
     if (many_equal || (!equal_before && !equal_after)) {
-      sorted[start + k] = entries[start + item.y].zw;
+      put(entries[start + item.y], start + k);
     } else if (!equal_before) {  // this lane has the first of the run and writes all of it
       uint end = k + 1u;
       while (end < n && sort_scratch[at + end].x == item.x) ++end;
       for (uint m = k; m < end; ++m) {
         uint index = sort_scratch[at + m].y, replica = entries[start + index].y, rank = k;
         for (uint o = k; o < end; ++o) rank += entries[start + sort_scratch[at + o].y].y < replica ? 1u : 0u;
-        sorted[start + rank] = entries[start + index].zw;
+        put(entries[start + index], start + rank);
       }
     }
   }

@@ -1,5 +1,5 @@
 // alpha.glsl - the alpha of one splat in a column of pixels, shared by the forward and the backward pass so that both
-// agree (mathematics.md 2.6). Needs kCutoffs, kPixels.
+// agree (mathematics.md 2.6). Needs kCutoffs, kPixels, share.glsl.
 #include "chainsplat/image_model.h"
 
 const float kAlphaCap = kCutoffs != 0u ? kMostAlpha : 2.0;
@@ -22,6 +22,10 @@ Falloff falloff_of(vec3 conic) {
   f.fall = -kHalfLog2e * conic.z;
   f.change = exp2(2.0 * f.fall);
   return f;
+}
+
+Falloff shared_by(Falloff f, uint turn) {
+  return Falloff(shared_by(f.slope, turn), shared_by(f.along, turn), shared_by(f.fall, turn), shared_by(f.change, turn));
 }
 
 // `opacity` times the falloff at kPixels pixels of a column, the first of them dy below the column's peak. From one row

@@ -1,6 +1,21 @@
 // gaussian.glsl - small functions of a Gaussian's parameters.
 #include "shared/gaussian.h"
 
+const uint kLinear = 4u;  // SH basis functions up to degree 1
+
+float opacity_of(float logit) { return 1.0 / (1.0 + exp(-logit)); }
+
+// A direction as two numbers, and back: the octahedron's faces laid into a square (Cigolle et al. 2014).
+vec2 signs_of(vec2 x) { return vec2(x.x < 0.0 ? -1.0 : 1.0, x.y < 0.0 ? -1.0 : 1.0); }
+vec2 packed(vec3 direction) {
+  vec3 p = direction / (abs(direction.x) + abs(direction.y) + abs(direction.z));
+  return p.z < 0.0 ? (1.0 - abs(p.yx)) * signs_of(p.xy) : p.xy;
+}
+vec3 unpacked(vec2 p) {
+  float z = 1.0 - abs(p.x) - abs(p.y);
+  return normalize(vec3(z < 0.0 ? (1.0 - abs(p.yx)) * signs_of(p) : p, z));
+}
+
 // Rotation matrix of a unit quaternion q = (w, x, y, z).
 mat3 rotation_matrix(vec4 q) {
   float w = q.x, x = q.y, y = q.z, z = q.w;

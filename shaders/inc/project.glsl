@@ -6,6 +6,7 @@
 const float kLeastRadius = 1e-5;  // m; what lies nearer to the axis has no side
 
 struct Projection {
+  vec3 mean;         // home frame, m
   vec3 x;            // camera frame, m
   mat3 link;         // rotation of camera_from_home
   vec4 q;            // unit quaternion
@@ -21,7 +22,12 @@ struct Projection {
   vec3 cov;          // xx, xy, yy of Sigma', px^2
 };
 
-// The side of the rope that Gaussian i of n is on, and the light there (mathematics.md 2.4).
+// SH coefficient l, RGB, of those that begin at parameter `sh`.
+vec3 coefficient(uint sh, uint l) {
+  return vec3(parameters[sh + 3u * l], parameters[sh + 3u * l + 1u], parameters[sh + 3u * l + 2u]);
+}
+
+// The side of the rope that a Gaussian is on, and the light there (mathematics.md 2.4).
 struct Side {
   vec3 normal;      // from the rope's axis to the Gaussian, camera frame
   float radius;     // m from the axis
@@ -30,11 +36,9 @@ struct Side {
   vec3 slope;       // of the brightness by the normal; 0 where it is cut
 };
 
-Side side_of(SplatView view, uint n, uint i, mat3 link) {
+Side side_of(SplatView view, vec3 mean, mat3 link) {
   Side side = Side(vec3(0.0), 1.0, 1.0, vec3(0.0), vec3(0.0));
   if (view.axis.w == 0.0) return side;
-  uint at = at_mean(n, i);
-  vec3 mean = vec3(parameters[at], parameters[at + 1u], parameters[at + 2u]);
   vec3 off = mean - dot(mean, view.axis.xyz) * view.axis.xyz;
   side.radius = max(length(off), kLeastRadius);
   side.normal = link * off / side.radius;
@@ -56,6 +60,7 @@ Projection project(SplatView view, uint n, uint i, uint of_link) {
   vec4 rotation = vec4(parameters[aq], parameters[aq + 1u], parameters[aq + 2u], parameters[aq + 3u]);
   vec3 log_scale = vec3(parameters[as], parameters[as + 1u], parameters[as + 2u]);
   Projection a;
+  a.mean = mean;
   a.link = transpose(mat3(row0.xyz, row1.xyz, row2.xyz));
   a.x = vec3(dot(row0.xyz, mean) + row0.w, dot(row1.xyz, mean) + row1.w, dot(row2.xyz, mean) + row2.w);
   a.q_size = length(rotation);

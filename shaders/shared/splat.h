@@ -27,6 +27,8 @@ struct SplatView {
   uint motion;                   // first link pose, in units of one pose (3 vec4 rows of camera_from_home)
 };
 
+const uint kViewRows = 11u;      // vec4 of a SplatView
+
 // One active tile: a tile of a view that is blended and contributes to the loss.
 struct SplatTile {
   uint view, x, y, padding;      // x, y in tiles
@@ -66,8 +68,7 @@ const uint kCounterWantTile = 14u;  // the tile capacity that was needed
 const uint kCounters = 16u;
 const uint kLongestList = 32768u;   // entries of a tile; lavapipe ends an invocation's loops after 65535 iterations
 
-const uint kFlagAccumulate = 1u;    // gradients of this chunk of views are added to those of the chunks before
-const uint kFlagHeldLinks = 2u;     // the gradient by link logits is not computed
+const uint kFlagHeldLinks = 1u;     // the gradient by link logits is not computed
 
 // splat record: 3 vec4
 //   0: u (px), opacity, depth (m)   1: conic xx, xy, yy, tiles x0 | x1 << 16   2: color, tiles y0 | y1 << 16
@@ -75,13 +76,15 @@ const uint kSplatRows = 3u;
 const uint kTileHits = 32u;         // first tiles of the rectangle, by rows, with a bit that says whether the splat
                                     // touches them; later tiles count as touched
 // gradient record of one (replica, view): 6 vec4
-//   0: mean (home), opacity   1: rotation   2: log scale   3: color   4: link moment   5: link force (camera frame)
+//   0: mean (home), opacity   1: rotation   2: log scale, direction   3: color, direction (home, packed)
+//   4: link moment   5: link force (camera frame)
 const uint kGradientRows = 6u;
-// partial gradient of one (instance, subgroup): 3 vec4
-//   0: u, opacity, red   1: xx, xy, yy of 2 dL/dSigma', green   2: blue, -, -, -
-const uint kPartialRows = 3u;
+// partial gradient of one (instance, cluster of lanes), in the order of the lists: 9 floats, no more, since what the
+// caches do not hold costs most
+//   u x 2, opacity, red   xx, xy, yy of 2 dL/dSigma', green   blue
+const uint kPartial = 9u;
 
 #ifdef __cplusplus
-static_assert(sizeof(SplatView) == 176 && sizeof(SplatTile) == 16 && sizeof(SplatPush) == 80);
+static_assert(sizeof(SplatView) == kViewRows * sizeof(vec4) && sizeof(SplatTile) == 16 && sizeof(SplatPush) == 80);
 }  // namespace chainsplat::shared
 #endif

@@ -1,6 +1,5 @@
 #include <algorithm>
-#include <cmath>
-#include <cstdlib>
+#include <array>
 
 #include "chainsplat/eval.h"
 #include "chainsplat/image_model.h"
@@ -11,7 +10,9 @@ using namespace image_model;
 
 namespace {
 
-constexpr int kMoments = 5;  // filtered quantities: x, y, x^2, y^2, x y
+// Filtered quantities. Of x^2 and y^2 only the sum is asked for.
+enum Moment { kX, kY, kSquares, kProduct, kMoments };
+constexpr int kTaps = 2 * kSsimReach + 1;
 
 struct Span {
   int first = 0, last = 0;  // [first, last); empty when first >= last
@@ -21,6 +22,20 @@ Span joined(const Span& a, const Span& b) {
   if (a.first >= a.last) return b;
   if (b.first >= b.last) return a;
   return {std::min(a.first, b.first), std::max(a.last, b.last)};
+}
+
+using Taps = std::array<const float*, kTaps>;
+
+// out[i] = sum of the window's weights times in[t][i] for i in [first, last). In single precision, which leaves 1e-7 of
+// the mean over an image; written out, so that the compiler has no loop in the loop.
+void filter(const Taps& in, float* out, int first, int last) {
+  static_assert(kSsimReach == 5);
+  std::array<float, kSsimReach + 1> w;
+  for (int t = 0; t <= kSsimReach; ++t) w[t] = static_cast<float>(kSsimWindow[t]);
+  const auto [a, b, c, d, e, middle, f, g, h, i, j] = in;
+  for (int x = first; x < last; ++x)
+    out[x] = w[0] * middle[x] + w[1] * (e[x] + f[x]) + w[2] * (d[x] + g[x]) + w[3] * (c[x] + h[x]) +
+             w[4] * (b[x] + i[x]) + w[5] * (a[x] + j[x]);
 }
 
 }  // namespace
@@ -48,56 +63,56 @@ double ssim(const std::vector<float>& a_rgb, const std::vector<float>& b_rgb, in
     for (int t = std::max(0, y - kSsimReach); t < std::min(height, y + kSsimReach + 1); ++t)
       span[y] = joined(span[y], row_span[t]);
 
-  // filter along rows, then along columns, and sum 1 - S
-  std::vector<double> filtered(kMoments * pixels, 0.0);  // along rows; 0 outside the spans in every channel
-  std::vector<double> line(kMoments * (width + 2u * kSsimReach)), sum(kMoments * static_cast<std::size_t>(width));
-  const std::size_t padded = width + 2u * kSsimReach;
+  // Rows are filtered along x as they come, colors interleaved, and the last kTaps of them, 0 outside of their spans,
+  // along y: what is in use fits the cache.
+  const int samples = 3 * width, margin = 3 * kSsimReach;
+  std::vector<float> line(static_cast<std::size_t>(kMoments) * (samples + 2 * margin));
+  std::vector<float> rows(static_cast<std::size_t>(kTaps) * kMoments * samples), column(kMoments * samples);
+  const auto filtered = [&](int y, int m) {
+    return &rows[(static_cast<std::size_t>((y + kTaps) % kTaps) * kMoments + m) * samples];
+  };
+  const auto filter_row = [&](int y) {
+    for (int m = 0; m < kMoments; ++m) std::fill_n(filtered(y, m), samples, 0.0f);
+    if (y >= height || row_span[y].first >= row_span[y].last) return;
+    const int first = 3 * row_span[y].first, last = 3 * row_span[y].last;
+    const std::size_t padded = samples + 2u * margin;
+    std::fill(line.begin(), line.end(), 0.0f);
+    const float *const a = &a_rgb[static_cast<std::size_t>(samples) * y],
+                       *const b = &b_rgb[static_cast<std::size_t>(samples) * y];
+    float* const at = &line[margin];
+    for (int i = std::max(0, first - margin); i < std::min(samples, last + margin); ++i) {
+      at[kX * padded + i] = a[i];
+      at[kY * padded + i] = b[i];
+      at[kSquares * padded + i] = a[i] * a[i] + b[i] * b[i];
+      at[kProduct * padded + i] = a[i] * b[i];
+    }
+    for (int m = 0; m < kMoments; ++m) {
+      Taps in;
+      for (int t = 0; t < kTaps; ++t) in[t] = &line[m * padded + 3u * t];
+      filter(in, filtered(y, m), first, last);
+    }
+  };
+  for (int y = 0; y < kSsimReach; ++y) filter_row(y);
   double deficit = 0.0;  // sum of 1 - S over pixels and channels
-  for (int channel = 0; channel < 3; ++channel) {
-    for (int y = 0; y < height; ++y) {
-      const Span s = row_span[y];
-      if (s.first >= s.last) continue;
-      std::fill(line.begin(), line.end(), 0.0);
-      for (int x = std::max(0, s.first - kSsimReach); x < std::min(width, s.last + kSsimReach); ++x) {
-        const std::size_t k = 3 * (static_cast<std::size_t>(width) * y + x) + channel;
-        const double a = a_rgb[k], b = b_rgb[k];
-        double* const at = &line[x + kSsimReach];
-        at[0] = a;
-        at[padded] = b;
-        at[2 * padded] = a * a;
-        at[3 * padded] = b * b;
-        at[4 * padded] = a * b;
-      }
-      for (int m = 0; m < kMoments; ++m) {
-        double* const out = &filtered[m * pixels + static_cast<std::size_t>(width) * y];
-        std::fill(out + s.first, out + s.last, 0.0);
-        for (int t = 0; t <= 2 * kSsimReach; ++t) {
-          const double* const in = &line[m * padded + t];
-          const double weight = kSsimWindow[std::abs(t - kSsimReach)];
-          for (int x = s.first; x < s.last; ++x) out[x] += weight * in[x];
-        }
-      }
+  std::vector<float> missing(samples);
+  for (int y = 0; y < height; ++y) {
+    filter_row(y + kSsimReach);
+    if (span[y].first >= span[y].last) continue;
+    const int first = 3 * span[y].first, last = 3 * span[y].last;
+    for (int m = 0; m < kMoments; ++m) {
+      Taps in;
+      for (int t = 0; t < kTaps; ++t) in[t] = filtered(y + t - kSsimReach, m);
+      filter(in, &column[m * samples], first, last);
     }
-    for (int y = 0; y < height; ++y) {
-      const Span s = span[y];
-      if (s.first >= s.last) continue;
-      for (int m = 0; m < kMoments; ++m) {
-        double* const out = &sum[static_cast<std::size_t>(width) * m];
-        std::fill(out + s.first, out + s.last, 0.0);
-        for (int t = std::max(0, y - kSsimReach); t < std::min(height, y + kSsimReach + 1); ++t) {
-          const double* const in = &filtered[m * pixels + static_cast<std::size_t>(width) * t];
-          const double weight = kSsimWindow[std::abs(t - y)];
-          for (int x = s.first; x < s.last; ++x) out[x] += weight * in[x];
-        }
-      }
-      for (int x = s.first; x < s.last; ++x) {
-        const double mx = sum[x], my = sum[width + x];
-        const double xx = sum[2 * width + x] - mx * mx, yy = sum[3 * width + x] - my * my,
-                     xy = sum[4 * width + x] - mx * my;
-        deficit +=
-            1.0 - (2 * mx * my + kSsimC1) * (2 * xy + kSsimC2) / ((mx * mx + my * my + kSsimC1) * (xx + yy + kSsimC2));
-      }
+    const float *const mx = &column[kX * samples], *const my = &column[kY * samples],
+                       *const squares = &column[kSquares * samples], *const product = &column[kProduct * samples];
+    constexpr float c1 = static_cast<float>(kSsimC1), c2 = static_cast<float>(kSsimC2);
+    for (int i = first; i < last; ++i) {
+      const float means = mx[i] * mx[i] + my[i] * my[i], mean_product = mx[i] * my[i];
+      missing[i] = 1.0f - (2.0f * mean_product + c1) * (2.0f * (product[i] - mean_product) + c2) /
+                              ((means + c1) * (squares[i] - means + c2));
     }
+    for (int i = first; i < last; ++i) deficit += missing[i];
   }
   return 1.0 - deficit / (3.0 * full_pixels);
 }

@@ -12,32 +12,51 @@ namespace {
 constexpr double kNoise = 0.04;  // intensity below which a residual counts as noise (quadratic), above: absolute
 constexpr double kGradientFloor = 1e-4;  // squared image gradient below which a pixel says nothing
 
-// Depth of the drawn surface, spread a few pixels over the silhouette's edge, where there is gradient but no depth.
+// Depth of the drawn surface, spread a few pixels over the silhouette's edge, where there is gradient but no depth:
+// each pass gives a pixel without depth the mean of its neighbors'.
 std::vector<float> spread_depth(const splat::Picture& picture) {
   constexpr int kPasses = 3;  // px: width of the soft edge of a splatted silhouette
   std::vector<float> depth = picture.depth;
   const int w = picture.width, h = picture.height;
-  for (int pass = 0; pass < kPasses; ++pass) {
-    std::vector<float> next = depth;
-    for (int y = 0; y < h; ++y) {
-      for (int x = 0; x < w; ++x) {
-        if (depth[y * w + x] > 0) continue;
-        float sum = 0;
-        int count = 0;
-        for (int dy = -1; dy <= 1; ++dy) {
-          for (int dx = -1; dx <= 1; ++dx) {
-            if (x + dx < 0 || y + dy < 0 || x + dx >= w || y + dy >= h) continue;
-            const float d = depth[(y + dy) * w + x + dx];
-            if (d > 0) {
-              sum += d;
-              ++count;
-            }
-          }
-        }
-        if (count > 0) next[y * w + x] = sum / static_cast<float>(count);
-      }
+  // calls visit(pixel) for the neighbors of pixel k
+  const auto each_neighbor = [&](int k, const auto& visit) {
+    const int x = k % w, y = k / w;
+    for (int v = std::max(0, y - 1); v <= std::min(h - 1, y + 1); ++v)
+      for (int u = std::max(0, x - 1); u <= std::min(w - 1, x + 1); ++u)
+        if (v * w + u != k) visit(v * w + u);
+  };
+  // only beside pixels that got their depth in the pass before is there something to do
+  std::vector<int> edge;
+  for (int y = 0, k = 0; y < h; ++y)
+    for (int x = 0; x < w; ++x, ++k) {
+      if (depth[k] <= 0) continue;
+      const bool inside = x > 0 && y > 0 && x < w - 1 && y < h - 1 && depth[k - 1] > 0 && depth[k + 1] > 0 &&
+                          depth[k - w] > 0 && depth[k + w] > 0 && depth[k - w - 1] > 0 && depth[k - w + 1] > 0 &&
+                          depth[k + w - 1] > 0 && depth[k + w + 1] > 0;
+      if (!inside) edge.push_back(k);
     }
-    depth = std::move(next);
+  std::vector<char> taken(depth.size(), 0);
+  for (int pass = 0; pass < kPasses; ++pass) {
+    std::vector<int> next;
+    for (const int k : edge)
+      each_neighbor(k, [&](int n) {
+        if (depth[n] > 0 || taken[n]) return;
+        taken[n] = 1;
+        next.push_back(n);
+      });
+    std::vector<float> means;
+    for (const int k : next) {
+      float sum = 0;
+      int count = 0;
+      each_neighbor(k, [&](int n) {
+        if (depth[n] <= 0) return;
+        sum += depth[n];
+        ++count;
+      });
+      means.push_back(sum / static_cast<float>(count));
+    }
+    for (std::size_t i = 0; i < next.size(); ++i) depth[next[i]] = means[i];
+    edge = std::move(next);
   }
   return depth;
 }

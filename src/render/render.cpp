@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "src/render/reach.h"
+
 namespace chainsplat::render {
 
 using math::Rectangle;
@@ -121,6 +123,7 @@ void for_batches(splat::Engine& engine, const splat::Gaussians& gaussians, const
                  const std::function<void(std::vector<Frame>& batch)>& use) {
   const double interval = options.interval > 0.0 ? options.interval : median_interval(times);
   const Lens lens = make_lens(camera, options.undistorted);
+  const std::vector<Replica> replicas = visible_replicas(gaussians);
 
   // plan every frame that the states cover: link motions and the rectangles to draw and to return
   struct Plan {
@@ -140,8 +143,8 @@ void for_batches(splat::Engine& engine, const splat::Gaussians& gaussians, const
   core::parallel_for(static_cast<std::int64_t>(plans.size()), [&](std::int64_t k) {
     Plan& plan = plans[k];
     plan.motions = chain::material_motions(chain, states, plan.frame.time, base.pose(plan.frame.time));
-    const Rectangle content =
-        intersection(reach(gaussians, plan.motions, camera), grown(lens.field_of_view, options.margin));
+    const Rectangle content = intersection(reach(replicas, gaussians.pixel_footprint, plan.motions, camera),
+                                           grown(lens.field_of_view, options.margin));
     if (content.empty()) return;
     const auto to_recorded = [&](const Vector2& p) { return capture::distort(camera, p); };
     plan.drawn = lens.active ? content : intersection(grown(content, options.margin), image_of(camera));

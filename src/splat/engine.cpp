@@ -66,7 +66,7 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   compact = pass("splat_compact", {});
   scan_block = pass("scan_block", {});
   scan_sums = pass("scan_sums", {});
-  project = pass("splat_project", {cut, tile_width, tile_height});
+  project = pass("splat_project", {cut, tile_width, tile_height, share});
   bin = pass("splat_bin", {});
   sort = pass("splat_sort", {laid_out.sort_lanes, laid_out.rank_limit, laid_out.sort_share});
   sort_long = pass("splat_sort_long", {laid_out.sort_lanes});
@@ -74,8 +74,9 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   blend_depth = pass("splat_blend", {lanes, tile_width, tile_height, pixels_per_lane, cut, 1, share});
   blend_backward =
       pass("splat_blend_backward", {lanes, tile_width, tile_height, pixels_per_lane, cut, laid_out.subgroup, share});
-  project_backward = pass("splat_project_backward", {});
-  gather = pass("splat_gather", {});
+  project_backward = pass("splat_project_backward", {share});
+  gather = pass("splat_gather", {0});
+  gather_onto = pass("splat_gather", {1});
   link_twist = pass("splat_link_twist", {});
   adam = pass("splat_adam", {}, sizeof(AdamPush));
   loss_pixel = pass("loss_pixel", {laid_out.sort_lanes, tile_width, tile_height});

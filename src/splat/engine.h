@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cstddef>
 #include <functional>
+#include <tuple>
 #include <utility>
 
 #include "chainsplat/splat.h"
@@ -90,7 +91,8 @@ struct Scene {
   std::size_t parameter_count = 0;
   double normalizer = 1.0;
   int step = 0;
-  std::uint64_t version = 0;  // of the parameters, unique among all scenes of an engine
+  // of the parameters and of the link logits among them, unique among all scenes of an engine
+  std::uint64_t version = 0, link_version = 0;
   int coefficients() const { return (degree + 1) * (degree + 1); }
 };
 
@@ -154,7 +156,7 @@ struct Engine::State {
   std::size_t range_limit;  // bytes of one storage buffer
 
   gpu::Pipeline replicate, compact, scan_block, scan_sums, project, bin, sort, sort_long, blend, blend_depth,
-      blend_backward, project_backward, gather, link_twist, adam, loss_pixel, ssim_rows, ssim_columns,
+      blend_backward, project_backward, gather, gather_onto, link_twist, adam, loss_pixel, ssim_rows, ssim_columns,
       ssim_rows_backward, ssim_columns_backward, color_pixels, color_equations;
   gpu::Commands commands;
   gpu::Bindings bindings;  // of the pipelines to the buffers below; bind() and scan() change what some names stand for
@@ -173,12 +175,12 @@ struct Engine::State {
   // have a size that depends on the number of views in a submission.
   // clang-format off
 #define REPLICA_BUFFERS(X) \
-  X(counters) X(replica_opacity) X(live_flag) X(live_prefix) X(live_block) X(live) X(replica_gradient)
+  X(counters) X(replica_share) X(live_flag) X(live_prefix) X(live_block) X(live) X(replica_gradient)
 #define VIEW_BUFFERS(X)                                                                             \
   X(views) X(motions) X(tile_map) X(tiles)                                                          \
   X(splats) X(instance_count) X(tile_hits) X(instance_prefix) X(instance_block) X(records)          \
   X(link_twists) X(tile_count) X(tile_prefix) X(tile_block) X(tile_cursor) X(tile_used)             \
-  X(tile_loss) X(entries) X(long_tiles) X(sort_scratch) X(sorted) X(partials) X(image)              \
+  X(tile_loss) X(entries) X(long_tiles) X(sort_scratch) X(sorted) X(instance_place) X(partials) X(image)              \
   X(depth_image) X(pixel_gradient) X(ssim_row_sums) X(ssim_factors) X(color_views) X(segments)      \
   X(tile_pixels) X(tile_summary) X(pixel_sums) X(link_sums)
 #define MEMBER(buffer) Buffer buffer;
@@ -189,9 +191,9 @@ struct Engine::State {
   const std::byte *read_pixel_sums = nullptr, *read_link_sums = nullptr;  // of the last run
   Buffer list_starts, list_blocks;  // replace tile_prefix and tile_block where every list has a fixed place
   std::uint32_t live_capacity = 0, instance_capacity = 0, tile_capacity = 0;
-  std::uint64_t versions = 0;                            // number of parameter versions so far, of all scenes
-  std::pair<std::uint64_t, std::uint32_t> replicated{};  // version and live capacity of the current live replicas
-  int not_finite = 0;                                    // gradients of the last run that Adam skipped
+  std::uint64_t versions = 0;                                   // number of parameter versions so far, of all scenes
+  std::tuple<std::uint64_t, bool, std::uint32_t> replicated{};  // version, held links and capacity of the live replicas
+  int not_finite = 0;                                           // gradients of the last run that Adam skipped
   int most_views = 1 << 20;  // per submission; lowered when a buffer would exceed the device's limit
   std::vector<gpu::Timing> timings;
 

@@ -196,12 +196,12 @@ bool Engine::State::make_room(Submission& s) {
   if (instance_capacity == 0) instance_capacity = narrow(std::max<std::size_t>(1024, kFirstInstances * s.pairs / 2));
   // the capacity that drawing has reached may be too large for gradients; an overflow then lowers the number of views
   if (options.backward)
-    instance_capacity = narrow(
-        std::min<std::size_t>(instance_capacity, range_limit / (sizeof(glm::vec4) * shared::kPartialRows * slots)));
+    instance_capacity =
+        narrow(std::min<std::size_t>(instance_capacity, range_limit / (sizeof(float) * shared::kPartial * slots)));
 
   // buffers of the lists, the picture and the gradients
   const auto blocks = [](std::size_t n) { return n / shared::kScanBlock + 1; };
-  need(replica_opacity, words(s.replicas), "replica opacity");
+  need(replica_share, words(s.replicas), "replica share");
   need(live_flag, words(s.replicas), "live flag");
   need(live_prefix, words(s.replicas), "live prefix");
   need(live_block, words(blocks(s.replicas)), "live block");
@@ -224,7 +224,8 @@ bool Engine::State::make_room(Submission& s) {
   need(entries, vectors(list_entries), "entries");
   need(long_tiles, words(s.tiles), "long tiles");
   need(sort_scratch, 4 * words(list_entries), "sort scratch");
-  need(sorted, 2 * words(list_entries), "sorted");
+  need(sorted, words(list_entries), "sorted");
+  need(instance_place, words(instance_capacity), "instance place");
   need(image, vectors(s.pixels), "image");
   need(depth_image, options.depth ? words(s.pixels) : 0, "depth image");
   need(pixel_gradient, s.dssim ? vectors(s.pixels) : 0, "pixel gradient");
@@ -234,7 +235,7 @@ bool Engine::State::make_room(Submission& s) {
     need(ssim_factors, 12 * words(near_pixels), "ssim factors");
   }
   if (options.backward) {
-    need(partials, vectors(static_cast<std::size_t>(shared::kPartialRows) * slots * instance_capacity), "partials");
+    need(partials, words(static_cast<std::size_t>(shared::kPartial) * slots * instance_capacity), "partials");
     need(records, vectors(shared::kGradientRows * s.pairs), "records");
     need(replica_gradient, words(s.replicas), "replica gradient");
     if (options.twists)
@@ -277,14 +278,15 @@ bool Engine::State::make_room(Submission& s) {
   push.weight_dssim = static_cast<float>(options.weights.dssim * options.color_scale);
   push.weight_mask = static_cast<float>(options.weights.mask * options.mask_scale);
   push.background = options.weights.background;
-  push.flags = (options.accumulate ? shared::kFlagAccumulate : 0) | (options.held_links ? shared::kFlagHeldLinks : 0);
+  push.flags = options.held_links ? shared::kFlagHeldLinks : 0;
   return true;
 }
 
 void Engine::State::record_lists(const Submission& s) {
   const Scene& scene = s.scene;
-  // clear the counters; the live replicas are kept for as long as the Gaussians do not change
-  const std::pair now{scene.version, live_capacity};
+  // clear the counters; the live replicas are kept for as long as the Gaussians, or held links, do not
+  // change
+  const std::tuple now{s.options.held_links ? scene.link_version : scene.version, s.options.held_links, live_capacity};
   const bool replicas_kept = replicated == now;
   replicated = now;
   const auto set_counters = [&](std::uint32_t from, std::uint32_t to, std::uint32_t value) {
@@ -359,7 +361,7 @@ void Engine::State::record_gradients(const Submission& s) {
   commands.stamp("blend backward");
   dispatch_live(project_backward, s.push);
   commands.stamp("project backward");
-  dispatch(gather, s.push, groups(scene.count));
+  dispatch(s.options.accumulate ? gather_onto : gather, s.push, groups(scene.count));
   if (s.options.twists && scene.count > 0) dispatch(link_twist, s.push, narrow(scene.links), s.views);
   commands.stamp("gather");
 }
@@ -369,6 +371,7 @@ void Engine::State::record_adam(const Submission& s, const AdamPush& push) {
   commands.dispatch(adam, &push, sizeof push, std::min(parameter_groups, kRow), (parameter_groups + kRow - 1) / kRow);
   commands.stamp("adam");
   s.scene.version = ++versions;
+  if (!s.options.held_links) s.scene.link_version = versions;
 }
 
 void Engine::State::record_colors(const Submission& s) {
@@ -397,7 +400,7 @@ bool Engine::State::has_fitted(const Submission& s, const std::byte* read_counte
   if (read[shared::kCounterWantTile] > tile_capacity)
     set_tile_capacity(static_cast<std::uint32_t>(kGrowth * read[shared::kCounterWantTile]));
   if (read[shared::kCounterWantInstances] > instance_capacity) instance_capacity = narrow(want_instances);
-  const std::size_t partial_bytes = vectors(static_cast<std::size_t>(shared::kPartialRows) * slots * instance_capacity);
+  const std::size_t partial_bytes = words(static_cast<std::size_t>(shared::kPartial) * slots * instance_capacity);
   if (partial_bytes > range_limit) {
     if (s.views == 1)
       throw WorkError(

@@ -95,7 +95,7 @@ void Engine::State::load_gaussians(Scene& scene, const Gaussians& gaussians) {
   const std::vector<float> all = packed(gaussians);
   scene.parameter_count = all.size();
   scene.step = 0;
-  scene.version = ++versions;
+  scene.version = scene.link_version = ++versions;
   write(scene.parameters, bytes_of(all), "parameters");
   need(scene.gradient, all.size() * sizeof(float), "gradient");
 }

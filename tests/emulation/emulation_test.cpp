@@ -52,18 +52,16 @@ Bindings with(const Push& push) {
 
 struct Lists {  // the output of splat_bin.comp
   std::vector<uint32_t> prefix, block, count;
-  std::vector<uvec4> entries;  // depth bits, replica, splat, instance
-  std::vector<uvec2> sorted;   // the output of the sorting kernels
+  std::vector<uvec4> entries;                    // depth bits, replica, splat, instance
+  std::vector<uint32_t> sorted, instance_place;  // the output of the sorting kernels
 };
 
-std::vector<uvec2> sorted_by_standard(const Lists& lists, std::size_t tile) {
+std::vector<uvec4> sorted_by_standard(const Lists& lists, std::size_t tile) {
   const auto first = lists.entries.begin() + lists.prefix[tile] + lists.block[0];
   std::vector<uvec4> list(first, first + lists.count[tile]);
   std::sort(list.begin(), list.end(),
             [](const uvec4& a, const uvec4& b) { return a.x != b.x ? a.x < b.x : a.y < b.y; });
-  std::vector<uvec2> out;
-  for (const uvec4& entry : list) out.emplace_back(entry.z, entry.w);
-  return out;
+  return list;
 }
 
 // Both sorting passes, as the engine dispatches them.
@@ -75,7 +73,10 @@ void sort(const Layout& layout, Lists& lists, uint32_t stride) {
   push.tile_stride = stride;
   std::vector<uint32_t> counters(shared::kCounters, 0), long_tiles(tiles, 0);
   std::vector<uvec2> scratch(2 * lists.entries.size());
-  lists.sorted.assign(lists.entries.size(), uvec2(~0u));
+  lists.sorted.assign(lists.entries.size(), ~0u);
+  uint32_t instances = 0;
+  for (const uvec4& entry : lists.entries) instances = std::max(instances, entry.w + 1);
+  lists.instance_place.assign(instances, ~0u);
   Bindings bound = with(push);
   bound.bind("tile_prefix", lists.prefix);
   bound.bind("tile_block", lists.block);
@@ -83,12 +84,14 @@ void sort(const Layout& layout, Lists& lists, uint32_t stride) {
   bound.bind("entries", lists.entries);
   bound.bind("long_tiles", long_tiles);
   bound.bind("sorted", lists.sorted);
+  bound.bind("instance_place", lists.instance_place);
   bound.bind("counters", counters);
   emulation::dispatch<kernels::SplatSort<kLaidOut.sort_lanes, kLaidOut.rank_limit, kLaidOut.sort_share>>(layout, bound,
-                                                                                                       tiles);
+                                                                                                         tiles);
   bound.bind("sort_scratch", scratch);
   if (counters[shared::kCounterLongTiles] > 0)
-    emulation::dispatch<kernels::SplatSortLong<kLaidOut.sort_lanes>>(layout, bound, counters[shared::kCounterLongTiles]);
+    emulation::dispatch<kernels::SplatSortLong<kLaidOut.sort_lanes>>(layout, bound,
+                                                                     counters[shared::kCounterLongTiles]);
 }
 
 // Lists of these lengths with shuffled entries and runs of equal depths, short ones and some longer than a lane's part.
@@ -106,7 +109,7 @@ Lists random_lists(const std::vector<uint32_t>& lengths, uint32_t seed) {
     float depth = 0.3f;
     for (uint32_t k = 0; k < length; ++k) {
       if (random() % 4 != 0 && !(long_runs && k > length / 4 && k < length / 4 + 20)) depth += 1e-3f * (random() % 100);
-      list.emplace_back(bits(depth), k, 1000 + k, 5000 + k);
+      list.emplace_back(bits(depth), k, 1000 + k, static_cast<uint32_t>(lists.entries.size()) + k);
     }
     std::shuffle(list.begin(), list.end(), random);
     for (uint32_t k = 0; k < length; ++k) list[k].y = (k * 7919u) % 32771u;  // orders replicas unlike depths
@@ -134,7 +137,12 @@ void check_sort() {
       for (std::size_t tile = 0; tile < lists.count.size(); ++tile) {
         CAPTURE(lists.count[tile]);
         const auto wanted = sorted_by_standard(lists, tile);
-        CHECK(std::equal(wanted.begin(), wanted.end(), lists.sorted.begin() + lists.prefix[tile] + lists.block[0]));
+        const uint32_t first = lists.prefix[tile] + lists.block[0];
+        bool as_wanted = true;
+        for (uint32_t k = 0; k < wanted.size(); ++k)
+          as_wanted =
+              as_wanted && lists.sorted[first + k] == wanted[k].z && lists.instance_place[wanted[k].w] == first + k;
+        CHECK(as_wanted);
       }
     }
   }
@@ -202,13 +210,14 @@ std::vector<View> clear_views(int count) {
 constexpr float kL1 = 0.7f, kMask = 0.4f;
 
 struct Wanted {
-  std::vector<reference::Picture> pictures;                // per view
+  std::vector<reference::Picture> pictures;                 // per view
   std::vector<std::vector<std::array<double, 9>>> partial;  // per view and splat, in the order of a partial's floats
 };
 
 // Stands for the output of the D-SSIM passes at a pixel.
 vec4 dssim_gradient(std::size_t view, int x, int y) {
-  return {0.3f * std::sin(static_cast<float>(x + 2 * y) + view), 0.2f * std::cos(static_cast<float>(3 * x - y)), -0.1f, 0};
+  return {0.3f * std::sin(static_cast<float>(x + 2 * y) + view), 0.2f * std::cos(static_cast<float>(3 * x - y)), -0.1f,
+          0};
 }
 
 bool has_dssim(int tile_x) { return tile_x == 0; }
@@ -260,9 +269,9 @@ Wanted wanted_of(const std::vector<View>& views, int tile) {
     for (const auto& s : splats) {
       const auto by = [&](const Variable& x) { return tape.adjoint(x.index); };
       // partials hold 2 dL/dSigma'; the tape's derivative by xy already contains both entries xy and yx
-      partial[s.replica] = {by(s.center[0]),           by(s.center[1]),     by(s.opacity),
-                            by(s.color[0]),            2 * by(s.covariance[0]), by(s.covariance[1]),
-                            2 * by(s.covariance[2]), by(s.color[1]),      by(s.color[2])};
+      partial[s.replica] = {by(s.center[0]),         by(s.center[1]),         by(s.opacity),
+                            by(s.color[0]),          2 * by(s.covariance[0]), by(s.covariance[1]),
+                            2 * by(s.covariance[2]), by(s.color[1]),          by(s.color[2])};
     }
     wanted.partial.push_back(std::move(partial));
     tape.forget(bottom);
@@ -357,7 +366,7 @@ Drawn draw(const Layout& layout, Scene& scene) {
   out.image.assign(scene.pixels, vec4(-1));
   out.depth.assign(scene.pixels, -1.0f);
   // fill with a value that cannot pass for a sum that a lane has written
-  out.partials.assign(4 * shared::kPartialRows * kLaidOut.slots * scene.splat_of_instance.size(), NAN);
+  out.partials.assign(shared::kPartial * kLaidOut.slots * scene.splat_of_instance.size(), NAN);
   std::vector<uint32_t> counters(shared::kCounters, 0), used(tiles, 0);
   Bindings bound = with(push);
   bound.bind("tiles", scene.tiles);
@@ -371,22 +380,25 @@ Drawn draw(const Layout& layout, Scene& scene) {
   bound.bind("image", out.image);
   bound.bind("tile_used", used);
   bound.bind("depth_image", out.depth);
-  emulation::dispatch<
-      kernels::SplatBlend<kLaidOut.lanes, kTile, kTile, kPixels, 1u, kDepth, kLaidOut.share>>(layout, bound, tiles);
+  emulation::dispatch<kernels::SplatBlend<kLaidOut.lanes, kTile, kTile, kPixels, 1u, kDepth, kLaidOut.share>>(
+      layout, bound, tiles);
   bound.bind("target", scene.targets);
   bound.bind("pixel_gradient", scene.dssim);
   bound.bind("partials", out.partials);
-  emulation::dispatch<kernels::SplatBlendBackward<kLaidOut.lanes, kTile, kTile, kPixels, 1u, kLaidOut.subgroup,
-                                                  kLaidOut.share>>(layout, bound, tiles);
+  emulation::dispatch<
+      kernels::SplatBlendBackward<kLaidOut.lanes, kTile, kTile, kPixels, 1u, kLaidOut.subgroup, kLaidOut.share>>(
+      layout, bound, tiles);
   return out;
 }
 
 // Sums the partials as splat_project_backward.comp does.
 std::vector<std::array<double, 9>> summed(const Scene& scene, const Drawn& drawn, uint32_t slots) {
   std::vector<std::array<double, 9>> out(scene.splats.size() / shared::kSplatRows);
-  for (std::size_t k = 0; k < scene.splat_of_instance.size() * slots; ++k)
-    for (std::size_t m = 0; m < 9; ++m)
-      out[scene.splat_of_instance[k / slots]][m] += drawn.partials[4 * shared::kPartialRows * k + m];
+  for (std::size_t k = 0; k < scene.splat_of_instance.size(); ++k)
+    for (std::size_t slot = 0; slot < slots; ++slot)
+      for (std::size_t m = 0; m < shared::kPartial; ++m)
+        out[scene.splat_of_instance[k]][m] +=
+            drawn.partials[shared::kPartial * (slots * scene.lists.instance_place[k] + slot) + m];
   return out;
 }
 
@@ -505,8 +517,7 @@ ColorResult color_sums(const Layout& layout, Colors& scene) {
   bound.bind("tile_summary", summary);
   bound.bind("pixel_sums", pixel_sums);
   bound.bind("link_sums", link_sums);
-  emulation::dispatch<
-      kernels::ColorPixels<kLanes, kTile, kTile, kLanes, kLaidOut.color_columns, kLaidOut.color_rows>>(
+  emulation::dispatch<kernels::ColorPixels<kLanes, kTile, kTile, kLanes, kLaidOut.color_columns, kLaidOut.color_rows>>(
       layout, bound, push.pixel_slices);
   emulation::dispatch<kernels::ColorEquations<kLanes, kTile, kTile, kLanes>>(layout, bound, push.links,
                                                                              push.equation_slices);
