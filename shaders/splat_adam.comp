@@ -2,7 +2,6 @@
 // gradient that is not finite is counted, and its parameter and moments stay as they are.
 #version 460
 #extension GL_GOOGLE_include_directive : require
-#extension GL_EXT_control_flow_attributes : require
 #include "shared/splat.h"
 #include "shared/adam.h"
 #include "shared/gaussian.h"
@@ -14,11 +13,10 @@ layout(std430) buffer FirstMoment { vec4 first_moment[]; };
 layout(std430) buffer SecondMoment { vec4 second_moment[]; };
 layout(std430) buffer Counters { uint counters[]; };
 
-// `place`: among the SH coefficients of one Gaussian, if parameter i is one of them.
-float rate_of(uint i, uint place) {
-  uint n = p.gaussians, c = p.coefficients;
+float rate_of(uint i) {
+  uint n = p.gaussians, c = p.coefficients, sh = at_sh(n, c, 0u);
   return i < at_rotation(n, 0u) ? p.mean : i < at_log_scale(n, 0u) ? p.rotation : i < at_opacity(n, 0u) ? p.log_scale
-         : i < at_sh(n, c, 0u) ? p.opacity : i < at_link(n, c, p.links, 0u) ? (place < 3u ? p.sh0 : p.sh_rest)
+         : i < sh ? p.opacity : i < at_link(n, c, p.links, 0u) ? ((i - sh) % (3u * c) < 3u ? p.sh0 : p.sh_rest)
          : p.link_logits;
 }
 
@@ -28,13 +26,7 @@ void main() {
   vec4 g = gradient[four], old_m = first_moment[four], old_s = second_moment[four];
   bvec4 bad = bvec4(uvec4(isnan(g)) | uvec4(isinf(g))), there = lessThan(uvec4(i, i + 1u, i + 2u, i + 3u), uvec4(p.total));
   vec4 m = p.beta1 * old_m + (1.0 - p.beta1) * g, s = p.beta2 * old_s + (1.0 - p.beta2) * g * g;
-  // one division for all four: a software device divides integers lane by lane
-  uint sh = at_sh(p.gaussians, p.coefficients, 0u), period = 3u * p.coefficients, place = i >= sh ? (i - sh) % period : 0u;
-  vec4 rate;
-  [[unroll]] for (uint k = 0u; k < 4u; ++k) {
-    rate[k] = rate_of(i + k, place);
-    if (i + k >= sh) place = place + 1u < period ? place + 1u : 0u;
-  }
+  vec4 rate = vec4(rate_of(i), rate_of(i + 1u), rate_of(i + 2u), rate_of(i + 3u));
   vec4 step = rate * m * p.correction1 / (sqrt(s * p.correction2) + p.epsilon);
   first_moment[four] = mix(m, old_m, bad);
   second_moment[four] = mix(s, old_s, bad);
