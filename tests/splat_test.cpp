@@ -857,6 +857,41 @@ TEST_CASE("the same input gives the same bits: loss, gradients, 20 steps, and on
   check_silent();
 }
 
+TEST_CASE("held links change nothing but that their logits stay: Gaussians that become visible are drawn") {
+  Scene scene = random_scene(47, 40, 4, 1, Logits::sharp);
+  // too faint to be drawn, until the moments that they have raise them
+  constexpr int kFaint = 20;
+  const float least = std::log(static_cast<float>(image_model::kLeastAlpha / (1.0 - image_model::kLeastAlpha)));
+  for (int i = 0; i < kFaint; ++i) scene.gaussians.opacity_logit[i] = least - 0.05f;
+  engine().set_views(scene.views, scene.packed_pointers());
+  engine().set_gaussians(scene.gaussians);
+  Engine::Snapshot start = engine().snapshot();
+  const std::size_t opacities =
+      scene.gaussians.mean.size() + scene.gaussians.rotation.size() + scene.gaussians.log_scale.size();
+  for (int i = 0; i < kFaint; ++i) {
+    start.first_moment[opacities + i] = -1.0f;
+    start.second_moment[opacities + i] = 1.0f;
+  }
+  start.step = 1000;
+  const std::array batch{0, 1, 2};
+  std::vector<Gaussians> after;
+  for (const float link_rate : {0.0f, 1e-30f}) {  // held; free, and too slow to change anything
+    engine().restore(start);
+    for (int step = 0; step < 6; ++step)
+      engine().step(batch, kAllTerms, {2e-4f, 1e-3f, 5e-3f, 5e-2f, 3e-3f, 2e-4f, link_rate}, false);
+    after.push_back(engine().gaussians());
+  }
+  CHECK(same_bits(after[0], after[1]));
+  int raised = 0, moved = 0;
+  for (int i = 0; i < kFaint; ++i) {
+    raised += after[0].opacity_logit[i] > least;
+    moved += after[0].mean[3 * i] != scene.gaussians.mean[3 * i];
+  }
+  CHECK(raised == kFaint);
+  CHECK(moved > kFaint / 4);  // those that others do not cover
+  check_silent();
+}
+
 TEST_CASE("Gaussians that change keep their moments, those that are added begin without") {
   const Scene scene = random_scene(43, 30, 3, 0, Logits::soft);
   const splat::AdamRates rates{2e-4f, 1e-3f, 5e-3f, 2e-2f, 3e-3f, 2e-4f, 2e-2f};
