@@ -17,7 +17,8 @@ layout(std430) readonly buffer TileCount { uint tile_count[]; };
 layout(std430) readonly buffer Entries { uvec4 entries[]; };  // depth bits, replica, splat, instance
 layout(std430) writeonly buffer LongTiles { uint long_tiles[]; };
 layout(std430) writeonly buffer Sorted { uint sorted[]; };    // splat
-layout(std430) writeonly buffer InstancePlace { uint instance_place[]; };  // in sorted[]; not of lists at fixed places
+// where each instance stands in sorted[]; not written for lists at fixed places, which have no instances
+layout(std430) writeonly buffer InstancePlace { uint instance_place[]; };
 layout(std430) buffer Counters { uint counters[]; };
 
 void main() {

@@ -68,7 +68,7 @@ const uint kCounterWantTile = 14u;  // the tile capacity that was needed
 const uint kCounters = 16u;
 const uint kLongestList = 32768u;   // entries of a tile; lavapipe ends an invocation's loops after 65535 iterations
 
-const uint kFlagHeldLinks = 1u;     // the gradient by link logits is not computed
+const uint kFlagHeldLinks = 1u;     // link logits have no gradient, and replicas are live whatever their opacity
 
 // splat record: 3 vec4
 //   0: u (px), opacity, depth (m)   1: conic xx, xy, yy, tiles x0 | x1 << 16   2: color, tiles y0 | y1 << 16
@@ -79,8 +79,8 @@ const uint kTileHits = 32u;         // first tiles of the rectangle, by rows, wi
 //   0: mean (home), opacity   1: rotation   2: log scale, direction   3: color, direction (home, packed)
 //   4: link moment   5: link force (camera frame)
 const uint kGradientRows = 6u;
-// partial gradient of one (instance, cluster of lanes), in the order of the lists: 9 floats, no more, since what the
-// caches do not hold costs most
+// partial gradient of one (instance, cluster of lanes), in the order of the lists: 9 floats without padding, because
+// the caches do not hold all of them and waiting for memory is what costs most
 //   u x 2, opacity, red   xx, xy, yy of 2 dL/dSigma', green   blue
 const uint kPartial = 9u;
 

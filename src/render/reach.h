@@ -16,7 +16,7 @@ struct Replica {
   double reach;             // standard deviations out to where its alpha falls to 1/255
 };
 
-// Those of all Gaussians. They do not depend on where the links are.
+// All visible replicas. They do not depend on where the links are, so that one list serves all frames.
 std::vector<Replica> visible_replicas(const splat::Gaussians& gaussians);
 
 // As render::reach, of replicas that were found before.

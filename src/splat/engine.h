@@ -155,6 +155,7 @@ struct Engine::State {
   double clamp_margin;      // of the projection's Jacobian, as a multiple of the half image
   std::size_t range_limit;  // bytes of one storage buffer
 
+  // gather_onto adds to the gradient of the chunks before
   gpu::Pipeline replicate, compact, scan_block, scan_sums, project, bin, sort, sort_long, blend, blend_depth,
       blend_backward, project_backward, gather, gather_onto, link_twist, adam, loss_pixel, ssim_rows, ssim_columns,
       ssim_rows_backward, ssim_columns_backward, color_pixels, color_equations;
@@ -180,8 +181,8 @@ struct Engine::State {
   X(views) X(motions) X(tile_map) X(tiles)                                                          \
   X(splats) X(instance_count) X(tile_hits) X(instance_prefix) X(instance_block) X(records)          \
   X(link_twists) X(tile_count) X(tile_prefix) X(tile_block) X(tile_cursor) X(tile_used)             \
-  X(tile_loss) X(entries) X(long_tiles) X(sort_scratch) X(sorted) X(instance_place) X(partials) X(image)              \
-  X(depth_image) X(pixel_gradient) X(ssim_row_sums) X(ssim_factors) X(color_views) X(segments)      \
+  X(tile_loss) X(entries) X(long_tiles) X(sort_scratch) X(sorted) X(instance_place) X(partials)     \
+  X(image) X(depth_image) X(pixel_gradient) X(ssim_row_sums) X(ssim_factors) X(color_views) X(segments)      \
   X(tile_pixels) X(tile_summary) X(pixel_sums) X(link_sums)
 #define MEMBER(buffer) Buffer buffer;
   REPLICA_BUFFERS(MEMBER) VIEW_BUFFERS(MEMBER)
