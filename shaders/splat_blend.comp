@@ -1,4 +1,4 @@
-// splat_blend.comp - one work group per active tile, a column of kPixels pixels per lane: front-to-back blending
+// splat_blend.comp - kLanes lanes per active tile, a column of kPixels pixels each: front-to-back blending
 // (mathematics.md 2.6). One loaded splat serves all pixels of the lane, which makes the pass fast where loads dominate
 // the cost (design.md, 'The size of the work'). For the same reason kShare lanes load one splat each and exchange them,
 // on devices where all lanes loading one splat costs as much as each loading another.
@@ -6,10 +6,11 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
+#extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_vote : require
 #extension GL_KHR_shader_subgroup_shuffle : require
 #include "shared/splat.h"
-layout(local_size_x_id = 0) in;  // kTileWidth * kTileHeight / kPixels
+layout(local_size_x_id = 0) in;  // a multiple of kLanes
 layout(constant_id = 1) const uint kTileWidth = 8u;
 layout(constant_id = 2) const uint kTileHeight = 8u;
 layout(constant_id = 3) const uint kPixels = 8u;
@@ -32,11 +33,15 @@ layout(std430) writeonly buffer DepthImage { float depth_image[]; };
 // entries per iteration: the values that a loop carries from one iteration to the next cost a fifth of an entry's time
 const uint kTurns = kShare > 1u ? 2u : 1u;
 
+const uint kLanes = kTileWidth * kTileHeight / kPixels;  // per tile
+
+#include "inc/group_tile.glsl"
 #include "inc/share.glsl"
 #include "inc/alpha.glsl"
 
 void main() {
-  uint tile = gl_WorkGroupID.x * p.tile_stride % p.tiles, lane = gl_LocalInvocationID.x;
+  uint tile = tile_of_lane(kLanes), lane = lane_in_tile(kLanes);
+  if (tile == kNoTile) return;
   SplatTile t = tiles[tile];
   SplatView view = views[t.view];
   uint column = t.x * kTileWidth + lane % kTileWidth;

@@ -1,4 +1,4 @@
-// splat_blend_backward.comp - one work group per active tile, laid out as in splat_blend.comp: the gradient of each
+// splat_blend_backward.comp - laid out as splat_blend.comp: the gradient of each
 // entry by the pixels of the tile (mathematics.md 2.8). It walks front to back: the color behind entry k is that of the
 // whole pixel minus that up to k, and only its product with the pixel's gradient is carried along. Each cluster of
 // kSubgroup lanes stores its sum in a slot of its own (no atomics), in the order of the list: stores that are scattered
@@ -32,13 +32,17 @@ layout(std430) readonly buffer Target { uint target[]; };
 layout(std430) readonly buffer PixelGradient { vec4 pixel_gradient[]; };  // of D-SSIM, by color and alpha
 layout(std430) writeonly buffer Partials { float partials[]; };  // kPartial per slot
 
+const uint kLanes = kTileWidth * kTileHeight / kPixels;  // per tile
+
+#include "inc/group_tile.glsl"
 #include "inc/share.glsl"
 #include "inc/alpha.glsl"
 #include "inc/background.glsl"
 #include "inc/subgroup_sum.glsl"
 
 void main() {
-  uint tile = gl_WorkGroupID.x * p.tile_stride % p.tiles, lane = gl_LocalInvocationID.x;
+  uint tile = tile_of_lane(kLanes), lane = lane_in_tile(kLanes);
+  if (tile == kNoTile) return;
   SplatTile t = tiles[tile];
   SplatView view = views[t.view];
   uint column = t.x * kTileWidth + lane % kTileWidth;
@@ -48,8 +52,7 @@ void main() {
   uint n = counters[kCounterOverflow] != 0u ? 0u : tile_count[tile];
   uint used = min(tile_used[tile], n);
 
-  uint cluster = gl_SubgroupID * (gl_SubgroupSize / kSubgroup) + gl_SubgroupInvocationID / kSubgroup;
-  uint cluster_lane = gl_SubgroupInvocationID % kSubgroup, cluster_slot = kPartial * cluster;
+  uint cluster_lane = lane % kSubgroup, cluster_slot = kPartial * (lane / kSubgroup);
 
   // gradient of the loss by the pixels
   bool dssim = p.weight_dssim > 0.0 && tile < p.near_tiles;
@@ -120,7 +123,7 @@ void main() {
     if (cluster_lane < turns) partials[own_slot + cluster_slot + 8u] = own_blue;
   }
   // entries behind the last one that a pixel used have no gradient
-  for (uint k = used + lane; k < n; k += gl_WorkGroupSize.x) {
+  for (uint k = used + lane; k < n; k += kLanes) {
     uint slot = kPartial * p.slots * (start + k);
     for (uint m = 0u; m < kPartial * p.slots; ++m) partials[slot + m] = 0.0;
   }

@@ -1,7 +1,7 @@
 // splat_project.comp - one invocation per (live replica, view): its 2-D splat, the tiles that it touches, and how many
 // of them are active. A splat extends to where its alpha falls to 1/255, not to three sigma. Where the tiles' lists
-// have fixed places (tile_capacity) the pass also enters the splat into them: for few splats this is faster than prefix
-// sums and splat_bin.comp.
+// have fixed places (tile_capacity) the pass also enters the splat into them, which is faster than prefix sums and
+// splat_bin.comp where there is room for the longest list in every tile.
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -21,12 +21,12 @@ layout(std430) readonly buffer Live { uint live[]; };
 layout(std430) readonly buffer Views { vec4 views[]; };
 layout(std430) readonly buffer Motions { vec4 motions[]; };
 layout(std430) readonly buffer TileMap { uint tile_map[]; };
-layout(std430) readonly buffer Counters { uint counters[]; };
+layout(std430) buffer Counters { uint counters[]; };
 layout(std430) writeonly buffer Splats { vec4 splats[]; };
 layout(std430) writeonly buffer InstanceCount { uint instance_count[]; };
 layout(std430) buffer TileCount { uint tile_count[]; };
 layout(std430) writeonly buffer TileHits { uint tile_hits[]; };
-layout(std430) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica number, splat, -
+layout(std430) writeonly buffer Entries { uvec4 entries[]; };  // depth bits, replica number, splat, instance
 
 #include "inc/project.glsl"
 #include "inc/share.glsl"
@@ -90,12 +90,17 @@ void main() {
     bool hit = place >= kTileHits || !(least_in(conic, low, low + size - 1.0) > kSlack * reach);
     if (tile != kNoTile && hit) {
       uint entry = atomicAdd(tile_count[tile], 1u);
+      uint instance = out_index * p.splat_capacity + min(count, p.splat_capacity - 1u);
       ++count;
       if (entry < p.tile_capacity)
-        entries[tile * p.tile_capacity + entry] = uvec4(floatBitsToUint(a.x.z), replica, out_index, 0u);
+        entries[tile * p.tile_capacity + entry] = uvec4(floatBitsToUint(a.x.z), replica, out_index, instance);
     }
     hits |= hit && place < kTileHits ? 1u << place : 0u;
     t = t.x + 1u < t1.x ? uvec2(t.x + 1u, t.y) : uvec2(t0.x, t.y + 1u);
+  }
+  if (p.tile_capacity > 0u && (p.flags & kFlagGradients) != 0u && count > p.splat_capacity) {
+    counters[kCounterOverflow] = 1u;
+    atomicMax(counters[kCounterWantSplat], count);
   }
   tile_hits[out_index] = hits;
   instance_count[out_index] = count;

@@ -39,7 +39,7 @@ void main() {
   uint count = counters[kCounterOverflow] != 0u ? 0u : instance_count[s];
   vec4 sum0 = vec4(0.0), sum1 = vec4(0.0);
   float blue = 0.0;
-  uint first = instance_prefix[s] + instance_block[s / kScanBlock];
+  uint first = p.tile_capacity > 0u ? s * p.splat_capacity : instance_prefix[s] + instance_block[s / kScanBlock];
   for (uint k = 0u; k < count; ++k) {
     uint partial = kPartial * p.slots * instance_place[first + k];
     for (uint slot = 0u; slot < p.slots; ++slot) {

@@ -1,4 +1,4 @@
-// splat_sort.comp - one work group per active tile: sorts a short list by (depth, replica). It sorts by rank: every key
+// splat_sort.comp - kLanes lanes per active tile: sorts a short list by (depth, replica). It sorts by rank: every key
 // is compared with every other. Longer lists are left to splat_sort_long.comp, a kernel of its own because a software
 // device also steps through code that a branch skips.
 #version 460
@@ -7,9 +7,10 @@
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_shuffle : require
 #include "shared/splat.h"
-layout(local_size_x_id = 0) in;
+layout(local_size_x_id = 0) in;  // a multiple of kLanes
 layout(constant_id = 1) const uint kRankLimit = 256u;  // longest list that is sorted by rank
 layout(constant_id = 2) const uint kShare = 8u;        // lanes that load one key each and exchange them
+layout(constant_id = 3) const uint kLanes = 8u;        // per tile
 layout(push_constant) uniform Push { SplatPush p; };
 layout(std430) readonly buffer TilePrefix { uint tile_prefix[]; };
 layout(std430) readonly buffer TileBlock { uint tile_block[]; };
@@ -17,14 +18,17 @@ layout(std430) readonly buffer TileCount { uint tile_count[]; };
 layout(std430) readonly buffer Entries { uvec4 entries[]; };  // depth bits, replica, splat, instance
 layout(std430) writeonly buffer LongTiles { uint long_tiles[]; };
 layout(std430) writeonly buffer Sorted { uint sorted[]; };    // splat
-// where each instance stands in sorted[]; not written for lists at fixed places, which have no instances
+// where each instance stands in sorted[]; only for gradients
 layout(std430) writeonly buffer InstancePlace { uint instance_place[]; };
 layout(std430) buffer Counters { uint counters[]; };
 
+#include "inc/group_tile.glsl"
+
 void main() {
-  uint tile = gl_WorkGroupID.x * p.tile_stride % p.tiles, lane = gl_LocalInvocationID.x, lanes = gl_WorkGroupSize.x;
+  uint tile = tile_of_lane(kLanes), lane = lane_in_tile(kLanes);
+  if (tile == kNoTile) return;
   uint start = tile_prefix[tile] + tile_block[tile / kScanBlock];
-  bool own_places = p.tile_capacity > 0u;
+  bool own_places = p.tile_capacity > 0u, gradients = (p.flags & kFlagGradients) != 0u;
   uint n = !own_places && counters[kCounterOverflow] != 0u ? 0u : tile_count[tile];
   bool no_place = own_places && n > p.tile_capacity;  // some of its entries were dropped
   if (n > kRankLimit || no_place) {
@@ -42,8 +46,8 @@ void main() {
   }
   uint shared_lane = gl_SubgroupInvocationID % kShare;
   // a lane computes the ranks of two entries at a time, so that one loaded key serves both
-  for (uint first = 0u; first < n; first += 2u * lanes) {
-    uvec2 k = uvec2(first + lane, first + lanes + lane);
+  for (uint first = 0u; first < n; first += 2u * kLanes) {
+    uvec2 k = uvec2(first + lane, first + kLanes + lane);
     uvec4 a = entries[start + min(k.x, n - 1u)], b = entries[start + min(k.y, n - 1u)];
     ivec2 depth = ivec2(a.x, b.x), nearer = ivec2(0), same = ivec2(0);  // positive floats sort like their bits
     // kShare lanes load one key each and exchange them
@@ -65,7 +69,7 @@ void main() {
     uvec2 place = start + uvec2(nearer);
     if (k.x < n) sorted[place.x] = a.z;
     if (k.y < n) sorted[place.y] = b.z;
-    if (k.x < n && !own_places) instance_place[a.w] = place.x;
-    if (k.y < n && !own_places) instance_place[b.w] = place.y;
+    if (k.x < n && gradients) instance_place[a.w] = place.x;
+    if (k.y < n && gradients) instance_place[b.w] = place.y;
   }
 }

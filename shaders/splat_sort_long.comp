@@ -25,7 +25,7 @@ shared uint least, most, long_run;
 
 void put(uvec4 entry, uint at) {
   sorted[at] = entry.z;
-  if (p.tile_capacity == 0u) instance_place[entry.w] = at;
+  if ((p.flags & kFlagGradients) != 0u) instance_place[entry.w] = at;
 }
 
 void everyone_sees() {

@@ -20,6 +20,7 @@
 #include "chainsplat/image_model.h"
 #include "reference_renderer.h"
 #include "shaders/shared/splat.h"
+#include "src/splat/engine.h"
 
 using namespace chainsplat;
 using splat::Engine;
@@ -696,6 +697,28 @@ TEST_CASE("600 Gaussians in one tile among others") {
   engine(false).loss(g, scene.views, scene.target_pointers(), kAllTerms, 0.0, &gradients, &pictures);
   check_picture(pictures[0], wanted.pictures[0]);
   check_gradients(gradients, wanted);
+  check_silent();
+}
+
+TEST_CASE("gradients of splats over 12, 35 and 130 tiles: few instances, more than have places, and than ever have") {
+  static_assert(12 < splat::kSplatCapacity && 35 > splat::kSplatCapacity && 130 > splat::kMostSplatCapacity);
+  Engine fresh(device(), {.exact_cutoffs = false});  // its splats reach every tile
+  core::Random random(78);
+  Scene scene;
+  scene.cameras = {make_camera(104, 80, 70.0, {})};
+  scene.gaussians = random_gaussians(random, 12, 2, 1, Logits::soft);
+  const std::vector<math::Pose> motions = random_motions(random, 2);
+  const auto plain = reference::parameters(scene.gaussians);
+  for (const auto& [width, height] : {std::pair{30, 21}, {52, 36}, {104, 80}, {30, 21}}) {
+    CAPTURE(width);
+    scene.views = {{&scene.cameras[0], (104 - width) / 2, (80 - height) / 2, width, height, motions}};
+    scene.targets = {random_target(random, width, height)};
+    const auto wanted =
+        reference::evaluate(plain, scene.views, scene.reference_targets(), kAllTerms, 0.0, reference::kNoCutoffs);
+    splat::Gradients gradients;
+    fresh.loss(scene.gaussians, scene.views, scene.target_pointers(), kAllTerms, 0.0, &gradients);
+    check_gradients(gradients, wanted);
+  }
   check_silent();
 }
 

@@ -23,7 +23,9 @@ struct DeviceInfo {
   int index = 0;
   std::string name, driver, type;  // type: "discrete GPU", "integrated GPU", "CPU", ...
   std::uint32_t api_version = 0, vendor = 0;
-  // Subgroups of every pipeline have subgroup_size lanes, or more on a device with several sizes that cannot fix one.
+  // Subgroups of every pipeline have subgroup_size lanes, or more on a device that has not one_subgroup_size: it has
+  // several sizes and cannot fix one.
+  bool one_subgroup_size = false;
   std::uint32_t subgroup_size = 0, max_workgroup_invocations = 0, shared_memory_bytes = 0;
   std::uint32_t storage_buffers = 0;    // the most that one kernel may bind
   std::uint64_t max_storage_range = 0;  // bytes of the largest buffer that a kernel can bind
@@ -31,7 +33,6 @@ struct DeviceInfo {
   bool software = false;                // a CPU device such as lavapipe
   bool unified_memory = false;          // Domain::device is mapped: the host reads and writes it at full speed
   bool timestamps = false;              // false: Commands::timings() is empty
-  bool push_descriptors = false;        // false: Commands uses descriptor sets
   std::vector<std::string> refused;     // reasons why the device cannot be used; empty if it can
 };
 
@@ -59,7 +60,7 @@ std::string doctor_text(const Doctor& doctor);  // several lines, for a terminal
 struct DeviceOptions {
   std::string selector;
   bool validation = false;  // enables the validation layer; InputError when it is not installed
-  bool least = false;       // for tests: use descriptor sets and staged transfers, as on the least capable device
+  bool least = false;       // for tests: use staged transfers, as on the least capable device
   // injected faults, for tests; 0: none
   std::uint64_t most_bytes = 0;    // device memory counts as full beyond this sum over all buffers
   std::uint64_t most_submits = 0;  // the device counts as lost after this number of submissions

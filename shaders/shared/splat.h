@@ -40,11 +40,11 @@ struct SplatPush {
   float weight_l1, weight_dssim, weight_mask;  // already divided by the number of summands of each mean
   uint near_tiles;                             // the first near_tiles active tiles have a D-SSIM term
   uint scan_length, scan_per_live, scan_counter, flags;
-  uint tile_stride;    // work group g of a pass over all active tiles processes tile g * tile_stride % tiles
+  uint tile_stride;    // passes over all active tiles visit tile k * tile_stride % tiles as the k-th
   uint tile_capacity;  // entries of each list at its fixed place, which splat_project.comp fills; 0: the lists are
                        // contiguous, laid out by prefix sums and filled by splat_bin.comp
   float background;    // gray, 0..1, that the loss lays drawn and wanted colors over
-  uint padding;
+  uint splat_capacity; // with lists at fixed places: of instances of each splat, which have fixed numbers then
 };
 
 const uint kNoTile = 0xffffffffu;
@@ -65,10 +65,12 @@ const uint kCounterTooLong = 9u;    // not 0: a tile's list is longer than kLong
 const uint kCounterLongTiles = 10u; // 3 uints: work groups of splat_sort_long.comp; the host sets the last two
 const uint kCounterNotFinite = 13u; // number of gradients that Adam skipped
 const uint kCounterWantTile = 14u;  // the tile capacity that was needed
+const uint kCounterWantSplat = 15u; // the splat capacity that was needed
 const uint kCounters = 16u;
 const uint kLongestList = 32768u;   // entries of a tile; lavapipe ends an invocation's loops after 65535 iterations
 
 const uint kFlagHeldLinks = 1u;     // link logits have no gradient, and replicas are live whatever their opacity
+const uint kFlagGradients = 2u;     // instance_place[] is needed
 
 // splat record: 3 vec4
 //   0: u (px), opacity, depth (m)   1: conic xx, xy, yy, tiles x0 | x1 << 16   2: color, tiles y0 | y1 << 16

@@ -63,6 +63,7 @@ Buffer::Handles::~Handles() {
 Buffer::Buffer(Device& device, std::size_t bytes, Domain domain, const char* name)
     : handles_(std::make_unique<Handles>()), bytes_(bytes) {
   handles_->device = &device;
+  handles_->number = ++device.buffers_made;
   const std::string where = "device " + device.info.name;
   if (bytes > device.info.max_storage_range) {
     throw WorkError(where,

@@ -9,6 +9,7 @@ namespace {
 
 constexpr std::uint32_t kQueriesAPool = 64;  // timestamps per query pool; a longer list makes further pools
 constexpr std::uint32_t kSetsAPool = 64;     // descriptor sets per pool; likewise
+constexpr std::uint32_t kMostSets = 512;     // are kept from one recording to the next; the engine needs some forty
 
 constexpr VkPipelineStageFlags2 kWorkStages =
     VK_PIPELINE_STAGE_2_COMPUTE_SHADER_BIT | VK_PIPELINE_STAGE_2_ALL_TRANSFER_BIT;
@@ -44,8 +45,15 @@ struct Commands::State {
   std::vector<Timing> timings;
   bool timings_due = false;  // submitted, and the timestamps are not yet read
 
+  // Descriptor sets are kept for the next recordings, most of which bind the same buffers again: pushing descriptors at
+  // every dispatch made training on lavapipe 2 % slower.
+  struct KnownSet {
+    std::array<std::uint64_t, kLeastStorageBuffers> buffers{};  // Buffer::Handles::number; 0 after the last
+    VkDescriptorSet set = VK_NULL_HANDLE;
+  };
+  std::map<const Pipeline::Handles*, std::vector<KnownSet>> sets;
   std::vector<VkDescriptorPool> set_pools;
-  std::uint32_t sets_used = 0;
+  std::uint32_t sets_made = 0;
 
   explicit State(Device& d) : device(d) {}
   ~State() {
@@ -109,8 +117,8 @@ struct Commands::State {
     }
   }
 
-  VkDescriptorSet make_set(VkDescriptorSetLayout layout) {
-    const std::uint32_t at = sets_used++;
+  VkDescriptorSet allocate_set(VkDescriptorSetLayout layout) {
+    const std::uint32_t at = sets_made++;
     if (at / kSetsAPool >= set_pools.size()) {
       const VkDescriptorPoolSize size{VK_DESCRIPTOR_TYPE_STORAGE_BUFFER, kSetsAPool * kLeastStorageBuffers};
       auto create = of_type<VkDescriptorPoolCreateInfo>(VK_STRUCTURE_TYPE_DESCRIPTOR_POOL_CREATE_INFO);
@@ -130,33 +138,45 @@ struct Commands::State {
     return set;
   }
 
+  // A set that binds the buffers that the pipeline's names stand for now: one that was made before, or a new one.
+  VkDescriptorSet set_for(const Pipeline& pipeline) {
+    const Pipeline::Handles& h = pipeline.handles();
+    const auto count = static_cast<std::uint32_t>(h.bindings.size());
+    std::array<std::uint64_t, kLeastStorageBuffers> numbers{};
+    for (std::uint32_t i = 0; i < count; ++i) {
+      const Buffer* const buffer = pipeline.buffer(i);
+      CHAINSPLAT_CHECK(buffer && buffer->made(), "buffer '" + h.bindings[i].buffer + "' of shader '" + h.name + "'");
+      numbers[i] = buffer->handles().number;
+    }
+    std::vector<KnownSet>& known = sets[&h];
+    for (const KnownSet& one : known)
+      if (one.buffers == numbers) return one.set;
+
+    const VkDescriptorSet set = allocate_set(h.set_layout);
+    std::array<VkDescriptorBufferInfo, kLeastStorageBuffers> infos{};
+    std::array<VkWriteDescriptorSet, kLeastStorageBuffers> writes{};
+    for (std::uint32_t i = 0; i < count; ++i) {
+      infos[i] = {pipeline.buffer(i)->handles().buffer, 0, VK_WHOLE_SIZE};
+      writes[i] = of_type<VkWriteDescriptorSet>(VK_STRUCTURE_TYPE_WRITE_DESCRIPTOR_SET);
+      writes[i].dstSet = set;
+      writes[i].dstBinding = h.bindings[i].number;
+      writes[i].descriptorCount = 1;
+      writes[i].descriptorType = VK_DESCRIPTOR_TYPE_STORAGE_BUFFER;
+      writes[i].pBufferInfo = &infos[i];
+    }
+    vkUpdateDescriptorSets(device.handle, count, writes.data(), 0, nullptr);
+    known.push_back({numbers, set});
+    return set;
+  }
+
   void bind(const Pipeline& pipeline, const void* push, std::size_t push_bytes) {
     const Pipeline::Handles& h = pipeline.handles();
     CHAINSPLAT_CHECK(push_bytes == h.push_bytes, h.name + " takes " + std::to_string(h.push_bytes) +
                                                      " bytes of push constants, got " + std::to_string(push_bytes));
     vkCmdBindPipeline(commands, VK_PIPELINE_BIND_POINT_COMPUTE, h.pipeline);
     if (!h.bindings.empty()) {
-      std::array<VkDescriptorBufferInfo, kLeastStorageBuffers> infos{};
-      std::array<VkWriteDescriptorSet, kLeastStorageBuffers> writes{};
-      const VkDescriptorSet set = h.pushes_descriptors ? VK_NULL_HANDLE : make_set(h.set_layout);
-      const auto count = static_cast<std::uint32_t>(h.bindings.size());
-      for (std::uint32_t i = 0; i < count; ++i) {
-        const Buffer* const buffer = pipeline.buffer(i);
-        CHAINSPLAT_CHECK(buffer && buffer->made(), "buffer '" + h.bindings[i].buffer + "' of shader '" + h.name + "'");
-        infos[i] = {buffer->handles().buffer, 0, VK_WHOLE_SIZE};
-        writes[i] = of_type<VkWriteDescriptorSet>(VK_STRUCTURE_TYPE_WRITE_DESCRIPTOR_SET);
-        writes[i].dstSet = set;
-        writes[i].dstBinding = h.bindings[i].number;
-        writes[i].descriptorCount = 1;
-        writes[i].descriptorType = VK_DESCRIPTOR_TYPE_STORAGE_BUFFER;
-        writes[i].pBufferInfo = &infos[i];
-      }
-      if (h.pushes_descriptors) {
-        device.push_descriptor_set(commands, VK_PIPELINE_BIND_POINT_COMPUTE, h.layout, 0, count, writes.data());
-      } else {
-        vkUpdateDescriptorSets(device.handle, count, writes.data(), 0, nullptr);
-        vkCmdBindDescriptorSets(commands, VK_PIPELINE_BIND_POINT_COMPUTE, h.layout, 0, 1, &set, 0, nullptr);
-      }
+      const VkDescriptorSet set = set_for(pipeline);
+      vkCmdBindDescriptorSets(commands, VK_PIPELINE_BIND_POINT_COMPUTE, h.layout, 0, 1, &set, 0, nullptr);
     }
     if (push_bytes > 0) vkCmdPushConstants(commands, h.layout, VK_SHADER_STAGE_COMPUTE_BIT, 0, h.push_bytes, push);
   }
@@ -181,8 +201,11 @@ void Commands::begin() {
   State& s = *state_;
   wait();
   s.device.check(vkResetCommandPool(s.device.handle, s.pool, 0), "reset commands");
-  for (VkDescriptorPool set_pool : s.set_pools) vkResetDescriptorPool(s.device.handle, set_pool, 0);
-  s.sets_used = 0;
+  if (s.sets_made > kMostSets) {
+    for (VkDescriptorPool set_pool : s.set_pools) vkResetDescriptorPool(s.device.handle, set_pool, 0);
+    s.sets.clear();
+    s.sets_made = 0;
+  }
   s.labels.clear();
   const VkCommandBufferBeginInfo info{VK_STRUCTURE_TYPE_COMMAND_BUFFER_BEGIN_INFO, nullptr, 0, nullptr};
   s.device.check(vkBeginCommandBuffer(s.commands, &info), "record commands");
@@ -205,9 +228,9 @@ void Commands::dispatch(const Pipeline& pipeline, const void* push, std::size_t 
 
 void Commands::dispatch_indirect(const Pipeline& pipeline, const void* push, std::size_t push_bytes,
                                  const Buffer& arguments, std::size_t offset) {
-  CHAINSPLAT_CHECK(offset % 4 == 0 && offset + sizeof(VkDispatchIndirectCommand) <= arguments.bytes(),
-                   pipeline.handles().name + ": " + std::to_string(offset) + " of " +
-                       std::to_string(arguments.bytes()));
+  CHAINSPLAT_CHECK(
+      offset % 4 == 0 && offset + sizeof(VkDispatchIndirectCommand) <= arguments.bytes(),
+      pipeline.handles().name + ": " + std::to_string(offset) + " of " + std::to_string(arguments.bytes()));
   state_->before_command();
   state_->bind(pipeline, push, push_bytes);
   vkCmdDispatchIndirect(state_->commands, arguments.handles().buffer, offset);

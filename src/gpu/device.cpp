@@ -23,14 +23,6 @@ bool instance_extension_present(const char* layer, const char* name) {
   return std::any_of(all.begin(), all.end(), [&](const auto& e) { return std::strcmp(e.extensionName, name) == 0; });
 }
 
-bool device_extension_present(VkPhysicalDevice device, const char* name) {
-  std::uint32_t count = 0;
-  if (vkEnumerateDeviceExtensionProperties(device, nullptr, &count, nullptr) != VK_SUCCESS) return false;
-  std::vector<VkExtensionProperties> all(count);
-  if (vkEnumerateDeviceExtensionProperties(device, nullptr, &count, all.data()) != VK_SUCCESS) return false;
-  return std::any_of(all.begin(), all.end(), [&](const auto& e) { return std::strcmp(e.extensionName, name) == 0; });
-}
-
 VKAPI_ATTR VkBool32 VKAPI_CALL on_message(VkDebugUtilsMessageSeverityFlagBitsEXT, VkDebugUtilsMessageTypeFlagsEXT,
                                           const VkDebugUtilsMessengerCallbackDataEXT* data, void* user) {
   auto* messages = static_cast<Messages*>(user);
@@ -132,16 +124,11 @@ Candidate examine_device(VkPhysicalDevice physical, int index) {
   auto driver = of_type<VkPhysicalDeviceDriverProperties>(VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_DRIVER_PROPERTIES);
   auto subgroup = of_type<VkPhysicalDeviceSubgroupProperties>(VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_SUBGROUP_PROPERTIES);
   auto v13 = of_type<VkPhysicalDeviceVulkan13Properties>(VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_VULKAN_1_3_PROPERTIES);
-  auto push = of_type<VkPhysicalDevicePushDescriptorPropertiesKHR>(
-      VK_STRUCTURE_TYPE_PHYSICAL_DEVICE_PUSH_DESCRIPTOR_PROPERTIES_KHR);
   properties.pNext = &driver;
   driver.pNext = &subgroup;
   subgroup.pNext = &v13;
-  if (device_extension_present(physical, VK_KHR_PUSH_DESCRIPTOR_EXTENSION_NAME)) v13.pNext = &push;
   vkGetPhysicalDeviceProperties2(physical, &properties);
   info.driver = std::string(driver.driverName) + " " + driver.driverInfo;
-  c.push_descriptors = push.maxPushDescriptors;
-  info.push_descriptors = push.maxPushDescriptors > 0;
 
   // features and limits without which the device is refused
   Features features;
@@ -166,6 +153,7 @@ Candidate examine_device(VkPhysicalDevice physical, int index) {
 
   c.subgroups = choose_subgroups(v13, subgroup.subgroupSize, features.v13.subgroupSizeControl);
   info.subgroup_size = c.subgroups.size;
+  info.one_subgroup_size = c.subgroups.fixed || v13.minSubgroupSize == v13.maxSubgroupSize;
 
   // the first queue family that can compute
   std::uint32_t count = 0;
@@ -457,8 +445,6 @@ DevicePtr open_device(const DeviceOptions& options) {
   d.physical = c.handle;
   d.info = c.info;
   d.queue_family = c.queue_family;
-  d.push_descriptors = options.least ? 0 : c.push_descriptors;
-  d.info.push_descriptors = d.push_descriptors > 0;
   d.info.unified_memory = c.info.unified_memory && !options.least;
   d.subgroups = c.subgroups;
   d.timestamp_mask = c.timestamp_bits >= 64 ? ~0ull : (1ull << c.timestamp_bits) - 1;
@@ -484,19 +470,12 @@ DevicePtr open_device(const DeviceOptions& options) {
   queue.queueFamilyIndex = d.queue_family;
   queue.queueCount = 1;
   queue.pQueuePriorities = &priority;
-  const char* const extensions[] = {VK_KHR_PUSH_DESCRIPTOR_EXTENSION_NAME};
   auto create = of_type<VkDeviceCreateInfo>(VK_STRUCTURE_TYPE_DEVICE_CREATE_INFO);
   create.pNext = &wanted.all;
   create.queueCreateInfoCount = 1;
   create.pQueueCreateInfos = &queue;
-  create.enabledExtensionCount = d.push_descriptors > 0 ? 1 : 0;
-  create.ppEnabledExtensionNames = extensions;
   d.check(vkCreateDevice(d.physical, &create, nullptr, &d.handle), "be opened");
   vkGetDeviceQueue(d.handle, d.queue_family, 0, &d.queue);
-  if (d.push_descriptors > 0) {
-    d.push_descriptor_set = reinterpret_cast<PFN_vkCmdPushDescriptorSetKHR>(
-        vkGetDeviceProcAddr(d.handle, "vkCmdPushDescriptorSetKHR"));
-  }
   if (d.instance.debug_utils) {
     d.set_name = reinterpret_cast<PFN_vkSetDebugUtilsObjectNameEXT>(
         vkGetInstanceProcAddr(d.instance.handle, "vkSetDebugUtilsObjectNameEXT"));

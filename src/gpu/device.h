@@ -66,7 +66,7 @@ Instance make_instance(bool validation, std::string* why);
 struct Candidate {
   VkPhysicalDevice handle = VK_NULL_HANDLE;
   DeviceInfo info;
-  std::uint32_t queue_family = 0, timestamp_bits = 0, push_descriptors = 0;
+  std::uint32_t queue_family = 0, timestamp_bits = 0;
   SubgroupChoice subgroups;
   float timestamp_period = 1.0f;  // ns per tick
 };
@@ -94,7 +94,6 @@ class Device {
   VkPhysicalDeviceMemoryProperties memory{};
   DeviceInfo info;
   std::uint32_t queue_family = 0;
-  std::uint32_t push_descriptors = 0;  // number of storage buffers that can be pushed; 0: use descriptor sets
   SubgroupChoice subgroups;
   bool full_subgroups = false;       // pipelines can request subgroups without inactive lanes
   std::uint64_t timestamp_mask = 0;  // valid bits of a timestamp; 0: no timestamps
@@ -102,6 +101,7 @@ class Device {
   bool validation = false;
   std::uint64_t most_bytes = 0, most_submits = 0;      // see DeviceOptions
   mutable std::atomic<std::uint64_t> buffer_bytes{0};  // allocated by all live buffers
+  std::atomic<std::uint64_t> buffers_made{0};
 
   // every submission signals the next value of the timeline, in queue order
   std::mutex queue_mutex;
@@ -120,7 +120,6 @@ class Device {
   Buffer staging;
   std::unique_ptr<Commands> staging_commands;
 
-  PFN_vkCmdPushDescriptorSetKHR push_descriptor_set = nullptr;
   PFN_vkSetDebugUtilsObjectNameEXT set_name = nullptr;
 
   ~Device();
@@ -134,6 +133,7 @@ struct Buffer::Handles {
   VkBuffer buffer = VK_NULL_HANDLE;
   VkDeviceMemory memory = VK_NULL_HANDLE;
   std::uint64_t allocated = 0;  // bytes
+  std::uint64_t number = 0;     // from 1, of this buffer alone; VkBuffer may be that of one that is gone
   ~Handles();
 };
 
@@ -149,7 +149,6 @@ struct Pipeline::Handles {
   };
   std::vector<Binding> bindings;
   std::uint32_t push_bytes = 0;
-  bool pushes_descriptors = false;
   ~Handles();
 };
 

@@ -131,14 +131,12 @@ std::shared_ptr<const Pipeline::Handles> make_handles(Device& device, const std:
   h.name = name;
   h.bindings = interface.bindings;
   h.push_bytes = static_cast<std::uint32_t>(push_bytes);
-  h.pushes_descriptors = device.push_descriptors >= h.bindings.size() && device.push_descriptor_set;
 
   // layout: storage buffers of set 0 and push constants
   std::vector<VkDescriptorSetLayoutBinding> bindings;
   for (const Pipeline::Handles::Binding& binding : h.bindings)
     bindings.push_back({binding.number, VK_DESCRIPTOR_TYPE_STORAGE_BUFFER, 1, VK_SHADER_STAGE_COMPUTE_BIT, nullptr});
   auto set = of_type<VkDescriptorSetLayoutCreateInfo>(VK_STRUCTURE_TYPE_DESCRIPTOR_SET_LAYOUT_CREATE_INFO);
-  set.flags = h.pushes_descriptors ? VK_DESCRIPTOR_SET_LAYOUT_CREATE_PUSH_DESCRIPTOR_BIT_KHR : 0;
   set.bindingCount = static_cast<std::uint32_t>(bindings.size());
   set.pBindings = bindings.data();
   device.check(vkCreateDescriptorSetLayout(device.handle, &set, nullptr, &h.set_layout), "make a descriptor layout");

@@ -62,6 +62,15 @@ const std::byte* Engine::State::record_download(const Buffer& buffer, std::size_
   return static_cast<const std::byte*>(to_host.mapped()) + at;
 }
 
+std::size_t Engine::State::most_placed_tiles(const RunOptions& options) const {
+  // measured on lavapipe; on GPUs only for the few pictures of color_sums()
+  if (!lists_may_have_places || (!options.chain && !gpu::info(device).software)) return 0;
+  if (!options.backward) return kListEntries / tile_capacity;
+  if (splat_capacity > kMostSplatCapacity) return 0;
+  const std::size_t most_entries = range_limit / (sizeof(float) * shared::kPartial * slots);
+  return std::min<std::size_t>(kListEntries, most_entries) / tile_capacity;
+}
+
 void Engine::State::set_tile_capacity(std::uint32_t capacity) {
   tile_capacity = capacity;
   std::vector<std::uint32_t> starts(kListEntries / capacity + 1);

@@ -3,6 +3,7 @@
 #include <array>
 #include <cmath>
 #include <numeric>
+#include <utility>
 
 #include "chainsplat/image_model.h"
 #include "src/splat/engine.h"
@@ -41,9 +42,11 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   CHAINSPLAT_CHECK(tile % pixels == 0, std::to_string(tile) + " " + std::to_string(pixels));
   tile_width = tile_height = static_cast<std::uint32_t>(tile);
   pixels_per_lane = static_cast<std::uint32_t>(pixels);
-  const TileLanes laid_out = tile_lanes(tile_width, pixels_per_lane, device_info.subgroup_size, device_info.software);
+  const TileLanes laid_out = tile_lanes(tile_width, pixels_per_lane, device_info.subgroup_size,
+                                        device_info.one_subgroup_size, device_info.software);
   const std::uint32_t lanes = laid_out.lanes, share = laid_out.share, color_lanes = laid_out.color_lanes;
   slots = laid_out.slots;
+  group_tiles = laid_out.tiles;
   constexpr double kNoClamp = 1e6;
   clamp_margin = settings.projection_clamp ? image_model::kClampMargin : kNoClamp;
   range_limit = static_cast<std::size_t>(std::min<std::uint64_t>(device_info.max_storage_range, 1ull << 30));
@@ -68,12 +71,13 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
   scan_sums = pass("scan_sums", {});
   project = pass("splat_project", {cut, tile_width, tile_height, share});
   bin = pass("splat_bin", {});
-  sort = pass("splat_sort", {laid_out.sort_lanes, laid_out.rank_limit, laid_out.sort_share});
+  sort = pass("splat_sort",
+              {laid_out.sort_lanes * group_tiles, laid_out.rank_limit, laid_out.sort_share, laid_out.sort_lanes});
   sort_long = pass("splat_sort_long", {laid_out.sort_lanes});
-  blend = pass("splat_blend", {lanes, tile_width, tile_height, pixels_per_lane, cut, 0, share});
-  blend_depth = pass("splat_blend", {lanes, tile_width, tile_height, pixels_per_lane, cut, 1, share});
-  blend_backward =
-      pass("splat_blend_backward", {lanes, tile_width, tile_height, pixels_per_lane, cut, laid_out.subgroup, share});
+  blend = pass("splat_blend", {lanes * group_tiles, tile_width, tile_height, pixels_per_lane, cut, 0, share});
+  blend_depth = pass("splat_blend", {lanes * group_tiles, tile_width, tile_height, pixels_per_lane, cut, 1, share});
+  blend_backward = pass("splat_blend_backward",
+                        {lanes * group_tiles, tile_width, tile_height, pixels_per_lane, cut, laid_out.subgroup, share});
   project_backward = pass("splat_project_backward", {share});
   gather = pass("splat_gather", {0});
   gather_onto = pass("splat_gather", {1});
@@ -90,17 +94,17 @@ Engine::State::State(gpu::Device& d, const Settings& settings) : device(d), comm
                       sizeof(ColorPush));
   color_equations = pass("color_equations", {color_lanes, tile_width, tile_height, color_lanes}, sizeof(ColorPush));
   need(counters, shared::kCounters * sizeof(std::uint32_t), "counters");
+  set_tile_capacity(kTileCapacity);
 }
 
 void Engine::State::run_all(Scene& scene, std::span<const int> batch, const RunOptions& options,
                             const AdamPush* adam_push,
                             const std::function<void(std::span<const int>, std::size_t)>& after) {
-  const bool dssim = options.loss && options.weights.dssim > 0.0f;
   timings.clear();
   std::size_t done = 0;
   while (done < batch.size()) {
     // plan anew for every chunk: an overflow may have lowered most_views
-    const std::vector<int> chunk = chunks(scene, batch.subspan(done), dssim).front();
+    const std::vector<int> chunk = chunks(scene, batch.subspan(done), options).front();
     RunOptions with = options;
     with.accumulate = done > 0;
     const bool last = done + chunk.size() == batch.size();
@@ -108,6 +112,11 @@ void Engine::State::run_all(Scene& scene, std::span<const int> batch, const RunO
     try {
       finished = run(scene, chunk, with, last ? adam_push : nullptr);
     } catch (const gpu::OutOfMemory&) {
+      // lists at fixed places hold 36 MiB, whatever is in them
+      if (std::exchange(lists_may_have_places, false)) {
+        release_view_buffers();
+        continue;
+      }
       if (chunk.size() == 1) throw;
       most_views = static_cast<int>(chunk.size()) / 2;
       release_view_buffers();

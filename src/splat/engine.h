@@ -29,26 +29,34 @@ using shared::SplatView;
 constexpr double kGrowth = 1.25;  // factor of spare room when a capacity is raised
 // Tile lists at fixed places: entries of all of them together, and capacity of each before any has overflowed.
 constexpr std::uint32_t kListEntries = 1 << 20, kTileCapacity = 512;
+// Places of a splat's instances with such lists: how many before any splat has touched more tiles, and the most; with
+// more the lists are contiguous.
+constexpr std::uint32_t kSplatCapacity = 16, kMostSplatCapacity = 64;
 
 constexpr std::uint32_t kRankLimit = 192;          // longest tile list that is sorted by rank; longer ones by radix
 constexpr std::uint32_t kSoftwareRankLimit = 512;  // the same on a software device, whose barriers make radix costly
 
+// Tiles per work group on a software device, and lanes at most: lavapipe allocates memory for every work group.
+constexpr std::uint32_t kSoftwareTiles = 8, kSoftwareLanes = 256;
+
 // Layout of the passes over tiles on a device: the specialization constants of their kernels.
 struct TileLanes {
-  std::uint32_t lanes;       // per work group (one tile) of the blending passes, each with kPixels pixels
+  std::uint32_t tiles;       // per work group of the blending passes and of splat_sort
+  std::uint32_t lanes;       // per tile of the blending passes, each with kPixels pixels
   std::uint32_t subgroup;    // lanes of a cluster, which sum a gradient by shuffles; a subgroup holds one or several
-  std::uint32_t slots;       // clusters per work group: number of partial sums per entry of a tile's list
+  std::uint32_t slots;       // clusters per tile: number of partial sums per entry of a tile's list
   std::uint32_t share;       // lanes that load one splat each and exchange them by shuffles; 1: every lane loads all
-  std::uint32_t sort_lanes;  // per work group (one tile) of the sorting passes
+  std::uint32_t sort_lanes;  // per tile of the sorting passes
   std::uint32_t sort_share;  // lanes of these that load one key each and exchange them by shuffles
   std::uint32_t rank_limit;
   std::uint32_t color_lanes;                // per work group (one subgroup) of the passes over colors
   std::uint32_t color_columns, color_rows;  // part of a tile that each of them covers
 };
 
-// `tile` is the tile's side in px, `subgroup_size` the least number of lanes that a subgroup has.
+// `tile` is the tile's side in px, `subgroup_size` the number of lanes of every subgroup, or without `one_size` the
+// least.
 constexpr TileLanes tile_lanes(std::uint32_t tile, std::uint32_t pixels_per_lane, std::uint32_t subgroup_size,
-                               bool software) {
+                               bool one_size, bool software) {
   TileLanes out{};
   subgroup_size = std::max(1u, subgroup_size);
   out.lanes = tile * tile / pixels_per_lane;
@@ -59,6 +67,10 @@ constexpr TileLanes tile_lanes(std::uint32_t tile, std::uint32_t pixels_per_lane
   // one subgroup per tile: no lane waits at a barrier for another subgroup
   out.sort_lanes = software ? 8 : 32;
   out.sort_share = std::min(out.sort_lanes, subgroup_size);
+  // only where no subgroup would have lanes of two tiles
+  const bool whole = one_size && out.lanes % subgroup_size == 0 && out.sort_lanes % subgroup_size == 0;
+  const std::uint32_t most = std::max(1u, kSoftwareLanes / std::max(out.lanes, out.sort_lanes));
+  out.tiles = software && whole ? std::min(kSoftwareTiles, most) : 1;
   out.rank_limit = software ? kSoftwareRankLimit : kRankLimit;
   out.color_lanes = std::min(subgroup_size, tile * tile);
   out.color_columns = std::max(1u, tile / out.color_lanes);
@@ -151,9 +163,10 @@ std::span<const std::byte> bytes_of(const std::vector<T>& values) {
 
 struct Engine::State {
   gpu::Device& device;
-  std::uint32_t tile_width, tile_height, pixels_per_lane, slots;  // slots: as in TileLanes
-  double clamp_margin;      // of the projection's Jacobian, as a multiple of the half image
-  std::size_t range_limit;  // bytes of one storage buffer
+  std::uint32_t tile_width, tile_height, pixels_per_lane;
+  std::uint32_t group_tiles, slots;  // TileLanes::tiles, slots
+  double clamp_margin;               // of the projection's Jacobian, as a multiple of the half image
+  std::size_t range_limit;           // bytes of one storage buffer
 
   // gather_onto adds to the gradient of the chunks before
   gpu::Pipeline replicate, compact, scan_block, scan_sums, project, bin, sort, sort_long, blend, blend_depth,
@@ -192,6 +205,8 @@ struct Engine::State {
   const std::byte *read_pixel_sums = nullptr, *read_link_sums = nullptr;  // of the last run
   Buffer list_starts, list_blocks;  // replace tile_prefix and tile_block where every list has a fixed place
   std::uint32_t live_capacity = 0, instance_capacity = 0, tile_capacity = 0;
+  std::uint32_t splat_capacity = kSplatCapacity;
+  bool lists_may_have_places = true;                            // false: memory is too short for that
   std::uint64_t versions = 0;                                   // number of parameter versions so far, of all scenes
   std::tuple<std::uint64_t, bool, std::uint32_t> replicated{};  // version, held links and capacity of the live replicas
   int not_finite = 0;                                           // gradients of the last run that Adam skipped
@@ -215,6 +230,8 @@ struct Engine::State {
   // Returns where the first `bytes` of a buffer can be read after the submission; `to_host` must be large enough.
   const std::byte* record_download(const Buffer& buffer, std::size_t bytes);
   void set_tile_capacity(std::uint32_t capacity);
+  // Tiles that one submission may have if every list is to have a fixed place; 0: lists are always contiguous.
+  std::size_t most_placed_tiles(const RunOptions& options) const;
 
   // scene.cpp
   void load_gaussians(Scene& scene, const Gaussians& gaussians);
@@ -222,7 +239,7 @@ struct Engine::State {
                   std::span<const std::vector<std::uint8_t>* const> targets,
                   std::span<const capture::PackedView* const> packed_targets, Active active);
   // Splits a batch into chunks of one submission each, bounded by the device's buffer ranges and group counts.
-  std::vector<std::vector<int>> chunks(const Scene& scene, std::span<const int> batch, bool dssim) const;
+  std::vector<std::vector<int>> chunks(const Scene& scene, std::span<const int> batch, const RunOptions& options) const;
 
   // passes.cpp: the steps of one submission, in this order
   Submission lay_out(Scene& scene, std::span<const int> chunk, const RunOptions& options);
@@ -244,6 +261,8 @@ struct Engine::State {
   bool run(Scene& scene, std::span<const int> chunk, const RunOptions& options, const AdamPush* adam_push);
   void scan(const Buffer& values, const Buffer& prefix, const Buffer& block, SplatPush push, std::size_t most);
   void dispatch(const gpu::Pipeline& pipeline, const SplatPush& push, std::uint32_t x, std::uint32_t y = 1);
+  // One after the other of all tiles, group_tiles of them in a work group.
+  void dispatch_tiles(const gpu::Pipeline& pipeline, const SplatPush& push);
   // One invocation per (live replica, view): the group counts are counters of the device.
   void dispatch_live(const gpu::Pipeline& pipeline, const SplatPush& push);
 

@@ -48,6 +48,10 @@ void Engine::State::dispatch(const gpu::Pipeline& pipeline, const SplatPush& pus
   commands.dispatch(pipeline, &push, sizeof push, x, y);
 }
 
+void Engine::State::dispatch_tiles(const gpu::Pipeline& pipeline, const SplatPush& push) {
+  dispatch(pipeline, push, (push.tiles + group_tiles - 1) / group_tiles);
+}
+
 void Engine::State::dispatch_live(const gpu::Pipeline& pipeline, const SplatPush& push) {
   commands.dispatch_indirect(pipeline, &push, sizeof push, counters, words(shared::kCounterDispatch));
 }
@@ -217,15 +221,15 @@ bool Engine::State::make_room(Submission& s) {
   need(tile_cursor, words(s.tiles), "tile cursor");
   need(tile_used, words(s.tiles), "tile used");
   need(tile_loss, 2 * vectors(s.tiles), "tile loss");
-  // lists at fixed places have no instance numbers, which only the sums of gradients need
-  if (options.chain && tile_capacity == 0) set_tile_capacity(kTileCapacity);
-  s.own_places = options.chain && static_cast<std::size_t>(s.tiles) * tile_capacity <= kListEntries;
+  s.own_places =
+      s.tiles <= most_placed_tiles(options) && (!options.backward || words(s.pairs * splat_capacity) <= range_limit);
   const std::uint32_t list_entries = s.own_places ? std::max(kListEntries, instance_capacity) : instance_capacity;
   need(entries, vectors(list_entries), "entries");
   need(long_tiles, words(s.tiles), "long tiles");
   need(sort_scratch, 4 * words(list_entries), "sort scratch");
   need(sorted, words(list_entries), "sorted");
-  need(instance_place, words(instance_capacity), "instance place");
+  const std::size_t instances = s.own_places ? s.pairs * splat_capacity : instance_capacity;
+  need(instance_place, options.backward ? words(instances) : 0, "instance place");
   need(image, vectors(s.pixels), "image");
   need(depth_image, options.depth ? words(s.pixels) : 0, "depth image");
   need(pixel_gradient, s.dssim ? vectors(s.pixels) : 0, "pixel gradient");
@@ -235,7 +239,8 @@ bool Engine::State::make_room(Submission& s) {
     need(ssim_factors, 12 * words(near_pixels), "ssim factors");
   }
   if (options.backward) {
-    need(partials, words(static_cast<std::size_t>(shared::kPartial) * slots * instance_capacity), "partials");
+    const std::size_t placed = s.own_places ? static_cast<std::size_t>(s.tiles) * tile_capacity : instance_capacity;
+    need(partials, words(static_cast<std::size_t>(shared::kPartial) * slots * placed), "partials");
     need(records, vectors(shared::kGradientRows * s.pairs), "records");
     need(replica_gradient, words(s.replicas), "replica gradient");
     if (options.twists)
@@ -278,7 +283,8 @@ bool Engine::State::make_room(Submission& s) {
   push.weight_dssim = static_cast<float>(options.weights.dssim * options.color_scale);
   push.weight_mask = static_cast<float>(options.weights.mask * options.mask_scale);
   push.background = options.weights.background;
-  push.flags = options.held_links ? shared::kFlagHeldLinks : 0;
+  push.splat_capacity = splat_capacity;
+  push.flags = (options.held_links ? shared::kFlagHeldLinks : 0) | (options.backward ? shared::kFlagGradients : 0);
   return true;
 }
 
@@ -336,13 +342,13 @@ void Engine::State::record_lists(const Submission& s) {
   }
 
   // every list by depth
-  dispatch(sort, s.push, s.tiles);
+  dispatch_tiles(sort, s.push);
   commands.dispatch_indirect(sort_long, &s.push, sizeof s.push, counters, words(shared::kCounterLongTiles));
   commands.stamp("sort");
 }
 
 void Engine::State::record_picture(const Submission& s) {
-  dispatch(s.options.depth ? blend_depth : blend, s.push, s.tiles);
+  dispatch_tiles(s.options.depth ? blend_depth : blend, s.push);
   commands.stamp("blend");
   if (s.options.sums) {
     dispatch(loss_pixel, s.push, s.tiles);
@@ -357,7 +363,7 @@ void Engine::State::record_picture(const Submission& s) {
 
 void Engine::State::record_gradients(const Submission& s) {
   const Scene& scene = s.scene;
-  dispatch(blend_backward, s.push, s.tiles);
+  dispatch_tiles(blend_backward, s.push);
   commands.stamp("blend backward");
   dispatch_live(project_backward, s.push);
   commands.stamp("project backward");
@@ -399,6 +405,8 @@ bool Engine::State::has_fitted(const Submission& s, const std::byte* read_counte
     live_capacity = narrow(std::min<std::size_t>(want_live, s.replicas));
   if (read[shared::kCounterWantTile] > tile_capacity)
     set_tile_capacity(static_cast<std::uint32_t>(kGrowth * read[shared::kCounterWantTile]));
+  if (read[shared::kCounterWantSplat] > splat_capacity)
+    splat_capacity = static_cast<std::uint32_t>(kGrowth * read[shared::kCounterWantSplat]);
   if (read[shared::kCounterWantInstances] > instance_capacity) instance_capacity = narrow(want_instances);
   const std::size_t partial_bytes = words(static_cast<std::size_t>(shared::kPartial) * slots * instance_capacity);
   if (partial_bytes > range_limit) {

@@ -165,7 +165,11 @@ void Engine::State::load_views(Scene& scene, std::span<const ViewSpec> specs,
   scene.normalizer = std::max(1.0, object_pixels / std::max<std::size_t>(1, specs.size()));
 }
 
-std::vector<std::vector<int>> Engine::State::chunks(const Scene& scene, std::span<const int> batch, bool dssim) const {
+std::vector<std::vector<int>> Engine::State::chunks(const Scene& scene, std::span<const int> batch,
+                                                    const RunOptions& options) const {
+  const bool dssim = options.loss && options.weights.dssim > 0.0f;
+  // Pictures without a loss do not mind how many submissions draw them, if all of a view's lists can have fixed places.
+  const std::size_t most_placed = gpu::info(device).software && !options.loss ? most_placed_tiles(options) : 0;
   const std::size_t most_pixels = range_limit / sizeof(glm::vec4);
   // the row sums of D-SSIM are the largest of the buffers that are laid out tile by tile
   const std::size_t most_tiles =
@@ -182,6 +186,7 @@ std::vector<std::vector<int>> Engine::State::chunks(const Scene& scene, std::spa
                           " pixels does not fit this device's buffers",
                       "use smaller images or another device");
     if (out.empty() || pixels + view_pixels > most_pixels || tile_total + view.active.size() > most_tiles ||
+        (most_placed > 0 && tile_total <= most_placed && tile_total + view.active.size() > most_placed) ||
         static_cast<int>(out.back().size()) >= most_views) {
       out.emplace_back();
       pixels = tile_total = 0;

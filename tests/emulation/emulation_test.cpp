@@ -64,6 +64,11 @@ std::vector<uvec4> sorted_by_standard(const Lists& lists, std::size_t tile) {
   return list;
 }
 
+template <TileLanes kLaidOut>
+uint32_t groups_of(uint32_t tiles) {
+  return (tiles + kLaidOut.tiles - 1) / kLaidOut.tiles;
+}
+
 // Both sorting passes, as the engine dispatches them.
 template <TileLanes kLaidOut>
 void sort(const Layout& layout, Lists& lists, uint32_t stride) {
@@ -71,6 +76,7 @@ void sort(const Layout& layout, Lists& lists, uint32_t stride) {
   SplatPush push{};
   push.tiles = tiles;
   push.tile_stride = stride;
+  push.flags = shared::kFlagGradients;
   std::vector<uint32_t> counters(shared::kCounters, 0), long_tiles(tiles, 0);
   std::vector<uvec2> scratch(2 * lists.entries.size());
   lists.sorted.assign(lists.entries.size(), ~0u);
@@ -86,8 +92,8 @@ void sort(const Layout& layout, Lists& lists, uint32_t stride) {
   bound.bind("sorted", lists.sorted);
   bound.bind("instance_place", lists.instance_place);
   bound.bind("counters", counters);
-  emulation::dispatch<kernels::SplatSort<kLaidOut.sort_lanes, kLaidOut.rank_limit, kLaidOut.sort_share>>(layout, bound,
-                                                                                                         tiles);
+  emulation::dispatch<kernels::SplatSort<kLaidOut.tiles * kLaidOut.sort_lanes, kLaidOut.rank_limit, kLaidOut.sort_share,
+                                         kLaidOut.sort_lanes>>(layout, bound, groups_of<kLaidOut>(tiles));
   bound.bind("sort_scratch", scratch);
   if (counters[shared::kCounterLongTiles] > 0)
     emulation::dispatch<kernels::SplatSortLong<kLaidOut.sort_lanes>>(layout, bound,
@@ -120,7 +126,9 @@ Lists random_lists(const std::vector<uint32_t>& lengths, uint32_t seed) {
 
 template <bool kSoftware, uint32_t kAsked>
 void check_sort() {
-  constexpr TileLanes kLaidOut = splat::tile_lanes(8, kSoftware ? 8 : 2, kAsked, kSoftware);
+  // where subgroups may be wider than asked for, and where they are not
+  constexpr TileLanes kAny = splat::tile_lanes(8, kSoftware ? 8 : 2, kAsked, false, kSoftware);
+  constexpr TileLanes kExact = splat::tile_lanes(8, kSoftware ? 8 : 2, kAsked, true, kSoftware);
   // lengths around the lanes of a work group and around the limits of sorting by rank; the latter take long
   const Lists few = random_lists({0, 1, 2, 7, 8, 31, 33, 64, 100}, kAsked);
   const Lists many = random_lists({191, 192, 193, 512, 513, 700}, kAsked);
@@ -133,7 +141,7 @@ void check_sort() {
       CAPTURE(width);
       CAPTURE(layout.scattered);
       CAPTURE(layout.backward);
-      sort<kLaidOut>(layout, lists, 5);
+      width == kAsked ? sort<kExact>(layout, lists, 5) : sort<kAny>(layout, lists, 5);
       for (std::size_t tile = 0; tile < lists.count.size(); ++tile) {
         CAPTURE(lists.count[tile]);
         const auto wanted = sorted_by_standard(lists, tile);
@@ -358,6 +366,7 @@ Drawn draw(const Layout& layout, Scene& scene) {
   push.tile_stride = tiles > 1 ? tiles - 1 : 1;
   push.slots = kLaidOut.slots;
   push.near_tiles = scene.near_tiles;
+  push.flags = shared::kFlagGradients;
   push.weight_l1 = kL1;
   push.weight_mask = kMask;
   push.weight_dssim = 1.0f;
@@ -380,14 +389,15 @@ Drawn draw(const Layout& layout, Scene& scene) {
   bound.bind("image", out.image);
   bound.bind("tile_used", used);
   bound.bind("depth_image", out.depth);
-  emulation::dispatch<kernels::SplatBlend<kLaidOut.lanes, kTile, kTile, kPixels, 1u, kDepth, kLaidOut.share>>(
-      layout, bound, tiles);
+  emulation::dispatch<
+      kernels::SplatBlend<kLaidOut.tiles * kLaidOut.lanes, kTile, kTile, kPixels, 1u, kDepth, kLaidOut.share>>(
+      layout, bound, groups_of<kLaidOut>(tiles));
   bound.bind("target", scene.targets);
   bound.bind("pixel_gradient", scene.dssim);
   bound.bind("partials", out.partials);
-  emulation::dispatch<
-      kernels::SplatBlendBackward<kLaidOut.lanes, kTile, kTile, kPixels, 1u, kLaidOut.subgroup, kLaidOut.share>>(
-      layout, bound, tiles);
+  emulation::dispatch<kernels::SplatBlendBackward<kLaidOut.tiles * kLaidOut.lanes, kTile, kTile, kPixels, 1u,
+                                                  kLaidOut.subgroup, kLaidOut.share>>(layout, bound,
+                                                                                      groups_of<kLaidOut>(tiles));
   return out;
 }
 
@@ -413,7 +423,8 @@ const Inputs& inputs() {
 
 template <bool kSoftware, uint32_t kTile, uint32_t kPixels, uint32_t kAsked>
 void check_pictures() {
-  constexpr TileLanes kLaidOut = splat::tile_lanes(kTile, kPixels, kAsked, kSoftware);
+  constexpr TileLanes kAny = splat::tile_lanes(kTile, kPixels, kAsked, false, kSoftware);
+  constexpr TileLanes kExact = splat::tile_lanes(kTile, kPixels, kAsked, true, kSoftware);
   constexpr uint32_t kDepth = kSoftware ? 1 : 0;
   const Wanted& wanted = kTile == 8 ? inputs().small : inputs().large;
   Scene scene = scene_of(inputs().views, kTile);
@@ -427,7 +438,8 @@ void check_pictures() {
       CAPTURE(width);
       CAPTURE(layout.scattered);
       CAPTURE(layout.backward);
-      const Drawn drawn = draw<kLaidOut, kTile, kPixels, kDepth>(layout, scene);
+      const Drawn drawn = width == kAsked ? draw<kExact, kTile, kPixels, kDepth>(layout, scene)
+                                          : draw<kAny, kTile, kPixels, kDepth>(layout, scene);
       if (first.image.empty()) first = drawn;
       CHECK(drawn.image == first.image);  // one lane computes a pixel, whatever its subgroup
       double worst = 0.0;
@@ -441,7 +453,7 @@ void check_pictures() {
         }
       }
       CHECK(worst <= kImageTolerance);
-      const auto sums = summed(scene, drawn, kLaidOut.slots);
+      const auto sums = summed(scene, drawn, kAny.slots);
       for (std::size_t m = 0; m < 9; ++m) {
         CAPTURE(m);
         double largest = 0.0, error = 0.0;
@@ -544,7 +556,7 @@ void check_close(const std::vector<double>& got, const std::vector<double>& want
 
 template <uint32_t kAsked>
 void check_colors(const ColorResult& wanted) {
-  constexpr TileLanes kLaidOut = splat::tile_lanes(Colors::kTile, 2, kAsked, false);
+  constexpr TileLanes kLaidOut = splat::tile_lanes(Colors::kTile, 2, kAsked, false, false);
   Colors scene;
   for (const uint32_t width : kWidths) {
     if (width < kAsked) continue;
@@ -614,7 +626,7 @@ TEST_CASE("blending and its backward pass equal the reference, laid out as on a 
 // Compares subgroup widths with each other only; splat_colors_test.cpp compares the available device with the host.
 TEST_CASE("sums over colors do not depend on the subgroups") {
   Colors scene;
-  const ColorResult narrow = color_sums<splat::tile_lanes(Colors::kTile, 2, 4, false)>({4, false, false}, scene);
+  const ColorResult narrow = color_sums<splat::tile_lanes(Colors::kTile, 2, 4, false, false)>({4, false, false}, scene);
   CHECK(narrow.pixel_sums[5] > 50);
   check_colors<4>(narrow);
   check_colors<8>(narrow);
