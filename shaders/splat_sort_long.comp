@@ -17,7 +17,9 @@ layout(std430) writeonly buffer InstancePlace { uint instance_place[]; };  // as
 
 const uint kDigitBits = 5u, kDigits = 1u << kDigitBits;
 const uint kLongRun = 8u;  // more equal depths in a row than this are sorted by radix, not one against the other
-const uint kUnroll = 4u;   // fewer, longer iterations: lavapipe ends an invocation's loops after 65535 of them in all
+// Turns per iteration: fewer, longer ones, because lavapipe ends an invocation's loops after 65535 of them in all, but not
+// all kDigits at once, which took it four seconds to compile.
+const uint kUnroll = 4u;
 
 shared uint place[kDigits * gl_WorkGroupSize.x];  // [digit][lane]: number of keys, then place of the next one
 shared uint lane_total[gl_WorkGroupSize.x];
@@ -62,7 +64,9 @@ uint sort_by_key(uint ping, uint pong, Stretch s, uint lane, uint lanes) {
   uint bits = most > low ? uint(findMSB(most - low)) + 1u : 0u;
   for (uint shift = 0u; shift < bits; shift += kDigitBits) {
     // count the keys of each digit
-    [[unroll]] for (uint d = 0u; d < kDigits; ++d) place[d * lanes + lane] = 0u;
+    [[dont_unroll]] for (uint first = 0u; first < kDigits; first += kUnroll) {
+      [[unroll]] for (uint d = first; d < first + kUnroll; ++d) place[d * lanes + lane] = 0u;
+    }
     for (uint first = s.from; first < s.to; first += kUnroll) {
       [[unroll]] for (uint m = 0u; m < kUnroll; ++m) {
         uint k = first + m;
@@ -72,16 +76,20 @@ uint sort_by_key(uint ping, uint pong, Stretch s, uint lane, uint lanes) {
     barrier();
     // exclusive prefix sums over [digit][lane], kDigits consecutive ones per lane
     uint total = 0u;
-    [[unroll]] for (uint d = 0u; d < kDigits; ++d) {
-      uint count = place[lane * kDigits + d];
-      place[lane * kDigits + d] = total;
-      total += count;
+    [[dont_unroll]] for (uint first = 0u; first < kDigits; first += kUnroll) {
+      [[unroll]] for (uint d = first; d < first + kUnroll; ++d) {
+        uint count = place[lane * kDigits + d];
+        place[lane * kDigits + d] = total;
+        total += count;
+      }
     }
     lane_total[lane] = total;
     barrier();
     uint before = 0u;
     for (uint l = 0u; l < lane; ++l) before += lane_total[l];
-    [[unroll]] for (uint d = 0u; d < kDigits; ++d) place[lane * kDigits + d] += before;
+    [[dont_unroll]] for (uint first = 0u; first < kDigits; first += kUnroll) {
+      [[unroll]] for (uint d = first; d < first + kUnroll; ++d) place[lane * kDigits + d] += before;
+    }
     barrier();
     // move each item to its place
     for (uint first = s.from; first < s.to; first += kUnroll) {

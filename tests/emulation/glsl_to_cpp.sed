@@ -18,7 +18,7 @@ s/^const /static constexpr /
 s/^shared //
 
 # statements
-s/\[\[unroll\]\] //
+s/\[\[(dont_)?unroll\]\] //g
 s/\b(inout|out) (\w+) (\w+)\[/\2 \3[/g
 s/\b(inout|out) (\w+) (\w+)/\2\& \3/g
 s/\.([xyzw]{2,4})\b/.\1()/g
