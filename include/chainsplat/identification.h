@@ -62,6 +62,10 @@ struct Options {
   int max_iterations = 25;    // of Levenberg-Marquardt, a horizon
   double model_error = 1e-3;  // m, of one coordinate of a point of the chain, beside what the states' covariances say
   int adam_iterations = 300;  // paper
+  // Angles times angles times frames of all recordings beyond which windows of them are fitted (mathematics.md 5.3):
+  // memory grows with that number, time with the angles once more. 24 angles at 30 Hz reach it after eight minutes, 128
+  // after a quarter of a minute.
+  std::size_t most_numbers = 1 << 23;
 };
 
 struct Result {
@@ -69,7 +73,8 @@ struct Result {
   dynamics::InitialState initial;  // at the first recognized time
   chain::States rollout;           // at all recognized times, under the capture's base motion
   dynamics::Estimates estimates;
-  double node_rms = 0.0;  // m, rollout against recognized nodes, over nodes but the grasp and frames
+  double node_rms =
+      0.0;  // m, rollout against recognized nodes, over nodes but the grasp and the frames that are fitted
   // m, the same with parameters of this recording alone. Much less: it is of another rope than the others.
   double alone_rms = 0.0;
 };

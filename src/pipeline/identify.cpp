@@ -66,40 +66,9 @@ void tell_fit(const std::string& stage, const solve::Summary& summary) {
   core::say_more(stage + ": " + solve::describe(summary));
 }
 
-namespace {
-
-// Numbers of all frames' covariances beyond which identification leaves frames out: it holds for each frame some
-// eighteen times as many. 24 angles at 30 Hz reach it after eight minutes, 128 after a quarter of a minute.
-constexpr std::size_t kMostCovariances = 1 << 23;
-
-chain::States every_nth(const chain::States& states, std::size_t every) {
-  chain::States out;
-  for (std::size_t k = 0; k < states.time.size(); k += every) {
-    out.time.push_back(states.time[k]);
-    out.theta.push_back(states.theta[k]);
-    if (!states.thetadot.empty()) out.thetadot.push_back(states.thetadot[k]);
-    if (!states.covariance.empty()) out.covariance.push_back(states.covariance[k]);
-    if (!states.roll.empty()) out.roll.push_back(states.roll[k]);
-  }
-  return out;
-}
-
-}  // namespace
-
 void identify_states(twin::Twin& twin, const trajectory::Trajectory& base, bool paper, std::uint64_t seed) {
   const Stopwatch watch(twin, "identify");
-  const identification::Options options = identification_options(twin, paper, seed);
-  const std::size_t angles = twin.chain.angles(), all = angles * angles * twin.states.time.size();
-  const std::size_t every = std::max<std::size_t>(1, (all + kMostCovariances - 1) / kMostCovariances);
-  if (every == 1) {
-    adopt(twin, base, identification::identify(twin.chain, base, twin.states, options));
-  } else {
-    core::say_more("identify: of so many angles over so long a time one frame in " + std::to_string(every));
-    identification::Result found = identification::identify(twin.chain, base, every_nth(twin.states, every), options);
-    found.rollout =
-        dynamics::rollout(dynamics::make_model(twin.chain, found.parameters), base, found.initial, twin.states.time);
-    adopt(twin, base, std::move(found));
-  }
+  adopt(twin, base, identification::identify(twin.chain, base, twin.states, identification_options(twin, paper, seed)));
   tell_fit("identify", *twin.estimates.solver);
 }
 
