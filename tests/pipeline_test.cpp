@@ -213,6 +213,65 @@ TEST_CASE("train by a call, stopped by the listener and gone on with, then evalu
                        doctest::Contains("`contact`: never comes nearer"), InputError);
 }
 
+TEST_CASE("trainings that share a workspace have the bits of those that do not, and notice a capture that changes") {
+  const test::TemporaryFolder folder("workspace");
+  // the base's clock is late, so that there is something to correct
+  const Path capture = folder.path / "capture";
+  std::filesystem::copy(kDemo, capture, std::filesystem::copy_options::recursive);
+  std::vector<trajectory::Sample> base = trajectory::read_tum(kDemo / "base.tum");
+  for (trajectory::Sample& sample : base) sample.time += 0.02;
+  core::write_file(capture / "base.tum", trajectory::write_tum(base));
+  pipeline::TrainOptions options = small();
+  options.frames = {3, 33};
+  const auto late = [](const pipeline::TrainResult& result) {
+    const capture::Correction* const found = capture::find(result.twin.corrections, "base", "time");
+    return found ? found->value[0] : 0.0;
+  };
+
+  const pipeline::TrainResult alone = pipeline::train(capture, folder.path / "alone", options);
+  CHECK(late(alone) == doctest::Approx(0.02).epsilon(0.2));
+  const std::shared_ptr<pipeline::Workspace> workspace = pipeline::make_workspace();
+  for (const char* const name : {"first", "second"}) {
+    CAPTURE(name);
+    const pipeline::TrainResult shared = pipeline::train(capture, folder.path / name, options, {}, workspace.get());
+    CHECK(files_of(folder.path / name) == files_of(folder.path / "alone"));
+    CHECK(late(shared) == late(alone));
+    CHECK(shared.twin.verdict.size() == alone.twin.verdict.size());
+    CHECK(shared.twin.chain.length == alone.twin.chain.length);
+  }
+
+  SUBCASE("taken as given instead") {
+    options.fixed = {"time"};
+    const pipeline::TrainResult held = pipeline::train(capture, folder.path / "held", options, {}, workspace.get());
+    CHECK(late(held) == 0.0);
+  }
+  SUBCASE("other frames") {
+    options.frames = {3, 20};
+    const pipeline::TrainResult fewer = pipeline::train(capture, folder.path / "fewer", options, {}, workspace.get());
+    CHECK(fewer.twin.states.time.size() == 17);
+  }
+  SUBCASE("the base's file changes") {
+    core::write_file(capture / "base.tum", core::read_file(kDemo / "base.tum"));
+    const pipeline::TrainResult again = pipeline::train(capture, folder.path / "again", options, {}, workspace.get());
+    CHECK(std::abs(late(again)) < 0.004);
+  }
+  SUBCASE("a stop leaves a workspace that can be used") {
+    core::Listener stopping;
+    stopping.stop = [] { return true; };
+    CHECK_THROWS_AS(pipeline::train(capture, folder.path / "stopped", options, stopping, workspace.get()), Interrupted);
+    core::clear_stop();
+    pipeline::train(capture, folder.path / "after", options, {}, workspace.get());
+    CHECK(files_of(folder.path / "after") == files_of(folder.path / "alone"));
+  }
+  SUBCASE("a mask of the same size changes") {
+    const std::uint64_t before = capture::stamp(capture);
+    CHECK(capture::stamp(capture) == before);
+    const Path mask = std::filesystem::directory_iterator(capture / "masks" / "cam0")->path();
+    std::filesystem::last_write_time(mask, std::filesystem::last_write_time(mask) + std::chrono::seconds(5));
+    CHECK(capture::stamp(capture) != before);
+  }
+}
+
 TEST_CASE("a log has a record for every stage, and the lock is one process's") {
   const test::TemporaryFolder folder("log");
   pipeline::ProgressLog log(folder.path / "log.jsonl");

@@ -140,6 +140,9 @@ struct LoadOptions {
 // Loads and checks a capture. `path` is the folder or its capture.json. Throws InputError at a problem; unknown keys
 // and other doubts are warned of.
 Capture load(const Path& path, const LoadOptions& options = {});
+// A number that changes when capture.json or a file that it names does: of texts, sizes and times of change. Throws as
+// load(), without looking into pictures.
+std::uint64_t stamp(const Path& path);
 // Throws InputError unless the views have such pixels. Where no camera has lens distortion both are the same.
 void require_pixels(const Capture& capture, Pixels pixels);
 

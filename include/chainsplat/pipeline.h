@@ -8,6 +8,7 @@
 #include <cstdint>
 #include <functional>
 #include <iosfwd>
+#include <memory>
 #include <optional>
 #include <string>
 #include <utility>
@@ -65,14 +66,20 @@ struct TrainResult {
   std::vector<std::pair<std::string, solve::Summary>> fits;
 };
 
+// What trainings in one process can hand on to the next, which is then cheaper and has the same bits: the opened device
+// with its kernels, and the last capture as it was read and corrected, until a file that it names changes. It costs the
+// memory of that capture's views once more, and doubts about reading it are warned of once. One call at a time uses it.
+struct Workspace;
+std::shared_ptr<Workspace> make_workspace();
+
 // Makes the twin of the capture (its folder or capture.json) in the folder `run`. Reports in stages "recognize",
 // "identify", "joint", "rollout", "evaluate", and writes them to log.jsonl. A call that was stopped goes on with
-// `resume`, with the same bits as if nothing had happened.
+// `resume`, with the same bits as if nothing had happened. `workspace`: what earlier calls left; null: nothing is kept.
 TrainResult train(const Path& capture, const Path& run, const TrainOptions& options,
-                  const core::Listener& listener = {});
+                  const core::Listener& listener = {}, Workspace* workspace = nullptr);
 // The same of a capture that is in memory (in_memory.h); the run does not say where its capture lies.
 TrainResult train(const capture::InMemory& capture, const Path& run, const TrainOptions& options,
-                  const core::Listener& listener = {});
+                  const core::Listener& listener = {}, Workspace* workspace = nullptr);
 
 // What of a capture was given wrongly by a little, without training: what train corrects, and what it says of it.
 struct Examination {

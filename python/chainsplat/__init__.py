@@ -27,6 +27,7 @@ from ._core import (
     Trajectory,
     Twin,
     WorkError,
+    Workspace,
     __version__,
     evaluate,
     excite,

@@ -24,22 +24,27 @@ std::string text_of(const py::handle& value) {
   return py::str(value).cast<std::string>();
 }
 
+struct Workspace {
+  std::shared_ptr<pipeline::Workspace> kept = pipeline::make_workspace();
+};
+
 // `options`: by the names of the program's job files (formats.md).
 std::shared_ptr<Twin> train(const std::variant<Path, const capture::InMemory*>& capture, const Path& folder,
                             const std::optional<ProgressFunction>& progress, bool resume, bool force,
                             const Path& picture, bool anyway, std::uint64_t seed, const std::string& device,
-                            const py::kwargs& settings) {
+                            Workspace* workspace, const py::kwargs& settings) {
   pipeline::TrainOptions options;
   options.resume = resume, options.force = force, options.picture = picture, options.anyway = anyway;
   options.seed = seed, options.device = device;
   for (const auto& [name, value] : settings)
     if (!value.is_none())
       pipeline::set(options, name.cast<std::string>(), text_of(value), "`" + name.cast<std::string>() + "`");
+  pipeline::Workspace* const kept = workspace ? workspace->kept.get() : nullptr;
   run(progress, [&](const core::Listener& listener) {
     if (const auto* const path = std::get_if<Path>(&capture))
-      pipeline::train(*path, folder, options, listener);
+      pipeline::train(*path, folder, options, listener, kept);
     else if (const capture::InMemory* const recording = std::get<const capture::InMemory*>(capture))
-      pipeline::train(*recording, folder, options, listener);
+      pipeline::train(*recording, folder, options, listener, kept);
     else
       throw InputError("`capture`", "is None", "give a folder or a Recording");
   });
@@ -170,14 +175,20 @@ py::dict errors_of(const excitation::Prediction& p) {
 
 void add_work(py::module_& m) {
   using py::arg;
+  py::class_<Workspace>(
+      m, "Workspace",
+      "What calls of train() in one process hand on to the next, which is then cheaper and has the same "
+      "bits: the opened device, and the last capture as it was read and corrected, until one of its "
+      "files changes. It costs that capture's memory once more.")
+      .def(py::init<>());
   m.def("train", &train, arg("capture"), arg("run"), arg("progress") = py::none(), arg("resume") = false,
         arg("force") = false, arg("picture") = "", arg("anyway") = false, arg("seed") = 0, arg("device") = "",
+        arg("workspace") = py::none(),
         "Makes the twin of a capture, a folder or a Recording, in the folder `run`, and returns it. progress: called "
         "with (stage, step, total, "
         "loss). Further options by name: joints, bending ('planar', 'spatial'), twist, every, frames ('0:60'), mode "
-        "('fast', 'paper'), stages, joint, fixed. Ctrl-C stops it and leaves a checkpoint, from which `resume` goes on "
-        "with "
-        "the same bits.");
+        "('fast', 'paper'), stages, joint, fixed. workspace: a Workspace, for several trainings one after the other. "
+        "Ctrl-C stops it and leaves a checkpoint, from which `resume` goes on with the same bits.");
   m.def(
       "identify", &identify, arg("runs"), arg("joint") = false, arg("markers") = std::vector<Path>{},
       arg("progress") = py::none(), arg("seed") = 0, arg("device") = "",

@@ -307,6 +307,11 @@ class Module(unittest.TestCase):
         for name in ("gaussians.ply", "metrics.json"):
             self.assertEqual((run_in_memory / name).read_bytes(), (run / name).read_bytes())
         self.assertEqual(len(cs.train(recording, run_in_memory, resume=True, **options).states), 8)
+        workspace = cs.Workspace()
+        for _ in range(2):
+            shared = cs.train(recording, run_in_memory, force=True, workspace=workspace, **options)
+            np.testing.assert_array_equal(shared.states.theta, twin.states.theta)
+            self.assertEqual((run_in_memory / "gaussians.ply").read_bytes(), (run / "gaussians.ply").read_bytes())
         arrays["times"][1] = arrays["times"][1][::-1]
         with self.assertRaises(cs.InputError) as caught:
             cs.train(cs.recording(**arrays), pathlib.Path(self.folder.name) / "no_run")

@@ -125,6 +125,13 @@ std::optional<Payload> read_payload(const ObjectReader& object, bool known_mass)
   return {};
 }
 
+std::vector<Path> files_of(const ImageSource& images) {
+  if (images.video) return {images.file};
+  std::vector<Path> files;
+  for (int k = 0; k < images.frames; ++k) files.push_back(images.frame_file(k));
+  return files;
+}
+
 std::uint64_t capture_hash(const std::string& text, const Manifest& manifest, const Path& base) {
   std::uint64_t hash = core::fnv1a(text);
   std::error_code error;
@@ -132,8 +139,8 @@ std::uint64_t capture_hash(const std::string& text, const Manifest& manifest, co
   for (const CameraSource& source : manifest.cameras)
     for (const ImageSource* images : {&source.images, source.masks ? &*source.masks : nullptr}) {
       if (!images) continue;
-      for (int k = 0; k < (images->video ? 1 : images->frames); ++k) {
-        const auto size = std::filesystem::file_size(images->video ? images->file : images->frame_file(k), error);
+      for (const Path& file : files_of(*images)) {
+        const auto size = std::filesystem::file_size(file, error);
         hash = core::fnv1a(error ? "-" : std::to_string(size) + " ", hash);
       }
     }
@@ -338,6 +345,24 @@ Manifest read_manifest(const InMemory& recording, const std::string& camera, boo
   manifest.file = "`document`";
   read_document(recording.document, camera, masked, &recording, manifest, findings);
   return manifest;
+}
+
+std::uint64_t stamp(const Path& path) {
+  Findings findings;
+  const Manifest manifest = read_manifest(path, "", true, findings);
+  throw_first(findings);
+  std::uint64_t hash = core::fnv1a(std::to_string(manifest.capture.hash));
+  for (const CameraSource& source : manifest.cameras)
+    for (const ImageSource* images :
+         {&source.images, source.masks ? &*source.masks : nullptr, source.depth ? &*source.depth : nullptr}) {
+      if (!images) continue;
+      for (const Path& file : files_of(*images)) {
+        std::error_code error;
+        const auto changed = std::filesystem::last_write_time(file, error).time_since_epoch().count();
+        hash = core::fnv1a(error ? "-" : std::to_string(changed) + " ", hash);
+      }
+    }
+  return hash;
 }
 
 }  // namespace chainsplat::capture

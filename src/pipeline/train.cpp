@@ -10,7 +10,7 @@
 #include "chainsplat/recognition.h"
 #include "chainsplat/run_folder.h"
 #include "chainsplat/silhouette.h"
-#include "pipeline/stages.h"
+#include "pipeline/workspace.h"
 
 namespace chainsplat::pipeline {
 
@@ -26,7 +26,9 @@ struct Training {
   capture::LoadOptions load;
   capture::Capture capture;
   twin::Twin twin;
-  gpu::DevicePtr device;
+  Workspace* workspace = nullptr;
+  gpu::DevicePtr own_device;            // where there is no workspace
+  gpu::Device* device = nullptr;        // that, or the workspace's
   math::MatrixX correction_covariance;  // of what was corrected in this call; empty: nothing
   bool continued = false;               // the twin was in the run folder
   bool recognize = false, identify = false, joint = false, roll_out = false, evaluate = false;  // what is to be done
@@ -122,11 +124,36 @@ void check_views(const Training& t) {
   }
 }
 
+// Which capture it is, in which state, and what of it is asked for.
+std::string capture_key(const Training& t) {
+  capture::LoadOptions nothing;
+  nothing.images = false;
+  const std::string name = t.recording ? "in memory" : fs::absolute(t.capture_path).lexically_normal().string();
+  const std::uint64_t state = t.recording ? capture::load(*t.recording, nothing).hash : capture::stamp(t.capture_path);
+  return name + " " + std::to_string(state) + " " + capture::frame_range_text(t.options.frames) +
+         (t.load.depth ? " depth" : "");
+}
+
 void load_capture(Training& t) {
   t.load.first = t.options.frames.first, t.load.last = t.options.frames.last;
   // read now, because a file that is wrong must not end a work that is done
   t.load.depth = t.load.recorded_too = asked_for(t, Stage::evaluate);
-  t.capture = t.recording ? capture::load(*t.recording, t.load) : capture::load(t.capture_path, t.load);
+  const auto load = [&] {
+    return t.recording ? capture::load(*t.recording, t.load) : capture::load(t.capture_path, t.load);
+  };
+  if (t.workspace) {
+    Workspace& kept = *t.workspace;
+    const std::string key = capture_key(t);
+    if (kept.capture_key != key) {
+      kept.capture_key.clear(), kept.correction_key.clear();
+      kept.read = {}, kept.mended = {}, kept.corrected = {};  // before the next one needs the memory
+      kept.read = load();
+      kept.capture_key = key;
+    }
+    t.capture = kept.read;
+  } else {
+    t.capture = load();
+  }
   check_not_capture(t.run, t.capture.folder);
   if (asked_for(t, Stage::recognize)) check_views(t);
   if (asked_for(t, Stage::evaluate)) capture::load_true_centerline(t.capture.folder);  // to find what is wrong with it
@@ -221,6 +248,29 @@ void check_work(Training& t) {
   if (t.continued && t.joint) check_joint(t.twin, t.run);
 }
 
+// Corrects the capture, or gives it what an earlier training found.
+Corrected corrected_by_now(Training& t) {
+  const std::vector<std::string>& fixed = t.options.fixed;
+  if (!t.workspace) return correct(t.capture, fixed, t.options.anyway);
+  Workspace& kept = *t.workspace;
+  std::string key = t.options.anyway ? "anyway" : "else";
+  for (const std::string& group : fixed) key += " " + group;
+  std::vector<capture::PackedView> views, recorded;
+  if (kept.correction_key != key) {
+    kept.correction_key.clear();
+    kept.corrected = correct(t.capture, fixed, t.options.anyway);
+    views = std::move(t.capture.views), recorded = std::move(t.capture.recorded);
+    kept.mended = t.capture;
+    kept.correction_key = key;
+  } else {
+    views = std::move(t.capture.views), recorded = std::move(t.capture.recorded);
+    t.capture = kept.mended;
+    for (capture::PackedView& view : views) view.time = t.capture.times[view.camera][view.frame];
+  }
+  t.capture.views = std::move(views), t.capture.recorded = std::move(recorded);
+  return kept.corrected;
+}
+
 // What the capture was given wrongly: estimated for a new twin, known of one that goes on.
 void correct_capture(Training& t) {
   if (!t.recognize) {
@@ -230,7 +280,7 @@ void correct_capture(Training& t) {
   const std::vector<std::string>& fixed = t.options.fixed;
   if (t.options.mode == twin::Mode::paper || std::find(fixed.begin(), fixed.end(), "all") != fixed.end()) return;
   core::report({"recognize", 0, 0, NAN, NAN, "cameras, clocks, grasp and size"});
-  Corrected found = correct(t.capture, fixed, t.options.anyway);
+  Corrected found = corrected_by_now(t);
   t.twin.corrections = std::move(found.corrections);
   t.twin.verdict = std::move(found.verdict);
   t.correction_covariance = std::move(found.covariance);
@@ -243,7 +293,11 @@ void correct_capture(Training& t) {
 
 void open_device(Training& t) {
   if (!t.recognize && !t.joint && !t.evaluate) return;
-  t.device = gpu::open_device({.selector = t.options.device});
+  gpu::DevicePtr& device = t.workspace ? t.workspace->device : t.own_device;
+  if (t.workspace && t.workspace->selector != t.options.device) device.reset();
+  if (!device) device = gpu::open_device({.selector = t.options.device});
+  if (t.workspace) t.workspace->selector = t.options.device;
+  t.device = device.get();
   const gpu::DeviceInfo& info = gpu::info(*t.device);
   t.twin.provenance.device = info.name;
   t.twin.provenance.driver = info.driver;
@@ -448,23 +502,31 @@ TrainResult run_training(Training t, const core::Listener& listener) {
     recognition::remove_checkpoint(run / kCheckpointFolder);
   }
   t.saved = t.continued;
-  run_logged(t, was_there, listener);
+  try {
+    run_logged(t, was_there, listener);
+  } catch (...) {
+    if (t.workspace) t.workspace->device.reset();  // it may be lost
+    throw;
+  }
   t.result.twin = std::move(t.twin);
   return std::move(t.result);
 }
 
 }  // namespace
 
-TrainResult train(const Path& capture, const Path& run, const TrainOptions& options, const core::Listener& listener) {
+std::shared_ptr<Workspace> make_workspace() { return std::make_shared<Workspace>(); }
+
+TrainResult train(const Path& capture, const Path& run, const TrainOptions& options, const core::Listener& listener,
+                  Workspace* workspace) {
   Training t;
-  t.capture_path = capture, t.run = run, t.options = options;
+  t.capture_path = capture, t.run = run, t.options = options, t.workspace = workspace;
   return run_training(std::move(t), listener);
 }
 
 TrainResult train(const capture::InMemory& capture, const Path& run, const TrainOptions& options,
-                  const core::Listener& listener) {
+                  const core::Listener& listener, Workspace* workspace) {
   Training t;
-  t.recording = &capture, t.capture_path = "`capture`", t.run = run, t.options = options;
+  t.recording = &capture, t.capture_path = "`capture`", t.run = run, t.options = options, t.workspace = workspace;
   return run_training(std::move(t), listener);
 }
 
