@@ -287,6 +287,32 @@ TEST_CASE("on a table a target that only the free end can be brought to is reach
   CHECK(plan(problem, options).reached);
 }
 
+TEST_CASE("a rope that is held above the table is planned for like one that is not") {
+  const auto planned = [](double lift) {
+    Problem problem = problem_of(chain::Bending::planar, true);
+    std::vector<double>& lower = problem.model.chain.lift;
+    lower.assign(problem.model.chain.links(), -lift);
+    lower[0] = 0.0, lower[1] = -0.5 * lift;
+    problem.base.translation.z() += lift;
+    problem.targets = {{0.05, 0.08, 0.01}};
+    Options options;
+    options.axes = {Axis::x, Axis::y};
+    return plan(problem, options);
+  };
+  const Plan flat = planned(0.0), held = planned(0.015);
+  CHECK(flat.reached);
+  CHECK(held.reached);
+  CHECK(held.hits[0].miss == doctest::Approx(flat.hits[0].miss).epsilon(0.01));
+  CHECK(held.iterations == flat.iterations);  // nothing was sought in vain
+
+  Problem problem = problem_of(chain::Bending::planar, true);
+  problem.model.chain.lift.assign(problem.model.chain.links(), -0.015);
+  problem.targets = {{0.05, 0.08, 0.01}};
+  Options options;
+  options.axes = {Axis::x, Axis::y};
+  CHECK(unreachable_distance(problem, options, problem.targets[0]) == 0.0);
+}
+
 TEST_CASE("a target out of reach is said to be so, with the nearest motion") {
   Problem problem = problem_of(chain::Bending::planar, false);
   Options options;

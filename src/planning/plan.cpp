@@ -345,7 +345,7 @@ double unreachable_distance(const Problem& problem, const Options& options, cons
   // a planar chain stays in its plane
   const Vector3 normal = problem.base.rotation * chain.bending_axis;
   if (default_axes(chain).size() == 1 && !turns && normal.cwiseAbs().dot(moved) < 1e-9)
-    bound = std::max(bound, std::abs(normal.dot(target - problem.base.translation)));
+    bound = std::max(bound, std::abs(normal.dot(target - where_it_lies(problem))));
   return bound;
 }
 

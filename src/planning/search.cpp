@@ -59,10 +59,15 @@ VectorX unknowns_of(const Motion& motion) {
   return unknowns;
 }
 
+Vector3 where_it_lies(const Problem& problem) {
+  const chain::Chain& chain = problem.model.chain;
+  return problem.base * (chain.link_lift(chain.links() - 1) * chain.bending_axis);
+}
+
 Vector3 at_rope_height(const Problem& problem, const Vector3& target) {
   if (!problem.tabletop || !problem.model.parameters.table_normal) return target;
   const Vector3& normal = *problem.model.parameters.table_normal;
-  return target + normal * normal.dot(problem.base.translation - target);
+  return target + normal * normal.dot(where_it_lies(problem) - target);
 }
 
 Task make_task(const Problem& problem, const Options& options, const std::vector<const dynamics::Model*>& models,

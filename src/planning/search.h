@@ -12,7 +12,9 @@ void append_piece(Motion& motion, double start, double duration);
 // Grid, initial state and target of the last piece of `motion`. `substeps` a 1/30 s.
 Task make_task(const Problem& problem, const Options& options, const std::vector<const dynamics::Model*>& models,
                const Motion& motion, const dynamics::InitialState& initial, const Vector3& target, int substeps);
-// The target at the height of the rope on a table.
+// The grasp at the height of the free end: a rope that is held above the table lies lower than in its grasp.
+Vector3 where_it_lies(const Problem& problem);
+// The target at that height, if the rope is on a table.
 Vector3 at_rope_height(const Problem& problem, const Vector3& target);
 
 void set_unknowns(Motion& motion, const VectorX& unknowns);  // of the last piece
