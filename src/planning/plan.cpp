@@ -24,12 +24,14 @@ constexpr double kEnough = 0.1;          // of the tolerance: no further iterati
 constexpr int kFineCost = 2;             // evaluations with coarse steps that one with full steps costs
 constexpr int kMostSpent = 160;          // of them, after which nothing further is tried
 constexpr double kGoodMiss = 0.3;        // of the tolerance: no further start is tried
+constexpr int kHard = 3;                 // groups after which the tolerance itself is enough
 constexpr double kStrictLimits = 100.0;  // times the usual weight
 // Starts optimized side by side; the next group only where the last failed.
 constexpr int kGroups[] = {1, 1, 2, 2, 2, 2, 2};
-constexpr double kPromising = 10.0;  // of the tolerance: a coarse miss from which it is worth to go on at once
-constexpr int kOutOfReach = 2;       // groups where geometry says that no motion reaches the target
-constexpr int kLastTries = 2;        // of the nearest others, where no start was good
+constexpr double kPromising = 10.0;     // of the tolerance: a coarse miss from which it is worth to go on at once,
+constexpr double kNearlyClear = 0.002;  // m, unless it is deeper than this in an obstacle: through it, not around it
+constexpr int kOutOfReach = 2;          // groups where geometry says that no motion reaches the target
+constexpr int kLastTries = 2;           // of the nearest others, where no start was good
 constexpr std::uint64_t kTargetStream = 0x7461726765740001ull;  // random numbers of random_target
 constexpr double kHorizons[] = {0.25, 0.35, 0.5, 0.7, 1.0};     // of the longest, for a free one
 constexpr double kTableSlack = 1e-6;                            // m, a target may lie in the table's plane
@@ -304,12 +306,14 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
       near.push_back(std::move(f));
     }
     std::stable_sort(near.begin(), near.end(), by_merit);
-    if (!near.empty() && merit(near.front(), options) <= kPromising * options.tolerance) {
+    if (!near.empty() && merit(near.front(), options) <= kPromising * options.tolerance &&
+        near.front().clearance > -kNearlyClear) {
       go_further(near.front());
       near.erase(near.begin());
     }
     if (core::stop_requested()) throw Interrupted(core::stop_requested());
     if (best && good(*best)) return *best;
+    if (best && best->good && groups >= kHard && merit(*best, options) <= options.tolerance) return *best;
     if (best && best->good && models.size() > 1 && group > 1) return *best;
   }
   for (int i = 0; i < kLastTries && !near.empty() && !(best && (good(*best) || spent > kMostSpent)); ++i) {
