@@ -215,14 +215,17 @@ Choices choices_of(const Straight& s, const RibbonOptions& options) {
   return out;
 }
 
+// Where a connector may be.
+bool in_tip(const Straight& s, int i) { return s.stations[i].arclength > (1.0 - kTipShare) * s.length; }
+
 // What speaks against a pair at station i. `sums`: of the odds of the columns before each.
 double cost_of(const Straight& s, const RibbonOptions& options, int i, const Outlines& pair,
                const std::vector<double>& sums) {
   const double expected = options.width * std::max(0.5, s.stations[i].radius);
   const double wide = 0.5 * (pair.b - pair.a) * s.du / expected,
                middle = (0.5 * (pair.a + pair.b) - 0.5 - s.half) * s.du / expected;
-  const bool tip = s.stations[i].arclength > (1.0 - kTipShare) * s.length && wide > 1.0;
-  const double width = tip ? kWiderTip * (wide - 1.0) : 0.5 * square((wide - 1.0) / options.width_deviation);
+  const double width =
+      in_tip(s, i) && wide > 1.0 ? kWiderTip * (wide - 1.0) : 0.5 * square((wide - 1.0) / options.width_deviation);
   return s.weight() *
          (width + 0.5 * square(middle / kCenter) - kColor * (sums[pair.b] - sums[pair.a]) * s.du / s.radius -
           kEdge * (s.steps[s.at(i, pair.a)] + s.steps[s.at(i, pair.b)]));
@@ -238,7 +241,10 @@ std::vector<Outlines> cheapest_way(const Straight& s, const Choices& choices, co
   std::vector<double> best(many), next(many), sums(s.columns + 1, 0.0);
   std::vector<std::uint8_t> came(static_cast<std::size_t>(s.count()) * many, kStay);
   for (int i = 0; i < s.count(); ++i) {
-    for (int k = 0; k < s.columns; ++k) sums[k + 1] = sums[k] + s.odds[s.at(i, k)];
+    for (int k = 0; k < s.columns; ++k) {
+      const double odds = s.odds[s.at(i, k)];
+      sums[k + 1] = sums[k] + (in_tip(s, i) ? std::max(0.0, odds) : odds);  // a connector has colors of its own
+    }
     for (int n = 0; n < many; ++n) {
       double least = i ? std::numeric_limits<double>::max() : 0.0;
       std::uint8_t by = kStay;
