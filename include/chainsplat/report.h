@@ -27,8 +27,8 @@ struct Quantity {
 std::vector<Quantity> identified(const twin::Twin& twin);
 
 // Standard deviations of the rollout's angles at its times, rad, by the covariance of what was identified: first order,
-// within the model. Empty where there is no covariance, and for the paper's integrator, whose steps have no
-// derivatives.
+// within the model. Empty where there is no covariance, for the paper's integrator, whose steps have no derivatives,
+// and where angles, unknowns and times are so many that the derivatives would fill the memory.
 std::vector<math::VectorX> rollout_deviations(const twin::Twin& twin, const trajectory::Trajectory& base);
 
 // What a camera saw, small: undistorted pictures as JPEG.
