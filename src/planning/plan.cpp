@@ -27,8 +27,7 @@ constexpr int kFinalSteps = 9, kFinalEvaluations = 20;
 constexpr int kPolishSteps = 4;          // with exact derivatives, each as dear as seven others
 constexpr double kWorthPolish = 2.0;     // of the tolerance
 constexpr double kEnough = 0.1;          // of the tolerance: no further iteration is made
-constexpr int kFineCost = 6;             // evaluations with coarse steps that one with full steps costs
-constexpr int kMostSpent = 480;          // of them, after which nothing further is tried
+constexpr double kMostSpent = 80.0;      // evaluations with full steps, after which nothing further is tried
 constexpr double kGoodMiss = 0.3;        // of the tolerance: no further start is tried
 constexpr int kHard = 3;                 // groups after which the tolerance itself is enough
 constexpr double kStrictLimits = 100.0;  // times the usual weight
@@ -283,12 +282,13 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
   const auto by_merit = [&](const Found& a, const Found& b) { return better(a, b, options); };
   std::vector<Found> near;  // where a start led with coarse steps, not gone further
   std::optional<Found> best;
-  int spent = 0;  // evaluations with coarse steps, or what costs as much
+  double spent = 0.0;  // evaluations with full steps, or what costs as much
+  const double coarse_cost = static_cast<double>(coarse_substeps(problem, options)) / substeps;
   const auto go_further = [&](Found found) {
     found.iterations = 0;
     finish(fine, found);
     iterations += found.iterations;
-    spent += kFineCost * found.iterations;
+    spent += found.iterations;
     if (!best || better(found, *best, options)) best = std::move(found);
   };
   std::size_t next = 0, next_tip = 0;
@@ -308,7 +308,7 @@ Found solve(const Problem& problem, const Options& options, const std::vector<co
                        [&](std::int64_t i) { found[i] = approach(*chosen[i].first, starts[chosen[i].second]); });
     for (Found& f : found) {
       iterations += f.iterations;
-      spent += f.iterations;
+      spent += coarse_cost * f.iterations;
       near.push_back(std::move(f));
     }
     std::stable_sort(near.begin(), near.end(), by_merit);
