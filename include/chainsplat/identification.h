@@ -73,8 +73,8 @@ struct Result {
   dynamics::InitialState initial;  // at the first recognized time
   chain::States rollout;           // at all recognized times, under the capture's base motion
   dynamics::Estimates estimates;
-  double node_rms =
-      0.0;  // m, rollout against recognized nodes, over nodes but the grasp and the frames that are fitted
+  // m, rollout against recognized nodes, over nodes but the grasp and over the frames that are fitted
+  double node_rms = 0.0;
   // m, the same with parameters of this recording alone. Much less: it is of another rope than the others.
   double alone_rms = 0.0;
 };

@@ -1089,7 +1089,7 @@ Result joined(const chain::Chain& chain, const trajectory::Trajectory& base, con
   return out;
 }
 
-// Windows of them, where they are long and have many angles.
+// Of all recordings; of windows of them, where all of it has more than Options::most_numbers.
 template <class R>
 std::vector<Result> fit_recordings(const chain::Chain& chain, std::span<const R> recordings, const Options& options) {
   const bool several = recordings.size() > 1;
@@ -1110,8 +1110,9 @@ std::vector<Result> fit_recordings(const chain::Chain& chain, std::span<const R>
       windows.push_back(window_of(recording, frames));
       const std::vector<double>& times = times_of(windows.back());
       char text[120];
-      std::snprintf(text, sizeof text, "identify: of so many angles over so long a time the window from %.2f to %.2f s",
-                    times.front(), times.back());
+      std::snprintf(text, sizeof text,
+                    "identify: too long to fit whole with so many angles; one window is %.2f to %.2f s", times.front(),
+                    times.back());
       core::say_more(text);
     }
   }

@@ -24,6 +24,7 @@ std::vector<std::vector<std::size_t>> windows_of(const chain::States& states, st
   std::iota(frames.begin(), frames.end(), std::size_t{0});
   if (all <= most) return {frames};
   const double seconds = states.time.back() - states.time.front();
+  if (!(seconds > 0.0) || states.theta.size() != all) return {frames};  // nothing to choose by, and it will be refused
   const auto rate = static_cast<double>(all - 1) / seconds;
   const auto every = std::clamp<std::size_t>(static_cast<std::size_t>(rate / kRate + 1e-6), 1, (all + most - 1) / most);
   for (std::size_t k = 0; k * every < all; ++k) frames[k] = k * every;

@@ -6,9 +6,10 @@
 
 namespace chainsplat::identification {
 
+inline constexpr int kMostWindows = 4;  // shorter ones would see less than a swing
+
 // The frames of each window, in order and `most` or fewer in all: one window of everything where that is within `most`,
 // else up to kMostWindows. The first window begins with the recording, the others are where the rope moves most.
-inline constexpr int kMostWindows = 4;
 std::vector<std::vector<std::size_t>> windows_of(const chain::States& states, std::size_t most);
 
 }  // namespace chainsplat::identification
