@@ -544,6 +544,9 @@ TEST_CASE("videos of images and masks, missing masks, timestamps, empty views") 
     made.write("cam1.txt", "# seconds\n0.01\n0.02\n0.15\n\n0.35\n");
     made.json["cameras"][1]["timestamps"] = "cam1.txt";
     CHECK(made.load().times[1] == std::vector<double>{0.01, 0.02, 0.15, 0.35});
+    const std::uint64_t before = capture::stamp(made.path());
+    made.write("cam1.txt", "0.01\n0.02\n0.15\n0.36\n");
+    CHECK(capture::stamp(made.path()) != before);
     made.write("cam1.txt", "0.01\n0.02\n0.15\n");
     CHECK(contains(made.refused(), "3 times for 4 frames"));
     made.write("cam1.txt", "0.01\n0.02\n0.02\n0.3\n");

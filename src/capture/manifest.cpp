@@ -352,7 +352,8 @@ std::uint64_t stamp(const Path& path) {
   const Manifest manifest = read_manifest(path, "", true, findings);
   throw_first(findings);
   std::uint64_t hash = core::fnv1a(std::to_string(manifest.capture.hash));
-  for (const CameraSource& source : manifest.cameras)
+  for (const CameraSource& source : manifest.cameras) {
+    hash = hash_of(source.times, hash);  // which may have a file of their own
     for (const ImageSource* images :
          {&source.images, source.masks ? &*source.masks : nullptr, source.depth ? &*source.depth : nullptr}) {
       if (!images) continue;
@@ -362,6 +363,7 @@ std::uint64_t stamp(const Path& path) {
         hash = core::fnv1a(error ? "-" : std::to_string(changed) + " ", hash);
       }
     }
+  }
   return hash;
 }
 
