@@ -4,7 +4,9 @@
 
 #include <doctest/doctest.h>
 
+#include <algorithm>
 #include <cmath>
+#include <random>
 
 #include "chainsplat/silhouette.h"
 #include "src/masking/cut.h"
@@ -42,6 +44,62 @@ capture::Image8 given_mask(int camera, int frame) {
   char name[64];
   std::snprintf(name, sizeof name, "masks/cam%d/%06d.png", camera, frame);
   return capture::read_image8(kDemo / name);
+}
+
+TEST_CASE("no labels of a box cost less than the least cut's") {
+  constexpr int kSide = 4, kPixels = kSide * kSide;
+  std::mt19937 random(7);
+  std::uniform_int_distribution<int> gray(0, 60);
+  for (const double size : {0.3, 3.0, 9.0, 30.0}) {  // of the log odds: nearly none decides its pixel, nearly all do
+    std::normal_distribution<float> odds_of(0.0f, static_cast<float>(size));
+    for (int round = 0; round < 5; ++round) {
+      std::vector<std::uint8_t> rgb(3 * kPixels);
+      for (std::uint8_t& value : rgb) value = static_cast<std::uint8_t>(gray(random));
+      std::vector<float> odds(kPixels);
+      for (float& value : odds) value = odds_of(random);
+      const int out = round == 0 ? -1 : 3 * round;  // a pixel that takes no part
+      if (out >= 0) odds[out] = std::nanf("");
+
+      // contours between neighbors, by the definition
+      struct Pair {
+        int a, b;
+        double cost;
+      };
+      std::vector<Pair> pairs;
+      double sum = 0.0;
+      for (int a = 0; a < kPixels; ++a)
+        for (int b = a + 1; b < kPixels; ++b) {
+          const int x = std::abs(a % kSide - b % kSide), y = std::abs(a / kSide - b / kSide);
+          if (x > 1 || y > 1 || a == out || b == out) continue;
+          double difference = 0.0;
+          for (int c = 0; c < 3; ++c) difference += std::pow(rgb[3 * a + c] - rgb[3 * b + c], 2);
+          sum += difference;
+          pairs.push_back({a, b, x + y == 2 ? -difference : difference});  // a diagonal one is marked by its sign
+        }
+      const double mean = sum / static_cast<double>(pairs.size());
+      for (Pair& pair : pairs)
+        pair.cost = masking::kContour * std::exp(-std::abs(pair.cost) / (2.0 * mean)) *
+                    (std::signbit(pair.cost) ? std::sqrt(0.5) : 1.0);
+      const auto cost = [&](unsigned labels) {
+        double total = 0.0;
+        for (int i = 0; i < kPixels; ++i)
+          if (i != out) total += std::max(0.0f, (labels >> i & 1u) != 0u ? -odds[i] : odds[i]);
+        for (const Pair& pair : pairs)
+          if ((labels >> pair.a & 1u) != (labels >> pair.b & 1u)) total += pair.cost;
+        return total;
+      };
+
+      const masking::Picture picture{rgb.data(), kSide, kSide, 3};
+      const std::vector<std::uint8_t> found = masking::least_cut(picture, {0, 0, kSide, kSide}, odds);
+      unsigned labels = 0;
+      for (int i = 0; i < kPixels; ++i) labels |= found[i] != 0 ? 1u << i : 0u;
+      if (out >= 0) CHECK(found[out] == 0);
+      double least = cost(0);
+      for (unsigned other = 1; other < 1u << kPixels; ++other)
+        if (out < 0 || (other >> out & 1u) == 0u) least = std::min(least, cost(other));
+      CHECK(cost(labels) == doctest::Approx(least).epsilon(1e-9));
+    }
+  }
 }
 
 TEST_CASE("the tube of a straight rope is a rectangle with the right sides") {

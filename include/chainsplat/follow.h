@@ -84,9 +84,10 @@ class Tracker {
   // The view of a whole picture (RGB, as recorded) of the first camera, for update(): its mask is made here, from the
   // twin's colors, or from what is not black where the first picture was masked before.
   capture::View mask(const capture::Image8& picture, double time);
-  // What mask() would have to do with the next picture and can be done before it comes: drawing the rope for its marks,
-  // in every tenth frame. Calling it is not needed.
-  void between_frames();
+  // What the next frame would have to wait for and can be done before it comes: drawing the rope for its marks, in
+  // every tenth frame, and, with the time of the next frame, s, the rope's motion until then. Give that time where it
+  // is known to a microsecond and the base's motion until then is known already. Calling it is not needed.
+  void between_frames(std::optional<double> next = {});
 
   const twin::Twin& twin() const;
   const dynamics::Model& model() const;

@@ -89,6 +89,8 @@ class LiveMasks {
   // Learns the rope's marks, which nothing that hides it has, from a drawn picture of the rope at these angles (an
   // undistorted crop with its coverage as alpha). `base`: world_from_base.
   void learn_marks(const capture::View& drawn, const math::Pose& base, const math::VectorX& theta);
+  // Tells before the next frame comes where mask() will be asked to look, which then has less to do.
+  void expect(const math::Pose& base, const math::VectorX& theta);
   // Returns the undistorted crop of a recorded frame (RGB, of the camera's size) with its mask; an empty view (width 0)
   // where nothing is found. `theta`: the expected angles; none where they are unknown (in the first frame, or when the
   // rope is lost).

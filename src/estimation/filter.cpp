@@ -192,9 +192,8 @@ Estimate update(State& state, std::span<const capture::View* const> views) {
   const capture::View& view = *views.front();
   const bool first = !state.belief;
   Motion motion;
-  if (!first)
-    motion =
-        state.ahead && state.ahead->time == view.time ? std::move(*state.ahead) : move(state, *state.belief, view.time);
+  if (!first) motion = is_ahead(state, view.time) ? std::move(*state.ahead) : move(state, *state.belief, view.time);
+  motion.time = view.time;
   state.ahead.reset();
   Belief predicted = first ? first_belief(state, view.time)
                            : predict(state, *state.belief, motion,

@@ -193,11 +193,16 @@ Belief predict(const State& state, const Belief& belief, const Motion& motion, C
   return out;
 }
 
+bool is_ahead(const State& state, double time) {
+  constexpr double kSameTime = 1e-6;  // s, in which nothing moves; times of frames are sums that are rounded
+  return state.ahead && std::abs(state.ahead->time - time) < kSameTime;
+}
+
 std::optional<VectorX> expected(State& state, double time) {
   if (!state.belief || state.lost) return std::nullopt;
   const int n = state.given.model.chain.angles();
   if (time <= state.belief->time) return state.belief->mean.head(n);
-  if (!state.ahead || state.ahead->time != time) state.ahead = move(state, *state.belief, time);
+  if (!is_ahead(state, time)) state.ahead = move(state, *state.belief, time);
   return state.ahead->theta;
 }
 

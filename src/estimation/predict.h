@@ -24,6 +24,8 @@ Motion move(const State& state, const Belief& belief, double time);
 // Returns the belief at the time to which it was moved.
 Belief predict(const State& state, const Belief& belief, const Motion& motion, Contact contact);
 
+// Whether the motion until that time is known already.
+bool is_ahead(const State& state, double time);
 // As Filter::expected(). The motion is kept for the frame of that time.
 std::optional<math::VectorX> expected(State& state, double time);
 

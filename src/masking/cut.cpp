@@ -3,6 +3,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <future>
+#include <numeric>
 #include <opencv2/core.hpp>
 #include <opencv2/imgproc.hpp>
 #include <opencv2/imgproc/detail/gcgraph.hpp>
@@ -15,8 +17,6 @@ namespace {
 constexpr double kPlacePixels = 0.6;                         // px per unit of log odds
 constexpr double kSurelyInside = 4.0, kSurelyOutside = 8.0;  // inside, evidence of occlusion can outweigh the place
 constexpr double kBand = 8.0;                                // px outside the tube, beyond which no pixel is labeled
-// the graph cut
-constexpr double kContour = 2.0;  // cost per pixel of a contour through a plain area
 // where the rope is hidden along its length
 constexpr double kInsideFrom = 0.3, kBesideTo = 1.5;  // radii from the outline, so that the outline itself is left out
 constexpr double kHiddenStep = 0.25;                  // diameters along the rope per step,
@@ -43,51 +43,141 @@ double squared_difference(const Picture& picture, int x, int y, int u, int v) {
   return sum;
 }
 
-constexpr int kNeighbors[4][2] = {{1, 0}, {0, 1}, {1, 1}, {-1, 1}};
+// A pixel has four neighbors ahead, and is one of four others.
+constexpr int kAhead = 4;
+constexpr int kNeighbors[kAhead][2] = {{1, 0}, {0, 1}, {1, 1}, {-1, 1}};
 
-// Returns the labels (0 or 255) of the box's pixels by a minimum cut. `odds`: log odds per pixel, NaN where the pixel
-// is certainly outside.
-cv::Mat least_cut(const Picture& picture, const math::Rectangle& box, const std::vector<float>& odds) {
-  const int width = box.width(), height = box.height();
-  // one node per undecided pixel
-  std::vector<int> node(odds.size(), -1);
-  int nodes = 0;
+enum class Label : signed char { none, undecided, outside, inside };  // none: certainly outside, no part of the cut
+
+// The pixels of a box, row by row, as nodes of a graph whose minimum cut is the outline.
+struct Grid {
+  int width = 0, height = 0;
+  std::vector<Label> label;
+  std::vector<double> odds;  // log odds for the inside, with what decided neighbors add
+  std::vector<double>
+      weight;  // cost of a contour between a pixel and each of the neighbors ahead; negative: none there
+
+  // Calls body(neighbor, weight) for all that a pixel has.
+  template <typename Body>
+  void each_neighbor(std::size_t pixel, const Body& body) const {
+    const int column = static_cast<int>(pixel % width), row = static_cast<int>(pixel / width);
+    for (int k = 0; k < kAhead; ++k) {
+      const std::ptrdiff_t step = kNeighbors[k][1] * width + kNeighbors[k][0];
+      if (const double ahead = weight[kAhead * pixel + k]; ahead >= 0.0) body(pixel + step, ahead);
+      const int x = column - kNeighbors[k][0], y = row - kNeighbors[k][1];
+      if (x < 0 || x >= width || y < 0) continue;
+      if (const double behind = weight[kAhead * (pixel - step) + k]; behind >= 0.0) body(pixel - step, behind);
+    }
+  }
+};
+
+// Turns squared differences of colors, whole numbers, into costs. As in GrabCut they are scaled by the picture's own
+// mean difference, `mean`.
+void weigh(std::vector<double>& weight, double mean) {
+  const double beta = mean > 0.0 ? 1.0 / (2.0 * mean) : 0.0;
+  // most differences are small: their exponentials are computed once
+  constexpr std::size_t kTable = 2048;
+  std::vector<double> table(std::min(kTable, weight.size()));
+  for (std::size_t d = 0; d < table.size(); ++d) table[d] = kContour * std::exp(-beta * static_cast<double>(d));
+  for (std::size_t at = 0; at < weight.size(); ++at) {
+    const double difference = weight[at];
+    if (difference < 0.0) continue;
+    const auto whole = static_cast<std::size_t>(difference);
+    const double straight = whole < table.size() ? table[whole] : kContour * std::exp(-beta * difference);
+    weight[at] = straight * (at % kAhead < 2 ? 1.0 : M_SQRT1_2);
+  }
+}
+
+Grid grid_of(const Picture& picture, const math::Rectangle& box, const std::vector<float>& odds) {
+  Grid grid{box.width(), box.height(), std::vector<Label>(odds.size(), Label::none), {odds.begin(), odds.end()}, {}};
   for (std::size_t i = 0; i < odds.size(); ++i)
-    if (!std::isnan(odds[i])) node[i] = nodes++;
-  // as in GrabCut, differences between neighbors are scaled by the picture's own mean difference
-  double sum = 0.0;
-  int pairs = 0;
-  const auto each_pair = [&](const auto& body) {
-    for (int y = 0; y < height; ++y)
-      for (int x = 0; x < width; ++x) {
-        const int i = y * width + x;
-        if (node[i] < 0) continue;
-        for (const auto& step : kNeighbors) {
-          const int u = x + step[0], v = y + step[1];
-          if (u < 0 || u >= width || v >= height || node[v * width + u] < 0) continue;
-          body(i, v * width + u, squared_difference(picture, box.x0 + x, box.y0 + y, box.x0 + u, box.y0 + v),
-               step[0] != 0 && step[1] != 0);
+    if (!std::isnan(odds[i])) grid.label[i] = Label::undecided;
+  grid.weight.assign(kAhead * odds.size(), -1.0);
+  std::vector<double> sums(grid.height, 0.0);  // per row, of whole numbers: exact in any order
+  std::vector<int> numbers(grid.height, 0);
+  cv::parallel_for_({0, grid.height}, [&](const cv::Range& rows) {
+    for (int y = rows.start; y < rows.end; ++y)
+      for (int x = 0; x < grid.width; ++x) {
+        const std::size_t i = static_cast<std::size_t>(y) * grid.width + x;
+        if (grid.label[i] == Label::none) continue;
+        for (int k = 0; k < kAhead; ++k) {
+          const int u = x + kNeighbors[k][0], v = y + kNeighbors[k][1];
+          if (u < 0 || u >= grid.width || v >= grid.height) continue;
+          if (grid.label[static_cast<std::size_t>(v) * grid.width + u] == Label::none) continue;
+          const double difference = squared_difference(picture, box.x0 + x, box.y0 + y, box.x0 + u, box.y0 + v);
+          grid.weight[kAhead * i + k] = difference;
+          sums[y] += difference, ++numbers[y];
         }
       }
-  };
-  each_pair([&](int, int, double difference, bool) { sum += difference, ++pairs; });
-  const double beta = sum > 0.0 ? pairs / (2.0 * sum) : 0.0;
-  // build the graph, cut it and read the labels
-  cv::detail::GCGraph<double> graph(nodes, 2 * pairs);
-  for (std::size_t i = 0; i < odds.size(); ++i) {
-    if (node[i] < 0) continue;
-    graph.addVtx();
-    graph.addTermWeights(node[i], std::max(0.0f, odds[i]), std::max(0.0f, -odds[i]));
-  }
-  each_pair([&](int i, int j, double difference, bool diagonal) {
-    const double weight = kContour * std::exp(-beta * difference) * (diagonal ? M_SQRT1_2 : 1.0);
-    graph.addEdges(node[i], node[j], weight, weight);
   });
+  const double sum = std::accumulate(sums.begin(), sums.end(), 0.0);
+  const int pairs = std::accumulate(numbers.begin(), numbers.end(), 0);
+  weigh(grid.weight, pairs > 0 ? sum / pairs : 0.0);
+  return grid;
+}
+
+// Labels the pixels whose odds outweigh all contours that there could be to undecided neighbors: no minimum cut has
+// them otherwise. Most pixels are such; what remains is a band about the outline.
+void decide(Grid& grid) {
+  constexpr double kMostContours = kAhead * kContour * (1.0 + M_SQRT1_2);
+  constexpr double kRounding = 1e-9;  // of sums of weights
+  const auto settle = [&](std::size_t i, double contours) {
+    if (std::abs(grid.odds[i]) <= contours + kRounding) return false;
+    grid.label[i] = grid.odds[i] > 0.0 ? Label::inside : Label::outside;
+    return true;
+  };
+  std::vector<std::size_t> band;
+  for (std::size_t i = 0; i < grid.label.size(); ++i)
+    if (grid.label[i] == Label::undecided && !settle(i, kMostContours)) band.push_back(i);
+  std::vector<double> contours(grid.label.size());  // to undecided neighbors
+  for (const std::size_t i : band)
+    grid.each_neighbor(i, [&](std::size_t other, double weight) {
+      if (grid.label[other] == Label::undecided)
+        contours[i] += weight;
+      else
+        grid.odds[i] += grid.label[other] == Label::inside ? weight : -weight;
+    });
+  while (!band.empty()) {  // a pixel that is decided may decide its neighbors
+    const std::size_t i = band.back();
+    band.pop_back();
+    if (grid.label[i] != Label::undecided || !settle(i, contours[i])) continue;
+    grid.each_neighbor(i, [&](std::size_t other, double weight) {
+      if (grid.label[other] != Label::undecided) return;
+      contours[other] -= weight;
+      grid.odds[other] += grid.label[i] == Label::inside ? weight : -weight;
+      band.push_back(other);
+    });
+  }
+}
+
+// Labels the pixels that are left.
+void cut_band(Grid& grid) {
+  std::vector<int> node(grid.label.size(), -1);
+  std::vector<std::size_t> band;
+  for (std::size_t i = 0; i < grid.label.size(); ++i)
+    if (grid.label[i] == Label::undecided) {
+      node[i] = static_cast<int>(band.size());
+      band.push_back(i);
+    }
+  cv::detail::GCGraph<double> graph(static_cast<unsigned>(band.size()),
+                                    static_cast<unsigned>(2 * kAhead * band.size()));
+  for (const std::size_t i : band) {
+    graph.addVtx();
+    graph.addTermWeights(node[i], std::max(0.0, grid.odds[i]), std::max(0.0, -grid.odds[i]));
+  }
+  bool joined = false;
+  for (const std::size_t i : band)
+    for (int k = 0; k < kAhead; ++k) {
+      const double weight = grid.weight[kAhead * i + k];
+      if (weight < 0.0) continue;
+      const std::size_t other = i + kNeighbors[k][1] * grid.width + kNeighbors[k][0];
+      if (grid.label[other] != Label::undecided) continue;
+      graph.addEdges(node[i], node[other], weight, weight);
+      joined = true;
+    }
+  if (!joined) return;  // only pixels that could be either are left, which count as outside
   graph.maxFlow();
-  cv::Mat labels(height, width, CV_8U, cv::Scalar(0));
-  for (int i = 0; i < width * height; ++i)
-    if (node[i] >= 0 && graph.inSourceSegment(node[i])) labels.data[i] = 255;
-  return labels;
+  for (const std::size_t i : band) grid.label[i] = graph.inSourceSegment(node[i]) ? Label::inside : Label::outside;
 }
 
 const Colors& colors_at(const Look& appearance, const chain::Chain& chain, double arclength) {
@@ -187,51 +277,69 @@ int without_specks(cv::Mat& labels) {
 
 }  // namespace
 
+std::vector<std::uint8_t> least_cut(const Picture& picture, const math::Rectangle& box,
+                                    const std::vector<float>& odds) {
+  Grid grid = grid_of(picture, box, odds);
+  decide(grid);
+  cut_band(grid);
+  std::vector<std::uint8_t> labels(grid.label.size());
+  std::transform(grid.label.begin(), grid.label.end(), labels.begin(),
+                 [](Label label) { return label == Label::inside ? 255 : 0; });
+  return labels;
+}
+
+Tube expected_tube(const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta,
+                   const capture::Camera& camera, double doubt) {
+  return tube(chain, base, theta, camera, 0.0, chain.length, kBand + (doubt - 1.0) * 2.0 * kPlacePixels);
+}
+
 capture::View cut(const Look& appearance, const Picture& picture, const capture::Camera& camera,
-                  const chain::Chain& chain, const math::Pose& base, const std::optional<math::VectorX>& theta,
-                  double doubt) {
+                  const chain::Chain& chain, const math::Pose& base, const Tube* place, double doubt) {
   // where the rope is expected, and where it may be hidden
   const Reach where = reach(chain, base, camera);
-  Tube place;
-  if (theta) place = tube(chain, base, *theta, camera, 0.0, chain.length, kBand + (doubt - 1.0) * 2.0 * kPlacePixels);
-  const math::Rectangle box = theta ? place.box : where.box;
+  const math::Rectangle box = place ? place->box : where.box;
   capture::View view;
   if (box.empty()) return view;
   std::vector<float> odds(static_cast<std::size_t>(box.width()) * box.height(), std::nanf(""));
   const double step = std::max(kHiddenStep * chain.diameter, chain.length / kMostHiddenSteps);
-  std::vector<double> hidden;
-  if (theta) hidden = hidden_odds(appearance, picture, place, chain, step);
+  std::future<std::vector<double>> hiding;
+  if (place)
+    hiding = std::async(std::launch::async, [&] { return hidden_odds(appearance, picture, *place, chain, step); });
   cv::Mat unusual;
-  if (theta && appearance.marks.along > 0) unusual = unusual_odds(appearance, picture, place, chain);
+  if (place && appearance.marks.along > 0) unusual = unusual_odds(appearance, picture, *place, chain);
+  const std::vector<double> hidden = place ? hiding.get() : std::vector<double>();
   // add the log odds of place, color, occlusion and background per pixel
-  double tube_area = 0.0;
-  for (int y = box.y0; y < box.y1; ++y)
-    for (int x = box.x0; x < box.x1; ++x) {
-      double sum = 0.0;
-      if (theta) {
-        const float outside = place.at(x, y);
-        if (outside == Tube::kFar) continue;
-        tube_area += outside < 0.0f;
-        sum = std::clamp(-outside / (doubt * kPlacePixels), -kSurelyOutside, kSurelyInside);
-      } else if (!where.holds(x, y)) {
-        continue;
+  std::vector<int> inside(box.height(), 0);
+  cv::parallel_for_({box.y0, box.y1}, [&](const cv::Range& rows) {
+    for (int y = rows.start; y < rows.end; ++y)
+      for (int x = box.x0; x < box.x1; ++x) {
+        double sum = 0.0;
+        if (place) {
+          const float outside = place->at(x, y);
+          if (outside == Tube::kFar) continue;
+          inside[y - box.y0] += outside < 0.0f;
+          sum = std::clamp(-outside / (doubt * kPlacePixels), -kSurelyOutside, kSurelyInside);
+        } else if (!where.holds(x, y)) {
+          continue;
+        }
+        const std::uint8_t* const rgb = pixel(picture, x, y);
+        if (place) {
+          const double arclength = place->arclength(x, y);
+          sum += color_odds(colors_at(appearance, chain, arclength), rgb) +
+                 hidden[static_cast<std::size_t>(std::min(arclength, chain.length) / step)];
+          if (!unusual.empty()) sum += unusual.at<float>(y - box.y0, x - box.x0);
+        } else {
+          sum += std::max(color_odds(appearance.near, rgb), color_odds(appearance.far, rgb));
+        }
+        sum += difference_odds(appearance.background, picture, x, y);
+        odds[static_cast<std::size_t>(y - box.y0) * box.width() + (x - box.x0)] = static_cast<float>(sum);
       }
-      const std::uint8_t* const rgb = pixel(picture, x, y);
-      if (theta) {
-        const double arclength = place.arclength(x, y);
-        sum += color_odds(colors_at(appearance, chain, arclength), rgb) +
-               hidden[static_cast<std::size_t>(std::min(arclength, chain.length) / step)];
-        if (!unusual.empty()) sum += unusual.at<float>(y - box.y0, x - box.x0);
-      } else {
-        sum += std::max(color_odds(appearance.near, rgb), color_odds(appearance.far, rgb));
-      }
-      sum += difference_odds(appearance.background, picture, x, y);
-      odds[static_cast<std::size_t>(y - box.y0) * box.width() + (x - box.x0)] = static_cast<float>(sum);
-    }
+  });
+  const double tube_area = std::accumulate(inside.begin(), inside.end(), 0);
   // label the pixels
   cv::Mat labels;
-  if (theta) {
-    labels = least_cut(picture, box, odds);
+  if (place) {
+    cv::Mat(box.height(), box.width(), CV_8U, least_cut(picture, box, odds).data()).copyTo(labels);
   } else {  // rough odds over a large area: the majority of each neighborhood decides
     labels = cv::Mat(box.height(), box.width(), CV_8U, cv::Scalar(0));
     for (std::size_t i = 0; i < odds.size(); ++i) labels.data[i] = odds[i] > 0.0f ? 255 : 0;
@@ -254,6 +362,12 @@ capture::View cut(const Look& appearance, const Picture& picture, const capture:
       out[3] = 255;
     }
   return view;
+}
+
+capture::View cut(const Look& appearance, const Picture& picture, const capture::Camera& camera,
+                  const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta, double doubt) {
+  const Tube place = expected_tube(chain, base, theta, camera, doubt);
+  return cut(appearance, picture, camera, chain, base, &place, doubt);
 }
 
 }  // namespace chainsplat::masking

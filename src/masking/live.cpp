@@ -31,9 +31,28 @@ constexpr int kColorEvery = 5;            // frames between two updates of the c
 constexpr int kColorFirst = 3;            // from this one on, not in those in which callers learn marks
 constexpr double kForgetColors = 0.1;     // share of the counted colors forgotten per update
 
+double most_radius(const Axis& line) {
+  double most = 0.0;
+  for (const AxisPoint& point : line.points) most = std::max(most, point.radius);
+  return most;
+}
+
 }  // namespace
 
 struct LiveMasks::State {
+  // Where the next mask is looked for, if that was known before its picture.
+  struct Ahead {
+    math::Pose base;
+    math::VectorX theta;
+    Tube tube;
+    bool is(const math::Pose& pose, const math::VectorX& angles) const {
+      constexpr double kSame = 1e-9;  // m and rad: the times of the two were rounded differently
+      return (base.rotation - pose.rotation).cwiseAbs().maxCoeff() < kSame &&
+             (base.translation - pose.translation).cwiseAbs().maxCoeff() < kSame && theta.size() == angles.size() &&
+             (theta - angles).cwiseAbs().maxCoeff() < kSame;
+    }
+  };
+
   State(const capture::Camera& recorded, const chain::Chain& rope, const std::vector<std::uint8_t>& object_rgb);
 
   capture::Camera camera;   // as recorded, with its lens distortion
@@ -47,10 +66,14 @@ struct LiveMasks::State {
   std::vector<std::int16_t> from;      // its source for cv::remap, per pixel: column and row of the recorded frame,
   std::vector<std::uint16_t> part;     // and the interpolation's index into OpenCV's table of weights
   int frames = 0;
+  std::optional<Ahead> ahead;
   // What the last frame teaches, beside what is done with its mask: the filter waits for the device, and the next frame
   // for the camera. Declared last: it ends before what it works on.
   std::future<void> learning;
 
+  Tube expected(const math::Pose& base, const math::VectorX& theta) const {
+    return expected_tube(chain, base, theta, pinhole, kDoubt);
+  }
   void map_straight();
   Picture straightened(const capture::Image8& recorded, const math::Rectangle& box);
   void end_learning() {
@@ -100,11 +123,14 @@ void LiveMasks::State::map_straight() {
 // A copy of the frame without its lens distortion, inside the box. It is seen until the next one.
 Picture LiveMasks::State::straightened(const capture::Image8& recorded, const math::Rectangle& box) {
   const int width = camera.width, height = camera.height;
+  straight.resize(recorded.pixels.size());
   if (!camera.distorted()) {
-    straight = recorded.pixels;
+    for (int y = box.y0; y < box.y1; ++y) {
+      const std::size_t first = 3 * (static_cast<std::size_t>(y) * width + box.x0);
+      std::copy_n(&recorded.pixels[first], 3 * box.width(), &straight[first]);
+    }
     return {straight.data(), width, height, 3};
   }
-  straight.resize(recorded.pixels.size());
   const cv::Rect rect(box.x0, box.y0, box.width(), box.height());
   const cv::Mat image(height, width, CV_8UC3, const_cast<std::uint8_t*>(recorded.pixels.data()));
   cv::Mat out(height, width, CV_8UC3, straight.data());
@@ -195,6 +221,10 @@ void LiveMasks::learn_marks(const capture::View& drawn, const math::Pose& base, 
   s.look.marks = marks(drawn, tube(s.chain, base, theta, s.pinhole, 0.0, s.chain.length, 0.0), s.chain);
 }
 
+void LiveMasks::expect(const math::Pose& base, const math::VectorX& theta) {
+  state_->ahead = State::Ahead{base, theta, state_->expected(base, theta)};
+}
+
 capture::View LiveMasks::mask(const capture::Image8& recorded, const math::Pose& base,
                               const std::optional<math::VectorX>& theta) {
   State& s = *state_;
@@ -204,16 +234,21 @@ capture::View LiveMasks::mask(const capture::Image8& recorded, const math::Pose&
   const Picture picture = s.straightened(recorded, where.box);
   if (s.frames == 0) s.learn_first_frame(picture, where.box);
   const std::optional<math::VectorX> place = theta ? theta : s.grown_in(picture, base);
-  capture::View view = cut(s.look, picture, s.pinhole, s.chain, base, place, kDoubt);
+  Tube tube;
+  if (place) tube = s.ahead && s.ahead->is(base, *place) ? std::move(s.ahead->tube) : s.expected(base, *place);
+  s.ahead.reset();
+  capture::View view = cut(s.look, picture, s.pinhole, s.chain, base, place ? &tube : nullptr, kDoubt);
   ++s.frames;
   if (!theta) return view;
   const bool colors = s.frames % kColorEvery == kColorFirst;
-  s.learning = std::async(
-      std::launch::async, [&s, picture, where, base, angles = *theta, mask = colors ? view : capture::View{}, colors] {
-        const Tube around = tube(s.chain, base, angles, s.pinhole, 0.0, s.chain.length, kAboutPixels);
-        s.learn_background(picture, where.box, around);
-        if (colors) s.learn_colors(picture, where, around, mask);
-      });
+  s.learning = std::async(std::launch::async, [&s, picture, where, base, angles = *theta,
+                                               mask = colors ? view : capture::View{}, colors] {
+    // the background begins a radius beside the rope; colors are compared farther from it
+    const Axis line = axis(s.chain, base, angles, s.pinhole, 0.0, s.chain.length);
+    const Tube around = masking::tube(line, s.camera.width, s.camera.height, colors ? kAboutPixels : most_radius(line));
+    s.learn_background(picture, where.box, around);
+    if (colors) s.learn_colors(picture, where, around, mask);
+  });
   return view;
 }
 

@@ -64,13 +64,14 @@ void settle(Colors& colors) {
   blur(object);
   blur(surroundings);
   // log ratio of the two shares, then its mean on either side
-  colors.log_odds.resize(kColorBins);
+  colors.log_odds.assign(kColorBins, 0.0f);
   const double floor = kUnheardOf / kColorBins;
   colors.usual = colors.separation = 0.0;
   for (int i = 0; i < kColorBins; ++i)
-    colors.log_odds[i] = static_cast<float>(
-        std::clamp(std::log((object[i] / object_sum + floor) / (surroundings[i] / surroundings_sum + floor)),
-                   -kSurestNot, kSurest));
+    if (object[i] > 0.0 || surroundings[i] > 0.0)  // few are; of the others both shares are `floor`
+      colors.log_odds[i] = static_cast<float>(
+          std::clamp(std::log((object[i] / object_sum + floor) / (surroundings[i] / surroundings_sum + floor)),
+                     -kSurestNot, kSurest));
   for (int i = 0; i < kColorBins; ++i) {
     colors.usual += colors.log_odds[i] * colors.object[i] / object_sum;
     colors.separation -= colors.log_odds[i] * colors.surroundings[i] / surroundings_sum;

@@ -253,10 +253,13 @@ capture::View Tracker::mask(const capture::Image8& picture, double time) {
   return marked(std::move(view));
 }
 
-void Tracker::between_frames() {
+void Tracker::between_frames(std::optional<double> next) {
   Implementation& t = *implementation_;
   if (const std::optional<math::VectorX> theta = t.live ? t.expected(t.last) : std::nullopt)
     t.learn_marks(t.base(t.last).pose, *theta);
+  if (!next || !(*next > t.last)) return;
+  const std::optional<math::VectorX> theta = t.expected(*next);  // the follower keeps what it took to know them
+  if (theta && t.live) t.live->expect(t.base(*next).pose, *theta);
 }
 
 const twin::Twin& Tracker::twin() const { return implementation_->twin; }
@@ -341,6 +344,7 @@ void Follower::follow(const std::function<void(const Followed&)>& each) {
   LiveFrame frame;
   std::vector<capture::View> made;
   double last = -std::numeric_limits<double>::infinity();  // s
+  std::optional<double> used;                              // s, time of the frame before that was followed
   for (int read = 0; f.source.next(frame); ++read) {
     core::stop_if_requested();
     if (!(frame.time > last))
@@ -361,7 +365,8 @@ void Follower::follow(const std::function<void(const Followed&)>& each) {
     if (f.options.base.empty() && f.source.base)
       estimate.base = estimation::base_correction(f.options.source.corrections) * estimate.base;
     each({frame, views, estimate, core::seconds_now() - frame.arrived});
-    f.tracker->between_frames();
+    f.tracker->between_frames(used ? std::optional(2.0 * frame.time - *used) : std::nullopt);
+    used = frame.time;
   }
 }
 

@@ -54,6 +54,15 @@ void Engine::State::record_uploads() {
   uploads.clear();
 }
 
+void Engine::State::fill(Buffer& buffer, std::uint32_t value, std::size_t first, std::size_t count) {
+  if (buffer.mapped()) {
+    std::fill_n(buffer.as<std::uint32_t>().begin() + static_cast<std::ptrdiff_t>(first), count, value);
+  } else {
+    commands.no_barrier();
+    commands.fill(buffer, value, first * sizeof value, count * sizeof value);
+  }
+}
+
 const std::byte* Engine::State::record_download(const Buffer& buffer, std::size_t bytes) {
   if (buffer.mapped()) return static_cast<const std::byte*>(buffer.mapped());
   const std::size_t at = to_host_bytes;

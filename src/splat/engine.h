@@ -227,6 +227,8 @@ struct Engine::State {
   void write(Buffer& buffer, std::span<const std::byte> data, const char* name);
   void stage(Buffer& buffer, std::span<const std::byte> data, const char* name);  // as part of the next submission
   void record_uploads();
+  // Words from `first` on. Where the host can write them it does, which costs nothing; the next dispatch waits for it.
+  void fill(Buffer& buffer, std::uint32_t value, std::size_t first, std::size_t count);
   // Returns where the first `bytes` of a buffer can be read after the submission; `to_host` must be large enough.
   const std::byte* record_download(const Buffer& buffer, std::size_t bytes);
   void set_tile_capacity(std::uint32_t capacity);

@@ -296,8 +296,7 @@ void Engine::State::record_lists(const Submission& s) {
   const bool replicas_kept = replicated == now;
   replicated = now;
   const auto set_counters = [&](std::uint32_t from, std::uint32_t to, std::uint32_t value) {
-    commands.fill(counters, value, words(from), words(to - from));
-    commands.no_barrier();
+    fill(counters, value, from, to - from);
   };
   if (!replicas_kept) set_counters(0, shared::kCounterKept, 0);
   set_counters(shared::kCounterDispatch + 1, shared::kCounterDispatch + 2, s.views);
@@ -305,11 +304,7 @@ void Engine::State::record_lists(const Submission& s) {
   set_counters(shared::kCounterInstances, shared::kCounterLongTiles + 1, 0);
   set_counters(shared::kCounterLongTiles + 1, shared::kCounterLongTiles + 3, 1);
   set_counters(shared::kCounterNotFinite, shared::kCounters, 0);
-  commands.fill(tile_count, 0, 0, words(std::max(1u, s.tiles)));
-  commands.no_barrier();
-  commands.fill(tile_cursor, 0, 0, words(std::max(1u, s.tiles)));
-  commands.no_barrier();
-  commands.fill(tile_used, 0, 0, words(std::max(1u, s.tiles)));
+  for (Buffer* const list : {&tile_count, &tile_cursor, &tile_used}) fill(*list, 0, 0, std::max(1u, s.tiles));
   commands.stamp("clear");
 
   // Gaussians to live replicas
