@@ -228,12 +228,22 @@ TEST_CASE("trainings that share a workspace have the bits of those that do not, 
     return found ? found->value[0] : 0.0;
   };
 
-  const pipeline::TrainResult alone = pipeline::train(capture, folder.path / "alone", options);
+  std::string description = core::read_file(capture / "capture.json");
+  core::write_file(capture / "capture.json", description.insert(1, "\"unheard_of\": 1,"));  // of which reading warns
+  std::vector<std::string> told;
+  core::Listener listener;
+  listener.warning = listener.record = [&](const std::string& line) { told.push_back(line); };
+
+  const pipeline::TrainResult alone = pipeline::train(capture, folder.path / "alone", options, listener);
   CHECK(late(alone) == doctest::Approx(0.02).epsilon(0.2));
+  const std::vector<std::string> told_alone = std::exchange(told, {});
+  CHECK(told_alone.size() >= 2);
   const std::shared_ptr<pipeline::Workspace> workspace = pipeline::make_workspace();
   for (const char* const name : {"first", "second"}) {
     CAPTURE(name);
-    const pipeline::TrainResult shared = pipeline::train(capture, folder.path / name, options, {}, workspace.get());
+    const pipeline::TrainResult shared =
+        pipeline::train(capture, folder.path / name, options, listener, workspace.get());
+    CHECK(std::exchange(told, {}) == told_alone);  // that the capture was read and corrected before hides nothing
     CHECK(files_of(folder.path / name) == files_of(folder.path / "alone"));
     CHECK(late(shared) == late(alone));
     CHECK(shared.twin.verdict.size() == alone.twin.verdict.size());

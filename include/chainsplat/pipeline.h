@@ -68,7 +68,8 @@ struct TrainResult {
 
 // What trainings in one process can hand on to the next, which is then cheaper and has the same bits: the opened device
 // with its kernels, and the last capture as it was read and corrected, until a file that it names changes. It costs the
-// memory of that capture's views once more, and doubts about reading it are warned of once. One call at a time uses it.
+// memory of that capture's views once more; what was said about reading and correcting it is said again. One call at a
+// time uses it.
 struct Workspace;
 std::shared_ptr<Workspace> make_workspace();
 

@@ -20,6 +20,7 @@
 #include <thread>
 #include <utility>
 
+#include "src/core/said.h"
 #include "src/core/write_parts.h"
 
 namespace chainsplat::core {
@@ -28,10 +29,22 @@ namespace {
 
 std::mutex listener_mutex;
 Listener current_listener;
+std::vector<Said>* kept_said = nullptr;  // of the SaidScope that lives
 std::atomic<int> stop_signal{0};
 std::atomic<int> thread_count{0};
 
 constexpr std::size_t kLargestFile = std::size_t{1} << 30;  // bytes; a twin of a million Gaussians needs a quarter
+
+// Tells it to the listener, and keeps it where that is asked for.
+void tell(Said::Kind kind, const std::string& text) {
+  std::lock_guard lock(listener_mutex);
+  if (kept_said) kept_said->push_back({kind, text});
+  const auto& listening = kind == Said::Kind::warning   ? current_listener.warning
+                          : kind == Said::Kind::message ? current_listener.message
+                          : kind == Said::Kind::detail  ? current_listener.detail
+                                                        : current_listener.record;
+  if (listening) listening(text);
+}
 
 // Returns the length in bytes of the UTF-8 character that `text` begins with, or 0 where it begins with none.
 std::size_t utf8_length(std::string_view text) {
@@ -90,24 +103,24 @@ ListenerScope::~ListenerScope() {
   set_listener(std::move(before_));
 }
 
-void warn(const std::string& line) {
+void warn(const std::string& line) { tell(Said::Kind::warning, line); }
+void say(const std::string& line) { tell(Said::Kind::message, line); }
+void say_more(const std::string& line) { tell(Said::Kind::detail, line); }
+void record(const std::string& json) { tell(Said::Kind::record, json); }
+
+SaidScope::SaidScope(std::vector<Said>& into) {
   std::lock_guard lock(listener_mutex);
-  if (current_listener.warning) current_listener.warning(line);
+  keeps_ = !kept_said;
+  if (keeps_) kept_said = &into;
 }
 
-void say(const std::string& line) {
+SaidScope::~SaidScope() {
   std::lock_guard lock(listener_mutex);
-  if (current_listener.message) current_listener.message(line);
+  if (keeps_) kept_said = nullptr;
 }
 
-void say_more(const std::string& line) {
-  std::lock_guard lock(listener_mutex);
-  if (current_listener.detail) current_listener.detail(line);
-}
-
-void record(const std::string& json) {
-  std::lock_guard lock(listener_mutex);
-  if (current_listener.record) current_listener.record(json);
+void say_again(const std::vector<Said>& said) {
+  for (const Said& one : said) tell(one.kind, one.text);
 }
 
 void report(const Progress& progress) {

@@ -147,8 +147,12 @@ void load_capture(Training& t) {
     if (kept.capture_key != key) {
       kept.capture_key.clear(), kept.correction_key.clear();
       kept.read = {}, kept.mended = {}, kept.corrected = {};  // before the next one needs the memory
+      kept.said_reading.clear();
+      const core::SaidScope scope(kept.said_reading);
       kept.read = load();
       kept.capture_key = key;
+    } else {
+      core::say_again(kept.said_reading);
     }
     t.capture = kept.read;
   } else {
@@ -258,11 +262,14 @@ Corrected corrected_by_now(Training& t) {
   std::vector<capture::PackedView> views, recorded;
   if (kept.correction_key != key) {
     kept.correction_key.clear();
+    kept.said_correcting.clear();
+    const core::SaidScope scope(kept.said_correcting);
     kept.corrected = correct(t.capture, fixed, t.options.anyway);
     views = std::move(t.capture.views), recorded = std::move(t.capture.recorded);
     kept.mended = t.capture;
     kept.correction_key = key;
   } else {
+    core::say_again(kept.said_correcting);
     views = std::move(t.capture.views), recorded = std::move(t.capture.recorded);
     t.capture = kept.mended;
     for (capture::PackedView& view : views) view.time = t.capture.times[view.camera][view.frame];
