@@ -11,6 +11,7 @@
 #include "chainsplat/gpu.h"
 #include "reference_colors.h"
 #include "src/estimation/predict.h"
+#include "src/estimation/setup.h"
 #include "src/math/decompositions.h"
 
 namespace {
@@ -604,12 +605,32 @@ TEST_CASE("a base whose stamps are late is found to be so while it moves") {
   estimation::State state = estimation::start(shared_twin(), {front_camera()}, late_base, 0.0);
   const auto found = follow(state, shared_views());
   CHECK(std::abs(state.setup.mean[0] - kLate) < 6e-3);  // in a second of motion
+  CHECK(found[1].settling);                             // nobody knows yet that nothing pushes
+  CHECK_FALSE(found.back().settling);
   CHECK(state.setup.information(0, 0) > 1.0 / (3e-3 * 3e-3));
   const std::size_t last = found.size() - 1;
   CHECK(rms(shared_twin().chain, found[last].theta, shared_truth().theta[last]) < 5e-3);
   estimation::State right = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
   follow(right, shared_views());
   CHECK(std::abs(right.setup.mean[0]) < 3e-3);
+}
+
+TEST_CASE("while a base's clock is not known, it may begin to move a little before or after it says so") {
+  constexpr double kBegin = 1.0;  // s
+  const auto base = [](double time) {
+    trajectory::BaseMotion out;
+    out.pose.translation = Vector3(0.2 * std::max(0.0, time - kBegin), 0.0, 0.55);
+    out.velocity[3] = time > kBegin ? 0.2 : 0.0;
+    return out;
+  };
+  estimation::State state = estimation::start(shared_twin(), {front_camera()}, base, 0.0);
+  for (const double time : {0.5, kBegin - 0.09, kBegin + 0.09, 1.5}) CHECK_FALSE(may_go_otherwise(state, time));
+  for (const double time : {kBegin - 0.05, kBegin + 0.05}) CHECK(may_go_otherwise(state, time));
+  const estimation::State live =
+      estimation::start(shared_twin(), {front_camera()}, base, 0.0, estimation::options_for_live_masks(false));
+  CHECK_FALSE(may_go_otherwise(live, kBegin));  // of which the clock is never known, and a touch would never be told
+  state.setup.information(0, 0) = 1.0 / (2e-3 * 2e-3);
+  CHECK_FALSE(may_go_otherwise(state, kBegin));
 }
 
 TEST_CASE("masks that are cut where the rope is expected teach nothing of the base's clock, which stays uncertain") {

@@ -233,7 +233,7 @@ Estimate update(State& state, std::span<const capture::View* const> views) {
   }
   if (out.likeness.value_or(1.0) < kUnlike) state.last_doubt = out.time;
   out.doubtful = !out.lost && out.time - state.last_doubt < kDoubtMemory;
-  out.settling = view.time < state.setup.settling_until;
+  out.settling = view.time < state.setup.settling_until || may_go_otherwise(state, view.time);
   state.setup.last = view.time;
   if (out.lost) state.whole = false, state.hidden_since = kNever;
   state.lost = out.lost;

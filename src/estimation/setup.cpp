@@ -34,6 +34,9 @@ constexpr double kMoving = 0.03;       // m/s, speed of the base from which its 
 // not known to move as it is said to for the time that accelerations are told from.
 constexpr double kSettled = 0.01;      // m/s, RMS along the rope
 constexpr double kSettlingTime = 0.1;  // s
+// A base's clock with a larger deviation may make it go, by so many deviations, when it does not.
+constexpr double kKnownClock = 0.005;  // s
+constexpr double kSureOfClock = 2.0;   // deviations
 constexpr double kFrame = 1.0 / 30.0;  // s, to the first frame from what was believed before
 
 // Whether the grasp's rotation is a number of its own: the first joint of a chain that bends in space takes it.
@@ -47,10 +50,15 @@ void add_table(const Given& given, Setup& setup) {
   setup.right.segment<3>(SetupEquations::kGrasp) -= tilt.gradient;
 }
 
+// Of the base's clock, s.
+double clock_deviation(const State& state) {
+  return 1.0 / std::sqrt(state.setup.information(SetupEquations::kClock, SetupEquations::kClock));
+}
+
 // The base's motion, and its velocity over the time in which it may be as its clock is known, if that is larger: a base
 // that rests may have begun to move.
 trajectory::BaseMotion base_as_timed(const State& state, double time) {
-  const double deviation = 1.0 / std::sqrt(state.setup.information(SetupEquations::kClock, SetupEquations::kClock));
+  const double deviation = clock_deviation(state);
   trajectory::BaseMotion out = base_at(state, time);
   const Pose before = base_at(state, time - deviation).pose, after = base_at(state, time + deviation).pose;
   math::Vector6 mean;
@@ -105,6 +113,16 @@ Setup first_setup(const Given& given, const std::vector<char>& unverified) {
 BaseCorrection base_correction(const Setup& setup) {
   return {setup.mean[SetupEquations::kClock],
           {math::exp_so3(setup.mean.segment<3>(SetupEquations::kGrasp)), Vector3::Zero()}};
+}
+
+bool may_go_otherwise(const State& state, double time) {
+  const double reach = kSureOfClock * clock_deviation(state);
+  if (!state.options.learns_setup || !state.given.identified || reach < kSureOfClock * kKnownClock) return false;
+  const auto velocity = [&](double at) {
+    const trajectory::BaseMotion base = base_at(state, at);
+    return Vector3(base.pose.rotation * base.velocity.tail<3>());
+  };
+  return (velocity(time + reach) - velocity(time - reach)).norm() > kSettled;
 }
 
 std::vector<capture::Finding> findings(const State& state) {
