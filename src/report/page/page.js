@@ -255,7 +255,7 @@ function sayAngles() {
   const shown = together();
   legend('legend_angles', shown.map(m => [m.name + (hasBand(m) ? ' \u00b1 2 \u03c3' : ''), styles[m.name].color, styles[m.name].line]));
   if (shown.some(m => m.sigma && !hasBand(m))) at('legend_angles').append(' (a single angle has its \u00b1 2 \u03c3)');
-  for (const m of shown.filter(m => !m.sigma)) at('legend_angles').append(` (what the ${m.name} is uncertain by is not known)`);
+  for (const m of shown.filter(m => !m.sigma)) at('legend_angles').append(` (no deviations of what is ${m.name} are known)`);
 }
 
 // A moment of a camera, by the names that findings and metrics use.
