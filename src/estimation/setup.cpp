@@ -34,7 +34,8 @@ constexpr double kMoving = 0.03;       // m/s, speed of the base from which its 
 // not known to move as it is said to for the time that accelerations are told from.
 constexpr double kSettled = 0.01;      // m/s, RMS along the rope
 constexpr double kSettlingTime = 0.1;  // s
-// A base's clock with a larger deviation may make it go, by so many deviations, when it does not.
+// While the clock's deviation is larger than this, the base may begin to move so many deviations before or after its
+// stamps say so.
 constexpr double kKnownClock = 0.005;  // s
 constexpr double kSureOfClock = 2.0;   // deviations
 constexpr double kFrame = 1.0 / 30.0;  // s, to the first frame from what was believed before

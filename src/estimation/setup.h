@@ -21,8 +21,8 @@ std::optional<silhouette::SetupEquations> look_at_setup(const State& state, std:
 void learn_setup(State& state, const std::optional<silhouette::SetupEquations>& looked, const Belief& predicted,
                  const math::VectorX& theta);
 
-// Whether the base's clock is known so badly that the base may go at this time, s, as it does not by its stamps: the
-// rope then seems to be pushed.
+// Whether the base's velocity at this time, s, may be clearly another than its stamps say, because its clock is not
+// known well enough yet. A rope that follows such a base seems to be pushed.
 bool may_go_otherwise(const State& state, double time);
 
 // As Filter::findings().

@@ -43,7 +43,7 @@ double squared_difference(const Picture& picture, int x, int y, int u, int v) {
   return sum;
 }
 
-// A pixel has four neighbors ahead, and is one of four others.
+// Of the eight neighbors of a pixel four are ahead of it; it is ahead of the other four.
 constexpr int kAhead = 4;
 constexpr int kNeighbors[kAhead][2] = {{1, 0}, {0, 1}, {1, 1}, {-1, 1}};
 
@@ -175,7 +175,7 @@ void cut_band(Grid& grid) {
       graph.addEdges(node[i], node[other], weight, weight);
       joined = true;
     }
-  if (!joined) return;  // only pixels that could be either are left, which count as outside
+  if (!joined) return;  // either label costs these pixels the same: they count as outside
   graph.maxFlow();
   for (const std::size_t i : band) grid.label[i] = graph.inSourceSegment(node[i]) ? Label::inside : Label::outside;
 }

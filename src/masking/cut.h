@@ -21,7 +21,7 @@ Tube expected_tube(const chain::Chain& chain, const math::Pose& base, const math
 // decide, as far as the rope can reach.
 capture::View cut(const Look& appearance, const Picture& picture, const capture::Camera& camera,
                   const chain::Chain& chain, const math::Pose& base, const Tube* place, double doubt);
-// The same about the angles.
+// The same with the expected_tube() of these angles.
 capture::View cut(const Look& appearance, const Picture& picture, const capture::Camera& camera,
                   const chain::Chain& chain, const math::Pose& base, const math::VectorX& theta, double doubt = 1.0);
 

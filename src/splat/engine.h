@@ -227,7 +227,8 @@ struct Engine::State {
   void write(Buffer& buffer, std::span<const std::byte> data, const char* name);
   void stage(Buffer& buffer, std::span<const std::byte> data, const char* name);  // as part of the next submission
   void record_uploads();
-  // Words from `first` on. Where the host can write them it does, which costs nothing; the next dispatch waits for it.
+  // Sets `count` 32-bit words from word `first` on: by the host where the buffer is mapped, else by a recorded command
+  // that the next dispatch waits for.
   void fill(Buffer& buffer, std::uint32_t value, std::size_t first, std::size_t count);
   // Returns where the first `bytes` of a buffer can be read after the submission; `to_host` must be large enough.
   const std::byte* record_download(const Buffer& buffer, std::size_t bytes);
