@@ -312,6 +312,64 @@ TEST_CASE("a ribbon finds outlines, connector and end; what has one side only, o
   CHECK(masking::score(masking::evidence(picture, leaving)) < masking::kDoubtful);
 }
 
+// A wall with a straight tube of one color from row 20 to 250, its axis at column `at`, `radius` px wide, lit from the
+// front and a quarter of a right angle to its left. Sampled eight times per pixel and blurred by a lens of 0.9 px.
+std::vector<std::uint8_t> wall_with_tube(double at, double radius) {
+  constexpr double kAmbient = 0.45, kTurn = M_PI / 8, kBlur = 0.9;
+  constexpr int kSamples = 8, kWidth = 200;
+  const std::array<double, 3> rope{210, 90, 160}, wall{120, 140, 100};
+  std::vector<std::array<double, 3>> fine(static_cast<std::size_t>(kSamples * kWidth));
+  for (std::size_t i = 0; i < fine.size(); ++i) {
+    const double across = ((static_cast<double>(i) + 0.5) / kSamples - at) / radius;
+    const double normal_to_light =
+        std::abs(across) < 1.0 ? std::cos(kTurn) * std::sqrt(1.0 - across * across) - std::sin(kTurn) * across : 0.0;
+    for (int c = 0; c < 3; ++c)
+      fine[i][c] =
+          std::abs(across) < 1.0 ? rope[c] * (kAmbient + (1.0 - kAmbient) * std::max(0.0, normal_to_light)) : wall[c];
+  }
+  std::vector<std::uint8_t> out;
+  for (int y = 0; y < 300; ++y)
+    for (int x = 0; x < kWidth; ++x)
+      for (int c = 0; c < 3; ++c) {
+        double sum = 0.0, all = 0.0;
+        for (int i = std::max(0, (x - 3) * kSamples); i < std::min(kWidth, x + 4) * kSamples; ++i) {
+          const double off = ((i + 0.5) / kSamples - (x + 0.5)) / kBlur, weight = std::exp(-0.5 * off * off);
+          sum += weight * (y >= 20 && y < 250 ? fine[i][c] : wall[c]), all += weight;
+        }
+        out.push_back(static_cast<std::uint8_t>(std::lround(sum / all) + (x * 7 + y * 13) % 5 - 2));
+      }
+  return out;
+}
+
+TEST_CASE("the rims of a tube are its outlines, where color changes most is inside") {
+  double steepest = 0.0, rims = 0.0;  // px, mean errors of the radius
+  for (const double radius : {3.2, 4.7, 8.3})
+    for (const double at : {100.0, 100.3, 100.7}) {
+      CAPTURE(radius);
+      CAPTURE(at);
+      const std::vector<std::uint8_t> pixels = wall_with_tube(at, radius);
+      const masking::Picture picture{pixels.data(), 200, 300, 3};
+      masking::Axis rough;  // beside the tube and a tenth too thin
+      for (int i = 0; i <= 76; ++i) rough.points.push_back({{101.6, 20.0 + 3.0 * i}, 0.9 * radius, 3e-3 * i});
+      const auto error = [&](bool by_rims) {
+        masking::RibbonOptions options;
+        options.rims = by_rims;
+        const masking::Ribbon ribbon = masking::find_ribbon({}, picture, rough, 0.23, options);
+        std::vector<double> radii, places;
+        for (const masking::AxisPoint& p : ribbon.axis.points)
+          if (p.at.y() < 210) radii.push_back(p.radius), places.push_back(p.at.x());
+        REQUIRE(radii.size() > 20);
+        if (by_rims) CHECK(std::abs(math::median(places) - at) < 0.25);
+        return std::abs(math::median(radii) - radius);
+      };
+      steepest += error(false) / 9, rims += error(true) / 9;
+      CHECK(error(true) < 0.25);
+    }
+  MESSAGE("radius off by ", steepest, " px where color changes most, by ", rims, " px with rims");
+  CHECK(rims < 0.12);
+  CHECK(rims < 0.5 * steepest);
+}
+
 TEST_CASE("growth: an edge is no rope, the grasp is found 12 mm away, a rope at rest does not turn up") {
   const chain::Chain rope =
       chain::make_chain(0.23, 0.006, Vector3::UnitY(), Vector3::UnitZ(), 10, chain::Bending::planar, false);

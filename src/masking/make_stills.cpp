@@ -131,6 +131,7 @@ void find_ribbons(const Recording& recording, const chain::Chain& chain, std::ve
         RibbonOptions ribbon;
         ribbon.width = width;
         ribbon.width_deviation = round ? kKnownWidth : still.broad ? kFirstBroadWidth : kFirstWidth;
+        ribbon.rims = round + 1 == kRibbonRounds;
         still.ribbon = find_ribbon(look, picture_of(*still.frame), still.along, chain.length, ribbon);
       });
       for (const Still& still : stills[c])

@@ -6,6 +6,8 @@
 #include <limits>
 #include <utility>
 
+#include "src/masking/rims.h"
+
 namespace chainsplat::masking {
 
 using math::Vector2;
@@ -28,6 +30,11 @@ constexpr double kWiderTip = 0.3;   // deviation of the width where a connector 
 constexpr double kTipShare = 0.15;  // of the length
 constexpr double kMove = 0.35;      // for each step of an outline across, from one station to the next
 constexpr double kLeastWidth = 0.5, kMostWidth = 2.9;  // of the usual one
+// finer than columns
+constexpr double kSmooth = 2.0;    // radii on either side, within which an outline is taken for straight
+constexpr double kLeastRim = 1.5;  // px, of a radius below which there are no rims to be seen
+constexpr double kRimPiece = 8.0;  // px, or a radius: length over which colors about the outlines are averaged
+constexpr double kRimPart = 6.0;   // radii, length over which an outline is moved as one
 // the ends
 constexpr double kEndSigma = 0.4;  // of the slack
 constexpr double kEndStep = 4.0;   // of a full step of color along the rope there
@@ -271,6 +278,70 @@ std::vector<Outlines> cheapest_way(const Straight& s, const Choices& choices, co
   return way;
 }
 
+// Where the outlines are, in px across the axis.
+struct FineOutlines {
+  std::vector<double> left, right;
+};
+
+// The columns of the outlines without their steps: a line through those within kSmooth radii.
+FineOutlines smoothed(const Straight& s, const std::vector<Outlines>& way) {
+  FineOutlines out{std::vector<double>(s.count()), std::vector<double>(s.count())};
+  const int around = std::max(1, static_cast<int>(kSmooth * s.radius / std::max(0.1, s.ds)));
+  for (int i = 0; i < s.count(); ++i) {
+    const int first = std::max(0, i - around), last = std::min(s.count() - 1, i + around);
+    double x = 0.0, xx = 0.0, n = last - first + 1.0, a = 0.0, b = 0.0, xa = 0.0, xb = 0.0;
+    for (int j = first; j <= last; ++j) {
+      const double at = j - i;
+      x += at, xx += at * at, a += way[j].a, b += way[j].b, xa += at * way[j].a, xb += at * way[j].b;
+    }
+    const double det = n * xx - x * x;
+    out.left[i] = ((xx * a - x * xa) / det - 0.5 - s.half) * s.du;
+    out.right[i] = ((xx * b - x * xb) / det - 0.5 - s.half) * s.du;
+  }
+  return out;
+}
+
+// The outlines moved to where the rims of a tube fit best.
+void move_to_rims(const Straight& s, FineOutlines& fine, int begin, int end) {
+  std::vector<double> radii;
+  for (int i = begin; i < end; ++i)
+    if (!in_tip(s, i)) radii.push_back(0.5 * (fine.right[i] - fine.left[i]));
+  if (radii.empty()) return;
+  const double radius = math::median(radii);
+  if (radius < kLeastRim) return;
+  const auto stations = [&](double pixels) { return std::max(1, static_cast<int>(pixels / std::max(0.1, s.ds))); };
+  const int piece = stations(std::max(s.radius, kRimPiece)), count = end - begin,
+            parts = std::max(1, count / stations(kRimPart * s.radius));
+  for (const bool right : {false, true}) {
+    std::vector<double>& line = right ? fine.right : fine.left;
+    std::vector<Rim> rims;
+    for (int first = begin; first + piece <= end && !in_tip(s, first + piece - 1); first += piece) {
+      Rim rim{(first + piece / 2 - begin) * parts / count, std::vector<Color>(rim_bins(radius), Color{})};
+      std::vector<int> samples(rim.colors.size(), 0);
+      for (int i = first; i < first + piece; ++i)
+        for (int k = 0; k < s.columns; ++k) {
+          const double across = (k - s.half) * s.du;
+          if ((across > 0.5 * (fine.left[i] + fine.right[i])) != right) continue;
+          const int bin = rim_bin(radius, right ? line[i] - across : across - line[i]);
+          if (bin < 0 || bin >= static_cast<int>(samples.size())) continue;
+          ++samples[bin];
+          for (int c = 0; c < 3; ++c) rim.colors[bin][c] += s.colors[s.at(i, k)][c];
+        }
+      for (std::size_t bin = 0; bin < samples.size(); ++bin)
+        for (float& value : rim.colors[bin])
+          value = samples[bin] ? value / static_cast<float>(samples[bin]) : std::numeric_limits<float>::quiet_NaN();
+      rims.push_back(std::move(rim));
+    }
+    const std::vector<double> beyond = fit_rims(rims, parts, radius);
+    for (int i = begin; i < end; ++i) {  // linear between the middles of the parts
+      const double at = std::clamp((i - begin + 0.5) * parts / count - 0.5, 0.0, parts - 1.0);
+      const int before = static_cast<int>(at), after = std::min(before + 1, parts - 1);
+      const double by = beyond[before] + (at - before) * (beyond[after] - beyond[before]);
+      line[i] += right ? by : -by;
+    }
+  }
+}
+
 // What each station says for the rope between the outlines.
 std::vector<double> words_for_rope(const Straight& s, const std::vector<Outlines>& way) {
   std::vector<double> edges, out(s.count());
@@ -345,10 +416,12 @@ Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, 
   const auto [begin, end] = ends_of(s, way, options);
   if (end - begin < kFewest) return out;
 
+  FineOutlines fine = smoothed(s, way);
+  if (options.rims) move_to_rims(s, fine, begin, end);
   std::vector<double> widths;
   for (int i = begin; i < end; ++i) {
     const Station& station = s.stations[i];
-    const double left = (way[i].a - 0.5 - s.half) * s.du, right = (way[i].b - 0.5 - s.half) * s.du;
+    const double left = fine.left[i], right = fine.right[i];
     out.axis.points.push_back(
         {station.at + 0.5 * (left + right) * station.across, 0.5 * (right - left), station.arclength});
     if (station.arclength < (1.0 - kTipShare) * length) widths.push_back(0.5 * (right - left) / station.radius);
