@@ -95,6 +95,23 @@ TEST_CASE(
   }
 }
 
+TEST_CASE("a grasp that is given a little above the table is named: the rope may be held so, or the grasp is wrong") {
+  for (const double above : {0.0, 0.0025}) {  // m
+    capture::Capture capture = demo();  // the plane in which it swings as a table
+    const math::Pose grasp = capture.base.pose(capture.base.start());
+    const math::Vector3 normal = grasp.rotation * capture.bending_axis;
+    capture.tabletop = true;
+    capture.table = capture::Table{grasp.translation - (0.5 * capture.diameter + above) * normal, normal};
+    const pipeline::Corrected found = pipeline::correct(capture, {}, false);
+    const capture::Finding* const said = finding(found.verdict, "grasp", "table");
+    CHECK((said != nullptr) == (above > 0.0));
+    if (!said) continue;
+    CHECK(said->value == doctest::Approx(1e3 * above).epsilon(0.3));
+    CHECK(!said->corrected);
+    CHECK(said->trusted);
+  }
+}
+
 TEST_CASE("a darker camera is named, and its pictures stay as they are") {
   constexpr double kDark = 0.7;
   capture::Capture capture = demo();

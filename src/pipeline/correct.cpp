@@ -303,6 +303,19 @@ void correct_colors(const silhouette::CorrectionFit& fit, const std::vector<std:
 // above it, cameras were found to be off by 10 degrees. Faults of base and grasp alone are less.
 double high(const capture::Capture& capture) { return std::max(0.25 * capture.diameter, 0.005); }
 
+// A rope that is held a little above its table looks like one whose grasp, or table, is given wrong by as much. How
+// it comes down would tell, but the fingers hide it.
+constexpr double kAboveTable = 0.001;  // m, from which on that is said
+void judge_height(const capture::Capture& capture, std::vector<Finding>& verdict) {
+  const double above = std::abs(silhouette::height_by_table(capture));
+  if (above < kAboveTable || above > high(capture)) return;
+  verdict.push_back({"grasp", "table", kMeters * above, 0.0, "mm", false, true, false, -1,
+                     text("the grasp is given %.1f mm above (or below) where the rope would lie on the table: either "
+                          "the rope is held so, as it is in the twin, or the grasp or the table is given wrong by as "
+                          "much, and the twin is wrong by as much relative to the grasp",
+                          kMeters * above)});
+}
+
 Finding held_high(double above) {
   return {"held-high", "object", kMeters * above, 0.0, "mm", false, false, false, -1,
           text("the rope is held %.0f mm above where it lies on the table: how it comes down is assumed, and nothing that "
@@ -358,6 +371,7 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   judge_outlines(fit, capture, out.verdict);
   judge_folds(fit, out.verdict);
   capture::apply(out.corrections, capture);
+  judge_height(capture, out.verdict);
   correct_colors(fit, fixed, capture, out);
   return out;
 }
