@@ -36,9 +36,9 @@ constexpr double kSettled = 0.01;      // m/s, RMS along the rope
 constexpr double kSettlingTime = 0.1;  // s
 // While the clock's deviation is larger than this, the base may begin to move so many deviations before or after its
 // stamps say so.
-constexpr double kKnownClock = 0.005;  // s
-constexpr double kSureOfClock = 2.0;   // deviations
-constexpr double kFrame = 1.0 / 30.0;  // s, to the first frame from what was believed before
+constexpr double kKnownClock = 0.005;        // s
+constexpr double kSureOfClock = 2.0;         // deviations
+constexpr double kBeforeFirst = 1.0 / 30.0;  // s, to the first frame from what was believed before
 
 // Whether the grasp's rotation is a number of its own: the first joint of a chain that bends in space takes it.
 bool bends_in_plane(const chain::Chain& chain) { return chain.angles() < chain.links(); }
@@ -227,7 +227,7 @@ void learn_setup(State& state, const std::optional<SetupEquations>& looked, cons
   setup.angles = frame.angles * solver.solve(frame.angles.transpose());
   move_cameras(state);
   if (state.belief) state.belief->mean.head(n) += change;
-  const double interval = setup.last == kNever ? kFrame : predicted.time - setup.last;
+  const double interval = setup.last == kNever ? kBeforeFirst : predicted.time - setup.last;
   if (displacement(chain, theta, change) > kSettled * interval) setup.settling_until = predicted.time + kSettlingTime;
 }
 

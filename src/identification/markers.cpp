@@ -12,14 +12,14 @@ using math::MatrixX;
 using math::Vector3;
 using math::VectorX;
 
-constexpr double kBendSd = 1.0;      // rad, one angle about the straight rope
-constexpr double kSmoothSd = 0.3;    // rad, between the same axes of neighboring joints
-constexpr double kRateSd = 9.0;      // rad/s, from one time to the next
-constexpr double kStretch = 0.05;    // of a rope, and
-constexpr double kMountMost = 0.03;  // m, of a marker's mount: how far beyond its arclength a marker may be
-constexpr int kIterations = 30;      // of Levenberg-Marquardt, per time
-constexpr double kConverged = 1e-9;  // rad, largest step
-constexpr double kFarthest = 1e4;    // m, from the grasp: no slip of a tracker, but damage
+constexpr double kBendSd = 1.0;        // rad, one angle about the straight rope
+constexpr double kSmoothSd = 0.3;      // rad, between the same axes of neighboring joints
+constexpr double kMarkerRateSd = 9.0;  // rad/s, from one time to the next
+constexpr double kStretch = 0.05;      // of a rope, and
+constexpr double kMountMost = 0.03;    // m, of a marker's mount: how far beyond its arclength a marker may be
+constexpr int kIterations = 30;        // of Levenberg-Marquardt, per time
+constexpr double kConverged = 1e-9;    // rad, largest step
+constexpr double kFarthest = 1e4;      // m, from the grasp: no slip of a tracker, but damage
 constexpr double kDoubt = 0.5;       // deviations: markers farther off, RMS, may mean that the rope was folded wrongly
 constexpr int kAimIterations = 8;    // of Gauss-Newton, per joint,
 constexpr double kAimDamping = 0.1;  // with this added to squared sines: full steps stay below a right angle
@@ -134,7 +134,7 @@ MarkerFit fit_markers(const chain::Chain& chain, const trajectory::Trajectory& b
   for (std::size_t frame = 0; frame < markers.time.size(); ++frame) {
     const math::Pose pose = base.pose(markers.time[frame]);
     const VectorX before = theta;
-    const double step_sd = frame == 0 ? 0.0 : kRateSd * (markers.time[frame] - markers.time[frame - 1]);
+    const double step_sd = frame == 0 ? 0.0 : kMarkerRateSd * (markers.time[frame] - markers.time[frame - 1]);
     const double hold = frame == 0 ? 0.0 : 1.0 / (step_sd * step_sd);
     double squares = 0.0;  // m^2, of the markers that are seen
     const auto evaluate = [&](const VectorX& angles, solve::NormalEquations* equations) {

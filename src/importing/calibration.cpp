@@ -19,8 +19,8 @@ using math::Vector3;
 
 namespace {
 
-constexpr double kRotationTolerance = 1e-2;    // of |R R^T - I|; the capture's reader is stricter, after cleaning
-constexpr double kQuaternionTolerance = 1e-2;  // of its length
+constexpr double kRotationTolerance = 1e-2;        // of |R R^T - I|; the capture's reader is stricter, after cleaning
+constexpr double kQuaternionNormTolerance = 1e-2;  // of its length
 
 InputError wrong(const Source& source, const std::string& what, const std::string& mend) {
   return {source.file.string() + (source.key.empty() ? "" : "#" + source.key), what, mend};
@@ -473,7 +473,7 @@ std::string known_calibrations() {
 }
 
 std::optional<Pose> rigid(const Vector3& translation, const Eigen::Quaterniond& rotation) {
-  if (!translation.allFinite() || !(std::abs(rotation.norm() - 1.0) < kQuaternionTolerance)) return std::nullopt;
+  if (!translation.allFinite() || !(std::abs(rotation.norm() - 1.0) < kQuaternionNormTolerance)) return std::nullopt;
   return Pose{rotation.normalized().toRotationMatrix(), translation};
 }
 

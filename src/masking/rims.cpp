@@ -22,7 +22,7 @@ constexpr double kBeyondDeviation = 0.2;                // px, of all parts
 constexpr double kBeyondScatter = 0.2;                  // px, of one part
 constexpr double kNoise = 2.0;  // gray levels, beyond which a piece is one that the model does not fit
 
-double square(double x) { return x * x; }
+double squared(double x) { return x * x; }
 
 double outside_of(double radius) { return kOutside + kMoreOutside * radius; }
 
@@ -40,11 +40,11 @@ Shares shares(double radius, double blur, double dim, double beyond) {
     const double at = (bin + 0.5) * kBin - outside_of(radius) + beyond;
     double all = 0.0, covered = 0.0, lit = 0.0;
     for (int tap = -kTaps; tap <= kTaps; ++tap) {
-      const double inside = at + tap * kTapStep * blur, weight = std::exp(-0.5 * square(tap * kTapStep));
+      const double inside = at + tap * kTapStep * blur, weight = std::exp(-0.5 * squared(tap * kTapStep));
       all += weight;
       if (inside <= 0.0) continue;
       const double across = std::max(0.0, 1.0 - inside / (radius + beyond));
-      covered += weight, lit += weight * (1.0 - dim + dim * std::sqrt(1.0 - square(across)));
+      covered += weight, lit += weight * (1.0 - dim + dim * std::sqrt(1.0 - squared(across)));
     }
     out.rope.push_back(lit / all), out.beside.push_back(1.0 - covered / all);
   }
@@ -66,7 +66,7 @@ double cost(const Rim& rim, const Shares& shares) {
     }
     left += std::max(0.0, yy - ((bb * ry - rb * by) * ry + (rr * by - rb * ry) * by) / (rr * bb - rb * rb));
   }
-  return 0.5 * kBin * count * std::log1p(left / (std::max(1, count) * square(kNoise)));
+  return 0.5 * kBin * count * std::log1p(left / (std::max(1, count) * squared(kNoise)));
 }
 
 }  // namespace
@@ -83,7 +83,7 @@ std::vector<double> fit_rims(const std::vector<Rim>& rims, int parts, double rad
       for (int n = -most; n <= most; ++n) {
         const double beyond = n * kNextBeyond;
         const Shares tried = shares(radius, b, d, beyond);
-        double sum = 0.5 * square(beyond / kBeyondDeviation) + 0.5 * square((d - kUsualDim) / kDimDeviation);
+        double sum = 0.5 * squared(beyond / kBeyondDeviation) + 0.5 * squared((d - kUsualDim) / kDimDeviation);
         for (const Rim& rim : rims) sum += cost(rim, tried);
         if (sum < least) least = sum, blur = b, dim = d, common = beyond;
       }
@@ -92,7 +92,7 @@ std::vector<double> fit_rims(const std::vector<Rim>& rims, int parts, double rad
   for (int n = -most; n <= most; ++n) {
     const double beyond = common + n * kNextBeyond;
     const Shares tried = shares(radius, blur, dim, beyond);
-    std::vector<double> sums(parts, 0.5 * square((beyond - common) / kBeyondScatter));
+    std::vector<double> sums(parts, 0.5 * squared((beyond - common) / kBeyondScatter));
     for (const Rim& rim : rims) sums[rim.part] += cost(rim, tried);
     for (int part = 0; part < parts; ++part)
       if (sums[part] < best[part]) best[part] = sums[part], out[part] = beyond;

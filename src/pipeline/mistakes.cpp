@@ -29,7 +29,7 @@ constexpr double kFound = 0.65;      // from this on, a mistake explains what is
 constexpr double kClearly = 0.2;     // by which it must raise the support to be believed
 constexpr double kClampBend = 1.0;   // rad between the grasp's direction and the rope up to which nothing is odd
 constexpr double kOtherSize = 0.15;  // relative distance of the principal point from the middle of the image
-constexpr double kMillimeters = 1e-3;
+constexpr double kFromMillimeters = 1e-3;
 
 // What is varied: everything that a frame is fitted with, but the pictures.
 struct Setup {
@@ -97,7 +97,7 @@ void invert(Camera& camera) { camera.world_from_camera = camera.world_from_camer
 void turn_axes(Camera& camera) {
   camera.world_from_camera.rotation *= Vector3(1.0, -1.0, -1.0).asDiagonal().toDenseMatrix();
 }
-void shrink(Camera& camera) { camera.world_from_camera.translation *= kMillimeters; }
+void shrink(Camera& camera) { camera.world_from_camera.translation *= kFromMillimeters; }
 // The ratio of two image sizes that is nearest: the principal point is never quite in the middle.
 double size_ratio(double middle, double principal) {
   constexpr std::array kRatios = {0.25, 1.0 / 3.0, 0.375, 0.5, 2.0 / 3.0, 0.75, 0.8, 1.0,
@@ -167,7 +167,7 @@ std::vector<Mistake> mistakes_of(const Capture& capture) {
                    }});
   };
   base("units", "the base's positions are in millimeters: write meters", [](const Pose& pose) {
-    return Pose{pose.rotation, kMillimeters * pose.translation};
+    return Pose{pose.rotation, kFromMillimeters * pose.translation};
   });
   base("quaternion-order", "the base's quaternions stand as w x y z: write x y z w", [](const Pose& pose) {
     return Pose{reordered(pose.rotation), pose.translation};
@@ -176,10 +176,10 @@ std::vector<Mistake> mistakes_of(const Capture& capture) {
        [](const Pose& pose) { return pose.inverse(); });
   out.push_back({"units", "cameras and base", "cameras and base are in millimeters: write meters", [](Setup& setup) {
                    for (Camera& camera : setup.cameras) shrink(camera);
-                   for (Pose& pose : setup.base) pose.translation *= kMillimeters;
+                   for (Pose& pose : setup.base) pose.translation *= kFromMillimeters;
                  }});
   out.push_back({"units", "object", "the rope's length and diameter are in millimeters: write meters",
-                 [](Setup& setup) { setup.length *= kMillimeters, setup.diameter *= kMillimeters; }});
+                 [](Setup& setup) { setup.length *= kFromMillimeters, setup.diameter *= kFromMillimeters; }});
   out.push_back({"units", "object", "the rope's length and diameter are in centimeters: write meters",
                  [](Setup& setup) { setup.length *= 0.01, setup.diameter *= 0.01; }});
   if (cameras > 1)

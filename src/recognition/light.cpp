@@ -14,8 +14,8 @@ using math::Vector3;
 
 constexpr int kTurns = 4;                 // of texture and light
 constexpr std::size_t kMostFrames = 200;  // evenly over the recording: many times more than nine numbers need
-constexpr double kNoise = 0.1;            // of the mean color, in a cell
-constexpr double kOutlier = 3.0;          // kNoise beyond which a residual, such as a highlight, counts less
+constexpr double kCellNoise = 0.1;        // of the mean color, in a cell
+constexpr double kCellOutlier = 3.0;      // kCellNoise beyond which a residual, such as a highlight, counts less
 constexpr double kEven = 1e-3;            // of all weight, toward a light that is the same on every side
 constexpr double kBrightest = 0.99;       // quantile of the brightness that was seen, which becomes 1
 constexpr float kDarkest = 0.05f;         // of the same unit as the mean color's light, while it is being found
@@ -91,10 +91,10 @@ Samples samples_of(const Grid& grid, const capture::Capture& capture, const std:
 }
 
 // Colors of the material, of which each sample shows so much.
-struct Texture {
+struct LitTexture {
   std::vector<Color> sum;
   std::vector<float> weight;
-  Texture(std::size_t cells, const Samples& samples, const std::vector<float>& brightness)
+  LitTexture(std::size_t cells, const Samples& samples, const std::vector<float>& brightness)
       : sum(cells, Color::Zero()), weight(cells, 0.0f) {
     for (const Sample& s : samples.all) {
       const float light = brightness[s.normal];
@@ -111,7 +111,7 @@ struct Texture {
 };
 
 // What the texture in that light leaves of the colors: mean square.
-double left_of(const Samples& samples, const Texture& texture, const std::vector<float>& brightness) {
+double left_of(const Samples& samples, const LitTexture& texture, const std::vector<float>& brightness) {
   double square = 0.0, weight = 0.0;
   for (const Sample& s : samples.all) {
     square += s.weight * (s.color - brightness[s.normal] * texture.of(s)).squaredNorm();
@@ -137,14 +137,14 @@ splat::Light light_on(const chain::Chain& chain, const capture::Capture& capture
   float weight = 0.0f;
   for (const Sample& s : samples.all) mean += s.weight * s.color, weight += s.weight;
   mean /= weight;
-  const double noise = kNoise * mean.norm(), outlier = kOutlier * noise;
+  const double noise = kCellNoise * mean.norm(), outlier = kCellOutlier * noise;
 
   Terms found = Terms::Zero();
   const std::vector<float> even(samples.normals.size(), 1.0f);
   std::vector<float> brightness = even;
-  const double without = left_of(samples, Texture(grid.size(), samples, even), even);
+  const double without = left_of(samples, LitTexture(grid.size(), samples, even), even);
   for (int turn = 0; turn < kTurns; ++turn) {
-    const Texture texture(grid.size(), samples, brightness);
+    const LitTexture texture(grid.size(), samples, brightness);
     Eigen::Matrix<double, kTerms, kTerms> normal = Eigen::Matrix<double, kTerms, kTerms>::Zero();
     Terms right = Terms::Zero();
     for (const Sample& s : samples.all) {
@@ -158,7 +158,7 @@ splat::Light light_on(const chain::Chain& chain, const capture::Capture& capture
     found = normal.selfadjointView<Eigen::Lower>().ldlt().solve(right);
     brightness = brightness_of(samples, found);
   }
-  const double left = left_of(samples, Texture(grid.size(), samples, brightness), brightness);
+  const double left = left_of(samples, LitTexture(grid.size(), samples, brightness), brightness);
   if (!(left < (1.0 - kBelieved) * without)) return {};
 
   std::vector<float> seen;

@@ -9,7 +9,7 @@ namespace chainsplat::recognition {
 
 namespace {
 
-constexpr double kNoise = 0.04;  // intensity below which a residual counts as noise (quadratic), above: absolute
+constexpr double kColorNoise = 0.04;  // intensity below which a residual counts as noise (quadratic), above: absolute
 constexpr double kGradientFloor = 1e-4;  // squared image gradient below which a pixel says nothing
 
 // Depth of the drawn surface, spread a few pixels over the silhouette's edge, where there is gradient but no depth:
@@ -61,14 +61,14 @@ std::vector<float> spread_depth(const splat::Picture& picture) {
   return depth;
 }
 
-// Charbonnier-like: quadratic below kNoise, absolute above; returns the weight, adds to the cost.
+// Charbonnier-like: quadratic below kColorNoise, absolute above; returns the weight, adds to the cost.
 double robust(double residual, double& cost) {
   const double size = std::abs(residual);
-  if (size <= kNoise) {
-    cost += 0.5 * residual * residual / kNoise;
-    return 1.0 / kNoise;
+  if (size <= kColorNoise) {
+    cost += 0.5 * residual * residual / kColorNoise;
+    return 1.0 / kColorNoise;
   }
-  cost += size - 0.5 * kNoise;
+  cost += size - 0.5 * kColorNoise;
   return 1.0 / size;
 }
 

@@ -11,8 +11,8 @@ namespace chainsplat::recognition {
 
 namespace {
 
-constexpr double kNoise = 0.1;        // of a cell's color, in units of the mean color: what neighbors share
-constexpr double kOutlier = 3.0;      // kNoise beyond which a residual counts less
+constexpr double kRollNoise = 0.1;    // of a cell's color, in units of the mean color: what neighbors share
+constexpr double kRollOutlier = 3.0;  // kRollNoise beyond which a residual counts less
 constexpr double kAlong = 0.15;       // rad per root of a diameter: turns of neighboring links differ by so much
 constexpr double kInTime = 1.0;       // rad per root of a second
 constexpr double kLeastLength = 0.1;  // diameters between middles of links, where the first joint is at the grasp
@@ -22,13 +22,13 @@ constexpr int kIterations = 4;        // Gauss-Newton steps a frame and pass
 constexpr double kBelieved = 0.25;    // least share of what is left without rolls that they must explain
 
 // The texture that the frames agree on, by the material's angle.
-struct Texture {
+struct RolledTexture {
   std::vector<Color> sum;
   std::vector<float> weight;
-  explicit Texture(const Grid& grid) : sum(grid.size(), Color::Zero()), weight(grid.size(), 0.0f) {}
+  explicit RolledTexture(const Grid& grid) : sum(grid.size(), Color::Zero()), weight(grid.size(), 0.0f) {}
 };
 
-void add(const Grid& grid, const Layout& layout, const math::VectorX& roll, Texture& texture) {
+void add(const Grid& grid, const Layout& layout, const math::VectorX& roll, RolledTexture& texture) {
   for (int row = 0; row < grid.rows; ++row)
     for (int column = 0; column < kColumns; ++column) {
       const std::size_t from = grid.cell(row, column);
@@ -49,7 +49,7 @@ struct Left {
   double square = 0.0, weight = 0.0;
 };
 
-Left left_of(const Grid& grid, const Layout& layout, const Texture& still) {
+Left left_of(const Grid& grid, const Layout& layout, const RolledTexture& still) {
   Left left;
   for (std::size_t cell = 0; cell < grid.size(); ++cell) {
     if (layout.weight[cell] <= 0.0f) continue;
@@ -60,10 +60,10 @@ Left left_of(const Grid& grid, const Layout& layout, const Texture& still) {
 }
 
 // Least squares over the turns of one frame's links, from `roll` on, which stay near `before`, `apart` seconds away.
-Left align(const Grid& grid, const Layout& layout, const Texture& texture, const math::VectorX* before, double apart,
-           math::VectorX& roll) {
+Left align(const Grid& grid, const Layout& layout, const RolledTexture& texture, const math::VectorX* before,
+           double apart, math::VectorX& roll) {
   constexpr float kKnown = 0.2f;  // least weight of a texture's cell
-  constexpr double kInverseVariance = 1.0 / (kNoise * kNoise);
+  constexpr double kInverseVariance = 1.0 / (kRollNoise * kRollNoise);
   const int links = grid.chain.links();
   for (int iteration = 0;; ++iteration) {
     math::Tridiagonal normal{0.0, math::VectorX::Zero(links), math::VectorX::Zero(links)};
@@ -82,7 +82,7 @@ Left align(const Grid& grid, const Layout& layout, const Texture& texture, const
         const Color slope = (second - first) * static_cast<float>(kColumns / kTurn);  // of the residual
         const double square = residual.squaredNorm();
         const double weight =
-            kInverseVariance * layout.weight[from] / (1.0 + square * kInverseVariance / (kOutlier * kOutlier));
+            kInverseVariance * layout.weight[from] / (1.0 + square * kInverseVariance / (kRollOutlier * kRollOutlier));
         normal.diagonal[link] += weight * slope.squaredNorm();
         gradient[link] += weight * slope.dot(residual);
         left.square += layout.weight[from] * square;
@@ -149,10 +149,10 @@ std::vector<math::VectorX> rolls_in(const chain::Chain& chain, const capture::Ca
   std::vector<math::VectorX> rolls(count, none);
   const auto apart = [&](std::size_t k) { return frames[k].time - frames[k - 1].time; };
   std::vector<Layout> layouts;
-  Texture texture(grid), still(grid);
+  RolledTexture texture(grid), still(grid);
   Left turned, unturned;
   for (int pass = 0; pass < kPasses; ++pass) {
-    Texture next(grid);
+    RolledTexture next(grid);
     for (std::size_t first = 0; first < count; first += part) {
       const std::size_t size = std::min(part, count - first);
       if (pass == 0 || size < count) layouts = laid_out(grid, capture, frames, first, size, states);

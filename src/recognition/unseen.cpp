@@ -204,14 +204,14 @@ Light light_of(const Surface& surface, const std::vector<Place>& places, const s
 }
 
 // What the seen surface tells of all of it.
-struct Texture {
+struct SeenTexture {
   Surface surface;
   std::vector<Place> places;  // of the Gaussians
   double slope = 0.0;         // of the helix along which colors repeat, m per rad
   Light light;
 };
-Texture texture_of(const chain::Chain& chain, std::span<const Viewpoint> views, const splat::Gaussians& gaussians) {
-  Texture texture{Surface(chain), {}, 0.0, {}};
+SeenTexture texture_of(const chain::Chain& chain, std::span<const Viewpoint> views, const splat::Gaussians& gaussians) {
+  SeenTexture texture{Surface(chain), {}, 0.0, {}};
   look(views, gaussians.light, texture.surface);
   for (int i = 0; i < gaussians.count; ++i) texture.places.push_back(place_of(texture.surface, gaussians, i));
   texture.slope = slope_of_texture(texture.surface);
@@ -220,7 +220,7 @@ Texture texture_of(const chain::Chain& chain, std::span<const Viewpoint> views, 
 }
 
 // From the nearest colors along the helix in both directions, the nearer the more, in the light of this side.
-std::optional<Vector3> guessed(const Texture& texture, double arclength, double angle) {
+std::optional<Vector3> guessed(const SeenTexture& texture, double arclength, double angle) {
   const Surface& surface = texture.surface;
   const Light& light = texture.light;
   const int column = static_cast<int>(angle / kTurn * kColumns);
@@ -246,7 +246,7 @@ struct Guess {
   double arclength, angle;
   Vector3 color;
 };
-std::vector<Guess> guesses(const Texture& texture, double radius, double spacing) {
+std::vector<Guess> guesses(const SeenTexture& texture, double radius, double spacing) {
   const Surface& surface = texture.surface;
   const chain::Chain& chain = surface.chain;
   const int rows = std::max(1, static_cast<int>(chain.length / spacing)),
@@ -287,7 +287,7 @@ void put(const Surface& surface, const Guess& guess, double radius, double spaci
 
 // What was seen only at a slant has the place and size that its outline asks for, but a color that one row of pixels
 // tells. It gets the texture's, the more the flatter it was seen, and that from every direction.
-void color_slanted(const Texture& texture, splat::Gaussians& g) {
+void color_slanted(const SeenTexture& texture, splat::Gaussians& g) {
   const Surface& surface = texture.surface;
   const std::size_t size = 3 * static_cast<std::size_t>(g.sh_coefficients());
   for (int i = 0; i < g.count; ++i) {
@@ -306,7 +306,7 @@ void color_slanted(const Texture& texture, splat::Gaussians& g) {
 }  // namespace
 
 int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, splat::Gaussians& gaussians) {
-  const Texture texture = texture_of(chain, views, gaussians);
+  const SeenTexture texture = texture_of(chain, views, gaussians);
   const Surface& surface = texture.surface;
   std::vector<int> kept;
   std::vector<double> radii;
@@ -335,7 +335,7 @@ int finish_unseen(const chain::Chain& chain, std::span<const Viewpoint> views, s
 
 std::vector<std::optional<TextureColor>> texture_colors(const chain::Chain& chain, std::span<const Viewpoint> views,
                                                         const splat::Gaussians& gaussians) {
-  const Texture texture = texture_of(chain, views, gaussians);
+  const SeenTexture texture = texture_of(chain, views, gaussians);
   std::vector<std::optional<TextureColor>> out(gaussians.count);
   for (int i = 0; i < gaussians.count; ++i) {
     const Place& at = texture.places[i];

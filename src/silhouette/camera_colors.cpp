@@ -21,7 +21,7 @@ using math::VectorX;
 
 namespace {
 
-constexpr int kMostFrames = 40;
+constexpr int kMostColorFrames = 40;
 // Patches of the rope's surface, along it and around it: as wide as a few pixels of usual cameras, so that half a pixel
 // of error hardly matters. A color is the mean over kSamples x kSamples points of its patch.
 constexpr int kAlong = 48, kAround = 12, kSamples = 3;
@@ -32,13 +32,13 @@ constexpr int kIterations = 12;
 constexpr double kCut = 4.685;  // Tukey's, of the residuals' robust deviation: highlights, shadows of the gripper
 constexpr double kLeastSpread = 0.004;  // of the residuals: one step of 8 bits
 // What one patch counts against the priors: neighbors share their errors.
-constexpr double kEvidence = 0.1;
+constexpr double kSampleEvidence = 0.1;
 // Highlights, and a lamp at the camera, change colors from camera to camera: on recordings whose cameras are alike
 // gains of 0.02 are found, and colors that are cut off move a part of a gain into the bias.
 constexpr double kModelGain = 0.03, kModelBias = 0.015;
-constexpr double kExact = 1e-6;  // a prior's deviation where what is given is exact
-constexpr double kTied = 1e6;    // information that ties the means over the cameras
-constexpr int kStretches = 8;    // of the rope, whose scatter tells what the equations do not know
+constexpr double kExact = 1e-6;    // a prior's deviation where what is given is exact
+constexpr double kTied = 1e6;      // information that ties the means over the cameras
+constexpr int kRopeStretches = 8;  // of the rope, whose scatter tells what the equations do not know
 
 // A patch's color in each camera that sees it.
 struct Patch {
@@ -92,7 +92,7 @@ std::vector<Patch> patches_of(const chain::Chain& chain, const capture::Capture&
   std::vector<Vector3> points(kSamples * kSamples), normals(points.size());
   for (int i = 0; i < kAlong; ++i)
     for (int j = 0; j < kAround; ++j) {
-      Patch patch{i * kStretches / kAlong, {}, {}};
+      Patch patch{i * kRopeStretches / kAlong, {}, {}};
       for (std::size_t v = 0; v < views.size(); ++v) {
         const Moment::Seen& seen = moment.seen[v];
         for (int a = 0; a < kSamples; ++a) {
@@ -135,7 +135,7 @@ std::vector<Moment> moments_of(const chain::Chain& chain, const capture::Capture
     if (moment.seen.size() > 1) all.push_back(std::move(moment));
   }
   std::vector<Moment> out;
-  const std::size_t every = std::max<std::size_t>(1, (all.size() + kMostFrames - 1) / kMostFrames);
+  const std::size_t every = std::max<std::size_t>(1, (all.size() + kMostColorFrames - 1) / kMostColorFrames);
   for (std::size_t f = 0; f < all.size(); f += every) out.push_back(std::move(all[f]));
   for (Moment& moment : out)
     for (Moment::Seen& seen : moment.seen) {
@@ -158,8 +158,8 @@ Channel fit_channel(const std::vector<Patch>& patches, int channel, const Vector
   prior.bottomRightCorner(cameras, cameras).array() += kTied;
   VectorX x = VectorX::Zero(2 * cameras);
   double spread = 0.1;
-  std::array<MatrixX, kStretches> normal;
-  std::array<VectorX, kStretches> right;
+  std::array<MatrixX, kRopeStretches> normal;
+  std::array<VectorX, kRopeStretches> right;
   MatrixX covariance;
   for (int iteration = 0; iteration < kIterations; ++iteration) {
     normal.fill(MatrixX::Zero(2 * cameras, 2 * cameras));
@@ -183,7 +183,7 @@ Channel fit_channel(const std::vector<Patch>& patches, int channel, const Vector
       const double size = residual.norm() / std::sqrt(count - 1.0);
       sizes.push_back(size);
       const double outside = size / (kCut * spread), inside = std::max(0.0, 1.0 - outside * outside);
-      const double weight = kEvidence * inside * inside / (spread * spread);
+      const double weight = kSampleEvidence * inside * inside / (spread * spread);
       MatrixX row = MatrixX::Zero(count, 2 * cameras);
       VectorX of_color(count);
       for (int i = 0; i < count; ++i) {
@@ -200,7 +200,7 @@ Channel fit_channel(const std::vector<Patch>& patches, int channel, const Vector
     spread = std::max(kLeastSpread, 1.4826 * sizes[sizes.size() / 2]);
     MatrixX sum = prior;
     VectorX pull = -prior * x;
-    for (int s = 0; s < kStretches; ++s) sum += normal[s], pull += right[s];
+    for (int s = 0; s < kRopeStretches; ++s) sum += normal[s], pull += right[s];
     x += sum.ldlt().solve(pull);
   }
   // what each stretch pulls is known only by the scatter between them: a jackknife
@@ -209,9 +209,9 @@ Channel fit_channel(const std::vector<Patch>& patches, int channel, const Vector
     if (one.size() > 0) sum += one;
   covariance = sum.inverse();
   VectorX variance = covariance.diagonal().cwiseMax(0.0);
-  for (int s = 0; s < kStretches && normal[s].size() > 0; ++s) {
+  for (int s = 0; s < kRopeStretches && normal[s].size() > 0; ++s) {
     const VectorX without = MatrixX(sum - normal[s]).ldlt().solve(right[s]);
-    variance += (kStretches - 1.0) / kStretches * without.cwiseAbs2();
+    variance += (kRopeStretches - 1.0) / kRopeStretches * without.cwiseAbs2();
   }
   return {x, variance.cwiseSqrt()};
 }

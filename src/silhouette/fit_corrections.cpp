@@ -20,12 +20,12 @@ namespace {
 // Gauss-Newton. Outlines farther from the rope than a cut do not count (Tukey); it starts wide, since what is given may
 // be wrong by many pixels, and narrows until the residuals' own spread sets it.
 constexpr int kSteps = 40;
-constexpr double kStep = 0.02;         // of the prior deviations, and rad: smaller steps end it
-constexpr double kLongestStep = 50.0;  // the same, in one step
-constexpr double kWidestCut = 30.0;    // px
-constexpr double kNarrowing = 0.6;     // of that cut from step to step
-constexpr double kWideEnd = 8.0;       // half widths: the reach of the free end as long as the cut is wide
-constexpr double kLeastSize = 0.5;     // share of the given length and diameter below which no correction goes
+constexpr double kStep = 0.02;               // of the prior deviations, and rad: smaller steps end it
+constexpr double kLongestCorrection = 50.0;  // the same, in one step
+constexpr double kWidestCut = 30.0;          // px
+constexpr double kNarrowing = 0.6;           // of that cut from step to step
+constexpr double kWideEnd = 8.0;             // half widths: the reach of the free end as long as the cut is wide
+constexpr double kLeastSize = 0.5;           // share of the given length and diameter below which no correction goes
 // The priors' penalty is kTails / 2 ln(1 + |y|^2 / kTails) in units of their deviation: nearly a Gaussian's for what a
 // careful laboratory gets wrong, and for a fault ten times that nearly flat.
 constexpr double kTails = 2.0;
@@ -42,7 +42,7 @@ constexpr double kCovered = 1.7321;
 constexpr double kSharp = 0.0014;  // m, start_deviations() above which it is not known whether it is the cut face
 constexpr double kRound = 0.25;  // deviation of how far the cut face reaches beyond its middle, of what a flat one does
 constexpr double kUnknownShare = 0.7;  // of the prior's deviation there above which a value is the prior's
-constexpr int kStretches = 12;         // of time, whose scatter tells what the equations do not know
+constexpr int kTimeStretches = 12;     // of time, whose scatter tells what the equations do not know
 constexpr double kSameClock = 1e-9;    // s
 constexpr int kLeastCameras = 2;       // from which poses and sizes can be told apart
 
@@ -306,7 +306,7 @@ MatrixX shared_covariance(const std::vector<FrameEquations>& frames, const Matri
   const Eigen::Index m = known.rows();
   const MatrixX information = known + outlines;
   MatrixX scatter = known;
-  const int count = static_cast<int>(frames.size()), stretches = std::min(kStretches, count);
+  const int count = static_cast<int>(frames.size()), stretches = std::min(kTimeStretches, count);
   for (int s = 0; s < stretches; ++s) {
     VectorX gradient = VectorX::Zero(m);
     for (int f = s * count / stretches; f < (s + 1) * count / stretches; ++f) {
@@ -488,7 +488,7 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
     for (const FrameEquations& frame : frames) cost += frame.cost;
     return cost;
   };
-  solve::Options solving{.steps = kSteps, .checked = false, .step_tolerance = kStep, .longest = kLongestStep};
+  solve::Options solving{.steps = kSteps, .checked = false, .step_tolerance = kStep, .longest = kLongestCorrection};
   solving.damping.rule = solve::Damping::Rule::none;
   CorrectionFit out;
   // which masks begin at the grasp is seen only when cameras and grasp are nearly right

@@ -44,7 +44,7 @@ int scalar_bytes(const std::string& type) {
   return found == sizes.end() ? 0 : found->second;
 }
 
-struct Property {
+struct PlyProperty {
   std::size_t offset = 0;  // in bytes from the start of the vertex (binary)
   int index = 0;           // among the properties of a vertex (ASCII)
   int bytes = 0;
@@ -53,8 +53,8 @@ struct Property {
 
 struct Header {
   std::string format;
-  std::size_t count = 0, stride = 0, data = 0;  // number of vertices; bytes per vertex; offset of the first one
-  std::map<std::string, Property> properties;   // of a vertex
+  std::size_t count = 0, stride = 0, data = 0;    // number of vertices; bytes per vertex; offset of the first one
+  std::map<std::string, PlyProperty> properties;  // of a vertex
   bool has_float(const std::string& name) const {
     const auto found = properties.find(name);
     return found != properties.end() && found->second.real && found->second.bytes == sizeof(float);
@@ -226,7 +226,7 @@ math::MatrixX read_points(const Path& path) {
   if (!ascii && !big && header.format != "binary_little_endian")
     throw InputError(file, "is in the format '" + header.format.substr(0, 30) + "'", mend);
 
-  std::array<Property, 3> axes;
+  std::array<PlyProperty, 3> axes;
   for (int d = 0; d < 3; ++d) {
     const std::string name(1, "xyz"[d]);
     const auto found = header.properties.find(name);

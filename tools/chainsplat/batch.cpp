@@ -31,10 +31,10 @@ using pipeline::BatchPlan;
 using pipeline::JobState;
 using Kind = JobState::Kind;
 
-constexpr double kRedrawSeconds = 1.0;  // a job's log has a record a second
-constexpr double kPlainSeconds = 30.0;  // between lines where standard error is no terminal
+constexpr double kBatchRedrawSeconds = 1.0;  // a job's log has a record a second
+constexpr double kBatchPlainSeconds = 30.0;  // between lines where standard error is no terminal
 
-struct Request {
+struct BatchRequest {
   std::string jobs, out, launcher = "local", time_limit = "1:00:00", sbatch;
   int parallel = 0;       // 0: by the device
   int warn_seconds = 60;  // before the time limit
@@ -94,7 +94,7 @@ class Board {
   }
   void draw(const BatchOutcome& outcome, const std::vector<const BatchJob*>& running, bool now) {
     const double time = core::seconds_now();
-    if (!shown_ || (!now && time - drawn_ < (terminal_ ? kRedrawSeconds : kPlainSeconds))) return;
+    if (!shown_ || (!now && time - drawn_ < (terminal_ ? kBatchRedrawSeconds : kBatchPlainSeconds))) return;
     drawn_ = time;
     clear();
     const std::size_t fresh = outcome.done + outcome.failed, ended = already_ + fresh;
@@ -133,12 +133,6 @@ BatchOutcome run_jobs(const Path& folder, const std::vector<const BatchJob*>& jo
   return pipeline::run_jobs(folder, jobs, options, listener);
 }
 
-std::string quoted(const std::string& text) {
-  std::string out = "'";
-  for (const char letter : text) out += letter == '\'' ? std::string("'\\''") : std::string(1, letter);
-  return out + "'";
-}
-
 // For a name in which Slurm fills in what follows a percent sign.
 std::string plain(const std::string& text) {
   std::string out;
@@ -162,24 +156,24 @@ bool on_path(const std::string& program) {
 }
 
 // A job array, one task a job. A task that is warned of its time limit leaves a checkpoint and asks to be queued again.
-void submit(const BatchPlan& plan, const Path& folder, const std::vector<const BatchJob*>& todo, const Request& request,
-            const Globals& globals) {
+void submit(const BatchPlan& plan, const Path& folder, const std::vector<const BatchJob*>& todo,
+            const BatchRequest& request, const Globals& globals) {
   std::string indices;
   for (const BatchJob* job : todo) indices += (indices.empty() ? "" : ",") + std::to_string(job - plan.jobs.data());
   const std::string program = fs::read_symlink("/proc/self/exe").string();
   std::string script =
       "#!/bin/bash\n# written by 'chainsplat batch --launcher slurm'; the program takes the shell's place,\n"
       "# so that the warning signal reaches it\nexec " +
-      quoted(program) + " batch task " + quoted(folder.string()) + " --no-progress";
-  if (!globals.device.empty()) script += " --device=" + quoted(globals.device);
+      shell_quoted(program) + " batch task " + shell_quoted(folder.string()) + " --no-progress";
+  if (!globals.device.empty()) script += " --device=" + shell_quoted(globals.device);
   if (globals.threads > 0) script += " --threads=" + std::to_string(globals.threads);
   core::write_file(folder / "logs/slurm.sh", script + "\n");
   std::string command = "sbatch --parsable --job-name=chainsplat --requeue --open-mode=append --array=" + indices +
-                        " --time=" + quoted(request.time_limit) + " --signal=B:USR1@" +
+                        " --time=" + shell_quoted(request.time_limit) + " --signal=B:USR1@" +
                         std::to_string(request.warn_seconds) +
-                        " --output=" + quoted(plain((folder / "logs").string()) + "/slurm-%a.txt");
-  for (const std::string& word : words_of(request.sbatch)) command += " " + quoted(word);
-  command += " " + quoted((folder / "logs/slurm.sh").string());
+                        " --output=" + shell_quoted(plain((folder / "logs").string()) + "/slurm-%a.txt");
+  for (const std::string& word : words_of(request.sbatch)) command += " " + shell_quoted(word);
+  command += " " + shell_quoted((folder / "logs/slurm.sh").string());
   say_more(command);
   FILE* pipe = ::popen((command + " 2>&1").c_str(), "r");
   std::string answer;
@@ -196,7 +190,7 @@ void submit(const BatchPlan& plan, const Path& folder, const std::vector<const B
               << "' tells how far they are\n";
 }
 
-void batch(const Globals& globals, const Request& request) {
+void batch(const Globals& globals, const BatchRequest& request) {
   if (request.jobs.empty() || request.out.empty())
     throw InputError("chainsplat batch", "needs JOBS.toml and -o DIR", "see 'chainsplat batch --help'");
   const bool slurm = request.launcher == "slurm";
@@ -270,7 +264,7 @@ void task(const Globals& globals, const std::string& dir, int index) {
   if (outcome.signal == SIGUSR1)
     if (const char* id = std::getenv("SLURM_JOB_ID")) {
       say("time limit near: a checkpoint was left, the task is queued again");
-      const std::string command = std::string("scontrol requeue ") + quoted(id);
+      const std::string command = std::string("scontrol requeue ") + shell_quoted(id);
       if (std::system(command.c_str()) != 0)
         throw WorkError("scontrol requeue", "failed", "submit the batch again, it goes on from the checkpoint");
       // Slurm ends this process now
@@ -287,7 +281,7 @@ void task(const Globals& globals, const std::string& dir, int index) {
 
 void add_batch_command(Command app, const Globals& globals, Job& job) {
   Command command = app.add_command("batch", "Many trainings: captures x settings x seeds, unattended");
-  auto request = std::make_shared<Request>();
+  auto request = std::make_shared<BatchRequest>();
   command
       .add_option("JOBS", request->jobs,
                   "Job file in TOML:\n"

@@ -35,7 +35,7 @@ namespace {
 
 using Json = nlohmann::ordered_json;
 
-struct Request {
+struct BenchRequest {
   std::string gaussians, views;  // empty: the fixed cases
   std::string scene = "both", capture;
   bool whole = false, only_capture = false;
@@ -141,7 +141,7 @@ double median(std::vector<double> values) {
 }
 
 // `most`: what memory is meant for.
-std::vector<int> numbers(const std::string& text, const char* option, int most) {
+std::vector<int> counts(const std::string& text, const char* option, int most) {
   std::vector<int> out;
   std::istringstream words(text);
   std::string word;
@@ -352,7 +352,7 @@ Json bench_capture(gpu::Device& device, const Path& folder, std::uint64_t seed) 
   return entry;
 }
 
-void bench(const Globals& globals, const Request& request) {
+void bench(const Globals& globals, const BenchRequest& request) {
   if (request.scene != "far" && request.scene != "close" && request.scene != "both")
     throw InputError("--scene", "'" + request.scene + "' is not a scene", "name far, close or both");
   std::vector<Case> cases(kCases.begin(), kCases.end());
@@ -360,8 +360,8 @@ void bench(const Globals& globals, const Request& request) {
     cases.clear();
     constexpr int kMostGaussians = 2000000, kMostViews = 1000;
     for (const int count :
-         numbers(request.gaussians.empty() ? "2000" : request.gaussians, "--gaussians", kMostGaussians))
-      for (const int views : numbers(request.views.empty() ? "1" : request.views, "--views", kMostViews))
+         counts(request.gaussians.empty() ? "2000" : request.gaussians, "--gaussians", kMostGaussians))
+      for (const int views : counts(request.views.empty() ? "1" : request.views, "--views", kMostViews))
         for (const bool close : {false, true}) cases.push_back({close, count, views, 8, request.whole});
   }
   if (request.only_capture && request.capture.empty())
@@ -421,7 +421,7 @@ void bench(const Globals& globals, const Request& request) {
 
 void add_bench_command(Command app, const Globals& globals, Job& job) {
   Command command = app.add_command("bench", "Measure drawing and training steps on fixed synthetic scenes");
-  auto request = std::make_shared<Request>();
+  auto request = std::make_shared<BenchRequest>();
   command.add_option("--gaussians", request->gaussians,
                      "Numbers of Gaussians, with commas between, in place of the fixed cases");
   command.add_option("--views", request->views, "Views a submission, with commas between, in place of the fixed cases");

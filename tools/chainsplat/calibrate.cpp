@@ -18,7 +18,7 @@ namespace {
 
 using Json = nlohmann::ordered_json;
 
-struct Request {
+struct CalibrateRequest {
   std::string out, base, board, svg, tags = "5x7", world = "camera", tag_size = "0.027", spacing = "0.009";
   int first_id = 0;
   std::vector<std::string> cameras, timestamps, rates, starts;
@@ -31,7 +31,7 @@ std::string text(const char* format, auto... values) {
   return out;
 }
 
-void write_board(const Globals& globals, const Request& request) {
+void write_board(const Globals& globals, const CalibrateRequest& request) {
   calibration::Board board;
   const std::size_t times = request.tags.find('x');
   const auto count = [&](const std::string& digits) {
@@ -94,7 +94,7 @@ std::string table(const calibration::Calibration& result) {
   return out;
 }
 
-void calibrate(const Globals& globals, Request& request) {
+void calibrate(const Globals& globals, CalibrateRequest& request) {
   if (!request.svg.empty()) return write_board(globals, request);
   calibration::Options& options = request.options;
   if (request.out.empty()) throw InputError("OUT", "is missing", "name the folder for the result, or give --board-svg");
@@ -151,7 +151,7 @@ void calibrate(const Globals& globals, Request& request) {
 void add_calibrate_command(Command app, const Globals& globals, Job& job) {
   Command command = app.add_command(
       "calibrate", "Intrinsics, poses and clocks of cameras from videos of a printed board; the board itself");
-  auto request = std::make_shared<Request>();
+  auto request = std::make_shared<CalibrateRequest>();
   calibration::Options& options = request->options;
   command.add_option("OUT", request->out,
                      "Folder for the result: NAME.json of every camera, calibration.json, pictures");

@@ -115,6 +115,8 @@ void check_one_wants_standard_output(const Globals& globals, const std::string& 
 // CAPTURE[:camera] as the two; the second is empty for all cameras. A folder whose own name has a colon is taken as it
 // is.
 std::pair<std::string, std::string> split_camera(const std::string& text);
+// A text in single quotes of a shell, whatever it holds; `also` escaped by backslashes.
+std::string shell_quoted(const std::string& text, const std::string& also = "");
 // One named row of metrics a line, with the head line; NaN as '-'.
 struct MetricsRow {
   std::string name;

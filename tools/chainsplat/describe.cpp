@@ -121,26 +121,16 @@ std::string bash_completions(const CLI::App& app) {
          "    COMPREPLY=($(compgen -f -- \"$word\"))\n  fi\n}\ncomplete -o filenames -F _chainsplat chainsplat\n";
 }
 
-// A text in single quotes of a shell, `also` escaped by backslashes.
-std::string quoted(const std::string& text, const std::string& also = "") {
-  std::string out = "'";
-  for (const char letter : text) {
-    if (also.find(letter) != std::string::npos) out += '\\';
-    out += letter == '\'' ? "'\\''" : std::string(1, letter);
-  }
-  return out + "'";
-}
-
 std::string zsh_completions(const CLI::App& app) {
   std::string list, cases;
   for (const CLI::App* command : commands_of(app)) {
-    list += "    " + quoted(command->get_name() + ":" + one_line(command->get_description())) + "\n";
+    list += "    " + shell_quoted(command->get_name() + ":" + one_line(command->get_description())) + "\n";
     cases += "    " + command->get_name() + ") _arguments '*:file:_files'";
     for (const CLI::App* from : {command, &app})
       for (const Described& option : options_of(*from))
         for (const std::string& name : option.names)
           if (!option.argument) {
-            const std::string text = quoted(option.text, "[]:\\");
+            const std::string text = shell_quoted(option.text, "[]:\\");
             cases += " \\\n      " + name + "'['" + text + "']'" + (option.value.empty() ? "" : "':value:_files'");
           }
     cases += " ;;\n";
@@ -160,13 +150,13 @@ std::string fish_completions(const CLI::App& app) {
       out += "complete -c chainsplat" + condition;
       for (const std::string& name : option.names)
         out += name.starts_with("--") ? " -l " + name.substr(2) : " -s " + name.substr(1);
-      out += (option.value.empty() ? "" : " -r") + std::string(" -d ") + quoted(option.text) + "\n";
+      out += (option.value.empty() ? "" : " -r") + std::string(" -d ") + shell_quoted(option.text) + "\n";
     }
   };
   options(app, "");
   for (const CLI::App* command : commands_of(app)) {
     out += "complete -c chainsplat -f -n __fish_use_subcommand -a " + command->get_name() + " -d " +
-           quoted(one_line(command->get_description())) + "\n";
+           shell_quoted(one_line(command->get_description())) + "\n";
     options(*command, " -n '__fish_seen_subcommand_from " + command->get_name() + "'");
   }
   return out;

@@ -20,7 +20,7 @@ namespace {
 
 using Json = nlohmann::ordered_json;
 
-struct Request {
+struct ExciteRequest {
   std::string run, out, axes;
   double rate = 100.0, noise = 0.0;  // rows per second; mm, 0: from the recording
   bool force = false;
@@ -28,9 +28,9 @@ struct Request {
 };
 
 // One file for the base's motion, and its table beside it.
-bool is_single(const Request& request) { return Path(request.out).extension() == ".tum"; }
+bool is_single(const ExciteRequest& request) { return Path(request.out).extension() == ".tum"; }
 
-Json document_of(const excitation::Result& result, const Request& request) {
+Json document_of(const excitation::Result& result, const ExciteRequest& request) {
   const excitation::Prediction& p = result.prediction;
   Json out;
   out["duration"] = request.options.duration;
@@ -65,7 +65,7 @@ Json document_of(const excitation::Result& result, const Request& request) {
 }
 
 // Writes the motion, and into a folder also the states that it predicts and `document`.
-void write_files(const Request& request, const excitation::Result& result, const Json& document) {
+void write_files(const ExciteRequest& request, const excitation::Result& result, const Json& document) {
   const Path out = request.out;
   const bool single = is_single(request);
   const auto beside = [&](const char* name, const char* extension) {
@@ -80,7 +80,7 @@ void write_files(const Request& request, const excitation::Result& result, const
   core::write_file(out / "excite.json", core::json_text(document) + "\n");
 }
 
-void print(const Request& request, const excitation::Result& result) {
+void print(const ExciteRequest& request, const excitation::Result& result) {
   const excitation::Prediction& p = result.prediction;
   const bool compare = !p.repeated.empty();
   std::cout << "parameter                    standard error   after excitation"
@@ -111,7 +111,7 @@ void print(const Request& request, const excitation::Result& result) {
   std::cout << line << request.out << "\n";
 }
 
-void excite(const Globals& globals, Request& request) {
+void excite(const Globals& globals, ExciteRequest& request) {
   watch_signals();
   excitation::Options& options = request.options;
   planning::check_rate(request.rate, options.duration, "give rows a second, for example 100");
@@ -141,7 +141,7 @@ void excite(const Globals& globals, Request& request) {
 void add_excite_command(Command app, const Globals& globals, Job& job) {
   Command command =
       app.add_command("excite", "Propose the base motion to record next: the parameters' errors shrink most");
-  auto request = std::make_shared<Request>();
+  auto request = std::make_shared<ExciteRequest>();
   excitation::Options& options = request->options;
   options.limits.stroke = 0.2;
   command.add_option("RUN", request->run, "Run folder of an identified twin").required();

@@ -22,7 +22,7 @@ namespace {
 
 using Json = nlohmann::ordered_json;
 
-struct Request {
+struct IdentifyRequest {
   std::vector<std::string> runs, markers;
   PayloadRequest payload;
   bool shape_only = false, joint = false;
@@ -82,7 +82,7 @@ void print_estimates(const dynamics::Estimates& found) {
   if (found.weak.size() > kMostLines) std::cout << "all of them: twin.json, identification.weak\n";
 }
 
-pipeline::IdentifyResult identified(const Globals& globals, const Request& request) {
+pipeline::IdentifyResult identified(const Globals& globals, const IdentifyRequest& request) {
   if (request.markers.empty())
     return pipeline::identify({request.runs.begin(), request.runs.end()},
                               {.joint = request.joint,
@@ -99,7 +99,7 @@ pipeline::IdentifyResult identified(const Globals& globals, const Request& reque
       {.shape_only = request.shape_only, .payload = payload_of(request.payload), .seed = globals.seed}, terminal());
 }
 
-void identify(const Globals& globals, const Request& request) {
+void identify(const Globals& globals, const IdentifyRequest& request) {
   watch_signals();
   const pipeline::IdentifyResult result = identified(globals, request);
   for (const Path& path : result.lost_metrics) {
@@ -165,7 +165,7 @@ void identify_online(const Globals& globals, const OnlineRequest& request) {
 void add_identify_command(Command app, const Globals& globals, Job& job) {
   Command identifier =
       app.add_command("identify", "The second stage alone: masses, stiffness, damping, friction of a twin");
-  auto request = std::make_shared<Request>();
+  auto request = std::make_shared<IdentifyRequest>();
   identifier
       .add_option("RUN", request->runs,
                   "Run folder with recognized states; it is updated. Several of one rope get one set of parameters,\n"

@@ -16,7 +16,7 @@ namespace {
 
 using Json = nlohmann::ordered_json;
 
-struct Request {
+struct ImportRequest {
   std::string out, base, urdf, tool, base_world, camera_world, camera_axes, length, diameter, mass, direction,
       bending_axis, table, gravity, scenario;
   std::vector<std::string> cameras, calibrations, poses_of, masks, timestamps, rates, starts;
@@ -43,7 +43,7 @@ capture::Table table(const std::string& text) {
   return {{v[0], v[1], v[2]}, normal.normalized()};
 }
 
-void read_cameras(Request& request) {
+void read_cameras(ImportRequest& request) {
   auto& cameras = request.options.cameras;
   for (const std::string& text : request.cameras) {
     const std::size_t equals = text.find('=');
@@ -80,7 +80,7 @@ void read_cameras(Request& request) {
       });
 }
 
-void import_capture(const Globals& globals, Request& request) {
+void import_capture(const Globals& globals, ImportRequest& request) {
   importing::Options& options = request.options;
   read_cameras(request);
   options.base = importing::read_source(request.base);
@@ -133,7 +133,7 @@ void import_capture(const Globals& globals, Request& request) {
 void add_import_command(Command app, const Globals& globals, Job& job) {
   Command importer =
       app.add_command("import", "Make a capture from videos, calibrations of other programs and a robot's log");
-  auto request = std::make_shared<Request>();
+  auto request = std::make_shared<ImportRequest>();
   importing::Options& options = request->options;
   importer.add_option("OUT", request->out, "Capture folder to make").required();
   const auto several = [&](const char* name, std::vector<std::string>& into, const char* help, const char* type) {

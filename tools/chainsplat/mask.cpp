@@ -24,18 +24,11 @@ using Json = nlohmann::ordered_json;
 
 constexpr std::string_view kImageName = "{image}", kMaskName = "{mask}";  // in the line of a command
 
-struct Request {
+struct MaskRequest {
   std::string capture, out, command, frames, preview;
   std::vector<std::string> points, boxes, empty;
   bool force = false;
 };
-
-// For the shell, whatever the text holds.
-std::string quoted(const std::string& text) {
-  std::string out = "'";
-  for (const char letter : text) letter == '\'' ? out += "'\\''" : out += letter;
-  return out + "'";
-}
 
 // The line with the files in place of {image} and {mask}. In one pass: a file's name may hold these letters, too.
 std::string filled_in(const std::string& line, const Path& image, const Path& mask) {
@@ -43,10 +36,10 @@ std::string filled_in(const std::string& line, const Path& image, const Path& ma
   for (std::size_t at = 0; at < line.size();) {
     const std::string_view rest = std::string_view(line).substr(at);
     if (rest.starts_with(kImageName)) {
-      out += quoted(image.string());
+      out += shell_quoted(image.string());
       at += kImageName.size();
     } else if (rest.starts_with(kMaskName)) {
-      out += quoted(mask.string());
+      out += shell_quoted(mask.string());
       at += kMaskName.size();
     } else {
       out += line[at++];
@@ -144,7 +137,7 @@ Hint read_hint(const std::string& text, const std::string& option, std::size_t c
   return out;
 }
 
-masking::Hints read_hints(const Request& request) {
+masking::Hints read_hints(const MaskRequest& request) {
   masking::Hints hints;
   for (const std::string& text : request.points) {
     const Hint hint = read_hint(text, "--point", 2);
@@ -164,7 +157,7 @@ masking::Hints read_hints(const Request& request) {
   return hints;
 }
 
-void print_document(const Request& request, const pipeline::MaskResult& result) {
+void print_document(const MaskRequest& request, const pipeline::MaskResult& result) {
   const math::Vector3& grasp = result.summary.grasp;
   Json document;
   document["masks"] = result.folder.string();
@@ -181,7 +174,7 @@ void print_document(const Request& request, const pipeline::MaskResult& result) 
   std::cout << core::json_text(document) << "\n";
 }
 
-void make_masks(const Globals& globals, const Request& request) {
+void make_masks(const Globals& globals, const MaskRequest& request) {
   pipeline::MaskOptions options;
   options.output = request.out;
   options.force = request.force;
@@ -203,7 +196,7 @@ void add_mask_command(Command app, const Globals& globals, Job& job) {
       "mask",
       "Make object masks for a capture that has none: from the known cameras, base motion, length and\n"
       "diameter, the background and the colors near the grasp; or by an outside program, frame by frame");
-  auto request = std::make_shared<Request>();
+  auto request = std::make_shared<MaskRequest>();
   command.add_option("CAPTURE", request->capture, "The capture's folder or its capture.json").required();
   command
       .add_option("-o,--output", request->out,

@@ -19,7 +19,7 @@ namespace {
 
 constexpr double kPerpendicular = 1e-6;  // largest cosine between direction and bending axis that is taken as 0
 
-struct Request {
+struct NewRequest {
   std::string out, bending;                            // empty: spatial, on a table planar
   double length = 0.0, diameter = 0.02, mass = 0.0;    // m, m, kg; mass 0: unknown
   double bending_stiffness = -1.0, retardation = 0.0;  // EI, N m^2, negative: not given; s
@@ -41,7 +41,7 @@ math::Vector3 unit_of(const std::vector<double>& values, const char* option) {
 }
 
 // A uniform straight rod that hangs free, in still air without drag, or lies on a table with this normal.
-dynamics::Parameters rod(const chain::Chain& chain, const Request& request, const math::Vector3& gravity,
+dynamics::Parameters rod(const chain::Chain& chain, const NewRequest& request, const math::Vector3& gravity,
                          const std::optional<math::Vector3>& table_normal) {
   dynamics::Parameters rod;
   const int links = chain.links() - 1;
@@ -77,7 +77,7 @@ dynamics::Parameters rod(const chain::Chain& chain, const Request& request, cons
 }
 
 // What CLI11's bounds let pass: no comparison with NaN is true.
-void check_numbers(const Request& request) {
+void check_numbers(const NewRequest& request) {
   for (const auto& [option, value] : {std::pair("--length", request.length),
                                       {"--diameter", request.diameter},
                                       {"--mass", request.mass},
@@ -87,7 +87,7 @@ void check_numbers(const Request& request) {
     if (std::isnan(value)) throw InputError(option, "is not a number", "give one");
 }
 
-void make_new(const Globals& globals, const Request& request) {
+void make_new(const Globals& globals, const NewRequest& request) {
   check_numbers(request);
   if (request.bending_stiffness >= 0.0 && !(request.mass > 0.0))
     throw InputError("--bending-stiffness", "moves nothing without a mass", "give --mass too");
@@ -160,7 +160,7 @@ void make_new(const Globals& globals, const Request& request) {
 void add_new_command(Command app, const Globals& globals, Job& job) {
   Command command =
       app.add_command("new", "Make a twin without videos: empty, to identify from markers, or of a known rod");
-  auto request = std::make_shared<Request>();
+  auto request = std::make_shared<NewRequest>();
   command.add_option("-o,--output", request->out, "Run folder to make: the twin").required().type_name("RUN");
   command.add_option("--length", request->length, "From the grasp to the free end, m")
       .required()

@@ -85,4 +85,13 @@ std::optional<capture::Payload> payload_of(const PayloadRequest& request) {
   return payload;
 }
 
+std::string shell_quoted(const std::string& text, const std::string& also) {
+  std::string out = "'";
+  for (const char letter : text) {
+    if (also.find(letter) != std::string::npos) out += '\\';
+    out += letter == '\'' ? "'\\''" : std::string(1, letter);
+  }
+  return out + "'";
+}
+
 }  // namespace chainsplat::tools

@@ -18,14 +18,14 @@ namespace {
 
 using Json = nlohmann::ordered_json;
 
-struct Request {
+struct TrainRequest {
   std::string capture, out, picture;
   std::string stages;  // empty: all
   std::string joints = "auto", bending = "auto", mode = "fast", paper, frames;
   pipeline::TrainOptions options;
 };
 
-pipeline::TrainOptions options_of(const Request& request, const Globals& globals) {
+pipeline::TrainOptions options_of(const TrainRequest& request, const Globals& globals) {
   pipeline::TrainOptions options = request.options;
   pipeline::set(options, "joints", request.joints, "`joints`");
   pipeline::set(options, "bending", request.bending, "`bending`");
@@ -60,7 +60,7 @@ Json summary_json(const pipeline::TrainResult& result, const std::string& run) {
   return document;
 }
 
-void train(const Globals& globals, const Request& request) {
+void train(const Globals& globals, const TrainRequest& request) {
   const pipeline::TrainOptions options = options_of(request, globals);
   watch_signals();
   const pipeline::TrainResult result = pipeline::train(request.capture, request.out, options, terminal());
@@ -81,7 +81,7 @@ void train(const Globals& globals, const Request& request) {
   if (!request.picture.empty() && result.recognized) std::cout << "picture: " << request.picture << "\n";
 }
 
-void add_recognition_options(Command command, Request& request) {
+void add_recognition_options(Command command, TrainRequest& request) {
   pipeline::TrainOptions& options = request.options;
   command.add_option("CAPTURE", request.capture, "The capture's folder or its capture.json").required();
   command.add_option("-o,--output", request.out, "Run folder to make: the twin").required().type_name("RUN");
@@ -124,7 +124,7 @@ void add_recognition_options(Command command, Request& request) {
 
 void add_training_commands(Command app, const Globals& globals, Job& job) {
   Command trainer = app.add_command("train", "Make a twin from a capture: recognize, identify, roll out, evaluate");
-  auto request = std::make_shared<Request>();
+  auto request = std::make_shared<TrainRequest>();
   add_recognition_options(trainer, *request);
   trainer.add_option("--stages", request->stages, "Only these, by comma: recognize,identify,rollout,evaluate")
       .type_name("LIST");
@@ -135,7 +135,7 @@ void add_training_commands(Command app, const Globals& globals, Job& job) {
   trainer.callback([&globals, &job, request] { job = [&globals, request] { train(globals, *request); }; });
 
   Command recognizer = app.add_command("recognize", "The first stage of train alone: Gaussians and angles from images");
-  auto recognition = std::make_shared<Request>();
+  auto recognition = std::make_shared<TrainRequest>();
   add_recognition_options(recognizer, *recognition);
   recognizer.callback([&globals, &job, recognition] {
     recognition->stages = "recognize";
