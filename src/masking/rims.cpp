@@ -17,7 +17,7 @@ constexpr double kLeastBlur = 0.3, kMostBlur = 2.3, kNextBlur = 1.2;  // px, and
 constexpr double kMostDim = 1.0, kNextDim = 0.125;
 constexpr double kMostBeyond = 0.8, kNextBeyond = 0.05;  // px, of all parts, and of one from that of all
 // what counts
-constexpr double kUsualDim = 0.3, kDimDeviation = 0.1;  // weak: a thousand samples decide, where they do
+constexpr double kUsualDim = 0.3, kDimDeviation = 0.1;  // where the picture does not tell
 constexpr double kBeyondDeviation = 0.2;                // px, of all parts
 constexpr double kBeyondScatter = 0.2;                  // px, of one part
 constexpr double kNoise = 2.0;  // gray levels, beyond which a piece is one that the model does not fit
