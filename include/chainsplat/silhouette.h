@@ -9,6 +9,7 @@
 // 'Recognition'.
 #pragma once
 #include <functional>
+#include <optional>
 #include <span>
 #include <vector>
 #include "chainsplat/capture.h"
@@ -93,8 +94,14 @@ JointChoice choose_joints(const chain::Chain& chain, const SequenceFit& fit);
 // of the diameter, or where one camera alone sees the rope. `fit` is that of `chain`, which is planar.
 // Mathematics.md 6.13.
 double fit_height(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& fit, double first);
-// The same as the table tells that the capture gives; 0 where it gives none, or none that is below the grasp and near
-// it.
+// How a rope lies on its table.
+struct Lying {
+  double height = 0.0;   // m, along the bending axis, from the plane of the grasp to where it lies
+  math::Vector3 normal;  // of the table, base frame, at the beginning
+};
+// As the capture gives the table; none where it gives none, or none that is below the grasp and near it.
+std::optional<Lying> lying_on_table(const capture::Capture& capture);
+// Its height, 0 where there is none.
 double height_by_table(const capture::Capture& capture);
 // Chain::lift of a chain that lies so far beside it: it goes there as a heavy rod does.
 std::vector<double> lying_down(const chain::Chain& chain, double height);
@@ -104,6 +111,9 @@ std::vector<double> lying_down(const chain::Chain& chain, double height);
 struct CorrectionOptions {
   std::vector<std::string> held = {};  // groups of corrected_quantities() that are not varied
   int frames = 75;                     // at most, spread over the recording
+  // How the planar chain lies on its table, by which its lift was made: then the lift follows the grasp's shift, and
+  // the table's height varies too.
+  std::optional<Lying> lying = {};
   // Known mistakes as the corrections that mend them, e.g. half a pixel. Quantities that are not in one of them are
   // right as given.
   std::vector<capture::Corrections> mistakes = {};
@@ -123,6 +133,9 @@ struct CorrectionFit {
   // By which share the outlines' square residuals would be larger with what was given, whatever of it is wrong.
   double evidence = 0.0;
   std::vector<double> evidence_after;  // the same with each of the options' mistakes mended, and nothing else
+  // Of a rope that lies: the shift of the grasp along the table's normal, m, that with all else as given leaves least
+  // evidence, and what it leaves.
+  double raised = 0.0, evidence_raised = 0.0;
   solve::Summary summary;              // the unknowns relative to their prior deviations, and rad
   std::vector<OutlineMisfit> misfits;  // by camera, after the corrections
   chain::Chain chain;                  // with the corrected length and diameter

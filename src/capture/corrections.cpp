@@ -34,6 +34,7 @@ const std::vector<CorrectedQuantity>& corrected_quantities() {
       {"grasp", "rotation", "grasp", "rad", 3, 0.005, 0.0, 3.2},
       {"object", "length", "length", "m", 1, 0.0, 0.01, 100.0},
       {"object", "diameter", "diameter", "m", 1, 0.0, 0.01, 100.0},
+      {"table", "height", "table", "m", 1, 0.001, 0.0, 100.0},
   };
   return quantities;
 }
@@ -162,6 +163,7 @@ void apply(const Corrections& corrections, Capture& capture) {
   };
   resize(capture.length, "length");
   resize(capture.diameter, "diameter");
+  if (capture.table) capture.table->point += value_of(corrections, "table", "height") * capture.table->normal;
 }
 
 }  // namespace chainsplat::capture

@@ -65,7 +65,7 @@ void read_base(Manifest& manifest, const std::string& file,
 // "sigma": how sure each thing is that may be corrected, with the same keys as "corrections" in twin.json.
 void read_sigma(const ObjectReader& reader, Capture& capture) {
   if (!reader.present()) return;
-  reader.know({"cameras", "base", "grasp", "object"});
+  reader.know({"cameras", "base", "grasp", "object", "table"});
   const auto read = [&](const ObjectReader& node, const std::string& subject, const char* kind) {
     if (!node.present()) return;
     std::vector<std::string> known;
@@ -91,6 +91,7 @@ void read_sigma(const ObjectReader& reader, Capture& capture) {
   read(reader.child("base", false, "{ \"time\": 0.002 }"), "base", "base");
   read(reader.child("grasp", false, "{ \"translation\": 0.001 }"), "grasp", "grasp");
   read(reader.child("object", false, "{ \"length\": 0.003 }"), "object", "object");
+  read(reader.child("table", false, "{ \"height\": 0.001 }"), "table", "table");
 }
 
 // object.tip_mass: a number, or { value, sigma }; object.tip_length.

@@ -5,6 +5,7 @@
 #include <cstdarg>
 #include <cstdio>
 #include <numbers>
+#include <optional>
 
 #include "chainsplat/camera_colors.h"
 #include "chainsplat/silhouette.h"
@@ -27,6 +28,9 @@ constexpr double kNothingWrong = 1.0;
 constexpr std::array kShifts = {0.5, -0.5};  // px
 constexpr double kLeftOfHalfPixel = 0.2;     // share
 constexpr double kLeastForHalfPixel = 0.15;  // as kNothingWrong
+// Standard deviation of how high a grasp is found to be above where the rope lies: m, and as a share of that height,
+// since how a rope comes down is assumed.
+constexpr double kRaisedDeviation = 0.00025, kComingDown = 0.25;
 // Standard deviations from which a correction is told (something is wrong, and this may be it), and told as certain.
 constexpr double kPossible = 1.5, kCertain = 3.0;
 constexpr double kMeters = 1e3, kSeconds = 1e3, kDegrees = 180.0 / std::numbers::pi;  // to mm, ms, degrees
@@ -152,6 +156,12 @@ void judge_rope(const capture::Corrections& found, const capture::Capture& given
     verdict.push_back({"grasp", "grasp", turn.value, turn.deviation, "deg", true, true, false, -1,
                        text("the rope %s held turned by %.1f +- %.1f degrees from how it was given: corrected",
                             is(turn), turn.value, turn.deviation)});
+  const Size table = size_of(capture::find(found, "table", "height"), kMeters);
+  if (worth_saying(table, kGrasp))
+    verdict.push_back({"table", "table", table.value, table.deviation, "mm", true, true, false, -1,
+                       text("the table %s %.1f +- %.1f mm %s than it was given, or the grasp as much %s: corrected",
+                            is(table), std::abs(table.value), table.deviation, table.value > 0.0 ? "higher" : "lower",
+                            table.value > 0.0 ? "lower" : "higher")});
   const Size length = size_of(capture::find(found, "object", "length"), 100.0 / given.length);
   if (worth_saying(length, kLength)) {
     const bool possible = std::abs(length.value) < 100.0 * kFartherThanAny;
@@ -241,17 +251,49 @@ capture::Corrections shifted_images(const capture::Capture& given, double shift)
   return out;
 }
 
+// A grasp that is given too high or too low above its table, by so much of the correction `fit.raised` that it is sure,
+// and by nothing else that is: its standard deviation, m.
+std::optional<double> raised_alone(const silhouette::CorrectionFit& fit,
+                                   const std::optional<silhouette::Lying>& lying) {
+  if (!lying || fit.evidence_raised >= kNothingWrong) return std::nullopt;
+  const double left = lying->height - fit.raised * fit.chain.bending_axis.dot(lying->normal);
+  const double deviation = std::hypot(kRaisedDeviation, kComingDown * left);
+  if (std::abs(fit.raised) < kCertain * deviation) return std::nullopt;
+  return deviation;
+}
+
+// Makes that the only correction. Nothing tells how far such a grasp is off within the table's plane: as far.
+void raise(const silhouette::CorrectionFit& fit, const math::Vector3& normal, double deviation, Corrected& out) {
+  const math::Matrix3 along = normal * normal.transpose();
+  const math::Matrix3 covariance =
+      deviation * deviation * along + fit.raised * fit.raised * (math::Matrix3::Identity() - along);
+  out.covariance = math::MatrixX::Zero(fit.covariance.rows(), fit.covariance.cols());
+  Eigen::Index at = 0;
+  for (capture::Correction& correction : out.corrections) {
+    if (correction.subject == "grasp" && correction.quantity->name == std::string("translation")) {
+      out.covariance.block<3, 3>(at, at) = covariance;
+      correction.value = fit.raised * normal;
+      correction.deviation = covariance.diagonal().cwiseSqrt();
+      correction.state = capture::CorrectionState::free;
+    }
+    at += correction.value.size();
+  }
+}
+
 // The corrections that the twin is made with: what was found; what was given where nothing is surely wrong, since it is
-// better known than what was found; or half a pixel where that alone explains what is wrong. Returns true for this one.
+// better known than what was found; or what alone explains what is wrong, the grasp's height above a table or half a
+// pixel. Returns true for half a pixel.
 bool decide(silhouette::CorrectionFit& fit, const silhouette::CorrectionOptions& options, Corrected& out) {
   const auto least = std::min_element(fit.evidence_after.begin(), fit.evidence_after.end());
   const bool half_pixel = fit.evidence > kLeastForHalfPixel && *least < kLeftOfHalfPixel * fit.evidence;
+  const auto raised = half_pixel ? std::nullopt : raised_alone(fit, options.lying);
   out.corrections = std::move(fit.corrections);
-  if (!half_pixel && fit.evidence >= kNothingWrong) {
+  if (!half_pixel && !raised && fit.evidence >= kNothingWrong) {
     out.covariance = std::move(fit.covariance);
     return false;
   }
   for (capture::Correction& correction : out.corrections) correction.value.setZero();
+  if (raised) raise(fit, options.lying->normal, *raised, out);
   if (!half_pixel) return false;
   const std::size_t which = least - fit.evidence_after.begin();
   for (capture::Correction& correction : out.corrections)
@@ -303,10 +345,11 @@ void correct_colors(const silhouette::CorrectionFit& fit, const std::vector<std:
 // above it, cameras were found to be off by 10 degrees. Faults of base and grasp alone are less.
 double high(const capture::Capture& capture) { return std::max(0.25 * capture.diameter, 0.005); }
 
-// A rope that is held a little above its table looks like one whose grasp, or table, is given wrong by as much. How
-// it comes down would tell, but the fingers hide it.
+// A rope that is held a little above its table looks like one whose grasp, or table, is given wrong by as much, where
+// one camera alone sees how it comes down or the grasp is to be taken as given.
 constexpr double kAboveTable = 0.001;  // m, from which on that is said
-void judge_height(const capture::Capture& capture, std::vector<Finding>& verdict) {
+void judge_height(const capture::Corrections& found, const capture::Capture& capture, std::vector<Finding>& verdict) {
+  if (capture::find(found, "grasp", "translation")->state != capture::CorrectionState::held) return;
   const double above = std::abs(silhouette::height_by_table(capture));
   if (above < kAboveTable || above > high(capture)) return;
   verdict.push_back({"grasp", "table", kMeters * above, 0.0, "mm", false, true, false, -1,
@@ -361,6 +404,7 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   }
   silhouette::CorrectionOptions options;
   options.held = fixed;
+  options.lying = silhouette::lying_on_table(capture);
   for (const double shift : kShifts) options.mistakes.push_back(shifted_images(capture, shift));
   silhouette::CorrectionFit fit = silhouette::fit_corrections(chain, capture, sequence, options);
   tell_fit("correct", fit.summary);
@@ -371,7 +415,7 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   judge_outlines(fit, capture, out.verdict);
   judge_folds(fit, out.verdict);
   capture::apply(out.corrections, capture);
-  judge_height(capture, out.verdict);
+  judge_height(out.corrections, capture, out.verdict);
   correct_colors(fit, fixed, capture, out);
   return out;
 }

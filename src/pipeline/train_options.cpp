@@ -40,7 +40,7 @@ void check_groups(const std::vector<std::string>& groups, const std::string& whe
   for (const std::string& group : groups)
     if (group != "all" && std::none_of(all.begin(), all.end(), [&](const auto& q) { return group == q.group; }))
       throw InputError(where, "'" + group + "' is nothing that is estimated",
-                       "name some of cameras,focal,time,length,diameter,grasp,masks,colors, or all");
+                       "name some of cameras,focal,time,length,diameter,grasp,table,masks,colors, or all");
 }
 
 std::vector<std::string> split(const std::string& text) {

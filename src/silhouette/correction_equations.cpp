@@ -11,6 +11,7 @@ using math::VectorX;
 namespace {
 
 constexpr double kBlobReach = 3.0;  // diameters from the chain within which a blob is the rope
+
 // What one pixel of outline counts against the priors, of one independent observation of a deviation of 1 px.
 // Neighboring outline and neighboring frames share the error of straight links, which pulls the grasp along the rope:
 // on recordings with truth the place of the grasp and the length were off by 10 mm with 1, by their priors with less
@@ -67,8 +68,10 @@ void pose_view(const CorrectionProblem& fit, const CorrectedFrame& frame, std::s
     out.twists.col(k) = math::transform_twist(out.problem.views[0].camera_from_base, out.problem.axes.col(k));
 }
 
-// How fast a point of the outline moves, px/s, px/m, ..., with the quantities that its view depends on.
-SharedRow shared_row(const PosedView& view, const OutlinePoint& p, double angle_speed) {
+// How fast a point of the outline moves, px/s, px/m, ..., with the quantities that its view depends on. `down`: m by
+// which its link comes down to the table for each meter that the grasp is above it; 0 where it does not lie on one.
+SharedRow shared_row(const PosedView& view, const OutlinePoint& p, double angle_speed, const Vector3& normal,
+                     double down) {
   const ViewWork& work = view.problem.views[0];
   const capture::Camera& camera = view.camera;
   const chain::Chain& chain = *view.problem.chain;
@@ -85,7 +88,9 @@ SharedRow shared_row(const PosedView& view, const OutlinePoint& p, double angle_
   const bool start = p.part == OutlinePoint::Part::start;
   row[kMaskStart] = start ? g.dot((p.segment->b - p.segment->a).normalized()) : 0.0;
   row[kBaseTime] = base_speed;
-  row.segment<3>(kGrasp) = camera_from_base.transpose() * g;
+  const Vector3 with_grasp = camera_from_base.transpose() * g;
+  row[kTableHeight] = down * chain.bending_axis.dot(normal) * chain.bending_axis.dot(with_grasp);
+  row.segment<3>(kGrasp) = with_grasp - row[kTableHeight] * normal;
   row.segment<3>(kGraspRotation) = camera_from_base.transpose() * from_grasp.cross(g);
   row[kLength] = start ? 0.0 : g.dot(from_grasp) / chain.length;
   row[kDiameter] = p.half_width / chain.diameter;
@@ -105,11 +110,34 @@ std::vector<Vector3> curvatures(const std::vector<Segment>& segments) {
   return out;
 }
 
-// How far the rope, an arc between its joints, is from the point of a straight link, camera frame, m.
-Vector3 sagitta(const Segment& segment, const Vector3& curvature, const Vector3& x) {
+// The rope as arcs that are as long as the straight links, camera frame.
+struct Arcs {
+  std::vector<Vector3> curvature;  // 1/m, by segment
+  std::vector<Vector3> before;     // m, where the segment begins: the arcs before it reach less far than their links
+};
+
+// m, by which an arc that is as long as its link reaches less far.
+Vector3 shorter(const Segment& segment, const Vector3& curvature) {
   const Vector3 link = segment.b - segment.a;
+  return -curvature.squaredNorm() * link.squaredNorm() / 24.0 * link;
+}
+
+Arcs arcs_of(const std::vector<Segment>& segments) {
+  Arcs out{curvatures(segments), {}};
+  Vector3 before = Vector3::Zero();
+  for (std::size_t i = 0; i < segments.size(); ++i) {
+    out.before.push_back(before);
+    before += shorter(segments[i], out.curvature[i]);
+  }
+  return out;
+}
+
+// How far the rope is from the point x of a straight link, m.
+Vector3 from_link(const Arcs& arcs, const Segment& segment, std::ptrdiff_t index, const Vector3& x) {
+  const Vector3 link = segment.b - segment.a, &curvature = arcs.curvature[index];
   const double t = std::clamp((x - segment.a).dot(link) / link.squaredNorm(), 0.0, 1.0);
-  return -0.5 * t * (1.0 - t) * link.squaredNorm() * curvature;
+  const Vector3 along = arcs.before[index] + t * shorter(segment, curvature);
+  return along - 0.5 * t * (1.0 - t) * link.squaredNorm() * curvature;
 }
 
 // A row of the least squares: how fast the distance of a point from the outline changes with the twist of its link
@@ -145,13 +173,17 @@ std::vector<LinkSums> link_sums(const PosedView& view, int camera, const Correct
     const int angles = chain.last_angle(link) + 1;
     speeds.col(link) = view.twists.leftCols(angles) * thetadot.head(angles);
   }
+  std::vector<double> down(chain.links(), 0.0);
+  for (int link = 0; fit.lying && link < chain.links(); ++link)
+    down[link] = lying_slope(chain, chain.link_lift(chain.links() - 1), link);
+  const Vector3 normal = fit.lying ? fit.lying->normal : Vector3::Zero();
   const std::vector<Segment>& segments = view.problem.views[0].segments;
-  const std::vector<Vector3> bends = curvatures(segments);
+  const Arcs arcs = arcs_of(segments);
   const auto add = [&](const OutlinePoint& p) {
     if (p.part == OutlinePoint::Part::before_grasp) return;  // the gripper's, or a cut face that is not round
     double residual = p.distance - view.mask_offset;
-    if (p.part == OutlinePoint::Part::side)
-      residual -= p.gradient.dot(sagitta(*p.segment, bends[p.segment - segments.data()], p.x));
+    if (p.part != OutlinePoint::Part::start)
+      residual -= p.gradient.dot(from_link(arcs, *p.segment, p.segment - segments.data(), p.x));
     const double weight = kEvidence * p.length * tukey_weight(residual, fit.cut);
     frame.sizes.push_back(std::abs(residual));
     sums.length += p.length;
@@ -167,7 +199,7 @@ std::vector<LinkSums> link_sums(const PosedView& view, int camera, const Correct
     PointRow row;
     row.head<3>() = p.x.cross(p.gradient);
     row.segment<3>(3) = p.gradient;
-    const SharedRow shared = shared_row(view, p, row.head<6>().dot(speeds.col(link)));
+    const SharedRow shared = shared_row(view, p, row.head<6>().dot(speeds.col(link)), normal, down[link]);
     row.tail<kSharedOfView>() = places.unit.cwiseProduct(shared);
     if (p.part == OutlinePoint::Part::start) {
       sums.start_weight += weight;

@@ -21,7 +21,8 @@ enum SharedOfView {
   kGraspRotation = 14,
   kLength = 17,
   kDiameter = 18,
-  kSharedOfView = 19
+  kTableHeight = 19,
+  kSharedOfView = 20
 };
 using SharedRow = Eigen::Matrix<double, kSharedOfView, 1>;
 
@@ -66,9 +67,16 @@ struct CorrectionProblem {
   std::vector<char> held;        // by angle
   double cut = 0.0;              // px, of Tukey's loss
   double end_reach = kEndReach;  // half widths from the chain's ends within which those of the rope are sought
+  std::optional<Lying> lying = {};
 };
 
-// `corrections`: where the shared unknowns are now; `chain`: with the rope's size there.
+// The height at which a rope lies where its grasp is shifted, m, recorded base frame, and its table is higher, m, than
+// they were given.
+double height_with(const chain::Chain& chain, const Lying& lying, const math::Vector3& grasp_shift, double table_shift);
+// How fast a link's lift changes with that height.
+double lying_slope(const chain::Chain& chain, double height, int link);
+
+// `corrections`: where the shared unknowns are now; `chain`: with the rope's size and lift there.
 FrameEquations frame_equations(const CorrectionProblem& problem, const CorrectedFrame& frame,
                                const capture::Corrections& corrections, const chain::Chain& chain,
                                const math::VectorX& theta);

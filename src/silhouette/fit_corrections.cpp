@@ -61,26 +61,30 @@ struct Layout {
   int size = 0;     // of those that are not held
 };
 
+bool bends_in_space(const chain::Chain& chain) { return chain.angles() >= chain.links(); }
+
 // Outlines say nothing of these.
 bool of_colors(const capture::CorrectedQuantity& quantity) { return quantity.group == std::string("colors"); }
 
 bool is_held(const capture::CorrectedQuantity& quantity, const capture::Capture& capture, const chain::Chain& chain,
-             int camera, const std::vector<std::string>& held) {
+             int camera, const CorrectionOptions& options) {
+  const std::vector<std::string>& held = options.held;
   const std::string group = quantity.group;
   const bool clock = group == "time", alone = static_cast<int>(capture.cameras.size()) < kLeastCameras;
   if (std::find(held.begin(), held.end(), group) != held.end()) return true;
   if (alone && !clock && quantity.name != std::string("mask_offset")) return true;
   if (clock && camera == 0) return true;  // the others count from its clock
+  if (group == "table" && !options.lying) return true;
   if (clock && camera < 0 && capture.base.samples().size() < 2) return true;
   // the first joint of a chain that bends in space takes the grasp's rotation, that of a planar one does not
-  return group == "grasp" && quantity.name == std::string("rotation") && chain.angles() >= chain.links();
+  return group == "grasp" && quantity.name == std::string("rotation") && bends_in_space(chain);
 }
 
 Layout layout_of(const capture::Capture& capture, const chain::Chain& chain, const CorrectionOptions& options) {
   Layout layout;
   const auto add = [&](const capture::CorrectedQuantity& quantity, int camera) {
     const double deviation = capture::prior_deviation(capture, camera, quantity);
-    const bool held = deviation == 0.0 || is_held(quantity, capture, chain, camera, options.held);
+    const bool held = deviation == 0.0 || is_held(quantity, capture, chain, camera, options);
     layout.columns.push_back({&quantity, camera, layout.numbers, held ? -1 : layout.size, deviation});
     layout.numbers += quantity.size;
     if (!held) layout.size += quantity.size;
@@ -199,20 +203,25 @@ chain::Chain resized(const chain::Chain& chain, double length, double diameter) 
   return out;
 }
 
-// The rope's size with these corrections. A size that is off by more than half is refused by the verdict anyway, and
-// must not become negative on the way there.
-chain::Chain resized(const chain::Chain& given, const capture::Corrections& corrections) {
+// The rope's size and lift with these corrections. A size that is off by more than half is refused by the verdict
+// anyway, and must not become negative on the way there.
+chain::Chain changed(const chain::Chain& given, const std::optional<Lying>& lying,
+                     const capture::Corrections& corrections) {
   const auto size = [&](double before, const char* quantity) {
     return std::max(kLeastSize * before, before + capture::value_of(corrections, "object", quantity));
   };
-  return resized(given, size(given.length, "length"), size(given.diameter, "diameter"));
+  chain::Chain out = resized(given, size(given.length, "length"), size(given.diameter, "diameter"));
+  if (lying)
+    out.lift = lying_down(out, height_with(out, *lying, capture::grasp_in_base(corrections).translation,
+                                           capture::value_of(corrections, "table", "height")));
+  return out;
 }
 
 std::vector<FrameEquations> all_equations(const CorrectionProblem& problem, const Layout& layout,
                                           const chain::Chain& given, const VectorX& x) {
   const int m = layout.size, n = given.angles();
   const capture::Corrections corrections = corrections_at(layout, problem.cameras, x.head(m));
-  const chain::Chain chain = resized(given, corrections);
+  const chain::Chain chain = changed(given, problem.lying, corrections);
   std::vector<FrameEquations> out(problem.frames.size());
   core::parallel_for(static_cast<std::int64_t>(out.size()), [&](std::int64_t f) {
     out[f] = frame_equations(problem, problem.frames[f], corrections, chain, x.segment(m + f * n, n));
@@ -266,18 +275,19 @@ solve::ArrowEquations arrow_of(const std::vector<FrameEquations>& frames, const 
   return arrow;
 }
 
-// The square by which residuals grow where the shared unknowns are off by `x`, and where the masks begin is free:
-// fingers hide a piece of the rope in many recordings that are right. `information`: of the outlines alone.
-double cost_of_change(const Layout& layout, const MatrixX& information, const VectorX& x) {
+// The inner product of two changes of the shared unknowns; of one with itself the square by which residuals grow. Where
+// the masks begin is free: fingers hide a piece of the rope in many recordings that are right. `information`: of the
+// outlines alone.
+double cost_of_change(const Layout& layout, const MatrixX& information, const VectorX& x, const VectorX& y) {
   std::vector<int> starts, others;
   for (const Column& column : layout.columns)
     for (int i = 0; column.first >= 0 && i < column.quantity->size; ++i)
       (is_mask_start(column) ? starts : others).push_back(column.first + i);
-  const VectorX change = x(others), pull = information(starts, others) * change;
-  const double with_starts = change.dot(MatrixX(information(others, others)) * change);
+  const double with_starts = x(others).dot(MatrixX(information(others, others)) * y(others));
   if (starts.empty()) return with_starts;
+  const VectorX pull = information(starts, others) * x(others), other_pull = information(starts, others) * y(others);
   const MatrixX own = information(starts, starts);
-  return with_starts - pull.dot(own.completeOrthogonalDecomposition().solve(pull));
+  return with_starts - pull.dot(own.completeOrthogonalDecomposition().solve(other_pull));
 }
 
 // The shared unknowns as `corrections` have them.
@@ -290,6 +300,16 @@ VectorX shared_of(const Layout& layout, const std::vector<capture::Camera>& came
     if (found && column.first >= 0) out.segment(column.first, column.quantity->size) = found->value / column.deviation;
   }
   return out;
+}
+
+// The correction of a grasp that is off by this much, m, base frame, and nothing else.
+capture::Corrections raised(const Vector3& shift) {
+  Correction c;
+  c.quantity = &capture::corrected_quantity("grasp", "translation");
+  c.subject = "grasp";
+  c.value = shift;
+  c.deviation = Vector3::Zero();
+  return {c};
 }
 
 // What the outlines alone say of the shared unknowns, whatever the angles are.
@@ -466,7 +486,8 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
                             {},
                             {},
                             kWidestCut,
-                            kWideEnd};
+                            kWideEnd,
+                            options.lying};
   problem.prior = joint_prior(chain, {});
   const int n = chain.angles(), m = layout.size;
   for (int k = 0; k < n; ++k) problem.held.push_back(chain::is_twist(chain, k));
@@ -510,10 +531,18 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
   const double squares = square_residuals(frames);
   const auto evidence_of = [&](const capture::Corrections& mended) {
     const VectorX change = x.head(m) - shared_of(layout, capture.cameras, mended);
-    return squares > 0.0 ? cost_of_change(layout, outlines, change) / squares : 0.0;
+    return squares > 0.0 ? cost_of_change(layout, outlines, change, change) / squares : 0.0;
   };
   out.evidence = evidence_of({});
   for (const capture::Corrections& mended : options.mistakes) out.evidence_after.push_back(evidence_of(mended));
+  if (options.lying) {
+    const VectorX up = shared_of(layout, capture.cameras, raised(options.lying->normal));
+    const double curvature = cost_of_change(layout, outlines, up, up);  // 0 where the grasp is held
+    if (curvature > 0.0) {
+      out.raised = cost_of_change(layout, outlines, up, x.head(m)) / curvature;
+      out.evidence_raised = evidence_of(raised(out.raised * options.lying->normal));
+    }
+  }
   out.corrections = corrections_at(layout, capture.cameras, x.head(m));
   set_states(layout, prior, covariance, out.corrections);
   out.covariance = covariance_of_numbers(layout, covariance);
@@ -523,7 +552,7 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
                                        .segment(layout.columns[i].number, layout.columns[i].quantity->size)
                                        .cwiseMax(0.0)
                                        .cwiseSqrt();
-  out.chain = resized(chain, out.corrections);
+  out.chain = changed(chain, options.lying, out.corrections);
   for (std::size_t f = 0; f < frames.size(); ++f) {
     out.time.push_back(problem.frames[f].time - capture::value_of(out.corrections, capture.cameras[0].name, "time"));
     out.theta.push_back(x.segment(m + static_cast<int>(f) * n, n));
@@ -564,7 +593,8 @@ std::vector<MatrixX> covariances_by_corrections(const chain::Chain& chain, const
                             joint_prior(chain, {}),
                             {},
                             kLargestCut,
-                            kEndReach};
+                            kEndReach,
+                            bends_in_space(chain) ? std::nullopt : lying_on_table(capture)};
   for (int k = 0; k < n; ++k) problem.held.push_back(chain::is_twist(chain, k));
   std::vector<MatrixX> out(states.time.size(), MatrixX::Zero(n, n));
   core::parallel_for(static_cast<std::int64_t>(out.size()), [&](std::int64_t k) {

@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "src/silhouette/correction_equations.h"
 #include "src/silhouette/frame.h"
 
 namespace chainsplat::silhouette {
@@ -19,28 +20,55 @@ constexpr double kFar = 0.25;                        // diameters, from which on
 // lies down depends on its fourth root only.
 constexpr double kSoftness = 0.006;
 
+// Arclength at which a rope that lies so far beside the plane of its grasp has come down to the table, m.
+double until(const chain::Chain& chain, double height) {
+  return std::pow(72.0 * kSoftness * std::pow(chain.length, 3) * std::abs(height), 0.25);
+}
+
+// Of a link's middle, as a share of `until`. The first link leaves the grasp in its plane.
+double place(const chain::Chain& chain, int link, double until) {
+  if (link == 0) return 0.0;
+  const double middle = 0.5 * (chain.link_start(link) + chain.link_end(link));
+  return middle < until ? middle / until : 1.0;
+}
+
 }  // namespace
 
 std::vector<double> lying_down(const chain::Chain& chain, double height) {
   if (height == 0.0) return {};
-  const double until = std::pow(72.0 * kSoftness * std::pow(chain.length, 3) * std::abs(height), 0.25);
   std::vector<double> out;
   for (int link = 0; link < chain.links(); ++link) {
-    const double middle = 0.5 * (chain.link_start(link) + chain.link_end(link));
-    const double x = std::min(1.0, middle / until);
-    out.push_back(link == 0 ? 0.0 : height * x * x * (6.0 - 8.0 * x + 3.0 * x * x));
+    const double x = place(chain, link, until(chain, height));
+    out.push_back(height * x * x * (6.0 - 8.0 * x + 3.0 * x * x));
   }
   return out;
 }
 
-double height_by_table(const capture::Capture& capture) {
+double lying_slope(const chain::Chain& chain, double height, int link) {
+  const double x = place(chain, link, until(chain, height));
+  return x * x * (3.0 - 2.0 * x);
+}
+
+std::optional<Lying> lying_on_table(const capture::Capture& capture) {
   constexpr double kHighest = 0.3;  // lengths of rope above the table: a rope that is held higher hangs
   constexpr double kAbove = 1.0;    // diameters that a table may be given too high
-  if (!capture.tabletop || !capture.table || capture.base.samples().empty()) return 0.0;
+  if (!capture.tabletop || !capture.table || capture.base.samples().empty()) return std::nullopt;
   const math::Pose grasp = capture.base.pose(capture.base.start());
   const double above = capture.table->normal.dot(grasp.translation - capture.table->point) - 0.5 * capture.diameter;
-  if (above > kHighest * capture.length || above < -kAbove * capture.diameter) return 0.0;
-  return -above * (grasp.rotation * capture.bending_axis).dot(capture.table->normal);
+  if (above > kHighest * capture.length || above < -kAbove * capture.diameter) return std::nullopt;
+  return Lying{-above * (grasp.rotation * capture.bending_axis).dot(capture.table->normal),
+               grasp.rotation.transpose() * capture.table->normal};
+}
+
+double height_by_table(const capture::Capture& capture) {
+  const std::optional<Lying> lying = lying_on_table(capture);
+  return lying ? lying->height : 0.0;
+}
+
+double height_with(const chain::Chain& chain, const Lying& lying, const math::Vector3& grasp_shift,
+                   double table_shift) {
+  const double up = chain.bending_axis.dot(lying.normal);  // 1, or -1 where the axis points into the table
+  return lying.height - up * (lying.normal.dot(grasp_shift) - table_shift);
 }
 
 double fit_height(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& fit, double first) {

@@ -250,7 +250,7 @@ capture::Corrections read_corrections(const Node& node) {
     }
   };
   for (const auto& [name, subject] : node["cameras"].members()) read(subject, name, true);
-  for (const char* const name : {"base", "grasp", "object"})
+  for (const char* const name : {"base", "grasp", "object", "table"})
     if (node.has(name)) read(node[name], name, false);
   return out;
 }
