@@ -2,14 +2,14 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
+
 #include "src/math/decompositions.h"
+#include "src/splat/color_model.h"
 
 namespace chainsplat::recognition {
 
 namespace {
 
-constexpr double kColorNoise = 0.04;  // intensity below which a residual counts as noise (quadratic), above: absolute
 constexpr double kGradientFloor = 1e-4;  // squared image gradient below which a pixel says nothing
 
 // Depth of the drawn surface, spread a few pixels over the silhouette's edge, where there is gradient but no depth:
@@ -61,17 +61,6 @@ std::vector<float> spread_depth(const splat::Picture& picture) {
   return depth;
 }
 
-// Charbonnier-like: quadratic below kColorNoise, absolute above; returns the weight, adds to the cost.
-double robust(double residual, double& cost) {
-  const double size = std::abs(residual);
-  if (size <= kColorNoise) {
-    cost += 0.5 * residual * residual / kColorNoise;
-    return 1.0 / kColorNoise;
-  }
-  cost += size - 0.5 * kColorNoise;
-  return 1.0 / size;
-}
-
 }  // namespace
 
 LinkEquations link_equations(const chain::Chain& chain, const capture::Camera& camera, const capture::View& view,
@@ -82,12 +71,7 @@ LinkEquations link_equations(const chain::Chain& chain, const capture::Camera& c
   out.right.assign(chain.links(), math::Vector6::Zero());
   const int w = picture.width, h = picture.height;
   const std::vector<float> depth = spread_depth(picture);
-  const math::Pose camera_from_world = camera.world_from_camera.inverse();
-  std::vector<math::Vector3> start(chain.links()), along(chain.links());
-  for (int j = 0; j < chain.links(); ++j) {
-    start[j] = motions[j] * (chain.link_start(j) * chain.direction);
-    along[j] = motions[j].rotation * chain.direction;
-  }
+  const splat::LinkAxes axes = splat::link_axes(chain, motions);
   const float* shown = picture.rgba.data();
   const std::uint8_t* wanted = view.rgba.data();
   constexpr float kByte = 1.0f / 255.0f;
@@ -101,11 +85,10 @@ LinkEquations link_equations(const chain::Chain& chain, const capture::Camera& c
       double gxx = 0, gxy = 0, gyy = 0;
       const bool border = x == 0 || y == 0 || x == w - 1 || y == h - 1;
       for (int c = 0; c < 4; ++c) {
-        const double scale = c == 3 ? mask_weight : 1.0;
+        const double scale = (c == 3 ? mask_weight : 1.0) / shared::kColorNoise;  // large residuals count as they are
         const double residual = shown[4 * k + c] - wanted[4 * k + c] * kByte;
-        double cost = 0.0;
-        const double weight = scale * robust(residual, cost);
-        out.cost += scale * cost;
+        const double weight = scale * splat::color_weight(residual);
+        out.cost += scale * splat::color_loss(residual);
         if (border) continue;
         const double gx = 0.25 * (shown[4 * (k + 1) + c] - shown[4 * (k - 1) + c] +
                                   kByte * (wanted[4 * (k + 1) + c] - wanted[4 * (k - 1) + c]));
@@ -117,29 +100,9 @@ LinkEquations link_equations(const chain::Chain& chain, const capture::Camera& c
         right += weight * residual * math::Vector2(gx, gy);
       }
       if (border || gxx + gyy < kGradientFloor || depth[k] <= 0) continue;
-      // surface point and its link
-      const double z = depth[k];
-      const math::Vector3 xc((view.x0 + x + 0.5 - camera.cx) / camera.fx * z,
-                             (view.y0 + y + 0.5 - camera.cy) / camera.fy * z, z);
-      const math::Vector3 xw = camera.world_from_camera * xc;
-      int link = 1;
-      double nearest = std::numeric_limits<double>::infinity();
-      for (int j = 1; j < chain.links(); ++j) {
-        const math::Vector3 from = xw - start[j];
-        const double s = std::clamp(from.dot(along[j]), 0.0, chain.link_end(j) - chain.link_start(j));
-        const double distance = (from - s * along[j]).squaredNorm();
-        if (distance < nearest) {
-          nearest = distance;
-          link = j;
-        }
-      }
-      // flow = P [w; v], P = dpi/dx R_cw [-[x], I]
-      Eigen::Matrix<double, 2, 3> projection;
-      projection << camera.fx / z, 0, -camera.fx * xc.x() / (z * z), 0, camera.fy / z, -camera.fy * xc.y() / (z * z);
-      const Eigen::Matrix<double, 2, 3> by_point = projection * camera_from_world.rotation;
-      Eigen::Matrix<double, 2, 6> flow;
-      flow.leftCols<3>() = -by_point * math::hat(xw);
-      flow.rightCols<3>() = by_point;
+      const math::Vector3 point = splat::surface_point(camera, view.x0 + x + 0.5, view.y0 + y + 0.5, depth[k]);
+      const int link = splat::nearest_link(axes, camera.world_from_camera * point);
+      const Eigen::Matrix<double, 2, 6> flow = splat::pixel_motion(camera, point);
       Eigen::Matrix2d gradient;
       gradient << gxx, gxy, gxy, gyy;
       // dI^/dxi = -grad . flow
