@@ -36,7 +36,7 @@ capture::Capture with_late_base(double late) {
 
 TEST_CASE("nothing is found wrong with a recording that is right") {
   const silhouette::CorrectionFit found = fit(demo());
-  CHECK(found.evidence < 0.2);
+  CHECK(found.evidence < 0.1);
   CHECK(std::abs(capture::value_of(found.corrections, "base", "time")) < 2e-3);
   CHECK(std::abs(capture::value_of(found.corrections, "object", "length")) < 0.005 * demo().length);
   for (const silhouette::OutlineMisfit& misfit : found.misfits) {
