@@ -254,8 +254,8 @@ capture::Corrections shifted_images(const capture::Capture& given, double shift)
   return out;
 }
 
-// A grasp that is given too high or too low above its table, by so much of the correction `fit.raised` that it is sure,
-// and by nothing else that is: its standard deviation, m.
+// The standard deviation, m, of the shift `fit.raised` of a grasp that is given too high or too low above its table; none
+// where the shift is not sure, or something else is wrong beside it.
 std::optional<double> raised_alone(const silhouette::CorrectionFit& fit,
                                    const std::optional<silhouette::Lying>& lying) {
   if (!lying || fit.evidence_raised >= kNothingWrongOnTable) return std::nullopt;
@@ -265,8 +265,10 @@ std::optional<double> raised_alone(const silhouette::CorrectionFit& fit,
   return deviation;
 }
 
-// Makes that the only correction. Nothing tells how far such a grasp is off within the table's plane: as far.
-void raise(const silhouette::CorrectionFit& fit, const math::Vector3& normal, double deviation, Corrected& out) {
+// Makes that shift the only correction. Within the table's plane nothing tells how far such a grasp is off: it may be as
+// far as across it.
+void correct_height_alone(const silhouette::CorrectionFit& fit, const math::Vector3& normal, double deviation,
+                          Corrected& out) {
   const math::Matrix3 along = normal * normal.transpose();
   const math::Matrix3 covariance =
       deviation * deviation * along + fit.raised * fit.raised * (math::Matrix3::Identity() - along);
@@ -297,7 +299,7 @@ bool decide(silhouette::CorrectionFit& fit, const silhouette::CorrectionOptions&
     return false;
   }
   for (capture::Correction& correction : out.corrections) correction.value.setZero();
-  if (raised) raise(fit, options.lying->normal, *raised, out);
+  if (raised) correct_height_alone(fit, options.lying->normal, *raised, out);
   if (!half_pixel) return false;
   const std::size_t which = least - fit.evidence_after.begin();
   for (capture::Correction& correction : out.corrections)

@@ -108,7 +108,8 @@ void add_recognition_options(Command command, TrainRequest& request) {
       .type_name("MODE");
   command
       .add_option("--fixed", options.fixed,
-                  "Take as given what is else corrected: cameras,focal,time,length,diameter,grasp,table,masks,colors, or all")
+                  "Take as given what is else corrected, with commas: cameras, focal, time, length, diameter, grasp, "
+                  "table, masks, colors, or all")
       .delimiter(',')
       .type_name("LIST");
   command
