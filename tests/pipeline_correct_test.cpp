@@ -167,6 +167,11 @@ TEST_CASE("a grasp that is given too high above its table is lowered, and one th
     CHECK(capture::find(nothing.corrections, "grasp", "translation")->value.isZero(0.0));
     CHECK(!finding(nothing.verdict, "grasp", "table"));
   }
+  capture::Capture low = lying(0.0);  // a table that is given far too low, where the rope does not lie
+  low.table->point -= 0.01 * low.table->normal;
+  const pipeline::Corrected below = pipeline::correct(low, {}, false);
+  for (const capture::Correction& correction : below.corrections) CHECK(correction.value.isZero(0.0));
+
   capture::Capture high = lying(0.0);
   const std::vector<capture::Camera> given = high.cameras;
   std::vector<trajectory::Sample> samples = high.base.samples();

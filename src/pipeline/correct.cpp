@@ -399,18 +399,19 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
                            "cameras are not in one world, or not all in meters"});
     return out;
   }
+  silhouette::CorrectionOptions options;
+  options.lying = silhouette::lying_on_table(capture);
   if (const double table = silhouette::height_by_table(capture); std::abs(table) > high(capture)) {
     const double seen = silhouette::fit_height(chain, capture, sequence, table);
     if (std::abs(seen) > high(capture)) {
       out.verdict.push_back(held_high(std::abs(seen)));
       return out;
     }
-    chain.lift = silhouette::lying_down(chain, seen);  // the table is given too low
+    options.lying->height = seen;  // the table is given too low
+    chain.lift = silhouette::lying_down(chain, seen);
     sequence = silhouette::fit_sequence(chain, capture);
   }
-  silhouette::CorrectionOptions options;
   options.held = fixed;
-  options.lying = silhouette::lying_on_table(capture);
   for (const double shift : kShifts) options.mistakes.push_back(shifted_images(capture, shift));
   silhouette::CorrectionFit fit = silhouette::fit_corrections(chain, capture, sequence, options);
   tell_fit("correct", fit.summary);
