@@ -103,8 +103,9 @@ struct Lying {
 std::optional<Lying> lying_on_table(const capture::Capture& capture);
 // Its height, 0 where there is none.
 double height_by_table(const capture::Capture& capture);
-// Chain::lift of a chain that lies so far beside it: it goes there as a heavy rod does.
-std::vector<double> lying_down(const chain::Chain& chain, double height);
+// Chain::lift of a chain that lies so far beside it: it goes there as a heavy rod does. `reach`: the arclength
+// until there, as a share of that of a rope of usual stiffness.
+std::vector<double> lying_down(const chain::Chain& chain, double height, double reach = 1.0);
 
 // --- what the recording was given wrongly ----------------------------------------------------------------------------
 

@@ -55,6 +55,10 @@ constexpr double kFold = 2.4;      // rad over two joints: no rope bends so far 
 constexpr double kLightest = 15.0, kHeaviest = 20000.0;  // kg/m^3; foam and tungsten
 constexpr double kFartherThanAny = 0.15;                 // share of the length by which no ruler is wrong
 
+bool is_fixed(const std::vector<std::string>& fixed, const char* group) {
+  return std::find(fixed.begin(), fixed.end(), group) != fixed.end();
+}
+
 std::string text(const char* format, ...) __attribute__((format(printf, 1, 2)));
 std::string text(const char* format, ...) {
   char line[256];
@@ -316,8 +320,7 @@ bool decide(silhouette::CorrectionFit& fit, const silhouette::CorrectionOptions&
 // already.
 void correct_colors(const silhouette::CorrectionFit& fit, const std::vector<std::string>& fixed,
                     capture::Capture& capture, Corrected& out) {
-  const bool held = std::find(fixed.begin(), fixed.end(), "colors") != fixed.end();
-  const bool varied = capture.cameras.size() > 1 && !held;
+  const bool varied = capture.cameras.size() > 1 && !is_fixed(fixed, "colors");
   silhouette::CameraColors colors;
   if (varied) colors = silhouette::fit_camera_colors(fit.chain, capture, {fit.time, fit.theta, {}, {}});
   bool differ = false;
@@ -367,9 +370,77 @@ void judge_height(const capture::Corrections& found, const capture::Capture& cap
 
 Finding held_high(double above) {
   return {"held-high", "object", kMeters * above, 0.0, "mm", false, false, false, -1,
-          text("the rope is held %.0f mm above where it lies on the table: how it comes down is assumed, and nothing that "
-               "was given could be checked: do not trust it to a few millimeters",
+          text("the rope is held %.0f mm above where it lies on the table: how it comes down is known roughly, and nothing "
+               "that was given could be checked: do not trust it to a few millimeters",
                kMeters * above)};
+}
+
+capture::Capture with(const capture::Correction& correction, const capture::Capture& given) {
+  capture::Capture out = given;
+  capture::apply({correction}, out);
+  return out;
+}
+
+capture::Correction shift_of(const char* subject, const char* name, const math::VectorX& value) {
+  capture::Correction shift;
+  shift.quantity = &capture::corrected_quantity(subject, name);
+  shift.subject = subject;
+  shift.value = value;
+  return shift;
+}
+
+// How the rope and its table may be, and all corrections where they are so.
+struct Hypothesis {
+  std::optional<capture::Correction> shift;  // of table or grasp, where one of them was given wrong by much
+  std::optional<silhouette::Lying> lying;    // after it
+  silhouette::CorrectionFit fit;
+};
+
+Hypothesis supposing(const capture::Capture& given, const chain::Chain& chain, silhouette::CorrectionOptions options,
+                     std::optional<capture::Correction> shift) {
+  const capture::Capture capture = shift ? with(*shift, given) : given;
+  silhouette::CorrectionFit fit =
+      silhouette::fit_corrections(chain, capture, silhouette::fit_sequence(chain, capture), options);
+  return {std::move(shift), std::move(options.lying), std::move(fit)};
+}
+
+// A rope that lies far beside the plane of its grasp, by table and grasp, is held so, or one of the two was given wrong by
+// as much. Outlines tell: where the table was, the rope is flat and in that plane; where the grasp was, it is flat beside
+// it; else it comes down as a rod of some stiffness does. They are judged by what is left with all corrections, since
+// wrong cameras hide the difference. None: it is held so, or may be. `sequence` is fitted to `chain`.
+constexpr std::array kReaches = {0.3, 0.5, 0.8, 1.25, 2.0};  // of ropes from 1 % to 16 times as stiff as usual
+constexpr double kClearly = 0.6;  // of the cost that is left with the rope held so; found: 0.26 to 0.42, or 0.88 and more
+std::optional<Hypothesis> misplaced(const capture::Capture& capture, const chain::Chain& chain,
+                                    const silhouette::SequenceFit& sequence,
+                                    const silhouette::CorrectionOptions& options) {
+  if (capture.cameras.size() < 2) return std::nullopt;  // one sees it as turns of the joints
+  const double height = options.lying->height, up = chain.bending_axis.dot(options.lying->normal);
+  chain::Chain held = chain;
+  silhouette::CorrectionOptions as_held = options;
+  as_held.lying.reset();  // its lift stays as it is
+  double cost = INFINITY;
+  for (const double reach : kReaches) {
+    held.lift = silhouette::lying_down(chain, height, reach);
+    cost = std::min(cost, supposing(capture, held, as_held, std::nullopt).fit.summary.final_cost);
+  }
+
+  chain::Chain flat = chain;
+  silhouette::CorrectionOptions as_flat = options;
+  std::optional<Hypothesis> best;
+  const auto consider = [&](const capture::Correction& shift) {
+    flat.lift = silhouette::lying_down(chain, as_flat.lying->height);
+    Hypothesis other = supposing(capture, flat, as_flat, shift);
+    if (other.fit.summary.final_cost < (best ? best->fit.summary.final_cost : kClearly * cost)) best = std::move(other);
+  };
+  if (!is_fixed(options.held, "table")) {
+    as_flat.lying->height = silhouette::fit_height(chain, capture, sequence, 0.0);
+    consider(shift_of("table", "height", math::VectorX::Constant(1, up * (as_flat.lying->height - height))));
+  }
+  if (!is_fixed(options.held, "grasp")) {
+    as_flat.lying->height = 0.0;
+    consider(shift_of("grasp", "translation", up * height * options.lying->normal));
+  }
+  return best;
 }
 
 }  // namespace
@@ -401,21 +472,26 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   }
   silhouette::CorrectionOptions options;
   options.lying = silhouette::lying_on_table(capture);
-  if (const double table = silhouette::height_by_table(capture); std::abs(table) > high(capture)) {
-    const double seen = silhouette::fit_height(chain, capture, sequence, table);
-    if (std::abs(seen) > high(capture)) {
-      out.verdict.push_back(held_high(std::abs(seen)));
+  options.held = fixed;
+  for (const double pixels : kShifts) options.mistakes.push_back(shifted_images(capture, pixels));
+  std::optional<Hypothesis> found;
+  if (options.lying && std::abs(options.lying->height) > high(capture)) {
+    found = misplaced(capture, chain, sequence, options);
+    if (!found) {
+      out.verdict.push_back(held_high(std::abs(options.lying->height)));
       return out;
     }
-    options.lying->height = seen;  // the table is given too low
-    chain.lift = silhouette::lying_down(chain, seen);
-    sequence = silhouette::fit_sequence(chain, capture);
   }
-  options.held = fixed;
-  for (const double shift : kShifts) options.mistakes.push_back(shifted_images(capture, shift));
-  silhouette::CorrectionFit fit = silhouette::fit_corrections(chain, capture, sequence, options);
+  if (!found) found = Hypothesis{std::nullopt, options.lying, silhouette::fit_corrections(chain, capture, sequence, options)};
+  options.lying = found->lying;
+  silhouette::CorrectionFit& fit = found->fit;
   tell_fit("correct", fit.summary);
-  const bool half_pixel = decide(fit, options, nothing_wrong(capture), out);
+  const auto& shift = found->shift;
+  const bool regrasped = shift && shift->subject == "grasp";
+  const bool half_pixel = decide(fit, options, regrasped ? 0.0 : nothing_wrong(capture), out);
+  if (shift)
+    for (capture::Correction& correction : out.corrections)
+      if (correction.subject == shift->subject && correction.quantity == shift->quantity) correction.value += shift->value;
   judge_clocks(out.corrections, capture, out.verdict);
   if (!half_pixel) judge_cameras(out.corrections, capture, out.verdict);
   judge_rope(out.corrections, capture, out.verdict);

@@ -21,8 +21,8 @@ constexpr double kFar = 0.25;                        // diameters, from which on
 constexpr double kSoftness = 0.006;
 
 // Arclength at which a rope that lies so far beside the plane of its grasp has come down to the table, m.
-double until(const chain::Chain& chain, double height) {
-  return std::pow(72.0 * kSoftness * std::pow(chain.length, 3) * std::abs(height), 0.25);
+double until(const chain::Chain& chain, double height, double reach = 1.0) {
+  return reach * std::pow(72.0 * kSoftness * std::pow(chain.length, 3) * std::abs(height), 0.25);
 }
 
 // Of a link's middle, as a share of `until`. The first link leaves the grasp in its plane.
@@ -34,11 +34,11 @@ double place(const chain::Chain& chain, int link, double until) {
 
 }  // namespace
 
-std::vector<double> lying_down(const chain::Chain& chain, double height) {
+std::vector<double> lying_down(const chain::Chain& chain, double height, double reach) {
   if (height == 0.0) return {};
   std::vector<double> out;
   for (int link = 0; link < chain.links(); ++link) {
-    const double x = place(chain, link, until(chain, height));
+    const double x = place(chain, link, until(chain, height, reach));
     out.push_back(height * x * x * (6.0 - 8.0 * x + 3.0 * x * x));
   }
   return out;
