@@ -194,6 +194,38 @@ TEST_CASE("a rope held high above its table, a grasp given so high and a table g
     CHECK((correction.subject == "table" || correction.value.isZero(0.0)));
 }
 
+TEST_CASE("frames that cameras lost are named, and their clocks go on where they were") {
+  capture::Capture right = demo();
+  pipeline::correct(right, {}, false);
+  const std::vector<std::vector<double>> times = right.times;
+  capture::Capture capture = demo();
+  const double interval = capture::frame_interval(capture, 1);
+  const std::vector<std::pair<int, int>> lost = {{1, 20}, {2, 35}};  // camera, frame
+  for (const auto& [camera, frame] : lost) {
+    for (std::size_t f = frame; f < capture.times[camera].size(); ++f) capture.times[camera][f] -= interval;
+    for (capture::PackedView& view : capture.views)
+      if (view.camera == camera && view.frame >= frame) view.time -= interval;
+  }
+  const std::vector<std::vector<double>> given = capture.times;
+  const pipeline::Corrected found = pipeline::correct(capture, {}, false);
+  for (const auto& [camera, frame] : lost) {
+    const capture::Finding* const said = finding(found.verdict, "lost-frames", capture.cameras[camera].name);
+    REQUIRE(said);
+    CHECK(said->value == 1.0);
+    CHECK(std::abs(said->frame - frame) <= 2);
+    CHECK(capture.times[camera].back() == doctest::Approx(times[camera].back()).epsilon(1e-3));
+  }
+  CHECK(!finding(found.verdict, "lost-frames", capture.cameras[0].name));
+  // what a twin carries does the same to the recording, and nothing to another one
+  for (const bool same : {true, false}) {
+    capture::Capture again = demo();
+    again.times = given;
+    if (!same) ++again.hash;
+    capture::apply(found.corrections, again);
+    CHECK((again.times[1].back() == capture.times[1].back()) == same);
+  }
+}
+
 TEST_CASE("where the grasp is to be taken as given, one that is above the table is named") {
   for (const double high : {0.0, 0.0025}) {  // m
     capture::Capture capture = on_table(-high);

@@ -107,6 +107,7 @@ struct Capture {
 double moment_reach(const std::vector<double>& moments);  // s, that half; infinite for a single moment
 // By moment the index of its frame among those at `times`, -1: none. `moments` increase; all in s.
 std::vector<int> frames_at(const std::vector<double>& moments, const std::vector<double>& times, double reach);
+double frame_interval(const Capture& capture, int camera);  // s, the median; 0 of a single frame
 // By moment the indices of its views in Capture::views, camera by camera.
 std::vector<std::vector<int>> views_at(const Capture& capture, const std::vector<double>& moments);
 

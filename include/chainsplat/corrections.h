@@ -30,6 +30,12 @@ struct CorrectedQuantity {
 // how far from the grasp along the rope its masks begin; gain, bias: recorded = (1 + gain) color + bias of red, green
 // and blue, colors in 0..1.
 const std::vector<CorrectedQuantity>& corrected_quantities();
+// Frames of a camera, as its video counts them, before each of which it lost one: a number may stand there several
+// times. The stamps of those after it are early by a frame. Known of one recording, which Correction::calibration names
+// then.
+const CorrectedQuantity& lost_frames();
+// A name of a recording, by its hash.
+std::string recording_text(const Capture& capture);
 // The one of this name; `subject` as in CorrectedQuantity.
 const CorrectedQuantity& corrected_quantity(const std::string& subject, const std::string& name);
 // Its standard deviation before anything was seen, in its unit: what the capture says, or else what a careful
@@ -74,6 +80,8 @@ const Correction* find(const Corrections& corrections, const std::string& subjec
 // The first number of a correction, 0 where there is none.
 double value_of(const Corrections& corrections, const std::string& subject, const std::string& quantity);
 
+// Makes a camera's stamps later by a frame from each of these frames on.
+void restore_lost(const math::VectorX& frames, int camera, Capture& capture);
 // Mends poses, focal lengths and colors of the cameras, the times of cameras and views, the base's motion, and the
 // rope's length and diameter. A base whose samples then end before the last frame (or begin after the first) is
 // continued with its last velocity and acceleration. Views keep their pixels. Cameras without corrections stay as they

@@ -109,6 +109,16 @@ std::vector<double> lying_down(const chain::Chain& chain, double height, double 
 
 // --- what the recording was given wrongly ----------------------------------------------------------------------------
 
+// A camera lost a frame before this one of its frames: its stamps, which count frames, are early by a frame from there
+// on.
+struct LostFrame {
+  int camera = 0, frame = 0;
+};
+// The first one that outlines show, as a jump of the camera's clock against the base's and the other cameras'.
+// `sequence` is fitted to `chain`. Mathematics.md 6.14.
+std::optional<LostFrame> first_lost_frame(const chain::Chain& chain, const capture::Capture& capture,
+                                          const SequenceFit& sequence);
+
 struct CorrectionOptions {
   std::vector<std::string> held = {};  // groups of corrected_quantities() that are not varied
   int frames = 75;                     // at most, spread over the recording

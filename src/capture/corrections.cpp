@@ -39,6 +39,17 @@ const std::vector<CorrectedQuantity>& corrected_quantities() {
   return quantities;
 }
 
+const CorrectedQuantity& lost_frames() {
+  static const CorrectedQuantity quantity = {"camera", "lost_frames", "time", "1", 0, 0.0, 0.0, kMostFrames};
+  return quantity;
+}
+
+std::string recording_text(const Capture& capture) {
+  char text[17];
+  std::snprintf(text, sizeof text, "%016llx", static_cast<unsigned long long>(capture.hash));
+  return text;
+}
+
 const CorrectedQuantity& corrected_quantity(const std::string& subject, const std::string& name) {
   const auto& all = corrected_quantities();
   const auto at =
@@ -131,11 +142,22 @@ trajectory::Trajectory corrected(const Corrections& corrections, const trajector
   return trajectory::fit(std::move(samples), "the corrected base");
 }
 
+void restore_lost(const VectorX& frames, int camera, Capture& capture) {
+  const double interval = frame_interval(capture, camera);
+  const auto later = [&](int frame) { return interval * static_cast<double>((frames.array() <= frame).count()); };
+  std::vector<double>& times = capture.times[camera];
+  for (std::size_t f = 0; f < times.size(); ++f) times[f] += later(static_cast<int>(f));
+  for (PackedView& view : capture.views)
+    if (view.camera == camera) view.time += later(view.frame);
+}
+
 void apply(const Corrections& corrections, Capture& capture) {
   if (std::all_of(corrections.begin(), corrections.end(), [](const Correction& c) { return c.value.isZero(0.0); }))
     return;
   double first = 1e300, last = -1e300;
   for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
+    const Correction* const lost = find(corrections, capture.cameras[c].name, lost_frames().name);
+    if (lost && lost->calibration == recording_text(capture)) restore_lost(lost->value, static_cast<int>(c), capture);
     const double late = value_of(corrections, capture.cameras[c].name, "time");
     if (late != 0.0) {
       for (double& time : capture.times[c]) time -= late;

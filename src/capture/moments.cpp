@@ -13,6 +13,14 @@ double moment_reach(const std::vector<double>& moments) {
   return 0.5 * kRounding * (moments.back() - moments.front()) / static_cast<double>(moments.size() - 1);
 }
 
+double frame_interval(const Capture& capture, int camera) {
+  const std::vector<double>& times = capture.times[camera];
+  if (times.size() < 2) return 0.0;
+  std::vector<double> intervals;
+  for (std::size_t f = 1; f < times.size(); ++f) intervals.push_back(times[f] - times[f - 1]);
+  return math::median(intervals);
+}
+
 std::vector<int> frames_at(const std::vector<double>& moments, const std::vector<double>& times, double reach) {
   std::vector<int> nearest(moments.size(), -1);
   for (std::size_t f = 0; f < times.size(); ++f) {

@@ -354,6 +354,46 @@ void correct_colors(const silhouette::CorrectionFit& fit, const std::vector<std:
 // above it, cameras were found to be off by 10 degrees. Faults of base and grasp alone are less.
 double high(const capture::Capture& capture) { return std::max(0.25 * capture.diameter, 0.005); }
 
+// Restores frames that cameras lost, one after the other, and fits `sequence` again after each. Beyond kMostLost the
+// recording is left as it is by then.
+constexpr int kMostLost = 30;           // of all cameras
+constexpr Eigen::Index kSurelyLost = 2;  // of one camera: among more, the places of some are off by a few frames
+capture::Corrections restore_lost_frames(const chain::Chain& chain, const std::vector<std::string>& fixed,
+                                         capture::Capture& capture, silhouette::SequenceFit& sequence,
+                                         std::vector<Finding>& verdict) {
+  std::vector<std::vector<double>> lost(capture.cameras.size());
+  if (is_fixed(fixed, "time") || capture.cameras.size() < 2) return {};
+  for (int count = 0; count < kMostLost; ++count) {
+    const auto one = silhouette::first_lost_frame(chain, capture, sequence);
+    if (!one) break;
+    lost[one->camera].push_back(one->frame);
+    capture::restore_lost(math::VectorX::Constant(1, one->frame), one->camera, capture);
+    sequence = silhouette::fit_sequence(chain, capture);
+  }
+  capture::Corrections out;
+  for (std::size_t c = 0; c < lost.size(); ++c) {
+    if (lost[c].empty()) continue;
+    std::sort(lost[c].begin(), lost[c].end());
+    capture::Correction correction;
+    correction.quantity = &capture::lost_frames();
+    correction.subject = capture.cameras[c].name;
+    correction.value = Eigen::Map<math::VectorX>(lost[c].data(), static_cast<Eigen::Index>(lost[c].size()));
+    correction.deviation = math::VectorX::Zero(correction.value.size());
+    correction.calibration = capture::recording_text(capture);
+    const auto count = correction.value.size();
+    const int first = static_cast<int>(lost[c].front());
+    const bool sure = count <= kSurelyLost;
+    verdict.push_back({"lost-frames", correction.subject, static_cast<double>(count), 0.0, "frames", true, sure, false,
+                       first,
+                       correction.subject + text(" lost %s before frame %d, so that its stamps are early from there on: "
+                                                 "corrected; give the stamps of its frames (`timestamps`)%s",
+                                                 count == 1 ? "a frame" : text("%d frames, one", int(count)).c_str(),
+                                                 first, sure ? "" : "; of so many some places are off, do not trust it")});
+    out.push_back(std::move(correction));
+  }
+  return out;
+}
+
 // A rope that is held a little above its table looks like one whose grasp, or table, is given wrong by as much, where
 // one camera alone sees how it comes down or the grasp is to be taken as given.
 constexpr double kAboveTable = 0.001;  // m, from which on that is said
@@ -470,6 +510,7 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
                            "cameras are not in one world, or not all in meters"});
     return out;
   }
+  capture::Corrections lost = restore_lost_frames(chain, fixed, capture, sequence, out.verdict);
   silhouette::CorrectionOptions options;
   options.lying = silhouette::lying_on_table(capture);
   options.held = fixed;
@@ -479,6 +520,7 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
     found = misplaced(capture, chain, sequence, options);
     if (!found) {
       out.verdict.push_back(held_high(std::abs(options.lying->height)));
+      out.corrections = std::move(lost);
       return out;
     }
   }
@@ -500,6 +542,7 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   capture::apply(out.corrections, capture);
   judge_height(out.corrections, capture, out.verdict);
   correct_colors(fit, fixed, capture, out);
+  out.corrections.insert(out.corrections.end(), lost.begin(), lost.end());
   return out;
 }
 

@@ -567,7 +567,7 @@ std::vector<MatrixX> covariances_by_corrections(const chain::Chain& chain, const
   const int cameras = static_cast<int>(capture.cameras.size()), n = chain.angles();
   Layout layout;
   for (const Correction& c : corrections) {
-    if (of_colors(*c.quantity)) continue;
+    if (of_colors(*c.quantity) || c.quantity == &capture::lost_frames()) continue;
     int camera = -1;
     for (int i = 0; i < cameras; ++i)
       if (capture.cameras[i].name == c.subject && c.quantity->subject == std::string("camera")) camera = i;

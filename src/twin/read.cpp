@@ -248,6 +248,20 @@ capture::Corrections read_corrections(const Node& node) {
       if (camera && subject.has("calibration")) c.calibration = subject["calibration"].text();
       out.push_back(std::move(c));
     }
+    const capture::CorrectedQuantity& lost = capture::lost_frames();
+    if (!camera || !subject.has(lost.name)) return;
+    const Node leaf = subject[lost.name];
+    capture::Correction c;
+    c.quantity = &lost;
+    c.subject = name;
+    std::vector<double> frames;
+    for (const Node& frame : leaf["value"].entries()) frames.push_back(frame.number());
+    c.value = Eigen::Map<math::VectorX>(frames.data(), static_cast<Eigen::Index>(frames.size()));
+    c.deviation = math::VectorX::Zero(c.value.size());
+    c.calibration = leaf["recording"].text();
+    if (c.value.size() == 0 || c.value.minCoeff() < 1.0 || c.value.maxCoeff() > lost.most)
+      leaf["value"].fail("is no list of frames from 1 on", "train again");
+    out.push_back(std::move(c));
   };
   for (const auto& [name, subject] : node["cameras"].members()) read(subject, name, true);
   for (const char* const name : {"base", "grasp", "object", "table"})

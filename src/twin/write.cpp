@@ -89,6 +89,10 @@ nlohmann::ordered_json to_json(const capture::Corrections& corrections) {
   for (const capture::Correction& c : corrections) {
     const bool camera = std::string(c.quantity->subject) == "camera";
     Json& subject = camera ? out["cameras"][c.subject] : out[c.subject];
+    if (c.quantity == &capture::lost_frames()) {
+      subject[c.quantity->name] = {{"value", list(c.value)}, {"recording", c.calibration}};
+      continue;
+    }
     const auto numbers = [](const math::VectorX& v) { return v.size() == 1 ? Json(v[0]) : list(v); };
     subject[c.quantity->name] = {
         {"value", numbers(c.value)}, {"sigma", numbers(c.deviation)}, {"state", capture::name(c.state)}};
