@@ -383,12 +383,12 @@ capture::Corrections restore_lost_frames(const chain::Chain& chain, const std::v
     const auto count = correction.value.size();
     const int first = static_cast<int>(lost[c].front());
     const bool sure = count <= kSurelyLost;
-    verdict.push_back({"lost-frames", correction.subject, static_cast<double>(count), 0.0, "frames", true, sure, false,
-                       first,
-                       correction.subject + text(" lost %s before frame %d, so that its stamps are early from there on: "
-                                                 "corrected; give the stamps of its frames (`timestamps`)%s",
-                                                 count == 1 ? "a frame" : text("%d frames, one", int(count)).c_str(),
-                                                 first, sure ? "" : "; of so many some places are off, do not trust it")});
+    verdict.push_back(
+        {"lost-frames", correction.subject, static_cast<double>(count), 0.0, "frames", true, sure, false, first,
+         correction.subject + text(" lost %s before frame %d, so that its stamps are early from there on: "
+                                   "corrected; give the stamps of its frames (`timestamps`)%s",
+                                   count == 1 ? "a frame" : text("%d frames, one", int(count)).c_str(), first,
+                                   sure ? "" : "; of so many some places are off, do not trust it")});
     out.push_back(std::move(correction));
   }
   return out;
@@ -409,10 +409,19 @@ void judge_height(const capture::Corrections& found, const capture::Capture& cap
 }
 
 Finding held_high(double above) {
-  return {"held-high", "object", kMeters * above, 0.0, "mm", false, false, false, -1,
-          text("the rope is held %.0f mm above where it lies on the table: how it comes down is known roughly, and nothing "
-               "that was given could be checked: do not trust it to a few millimeters",
-               kMeters * above)};
+  return {
+      "held-high",
+      "object",
+      kMeters * above,
+      0.0,
+      "mm",
+      false,
+      false,
+      false,
+      -1,
+      text("the rope is held %.0f mm above where it lies on the table: how it comes down is known roughly, and nothing "
+           "that was given could be checked: do not trust it to a few millimeters",
+           kMeters * above)};
 }
 
 capture::Capture with(const capture::Correction& correction, const capture::Capture& given) {
@@ -524,7 +533,8 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
       return out;
     }
   }
-  if (!found) found = Hypothesis{std::nullopt, options.lying, silhouette::fit_corrections(chain, capture, sequence, options)};
+  if (!found)
+    found = Hypothesis{std::nullopt, options.lying, silhouette::fit_corrections(chain, capture, sequence, options)};
   options.lying = found->lying;
   silhouette::CorrectionFit& fit = found->fit;
   tell_fit("correct", fit.summary);
