@@ -357,7 +357,7 @@ double high(const capture::Capture& capture) { return std::max(0.25 * capture.di
 // Restores frames that cameras lost, one after the other, and fits `sequence` again after each. Beyond kMostLost the
 // recording is left as it is by then.
 constexpr int kMostLost = 30;           // of all cameras
-constexpr Eigen::Index kSurelyLost = 2;  // of one camera: among more, the places of some are off by a few frames
+constexpr Eigen::Index kSurelyLost = 1;  // of one camera: where it lost more, some are missed or a few frames off
 capture::Corrections restore_lost_frames(const chain::Chain& chain, const std::vector<std::string>& fixed,
                                          capture::Capture& capture, silhouette::SequenceFit& sequence,
                                          std::vector<Finding>& verdict) {
@@ -388,7 +388,7 @@ capture::Corrections restore_lost_frames(const chain::Chain& chain, const std::v
          correction.subject + text(" lost %s before frame %d, so that its stamps are early from there on: "
                                    "corrected; give the stamps of its frames (`timestamps`)%s",
                                    count == 1 ? "a frame" : text("%d frames, one", int(count)).c_str(), first,
-                                   sure ? "" : "; of so many some places are off, do not trust it")});
+                                   sure ? "" : "; some may be missed, do not trust it")});
     out.push_back(std::move(correction));
   }
   return out;
