@@ -131,6 +131,12 @@ TEST_CASE("straight links do not make a bent rope shorter") {
   CHECK(std::abs(found(3.0) - found(0.3)) < 0.005 * demo().length);
 }
 
+void raise_grasp(double height, capture::Capture& capture) {
+  std::vector<trajectory::Sample> samples = capture.base.samples();
+  for (trajectory::Sample& sample : samples) sample.pose.translation += height * capture.table->normal;
+  capture.base = trajectory::fit(samples, "base.tum");
+}
+
 TEST_CASE("a grasp that is given too high above its table is lowered, and one that is truly held so high stays") {
   constexpr double kOff = 0.003;  // m
   for (const double held : {0.0, kOff}) {
@@ -141,9 +147,7 @@ TEST_CASE("a grasp that is given too high above its table is lowered, and one th
   }
   capture::Capture high = lying(0.0);
   const std::vector<capture::Camera> given = high.cameras;
-  std::vector<trajectory::Sample> samples = high.base.samples();
-  for (trajectory::Sample& sample : samples) sample.pose.translation += kOff * high.table->normal;
-  high.base = trajectory::fit(samples, "base.tum");
+  raise_grasp(kOff, high);
   const pipeline::Corrected lowered = pipeline::correct(high, {}, false);
   const capture::Finding* const said = finding(lowered.verdict, "grasp", "grasp");
   REQUIRE(said);
@@ -152,12 +156,6 @@ TEST_CASE("a grasp that is given too high above its table is lowered, and one th
   CHECK(said->corrected);
   for (std::size_t c = 0; c < given.size(); ++c)  // and that alone
     CHECK(high.cameras[c].world_from_camera.translation == given[c].world_from_camera.translation);
-}
-
-void raise_grasp(double height, capture::Capture& capture) {
-  std::vector<trajectory::Sample> samples = capture.base.samples();
-  for (trajectory::Sample& sample : samples) sample.pose.translation += height * capture.table->normal;
-  capture.base = trajectory::fit(samples, "base.tum");
 }
 
 TEST_CASE("a rope held high above its table, a grasp given so high and a table given so low are told apart") {

@@ -363,6 +363,7 @@ capture::Corrections restore_lost_frames(const chain::Chain& chain, const std::v
                                          std::vector<Finding>& verdict) {
   std::vector<std::vector<double>> lost(capture.cameras.size());
   if (is_fixed(fixed, "time") || capture.cameras.size() < 2) return {};
+  const std::vector<std::vector<double>> given = capture.times;
   for (int count = 0; count < kMostLost; ++count) {
     const auto one = silhouette::first_lost_frame(chain, capture, sequence);
     if (!one) break;
@@ -370,6 +371,9 @@ capture::Corrections restore_lost_frames(const chain::Chain& chain, const std::v
     capture::restore_lost(math::VectorX::Constant(1, one->frame), one->camera, capture);
     sequence = silhouette::fit_sequence(chain, capture);
   }
+  // all at once, as apply() does it later: the same stamps to the bit
+  capture.times = given;
+  for (capture::PackedView& view : capture.views) view.time = given[view.camera][view.frame];
   capture::Corrections out;
   for (std::size_t c = 0; c < lost.size(); ++c) {
     if (lost[c].empty()) continue;
@@ -380,6 +384,7 @@ capture::Corrections restore_lost_frames(const chain::Chain& chain, const std::v
     correction.value = Eigen::Map<math::VectorX>(lost[c].data(), static_cast<Eigen::Index>(lost[c].size()));
     correction.deviation = math::VectorX::Zero(correction.value.size());
     correction.calibration = capture::recording_text(capture);
+    capture::restore_lost(correction.value, static_cast<int>(c), capture);
     const auto count = correction.value.size();
     const int first = static_cast<int>(lost[c].front());
     const bool sure = count <= kSurelyLost;
