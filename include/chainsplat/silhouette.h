@@ -119,12 +119,17 @@ struct LostFrame {
 std::optional<LostFrame> first_lost_frame(const chain::Chain& chain, const capture::Capture& capture,
                                           const SequenceFit& sequence);
 
+constexpr double kAsRecognized = 0.02;
 struct CorrectionOptions {
   std::vector<std::string> held = {};  // groups of corrected_quantities() that are not varied
   int frames = 75;                     // at most, spread over the recording
   // How the planar chain lies on its table, by which its lift was made: then the lift follows the grasp's shift, and
   // the table's height varies too.
   std::optional<Lying> lying = {};
+  // Of the angles, relative to what outlines count as here. kAsRecognized: as in recognition. 1: the rope is held 50
+  // times as straight, without which much that is wrong at a time would go into its length.
+  double prior_weight = 1.0;
+  std::string only = {};  // the cause that is corrected, by its name; none: all there may be
   // Known mistakes as the corrections that mend them, e.g. half a pixel. Quantities that are not in one of them are
   // right as given.
   std::vector<capture::Corrections> mistakes = {};
@@ -138,15 +143,19 @@ struct OutlineMisfit {
   double worst_rms = 0.0;
 };
 
+// One thing that may be all that is wrong with a recording.
+struct Cause {
+  std::string name;       // "base.time", "cam1.pose", "length", "masks", "grasp.translation, masks", ...
+  int numbers = 0;        // that it is made of
+  double evidence = 0.0;  // that something is wrong, which is left when it is corrected and nothing else
+};
 struct CorrectionFit {
   capture::Corrections corrections;
   math::MatrixX covariance;  // of all their numbers, in their order and units; 0 for those that are held
   // By which share the outlines' square residuals would be larger with what was given, whatever of it is wrong.
   double evidence = 0.0;
+  std::vector<Cause> causes;
   std::vector<double> evidence_after;  // the same with each of the options' mistakes mended, and nothing else
-  // Of a rope that lies: the shift of the grasp along the table's normal, m, that with all else as given leaves least
-  // evidence, and what it leaves.
-  double raised = 0.0, evidence_raised = 0.0;
   solve::Summary summary;              // the unknowns relative to their prior deviations, and rad
   std::vector<OutlineMisfit> misfits;  // by camera, after the corrections
   chain::Chain chain;                  // with the corrected length and diameter

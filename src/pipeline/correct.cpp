@@ -20,20 +20,22 @@ using capture::Finding;
 
 constexpr int kJoints = 16;  // with eight, the clamp's bend is taken for a wrong length (design.md, 'Corrections')
 // Share by which the outlines' square residuals must be larger with what was given before anything is changed. Straight
-// links alone leave up to 0.08 on clean recordings of hanging ropes and 0.98 on a table, where ropes are bent more and the
-// prior of the angles makes them straighter (design.md, 'Corrections').
+// links alone leave up to 0.08 on right recordings of hanging ropes and 0.52 on a table, where ropes are bent more
+// (design.md, 'Corrections').
 constexpr double kNothingWrong = 0.15, kNothingWrongOnTable = 1.0;
 double nothing_wrong(const capture::Capture& capture) {
   return capture.tabletop ? kNothingWrongOnTable : kNothingWrong;
 }
-// Pixel centers are counted from (0, 0) by most other tools. Taking this back must leave at most this share of the
-// evidence that something is wrong, of which there must be so much at least.
+// Below this evidence no cause is looked for. Pixel centers are counted from (0, 0) by most other tools: taking this
+// back must leave at most this share of the evidence.
+constexpr double kLeastEvidence = kNothingWrong;
 constexpr std::array kShifts = {0.5, -0.5};  // px
 constexpr double kLeftOfHalfPixel = 0.2;     // share
-constexpr double kLeastForHalfPixel = 0.15;  // as kNothingWrong
-// Standard deviation of how high a grasp is found to be above where the rope lies: m, and as a share of that height,
-// since how a rope comes down is assumed.
-constexpr double kRaisedDeviation = 0.00025, kComingDown = 0.25;
+// Any other thing alone is corrected if it leaves at most kLeftOfOne of the evidence, to which each of its numbers adds
+// kPerNumber, since many numbers explain a part of anything; and no more than right recordings have.
+constexpr double kLeftOfOne = 0.25, kPerNumber = 0.03;
+constexpr double kRight = 0.15, kRightOnTable = 0.5;
+constexpr double kAboveTable = 0.001;  // m, from which on a rope is said to be held above its table
 // Standard deviations from which a correction is told (something is wrong, and this may be it), and told as certain.
 constexpr double kPossible = 1.5, kCertain = 3.0;
 constexpr double kMeters = 1e3, kSeconds = 1e3, kDegrees = 180.0 / std::numbers::pi;  // to mm, ms, degrees
@@ -258,54 +260,48 @@ capture::Corrections shifted_images(const capture::Capture& given, double shift)
   return out;
 }
 
-// The standard deviation, m, of the shift `fit.raised` of a grasp that is given too high or too low above its table; none
-// where the shift is not sure, or something else is wrong beside it.
-std::optional<double> raised_alone(const silhouette::CorrectionFit& fit,
-                                   const std::optional<silhouette::Lying>& lying) {
-  if (!lying || fit.evidence_raised >= kNothingWrongOnTable) return std::nullopt;
-  const double left = lying->height - fit.raised * fit.chain.bending_axis.dot(lying->normal);
-  const double deviation = std::hypot(kRaisedDeviation, kComingDown * left);
-  if (std::abs(fit.raised) < kCertain * deviation) return std::nullopt;
-  return deviation;
-}
-
-// Makes that shift the only correction. Within the table's plane nothing tells how far such a grasp is off: it may be as
-// far as across it.
-void correct_height_alone(const silhouette::CorrectionFit& fit, const math::Vector3& normal, double deviation,
-                          Corrected& out) {
-  const math::Matrix3 along = normal * normal.transpose();
-  const math::Matrix3 covariance =
-      deviation * deviation * along + fit.raised * fit.raised * (math::Matrix3::Identity() - along);
-  out.covariance = math::MatrixX::Zero(fit.covariance.rows(), fit.covariance.cols());
-  Eigen::Index at = 0;
-  for (capture::Correction& correction : out.corrections) {
-    if (correction.subject == "grasp" && correction.quantity->name == std::string("translation")) {
-      out.covariance.block<3, 3>(at, at) = covariance;
-      correction.value = fit.raised * normal;
-      correction.deviation = covariance.diagonal().cwiseSqrt();
-      correction.state = capture::CorrectionState::free;
-    }
-    at += correction.value.size();
-  }
-}
-
-// The corrections that the twin is made with: what was found; what was given where nothing is surely wrong, since it is
-// better known than what was found; or what alone explains what is wrong, the grasp's height above a table or half a
-// pixel. Returns true for half a pixel.
-bool decide(silhouette::CorrectionFit& fit, const silhouette::CorrectionOptions& options, double nothing_wrong,
-            Corrected& out) {
+bool is_half_pixel(const silhouette::CorrectionFit& fit) {
   const auto least = std::min_element(fit.evidence_after.begin(), fit.evidence_after.end());
-  const bool half_pixel = fit.evidence > kLeastForHalfPixel && *least < kLeftOfHalfPixel * fit.evidence;
-  const auto raised = half_pixel ? std::nullopt : raised_alone(fit, options.lying);
-  out.corrections = std::move(fit.corrections);
-  if (!half_pixel && !raised && fit.evidence >= nothing_wrong) {
-    out.covariance = std::move(fit.covariance);
-    return false;
+  return fit.evidence > kLeastEvidence && *least < kLeftOfHalfPixel * fit.evidence;
+}
+
+// The one thing that explains what is wrong; null where it takes more.
+const silhouette::Cause* single_cause(const silhouette::CorrectionFit& fit, bool tabletop) {
+  if (fit.evidence < kLeastEvidence) return nullptr;
+  const silhouette::Cause* best = nullptr;
+  double least = kLeftOfOne * fit.evidence;
+  for (const silhouette::Cause& cause : fit.causes) {
+    const double left = cause.evidence + kPerNumber * cause.numbers * fit.evidence;
+    if (cause.evidence >= (tabletop ? kRightOnTable : kRight) || left >= least) continue;
+    best = &cause;
+    least = left;
   }
-  for (capture::Correction& correction : out.corrections) correction.value.setZero();
-  if (raised) correct_height_alone(fit, options.lying->normal, *raised, out);
-  if (!half_pixel) return false;
-  const std::size_t which = least - fit.evidence_after.begin();
+  return best;
+}
+
+// Whether a rope that is not known to hang lies on its table, as far as table and grasp tell, with these corrections.
+bool lies(capture::Capture capture, const capture::Corrections& corrections) {
+  capture::apply(corrections, capture);
+  return std::abs(silhouette::height_by_table(capture)) <= kAboveTable;
+}
+
+// What is corrected when one thing explains all: `alone` was fitted with that one free, `all` with all. The deviations
+// of the others say what the recording tells of them.
+void keep_given(silhouette::CorrectionFit& alone, const silhouette::CorrectionFit& all) {
+  for (std::size_t i = 0; i < alone.corrections.size(); ++i) {
+    capture::Correction& correction = alone.corrections[i];
+    if (correction.state != capture::CorrectionState::held) continue;
+    correction.value.setZero();
+    correction.deviation = all.corrections[i].deviation;
+    correction.state = all.corrections[i].state;
+  }
+}
+
+// Half a pixel is the only correction.
+void correct_half_pixel(const silhouette::CorrectionFit& fit, const silhouette::CorrectionOptions& options,
+                        Corrected& out) {
+  const auto which =
+      std::min_element(fit.evidence_after.begin(), fit.evidence_after.end()) - fit.evidence_after.begin();
   for (capture::Correction& correction : out.corrections)
     if (const auto* const turn = capture::find(options.mistakes[which], correction.subject, correction.quantity->name))
       correction.value = turn->value;
@@ -313,7 +309,6 @@ bool decide(silhouette::CorrectionFit& fit, const silhouette::CorrectionOptions&
       {"half-pixel", "cameras", kShifts[which], 0.0, "px", true, true, false, -1,
        text("the cameras' cx and cy are half a pixel too %s%s: corrected", kShifts[which] > 0.0 ? "small" : "large",
             kShifts[which] > 0.0 ? " (they count pixel centers from 0, 0; here from 0.5, 0.5)" : "")});
-  return true;
 }
 
 // Adds how the cameras' colors differ to the corrections and mends it in `capture`, whose cameras are corrected
@@ -401,7 +396,6 @@ capture::Corrections restore_lost_frames(const chain::Chain& chain, const std::v
 
 // A rope that is held a little above its table looks like one whose grasp, or table, is given wrong by as much, where
 // one camera alone sees how it comes down or the grasp is to be taken as given.
-constexpr double kAboveTable = 0.001;  // m, from which on that is said
 void judge_height(const capture::Corrections& found, const capture::Capture& capture, std::vector<Finding>& verdict) {
   if (capture::find(found, "grasp", "translation")->state != capture::CorrectionState::held) return;
   const double above = std::abs(silhouette::height_by_table(capture));
@@ -529,23 +523,49 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   options.lying = silhouette::lying_on_table(capture);
   options.held = fixed;
   for (const double pixels : kShifts) options.mistakes.push_back(shifted_images(capture, pixels));
-  std::optional<Hypothesis> found;
-  if (options.lying && std::abs(options.lying->height) > high(capture)) {
-    found = misplaced(capture, chain, sequence, options);
-    if (!found) {
-      out.verdict.push_back(held_high(std::abs(options.lying->height)));
-      out.corrections = std::move(lost);
-      return out;
+  const bool above = options.lying && std::abs(options.lying->height) > high(capture);
+
+  silhouette::CorrectionOptions judging = options;
+  judging.prior_weight = silhouette::kAsRecognized;
+  silhouette::CorrectionFit fit = silhouette::fit_corrections(chain, capture, sequence, judging);
+  const bool half_pixel = is_half_pixel(fit);
+  bool corrected = false;
+  if (const silhouette::Cause* const cause = half_pixel ? nullptr : single_cause(fit, capture.tabletop)) {
+    judging.only = cause->name;
+    silhouette::CorrectionFit alone = silhouette::fit_corrections(chain, capture, sequence, judging);
+    // where a rope is held above its table, how it comes down is assumed, which other faults would make up for
+    corrected = lies(capture, alone.corrections);
+    if (corrected) {
+      core::say_more("correct: " + cause->name + " alone explains what is wrong");
+      keep_given(alone, fit);
+      fit = std::move(alone);
     }
   }
-  if (!found)
-    found = Hypothesis{std::nullopt, options.lying, silhouette::fit_corrections(chain, capture, sequence, options)};
-  options.lying = found->lying;
-  silhouette::CorrectionFit& fit = found->fit;
+  std::optional<capture::Correction> shift;
+  if (!half_pixel && !corrected) {
+    std::optional<Hypothesis> found;
+    if (above) {
+      found = misplaced(capture, chain, sequence, options);
+      if (!found) {
+        out.verdict.push_back(held_high(std::abs(options.lying->height)));
+        out.corrections = std::move(lost);
+        return out;
+      }
+      shift = found->shift;
+      fit = std::move(found->fit);
+      corrected = shift->subject == std::string("grasp") || fit.evidence >= nothing_wrong(capture);
+    } else if (fit.evidence >= nothing_wrong(capture)) {
+      fit = silhouette::fit_corrections(chain, capture, sequence, options);
+      corrected = true;
+    }
+  }
   tell_fit("correct", fit.summary);
-  const auto& shift = found->shift;
-  const bool regrasped = shift && shift->subject == "grasp";
-  const bool half_pixel = decide(fit, options, regrasped ? 0.0 : nothing_wrong(capture), out);
+  out.corrections = std::move(fit.corrections);
+  if (corrected)
+    out.covariance = std::move(fit.covariance);
+  else
+    for (capture::Correction& correction : out.corrections) correction.value.setZero();
+  if (half_pixel) correct_half_pixel(fit, options, out);
   if (shift)
     for (capture::Correction& correction : out.corrections)
       if (correction.subject == shift->subject && correction.quantity == shift->quantity) correction.value += shift->value;

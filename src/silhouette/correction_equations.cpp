@@ -16,7 +16,7 @@ constexpr double kBlobReach = 3.0;  // diameters from the chain within which a b
 // Neighboring outline and neighboring frames share the error of straight links, which pulls the grasp along the rope:
 // on recordings with truth the place of the grasp and the length were off by 10 mm with 1, by their priors with less
 // than 0.05.
-constexpr double kEvidence = 0.02;
+constexpr double kEvidence = kAsRecognized;
 
 // The rope in one view, posed with the corrections, and how what the view depends on moves it. Its parts point at each
 // other.
@@ -93,7 +93,7 @@ SharedRow shared_row(const PosedView& view, const OutlinePoint& p, double angle_
   row.segment<3>(kGrasp) = with_grasp - row[kTableHeight] * normal;
   row.segment<3>(kGraspRotation) = camera_from_base.transpose() * from_grasp.cross(g);
   row[kLength] = start ? 0.0 : g.dot(from_grasp) / chain.length;
-  row[kDiameter] = p.half_width / chain.diameter;
+  row[kDiameter] = p.half_width / chain.diameter + 0.5 * row[kTableHeight];  // a thicker rope lies higher
   return row;
 }
 

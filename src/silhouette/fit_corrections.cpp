@@ -5,7 +5,7 @@
 #include "chainsplat/core.h"
 #include "src/math/decompositions.h"
 #include "src/math/usual.h"
-#include "src/silhouette/correction_equations.h"
+#include "src/silhouette/correction_layout.h"
 
 namespace chainsplat::silhouette {
 
@@ -43,85 +43,12 @@ constexpr double kSharp = 0.0014;  // m, start_deviations() above which it is no
 constexpr double kRound = 0.25;  // deviation of how far the cut face reaches beyond its middle, of what a flat one does
 constexpr double kUnknownShare = 0.7;  // of the prior's deviation there above which a value is the prior's
 constexpr int kTimeStretches = 12;     // of time, whose scatter tells what the equations do not know
+constexpr double kHeld = 1e12;         // information that holds an unknown, in units of its deviation
+constexpr double kExact = 1e-4;        // of the prior's deviation, below which it was held so
 constexpr double kSameClock = 1e-9;    // s
-constexpr int kLeastCameras = 2;       // from which poses and sizes can be told apart
-
-// Where one kind of correction of one subject stands among the shared unknowns, which are in units of its deviation.
-struct Column {
-  const capture::CorrectedQuantity* quantity = nullptr;
-  int camera = -1;         // -1: of base, grasp or object
-  int number = 0;          // of its first number among those of all columns
-  int first = -1;          // among the shared unknowns; -1: held
-  double deviation = 0.0;  // in the quantity's unit
-};
-
-struct Layout {
-  std::vector<Column> columns;
-  int numbers = 0;  // of all columns
-  int size = 0;     // of those that are not held
-};
-
-bool bends_in_space(const chain::Chain& chain) { return chain.angles() >= chain.links(); }
-
-// Outlines say nothing of these.
-bool of_colors(const capture::CorrectedQuantity& quantity) { return quantity.group == std::string("colors"); }
-
-bool is_held(const capture::CorrectedQuantity& quantity, const capture::Capture& capture, const chain::Chain& chain,
-             int camera, const CorrectionOptions& options) {
-  const std::vector<std::string>& held = options.held;
-  const std::string group = quantity.group;
-  const bool clock = group == "time", alone = static_cast<int>(capture.cameras.size()) < kLeastCameras;
-  if (std::find(held.begin(), held.end(), group) != held.end()) return true;
-  if (alone && !clock && quantity.name != std::string("mask_offset")) return true;
-  if (clock && camera == 0) return true;  // the others count from its clock
-  if (group == "table" && !options.lying) return true;
-  if (clock && camera < 0 && capture.base.samples().size() < 2) return true;
-  // the first joint of a chain that bends in space takes the grasp's rotation, that of a planar one does not
-  return group == "grasp" && quantity.name == std::string("rotation") && bends_in_space(chain);
-}
-
-Layout layout_of(const capture::Capture& capture, const chain::Chain& chain, const CorrectionOptions& options) {
-  Layout layout;
-  const auto add = [&](const capture::CorrectedQuantity& quantity, int camera) {
-    const double deviation = capture::prior_deviation(capture, camera, quantity);
-    const bool held = deviation == 0.0 || is_held(quantity, capture, chain, camera, options);
-    layout.columns.push_back({&quantity, camera, layout.numbers, held ? -1 : layout.size, deviation});
-    layout.numbers += quantity.size;
-    if (!held) layout.size += quantity.size;
-  };
-  for (const auto& quantity : capture::corrected_quantities()) {
-    if (of_colors(quantity)) continue;
-    if (quantity.subject == std::string("camera")) {
-      for (int c = 0; c < static_cast<int>(capture.cameras.size()); ++c) add(quantity, c);
-    } else {
-      add(quantity, -1);
-    }
-  }
-  return layout;
-}
-
-// The columns that views of each camera depend on, in the order of SharedOfView.
-std::vector<SharedPlaces> places_of(const Layout& layout, int cameras) {
-  std::vector<SharedPlaces> out(cameras);
-  for (int c = 0; c < cameras; ++c) {
-    int at = 0;
-    for (const Column& column : layout.columns) {
-      if (column.camera >= 0 && column.camera != c) continue;
-      for (int i = 0; i < column.quantity->size; ++i, ++at) {
-        CHAINSPLAT_CHECK(at < kSharedOfView, "quantities");
-        out[c].at[at] = column.first < 0 ? -1 : column.first + i;
-        out[c].unit[at] = column.first < 0 ? 0.0 : column.deviation;
-      }
-    }
-    CHAINSPLAT_CHECK(at == kSharedOfView, "quantities " + std::to_string(at));
-  }
-  return out;
-}
 
 // Whether all masks may begin anywhere, or those begin at the grasp that do so nearly.
 enum class Starts { anywhere, at_grasp };
-
-bool is_mask_start(const Column& column) { return column.quantity->name == std::string("mask_start"); }
 
 // How little each camera's masks tell of where the rope leaves the gripper, m along it. Fingers have another shape than
 // the rope's cut face, so that the outline there scatters more than elsewhere; and no cut is quite flat.
@@ -177,22 +104,6 @@ VectorX prior_weights(const Layout& layout, const VectorX& x, Starts starts,
   return out;
 }
 
-capture::Corrections corrections_at(const Layout& layout, const std::vector<capture::Camera>& cameras,
-                                    const VectorX& x) {
-  capture::Corrections out;
-  for (const Column& column : layout.columns) {
-    const capture::CorrectedQuantity& q = *column.quantity;
-    Correction c;
-    c.quantity = &q;
-    c.subject = column.camera < 0 ? std::string(q.subject) : cameras[column.camera].name;
-    c.value = column.first < 0 ? VectorX::Zero(q.size) : VectorX(column.deviation * x.segment(column.first, q.size));
-    c.deviation = VectorX::Zero(q.size);
-    if (column.camera >= 0) c.calibration = capture::calibration_text(cameras[column.camera]);
-    out.push_back(std::move(c));
-  }
-  return out;
-}
-
 chain::Chain resized(const chain::Chain& chain, double length, double diameter) {
   chain::Chain out = chain;
   const double ratio = length / chain.length;
@@ -212,8 +123,10 @@ chain::Chain changed(const chain::Chain& given, const std::optional<Lying>& lyin
   };
   chain::Chain out = resized(given, size(given.length, "length"), size(given.diameter, "diameter"));
   if (lying)
-    out.lift = lying_down(out, height_with(out, *lying, capture::grasp_in_base(corrections).translation,
-                                           capture::value_of(corrections, "table", "height")));
+    // a thicker rope lies higher
+    out.lift = lying_down(
+        out, height_with(out, *lying, capture::grasp_in_base(corrections).translation,
+                         capture::value_of(corrections, "table", "height") + 0.5 * (out.diameter - given.diameter)));
   return out;
 }
 
@@ -256,9 +169,9 @@ void add_table(const capture::Capture& capture, const Layout& layout, const Vect
 }
 
 Known known_at(const capture::Capture& capture, const Layout& layout, const VectorX& x, Starts starts,
-               const std::vector<FrameEquations>& frames) {
+               const std::vector<FrameEquations>& frames, const MatrixX& held) {
   const VectorX weights = prior_weights(layout, x, starts, start_deviations(frames));
-  Known known{weights.asDiagonal(), weights.cwiseProduct(x)};
+  Known known{MatrixX(weights.asDiagonal()) + held, weights.cwiseProduct(x) + held * x};
   add_table(capture, layout, x, known);
   return known;
 }
@@ -275,41 +188,45 @@ solve::ArrowEquations arrow_of(const std::vector<FrameEquations>& frames, const 
   return arrow;
 }
 
-// The inner product of two changes of the shared unknowns; of one with itself the square by which residuals grow. Where
-// the masks begin is free: fingers hide a piece of the rope in many recordings that are right. `information`: of the
-// outlines alone.
-double cost_of_change(const Layout& layout, const MatrixX& information, const VectorX& x, const VectorX& y) {
+// The square of a change of the shared unknowns, by which residuals grow, as a matrix. Where the masks begin is free:
+// fingers hide a piece of the rope in many recordings that are right. `information`: of the outlines alone.
+MatrixX cost_of_change(const Layout& layout, const MatrixX& information) {
   std::vector<int> starts, others;
   for (const Column& column : layout.columns)
     for (int i = 0; column.first >= 0 && i < column.quantity->size; ++i)
       (is_mask_start(column) ? starts : others).push_back(column.first + i);
-  const double with_starts = x(others).dot(MatrixX(information(others, others)) * y(others));
-  if (starts.empty()) return with_starts;
-  const VectorX pull = information(starts, others) * x(others), other_pull = information(starts, others) * y(others);
-  const MatrixX own = information(starts, starts);
-  return with_starts - pull.dot(own.completeOrthogonalDecomposition().solve(other_pull));
+  MatrixX out = MatrixX::Zero(information.rows(), information.cols());
+  out(others, others) = MatrixX(information(others, others));
+  if (starts.empty()) return out;
+  const MatrixX pull = information(starts, others), own = information(starts, starts);
+  out(others, others) -= pull.transpose() * own.completeOrthogonalDecomposition().solve(pull);
+  return out;
 }
 
-// The shared unknowns as `corrections` have them.
-VectorX shared_of(const Layout& layout, const std::vector<capture::Camera>& cameras,
-                  const capture::Corrections& corrections) {
-  VectorX out = VectorX::Zero(layout.size);
-  for (const Column& column : layout.columns) {
-    const std::string subject = column.camera < 0 ? std::string(column.quantity->subject) : cameras[column.camera].name;
-    const Correction* const found = capture::find(corrections, subject, column.quantity->name);
-    if (found && column.first >= 0) out.segment(column.first, column.quantity->size) = found->value / column.deviation;
+// Each thing that may be all that is wrong, and what it leaves of the evidence. `x`: all that was found.
+std::vector<Cause> causes_of(const Layout& layout, const std::vector<capture::Camera>& cameras, const MatrixX& cost,
+                             const VectorX& x, double squares) {
+  std::vector<Cause> out;
+  for (const Direction& d : single_causes(layout, cameras)) {
+    const MatrixX cost_of = d.directions.transpose() * cost;
+    const VectorX along = MatrixX(cost_of * d.directions).completeOrthogonalDecomposition().solve(VectorX(cost_of * x));
+    const VectorX left = x - d.directions * along;
+    out.push_back({d.name, static_cast<int>(d.directions.cols()), left.dot(cost * left) / squares});
   }
   return out;
 }
 
-// The correction of a grasp that is off by this much, m, base frame, and nothing else.
-capture::Corrections raised(const Vector3& shift) {
-  Correction c;
-  c.quantity = &capture::corrected_quantity("grasp", "translation");
-  c.subject = "grasp";
-  c.value = shift;
-  c.deviation = Vector3::Zero();
-  return {c};
+// Holds all unknowns but those of the cause of this name, and where the masks begin.
+MatrixX held_but(const Layout& layout, const std::vector<capture::Camera>& cameras, const std::string& name) {
+  const std::vector<Direction> causes = single_causes(layout, cameras);
+  const auto cause = std::find_if(causes.begin(), causes.end(), [&](const Direction& d) { return d.name == name; });
+  CHAINSPLAT_CHECK(cause != causes.end(), "cause " + name);
+  const MatrixX& d = cause->directions;
+  MatrixX out =
+      MatrixX::Identity(layout.size, layout.size) - d * MatrixX(d.transpose() * d).ldlt().solve(MatrixX(d.transpose()));
+  for (const Column& column : layout.columns)
+    if (column.first >= 0 && is_mask_start(column)) out(column.first, column.first) = 0.0;
+  return kHeld * out;
 }
 
 // What the outlines alone say of the shared unknowns, whatever the angles are.
@@ -418,22 +335,14 @@ std::vector<VectorX> choose_frames(const SequenceFit& sequence, int most, const 
   return theta;
 }
 
-// The covariance of all numbers of the corrections, in their units: 0 for those that are held.
-MatrixX covariance_of_numbers(const Layout& layout, const MatrixX& shared) {
-  MatrixX unit = MatrixX::Zero(layout.numbers, layout.size);
-  for (const Column& column : layout.columns)
-    for (int i = 0; column.first >= 0 && i < column.quantity->size; ++i)
-      unit(column.number + i, column.first + i) = column.deviation;
-  return unit * shared * unit.transpose();
-}
-
 void set_states(const Layout& layout, const VectorX& prior, const MatrixX& shared, capture::Corrections& corrections) {
   for (std::size_t i = 0; i < corrections.size(); ++i) {
     const Column& column = layout.columns[i];
     if (column.first < 0) continue;
     const double relative = shared.diagonal().segment(column.first, column.quantity->size).cwiseSqrt().minCoeff();
-    corrections[i].state =
-        relative * std::sqrt(prior[column.first]) < kUnknownShare ? CorrectionState::free : CorrectionState::prior;
+    corrections[i].state = relative < kExact                                           ? CorrectionState::held
+                           : relative * std::sqrt(prior[column.first]) < kUnknownShare ? CorrectionState::free
+                                                                                       : CorrectionState::prior;
   }
 }
 
@@ -477,6 +386,8 @@ std::vector<OutlineMisfit> misfits_of(const CorrectionProblem& problem, const st
 CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& sequence,
                               const CorrectionOptions& options) {
   const Layout layout = layout_of(capture, chain, options);
+  const MatrixX held =
+      options.only.empty() ? MatrixX::Zero(layout.size, layout.size) : held_but(layout, capture.cameras, options.only);
   CorrectionProblem problem{views_of(capture),
                             capture.cameras,
                             [&](double time) { return capture.base.at(time); },
@@ -488,7 +399,7 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
                             kWidestCut,
                             kWideEnd,
                             options.lying};
-  problem.prior = joint_prior(chain, {});
+  problem.prior = options.prior_weight * joint_prior(chain, {});
   const int n = chain.angles(), m = layout.size;
   for (int k = 0; k < n; ++k) problem.held.push_back(chain::is_twist(chain, k));
   const std::vector<VectorX> theta = choose_frames(sequence, options.frames, capture, problem);
@@ -504,7 +415,7 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
     wide *= kNarrowing;
     problem.cut = std::max({cut_of(frames), kLeastCut, wide});
     if (wide <= kLeastCut) problem.end_reach = kEndReach;
-    if (equations) *equations = arrow_of(frames, known_at(capture, layout, at.head(m), starts, frames));
+    if (equations) *equations = arrow_of(frames, known_at(capture, layout, at.head(m), starts, frames, held));
     double cost = 0.5 * at.head(m).squaredNorm();
     for (const FrameEquations& frame : frames) cost += frame.cost;
     return cost;
@@ -527,22 +438,16 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
   const VectorX prior = prior_weights(layout, x.head(m), starts, start_deviations(frames));
   const MatrixX outlines = outline_information(frames);
   const MatrixX covariance =
-      shared_covariance(frames, outlines, known_at(capture, layout, x.head(m), starts, frames).information);
+      shared_covariance(frames, outlines, known_at(capture, layout, x.head(m), starts, frames, held).information);
   const double squares = square_residuals(frames);
+  const MatrixX cost_matrix = cost_of_change(layout, outlines);
   const auto evidence_of = [&](const capture::Corrections& mended) {
     const VectorX change = x.head(m) - shared_of(layout, capture.cameras, mended);
-    return squares > 0.0 ? cost_of_change(layout, outlines, change, change) / squares : 0.0;
+    return squares > 0.0 ? change.dot(cost_matrix * change) / squares : 0.0;
   };
   out.evidence = evidence_of({});
   for (const capture::Corrections& mended : options.mistakes) out.evidence_after.push_back(evidence_of(mended));
-  if (options.lying) {
-    const VectorX up = shared_of(layout, capture.cameras, raised(options.lying->normal));
-    const double curvature = cost_of_change(layout, outlines, up, up);  // 0 where the grasp is held
-    if (curvature > 0.0) {
-      out.raised = cost_of_change(layout, outlines, up, x.head(m)) / curvature;
-      out.evidence_raised = evidence_of(raised(out.raised * options.lying->normal));
-    }
-  }
+  if (squares > 0.0) out.causes = causes_of(layout, capture.cameras, cost_matrix, x.head(m), squares);
   out.corrections = corrections_at(layout, capture.cameras, x.head(m));
   set_states(layout, prior, covariance, out.corrections);
   out.covariance = covariance_of_numbers(layout, covariance);
