@@ -370,6 +370,60 @@ TEST_CASE("the rims of a tube are its outlines, where color changes most is insi
   CHECK(rims < 0.5 * steepest);
 }
 
+// A board of this color on which a rope lies from row 20 to 250, its axis at column 100.3 and 6 px wide on either side,
+// striped in these colors and lit from the left. On its right is its shadow, 4 px wide.
+std::vector<std::uint8_t> board_with_rope(const std::array<double, 3>& board,
+                                          const std::vector<std::array<double, 3>>& stripes) {
+  constexpr double kAt = 100.3, kRadius = 6.0, kShadow = 4.0, kInShadow = 0.4;
+  constexpr int kSamples = 8, kStripe = 12;
+  std::vector<std::uint8_t> out;
+  for (int y = 0; y < 300; ++y)
+    for (int x = 0; x < 200; ++x)
+      for (int c = 0; c < 3; ++c) {
+        double sum = 0.0;
+        for (int i = 0; i < kSamples; ++i) {
+          const double across = (x + (i + 0.5) / kSamples - kAt) / kRadius;
+          const bool there = y >= 20 && y < 250;
+          const double light = 0.25 + 0.75 * std::max(0.0, std::cos(0.9 + std::asin(std::clamp(across, -1.0, 1.0))));
+          if (there && std::abs(across) < 1.0)
+            sum += light * stripes[(y / kStripe) % stripes.size()][c];
+          else
+            sum += board[c] * (there && across >= 1.0 && across < 1.0 + kShadow / kRadius ? kInShadow : 1.0);
+        }
+        out.push_back(static_cast<std::uint8_t>(std::lround(sum / kSamples) + (x * 7 + y * 13 + c * 3) % 5 - 2));
+      }
+  return out;
+}
+
+TEST_CASE("a rope's shadow on what it lies on is not a part of it; where hues do not tell, nothing changes") {
+  masking::Axis rough;  // beside the rope
+  for (int i = 0; i <= 76; ++i) rough.points.push_back({{101.8, 20.0 + 3.0 * i}, 6.0, 3e-3 * i});
+  const auto outlines = [&](const std::vector<std::uint8_t>& pixels, bool shadow) {  // medians, px: left, right
+    masking::RibbonOptions options;
+    options.shadow = shadow, options.width_deviation = 0.4, options.rims = true;
+    const masking::Ribbon ribbon = masking::find_ribbon({}, {pixels.data(), 200, 300, 3}, rough, 0.23, options);
+    std::vector<double> left, right;
+    for (const masking::AxisPoint& p : ribbon.axis.points) {
+      if (p.at.y() < 40 || p.at.y() > 210) continue;
+      left.push_back(p.at.x() - p.radius), right.push_back(p.at.x() + p.radius);
+    }
+    REQUIRE(left.size() > 20);
+    return std::array{math::median(left), math::median(right)};
+  };
+  const std::array<double, 3> wood{200, 160, 118}, gray{170, 170, 170};
+  const std::vector<std::uint8_t> striped = board_with_rope(wood, {{40, 110, 170}, {210, 70, 50}, {230, 230, 230}});
+  const auto with = outlines(striped, true), without = outlines(striped, false);
+  MESSAGE("right outline off by ", with[1] - 106.3, " px, as part of the rope ", without[1] - 106.3, " px");
+  CHECK(with[0] == doctest::Approx(94.3).epsilon(0.006));
+  CHECK(with[1] == doctest::Approx(106.3).epsilon(0.006));
+  CHECK(without[1] > 107.5);
+  // a rope of the board's hue: there is no telling
+  const std::vector<std::uint8_t> alike = board_with_rope(gray, {{235, 235, 235}, {90, 90, 90}});
+  const auto told = outlines(alike, true), untold = outlines(alike, false);
+  CHECK(told[0] == doctest::Approx(untold[0]).epsilon(0.005));
+  CHECK(told[1] == doctest::Approx(untold[1]).epsilon(0.005));
+}
+
 TEST_CASE("growth: an edge is no rope, the grasp is found 12 mm away, a rope at rest does not turn up") {
   const chain::Chain rope =
       chain::make_chain(0.23, 0.006, Vector3::UnitY(), Vector3::UnitZ(), 10, chain::Bending::planar, false);

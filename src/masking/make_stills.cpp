@@ -133,6 +133,7 @@ void find_ribbons(const Recording& recording, const chain::Chain& chain, std::ve
         Still& still = stills[c][i];
         RibbonOptions ribbon;
         ribbon.width = width;
+        ribbon.shadow = recording.capture.tabletop;
         ribbon.width_deviation = round ? kKnownWidth : still.broad ? kFirstBroadWidth : kFirstWidth;
         ribbon.rims = round + 1 == kRibbonRounds;
         still.ribbon = find_ribbon(look, picture_of(*still.frame), still.along, chain.length, ribbon);

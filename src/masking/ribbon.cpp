@@ -7,6 +7,7 @@
 #include <utility>
 
 #include "src/masking/rims.h"
+#include "src/masking/shadow.h"
 
 namespace chainsplat::masking {
 
@@ -47,8 +48,6 @@ constexpr double kAlike = 14.0;             // to within so many gray levels
 constexpr double kUnlike = 4.0;             // and times their usual spread, from where on it is another color
 
 double square(double x) { return x * x; }
-
-using Color = std::array<float, 3>;
 
 Color color_at(const Picture& picture, const Vector2& at) {
   const double x = std::clamp(at.x() - 0.5, 0.0, picture.width - 1.001),
@@ -162,6 +161,22 @@ Straight straighten(const Look& look, const Picture& picture, const Axis& along,
     }
   }
   return out;
+}
+
+// Takes the rope's shadow away.
+void unshade(Straight& s, double usual) {
+  Strip strip;
+  strip.colors = s.colors;
+  for (int k = 0; k < s.columns; ++k) strip.across.push_back((k - s.half) * s.du / usual);
+  const auto before = [&](double arclength) {
+    return static_cast<int>(std::count_if(s.stations.begin(), s.stations.end(),
+                                          [&](const Station& one) { return one.arclength < arclength; }));
+  };
+  strip.begin = before(0.0), strip.end = before(s.length);
+  strip.about = s.about;
+  Shadowless seen = without_shadow(strip);
+  s.colors = std::move(seen.colors);
+  for (std::size_t at = 0; at < s.odds.size(); ++at) s.odds[at] = std::max(-kMostOdds, s.odds[at] + seen.odds[at]);
 }
 
 // Steps between columns: of the colors on either side, averaged over a radius of length. A full step counts fully at
@@ -409,6 +424,7 @@ Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, 
   Ribbon out;
   if (along.points.size() < 2) return out;
   Straight s = straighten(look, picture, along, length, options);
+  if (options.shadow) unshade(s, options.width * s.radius);
   find_steps(s);
   const Choices choices = choices_of(s, options);
   if (choices.all.empty()) return out;

@@ -69,6 +69,13 @@ expect_code 0 'a table'
 for camera in cam0 cam1 cam2 cam3; do expect_iou 0.85 $camera 'a table'; done
 warned && fail 'a table: a good mask is warned of'
 
+# a rope on a table that is darker in its shadow, all along one side of it in all views
+shadow=$work/shadow
+"$source_dir/tools/make_clutter" "$shadow" --family table --seed 504 --scale 0.5 || fail 'make_clutter --family table'
+run mask "$shadow" -o "$work/in_shadow" --json
+expect_code 0 'a shadow'
+for camera in cam0 cam1 cam2 cam3; do expect_iou 0.91 $camera 'a shadow'; done
+
 # the recipe of docs/guide.md, 3: a color threshold
 run mask "$table" -o "$work/threshold" --json --command "ffmpeg -v error -y -i {image} -vf \"format=gbrp,geq=r='255*gt(g(X,Y)-b(X,Y),60)*gt(g(X,Y)-r(X,Y),10)':g=0:b=0,extractplanes=r\" {mask}"
 expect_code 0 'a color threshold'
