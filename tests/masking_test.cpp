@@ -12,6 +12,7 @@
 #include "src/masking/cut.h"
 #include "src/masking/grow.h"
 #include "src/masking/look.h"
+#include "src/masking/one_rope.h"
 #include "src/masking/ribbon.h"
 
 namespace {
@@ -422,6 +423,54 @@ TEST_CASE("a rope's shadow on what it lies on is not a part of it; where hues do
   const auto told = outlines(alike, true), untold = outlines(alike, false);
   CHECK(told[0] == doctest::Approx(untold[0]).epsilon(0.005));
   CHECK(told[1] == doctest::Approx(untold[1]).epsilon(0.005));
+}
+
+TEST_CASE("outlines of several pictures make one rope, and one that is none of the rope's hardly counts") {
+  // a rope of 12 mm along the ground, three cameras at 0.8 m that look down at it
+  const chain::Chain rope =
+      chain::make_chain(0.3, 0.012, Vector3::UnitX(), Vector3::UnitZ(), 8, chain::Bending::planar, false);
+  math::Pose base;
+  VectorX theta(rope.angles());
+  for (int k = 0; k < rope.angles(); ++k) theta[k] = 0.15 * std::cos(0.8 * k);
+  const Vector3 shift(0.002, -0.004, 0.001);
+  const double width = 1.1;
+  std::vector<capture::Camera> cameras(3, front_camera());
+  std::vector<masking::Ribbon> ribbons;
+  math::Pose shifted = base;
+  shifted.translation = shift;
+  for (int c = 0; c < 3; ++c) {
+    capture::Camera& camera = cameras[c];
+    camera.width = 640, camera.height = 480, camera.fx = camera.fy = 600.0, camera.cx = 320.0, camera.cy = 240.0;
+    const double azimuth = 2.1 * c + 0.4;
+    const Vector3 middle(0.15, 0.03, 0.0), from(0.55 * std::cos(azimuth), 0.55 * std::sin(azimuth), 0.6);
+    const Vector3 z = -from.normalized(), x = z.cross(Vector3::UnitZ()).normalized();
+    camera.world_from_camera.translation = middle + from;
+    camera.world_from_camera.rotation << x, z.cross(x), z;
+    masking::Ribbon ribbon;
+    ribbon.axis = masking::axis(rope, shifted, theta, camera, 0.0, rope.length);
+    for (masking::AxisPoint& p : ribbon.axis.points) p.radius *= width;
+    ribbons.push_back(ribbon);
+  }
+  for (std::size_t i = 5; i < ribbons[1].axis.points.size() / 2; ++i) {  // a shadow, for half the length
+    masking::AxisPoint& p = ribbons[1].axis.points[i];
+    const math::Vector2 along = ribbons[1].axis.points[i + 1].at - p.at;
+    p.at += math::Vector2(-along.y(), along.x()).normalized() * 1.5;
+    p.radius += 1.5;
+  }
+  std::vector<masking::Outlined> seen;
+  for (int c = 0; c < 3; ++c) seen.push_back({&cameras[c], base, &ribbons[c]});
+  masking::OneRope start{theta, Vector3::Zero(), 1.0};
+  for (int k = 0; k < rope.angles(); ++k) start.theta[k] += k % 2 ? 0.03 : -0.03;
+  const masking::OneRope fit = masking::fit_one_rope(rope, seen, start);
+  const auto line = [&](const VectorX& angles, const Vector3& moved) {
+    math::Pose at = base;
+    at.translation = moved;
+    return chain::centerline(rope, chain::link_motions(rope, angles, at), chain::equal_arclengths(rope, 31));
+  };
+  const double rms = 1e3 * std::sqrt((line(fit.theta, fit.shift) - line(theta, shift)).colwise().squaredNorm().mean());
+  MESSAGE("one rope: ", rms, " mm, width ", fit.width);
+  CHECK(rms < 0.4);
+  CHECK(fit.width == doctest::Approx(width).epsilon(0.01));
 }
 
 TEST_CASE("growth: an edge is no rope, the grasp is found 12 mm away, a rope at rest does not turn up") {
