@@ -23,6 +23,10 @@ constexpr double kUnsure = 0.7;       // its score is multiplied by this
 // px across the rope, below which its score is that of an unsure one: of ten such stills that looked right, four had an
 // IoU of 0.24 to 0.52.
 constexpr double kFewestPixels = 2.2;
+// of the given diameter: narrower masks have the score of unsure ones, too. The lit middle of a cable has outlines of
+// its own, a tube within the tube; nothing is like that outside of it, and given diameters are right to a fifth.
+constexpr double kNarrow = 0.8;
+constexpr double kAtPoint = 2.0;              // radii, within which a rope runs through a point of the user's
 constexpr double kLeastStillEvidence = 0.02;  // nats per sample
 constexpr double kFirstWidth = 0.2, kFirstBroadWidth = 0.4,
                  kKnownWidth = 0.12;                   // deviation of the width before and after it was measured
@@ -177,13 +181,23 @@ void find_ribbons(const Recording& recording, const chain::Chain& chain, std::ve
   }
 }
 
-double score_of(const Still& still) {
+bool runs_through(const Axis& axis, const math::Vector2& point) {
+  return std::any_of(axis.points.begin(), axis.points.end(),
+                     [&](const AxisPoint& p) { return (p.at - point).norm() < kAtPoint * std::max(1.0, p.radius); });
+}
+
+double score_of(const Help& help, int camera, const Still& still) {
   // another way from the grasp that explains the picture nearly as well: another cable that crosses, perhaps
   const double sure = std::min(1.0, kUnsure + (1.0 - kUnsure) * still.grown->margin / kSureMargin);
+  const Axis& axis = still.ribbon.axis;
   std::vector<double> radii;
-  for (const AxisPoint& p : still.ribbon.axis.points) radii.push_back(p.radius);
+  for (const AxisPoint& p : axis.points) radii.push_back(p.radius);
   const bool thin = radii.empty() || 2.0 * math::median(radii) < kFewestPixels;
-  return (thin ? std::min(sure, kUnsure) : sure) * score(evidence(picture_of(*still.frame), still.ribbon.axis));
+  const bool elsewhere = std::any_of(help.points.begin(), help.points.end(), [&](const Help::Point& point) {
+    return point.camera == camera && point.frame == still.frame->frame && !runs_through(axis, point.at);
+  });
+  const bool unsure = thin || elsewhere || still.ribbon.width < kNarrow;
+  return (unsure ? std::min(sure, kUnsure) : sure) * score(evidence(picture_of(*still.frame), axis));
 }
 
 }  // namespace
@@ -206,7 +220,8 @@ Summary make_stills(const Recording& recording, const chain::Chain& chain, const
       ++summary.frames;
       summary.empty += view.width == 0;
       summary.inside += view.width != 0;
-      sink(static_cast<int>(c), still.frame->frame, recorded_mask(view, recording.capture.cameras[c]), score_of(still));
+      sink(static_cast<int>(c), still.frame->frame, recorded_mask(view, recording.capture.cameras[c]),
+           score_of(recording.help, static_cast<int>(c), still));
     }
   summary.inside /= summary.frames;
   return summary;

@@ -46,6 +46,18 @@ expect_iou 0.8 cam0 'a point'
 run mask "$window" -o "$work/without" --empty "cam0=$window/truth/empty/cam0.png" --json
 expect_code 0 'an empty scene'
 expect_iou 0.75 cam0 'an empty scene'
+# what does not run through the user's point is warned of: a window's frame, in place of a black cable before the window
+frame=$work/frame
+"$source_dir/tools/make_clutter" "$frame" --seed 1202 --frames 1 --scale 0.5 || fail 'make_clutter'
+run mask "$frame" -o "$work/missed" --point cam0:339.7,177.9 --json
+expect_code 0 'a point that is missed'
+warned || fail 'a point that is missed: no warning'
+# and so is a mask of a white cable's lit middle alone
+middle=$work/middle
+"$source_dir/tools/make_clutter" "$middle" --seed 615 --frames 1 --scale 0.5 || fail 'make_clutter'
+run mask "$middle" -o "$work/lit" --empty "cam0=$middle/truth/empty/cam0.png" --json
+expect_code 0 'the lit middle of a cable'
+warned || fail 'the lit middle of a cable: no warning'
 # a box is of its frame, also where the scene is known: around all of them this one changes frame 1
 three=$work/three
 "$source_dir/tools/make_clutter" "$three" --seed 43 --frames 3 --scale 0.5 --grasp-error 14 || fail 'make_clutter'
