@@ -313,6 +313,26 @@ TEST_CASE("a ribbon finds outlines, connector and end; what has one side only, o
   CHECK(masking::score(masking::evidence(picture, leaving)) < masking::kDoubtful);
 }
 
+TEST_CASE("the blur of a step is no thin rope") {
+  // a wall that is dark from column 100 on, blurred over 3 px, and a cable of 2.5 px at column 60
+  std::vector<std::uint8_t> pixels;
+  for (int y = 0; y < 300; ++y)
+    for (int x = 0; x < 200; ++x) {
+      const double dark = std::clamp((x + 0.5 - 98.5) / 3.0, 0.0, 1.0);
+      const double cable = std::clamp(1.75 - std::abs(x + 0.5 - 60.0), 0.0, 1.0);
+      const double value = 200.0 - 160.0 * dark - 100.0 * cable;
+      for (int c = 0; c < 3; ++c) pixels.push_back(static_cast<std::uint8_t>(value + (x * 7 + y * 13) % 5 - 2));
+    }
+  const masking::Picture picture{pixels.data(), 200, 300, 3};
+  const auto score_at = [&](double x) {
+    masking::Axis axis;
+    for (int i = 0; i <= 75; ++i) axis.points.push_back({{x, 20.0 + 3.0 * i}, 1.25, 3e-3 * i});
+    return masking::score(masking::evidence(picture, axis));
+  };
+  CHECK(score_at(100.0) < 0.3);
+  CHECK(score_at(60.0) > masking::kDoubtful);
+}
+
 // A wall with a straight tube of one color from row 20 to 250, its axis at column `at`, `radius` px wide, lit from the
 // front and a quarter of a right angle to its left. Sampled eight times per pixel and blurred by a lens of 0.9 px.
 std::vector<std::uint8_t> wall_with_tube(double at, double radius) {

@@ -24,8 +24,9 @@ constexpr double kUnsure = 0.7;       // its score is multiplied by this
 // IoU of 0.24 to 0.52.
 constexpr double kFewestPixels = 2.2;
 // of the given diameter: narrower masks have the score of unsure ones, too. The lit middle of a cable has outlines of
-// its own, a tube within the tube; nothing is like that outside of it, and given diameters are right to a fifth.
-constexpr double kNarrow = 0.8;
+// its own, a tube within the tube; nothing is like that outside of it, and given diameters are right to a fifth, masks'
+// widths to some hundredths.
+constexpr double kNarrow = 0.77;
 constexpr double kAtPoint = 2.0;              // radii, within which a rope runs through a point of the user's
 constexpr double kLeastStillEvidence = 0.02;  // nats per sample
 constexpr double kFirstWidth = 0.2, kFirstBroadWidth = 0.4,

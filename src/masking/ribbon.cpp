@@ -42,6 +42,8 @@ constexpr double kEndStep = 4.0;   // of a full step of color along the rope the
 
 // the evidence
 constexpr double kSeen = 10.0;              // gray levels, the least contrast that is one
+constexpr double kBlurWidth = 4.0;          // px, that the blur of a step may be wide,
+constexpr double kBlurred = 2.0;            // and gray levels, by which it differs from mixtures of both sides
 constexpr double kLeastSpread = 6.0;        // gray levels, of the rope's colors along it,
 constexpr int kParts = 6, kOtherParts = 3;  // of the rope; in so many others a color must come back,
 constexpr double kAlike = 14.0;             // to within so many gray levels
@@ -67,6 +69,17 @@ double difference(const Color& a, const Color& b) {
   double sum = 0.0;
   for (int c = 0; c < 3; ++c) sum += square(a[c] - b[c]);
   return std::sqrt(sum / 3.0);
+}
+
+// How far a color is from all mixtures of two others: the blur of a step from one to the other has those, and looks
+// like a thin rope along the step.
+double from_blur(const Color& color, const Color& a, const Color& b) {
+  double both = 0.0, all = 1e-9;
+  for (int c = 0; c < 3; ++c) both += static_cast<double>(color[c] - a[c]) * (b[c] - a[c]), all += square(b[c] - a[c]);
+  const auto share = static_cast<float>(std::clamp(both / all, 0.0, 1.0));
+  Color mixed;
+  for (int c = 0; c < 3; ++c) mixed[c] = a[c] + share * (b[c] - a[c]);
+  return difference(color, mixed);
 }
 
 struct Station {
@@ -505,8 +518,10 @@ Evidence evidence(const Picture& picture, const Axis& axis) {
     return std::count(has.begin(), has.end(), true) >= kOtherParts;
   };
   for (int i = 0; i < count; ++i) {
-    const double left = difference(sides[1][i], sides[0][i]), right = difference(sides[1][i], sides[2][i]);
-    out.edges += (std::min(left, right) > kSeen) / (1.0 * count);
+    const Color &left = sides[0][i], &own = sides[1][i], &right = sides[2][i];
+    const bool blur = 2.0 * radius < kBlurWidth && from_blur(own, left, right) < kBlurred;
+    const bool seen = std::min(difference(own, left), difference(own, right)) > kSeen && !blur;
+    out.edges += seen / (1.0 * count);
     out.steady += (spread[i] < kUnlike * typical || elsewhere(i)) / (1.0 * count);
   }
   return out;
