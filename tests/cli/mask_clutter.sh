@@ -52,6 +52,9 @@ frame=$work/frame
 run mask "$frame" -o "$work/missed" --point cam0:339.7,177.9 --json
 expect_code 0 'a point that is missed'
 warned || fail 'a point that is missed: no warning'
+run mask "$still" -o "$work/off" --point cam0:20,20 --json
+expect_code 0 'a point beside the cable'
+warned || fail 'a point beside the cable: no warning'
 # and so is a mask of a white cable's lit middle alone
 middle=$work/middle
 "$source_dir/tools/make_clutter" "$middle" --seed 615 --frames 1 --scale 0.5 || fail 'make_clutter'
