@@ -12,6 +12,7 @@
 #include "src/masking/cut.h"
 #include "src/masking/grow.h"
 #include "src/masking/look.h"
+#include "src/masking/one_rope.h"
 #include "src/masking/ribbon.h"
 
 namespace {
@@ -312,6 +313,26 @@ TEST_CASE("a ribbon finds outlines, connector and end; what has one side only, o
   CHECK(masking::score(masking::evidence(picture, leaving)) < masking::kDoubtful);
 }
 
+TEST_CASE("the blur of a step is no thin rope") {
+  // a wall that is dark from column 100 on, blurred over 3 px, and a cable of 2.5 px at column 60
+  std::vector<std::uint8_t> pixels;
+  for (int y = 0; y < 300; ++y)
+    for (int x = 0; x < 200; ++x) {
+      const double dark = std::clamp((x + 0.5 - 98.5) / 3.0, 0.0, 1.0);
+      const double cable = std::clamp(1.75 - std::abs(x + 0.5 - 60.0), 0.0, 1.0);
+      const double value = 200.0 - 160.0 * dark - 100.0 * cable;
+      for (int c = 0; c < 3; ++c) pixels.push_back(static_cast<std::uint8_t>(value + (x * 7 + y * 13) % 5 - 2));
+    }
+  const masking::Picture picture{pixels.data(), 200, 300, 3};
+  const auto score_at = [&](double x) {
+    masking::Axis axis;
+    for (int i = 0; i <= 75; ++i) axis.points.push_back({{x, 20.0 + 3.0 * i}, 1.25, 3e-3 * i});
+    return masking::score(masking::evidence(picture, axis));
+  };
+  CHECK(score_at(100.0) < 0.3);
+  CHECK(score_at(60.0) > masking::kDoubtful);
+}
+
 // A wall with a straight tube of one color from row 20 to 250, its axis at column `at`, `radius` px wide, lit from the
 // front and a quarter of a right angle to its left. Sampled eight times per pixel and blurred by a lens of 0.9 px.
 std::vector<std::uint8_t> wall_with_tube(double at, double radius) {
@@ -368,6 +389,108 @@ TEST_CASE("the rims of a tube are its outlines, where color changes most is insi
   MESSAGE("radius off by ", steepest, " px where color changes most, by ", rims, " px with rims");
   CHECK(rims < 0.12);
   CHECK(rims < 0.5 * steepest);
+}
+
+// A board of this color on which a rope lies from row 20 to 250, its axis at column 100.3 and 6 px wide on either side,
+// striped in these colors and lit from the left. On its right is its shadow, 4 px wide.
+std::vector<std::uint8_t> board_with_rope(const std::array<double, 3>& board,
+                                          const std::vector<std::array<double, 3>>& stripes) {
+  constexpr double kAt = 100.3, kRadius = 6.0, kShadow = 4.0, kInShadow = 0.4;
+  constexpr int kSamples = 8, kStripe = 12;
+  std::vector<std::uint8_t> out;
+  for (int y = 0; y < 300; ++y)
+    for (int x = 0; x < 200; ++x)
+      for (int c = 0; c < 3; ++c) {
+        double sum = 0.0;
+        for (int i = 0; i < kSamples; ++i) {
+          const double across = (x + (i + 0.5) / kSamples - kAt) / kRadius;
+          const bool there = y >= 20 && y < 250;
+          const double light = 0.25 + 0.75 * std::max(0.0, std::cos(0.9 + std::asin(std::clamp(across, -1.0, 1.0))));
+          if (there && std::abs(across) < 1.0)
+            sum += light * stripes[(y / kStripe) % stripes.size()][c];
+          else
+            sum += board[c] * (there && across >= 1.0 && across < 1.0 + kShadow / kRadius ? kInShadow : 1.0);
+        }
+        out.push_back(static_cast<std::uint8_t>(std::lround(sum / kSamples) + (x * 7 + y * 13 + c * 3) % 5 - 2));
+      }
+  return out;
+}
+
+TEST_CASE("a rope's shadow on what it lies on is not a part of it; where hues do not tell, nothing changes") {
+  masking::Axis rough;  // beside the rope
+  for (int i = 0; i <= 76; ++i) rough.points.push_back({{101.8, 20.0 + 3.0 * i}, 6.0, 3e-3 * i});
+  const auto outlines = [&](const std::vector<std::uint8_t>& pixels, bool shadow) {  // medians, px: left, right
+    masking::RibbonOptions options;
+    options.shadow = shadow, options.width_deviation = 0.4, options.rims = true;
+    const masking::Ribbon ribbon = masking::find_ribbon({}, {pixels.data(), 200, 300, 3}, rough, 0.23, options);
+    std::vector<double> left, right;
+    for (const masking::AxisPoint& p : ribbon.axis.points) {
+      if (p.at.y() < 40 || p.at.y() > 210) continue;
+      left.push_back(p.at.x() - p.radius), right.push_back(p.at.x() + p.radius);
+    }
+    REQUIRE(left.size() > 20);
+    return std::array{math::median(left), math::median(right)};
+  };
+  const std::array<double, 3> wood{200, 160, 118}, gray{170, 170, 170};
+  const std::vector<std::uint8_t> striped = board_with_rope(wood, {{40, 110, 170}, {210, 70, 50}, {230, 230, 230}});
+  const auto with = outlines(striped, true), without = outlines(striped, false);
+  MESSAGE("right outline off by ", with[1] - 106.3, " px, as part of the rope ", without[1] - 106.3, " px");
+  CHECK(with[0] == doctest::Approx(94.3).epsilon(0.006));
+  CHECK(with[1] == doctest::Approx(106.3).epsilon(0.006));
+  CHECK(without[1] > 107.5);
+  // a rope of the board's hue: there is no telling
+  const std::vector<std::uint8_t> alike = board_with_rope(gray, {{235, 235, 235}, {90, 90, 90}});
+  const auto told = outlines(alike, true), untold = outlines(alike, false);
+  CHECK(told[0] == doctest::Approx(untold[0]).epsilon(0.005));
+  CHECK(told[1] == doctest::Approx(untold[1]).epsilon(0.005));
+}
+
+TEST_CASE("outlines of several pictures make one rope, and one that is none of the rope's hardly counts") {
+  // a rope of 12 mm along the ground, three cameras at 0.8 m that look down at it
+  const chain::Chain rope =
+      chain::make_chain(0.3, 0.012, Vector3::UnitX(), Vector3::UnitZ(), 8, chain::Bending::planar, false);
+  math::Pose base;
+  VectorX theta(rope.angles());
+  for (int k = 0; k < rope.angles(); ++k) theta[k] = 0.15 * std::cos(0.8 * k);
+  const Vector3 shift(0.002, -0.004, 0.001);
+  const double width = 1.1;
+  std::vector<capture::Camera> cameras(3, front_camera());
+  std::vector<masking::Ribbon> ribbons;
+  math::Pose shifted = base;
+  shifted.translation = shift;
+  for (int c = 0; c < 3; ++c) {
+    capture::Camera& camera = cameras[c];
+    camera.width = 640, camera.height = 480, camera.fx = camera.fy = 600.0, camera.cx = 320.0, camera.cy = 240.0;
+    const double azimuth = 2.1 * c + 0.4;
+    const Vector3 middle(0.15, 0.03, 0.0), from(0.55 * std::cos(azimuth), 0.55 * std::sin(azimuth), 0.6);
+    const Vector3 z = -from.normalized(), x = z.cross(Vector3::UnitZ()).normalized();
+    camera.world_from_camera.translation = middle + from;
+    camera.world_from_camera.rotation << x, z.cross(x), z;
+    masking::Ribbon ribbon;
+    ribbon.axis = masking::axis(rope, shifted, theta, camera, 0.0, rope.length);
+    for (masking::AxisPoint& p : ribbon.axis.points) p.radius *= width;
+    ribbons.push_back(ribbon);
+  }
+  for (std::size_t i = 5; i < ribbons[1].axis.points.size() / 2; ++i) {  // a shadow, for half the length
+    masking::AxisPoint& p = ribbons[1].axis.points[i];
+    const math::Vector2 along = ribbons[1].axis.points[i + 1].at - p.at;
+    p.at += math::Vector2(-along.y(), along.x()).normalized() * 1.5;
+    p.radius += 1.5;
+  }
+  std::vector<masking::Outlined> seen;
+  for (int c = 0; c < 3; ++c) seen.push_back({&cameras[c], base, &ribbons[c]});
+  masking::OneRope start{theta, Vector3::Zero(), 1.0};
+  for (int k = 0; k < rope.angles(); ++k) start.theta[k] += k % 2 ? 0.03 : -0.03;
+  const masking::OneRope fit = masking::fit_one_rope(rope, seen, start);
+  const auto line = [&](const VectorX& angles, const Vector3& moved) {
+    math::Pose at = base;
+    at.translation = moved;
+    return chain::centerline(rope, chain::link_motions(rope, angles, at), chain::equal_arclengths(rope, 31));
+  };
+  const double rms = 1e3 * std::sqrt((line(fit.theta, fit.shift) - line(theta, shift)).colwise().squaredNorm().mean());
+  MESSAGE("one rope: ", rms, " mm, width ", fit.width);
+  CHECK(rms < 0.4);
+  CHECK(fit.width == doctest::Approx(width).epsilon(0.01));
 }
 
 TEST_CASE("growth: an edge is no rope, the grasp is found 12 mm away, a rope at rest does not turn up") {

@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "src/masking/cut.h"
+#include "src/masking/one_rope.h"
 #include "src/masking/ribbon.h"
 
 namespace chainsplat::masking {
@@ -22,12 +23,18 @@ constexpr double kUnsure = 0.7;       // its score is multiplied by this
 // px across the rope, below which its score is that of an unsure one: of ten such stills that looked right, four had an
 // IoU of 0.24 to 0.52.
 constexpr double kFewestPixels = 2.2;
+// of the given diameter: narrower masks have the score of unsure ones, too. The lit middle of a cable has outlines of
+// its own, a tube within the tube; nothing is like that outside of it, and given diameters are right to a fifth, masks'
+// widths to some hundredths.
+constexpr double kNarrow = 0.77;
+constexpr double kAtPoint = 2.0;              // radii, within which a rope runs through a point of the user's
 constexpr double kLeastStillEvidence = 0.02;  // nats per sample
 constexpr double kFirstWidth = 0.2, kFirstBroadWidth = 0.4,
                  kKnownWidth = 0.12;                   // deviation of the width before and after it was measured
 constexpr double kBroad = 4.0;                         // px, of a radius beyond which blur hardly changes a width
 constexpr double kLeastWidth = 0.6, kMostWidth = 1.7;  // of the given diameter, as far as it is believed to be wrong
-constexpr int kRibbonRounds = 3;                       // of colors and ribbons; the last keeps the width
+constexpr double kSharedWidth = 0.1;  // deviation of the width that all pictures of a moment have, about the usual one
+constexpr int kRibbonRounds = 3;      // of colors and ribbons; the last keeps the width
 
 // The mask of what lies inside the tube.
 View inside_of(const Tube& tube, int camera, const Frame& frame) {
@@ -50,10 +57,13 @@ View inside_of(const Tube& tube, int camera, const Frame& frame) {
 struct Still {
   const Frame* frame;
   const Grown* grown;  // of the moment nearest in time
-  Axis along = {};     // of the grown chain
+  OneRope rope;        // the grown chain, or what all pictures of the moment make of it, and the width of ribbons
+  Axis along = {};     // of that rope
   Ribbon ribbon = {};
   bool broad = false;  // enough pixels across that blur hardly changes the width
 };
+
+double bend_change_of(const capture::Capture& scene) { return scene.tabletop ? kLyingBendChange : kHangingBendChange; }
 
 // Grows every moment by itself, then with the grasp and the colors that the moments agree upon.
 std::vector<Grown> grow_stills(const Recording& recording, const chain::Chain& chain,
@@ -63,7 +73,7 @@ std::vector<Grown> grow_stills(const Recording& recording, const chain::Chain& c
   const auto clues_of = [&](const Moment& moment, int pass) {
     Clues clues;
     clues.grasp = grasp;
-    clues.bend_change = scene.tabletop ? kLyingBendChange : kHangingBendChange;
+    clues.bend_change = bend_change_of(scene);
     clues.grasp_deviation = pass ? kGraspScatter : kGraspDeviation;
     if (!scene.tabletop && scene.gravity.norm() > 0.0)
       clues.down = scene.base.pose(moment.time).rotation.transpose() * scene.gravity.normalized();
@@ -90,14 +100,14 @@ std::vector<std::vector<Still>> stills_of(const std::vector<Samples>& samples, c
       std::size_t nearest = 0;
       for (std::size_t i = 1; i < moments.size(); ++i)
         if (std::abs(moments[i].time - frame.time) < std::abs(moments[nearest].time - frame.time)) nearest = i;
-      out[c].push_back({&frame, &grown[nearest]});
+      out[c].push_back({&frame, &grown[nearest], {grown[nearest].theta, grown[nearest].shift, 1.0}});
     }
   return out;
 }
 
 math::Pose base_at(const Recording& recording, const Still& still) {
   math::Pose base = recording.capture.base.pose(still.frame->time);
-  base.translation = base * still.grown->shift;
+  base.translation = base * still.rope.shift;
   return base;
 }
 
@@ -112,7 +122,7 @@ Look look_of(const Recording& recording, const chain::Chain& chain, int camera, 
     const Picture picture = picture_of(*still.frame);
     const bool by_ribbon = ribbons && still.ribbon.axis.points.size() > 1;
     const math::Pose base = base_at(recording, still);
-    still.along = axis(chain, base, still.grown->theta, pinhole, 0.0, chain.length);
+    still.along = axis(chain, base, still.rope.theta, pinhole, 0.0, chain.length);
     const Tube around = tube(by_ribbon ? still.ribbon.axis : still.along, picture.width, picture.height, kAboutPixels);
     still.broad = around.radius > kBroad;
     count_colors(look, picture, around, reach(chain, base, pinhole), chain,
@@ -122,9 +132,32 @@ Look look_of(const Recording& recording, const chain::Chain& chain, int camera, 
   return look;
 }
 
+// What the ribbons of several pictures of one moment make of the rope.
+void join_pictures(const Recording& recording, const chain::Chain& chain, std::vector<std::vector<Still>>& stills) {
+  std::vector<std::vector<Still*>> moments;
+  std::vector<std::vector<Outlined>> seen;
+  for (std::size_t c = 0; c < stills.size(); ++c)
+    for (Still& still : stills[c]) {
+      if (still.ribbon.axis.points.size() < 3) continue;
+      const auto same = std::find_if(moments.begin(), moments.end(), [&](const std::vector<Still*>& moment) {
+        return moment.front()->grown == still.grown;
+      });
+      const std::size_t m = same - moments.begin();
+      if (same == moments.end()) moments.emplace_back(), seen.emplace_back();
+      moments[m].push_back(&still);
+      seen[m].push_back(
+          {&recording.pinholes[c], recording.capture.base.pose(still.frame->time), &moments[m].back()->ribbon});
+    }
+  core::parallel_for(static_cast<std::int64_t>(moments.size()), [&](std::int64_t m) {
+    if (moments[m].size() < 2) return;
+    const OneRope rope = fit_one_rope(chain, seen[m], moments[m].front()->rope,
+                                      {kSharedWidth, kGraspDeviation, bend_change_of(recording.capture)});
+    for (Still* const still : moments[m]) still->rope = rope;
+  });
+}
+
 // Colors and ribbons in turn; the width is what the ribbons of all cameras have in common.
 void find_ribbons(const Recording& recording, const chain::Chain& chain, std::vector<std::vector<Still>>& stills) {
-  double width = 1.0;
   for (int round = 0; round < kRibbonRounds; ++round) {
     std::vector<double> widths;
     for (std::size_t c = 0; c < stills.size(); ++c) {
@@ -132,7 +165,8 @@ void find_ribbons(const Recording& recording, const chain::Chain& chain, std::ve
       core::parallel_for(static_cast<std::int64_t>(stills[c].size()), [&](std::int64_t i) {
         Still& still = stills[c][i];
         RibbonOptions ribbon;
-        ribbon.width = width;
+        ribbon.width = std::clamp(still.rope.width, kLeastWidth, kMostWidth);
+        ribbon.shadow = recording.capture.tabletop;
         ribbon.width_deviation = round ? kKnownWidth : still.broad ? kFirstBroadWidth : kFirstWidth;
         ribbon.rims = round + 1 == kRibbonRounds;
         still.ribbon = find_ribbon(look, picture_of(*still.frame), still.along, chain.length, ribbon);
@@ -141,17 +175,30 @@ void find_ribbons(const Recording& recording, const chain::Chain& chain, std::ve
         if (!still.ribbon.axis.points.empty()) widths.push_back(still.ribbon.width);
     }
     if (widths.empty()) throw_nothing(recording);
-    if (round + 1 < kRibbonRounds) width = std::clamp(math::median(widths), kLeastWidth, kMostWidth);
+    if (round + 1 == kRibbonRounds) break;
+    for (std::vector<Still>& of_camera : stills)
+      for (Still& still : of_camera) still.rope.width = math::median(widths);
+    join_pictures(recording, chain, stills);
   }
 }
 
-double score_of(const Still& still) {
+bool runs_through(const Axis& axis, const math::Vector2& point) {
+  return std::any_of(axis.points.begin(), axis.points.end(),
+                     [&](const AxisPoint& p) { return (p.at - point).norm() < kAtPoint * std::max(1.0, p.radius); });
+}
+
+double score_of(const Help& help, int camera, const Still& still) {
   // another way from the grasp that explains the picture nearly as well: another cable that crosses, perhaps
   const double sure = std::min(1.0, kUnsure + (1.0 - kUnsure) * still.grown->margin / kSureMargin);
+  const Axis& axis = still.ribbon.axis;
   std::vector<double> radii;
-  for (const AxisPoint& p : still.ribbon.axis.points) radii.push_back(p.radius);
+  for (const AxisPoint& p : axis.points) radii.push_back(p.radius);
   const bool thin = radii.empty() || 2.0 * math::median(radii) < kFewestPixels;
-  return (thin ? std::min(sure, kUnsure) : sure) * score(evidence(picture_of(*still.frame), still.ribbon.axis));
+  const bool elsewhere = std::any_of(help.points.begin(), help.points.end(), [&](const Help::Point& point) {
+    return point.camera == camera && point.frame == still.frame->frame && !runs_through(axis, point.at);
+  });
+  const bool unsure = thin || elsewhere || still.ribbon.width < kNarrow;
+  return (unsure ? std::min(sure, kUnsure) : sure) * score(evidence(picture_of(*still.frame), axis));
 }
 
 }  // namespace
@@ -174,7 +221,8 @@ Summary make_stills(const Recording& recording, const chain::Chain& chain, const
       ++summary.frames;
       summary.empty += view.width == 0;
       summary.inside += view.width != 0;
-      sink(static_cast<int>(c), still.frame->frame, recorded_mask(view, recording.capture.cameras[c]), score_of(still));
+      sink(static_cast<int>(c), still.frame->frame, recorded_mask(view, recording.capture.cameras[c]),
+           score_of(recording.help, static_cast<int>(c), still));
     }
   summary.inside /= summary.frames;
   return summary;

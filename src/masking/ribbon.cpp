@@ -7,6 +7,7 @@
 #include <utility>
 
 #include "src/masking/rims.h"
+#include "src/masking/shadow.h"
 
 namespace chainsplat::masking {
 
@@ -41,14 +42,14 @@ constexpr double kEndStep = 4.0;   // of a full step of color along the rope the
 
 // the evidence
 constexpr double kSeen = 10.0;              // gray levels, the least contrast that is one
+constexpr double kBlurWidth = 4.0;          // px, that the blur of a step may be wide,
+constexpr double kBlurred = 2.0;            // and gray levels, by which it differs from mixtures of both sides
 constexpr double kLeastSpread = 6.0;        // gray levels, of the rope's colors along it,
 constexpr int kParts = 6, kOtherParts = 3;  // of the rope; in so many others a color must come back,
 constexpr double kAlike = 14.0;             // to within so many gray levels
 constexpr double kUnlike = 4.0;             // and times their usual spread, from where on it is another color
 
 double square(double x) { return x * x; }
-
-using Color = std::array<float, 3>;
 
 Color color_at(const Picture& picture, const Vector2& at) {
   const double x = std::clamp(at.x() - 0.5, 0.0, picture.width - 1.001),
@@ -68,6 +69,17 @@ double difference(const Color& a, const Color& b) {
   double sum = 0.0;
   for (int c = 0; c < 3; ++c) sum += square(a[c] - b[c]);
   return std::sqrt(sum / 3.0);
+}
+
+// How far a color is from all mixtures of two others: the blur of a step from one to the other has those, and looks
+// like a thin rope along the step.
+double from_blur(const Color& color, const Color& a, const Color& b) {
+  double both = 0.0, all = 1e-9;
+  for (int c = 0; c < 3; ++c) both += static_cast<double>(color[c] - a[c]) * (b[c] - a[c]), all += square(b[c] - a[c]);
+  const auto share = static_cast<float>(std::clamp(both / all, 0.0, 1.0));
+  Color mixed;
+  for (int c = 0; c < 3; ++c) mixed[c] = a[c] + share * (b[c] - a[c]);
+  return difference(color, mixed);
 }
 
 struct Station {
@@ -162,6 +174,22 @@ Straight straighten(const Look& look, const Picture& picture, const Axis& along,
     }
   }
   return out;
+}
+
+// Takes the rope's shadow away.
+void unshade(Straight& s, double usual) {
+  Strip strip;
+  strip.colors = s.colors;
+  for (int k = 0; k < s.columns; ++k) strip.across.push_back((k - s.half) * s.du / usual);
+  const auto before = [&](double arclength) {
+    return static_cast<int>(std::count_if(s.stations.begin(), s.stations.end(),
+                                          [&](const Station& one) { return one.arclength < arclength; }));
+  };
+  strip.begin = before(0.0), strip.end = before(s.length);
+  strip.about = s.about;
+  Shadowless seen = without_shadow(strip);
+  s.colors = std::move(seen.colors);
+  for (std::size_t at = 0; at < s.odds.size(); ++at) s.odds[at] = std::max(-kMostOdds, s.odds[at] + seen.odds[at]);
 }
 
 // Steps between columns: of the colors on either side, averaged over a radius of length. A full step counts fully at
@@ -409,6 +437,7 @@ Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, 
   Ribbon out;
   if (along.points.size() < 2) return out;
   Straight s = straighten(look, picture, along, length, options);
+  if (options.shadow) unshade(s, options.width * s.radius);
   find_steps(s);
   const Choices choices = choices_of(s, options);
   if (choices.all.empty()) return out;
@@ -489,8 +518,10 @@ Evidence evidence(const Picture& picture, const Axis& axis) {
     return std::count(has.begin(), has.end(), true) >= kOtherParts;
   };
   for (int i = 0; i < count; ++i) {
-    const double left = difference(sides[1][i], sides[0][i]), right = difference(sides[1][i], sides[2][i]);
-    out.edges += (std::min(left, right) > kSeen) / (1.0 * count);
+    const Color &left = sides[0][i], &own = sides[1][i], &right = sides[2][i];
+    const bool blur = 2.0 * radius < kBlurWidth && from_blur(own, left, right) < kBlurred;
+    const bool seen = std::min(difference(own, left), difference(own, right)) > kSeen && !blur;
+    out.edges += seen / (1.0 * count);
     out.steady += (spread[i] < kUnlike * typical || elsewhere(i)) / (1.0 * count);
   }
   return out;

@@ -14,6 +14,7 @@ struct RibbonOptions {
   double width = 1.0;            // usual width as a share of the axis' own,
   double width_deviation = 0.2;  // and how sure that is
   double slack = 0.01;           // m, by which the rope may end or come out of the gripper elsewhere
+  bool shadow = false;           // it lies on something, on which it casts a shadow
   bool rims = false;             // outlines where the rims of a tube fit, instead of where colors change most
 };
 

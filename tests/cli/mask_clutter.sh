@@ -46,6 +46,21 @@ expect_iou 0.8 cam0 'a point'
 run mask "$window" -o "$work/without" --empty "cam0=$window/truth/empty/cam0.png" --json
 expect_code 0 'an empty scene'
 expect_iou 0.75 cam0 'an empty scene'
+# what does not run through the user's point is warned of: a window's frame, in place of a black cable before the window
+frame=$work/frame
+"$source_dir/tools/make_clutter" "$frame" --seed 1202 --frames 1 --scale 0.5 || fail 'make_clutter'
+run mask "$frame" -o "$work/missed" --point cam0:339.7,177.9 --json
+expect_code 0 'a point that is missed'
+warned || fail 'a point that is missed: no warning'
+run mask "$still" -o "$work/off" --point cam0:20,20 --json
+expect_code 0 'a point beside the cable'
+warned || fail 'a point beside the cable: no warning'
+# and so is a mask of a white cable's lit middle alone
+middle=$work/middle
+"$source_dir/tools/make_clutter" "$middle" --seed 615 --frames 1 --scale 0.5 || fail 'make_clutter'
+run mask "$middle" -o "$work/lit" --empty "cam0=$middle/truth/empty/cam0.png" --json
+expect_code 0 'the lit middle of a cable'
+warned || fail 'the lit middle of a cable: no warning'
 # a box is of its frame, also where the scene is known: around all of them this one changes frame 1
 three=$work/three
 "$source_dir/tools/make_clutter" "$three" --seed 43 --frames 3 --scale 0.5 --grasp-error 14 || fail 'make_clutter'
@@ -68,6 +83,13 @@ run mask "$table" -o "$work/views" --json
 expect_code 0 'a table'
 for camera in cam0 cam1 cam2 cam3; do expect_iou 0.85 $camera 'a table'; done
 warned && fail 'a table: a good mask is warned of'
+
+# a rope on a table that is darker in its shadow, all along one side of it in all views
+shadow=$work/shadow
+"$source_dir/tools/make_clutter" "$shadow" --family table --seed 504 --scale 0.5 || fail 'make_clutter --family table'
+run mask "$shadow" -o "$work/in_shadow" --json
+expect_code 0 'a shadow'
+for camera in cam0 cam1 cam2 cam3; do expect_iou 0.91 $camera 'a shadow'; done
 
 # the recipe of docs/guide.md, 3: a color threshold
 run mask "$table" -o "$work/threshold" --json --command "ffmpeg -v error -y -i {image} -vf \"format=gbrp,geq=r='255*gt(g(X,Y)-b(X,Y),60)*gt(g(X,Y)-r(X,Y),10)':g=0:b=0,extractplanes=r\" {mask}"
