@@ -20,8 +20,8 @@ using capture::Finding;
 
 constexpr int kJoints = 16;  // with eight, the clamp's bend is taken for a wrong length (design.md, 'Corrections')
 // Share by which the outlines' square residuals must be larger with what was given before anything is changed. Straight
-// links alone leave up to 0.08 on right recordings of hanging ropes and 0.52 on a table, where ropes are bent more
-// (design.md, 'Corrections').
+// links alone leave up to 0.1 on right recordings. Correcting all that may be wrong leaves half a millimeter on a table,
+// so that more must be wrong there (design.md, 'Corrections').
 constexpr double kNothingWrong = 0.15, kNothingWrongOnTable = 1.0;
 double nothing_wrong(const capture::Capture& capture) {
   return capture.tabletop ? kNothingWrongOnTable : kNothingWrong;
@@ -32,9 +32,9 @@ constexpr double kLeastEvidence = kNothingWrong;
 constexpr std::array kShifts = {0.5, -0.5};  // px
 constexpr double kLeftOfHalfPixel = 0.2;     // share
 // Any other thing alone is corrected if it leaves at most kLeftOfOne of the evidence, to which each of its numbers adds
-// kPerNumber, since many numbers explain a part of anything; and no more than right recordings have.
+// kPerNumber, since many numbers explain a part of anything; and less than kRight, from which on more would be wrong.
 constexpr double kLeftOfOne = 0.25, kPerNumber = 0.03;
-constexpr double kRight = 0.15, kRightOnTable = 0.5;
+constexpr double kRight = kNothingWrong, kRightOnTable = 0.5;
 constexpr double kAboveTable = 0.001;  // m, from which on a rope is said to be held above its table
 // Standard deviations from which a correction is told (something is wrong, and this may be it), and told as certain.
 constexpr double kPossible = 1.5, kCertain = 3.0;
