@@ -440,7 +440,6 @@ capture::Correction shift_of(const char* subject, const char* name, const math::
 // How the rope and its table may be, and all corrections where they are so.
 struct Hypothesis {
   std::optional<capture::Correction> shift;  // of table or grasp, where one of them was given wrong by much
-  std::optional<silhouette::Lying> lying;    // after it
   silhouette::CorrectionFit fit;
 };
 
@@ -449,7 +448,7 @@ Hypothesis supposing(const capture::Capture& given, const chain::Chain& chain, s
   const capture::Capture capture = shift ? with(*shift, given) : given;
   silhouette::CorrectionFit fit =
       silhouette::fit_corrections(chain, capture, silhouette::fit_sequence(chain, capture), options);
-  return {std::move(shift), std::move(options.lying), std::move(fit)};
+  return {std::move(shift), std::move(fit)};
 }
 
 // A rope that lies far beside the plane of its grasp, by table and grasp, is held so, or one of the two was given wrong by
@@ -491,6 +490,54 @@ std::optional<Hypothesis> misplaced(const capture::Capture& capture, const chain
   return best;
 }
 
+// What is corrected, and by which fit.
+struct Decision {
+  silhouette::CorrectionFit fit;
+  bool corrected = false;                    // by what it found; else nothing is, but for the next two
+  bool half_pixel = false;                   // by this alone
+  std::optional<capture::Correction> shift;  // beside what it found: of table or grasp
+};
+
+// None: the rope is held above its table, or may be.
+std::optional<Decision> decide(const capture::Capture& capture, const chain::Chain& chain,
+                               const silhouette::SequenceFit& sequence, const silhouette::CorrectionOptions& options) {
+  silhouette::CorrectionOptions judging = options;
+  judging.prior_weight = silhouette::kAsRecognized;
+  Decision out;
+  out.fit = silhouette::fit_corrections(chain, capture, sequence, judging);
+  out.half_pixel = is_half_pixel(out.fit);
+  if (out.half_pixel) return out;
+
+  // one thing alone
+  if (const silhouette::Cause* const cause = single_cause(out.fit, capture.tabletop)) {
+    judging.only = cause->name;
+    silhouette::CorrectionFit alone = silhouette::fit_corrections(chain, capture, sequence, judging);
+    // where a rope is held above its table, how it comes down is assumed, which other faults would make up for
+    if (lies(capture, alone.corrections)) {
+      core::say_more("correct: " + cause->name + " alone explains what is wrong");
+      keep_given(alone, out.fit);
+      out.fit = std::move(alone);
+      out.corrected = true;
+      return out;
+    }
+  }
+
+  // table or grasp by much, and others
+  if (options.lying && std::abs(options.lying->height) > high(capture)) {
+    std::optional<Hypothesis> found = misplaced(capture, chain, sequence, options);
+    if (!found) return std::nullopt;
+    out.fit = std::move(found->fit);
+    out.shift = std::move(found->shift);
+    out.corrected = out.shift->subject == "grasp" || out.fit.evidence >= nothing_wrong(capture);
+    return out;
+  }
+
+  // all that may be wrong
+  out.corrected = out.fit.evidence >= nothing_wrong(capture);
+  if (out.corrected) out.fit = silhouette::fit_corrections(chain, capture, sequence, options);
+  return out;
+}
+
 }  // namespace
 
 Corrected correct(capture::Capture& capture, const std::vector<std::string>& fixed, bool anyway) {
@@ -523,42 +570,13 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   options.lying = silhouette::lying_on_table(capture);
   options.held = fixed;
   for (const double pixels : kShifts) options.mistakes.push_back(shifted_images(capture, pixels));
-  const bool above = options.lying && std::abs(options.lying->height) > high(capture);
-
-  silhouette::CorrectionOptions judging = options;
-  judging.prior_weight = silhouette::kAsRecognized;
-  silhouette::CorrectionFit fit = silhouette::fit_corrections(chain, capture, sequence, judging);
-  const bool half_pixel = is_half_pixel(fit);
-  bool corrected = false;
-  if (const silhouette::Cause* const cause = half_pixel ? nullptr : single_cause(fit, capture.tabletop)) {
-    judging.only = cause->name;
-    silhouette::CorrectionFit alone = silhouette::fit_corrections(chain, capture, sequence, judging);
-    // where a rope is held above its table, how it comes down is assumed, which other faults would make up for
-    corrected = lies(capture, alone.corrections);
-    if (corrected) {
-      core::say_more("correct: " + cause->name + " alone explains what is wrong");
-      keep_given(alone, fit);
-      fit = std::move(alone);
-    }
+  std::optional<Decision> decision = decide(capture, chain, sequence, options);
+  if (!decision) {
+    out.verdict.push_back(held_high(std::abs(options.lying->height)));
+    out.corrections = std::move(lost);
+    return out;
   }
-  std::optional<capture::Correction> shift;
-  if (!half_pixel && !corrected) {
-    std::optional<Hypothesis> found;
-    if (above) {
-      found = misplaced(capture, chain, sequence, options);
-      if (!found) {
-        out.verdict.push_back(held_high(std::abs(options.lying->height)));
-        out.corrections = std::move(lost);
-        return out;
-      }
-      shift = found->shift;
-      fit = std::move(found->fit);
-      corrected = shift->subject == std::string("grasp") || fit.evidence >= nothing_wrong(capture);
-    } else if (fit.evidence >= nothing_wrong(capture)) {
-      fit = silhouette::fit_corrections(chain, capture, sequence, options);
-      corrected = true;
-    }
-  }
+  auto& [fit, corrected, half_pixel, shift] = *decision;
   tell_fit("correct", fit.summary);
   out.corrections = std::move(fit.corrections);
   if (corrected)
