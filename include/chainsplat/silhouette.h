@@ -145,7 +145,7 @@ struct OutlineMisfit {
 
 // One thing that may be all that is wrong with a recording.
 struct Cause {
-  std::string name;       // "base.time", "cam1.pose", "length", "masks", "grasp.translation, masks", ...
+  std::string name;       // "base.time", "cam1.pose", "length", "masks", "grasp and length, masks", ...
   int numbers = 0;        // that it is made of
   double evidence = 0.0;  // that something is wrong, which is left when it is corrected and nothing else
 };

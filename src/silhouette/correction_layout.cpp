@@ -125,9 +125,11 @@ std::vector<Direction> single_causes(const Layout& layout, const std::vector<cap
     return [=](const Column& column) { return column.quantity->subject == std::string(subject) && is(column, name); };
   };
   add("base.time", of("base", "time"));
-  add("grasp.translation", of("grasp", "translation"));
+  // a grasp that is off along the rope looks like another length: with its shift free the length is, too
+  add("grasp and length", [](const Column& column) {
+    return (column.quantity->subject == std::string("grasp") && is(column, "translation")) || is(column, "length");
+  });
   add("grasp.rotation", of("grasp", "rotation"));
-  add("grasp", [](const Column& column) { return column.quantity->subject == std::string("grasp"); });
   add("length", of("object", "length"));
   add("diameter", of("object", "diameter"));
   add("table", of("table", "height"));
