@@ -130,6 +130,7 @@ struct CorrectionOptions {
   // times as straight, without which much that is wrong at a time would go into its length.
   double prior_weight = 1.0;
   std::string only = {};  // the cause that is corrected, by its name; none: all there may be
+  std::string then = {};  // the cause that is, from there on; none: the same
   // Known mistakes as the corrections that mend them, e.g. half a pixel. Quantities that are not in one of them are
   // right as given.
   std::vector<capture::Corrections> mistakes = {};
@@ -146,8 +147,10 @@ struct OutlineMisfit {
 // One thing that may be all that is wrong with a recording.
 struct Cause {
   std::string name;       // "base.time", "cam1.pose", "length", "masks", "grasp and length, masks", ...
+  std::string in_doubt;   // the name of the cause with what this one may be mistaken for, too: "grasp and length"
   int numbers = 0;        // that it is made of
   double evidence = 0.0;  // that something is wrong, which is left when it is corrected and nothing else
+  double surprise = 0.0;  // -ln of how likely it is that just this is wrong, as far as priors tell (mathematics.md 6.10)
 };
 struct CorrectionFit {
   capture::Corrections corrections;
@@ -155,6 +158,7 @@ struct CorrectionFit {
   // By which share the outlines' square residuals would be larger with what was given, whatever of it is wrong.
   double evidence = 0.0;
   std::vector<Cause> causes;
+  double surprise = 0.0;  // of this fit, as a cause's
   std::vector<double> evidence_after;  // the same with each of the options' mistakes mended, and nothing else
   solve::Summary summary;              // the unknowns relative to their prior deviations, and rad
   std::vector<OutlineMisfit> misfits;  // by camera, after the corrections

@@ -35,6 +35,7 @@ constexpr double kLeftOfHalfPixel = 0.2;     // share
 // kPerNumber, since many numbers explain a part of anything; and less than kRight, from which on more would be wrong.
 constexpr double kLeftOfOne = 0.25, kPerNumber = 0.03;
 constexpr double kRight = kNothingWrong, kRightOnTable = 0.5;
+constexpr double kAsWell = 0.05;  // evidence by which explanations of right recordings differ, since links are straight
 constexpr double kAboveTable = 0.001;  // m, from which on a rope is said to be held above its table
 // Standard deviations from which a correction is told (something is wrong, and this may be it), and told as certain.
 constexpr double kPossible = 1.5, kCertain = 3.0;
@@ -265,7 +266,8 @@ bool is_half_pixel(const silhouette::CorrectionFit& fit) {
   return fit.evidence > kLeastEvidence && *least < kLeftOfHalfPixel * fit.evidence;
 }
 
-// The one thing that explains what is wrong; null where it takes more.
+// The one thing that explains what is wrong; null where it takes more. Of those that may be mistaken for each other it is
+// the likeliest.
 const silhouette::Cause* single_cause(const silhouette::CorrectionFit& fit, bool tabletop) {
   if (fit.evidence < kLeastEvidence) return nullptr;
   const silhouette::Cause* best = nullptr;
@@ -276,6 +278,10 @@ const silhouette::Cause* single_cause(const silhouette::CorrectionFit& fit, bool
     best = &cause;
     least = left;
   }
+  if (!best) return nullptr;
+  const double as_well = best->evidence + kAsWell;
+  for (const silhouette::Cause& cause : fit.causes)
+    if (cause.in_doubt == best->in_doubt && cause.evidence <= as_well && cause.surprise < best->surprise) best = &cause;
   return best;
 }
 
@@ -283,6 +289,35 @@ const silhouette::Cause* single_cause(const silhouette::CorrectionFit& fit, bool
 bool lies(capture::Capture capture, const capture::Corrections& corrections) {
   capture::apply(corrections, capture);
   return std::abs(silhouette::height_by_table(capture)) <= kAboveTable;
+}
+
+// Corrections of one cause alone, or of it and what it may be mistaken for, whichever is likelier. Both count among what
+// is not known.
+silhouette::CorrectionFit fit_alone(const chain::Chain& chain, const capture::Capture& capture,
+                                    const silhouette::SequenceFit& sequence, const silhouette::Cause& cause,
+                                    silhouette::CorrectionOptions options) {
+  options.only = cause.name;
+  silhouette::CorrectionFit one = silhouette::fit_corrections(chain, capture, sequence, options);
+  if (cause.in_doubt == cause.name) return one;
+  options.then = cause.in_doubt;
+  silhouette::CorrectionFit other = silhouette::fit_corrections(chain, capture, sequence, options);
+  if (other.surprise < one.surprise) std::swap(one, other);
+  const double share = 1.0 / (1.0 + std::exp(other.surprise - one.surprise));  // how likely the other is
+  math::VectorX apart(one.covariance.rows());
+  Eigen::Index at = 0;
+  for (std::size_t i = 0; i < one.corrections.size(); ++i) {
+    capture::Correction& correction = one.corrections[i];
+    if (correction.state == capture::CorrectionState::held) {
+      correction.value.setZero();
+      correction.state = other.corrections[i].state;
+    }
+    const math::VectorX difference = other.corrections[i].value - correction.value;
+    correction.deviation = (correction.deviation.array().square() + share * difference.array().square()).sqrt();
+    apart.segment(at, difference.size()) = difference;
+    at += difference.size();
+  }
+  one.covariance += share * apart * apart.transpose();
+  return one;
 }
 
 // What is corrected when one thing explains all: `alone` was fitted with that one free, `all` with all. The deviations
@@ -510,8 +545,7 @@ std::optional<Decision> decide(const capture::Capture& capture, const chain::Cha
 
   // one thing alone
   if (const silhouette::Cause* const cause = single_cause(out.fit, capture.tabletop)) {
-    judging.only = cause->name;
-    silhouette::CorrectionFit alone = silhouette::fit_corrections(chain, capture, sequence, judging);
+    silhouette::CorrectionFit alone = fit_alone(chain, capture, sequence, *cause, judging);
     // where a rope is held above its table, how it comes down is assumed, which other faults would make up for
     if (lies(capture, alone.corrections)) {
       core::say_more("correct: " + cause->name + " alone explains what is wrong");

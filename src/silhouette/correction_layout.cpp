@@ -111,7 +111,7 @@ MatrixX covariance_of_numbers(const Layout& layout, const MatrixX& shared) {
 
 std::vector<Direction> single_causes(const Layout& layout, const std::vector<capture::Camera>& cameras) {
   std::vector<Direction> out;
-  const auto add = [&](const std::string& name, const auto& belongs) {
+  const auto add = [&](const std::string& name, const auto& belongs, const std::string& in_doubt = {}) {
     std::vector<int> numbers;
     for (const Column& column : layout.columns)
       for (int i = 0; column.first >= 0 && belongs(column) && i < column.quantity->size; ++i)
@@ -119,18 +119,20 @@ std::vector<Direction> single_causes(const Layout& layout, const std::vector<cap
     if (numbers.empty()) return;
     MatrixX directions = MatrixX::Zero(layout.size, static_cast<Eigen::Index>(numbers.size()));
     for (std::size_t k = 0; k < numbers.size(); ++k) directions(numbers[k], static_cast<Eigen::Index>(k)) = 1.0;
-    out.push_back({name, std::move(directions)});
+    out.push_back({name, in_doubt.empty() ? name : in_doubt, std::move(directions)});
   };
   const auto of = [](const char* subject, const char* name) {
     return [=](const Column& column) { return column.quantity->subject == std::string(subject) && is(column, name); };
   };
   add("base.time", of("base", "time"));
-  // a grasp that is off along the rope looks like another length: with its shift free the length is, too
-  add("grasp and length", [](const Column& column) {
+  // a grasp that is off along the rope looks like another length: where one of them is free the other is, too
+  const std::string both_of_them = "grasp and length";
+  add("grasp", of("grasp", "translation"), both_of_them);
+  add("length", of("object", "length"), both_of_them);
+  add(both_of_them, [](const Column& column) {
     return (column.quantity->subject == std::string("grasp") && is(column, "translation")) || is(column, "length");
   });
   add("grasp.rotation", of("grasp", "rotation"));
-  add("length", of("object", "length"));
   add("diameter", of("object", "diameter"));
   add("table", of("table", "height"));
   add("focal", of("camera", "focal"));
@@ -144,14 +146,14 @@ std::vector<Direction> single_causes(const Layout& layout, const std::vector<cap
   MatrixX first = MatrixX::Zero(layout.size, 1);
   for (const Column& column : layout.columns)
     if (column.first >= 0 && is(column, "time")) first(column.first, 0) = 1.0 / column.deviation;
-  if (first.any()) out.push_back({cameras[0].name + ".time", std::move(first)});
+  if (first.any()) out.push_back({cameras[0].name + ".time", cameras[0].name + ".time", std::move(first)});
 
   const std::size_t alone = out.size();
   add("masks", of("camera", "mask_offset"));
   for (std::size_t i = 0; out.size() > alone && i < alone; ++i) {
     MatrixX both(layout.size, out[i].directions.cols() + out[alone].directions.cols());
     both << out[i].directions, out[alone].directions;
-    out.push_back({out[i].name + ", masks", std::move(both)});
+    out.push_back({out[i].name + ", masks", out[i].in_doubt + ", masks", std::move(both)});
   }
   return out;
 }

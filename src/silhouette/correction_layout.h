@@ -42,7 +42,7 @@ math::MatrixX covariance_of_numbers(const Layout& layout, const math::MatrixX& s
 
 // One thing that may be all that is wrong with a recording: these directions of the shared unknowns, by column.
 struct Direction {
-  std::string name;  // as Cause::name
+  std::string name, in_doubt;  // as in Cause
   math::MatrixX directions;
 };
 // What recordings are given wrongly most often, each alone and together with masks that are wider than the rope.

@@ -46,6 +46,7 @@ constexpr int kTimeStretches = 12;     // of time, whose scatter tells what the 
 constexpr double kHeld = 1e12;         // information that holds an unknown, in units of its deviation
 constexpr double kExact = 1e-4;        // of the prior's deviation, below which it was held so
 constexpr double kSameClock = 1e-9;    // s
+constexpr double kMillimeter = 1e-3;   // m
 
 // Whether all masks may begin anywhere, or those begin at the grasp that do so nearly.
 enum class Starts { anywhere, at_grasp };
@@ -188,40 +189,88 @@ solve::ArrowEquations arrow_of(const std::vector<FrameEquations>& frames, const 
   return arrow;
 }
 
-// The square of a change of the shared unknowns, by which residuals grow, as a matrix. Where the masks begin is free:
-// fingers hide a piece of the rope in many recordings that are right. `information`: of the outlines alone.
-MatrixX cost_of_change(const Layout& layout, const MatrixX& information) {
+// The shared unknowns that say where masks begin, and the others.
+struct Parts {
   std::vector<int> starts, others;
+};
+Parts parts_of(const Layout& layout) {
+  Parts out;
   for (const Column& column : layout.columns)
     for (int i = 0; column.first >= 0 && i < column.quantity->size; ++i)
-      (is_mask_start(column) ? starts : others).push_back(column.first + i);
-  MatrixX out = MatrixX::Zero(information.rows(), information.cols());
-  out(others, others) = MatrixX(information(others, others));
-  if (starts.empty()) return out;
-  const MatrixX pull = information(starts, others), own = information(starts, starts);
-  out(others, others) -= pull.transpose() * own.completeOrthogonalDecomposition().solve(pull);
+      (is_mask_start(column) ? out.starts : out.others).push_back(column.first + i);
   return out;
 }
 
-// Each thing that may be all that is wrong, and what it leaves of the evidence. `x`: all that was found.
-std::vector<Cause> causes_of(const Layout& layout, const std::vector<capture::Camera>& cameras, const MatrixX& cost,
-                             const VectorX& x, double squares) {
-  std::vector<Cause> out;
-  for (const Direction& d : single_causes(layout, cameras)) {
-    const MatrixX cost_of = d.directions.transpose() * cost;
-    const VectorX along = MatrixX(cost_of * d.directions).completeOrthogonalDecomposition().solve(VectorX(cost_of * x));
-    const VectorX left = x - d.directions * along;
-    out.push_back({d.name, static_cast<int>(d.directions.cols()), left.dot(cost * left) / squares});
+// Where masks begin is free: fingers hide a piece of the rope in many recordings that are right. So the outlines'
+// `information` of all else is that with the starts at their best, which follow a change of the others by `follow`.
+struct Followed {
+  MatrixX cost;    // of all shared unknowns, 0 for the starts: the square of a change, by which residuals grow
+  MatrixX follow;  // starts x others
+};
+Followed cost_of_change(const Parts& parts, const MatrixX& information) {
+  Followed out{MatrixX::Zero(information.rows(), information.cols()), {}};
+  const auto& [starts, others] = parts;
+  out.cost(others, others) = MatrixX(information(others, others));
+  if (starts.empty()) return out;
+  const MatrixX pull = information(starts, others), own = information(starts, starts);
+  out.follow = -own.completeOrthogonalDecomposition().solve(pull);
+  out.cost(others, others) += pull.transpose() * out.follow;
+  return out;
+}
+
+// -ln of how likely it is that just these directions are wrong, and by x: of the heavy-tailed prior's density and of the
+// mixture's about where masks begin, in units of 1 mm, and of the share of what the priors leave open of the directions
+// that the outlines leave, whose `cost` is that of cost_of_change(). But for constants.
+double surprise_of(const Layout& layout, const MatrixX& directions, const MatrixX& cost, const VectorX& x,
+                   const std::vector<double>& start_deviations) {
+  const MatrixX known = directions.transpose() * cost * directions;
+  double out = 0.5 * std::log((MatrixX::Identity(known.rows(), known.cols()) + known).determinant());
+  for (const Column& column : layout.columns) {
+    if (column.first < 0) continue;
+    if (!is_mask_start(column)) {
+      out += 0.5 * kTails * std::log1p(x.segment(column.first, column.quantity->size).squaredNorm() / kTails);
+      continue;
+    }
+    const double start = column.deviation * x[column.first], untold = start_deviations[column.camera];
+    const double narrow = std::hypot(column.deviation, untold), wide = std::max(narrow, kHidden);
+    const auto density = [&](double deviation) {
+      return kMillimeter / deviation * std::exp(-0.5 * start * start / (deviation * deviation));
+    };
+    out -= std::log(untold > kSharp ? density(wide) : 0.5 * (density(narrow) + density(wide)));
   }
   return out;
 }
 
-// Holds all unknowns but those of the cause of this name, and where the masks begin.
-MatrixX held_but(const Layout& layout, const std::vector<capture::Camera>& cameras, const std::string& name) {
+// Each thing that may be all that is wrong, and what it leaves of the evidence. `x`: all that was found.
+std::vector<Cause> causes_of(const Layout& layout, const std::vector<capture::Camera>& cameras,
+                             const MatrixX& information, const std::vector<double>& start_deviations, const VectorX& x,
+                             double squares) {
+  const Parts parts = parts_of(layout);
+  const auto [cost, follow] = cost_of_change(parts, information);
+  std::vector<Cause> out;
+  for (const Direction& d : single_causes(layout, cameras)) {
+    const MatrixX cost_of = d.directions.transpose() * cost;
+    const VectorX along = MatrixX(cost_of * d.directions).completeOrthogonalDecomposition().solve(VectorX(cost_of * x));
+    VectorX alone = d.directions * along;
+    const VectorX left = x - alone;
+    if (!parts.starts.empty()) alone(parts.starts) = VectorX(x(parts.starts)) - follow * VectorX(left(parts.others));
+    out.push_back({d.name, d.in_doubt, static_cast<int>(d.directions.cols()), left.dot(cost * left) / squares,
+                   surprise_of(layout, d.directions, cost, alone, start_deviations)});
+  }
+  return out;
+}
+
+// The directions of the cause of this name; of none, no name, all are.
+MatrixX directions_of(const Layout& layout, const std::vector<capture::Camera>& cameras, const std::string& name) {
+  if (name.empty()) return MatrixX::Identity(layout.size, layout.size);
   const std::vector<Direction> causes = single_causes(layout, cameras);
   const auto cause = std::find_if(causes.begin(), causes.end(), [&](const Direction& d) { return d.name == name; });
   CHAINSPLAT_CHECK(cause != causes.end(), "cause " + name);
-  const MatrixX& d = cause->directions;
+  return cause->directions;
+}
+
+// Information that holds all unknowns but these directions, and where the masks begin.
+MatrixX holding_all_but(const Layout& layout, const MatrixX& d) {
   MatrixX out =
       MatrixX::Identity(layout.size, layout.size) - d * MatrixX(d.transpose() * d).ldlt().solve(MatrixX(d.transpose()));
   for (const Column& column : layout.columns)
@@ -386,8 +435,8 @@ std::vector<OutlineMisfit> misfits_of(const CorrectionProblem& problem, const st
 CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& sequence,
                               const CorrectionOptions& options) {
   const Layout layout = layout_of(capture, chain, options);
-  const MatrixX held =
-      options.only.empty() ? MatrixX::Zero(layout.size, layout.size) : held_but(layout, capture.cameras, options.only);
+  MatrixX directions = directions_of(layout, capture.cameras, options.only);
+  MatrixX held = holding_all_but(layout, directions);
   CorrectionProblem problem{views_of(capture),
                             capture.cameras,
                             [&](double time) { return capture.base.at(time); },
@@ -426,6 +475,10 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
   // which masks begin at the grasp is seen only when cameras and grasp are nearly right
   const solve::Summary first = solve::least_squares(x, evaluate, solving);
   starts = Starts::at_grasp;
+  if (!options.then.empty()) {
+    directions = directions_of(layout, capture.cameras, options.then);
+    held = holding_all_but(layout, directions);
+  }
   out.summary = solve::least_squares(x, evaluate, solving);
   out.summary.iterations += first.iterations;
   out.summary.initial_cost = first.initial_cost;
@@ -435,19 +488,21 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
   }
 
   const std::vector<FrameEquations> frames = all_equations(problem, layout, chain, x);
-  const VectorX prior = prior_weights(layout, x.head(m), starts, start_deviations(frames));
+  const std::vector<double> untold = start_deviations(frames);
+  const VectorX prior = prior_weights(layout, x.head(m), starts, untold);
   const MatrixX outlines = outline_information(frames);
   const MatrixX covariance =
       shared_covariance(frames, outlines, known_at(capture, layout, x.head(m), starts, frames, held).information);
   const double squares = square_residuals(frames);
-  const MatrixX cost_matrix = cost_of_change(layout, outlines);
+  const MatrixX cost = cost_of_change(parts_of(layout), outlines).cost;
   const auto evidence_of = [&](const capture::Corrections& mended) {
     const VectorX change = x.head(m) - shared_of(layout, capture.cameras, mended);
-    return squares > 0.0 ? change.dot(cost_matrix * change) / squares : 0.0;
+    return squares > 0.0 ? change.dot(cost * change) / squares : 0.0;
   };
   out.evidence = evidence_of({});
   for (const capture::Corrections& mended : options.mistakes) out.evidence_after.push_back(evidence_of(mended));
-  if (squares > 0.0) out.causes = causes_of(layout, capture.cameras, cost_matrix, x.head(m), squares);
+  out.surprise = surprise_of(layout, directions, cost, x.head(m), untold);
+  if (squares > 0.0) out.causes = causes_of(layout, capture.cameras, outlines, untold, x.head(m), squares);
   out.corrections = corrections_at(layout, capture.cameras, x.head(m));
   set_states(layout, prior, covariance, out.corrections);
   out.covariance = covariance_of_numbers(layout, covariance);
