@@ -160,6 +160,34 @@ TEST_CASE("a thicker rope lies higher on its table, which is no other table") {
   CHECK(size_of(found, "grasp", "translation") == 0.0);
 }
 
+TEST_CASE("a grasp that is off along the rope and a wrong length are told apart where masks begin") {
+  constexpr double kOff = 0.004;  // m
+  const auto drawn = [] {
+    capture::Capture capture = demo();
+    draw(
+        {}, [](double time) { return 0.02 * std::sin(3.0 * time); }, capture);
+    return capture;
+  };
+  {
+    capture::Capture capture = drawn();
+    std::vector<trajectory::Sample> samples = capture.base.samples();
+    for (trajectory::Sample& sample : samples)
+      sample.pose.translation -= kOff * (sample.pose.rotation * capture.direction);
+    capture.base = trajectory::fit(samples, "base.tum");
+    const pipeline::Corrected found = pipeline::correct(capture, {}, false);
+    CHECK(size_of(found, "grasp", "translation") == doctest::Approx(kOff).epsilon(0.3));
+    CHECK(size_of(found, "object", "length") < 0.3 * kOff);
+    CHECK(capture::find(found.corrections, "object", "length")->deviation[0] > 0.1 * kOff);  // it may have been this
+  }
+  {
+    capture::Capture capture = drawn();
+    capture.length -= kOff;
+    const pipeline::Corrected found = pipeline::correct(capture, {}, false);
+    CHECK(size_of(found, "object", "length") == doctest::Approx(kOff).epsilon(0.3));
+    CHECK(size_of(found, "grasp", "translation") < 0.3 * kOff);
+  }
+}
+
 TEST_CASE("straight links do not make a bent rope shorter") {
   const auto found = [](double bend) {  // m, of the length, all else held; rad by all joints
     capture::Capture capture = demo();
