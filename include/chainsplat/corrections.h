@@ -79,6 +79,8 @@ std::string calibration_text(const Camera& camera);
 const Correction* find(const Corrections& corrections, const std::string& subject, const std::string& quantity);
 // The first number of a correction, 0 where there is none.
 double value_of(const Corrections& corrections, const std::string& subject, const std::string& quantity);
+// Whether one of them is not 0.
+bool any_correction(const Corrections& corrections);
 
 // Makes a camera's stamps later by a frame from each of these frames on.
 void restore_lost(const math::VectorX& frames, int camera, Capture& capture);

@@ -4,20 +4,22 @@
 #include <string>
 #include <vector>
 
-#include "chainsplat/dynamics.h"
-
 namespace chainsplat::twin {
+
+struct Twin;
 
 struct Property {
   std::string name, unit;  // "bending_stiffness", "N m^2"
   double value = 0.0;
-  double sigma = 0.0;  // standard deviation by the estimates' covariance and, of a friction coefficient, by how much
-                       // the links' own differ; NaN where that is not known
+  // Standard deviation by the estimates' covariance; of a friction coefficient also by how much the links' own differ,
+  // of the mass per length also by what is not known of a length that was corrected. NaN where that is not known.
+  double sigma = 0.0;
 };
 
-// Of a rope; those that it does not have are left out: damping ratio and first frequency of ropes on a table, a
-// friction coefficient in free space. `known_mass`: else stiffnesses, moments and masses are per kilogram of rope.
-std::vector<Property> properties(const dynamics::Model& model, const dynamics::Estimates& estimates, bool known_mass);
+// Of a rope that has parameters; those that it does not have are left out: damping ratio and first frequency of ropes
+// on a table, a friction coefficient in free space. Without a known mass stiffnesses, moments and masses are per
+// kilogram of rope. Throws InputError where the parameters are no rope's.
+std::vector<Property> properties(const Twin& twin);
 // A line each, as programs print them: value and standard deviation, or "(held)" where it was given and not estimated.
 std::string describe(const std::vector<Property>& properties);
 

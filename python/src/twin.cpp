@@ -227,8 +227,8 @@ void add_twin(py::module_& m) {
           "properties",
           [](const Twin& t) {
             py::dict out;
-            for (const twin::Property& p :
-                 twin::properties(model_of(t.rope), t.rope.twin.estimates, t.rope.twin.known_mass))
+            model_of(t.rope);  // says what is missing
+            for (const twin::Property& p : twin::properties(t.rope.twin))
               out[p.name.c_str()] = py::make_tuple(p.value, p.sigma, p.unit);
             return out;
           },

@@ -85,6 +85,10 @@ double value_of(const Corrections& corrections, const std::string& subject, cons
   return found ? found->value[0] : 0.0;
 }
 
+bool any_correction(const Corrections& corrections) {
+  return std::any_of(corrections.begin(), corrections.end(), [](const Correction& c) { return !c.value.isZero(0.0); });
+}
+
 std::string calibration_text(const Camera& camera) {
   std::array<double, 14> numbers{};
   Eigen::Map<math::Matrix3>(numbers.data()) = camera.world_from_camera.rotation;
@@ -152,8 +156,7 @@ void restore_lost(const VectorX& frames, int camera, Capture& capture) {
 }
 
 void apply(const Corrections& corrections, Capture& capture) {
-  if (std::all_of(corrections.begin(), corrections.end(), [](const Correction& c) { return c.value.isZero(0.0); }))
-    return;
+  if (!any_correction(corrections)) return;
   double first = 1e300, last = -1e300;
   for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
     const Correction* const lost = find(corrections, capture.cameras[c].name, lost_frames().name);

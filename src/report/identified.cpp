@@ -145,8 +145,7 @@ void add_resistance(const twin::Twin& twin, std::vector<Quantity>& out) {
 std::vector<Quantity> identified(const twin::Twin& twin) {
   std::vector<Quantity> out;
   if (!twin.parameters) return out;
-  const std::vector<twin::Property> properties =
-      twin::properties(dynamics::make_model(twin.chain, *twin.parameters), twin.estimates, twin.known_mass);
+  const std::vector<twin::Property> properties = twin::properties(twin);
   add_masses(twin, out);
   add_bending(twin, properties, out);
   add_swing(properties, out);

@@ -9,6 +9,7 @@
 #include "chainsplat/dynamics/parametrization.h"
 #include "chainsplat/dynamics/rod.h"
 #include "chainsplat/text.h"
+#include "chainsplat/twin.h"
 #include "src/math/decompositions.h"
 
 namespace chainsplat::twin {
@@ -47,9 +48,15 @@ VectorX hanging_from(const dynamics::Model& model, const VectorX& near) {
   }
 }
 
-// Each with the deviation that the covariance cannot know of, mostly 0. `near`: the shape at rest, of a rope that is
-// much the same; empty: not known.
-std::vector<Property> values(const dynamics::Model& model, bool known_mass, VectorX& near) {
+// What is not known of the length, as a share of it; 0 where nothing was corrected and it is as given.
+double relative_length_deviation(const Twin& twin) {
+  const capture::Correction* const length = capture::find(twin.corrections, "object", "length");
+  return length && capture::any_correction(twin.corrections) ? length->deviation[0] / twin.chain.length : 0.0;
+}
+
+// Each with the deviation that the estimates' covariance cannot know of, mostly 0. `relative_length`: that of the
+// length. `near`: the shape at rest, of a rope that is much the same; empty: not known.
+std::vector<Property> values(const dynamics::Model& model, bool known_mass, VectorX& near, double relative_length) {
   const dynamics::Parameters& p = model.parameters;
   const chain::Chain& chain = model.chain;
   const std::string per_mass = known_mass ? "" : "/kg";
@@ -79,7 +86,7 @@ std::vector<Property> values(const dynamics::Model& model, bool known_mass, Vect
         {"torsional_stiffness", "N m^2" + per_mass, twisting / static_cast<double>(p.torsional_stiffness.size())});
   if (!p.bending_friction.empty()) out.push_back({"bending_friction", "N m" + per_mass, friction / bends});
   if (hanging.size() > 0) add_first_mode(model, hanging, out);
-  out.push_back({"mass_per_length", known_mass ? "kg/m" : "1/m", mass / length});
+  out.push_back({"mass_per_length", known_mass ? "kg/m" : "1/m", mass / length, relative_length * mass / length});
   if (p.table_normal) {
     // one coefficient belongs to the two materials: what the links' differ by is error
     const double mean = held / mass;
@@ -95,9 +102,11 @@ std::vector<Property> values(const dynamics::Model& model, bool known_mass, Vect
 
 }  // namespace
 
-std::vector<Property> properties(const dynamics::Model& model, const dynamics::Estimates& estimates, bool known_mass) {
+std::vector<Property> properties(const Twin& twin) {
+  const dynamics::Model model = dynamics::make_model(twin.chain, *twin.parameters);
+  const dynamics::Estimates& estimates = twin.estimates;
   VectorX near;
-  std::vector<Property> out = values(model, known_mass, near);
+  std::vector<Property> out = values(model, twin.known_mass, near, relative_length_deviation(twin));
   const std::vector<dynamics::Unknown> all = dynamics::unknowns_of(model.chain, estimates);
   const std::vector<Eigen::Index> known = dynamics::parameters_among(all);
   const bool told = estimates.covariance.rows() == static_cast<Eigen::Index>(all.size()) && !known.empty() &&
@@ -116,7 +125,7 @@ std::vector<Property> properties(const dynamics::Model& model, const dynamics::E
       const dynamics::Parameters p =
           dynamics::moved(model.chain, model.parameters, {&unknown, 1}, VectorX::Constant(1, by));
       VectorX start = near;
-      return values(dynamics::make_model(model.chain, p), known_mass, start);
+      return values(dynamics::make_model(model.chain, p), twin.known_mass, start, 0.0);
     };
     const std::vector<Property> up = moved(step), down = moved(-step);
     for (std::size_t k = 0; k < out.size(); ++k)

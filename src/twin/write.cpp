@@ -245,8 +245,7 @@ Json identification_json(const Twin& twin) {
 Json properties_json(const Twin& twin) {
   Json out = Json::object();
   try {
-    const dynamics::Model model = dynamics::make_model(twin.chain, *twin.parameters);
-    for (const Property& p : properties(model, twin.estimates, twin.known_mass))
+    for (const Property& p : properties(twin))
       out[p.name] = {{"value", p.value}, {"sigma", std::isfinite(p.sigma) ? Json(p.sigma) : Json()}, {"unit", p.unit}};
   } catch (const InputError&) {
   }

@@ -109,7 +109,7 @@ void export_twin(const Globals& globals, const ExportRequest& request) {
   options.mesh = request.mesh;
   if (twin.parameters) {
     const dynamics::Model model = dynamics::make_model(twin.chain, *twin.parameters);
-    options.properties = twin::properties(model, twin.estimates, twin.known_mass);
+    options.properties = twin::properties(twin);
     // a simulator's model starts where `rollout` does
     if (!request.base.empty()) twin.initial = pipeline::rest_state(twin, model, base.pose(base.start()), base.start());
   }
