@@ -150,7 +150,7 @@ struct Cause {
   std::string in_doubt;   // the name of the cause with what this one may be mistaken for, too: "grasp and length"
   int numbers = 0;        // that it is made of
   double evidence = 0.0;  // that something is wrong, which is left when it is corrected and nothing else
-  double surprise = 0.0;  // -ln of how likely it is that just this is wrong, as far as priors tell (mathematics.md 6.10)
+  double surprise = 0.0;  // -ln of how likely just this is by the priors (mathematics.md 6.10, 'Which of two')
 };
 struct CorrectionFit {
   capture::Corrections corrections;
@@ -158,7 +158,7 @@ struct CorrectionFit {
   // By which share the outlines' square residuals would be larger with what was given, whatever of it is wrong.
   double evidence = 0.0;
   std::vector<Cause> causes;
-  double surprise = 0.0;  // of this fit, as a cause's
+  double surprise = 0.0;               // of this fit, as a cause's
   std::vector<double> evidence_after;  // the same with each of the options' mistakes mended, and nothing else
   solve::Summary summary;              // the unknowns relative to their prior deviations, and rad
   std::vector<OutlineMisfit> misfits;  // by camera, after the corrections

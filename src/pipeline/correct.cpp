@@ -266,8 +266,8 @@ bool is_half_pixel(const silhouette::CorrectionFit& fit) {
   return fit.evidence > kLeastEvidence && *least < kLeftOfHalfPixel * fit.evidence;
 }
 
-// The one thing that explains what is wrong; null where it takes more. Of those that may be mistaken for each other it is
-// the likeliest.
+// The one thing that explains what is wrong; null where it takes more. Of those that may be mistaken for each other it
+// is the likeliest.
 const silhouette::Cause* single_cause(const silhouette::CorrectionFit& fit, bool tabletop) {
   if (fit.evidence < kLeastEvidence) return nullptr;
   const silhouette::Cause* best = nullptr;
@@ -291,8 +291,8 @@ bool lies(capture::Capture capture, const capture::Corrections& corrections) {
   return std::abs(silhouette::height_by_table(capture)) <= kAboveTable;
 }
 
-// Corrections of one cause alone, or of it and what it may be mistaken for, whichever is likelier. Both count among what
-// is not known.
+// Corrections of one cause alone, or of it and what it may be mistaken for, whichever is likelier. The deviations say
+// how far the two are apart.
 silhouette::CorrectionFit fit_alone(const chain::Chain& chain, const capture::Capture& capture,
                                     const silhouette::SequenceFit& sequence, const silhouette::Cause& cause,
                                     silhouette::CorrectionOptions options) {

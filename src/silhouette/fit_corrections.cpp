@@ -218,9 +218,9 @@ Followed cost_of_change(const Parts& parts, const MatrixX& information) {
   return out;
 }
 
-// -ln of how likely it is that just these directions are wrong, and by x: of the heavy-tailed prior's density and of the
-// mixture's about where masks begin, in units of 1 mm, and of the share of what the priors leave open of the directions
-// that the outlines leave, whose `cost` is that of cost_of_change(). But for constants.
+// -ln of how likely it is, but for constants, that just these directions are wrong, and by x: of the heavy-tailed
+// prior's density there, of the mixture's about where masks begin (in units of 1 mm), and of the share that the
+// outlines leave of what the priors leave open. `cost`: that of cost_of_change().
 double surprise_of(const Layout& layout, const MatrixX& directions, const MatrixX& cost, const VectorX& x,
                    const std::vector<double>& start_deviations) {
   const MatrixX known = directions.transpose() * cost * directions;

@@ -113,8 +113,7 @@ void identify(const Globals& globals, const IdentifyRequest& request) {
     return;
   }
   print_estimates(result.twins[0].estimates);
-  if (const twin::Twin& twin = result.twins[0]; twin.parameters)
-    std::cout << twin::describe(twin::properties(twin));
+  if (const twin::Twin& twin = result.twins[0]; twin.parameters) std::cout << twin::describe(twin::properties(twin));
   for (const std::string& run : request.runs) std::cout << "twin: " << run << "\n";
   for (std::size_t i = 0; i < result.twins.size(); ++i)
     for (const capture::Finding& finding : result.twins[i].verdict)

@@ -73,8 +73,7 @@ void train(const Globals& globals, const TrainRequest& request) {
   if (result.recognized) rows.push_back({"recognized", &result.recognized->mean});
   if (result.rollout) rows.push_back({"rollout", &result.rollout->mean});
   if (!rows.empty()) std::cout << metrics_table(rows);
-  if (const twin::Twin& twin = result.twin; twin.parameters)
-    std::cout << twin::describe(twin::properties(twin));
+  if (const twin::Twin& twin = result.twin; twin.parameters) std::cout << twin::describe(twin::properties(twin));
   std::cout << "twin: " << request.out << "\nreport: " << (Path(request.out) / pipeline::kReportFile).string() << "\n";
   for (const capture::Finding& finding : result.twin.verdict) std::cout << core::printable(finding.text) << "\n";
   if (!request.picture.empty() && result.recognized) std::cout << "picture: " << request.picture << "\n";
