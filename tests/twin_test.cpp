@@ -194,6 +194,31 @@ TEST_CASE("torsion, friction in bending and a payload read back, in a file that 
   CHECK(properties["first_frequency"]["value"] > 0.5);
 }
 
+TEST_CASE("a corrected length makes the mass per length less sure, and a negative deviation is refused") {
+  const test::TemporaryFolder folder("twin");
+  constexpr double kDeviation = 0.001;  // m
+  twin::Twin twin = full_twin();
+  capture::Correction longer;
+  longer.quantity = &capture::corrected_quantity("object", "length");
+  longer.subject = "object";
+  longer.value = longer.deviation = math::VectorX::Constant(1, kDeviation);
+  const auto mass_per_length = [&] {
+    for (const twin::Property& p : twin::properties(twin))
+      if (p.name == "mass_per_length") return p;
+    return twin::Property{};
+  };
+  const twin::Property before = mass_per_length();
+  twin.corrections = {longer};
+  const twin::Property after = mass_per_length();
+  CHECK(after.value == before.value);
+  CHECK(after.sigma == doctest::Approx(std::hypot(before.sigma, kDeviation / twin.chain.length * before.value)));
+  twin::save(twin, folder.path);
+  CHECK(twin::load(folder.path).corrections.at(0).deviation[0] == kDeviation);
+  twin.corrections[0].deviation[0] = -kDeviation;
+  twin::save(twin, folder.path);
+  CHECK_THROWS_WITH_AS(twin::load(folder.path), doctest::Contains("sigma: is negative"), InputError);
+}
+
 TEST_CASE("a chain alone is read from a whole file or from its part, held as another rope") {
   const test::TemporaryFolder folder("chain");
   const twin::Twin twin = full_twin();

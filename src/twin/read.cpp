@@ -237,6 +237,7 @@ capture::Corrections read_corrections(const Node& node) {
       c.subject = name;
       c.value = numbers("value");
       c.deviation = numbers("sigma");
+      if (c.deviation.minCoeff() < 0.0) leaf["sigma"].fail("is negative", "train again");
       if (c.value.cwiseAbs().maxCoeff() > quantity.most)
         leaf["value"].fail("is more than " + core::exact(quantity.most) + " " + quantity.unit, "train again");
       const std::string state = leaf["state"].text();
