@@ -24,6 +24,9 @@ struct Camera {
   double fx = 0, fy = 0, cx = 0, cy = 0;  // px
   std::array<double, 5> distortion{};     // OpenCV's k1 k2 p1 p2 k3
   math::Pose world_from_camera;
+  // s, from reading the first row to reading the last one, all rows evenly; negative where the last row comes first; 0:
+  // all at once
+  double readout = 0.0;
   // recorded = gain * color + bias of red, green and blue, colors in 0..1, as corrections say (formats.md 2.1.1)
   math::Vector3 gain = math::Vector3::Ones(), bias = math::Vector3::Zero();
   bool distorted() const;
@@ -42,7 +45,7 @@ enum class Pixels { undistorted, recorded };
 struct ViewPlace {
   int camera = 0;     // index into Capture::cameras
   int frame = 0;      // the camera's frame number
-  double time = 0.0;  // s
+  double time = 0.0;  // s, when its middle row was read
   int x0 = 0, y0 = 0, width = 0, height = 0;
 };
 
@@ -92,7 +95,8 @@ struct Capture {
   math::Vector3 direction, bending_axis;  // unit, base frame
   std::optional<Table> table;
   std::vector<Camera> cameras;
-  std::vector<std::vector<double>> times;  // s, frame times of each camera (of all frames, loaded or not)
+  // s, by camera when the middle row of each frame was read (of all frames, loaded or not)
+  std::vector<std::vector<double>> times;
   std::vector<PackedView> views;           // sorted by camera, then frame; only the frames asked for
   std::vector<PackedView> recorded;        // LoadOptions::recorded_too; empty: not kept
   Pixels pixels = Pixels::undistorted;     // of the views
@@ -115,6 +119,7 @@ std::vector<std::vector<int>> views_at(const Capture& capture, const std::vector
 constexpr double kSlowestRate = 0.1, kFastestRate = 1e6;  // frames per second
 constexpr int kMostFrames = 1000000;                      // per camera
 constexpr int kMostPixels = 1 << 27;                      // per image
+constexpr double kLongestReadout = 0.2;                   // s
 
 // Frames [first, last) of every camera, by its own numbering; last < 0: to the end.
 struct FrameRange {

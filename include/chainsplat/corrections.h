@@ -27,7 +27,8 @@ struct CorrectedQuantity {
 // rotation: rotation vector of a camera in its own frame (world_from_camera's rotation times its exponential), of the
 // grasp in the base frame; translation: of a camera in the world frame, of the grasp in the base frame; focal: of fx,
 // with fy in proportion; mask_offset: by how much the camera's masks are wider than the rope on each side; mask_start:
-// how far from the grasp along the rope its masks begin; gain, bias: recorded = (1 + gain) color + bias of red, green
+// how far from the grasp along the rope its masks begin; readout: of Camera::readout, with which the frames' times move
+// to their middle rows; gain, bias: recorded = (1 + gain) color + bias of red, green
 // and blue, colors in 0..1.
 const std::vector<CorrectedQuantity>& corrected_quantities();
 // Frames of a camera, as its video counts them, before each of which it lost one: a number may stand there several

@@ -41,6 +41,7 @@ class Camera:
     cx: float
     cy: float
     distortion: List[float]
+    readout: float
     world_from_camera: _Numbers
     def project(self, points: ArrayLike) -> _Numbers: ...
 

@@ -122,6 +122,7 @@ void add_types(py::module_& m) {
       .def_readonly("cx", &capture::Camera::cx)
       .def_readonly("cy", &capture::Camera::cy)
       .def_readonly("distortion", &capture::Camera::distortion)
+      .def_readonly("readout", &capture::Camera::readout, "s, from the first row to the last; 0: all at once")
       .def_property_readonly(
           "world_from_camera", [](const capture::Camera& c) { return array_of(c.world_from_camera); }, "(4, 4), m")
       .def(

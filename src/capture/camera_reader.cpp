@@ -16,7 +16,8 @@ namespace {
 
 constexpr double kLeastFocal = 1.0, kMostFocal = 1e6;  // px; less is no length in pixels, more are parallel rays
 constexpr double kRotationTolerance = 1e-3;            // of |R R^T - I|; numbers of three digits pass
-constexpr double kInversePixels = 1e-3;                // px, largest error of undistort(distort(.)) at the border
+constexpr const char* kReadout = "seconds from the first row to the last, like 0.015, or 0 for a global shutter";
+constexpr double kInversePixels = 1e-3;  // px, largest error of undistort(distort(.)) at the border
 
 void read_pose(const ObjectReader& reader, Camera& camera) {
   const char* const expected = "a 4x4 matrix by rows, camera to world, camera axes x right, y down, z forward";
@@ -85,8 +86,8 @@ void refuse_lens_models(const ObjectReader& reader) {
 // Reads a camera except its name and the location of its frames.
 Camera read_optics(const ObjectReader& reader) {
   refuse_lens_models(reader);
-  reader.know({"name", "width", "height", "fx", "fy", "cx", "cy", "distortion", "world_from_camera", "images", "masks",
-               "depth", "depth_scale", "rate", "start", "timestamps"});
+  reader.know({"name", "width", "height", "fx", "fy", "cx", "cy", "distortion", "world_from_camera", "readout",
+               "images", "masks", "depth", "depth_scale", "rate", "start", "timestamps"});
   Camera camera;
   camera.width = reader.pixels("width");
   camera.height = reader.pixels("height");
@@ -112,6 +113,10 @@ Camera read_optics(const ObjectReader& reader) {
     std::copy(values->begin(), values->end(), camera.distortion.begin());
   if (camera.width > 0 && camera.height > 0 && camera.fx >= kLeastFocal && camera.fy >= kLeastFocal)
     check_lens(reader, camera);
+  camera.readout = reader.number("readout", false, kReadout).value_or(0.0);
+  if (!(std::abs(camera.readout) <= kLongestReadout))
+    reader.problem("readout", core::exact(camera.readout) + " s is more than any camera takes",
+                   std::string("write ") + kReadout);
   read_pose(reader, camera);
   return camera;
 }
@@ -120,6 +125,7 @@ CameraSource read_named(const ObjectReader& reader, const std::string& where) {
   CameraSource source;
   source.where = where;
   source.camera = read_optics(reader);
+  source.readout_given = reader.has("readout");
   source.camera.name = reader.text("name", true, "a short name like cam0").value_or("");
   if (reader.has("name") && !good_name(source.camera.name))
     reader.problem("name", in_quotes(source.camera.name) + " cannot name a folder", "use letters, digits, - and _");

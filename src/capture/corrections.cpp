@@ -35,6 +35,7 @@ const std::vector<CorrectedQuantity>& corrected_quantities() {
       {"object", "length", "length", "m", 1, 0.0, 0.01, 100.0},
       {"object", "diameter", "diameter", "m", 1, 0.0, 0.01, 100.0},
       {"table", "height", "table", "m", 1, 0.001, 0.0, 100.0},
+      {"camera", "readout", "time", "s", 1, 0.02, 0.0, kLongestReadout},
   };
   return quantities;
 }
@@ -126,6 +127,7 @@ Camera corrected(const Corrections& corrections, Camera camera) {
   camera.fy *= scale;
   if (const Correction* const gain = find(corrections, camera.name, "gain")) camera.gain += gain->value;
   if (const Correction* const bias = find(corrections, camera.name, "bias")) camera.bias += bias->value;
+  camera.readout += value_of(corrections, camera.name, "readout");
   if (!(camera.gain.minCoeff() > kLeastShare))
     throw InputError(camera.name, "the twin's correction leaves nothing of its colors", "train again");
   return camera;
@@ -161,7 +163,11 @@ void apply(const Corrections& corrections, Capture& capture) {
   for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
     const Correction* const lost = find(corrections, capture.cameras[c].name, lost_frames().name);
     if (lost && lost->calibration == recording_text(capture)) restore_lost(lost->value, static_cast<int>(c), capture);
-    const double late = value_of(corrections, capture.cameras[c].name, "time");
+    // a frame's time is that of its middle row
+    const double given = capture.cameras[c].readout;
+    const double readout = given + value_of(corrections, capture.cameras[c].name, "readout");
+    const double late =
+        value_of(corrections, capture.cameras[c].name, "time") - 0.5 * (std::abs(readout) - std::abs(given));
     if (late != 0.0) {
       for (double& time : capture.times[c]) time -= late;
       for (PackedView& view : capture.views)

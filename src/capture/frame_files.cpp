@@ -11,6 +11,7 @@ namespace chainsplat::capture {
 namespace {
 
 constexpr double kLongestRecording = 3600.0;  // s; the dynamics are integrated over it in millisecond steps
+constexpr double kRounding = 1.0 + 1e-3;      // a readout that fills the interval may be written in few digits
 constexpr const char* kOwnFile = "copy the file itself into the capture's folder";
 
 // Sets source.frames, and `*rate` for a video. Returns false and records a problem when there is no frame, a number is
@@ -123,6 +124,18 @@ void check_span(CameraSource& source, const std::string& key, Findings& findings
   }
 }
 
+// A stamp is of the first row that was read; a frame's time is that of its middle row.
+void add_readout(CameraSource& source, Findings& findings) {
+  const double readout = std::abs(source.camera.readout);
+  if (readout == 0.0) return;
+  if (source.times.size() > 1 && readout > kRounding * source.interval)
+    findings.problems.push_back(
+        {source.where + ".readout",
+         core::brief(readout) + " s are more than the " + core::brief(source.interval) + " s from frame to frame",
+         "write the seconds from the first row to the last, or 0 for a global shutter"});
+  for (double& time : source.times) time += 0.5 * readout;
+}
+
 // Sets source.times and source.interval from the timestamps, or else from start and rate.
 void set_times(CameraSource& source, const Path& folder, Findings& findings) {
   const int frames = source.images.frames;
@@ -153,6 +166,7 @@ void set_times(CameraSource& source, const Path& folder, Findings& findings) {
     source.interval = 1.0 / source.rate;
   }
   check_span(source, source.timestamps ? ".timestamps" : ".rate", findings);
+  add_readout(source, findings);
 }
 
 // The frames of a camera that are in memory.
@@ -181,6 +195,7 @@ void survey_pictures(CameraSource& source, bool masked, Findings& findings) {
     return wrong("`masks` do not have one channel and the camera's size, one per time", "give one per image");
   source.interval = median_interval(source.times);
   check_span(source, "", findings);
+  add_readout(source, findings);
 }
 
 }  // namespace

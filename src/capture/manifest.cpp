@@ -325,6 +325,8 @@ void read_document(const std::string& text, const std::string& camera, bool mask
     capture.has_depth = capture.has_depth || source.depth.has_value();
   }
   read_sigma(top.child("sigma", false, "{ \"object\": { \"length\": 0.003 } }"), capture);
+  for (const CameraSource& source : manifest.cameras)  // unless its "sigma" is given, too, which stands before it
+    if (source.readout_given) capture.sigma.push_back({source.camera.name, "readout", 0.0});
   if (findings.problems.empty())
     capture.hash = recording ? capture_hash(*recording) : capture_hash(text, manifest, base_file);
 }

@@ -40,6 +40,7 @@ struct CameraSource {
   double rate = 0.0;         // frames per second; 0 with timestamps
   double start = 0.0;        // s, time of the first frame
   std::optional<Path> timestamps;
+  bool readout_given = false;  // and exact then
   double interval = 0.0;      // s, median time between frames
   double video_rate = 0.0;    // frames per second by the container, 0 = unknown
   std::vector<double> times;  // s, one per frame; empty after a problem

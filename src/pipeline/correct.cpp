@@ -9,6 +9,7 @@
 
 #include "chainsplat/camera_colors.h"
 #include "chainsplat/silhouette.h"
+#include "pipeline/clocks.h"
 #include "pipeline/mistakes.h"
 #include "pipeline/stages.h"
 
@@ -18,7 +19,7 @@ namespace {
 
 using capture::Finding;
 
-constexpr int kJoints = 16;  // with eight, the clamp's bend is taken for a wrong length (design.md, 'Corrections')
+constexpr int kReadoutRounds = 3;  // of a readout and all else in turn; the first leaves a tenth or two of it
 // Share by which the outlines' square residuals must be larger with what was given before anything is changed. Straight
 // links alone leave up to 0.1 on right recordings. Correcting all that may be wrong leaves half a millimeter on a table,
 // so that more must be wrong there (design.md, 'Corrections').
@@ -384,51 +385,6 @@ void correct_colors(const silhouette::CorrectionFit& fit, const std::vector<std:
 // above it, cameras were found to be off by 10 degrees. Faults of base and grasp alone are less.
 double high(const capture::Capture& capture) { return std::max(0.25 * capture.diameter, 0.005); }
 
-// Restores frames that cameras lost, one after the other, and fits `sequence` again after each. Beyond kMostLost the
-// recording is left as it is by then.
-constexpr int kMostLost = 30;           // of all cameras
-constexpr Eigen::Index kSurelyLost = 1;  // of one camera: where it lost more, some are missed or a few frames off
-capture::Corrections restore_lost_frames(const chain::Chain& chain, const std::vector<std::string>& fixed,
-                                         capture::Capture& capture, silhouette::SequenceFit& sequence,
-                                         std::vector<Finding>& verdict) {
-  std::vector<std::vector<double>> lost(capture.cameras.size());
-  if (is_fixed(fixed, "time") || capture.cameras.size() < 2) return {};
-  const std::vector<std::vector<double>> given = capture.times;
-  for (int count = 0; count < kMostLost; ++count) {
-    const auto one = silhouette::first_lost_frame(chain, capture, sequence);
-    if (!one) break;
-    lost[one->camera].push_back(one->frame);
-    capture::restore_lost(math::VectorX::Constant(1, one->frame), one->camera, capture);
-    sequence = silhouette::fit_sequence(chain, capture);
-  }
-  // all at once, as apply() does it later: the same stamps to the bit
-  capture.times = given;
-  for (capture::PackedView& view : capture.views) view.time = given[view.camera][view.frame];
-  capture::Corrections out;
-  for (std::size_t c = 0; c < lost.size(); ++c) {
-    if (lost[c].empty()) continue;
-    std::sort(lost[c].begin(), lost[c].end());
-    capture::Correction correction;
-    correction.quantity = &capture::lost_frames();
-    correction.subject = capture.cameras[c].name;
-    correction.value = Eigen::Map<math::VectorX>(lost[c].data(), static_cast<Eigen::Index>(lost[c].size()));
-    correction.deviation = math::VectorX::Zero(correction.value.size());
-    correction.calibration = capture::recording_text(capture);
-    capture::restore_lost(correction.value, static_cast<int>(c), capture);
-    const auto count = correction.value.size();
-    const int first = static_cast<int>(lost[c].front());
-    const bool sure = count <= kSurelyLost;
-    verdict.push_back(
-        {"lost-frames", correction.subject, static_cast<double>(count), 0.0, "frames", true, sure, false, first,
-         correction.subject + text(" lost %s before frame %d, so that its stamps are early from there on: "
-                                   "corrected; give the stamps of its frames (`timestamps`)%s",
-                                   count == 1 ? "a frame" : text("%d frames, one", int(count)).c_str(), first,
-                                   sure ? "" : "; some may be missed, do not trust it")});
-    out.push_back(std::move(correction));
-  }
-  return out;
-}
-
 // A rope that is held a little above its table looks like one whose grasp, or table, is given wrong by as much, where
 // one camera alone sees how it comes down or the grasp is to be taken as given.
 void judge_height(const capture::Corrections& found, const capture::Capture& capture, std::vector<Finding>& verdict) {
@@ -574,24 +530,30 @@ std::optional<Decision> decide(const capture::Capture& capture, const chain::Cha
 
 }  // namespace
 
-Corrected correct(capture::Capture& capture, const std::vector<std::string>& fixed, bool anyway) {
-  Corrected out;
-  out.verdict = find_mistakes(capture);
-  judge_mass(capture, out.verdict);
-  if (!out.verdict.empty() && !anyway) return out;
+FirstFit first_fit(const capture::Capture& capture, int joints) {
   const auto chain_of = [&](chain::Bending kind) {
-    return chain::make_chain(capture.length, capture.diameter, capture.direction, capture.bending_axis, kJoints, kind,
+    return chain::make_chain(capture.length, capture.diameter, capture.direction, capture.bending_axis, joints, kind,
                              false);
   };
-  chain::Chain chain = chain_of(capture.tabletop ? chain::Bending::planar : chain::Bending::spatial);
-  chain.lift = silhouette::lying_down(chain, silhouette::height_by_table(capture));
-  silhouette::SequenceFit sequence = silhouette::fit_sequence(chain, capture);
+  FirstFit out;
+  out.chain = chain_of(capture.tabletop ? chain::Bending::planar : chain::Bending::spatial);
+  out.chain.lift = silhouette::lying_down(out.chain, silhouette::height_by_table(capture));
+  out.sequence = silhouette::fit_sequence(out.chain, capture);
   // one camera does not see depth, into which a chain that bends in space would fold
   if (!capture.tabletop && capture.cameras.size() == 1 &&
-      silhouette::choose_bending(chain, capture, sequence).bending == chain::Bending::planar) {
-    chain = chain_of(chain::Bending::planar);
-    sequence = silhouette::fit_sequence(chain, capture);
+      silhouette::choose_bending(out.chain, capture, out.sequence).bending == chain::Bending::planar) {
+    out.chain = chain_of(chain::Bending::planar);
+    out.sequence = silhouette::fit_sequence(out.chain, capture);
   }
+  return out;
+}
+
+namespace {
+
+// What is left to correct of a capture whose rows were read at once.
+Corrected correct_all_but_readout(capture::Capture& capture, const std::vector<std::string>& fixed, FirstFit fit_by_now) {
+  Corrected out;
+  auto& [chain, sequence] = fit_by_now;
   if (std::none_of(sequence.frames.begin(), sequence.frames.end(),
                    [](const auto& f) { return f.residual_pixels > 0.0; })) {
     out.verdict.push_back({"unseen", "base", 0.0, 0.0, "share", false, false, true, -1,
@@ -599,7 +561,8 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
                            "cameras are not in one world, or not all in meters"});
     return out;
   }
-  capture::Corrections lost = restore_lost_frames(chain, fixed, capture, sequence, out.verdict);
+  capture::Corrections lost;
+  if (!is_fixed(fixed, "time")) lost = restore_lost_frames(chain, capture, sequence, out.verdict);
   silhouette::CorrectionOptions options;
   options.lying = silhouette::lying_on_table(capture);
   options.held = fixed;
@@ -633,9 +596,93 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   return out;
 }
 
+bool impossible(const Corrected& found) {
+  return std::any_of(found.verdict.begin(), found.verdict.end(), [](const Finding& f) { return f.impossible; });
+}
+
+void add(Corrected found, Corrected& out) {
+  out.corrections = std::move(found.corrections);
+  out.covariance = std::move(found.covariance);
+  out.verdict.insert(out.verdict.end(), found.verdict.begin(), found.verdict.end());
+}
+
+// Adds a readout that was found to what else was.
+void add_readout(const Readout& readout, Corrected& out) {
+  Eigen::Index numbers = 0;
+  std::vector<Eigen::Index> at;
+  for (capture::Correction& correction : out.corrections) {
+    const bool one = correction.quantity == &capture::corrected_quantity("camera", "readout");
+    if (one) {
+      correction.value.setConstant(readout.value);
+      correction.deviation.setConstant(readout.deviation);
+      correction.state = capture::CorrectionState::free;
+      at.push_back(numbers);
+    }
+    numbers += correction.value.size();
+  }
+  if (at.empty()) return;
+  if (out.covariance.size() == 0) out.covariance = math::MatrixX::Zero(numbers, numbers);
+  for (const Eigen::Index a : at)
+    for (const Eigen::Index b : at) out.covariance(a, b) = readout.deviation * readout.deviation;
+  const Size size{kSeconds * readout.value, kSeconds * readout.deviation};
+  out.verdict.push_back(
+      {"rolling-shutter", "cameras", size.value, size.deviation, "ms", true, true, false, -1,
+       text("the cameras read their rows one after the other, in %.1f +- %.1f ms: corrected; give it as `readout`",
+            size.value, size.deviation)});
+}
+
+}  // namespace
+
+Corrected correct(capture::Capture& capture, const std::vector<std::string>& fixed, bool anyway) {
+  Corrected out;
+  out.verdict = find_mistakes(capture);
+  judge_mass(capture, out.verdict);
+  if (!out.verdict.empty() && !anyway) return out;
+  FirstFit fit = first_fit(capture);
+  if (!readout_is_open(capture, fixed)) {
+    add(correct_all_but_readout(capture, fixed, fit), out);
+    return out;
+  }
+  const capture::Capture given = capture;
+  Readout readout;
+  Corrected found;
+  for (int round = 0;; ++round) {
+    if (readout.value != 0.0) {
+      capture = with_readout(given, readout.value);
+      fit = first_fit(capture);
+    }
+    const capture::Capture by_now = capture;
+    found = correct_all_but_readout(capture, fixed, fit);
+    if (round == kReadoutRounds || impossible(found)) break;
+    MotionReadout moved = readout_by_motion(capture);
+    // Rows that are read late look like a base that is early: which of the two it is, the motion tells. A base that is
+    // known to be late is not known well enough beside a readout.
+    if (capture::value_of(found.corrections, "base", "time") != 0.0) {
+      capture::Capture by_given_clocks = by_now;
+      std::vector<std::string> with_clocks = fixed;
+      with_clocks.emplace_back("time");
+      correct_all_but_readout(by_given_clocks, with_clocks, fit);
+      const MotionReadout other = readout_by_motion(by_given_clocks);
+      const bool better = other.left < (1.0 - kLeastExplained) * moved.before;
+      moved.more = better ? other.more : std::nullopt;
+    }
+    if (!moved.more) break;
+    readout = {readout.value + moved.more->value, moved.more->deviation};
+    core::say_more(text("correct: the rows are read in %.1f ms, by the motion", kSeconds * readout.value));
+  }
+  add(std::move(found), out);
+  if (readout.value == 0.0) return out;
+  add_readout(readout, out);
+  capture.views = given.views;
+  for (capture::PackedView& view : capture.views) view.time = capture.times[view.camera][view.frame];
+  read_at_once(capture);
+  return out;
+}
+
 Examination examine(const Path& path, const core::Listener& listener) {
   const core::ListenerScope scope(listener);
   capture::Capture capture = capture::load(path);
+  read_at_once(capture);
   Corrected found = correct(capture, {}, false);
   return {std::move(found.corrections), std::move(found.verdict)};
 }

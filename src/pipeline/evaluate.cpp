@@ -12,6 +12,7 @@
 #include "chainsplat/pipeline.h"
 #include "chainsplat/rope.h"
 #include "chainsplat/run_folder.h"
+#include "chainsplat/shutter.h"
 
 namespace chainsplat::pipeline {
 
@@ -119,6 +120,7 @@ Evaluation evaluate(const Path& run, const Path& capture, const EvaluateOptions&
     twin.states = {};
     twin.rollout = rollout_on(twin, run, recorded);
   }
+  silhouette::read_at_once(recorded, twin.chain, own ? twin.states : twin.rollout);
   const gpu::DevicePtr device = gpu::open_device({.selector = options.device});
   splat::Engine engine(*device);
   Evaluation found;

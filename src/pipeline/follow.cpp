@@ -12,6 +12,7 @@
 #include "chainsplat/gpu.h"
 #include "chainsplat/masking.h"
 #include "chainsplat/run_folder.h"
+#include "chainsplat/shutter.h"
 #include "pipeline/bright_view.h"
 
 namespace chainsplat::pipeline {
@@ -107,8 +108,10 @@ struct Tracker::Implementation {
   std::array<int, 4> masked = {0, 0, 0, 0};                // crop of the last mask: x0, y0, width, height
   int marked = -1;                                         // frames that were masked when marks were learned last
   double last = -std::numeric_limits<double>::infinity();  // s, of the last frame
+  math::VectorX last_theta;                                // rad, in it; empty: none yet
 
   void open_engine();
+  std::vector<capture::View> read_at_once(std::span<const capture::View> views) const;
   Kinds make_follower(const std::vector<capture::Camera>& cameras, const std::vector<char>& unverified, double start);
   estimation::CompareColors color_comparison();
   estimation::LinkGradient link_gradient();
@@ -206,6 +209,24 @@ void Tracker::Implementation::look_at_first_picture(const capture::Image8& pictu
     live.emplace(cameras()[0], twin.chain, colors);
 }
 
+// As if the cameras read all rows at once, by the motion from the last frame to what is expected in this one: as it is
+// where nothing is expected.
+std::vector<capture::View> Tracker::Implementation::read_at_once(std::span<const capture::View> views) const {
+  std::vector<capture::View> out(views.begin(), views.end());
+  const double time = views[0].time;
+  const std::optional<math::VectorX> here = expected(time);
+  if (!here || last_theta.size() == 0) return out;
+  const math::VectorX rate = (*here - last_theta) / (time - last);
+  const silhouette::NodesAt nodes = [&](double at) {
+    const math::Pose pose = std::visit([&](const auto& f) { return f.base_at(at); }, follower).pose;
+    return chain::nodes(twin.chain, chain::link_motions(twin.chain, *here + (at - time) * rate, pose));
+  };
+  core::parallel_for(static_cast<std::int64_t>(out.size()), [&](std::int64_t i) {
+    out[i] = silhouette::as_read_at_once(out[i], cameras()[out[i].camera], capture::Pixels::undistorted, nodes);
+  });
+  return out;
+}
+
 // Every tenth frame: the rope shows nearly the same side.
 void Tracker::Implementation::learn_marks(const math::Pose& pose, const math::VectorX& theta) {
   constexpr int kMarksEvery = 10;  // frames
@@ -230,10 +251,17 @@ estimation::Estimate Tracker::update(std::span<const capture::View> views) {
   if (!(views[0].time > t.last))
     throw InputError(t.options.name, core::exact(views[0].time) + " s is not after the frame before",
                      "give times that increase");
+  std::vector<capture::View> mended;
+  if (silhouette::has_rolling_shutter(t.cameras())) {
+    mended = t.read_at_once(views);
+    views = mended;
+  }
   t.last = views[0].time;
   std::vector<const capture::View*> pointers;
   for (const capture::View& view : views) pointers.push_back(&view);
-  return std::visit([&](auto& f) { return f.update(pointers); }, t.follower);
+  estimation::Estimate out = std::visit([&](auto& f) { return f.update(pointers); }, t.follower);
+  t.last_theta = out.theta;
+  return out;
 }
 
 capture::View Tracker::mask(const capture::Image8& picture, double time) {

@@ -77,6 +77,7 @@ FrameSource open_stream(const SourceOptions& options) {
   FrameSource source;
   source.cameras = as_corrected(options.corrections, {calibration.camera}, &source.unverified);
   const double late = capture::value_of(options.corrections, calibration.camera.name, "time");
+  const double half_readout = 0.5 * std::abs(source.cameras[0].readout);  // a frame's time is that of its middle row
   const auto reader = std::make_shared<capture::VideoReader>(
       options.source, 1,
       capture::DeviceFormat{.width = calibration.camera.width, .height = calibration.camera.height, .rate = rate});
@@ -92,7 +93,7 @@ FrameSource open_stream(const SourceOptions& options) {
   std::optional<double> offset;                             // from that clock to ours
   double stamp = -std::numeric_limits<double>::infinity();  // s, the last frame's by that clock
   source.next = [camera = source.cameras[0], frames = options.frames, reader, rate, start, where, device, unix, offset,
-                 stamp, late, count = 0](LiveFrame& frame) mutable {
+                 stamp, late, half_readout, count = 0](LiveFrame& frame) mutable {
     int stale = 0;  // in a row: some drivers' stamps jitter, others' are none
     do {
       if (frames.last >= 0 && count >= frames.last) return false;
@@ -113,7 +114,7 @@ FrameSource open_stream(const SourceOptions& options) {
     } while (frame.frame < frames.first || stale > 0);
     if (device) stamp = reader->time();
     if (device && !offset) offset = unix ? until_unix(reader->time()) : start - reader->first_time();
-    frame.time = (device ? reader->time() + *offset : start + frame.frame / rate) - late;
+    frame.time = (device ? reader->time() + *offset : start + frame.frame / rate) - late + half_readout;
     frame.views.clear();
     frame.arrived = core::seconds_now();
     return true;

@@ -3,6 +3,7 @@
 
 #include "chainsplat/refinement.h"
 #include "chainsplat/run_folder.h"
+#include "chainsplat/shutter.h"
 #include "pipeline/stages.h"
 
 namespace chainsplat::pipeline {
@@ -54,6 +55,7 @@ capture::Capture load_own_capture(const twin::Twin& twin, const Path& run) {
   if (twin.provenance.capture_hash != hash_text(capture.hash))
     throw InputError(capture.folder.string(), "has changed since " + run.string() + " was made", "train it again");
   capture::apply(twin.corrections, capture);
+  silhouette::read_at_once(capture, twin.chain, twin.states);
   return capture;
 }
 

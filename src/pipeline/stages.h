@@ -25,6 +25,18 @@ class Stopwatch {
   double start_;
 };
 
+// The rope's outlines fitted by a chain of many joints, before anything of the capture is corrected.
+struct FirstFit {
+  chain::Chain chain;
+  silhouette::SequenceFit sequence;
+};
+constexpr int kFirstJoints = 16;  // with eight, the clamp's bend is taken for a wrong length (design.md, 'Corrections')
+FirstFit first_fit(const capture::Capture& capture, int joints = kFirstJoints);
+
+// Views of cameras with a rolling shutter as if they had been read at once, by the motion that they show
+// (chainsplat/shutter.h).
+void read_at_once(capture::Capture& capture);
+
 // Estimates what `capture` was given wrongly, mends it, and says so in the verdict. `fixed`: groups taken as given.
 // Joints and bending are its own, so that what the twin's chain cannot follow is not taken for a fault of the capture.
 // Where a finding is `impossible` nothing is estimated, unless `anyway`.
@@ -39,8 +51,8 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
 identification::Options identification_options(const twin::Twin& twin, bool paper, std::uint64_t seed);
 // Adds to the verdict what the views left open about the plane that a planar twin bends in, where that is much.
 void judge_bending(twin::Twin& twin, const silhouette::BendingChoice& choice);
-// Adds to the verdict where the recognized rope is in no camera's mask, as behind a gripper: what is recognized there is a
-// guess. `capture`: its views.
+// Adds to the verdict where the recognized rope is in no camera's mask, as behind a gripper: what is recognized there
+// is a guess. `capture`: its views.
 void judge_hidden(twin::Twin& twin, const capture::Capture& capture);
 // What the verdict says of the identified motion (twin.rollout) beside the recognized one (twin.states), anew.
 void judge_motion(twin::Twin& twin, const trajectory::Trajectory& base);

@@ -9,6 +9,7 @@
 #include "chainsplat/in_memory.h"
 #include "chainsplat/recognition.h"
 #include "chainsplat/run_folder.h"
+#include "chainsplat/shutter.h"
 #include "chainsplat/silhouette.h"
 #include "pipeline/workspace.h"
 
@@ -257,6 +258,7 @@ Corrected corrected_by_now(Training& t) {
   const std::vector<std::string>& fixed = t.options.fixed;
   if (!t.workspace) return correct(t.capture, fixed, t.options.anyway);
   Workspace& kept = *t.workspace;
+  const bool rolling = silhouette::has_rolling_shutter(t.capture.cameras);  // as given: the views are made for that
   std::string key = t.options.anyway ? "anyway" : "else";
   for (const std::string& group : fixed) key += " " + group;
   std::vector<capture::PackedView> views, recorded;
@@ -273,6 +275,9 @@ Corrected corrected_by_now(Training& t) {
     views = std::move(t.capture.views), recorded = std::move(t.capture.recorded);
     t.capture = kept.mended;
     for (capture::PackedView& view : views) view.time = t.capture.times[view.camera][view.frame];
+    t.capture.views = std::move(views), t.capture.recorded = std::move(recorded);
+    if (!rolling) read_at_once(t.capture);
+    return kept.corrected;
   }
   t.capture.views = std::move(views), t.capture.recorded = std::move(recorded);
   return kept.corrected;
@@ -282,8 +287,10 @@ Corrected corrected_by_now(Training& t) {
 void correct_capture(Training& t) {
   if (!t.recognize) {
     capture::apply(t.twin.corrections, t.capture);
+    silhouette::read_at_once(t.capture, t.twin.chain, t.twin.states);
     return;
   }
+  read_at_once(t.capture);
   const std::vector<std::string>& fixed = t.options.fixed;
   if (t.options.mode == twin::Mode::paper || std::find(fixed.begin(), fixed.end(), "all") != fixed.end()) return;
   core::report({"recognize", 0, 0, NAN, NAN, "cameras, clocks, grasp and size"});
@@ -391,6 +398,21 @@ struct Comparison {
   eval::Metrics recognized;
 };
 
+// What was recorded, as evaluation compares it. `capture`: as it was recognized, with `states` of `chain`.
+capture::Capture recorded_of(const Training& t, capture::Capture capture, const chain::Chain& chain,
+                             const chain::States& states) {
+  if (!silhouette::has_rolling_shutter(capture.cameras))
+    return t.recording ? capture::load_recorded(std::move(capture), *t.recording, t.load)
+                       : capture::load_recorded(std::move(capture), t.capture_path, t.load);
+  // read again, since its views are not as they were recorded, and now with depth
+  capture::LoadOptions load = t.load;
+  load.pixels = capture::Pixels::recorded, load.recorded_too = false;
+  capture = t.recording ? capture::load(*t.recording, load) : capture::load(t.capture_path, load);
+  capture::apply(t.twin.corrections, capture);
+  silhouette::read_at_once(capture, chain, states);
+  return capture;
+}
+
 // Begins to compare the recognized motion with the recording, in a thread of its own: identification, which comes next,
 // keeps one core busy and the device not at all. Takes the capture's frames; the thread reads nothing that changes.
 std::future<Comparison> begin_comparison(Training& t) {
@@ -398,13 +420,9 @@ std::future<Comparison> begin_comparison(Training& t) {
   shown.time = t.twin.states.time;
   shown.theta = t.twin.states.theta;
   shown.roll = t.twin.states.roll;
-  return std::async(std::launch::async, [&recording = t.recording, &path = t.capture_path, &load = t.load,
-                                         &device = *t.device, capture = std::move(t.capture), chain = t.twin.chain,
+  return std::async(std::launch::async, [&t, &device = *t.device, capture = std::move(t.capture), chain = t.twin.chain,
                                          gaussians = t.twin.gaussians, shown = std::move(shown)]() mutable {
-    Comparison c{recording ? capture::load_recorded(std::move(capture), *recording, load)
-                           : capture::load_recorded(std::move(capture), path, load),
-                 splat::Engine(device),
-                 {}};
+    Comparison c{recorded_of(t, std::move(capture), chain, shown), splat::Engine(device), {}};
     c.recognized = eval::evaluate(c.engine, gaussians, chain, shown, c.recorded);
     return c;
   });

@@ -84,6 +84,7 @@ SharedRow shared_row(const PosedView& view, const OutlinePoint& p, double angle_
   row.segment<3>(kTranslation) = -(camera.world_from_camera.rotation * g);
   row[kFocal] = (p.outward.dot(from_center) + p.half_width) / camera.fx;
   row[kCameraTime] = -angle_speed - base_speed;
+  row[kReadout] = (angle_speed + base_speed) * image_of(camera, p.x).y() / camera.height;
   row[kMaskOffset] = 1.0;
   const bool start = p.part == OutlinePoint::Part::start;
   row[kMaskStart] = start ? g.dot((p.segment->b - p.segment->a).normalized()) : 0.0;

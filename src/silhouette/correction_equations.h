@@ -22,7 +22,8 @@ enum SharedOfView {
   kLength = 17,
   kDiameter = 18,
   kTableHeight = 19,
-  kSharedOfView = 20
+  kReadout = 20,  // s, from the first row, which is read at the view's time, to the last
+  kSharedOfView = 21
 };
 using SharedRow = Eigen::Matrix<double, kSharedOfView, 1>;
 

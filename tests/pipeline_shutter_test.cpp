@@ -1,0 +1,190 @@
+// A rope that swings, seen by cameras whose rows are drawn each at its own time.
+#include "chainsplat/shutter.h"
+
+#include <doctest/doctest.h>
+
+#include <algorithm>
+#include <cmath>
+
+#include "chainsplat/dynamics.h"
+#include "pipeline/stages.h"
+
+using namespace chainsplat;
+
+namespace {
+
+using math::MatrixX;
+using math::Vector2;
+using math::Vector3;
+using math::VectorX;
+
+const capture::Capture& demo() {
+  static const capture::Capture capture = capture::load(Path(CHAINSPLAT_SOURCE_DIR) / "assets/demo_free_30");
+  return capture;
+}
+
+chain::Chain rope() {
+  return chain::make_chain(demo().length, demo().diameter, demo().direction, demo().bending_axis, 12,
+                           chain::Bending::spatial, false);
+}
+
+// The rope moved by the demo's base.
+const chain::States& swing() {
+  static const chain::States states = [] {
+    const chain::Chain chain = rope();
+    dynamics::Parameters p;
+    const int moving = chain.links() - 1;
+    p.link_mass.assign(moving, 0.05 / moving);
+    for (auto* friction : {&p.viscous_friction, &p.coulomb_friction, &p.air_linear, &p.air_quadratic})
+      friction->assign(moving, 0.0);
+    p.stiffness.assign(chain.angles(), 0.02);
+    p.damping.assign(chain.angles(), 2e-4);
+    p.rest_angle.assign(chain.angles(), 0.0);
+    p.radius = 0.5 * chain.diameter;
+    const dynamics::Model model = dynamics::make_model(chain, p);
+    std::vector<double> times;
+    const double first = demo().base.start(), last = demo().base.end();
+    for (double time = first; time < last; time += 1.0 / 240.0) times.push_back(time);
+    dynamics::InitialState initial;
+    initial.time = first;
+    initial.theta = dynamics::static_equilibrium(model, demo().base.pose(first)).theta;
+    initial.thetadot = VectorX::Zero(chain.angles());
+    return dynamics::rollout(model, demo().base, initial, times);
+  }();
+  return states;
+}
+
+MatrixX nodes_at(double time) {
+  const chain::Chain chain = rope();
+  const MatrixX nodes =
+      chain::nodes(chain, chain::link_motions(chain, chain::interpolate(swing(), time), demo().base.pose(time)));
+  return nodes.rightCols(nodes.cols() - 1);  // the grasp is twice there
+}
+
+double away(const Vector2& from, const Vector2& to, const Vector2& pixel) {
+  const Vector2 step = to - from;
+  return (pixel - from - std::clamp((pixel - from).dot(step) / step.squaredNorm(), 0.0, 1.0) * step).norm();
+}
+
+// Rows [first, last) of what the camera sees at a time: a tube about the nodes that is cut off flat enough at its ends.
+void draw_rows(const capture::Camera& camera, double time, int first, int last, capture::View& view) {
+  const MatrixX nodes = nodes_at(time);
+  std::vector<Vector2> line;
+  double radius = 0.0;
+  for (Eigen::Index i = 0; i < nodes.cols(); ++i) {
+    const Vector3 x = camera.world_from_camera.inverse() * Vector3(nodes.col(i));
+    line.push_back(capture::project(camera, x));
+    radius = 0.5 * demo().diameter * camera.fx / x.z();
+  }
+  // rounded ends reach as far as the rope
+  line.front() += radius * (line[1] - line[0]).normalized();
+  line.back() += radius * (line[line.size() - 2] - line.back()).normalized();
+  for (int v = first; v < last; ++v)
+    for (int u = 0; u < view.width; ++u) {
+      double least = INFINITY;
+      for (std::size_t i = 0; i + 1 < line.size(); ++i)
+        least = std::min(least, away(line[i], line[i + 1], Vector2(u + 0.5, v + 0.5)));
+      if (least < radius)
+        for (int c = 0; c < 4; ++c) view.rgba[4 * (std::size_t(v) * view.width + u) + c] = c == 3 ? 255 : 128;
+    }
+}
+
+// All its rows, which take so long from the first to the last; at `time` the middle one is read.
+capture::View drawn(const capture::ViewPlace& place, const capture::Camera& camera, double time, double readout) {
+  capture::View view;
+  static_cast<capture::ViewPlace&>(view) = place;
+  view.time = time;
+  view.x0 = view.y0 = 0, view.width = camera.width, view.height = camera.height;
+  view.rgba.assign(std::size_t{4} * camera.width * camera.height, 0);
+  constexpr int kTogether = 2;  // rows
+  for (int v = 0; v < view.height; v += kTogether)
+    draw_rows(camera, time + ((v + 0.5 * kTogether) / camera.height - 0.5) * readout, v, v + kTogether, view);
+  return view;
+}
+
+// The demo with the rope that swings in the place of its own. Its frames are stamped when their first rows are read.
+capture::Capture recorded(double readout) {
+  capture::Capture out = demo();
+  core::parallel_for(static_cast<std::int64_t>(out.views.size()), [&](std::int64_t i) {
+    capture::PackedView& view = out.views[i];
+    const double stamp = view.time;
+    view = capture::packed(drawn(view, out.cameras[view.camera], stamp + 0.5 * readout, readout));
+    view.time = stamp;
+  });
+  return out;
+}
+
+double overlap(const capture::View& a, const capture::View& b, const capture::Camera& camera) {
+  const auto shows = [](const capture::View& view, int u, int v) {
+    u -= view.x0, v -= view.y0;
+    return u >= 0 && v >= 0 && u < view.width && v < view.height &&
+           view.rgba[4 * (std::size_t(v) * view.width + u) + 3] >= 128;
+  };
+  int both = 0, any = 0;
+  for (int v = 0; v < camera.height; ++v)
+    for (int u = 0; u < camera.width; ++u) {
+      both += shows(a, u, v) && shows(b, u, v);
+      any += shows(a, u, v) || shows(b, u, v);
+    }
+  return static_cast<double>(both) / any;
+}
+
+const capture::Finding* rolling(const pipeline::Corrected& found) {
+  for (const capture::Finding& f : found.verdict)
+    if (f.code == "rolling-shutter") return &f;
+  return nullptr;
+}
+
+TEST_CASE("rows that were read one after the other are put where they were at one time") {
+  constexpr double kTime = 0.6;
+  constexpr int kLarger = 3;  // than the demo's pictures, in which the rope goes by a few pixels
+  for (const double readout : {0.03, -0.03}) {
+    capture::Camera camera = demo().cameras[0];
+    for (double* const size : {&camera.fx, &camera.fy, &camera.cx, &camera.cy}) *size *= kLarger;
+    camera.width *= kLarger, camera.height *= kLarger;
+    const capture::View right = drawn({}, camera, kTime, 0.0), late = drawn({}, camera, kTime, readout);
+    camera.readout = readout;
+    const capture::View mended = silhouette::as_read_at_once(late, camera, capture::Pixels::undistorted, nodes_at);
+    CHECK(overlap(late, right, camera) < 0.88);
+    CHECK(overlap(mended, right, camera) > 0.96);
+    camera.readout = 0.0;
+    CHECK(silhouette::as_read_at_once(late, camera, capture::Pixels::undistorted, nodes_at).rgba == late.rgba);
+  }
+}
+
+TEST_CASE("a rolling shutter is found where there is one") {
+  {
+    constexpr double readout = 0.025;
+    capture::Capture capture = recorded(readout);
+    const pipeline::Corrected found = pipeline::correct(capture, {}, false);
+    const capture::Finding* const said = rolling(found);
+    REQUIRE(said);
+    CHECK(said->corrected);
+    CHECK(std::abs(said->value - 1e3 * readout) < 3.0 * said->deviation);
+    CHECK(said->value == doctest::Approx(1e3 * readout).epsilon(0.2));
+    const capture::Correction& camera = *capture::find(found.corrections, "cam1", "readout");
+    CHECK(camera.value[0] == doctest::Approx(1e-3 * said->value));
+    CHECK(camera.state == capture::CorrectionState::free);
+    CHECK(capture.cameras[1].readout == camera.value[0]);
+    CHECK(capture.times[1][3] == doctest::Approx(demo().times[1][3] + 0.5 * camera.value[0]));
+    CHECK(std::abs(capture::value_of(found.corrections, "base", "time")) < 0.002);
+    // a twin mends the recording again in the same way
+    capture::Capture again = recorded(readout);
+    capture::apply(found.corrections, again);
+    CHECK(again.times == capture.times);
+    CHECK(again.cameras[2].readout == capture.cameras[2].readout);
+  }
+  capture::Capture right = recorded(0.0);
+  CHECK_FALSE(rolling(pipeline::correct(right, {}, false)));
+  CHECK(right.cameras[0].readout == 0.0);
+}
+
+TEST_CASE("a readout that is given, or to be taken as given, is not looked for") {
+  capture::Capture held = recorded(0.025);
+  CHECK_FALSE(rolling(pipeline::correct(held, {"time"}, false)));
+  capture::Capture exact = recorded(0.025);
+  exact.sigma.push_back({"cam0", "readout", 0.0});
+  CHECK_FALSE(rolling(pipeline::correct(exact, {}, false)));
+}
+
+}  // namespace
