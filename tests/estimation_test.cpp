@@ -507,7 +507,8 @@ TEST_CASE("a rope that swung into something is found where one camera does not s
     dynamics::InitialState state{0.4, VectorX::Zero(n), VectorX::Zero(n)};
     for (int k = 0; k < n; k += 2) state.thetadot[k] = -1.0;
     const estimation::State before = estimation::start(twin, {front_camera()}, moving_base, 0.0);
-    estimation::Belief belief{state.time, VectorX::Zero(3 * n), 1e-4 * MatrixX::Identity(3 * n, 3 * n)};
+    estimation::Belief belief{state.time, VectorX::Zero(3 * n), 1e-4 * MatrixX::Identity(3 * n, 3 * n),
+                              VectorX::Zero(3 * n)};
     belief.mean.segment(n, n) = state.thetadot;
     strike(model, moving_base(state.time), link, state);
     const double time = state.time + kInterval;
@@ -643,6 +644,17 @@ TEST_CASE("masks that are cut where the rope is expected teach nothing of the ba
   CHECK(state.setup.mean.isZero());
   CHECK(state.setup.information == before);
   const chain::Chain& chain = shared_twin().chain;
+  // how the angles change with the clock is told, so that those with the right one follow
+  estimation::State right = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0, options);
+  const auto known = follow(right, shared_views());
+  double off = 0.0, left = 0.0;
+  for (std::size_t f = 5; f < found.size(); ++f) {
+    CHECK(found[f].late_sigma == doctest::Approx(1.0 / 30.0));
+    const VectorX change = known[f].theta - found[f].theta;
+    off += change.squaredNorm();
+    left += (change - kLate * found[f].theta_by_late).squaredNorm();
+  }
+  CHECK(std::sqrt(left) < 0.3 * std::sqrt(off));
   for (std::size_t f = 0; f < found.size(); ++f)
     CHECK(rms(chain, found[f].theta, shared_truth().theta[f]) < 3.0 * deviation(chain, found[f]));
 }
@@ -745,7 +757,8 @@ TEST_CASE("a mask that is too wide on a table is thought to be so on the rope's 
   estimation::State state = estimation::start(
       twin, {camera}, [](double) { return trajectory::BaseMotion{}; }, 0.0);
   state.edge_offset = 0.5;
-  estimation::Belief belief{0.0, VectorX::Zero(3 * n + 2), 1e-4 * MatrixX::Identity(3 * n + 2, 3 * n + 2)};
+  estimation::Belief belief{0.0, VectorX::Zero(3 * n + 2), 1e-4 * MatrixX::Identity(3 * n + 2, 3 * n + 2),
+                            VectorX::Zero(3 * n + 2)};
   belief.mean.tail(2) << 1.0, -1.0;  // forgotten by the time of the prediction
   const VectorX shift = moved_to(state, belief, 100.0, estimation::Contact::none).mean.tail(2);
   CHECK(shift[0] == doctest::Approx(0.0).epsilon(1e-6));
@@ -758,7 +771,7 @@ TEST_CASE("the predicted covariance is that of the predicted mean's derivative")
   const estimation::State state = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
   estimation::Belief belief;
   belief.time = 0.3;
-  belief.mean = VectorX::Zero(3 * n);
+  belief.mean = belief.by_late = VectorX::Zero(3 * n);
   for (int k = 0; k < 3 * n; ++k) belief.mean[k] = 0.1 * std::sin(1.0 + k);
   VectorX direction(3 * n);  // smooth along the rope: the variational equation is of second order in stiff modes only
   for (int k = 0; k < 3 * n; ++k) direction[k] = 1.0 + 0.3 * std::cos(0.2 * k);
@@ -803,11 +816,18 @@ TEST_CASE("what a line says of the base is read back, and refused where it canno
   CHECK_FALSE(read(R"(, "settling": true)"));
   CHECK(read(R"(, "base_late": 0.02)")->base->late == 0.02);
   CHECK_FALSE(read("")->base);
+  CHECK(read("")->late_sigma == 0.0);
+  CHECK(read("")->theta_by_late.size() == 0);
+  const estimation::EstimateLine late = *read(R"(, "base_late_sigma": 0.03, "theta_by_base_late": [0.4, -2])");
+  CHECK(late.late_sigma == 0.03);
+  CHECK(late.theta_by_late == Vector2(0.4, -2.0));
   const estimation::EstimateLine held = *read(R"(, "grasp_rotation": [0.1, 0, 0.2], "grasp_shift": [0, 0.01, 0])");
   CHECK((math::log_so3(held.base->grasp.rotation) - Vector3(0.1, 0.0, 0.2)).norm() < 1e-12);
   CHECK(held.base->grasp.translation == Vector3(0.0, 0.01, 0.0));
-  for (const char* wrong : {R"(, "base_late": "x")", R"(, "base_late": 1e9)", R"(, "grasp_rotation": [0.1])",
-                            R"(, "grasp_rotation": [9, 9, 9])", R"(, "grasp_shift": [0, 0])"})
+  for (const char* wrong :
+       {R"(, "base_late": "x")", R"(, "base_late": 1e9)", R"(, "grasp_rotation": [0.1])",
+        R"(, "grasp_rotation": [9, 9, 9])", R"(, "grasp_shift": [0, 0])", R"(, "base_late_sigma": -0.1)",
+        R"(, "base_late_sigma": "x")", R"(, "theta_by_base_late": [1])", R"(, "theta_by_base_late": [1, 1e9])"})
     CHECK_THROWS_AS(read(wrong), InputError);
 }
 
@@ -850,6 +870,8 @@ TEST_CASE("a line of JSON holds what formats.md 3.1 names") {
   e.theta[1] = NAN;  // JSON has no such number
   e.covariance(1, 0) = INFINITY;
   CHECK(line["base_late"] == 0.0);
+  CHECK(line["base_late_sigma"] == 0.0);
+  CHECK(line["theta_by_base_late"].empty());
   CHECK(line["grasp_rotation"].size() == 3);
   const auto broken = nlohmann::json::parse(estimation::to_json(e, 0.0079));
   CHECK(broken["theta"][1].is_null());

@@ -34,6 +34,8 @@ struct EstimateLine {
   math::MatrixX covariance;              // of theta, rad^2
   // Of the base motion that the frames were given with: a capture's file, not as the twin corrects it.
   std::optional<BaseCorrection> base;
+  double late_sigma = 0.0;      // s, standard deviation of base->late; 0: not told
+  math::VectorX theta_by_late;  // rad/s, how theta changes with it
 };
 
 // None where the frame is lost, doubtful or settling. `before`: time of the line before. Throws InputError with `where`

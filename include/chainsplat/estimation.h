@@ -72,6 +72,9 @@ struct Estimate {
                                    // of the views'; none: not compared, or a rope without marks
   double gain = 1.0, bias = 0.0;   // exposure of the last view relative to the twin's colors
   BaseCorrection base;             // of the base motion as it was given (Filter::base_at())
+  double late_sigma = 0.0;         // s, standard deviation of base.late; 0: not known
+  math::VectorX theta_by_late;     // rad/s, how theta changes with base.late, as it is seen with the base where it is
+                                   // believed to be; n, or empty: not known
   double surprise = 0.0;           // squared innovation over its expectation, about 1 as long as the model holds
   bool seen = false;               // whether a mask shows anything
   bool lost = false;               // whether the estimate does not explain the mask, the masks were empty for long,

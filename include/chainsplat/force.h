@@ -33,13 +33,22 @@ struct Motion {
   MatrixX noise;                                    // n x n, rad^2, of the observed angles
   std::vector<Matrix3> covariance;                  // one per time
   std::vector<MatrixX> standing;                    // n x n, rad^2, one per time, or empty
+  std::vector<double> clock;                        // s, Clock::sigma, one per time, or empty: the clock is known
+  std::vector<MatrixX> by_clock;                    // n x 3: what one such deviation adds to theta, thetadot, thetaddot
+};
+
+// What is not known of the base's clock at a time. A base that is later also makes the angles others: they were found
+// with the base where it was believed to be. By how many of its deviations the clock is off is the same at all times.
+struct Clock {
+  double sigma = 0.0;  // s, standard deviation of how late the base's stamps are
+  VectorX theta;       // rad/s, how the angles change with it; n, or empty: not known
 };
 
 // Smooths every angle by a Kalman filter and Rauch-Tung-Striebel smoother under random jerk. The sizes of jerk and
 // noise and the correlations of the angles' errors are found by maximum likelihood; the ratio of jerk and noise is the
 // same for all angles. The covariances of `states`, if any, are those of the angles' lasting errors. Throws InputError
-// for fewer than three times.
-Motion smooth(const chain::States& states);
+// for fewer than three times. `clock`: one per time, or empty; where no deviation is above 0 the base's clock is known.
+Motion smooth(const chain::States& states, std::span<const Clock> clock = {});
 
 // Returns the covariance of angles of which only the standard deviations are known. Cameras observe positions: the
 // errors of the links' ends are independent, so that those of neighboring angles cancel.
@@ -135,7 +144,7 @@ class LiveForce {
 
   // Adds a state. `standing`: n x n, or empty at all times; times must increase. Returns none for the first kLiveLag
   // states.
-  std::optional<Estimate> update(double time, const VectorX& theta, const MatrixX& standing);
+  std::optional<Estimate> update(double time, const VectorX& theta, const MatrixX& standing, const Clock& clock = {});
   // Returns the estimates that are due after the last state; none for fewer than three states.
   std::vector<Estimate> finish();
   std::size_t taken() const;  // number of states received

@@ -141,6 +141,8 @@ class Estimate:
     thetadot: _Numbers
     covariance: _Numbers
     base_late: float
+    base_late_sigma: float
+    theta_by_base_late: _Numbers
     grasp: _Numbers
     settling: bool
     centerline_sigma: float

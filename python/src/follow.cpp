@@ -96,6 +96,9 @@ void add_follow(py::module_& m) {
       .def_property_readonly(
           "base_late", [](const Estimate& e) { return e.base.late; },
           "s, by which the base's stamps are believed to be late")
+      .def_readonly("base_late_sigma", &Estimate::late_sigma, "s, standard deviation of base_late")
+      .def_readonly("theta_by_base_late", &Estimate::theta_by_late,
+                    "(n,), rad/s: how theta changes with base_late; (0,): not known")
       .def_property_readonly(
           "grasp", [](const Estimate& e) { return array_of(e.base.grasp); },
           "(4, 4): how the rope is believed to be held, base from grasp; the identity where it is as given")

@@ -5,6 +5,7 @@
 #include <iterator>
 
 #include "shaders/shared/color.h"
+#include "src/estimation/predict.h"
 #include "src/math/decompositions.h"
 
 namespace chainsplat::estimation {
@@ -98,6 +99,8 @@ void look_at_colors(const State& state, std::span<const capture::View* const> vi
     right += information * (before.mean.head(n) - theta);  // linearized at theta, relative to the prior mean
     const MatrixX inverse = (MatrixX::Identity(n, n) + information * before.covariance.topLeftCorner(n, n)).inverse();
     belief.mean = before.mean - by_angles * (inverse * right);
+    const VectorX moves = before.by_late.head(n) - staying_angles(state, theta, shown[0]->time);
+    belief.by_late = before.by_late - by_angles * (inverse * (information * moves));
     belief.covariance = before.covariance - by_angles * (inverse * information) * by_angles.transpose();
     symmetrize(belief.covariance);
     belief.covariance.diagonal().array() += kLeastVariance;

@@ -170,7 +170,9 @@ void learn(State& state, std::span<const capture::View* const> views, const Atte
 void report(const State& state, std::span<const capture::View* const> views, Estimate& out) {
   const int n = state.given.model.chain.angles();
   out.base = base_correction(state.setup);
+  out.late_sigma = late_deviation(state.setup);
   out.theta = state.belief->mean.head(n);
+  out.theta_by_late = state.belief->by_late.head(n);
   out.thetadot = state.belief->mean.segment(n, n);
   out.covariance = state.belief->covariance.topLeftCorner(2 * n, 2 * n);
   if (out.doubtful) out.covariance.diagonal().head(n).array() += kDoubtAngle * kDoubtAngle;

@@ -24,6 +24,10 @@ Motion move(const State& state, const Belief& belief, double time);
 // Returns the belief at the time to which it was moved.
 Belief predict(const State& state, const Belief& belief, const Motion& motion, Contact contact);
 
+// Returns how angles that the cameras have seen, rad/s, change with how late the base's stamps are: the links' ends
+// stay in the world while the base moves.
+math::VectorX staying_angles(const State& state, const math::VectorX& theta, double time);
+
 // Whether the motion until that time is known already.
 bool is_ahead(const State& state, double time);
 // As Filter::expected(). The motion is kept for the frame of that time.

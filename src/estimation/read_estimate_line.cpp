@@ -106,6 +106,12 @@ std::optional<EstimateLine> read_estimate_line(const std::string& line, const st
     if (object.contains(field)) out.base.emplace();
   if (const auto late = object.find("base_late"); late != object.end())
     out.base->late = number(*late, where, "base_late", kLatest);
+  if (const auto sigma = object.find("base_late_sigma"); sigma != object.end())
+    out.late_sigma = number(*sigma, where, "base_late_sigma", kLatest);
+  if (out.late_sigma < 0.0) refuse(where, "base_late_sigma", "is negative");
+  out.theta_by_late = numbers(object, where, "theta_by_base_late", kMostAngle);
+  if (out.theta_by_late.size() != angles && out.theta_by_late.size() > 0)
+    refuse(where, "theta_by_base_late", "has not the number of the angles");
   if (const math::VectorX turn = numbers(object, where, "grasp_rotation", M_PI); turn.size() > 0) {
     if (turn.size() != 3) refuse(where, "grasp_rotation", "is no rotation vector");
     out.base->grasp.rotation = math::exp_so3(turn);

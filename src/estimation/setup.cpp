@@ -111,6 +111,11 @@ Setup first_setup(const Given& given, const std::vector<char>& unverified) {
   return setup;
 }
 
+double late_deviation(const Setup& setup) {
+  const VectorX clock = VectorX::Unit(setup.mean.size(), SetupEquations::kClock);
+  return std::sqrt(setup.information.ldlt().solve(clock)[SetupEquations::kClock]);
+}
+
 BaseCorrection base_correction(const Setup& setup) {
   return {setup.mean[SetupEquations::kClock],
           {math::exp_so3(setup.mean.segment<3>(SetupEquations::kGrasp)), Vector3::Zero()}};

@@ -10,8 +10,9 @@ namespace chainsplat::estimation {
 // whether no training has compared its pose with the rope; empty: none.
 Setup first_setup(const Given& given, const std::vector<char>& unverified);
 
-// What of it the base is mended by.
+// What of it the base is mended by, and the standard deviation of how late its stamps are, s.
 BaseCorrection base_correction(const Setup& setup);
+double late_deviation(const Setup& setup);
 
 // What a frame that is explained says of the setup. The belief before it was `predicted`, and its masks found the
 // angles `theta`. None where it says nothing.

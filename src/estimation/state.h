@@ -46,6 +46,7 @@ struct Belief {
   double time = 0.0;  // s
   math::VectorX mean;
   math::MatrixX covariance;
+  math::VectorX by_late;  // per s: how the mean changes with how late the base's stamps are
 };
 
 // The mean of a belief moved to a later time by the twin's dynamics, and its derivatives by the mean before, n x 3 n.
@@ -53,6 +54,7 @@ struct Motion {
   double time = 0.0;  // s
   math::VectorX theta, thetadot;
   math::MatrixX theta_by_state, thetadot_by_state;
+  math::VectorX theta_by_late, thetadot_by_late;  // rad/s, rad/s^2: by the base's clock, from the same mean before
 };
 
 // The filter between two frames.

@@ -36,6 +36,8 @@ std::string to_json(const Estimate& estimate, double latency, bool rates) {
   for (Eigen::Index row = 0; row < rows; ++row)
     for (Eigen::Index column = 0; column <= row; ++column)
       covariance.push_back(rounded(estimate.covariance(row, column)));
+  Json by_late = Json::array();
+  for (const double value : estimate.theta_by_late) by_late.push_back(rounded(value));
   VectorX variance;  // none by Adam
   if (estimate.covariance.size() > 0) variance = estimate.covariance.diagonal().head(n);
   const Json line{{"frame", estimate.frame},
@@ -52,6 +54,8 @@ std::string to_json(const Estimate& estimate, double latency, bool rates) {
                   {"lost", estimate.lost},
                   {"status", status(estimate)},
                   {"base_late", estimate.base.late},
+                  {"base_late_sigma", rounded(estimate.late_sigma)},
+                  {"theta_by_base_late", std::move(by_late)},
                   {"grasp_rotation", list(math::log_so3(estimate.base.grasp.rotation))},
                   {"grasp_shift", list(estimate.base.grasp.translation)},
                   {"settling", estimate.settling},

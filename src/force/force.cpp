@@ -34,11 +34,48 @@ constexpr double kUnknownDeviation = 0.2;  // of a joint's stiffness and damping
 // s of states that a live smoother uses. The size of the jerk changes with a push, so that 1 s fits it better than 4 s.
 constexpr double kLiveWindow = 1.0;
 
+// By how many of its deviations the base's clock may be off: what is tried, where it is not known.
+constexpr double kClockReach = 3.0, kClockStep = 0.25;
+// Relative deviation of what the clock adds to the angles, which estimation knows to first order: of ropes that were
+// followed with a base 15 and 33 ms late it was off by 0.15 to 0.23 (RMS).
+constexpr double kAddedDeviation = 0.2;
+
+using Factor = Eigen::LLT<MatrixX>;
+
+Factor factor_of(const MatrixX& covariance) {
+  Factor out(covariance);
+  if (!math::is_positive(out))
+    throw InputError("force", "the covariance of the unexplained torque is not positive definite",
+                     "check the states, their covariance and the twin's parameters");
+  return out;
+}
+
+// The forces at one place, one column for each column of the residual.
+struct Forces {
+  MatrixX force;
+  Matrix3 covariance, information;
+  VectorX evidence;
+};
+
+Forces solve_each(const MatrixX& jacobian, const MatrixX& residual, const Factor& factor, const Matrix3& prior) {
+  const MatrixX weighted = factor.solve(jacobian.transpose());  // n x 3
+  Forces out;
+  out.information = jacobian * weighted + prior.inverse();
+  out.covariance = out.information.inverse();
+  out.force = out.covariance * (weighted.transpose() * residual);
+  const double share = std::log(prior.determinant() * out.information.determinant());
+  out.evidence.resize(residual.cols());
+  for (Eigen::Index h = 0; h < residual.cols(); ++h)
+    out.evidence[h] = 0.5 * (out.force.col(h).dot(out.information * out.force.col(h)) - share);
+  return out;
+}
+
 // The data of one time: the residual torque, its covariance, and the rope's configuration.
 struct Frame {
-  VectorX residual;
-  MatrixX covariance;          // of the residual, with friction at rest as noise
+  MatrixX residual;            // one column for each of Track::clock
+  MatrixX covariance;          // of each of them, with friction at rest as noise
   MatrixX sliding_covariance;  // the same without friction at rest
+  Factor factor;               // of `covariance`
   MatrixX axes;
   std::vector<Pose> motions;
   std::vector<double> hidden;  // N per link, friction that may balance a force unseen
@@ -49,19 +86,38 @@ struct Frame {
   bool is_named = false;
 };
 
+// Returns the residual for each clock that is tried.
+MatrixX residuals_by_clock(const dynamics::Model& model, const dynamics::BaseFunction& base, const Motion& motion,
+                           std::size_t f, const Track& track) {
+  MatrixX out(model.chain.angles(), track.clock.size());
+  for (Eigen::Index h = 0; h < out.cols(); ++h) {
+    const double off = track.clock[h];
+    double late = 0.0;                                       // s
+    MatrixX added = MatrixX::Zero(model.chain.angles(), 3);  // to theta, thetadot, thetaddot
+    if (!motion.clock.empty()) late = off * motion.clock[f], added = off * motion.by_clock[f];
+    out.col(h) = residual_torque(model, base(motion.time[f] + late), motion.theta[f] + added.col(0),
+                                 motion.thetadot[f] + added.col(1), motion.thetaddot[f] + added.col(2));
+  }
+  return out;
+}
+
 Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> deviations,
-               const trajectory::BaseMotion& base, const Motion& motion, std::size_t f, const Options& options) {
+               const dynamics::BaseFunction& base_at, const Motion& motion, std::size_t f, const VectorX& clock,
+               const Track& track) {
+  const Options& options = track.options;
+  const trajectory::BaseMotion base = base_at(motion.time[f]);
   const chain::Chain& chain = model.chain;
   const dynamics::Parameters& p = model.parameters;
   const int n = chain.angles();
   const VectorX &theta = motion.theta[f], &thetadot = motion.thetadot[f], &thetaddot = motion.thetaddot[f];
   Frame out;
   // the residual and the configuration
-  out.residual = residual_torque(model, base, theta, thetadot, thetaddot);
+  out.residual = residuals_by_clock(model, base_at, motion, f, track);
   VectorX slip;  // shares of friction in bending
   if (!p.bending_friction.empty())
     if (const VectorX z = dynamics::internal_state_in_motion(model, theta, thetadot); z.size() >= n) slip = z.head(n);
-  for (Eigen::Index k = 0; k < slip.size(); ++k) out.residual[k] += p.bending_friction[k] * slip[k];
+  for (Eigen::Index k = 0; k < slip.size(); ++k) out.residual.row(k).array() += p.bending_friction[k] * slip[k];
+  const VectorX residual = out.residual.col(track.clock.size() / 2);  // by the clock as it is believed to be
   out.axes = chain::world_axes(chain, theta, base.pose);
   out.motions = chain::link_motions(chain, theta, base.pose);
 
@@ -76,8 +132,19 @@ Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> de
     out.covariance.noalias() += at.stiffness * motion.standing[f] * at.stiffness.transpose();
   // from the parameters',
   for (const dynamics::Model& other : deviations) {
-    const VectorX off = residual_torque(other, base, theta, thetadot, thetaddot) - out.residual;
+    const VectorX off = residual_torque(other, base, theta, thetadot, thetaddot) - residual;
     out.covariance.noalias() += off * off.transpose();
+  }
+  // from the base's clock, which is between those that are tried, and adds to a joint's angles about what it is said
+  // to,
+  if (!motion.clock.empty()) {
+    VectorX added = VectorX::Zero(chain.links());  // rad^2, at the joint before each link
+    for (int k = 0; k < n; ++k) added[chain.child_link[k]] += std::pow(motion.by_clock[f](k, 0), 2);
+    added *= std::pow(kAddedDeviation, 2) * clock.dot(track.clock.cwiseAbs2());
+    for (int k = 0; k < n; ++k)
+      out.covariance.noalias() += added[chain.child_link[k]] * at.stiffness.col(k) * at.stiffness.col(k).transpose();
+    const VectorX step = (out.residual.rightCols(1) - out.residual.leftCols(1)) / (track.clock.size() - 1.0);
+    out.covariance.noalias() += step * step.transpose() / 12.0;
   }
   // from friction in bending, of any share that motion has not decided,
   for (Eigen::Index k = 0; k < slip.size(); ++k)
@@ -128,6 +195,7 @@ Frame frame_of(const dynamics::Model& model, std::span<const dynamics::Model> de
         out.covariance.noalias() += std::exp(-apart / options.friction_reach) * friction[a].transpose() * friction[b];
       }
   }
+  out.factor = factor_of(out.covariance);
   return out;
 }
 
@@ -157,12 +225,12 @@ Contact contact_at(const chain::Chain& chain, double arclength) {
   return {chain::link_at(chain, arclength), arclength, arclength * chain.direction, 0.0};
 }
 
-// A contact with its force by the residual and the prior.
+// A contact with its forces by the residual and the prior.
 struct Touch {
   Contact contact;
   Matrix3 prior;
   MatrixX jacobian;
-  Fit fit;
+  Forces fit;
 };
 
 Touch touch_at(const dynamics::Model& model, const Frame& frame, const Contact& contact, const Options& options) {
@@ -174,16 +242,17 @@ Touch touch_at(const dynamics::Model& model, const Frame& frame, const Contact& 
   out.contact = contact;
   out.prior = across * across * Matrix3::Identity() + (along * along - across * across) * tangent * tangent.transpose();
   out.jacobian = felt_jacobian(model, frame, contact, options.pressing);
-  out.fit = solve(out.jacobian, frame.residual, frame.covariance, out.prior);
+  out.fit = solve_each(out.jacobian, frame.residual, frame.factor, out.prior);
   return out;
 }
 
 // Returns the contact at an arclength, on the side of the rope that is pushed, where a force along the rope has the
-// radius as its lever.
-Touch touch_on_surface(const dynamics::Model& model, const Frame& frame, double arclength, const Options& options) {
+// radius as its lever. `clock`: probabilities of Track::clock.
+Touch touch_on_surface(const dynamics::Model& model, const Frame& frame, double arclength, const VectorX& clock,
+                       const Options& options) {
   const chain::Chain& chain = model.chain;
   const Touch axis = touch_at(model, frame, contact_at(chain, arclength), options);
-  const Vector3 push = frame.motions[axis.contact.link].rotation.transpose() * axis.fit.force;
+  const Vector3 push = frame.motions[axis.contact.link].rotation.transpose() * (axis.fit.force * clock);
   const Vector3 across = push - chain.direction.dot(push) * chain.direction;
   const double weight = dynamics::total_mass(model.parameters) * model.parameters.gravity.norm();
   if (across.norm() <= kTouchingWeight * weight) return axis;
@@ -192,38 +261,46 @@ Touch touch_on_surface(const dynamics::Model& model, const Frame& frame, double 
   return touch_at(model, frame, contact, options);
 }
 
-// Returns the fits at every place that is tracked: all along the rope, or the named one.
-std::vector<Fit> fits_at(const dynamics::Model& model, const Frame& frame, const Track& track, bool automatic) {
-  std::vector<Fit> out;
+// Returns the forces at every place that is tracked: all along the rope, or the named one. `clock`: as above, before
+// this time is looked at.
+std::vector<Forces> fits_at(const dynamics::Model& model, const Frame& frame, const VectorX& clock, const Track& track,
+                            bool automatic) {
+  std::vector<Forces> out;
   if (!automatic && !frame.is_named) {
-    out.emplace_back().evidence = kNotSaid;
+    out.emplace_back().evidence = VectorX::Constant(track.clock.size(), kNotSaid);
   } else if (!automatic) {
     out.push_back(touch_at(model, frame, frame.named, track.options).fit);
   } else {
     for (const double arclength : track.arclengths)
-      out.push_back(touch_on_surface(model, frame, arclength, track.options).fit);
+      out.push_back(touch_on_surface(model, frame, arclength, clock, track.options).fit);
   }
   return out;
 }
 
-VectorX evidence_of(const std::vector<Fit>& fits) {
-  VectorX out(static_cast<Eigen::Index>(fits.size()));
-  for (std::size_t i = 0; i < fits.size(); ++i) out[static_cast<Eigen::Index>(i)] = fits[i].evidence;
+// Returns the log likelihoods that likelihood() takes, relative to that of no contact and the first clock.
+MatrixX logs_of(const Frame& frame, const std::vector<Forces>& fits) {
+  const auto places = static_cast<Eigen::Index>(fits.size());
+  const VectorX squares = frame.factor.matrixL().solve(frame.residual).colwise().squaredNorm();
+  MatrixX out = (-0.5 * (squares.array() - squares[0])).matrix().transpose().replicate(places + 1, 1);
+  for (Eigen::Index i = 0; i < places; ++i) out.row(1 + i) += fits[i].evidence;
   return out;
 }
 
-Track track_of(const chain::Chain& chain, bool automatic, const Options& options) {
+Track track_of(const chain::Chain& chain, bool automatic, bool clock_known, const Options& options) {
   Track out;
   out.odds = automatic ? kOddsOfNone : kOddsWhereNamed;
   out.options = options;
   const int places = automatic ? options.places : 1;
   for (int i = 1; i <= places; ++i) out.arclengths.push_back(chain.length * i / places);
+  const auto steps = static_cast<Eigen::Index>(clock_known ? 0.0 : kClockReach / kClockStep);
+  out.clock = VectorX::LinSpaced(2 * steps + 1, -static_cast<double>(steps), static_cast<double>(steps)) * kClockStep;
+  if (clock_known) out.clock.setZero();
   return out;
 }
 
 // Returns the estimate of one time from the belief about the contact's place.
-Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, const std::vector<Fit>& fits,
-                 const VectorX& belief, const Track& track, bool automatic) {
+Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, const std::vector<Forces>& fits,
+                 const MatrixX& belief, const Track& track, bool automatic) {
   const chain::Chain& chain = model.chain;
   const dynamics::Parameters& p = model.parameters;
   Estimate e;
@@ -231,29 +308,24 @@ Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, 
   // without a contact the place is the free end
   e.contact = automatic || !frame.is_named ? contact_at(chain, chain.length) : frame.named;
   if (automatic || frame.is_named) {
-    e.probability = 1.0 - belief[0];
-    const auto at = belief.tail(belief.size() - 1);
-    const Eigen::Map<const VectorX> s(track.arclengths.data(), at.size());
-    Touch touch;
-    Vector3 force;
-    Matrix3 covariance;
-    if (automatic) {
-      // mean over the places, weighted by the belief; the spread of their forces adds to each one's own error
-      const double sum = std::max(at.sum(), std::numeric_limits<double>::min());
-      const double mean = at.dot(s) / sum;
-      e.arclength_sigma = std::sqrt(at.dot((s.array() - mean).square().matrix()) / sum);
-      touch = touch_on_surface(model, frame, std::clamp(mean, s[0], chain.length), track.options);
-      force.setZero();
-      covariance.setZero();
-      for (std::size_t i = 0; i < fits.size(); ++i) force += at[i] / sum * fits[i].force;
-      for (std::size_t i = 0; i < fits.size(); ++i) {
-        const Vector3 off = fits[i].force - force;
-        covariance += at[i] / sum * (fits[i].covariance + off * off.transpose());
-      }
-    } else {
-      touch = touch_at(model, frame, frame.named, track.options);
-      force = touch.fit.force;
-      covariance = touch.fit.covariance;
+    e.probability = 1.0 - belief.row(0).sum();
+    const MatrixX at = belief.bottomRows(belief.rows() - 1);  // by place and clock
+    const VectorX at_place = at.rowwise().sum(), clock = belief.colwise().sum();
+    const Eigen::Map<const VectorX> s(track.arclengths.data(), at.rows());
+    const double sum = std::max(at.sum(), std::numeric_limits<double>::min());
+    const double mean = at_place.dot(s) / sum;
+    if (automatic) e.arclength_sigma = std::sqrt(at_place.dot((s.array() - mean).square().matrix()) / sum);
+    const Touch touch = automatic
+                            ? touch_on_surface(model, frame, std::clamp(mean, s[0], chain.length), clock, track.options)
+                            : touch_at(model, frame, frame.named, track.options);
+    // mean over places and clocks, weighted by the belief; the spread of their forces adds to each one's own error
+    Vector3 force = Vector3::Zero();
+    Matrix3 covariance = Matrix3::Zero();
+    for (Eigen::Index i = 0; i < at.rows(); ++i) force += fits[i].force * at.row(i).transpose() / sum;
+    for (Eigen::Index i = 0; i < at.rows(); ++i) {
+      const MatrixX off = fits[i].force.colwise() - force;
+      covariance += at_place[i] / sum * fits[i].covariance;
+      covariance += off * (at.row(i).transpose() / sum).asDiagonal() * off.transpose();
     }
     e.contact = touch.contact;
     if (const auto& normal = p.table_normal) {
@@ -274,7 +346,7 @@ Estimate line_of(const dynamics::Model& model, double time, const Frame& frame, 
     e.touching = e.probability > 0.5 && e.force.norm() > kTouchingWeight * dynamics::total_mass(p) * p.gravity.norm() &&
                  force.dot(covariance.ldlt().solve(force)) > kTouchingErrors * kTouchingErrors;
     // friction at rest may balance any force up to its limit: bounds around the force if it balanced none
-    const Fit sliding = solve(touch.jacobian, frame.residual, frame.sliding_covariance, touch.prior);
+    const Fit sliding = solve(touch.jacobian, frame.residual * clock, frame.sliding_covariance, touch.prior);
     const double limit = std::accumulate(frame.hidden.begin(), frame.hidden.end(), 0.0);
     e.low = e.high = e.force;
     if (const auto& normal = p.table_normal) {
@@ -340,17 +412,12 @@ VectorX residual_torque(const dynamics::Model& model, const trajectory::BaseMoti
 }
 
 Fit solve(const MatrixX& jacobian, const VectorX& residual, const MatrixX& covariance, const Matrix3& prior) {
-  const Eigen::LLT<MatrixX> factor(covariance);
-  if (!math::is_positive(factor))
-    throw InputError("force", "the covariance of the unexplained torque is not positive definite",
-                     "check the states, their covariance and the twin's parameters");
-  const MatrixX weighted = factor.solve(jacobian.transpose());  // n x 3
-  const Matrix3 information = jacobian * weighted + prior.inverse();
+  const Forces found = solve_each(jacobian, residual, factor_of(covariance), prior);
   Fit out;
-  out.covariance = information.inverse();
-  out.force = out.covariance * (weighted.transpose() * residual);
-  out.explained = out.force.dot(information * out.force);
-  out.evidence = 0.5 * (out.explained - std::log(prior.determinant() * information.determinant()));
+  out.covariance = found.covariance;
+  out.force = found.force.col(0);
+  out.explained = out.force.dot(found.information * out.force);
+  out.evidence = found.evidence[0];
   return out;
 }
 
@@ -414,11 +481,10 @@ std::vector<Estimate> estimate(const dynamics::Model& model, std::span<const dyn
   const std::size_t count = motion.time.size();
   const bool automatic = contacts.empty();
   CHAINSPLAT_CHECK(automatic || contacts.size() == count, std::to_string(contacts.size()));
-  const Track track = track_of(model.chain, automatic, options);
+  const Track track = track_of(model.chain, automatic, motion.clock.empty(), options);
   // forward pass of the hidden Markov chain
   std::vector<Frame> frames;
-  std::vector<std::vector<Fit>> fits;
-  std::vector<VectorX> likely, belief;
+  std::vector<MatrixX> likely, belief;
   const auto interval = [&](std::size_t f) {
     return f > 0 ? motion.time[f] - motion.time[f - 1] : motion.time[1] - motion.time[0];
   };
@@ -429,23 +495,27 @@ std::vector<Estimate> estimate(const dynamics::Model& model, std::span<const dyn
     return step;
   };
   for (std::size_t f = 0; f < count; ++f) {
-    frames.push_back(frame_of(model, deviations, base(motion.time[f]), motion, f, options));
+    const MatrixX before = f > 0 ? MatrixX(step_over(interval(f)) * belief[f - 1]) : first_belief(track);
+    const VectorX clock = before.colwise().sum();
+    frames.push_back(frame_of(model, deviations, base, motion, f, clock, track));
     if (!automatic && contacts[f]) frames[f].named = *contacts[f], frames[f].is_named = true;
-    fits.push_back(fits_at(model, frames[f], track, automatic));
-    likely.push_back(likelihood(track, evidence_of(fits[f]), interval(f)));
-    belief.push_back(
-        posterior(f > 0 ? VectorX(step_over(interval(f)) * belief[f - 1]) : first_belief(track), likely[f]));
+    const std::vector<Forces> fits = fits_at(model, frames[f], clock, track, automatic);
+    likely.push_back(likelihood(track, logs_of(frames[f], fits), interval(f)));
+    belief.push_back(posterior(before, likely[f]));
   }
   // backward pass
-  VectorX later = VectorX::Ones(belief.back().size());
+  MatrixX later = MatrixX::Ones(belief.back().rows(), belief.back().cols());
   for (std::size_t f = count - 1; f-- > 0;) {
-    later = step_over(interval(f + 1)).transpose() * later.cwiseProduct(likely[f + 1]);
+    later = (step_over(interval(f + 1)).transpose() * later.cwiseProduct(likely[f + 1])).eval();
     later /= later.sum();
     belief[f] = posterior(belief[f], later);
   }
+  // the forces again, as they would be too many to keep
   std::vector<Estimate> out;
-  for (std::size_t f = 0; f < count; ++f)
-    out.push_back(line_of(model, motion.time[f], frames[f], fits[f], belief[f], track, automatic));
+  for (std::size_t f = 0; f < count; ++f) {
+    const std::vector<Forces> fits = fits_at(model, frames[f], belief[f].colwise().sum(), track, automatic);
+    out.push_back(line_of(model, motion.time[f], frames[f], fits, belief[f], track, automatic));
+  }
   return out;
 }
 
@@ -456,23 +526,26 @@ struct LiveForce::State {
   ContactAt contact;
   Options options;
   chain::States states = {};         // of the last seconds
-  VectorX belief = {};               // about the contact's place at the last estimate's time; empty before the first
+  std::vector<Clock> clocks = {};    // of the same
+  MatrixX belief = {};               // about contact and clock at the last estimate's time; empty before the first
   std::size_t lines = 0, taken = 0;  // numbers of estimates returned and of states received
 
   // Returns the estimate of state `at` of the window, which ends with the newest state.
   Estimate line(std::size_t at) {
     const bool automatic = !contact;
-    const Motion motion = smooth(states);
+    const Motion motion = smooth(states, clocks);
     const double time = motion.time[at];
-    Frame frame = frame_of(model, deviations, base(time), motion, at, options);
+    const Track track = track_of(model.chain, automatic, motion.clock.empty() && belief.cols() <= 1, options);
+    if (belief.cols() == 1 && track.clock.size() > 1) belief = (belief * first_clock(track).transpose()).eval();
+    const double interval = at > 0 ? time - motion.time[at - 1] : motion.time[at + 1] - time;
+    const MatrixX before = belief.size() == 0 ? first_belief(track) : MatrixX(transition(track, interval) * belief);
+    const VectorX clock = before.colwise().sum();
+    Frame frame = frame_of(model, deviations, base, motion, at, clock, track);
     if (!automatic)
       if (const std::optional<Contact> touched = contact(time, motion.theta[at]))
         frame.named = *touched, frame.is_named = true;
-    const Track track = track_of(model.chain, automatic, options);
-    const std::vector<Fit> fits = fits_at(model, frame, track, automatic);
-    const double interval = at > 0 ? time - motion.time[at - 1] : motion.time[at + 1] - time;
-    const VectorX before = belief.size() == 0 ? first_belief(track) : VectorX(transition(track, interval) * belief);
-    belief = posterior(before, likelihood(track, evidence_of(fits), interval));
+    const std::vector<Forces> fits = fits_at(model, frame, clock, track, automatic);
+    belief = posterior(before, likelihood(track, logs_of(frame, fits), interval));
     ++lines;
     return line_of(model, time, frame, fits, belief, track, automatic);
   }
@@ -487,11 +560,13 @@ LiveForce::~LiveForce() = default;
 LiveForce::LiveForce(LiveForce&&) noexcept = default;
 LiveForce& LiveForce::operator=(LiveForce&&) noexcept = default;
 
-std::optional<Estimate> LiveForce::update(double time, const VectorX& theta, const MatrixX& standing) {
+std::optional<Estimate> LiveForce::update(double time, const VectorX& theta, const MatrixX& standing,
+                                          const Clock& clock) {
   State& live = *state_;
   live.states.time.push_back(time);
   live.states.theta.push_back(theta);
   if (standing.size() > 0) live.states.covariance.push_back(standing);
+  live.clocks.push_back(clock);
   ++live.taken;
   // the window keeps the states that the next estimate and the speed before it need
   std::size_t old = 0;
@@ -500,6 +575,7 @@ std::optional<Estimate> LiveForce::update(double time, const VectorX& theta, con
   live.states.theta.erase(live.states.theta.begin(), live.states.theta.begin() + old);
   if (!live.states.covariance.empty())
     live.states.covariance.erase(live.states.covariance.begin(), live.states.covariance.begin() + old);
+  live.clocks.erase(live.clocks.begin(), live.clocks.begin() + old);
   if (live.taken <= kLiveLag) return {};
   return live.line(live.states.time.size() - 1 - kLiveLag);
 }

@@ -1,4 +1,5 @@
 // Smoothing of angles over time under random jerk: Kalman filter and Rauch-Tung-Striebel smoother.
+#include <algorithm>
 #include <cmath>
 
 #include "chainsplat/force.h"
@@ -86,43 +87,67 @@ Filtered filter(const std::vector<double>& time, const std::vector<VectorX>& the
   return out;
 }
 
+// By all times: means, n x 3, and covariance for noise of 1 rad.
+struct Smoothed {
+  std::vector<MatrixX> mean;
+  std::vector<Matrix3> covariance;
+};
+
+Smoothed smooth_backward(const std::vector<double>& time, const Filtered& forward) {
+  const std::size_t count = time.size();
+  Smoothed out{std::vector<MatrixX>(count), std::vector<Matrix3>(count)};
+  MatrixX mean = forward.mean.back();
+  Matrix3 covariance = forward.covariance.back();
+  for (std::size_t f = count; f-- > 0;) {
+    if (f + 1 < count) {
+      const Matrix3 step = transition(time[f + 1] - time[f]);
+      const Matrix3 gain = forward.covariance[f] * step.transpose() * forward.predicted_covariance[f + 1].inverse();
+      mean = (forward.mean[f] + (mean - forward.predicted[f + 1]) * gain.transpose()).eval();
+      covariance =
+          (forward.covariance[f] + gain * (covariance - forward.predicted_covariance[f + 1]) * gain.transpose()).eval();
+    }
+    out.mean[f] = mean;
+    out.covariance[f] = 0.5 * (covariance + covariance.transpose());
+  }
+  return out;
+}
+
 }  // namespace
 
-Motion smooth(const chain::States& states) {
+Motion smooth(const chain::States& states, std::span<const Clock> clock) {
   const std::size_t count = states.time.size();
   if (count < 3) throw InputError("states", "are fewer than three", "give more: forces need accelerations");
+  CHAINSPLAT_CHECK(clock.empty() || clock.size() == count, std::to_string(clock.size()));
   // choose the ratio by maximum likelihood
   Filtered best;
+  double best_ratio = kLeastRatio;
   for (int i = 0; i < kRatios; ++i) {
     const double ratio = kLeastRatio * std::pow(kLargestRatio / kLeastRatio, i / (kRatios - 1.0));
     Filtered tried = filter(states.time, states.theta, ratio);
-    if (i == 0 || tried.log_likelihood > best.log_likelihood) best = std::move(tried);
+    if (i > 0 && !(tried.log_likelihood > best.log_likelihood)) continue;
+    best = std::move(tried);
+    best_ratio = ratio;
   }
-  // smooth backward
+  Smoothed all = smooth_backward(states.time, best);
   Motion out;
   out.time = states.time;
-  out.theta.resize(count);
-  out.thetadot.resize(count);
-  out.thetaddot.resize(count);
-  out.covariance.resize(count);
+  for (const MatrixX& mean : all.mean) {
+    out.theta.push_back(mean.col(0));
+    out.thetadot.push_back(mean.col(1));
+    out.thetaddot.push_back(mean.col(2));
+  }
+  out.covariance = std::move(all.covariance);
   out.noise = best.noise;
   out.standing = states.covariance;
-  MatrixX mean = best.mean.back();
-  Matrix3 covariance = best.covariance.back();
-  for (std::size_t back = 0; back < count; ++back) {
-    const std::size_t f = count - 1 - back;
-    if (back > 0) {
-      const Matrix3 step = transition(states.time[f + 1] - states.time[f]);
-      const Matrix3 gain = best.covariance[f] * step.transpose() * best.predicted_covariance[f + 1].inverse();
-      mean = (best.mean[f] + (mean - best.predicted[f + 1]) * gain.transpose()).eval();
-      covariance =
-          (best.covariance[f] + gain * (covariance - best.predicted_covariance[f + 1]) * gain.transpose()).eval();
-    }
-    out.theta[f] = mean.col(0);
-    out.thetadot[f] = mean.col(1);
-    out.thetaddot[f] = mean.col(2);
-    out.covariance[f] = 0.5 * (covariance + covariance.transpose());
+  if (std::all_of(clock.begin(), clock.end(), [](const Clock& at) { return at.sigma == 0.0; })) return out;
+  // the smoother is linear: what the clock adds to the angles goes through it as they do
+  std::vector<VectorX> added;
+  for (std::size_t f = 0; f < count; ++f) {
+    const bool known = clock[f].theta.size() > 0;
+    added.push_back(known ? VectorX(clock[f].sigma * clock[f].theta) : VectorX::Zero(states.theta[f].size()));
+    out.clock.push_back(clock[f].sigma);
   }
+  out.by_clock = smooth_backward(states.time, filter(states.time, added, best_ratio)).mean;
   return out;
 }
 

@@ -5,11 +5,16 @@
 
 namespace chainsplat::force {
 
-VectorX first_belief(const Track& track) {
+MatrixX first_belief(const Track& track) {
   const auto places = static_cast<Eigen::Index>(track.arclengths.size());
-  VectorX out = VectorX::Constant(places + 1, 1.0 / (places * (1.0 + track.odds)));
-  out[0] = track.odds / (1.0 + track.odds);
-  return out;
+  VectorX place = VectorX::Constant(places + 1, 1.0 / (places * (1.0 + track.odds)));
+  place[0] = track.odds / (1.0 + track.odds);
+  return place * first_clock(track).transpose();
+}
+
+VectorX first_clock(const Track& track) {
+  const VectorX likely = (-0.5 * track.clock.array().square()).exp();
+  return likely / likely.sum();
 }
 
 MatrixX transition(const Track& track, double interval) {
@@ -30,14 +35,13 @@ MatrixX transition(const Track& track, double interval) {
   return out;
 }
 
-VectorX likelihood(const Track& track, const VectorX& evidence, double interval) {
-  VectorX logs(evidence.size() + 1);
-  logs << 0.0, std::min(1.0, interval / track.options.error_memory) * evidence;
-  return (logs.array() - logs.maxCoeff()).exp();
+MatrixX likelihood(const Track& track, const MatrixX& logs, double interval) {
+  const MatrixX counted = std::min(1.0, interval / track.options.error_memory) * logs;
+  return (counted.array() - counted.maxCoeff()).exp();
 }
 
-VectorX posterior(const VectorX& before, const VectorX& likely) {
-  const VectorX out = before.cwiseProduct(likely);
+MatrixX posterior(const MatrixX& before, const MatrixX& likely) {
+  const MatrixX out = before.cwiseProduct(likely);
   return out / out.sum();
 }
 

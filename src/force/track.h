@@ -9,19 +9,23 @@ namespace chainsplat::force {
 
 struct Track {
   std::vector<double> arclengths;  // m, the places
+  VectorX clock;                   // deviations by which the base's clock may be off, tried side by side
   double odds = 1.0;               // prior odds of no contact against a contact
   Options options;
 };
 
-// Returns the prior belief. Beliefs are probabilities: of 'nowhere' first, then of the places.
-VectorX first_belief(const Track& track);
-// Returns the transition matrix to a time `interval` s later; one column per state before.
+// Returns the prior belief. Beliefs are probabilities: a row for 'nowhere', then one for each place; a column for each
+// of `clock`, which stays as it is over time.
+MatrixX first_belief(const Track& track);
+// Returns that about the clock alone, one number for each of `clock`.
+VectorX first_clock(const Track& track);
+// Returns the transition matrix of the places to a time `interval` s later; one column per state before.
 MatrixX transition(const Track& track, double interval);
-// Returns the likelihood of the observation at a time per state, up to a factor. `evidence`: log likelihood ratio of a
-// force at each place to none; `interval`: s since the previous time. Errors are correlated over time, so that evidence
-// counts only in part when it follows shortly.
-VectorX likelihood(const Track& track, const VectorX& evidence, double interval);
+// Returns the likelihood of the observation at a time, up to a factor, from log likelihoods; shaped as a belief.
+// `interval`: s since the previous time. Errors are correlated over time, so that evidence counts only in part when it
+// follows shortly.
+MatrixX likelihood(const Track& track, const MatrixX& logs, double interval);
 // Returns the belief after an observation by Bayes' rule.
-VectorX posterior(const VectorX& before, const VectorX& likely);
+MatrixX posterior(const MatrixX& before, const MatrixX& likely);
 
 }  // namespace chainsplat::force

@@ -41,6 +41,7 @@ struct State {
   math::VectorX theta;
   math::MatrixX standing;                            // n x n, or empty
   std::optional<estimation::BaseCorrection> base{};  // what the line says of the base
+  force::Clock clock{};                              // what of its clock is not known
 };
 
 // Gives every state to `take`, as soon as its line is there.
@@ -51,7 +52,7 @@ void each_state(const ForceOptions& options, const chain::Chain& chain, const st
     return;
   }
   each_estimate(options.estimate, chain.angles(), [&](const estimation::EstimateLine& line) {
-    State state{line.time, line.theta, {}, line.base};
+    State state{line.time, line.theta, {}, line.base, {line.late_sigma, line.theta_by_late}};
     if (line.sigma.size() > 0)  // estimate's solver adam writes none
       state.standing =
           line.covariance.size() > 0 ? line.covariance : force::angle_covariance(chain, line.theta, line.sigma);
@@ -165,7 +166,7 @@ void Work::live() {
       base_.check_covers(first, state.time);
       base_.forget();  // it goes for the few states before it, too
       base_.mend(state.time, state.base);
-      if (const auto estimate = live.update(state.time, state.theta, state.standing)) tell(*estimate);
+      if (const auto estimate = live.update(state.time, state.theta, state.standing, state.clock)) tell(*estimate);
     });
     if (live.taken() < 3) throw InputError(source_, kFew, kMore);
     for (const force::Estimate& estimate : live.finish()) tell(estimate);
@@ -178,17 +179,19 @@ void Work::live() {
 
 void Work::whole() {
   chain::States states;
+  std::vector<force::Clock> clocks;
   each_state(options_, twin_.chain, [&](const State& state) {
     base_.mend(state.time, state.base);
     states.time.push_back(state.time);
     states.theta.push_back(state.theta);
     if (state.standing.size() > 0) states.covariance.push_back(state.standing);
+    clocks.push_back(state.clock);
   });
   const std::size_t count = states.time.size();
   if (count < 3) throw InputError(source_, kFew, kMore);
   base_.check_covers(states.time.front(), states.time.back());
   twin::warn_beyond(twin_.validity, twin::validity_of(twin_.chain, base_.given(), states), source_);
-  const force::Motion motion = force::smooth(states);
+  const force::Motion motion = force::smooth(states, clocks);
   const force::ContactAt touched = contact((states.time.back() - states.time.front()) / (count - 1.0));
   const std::vector<std::optional<force::Contact>> contacts = contacts_along(motion, touched);
   if (touched) check_near();

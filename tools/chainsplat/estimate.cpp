@@ -134,7 +134,7 @@ class Push {
   std::optional<force::Estimate> update(const estimation::Estimate& e) {
     if (!live_ || e.lost || e.doubtful || e.settling) return {};
     const Eigen::Index n = std::min(e.theta.size(), e.covariance.rows());  // 0: no covariance
-    return live_->update(e.time, e.theta, e.covariance.topLeftCorner(n, n));
+    return live_->update(e.time, e.theta, e.covariance.topLeftCorner(n, n), {e.late_sigma, e.theta_by_late});
   }
 
  private:
