@@ -133,7 +133,7 @@ VectorX left_by_motion(const chain::Chain& chain, const capture::Capture& captur
 
 }  // namespace
 
-MotionReadout readout_by_motion(const capture::Capture& capture) {
+MotionReadout readout_by_motion(const capture::Capture& capture) try {
   MotionReadout out;
   if (capture.tabletop || capture.times.empty() || capture.times[0].size() < kLeastMoments) return out;
   const FirstFit fit = first_fit(capture, kFewJoints);
@@ -155,6 +155,8 @@ MotionReadout readout_by_motion(const capture::Capture& capture) {
   out.left = after;
   out.more = Readout{value, std::sqrt(after / (kIndependent * slope.squaredNorm()))};
   return out;
+} catch (const WorkError&) {
+  return {};  // no parameters move the rope at all: identification, which follows, says so
 }
 
 }  // namespace chainsplat::pipeline
