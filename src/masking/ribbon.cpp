@@ -31,6 +31,8 @@ constexpr double kWiderTip = 0.3;   // deviation of the width where a connector 
 constexpr double kTipShare = 0.15;  // of the length
 constexpr double kMove = 0.35;      // for each step of an outline across, from one station to the next
 constexpr double kLeastWidth = 0.5, kMostWidth = 2.9;  // of the usual one
+constexpr double kPastPoint =
+    1e6;  // of outlines that have a place of the user's not between them: more than all others
 // finer than columns
 constexpr double kSmooth = 2.0;    // radii on either side, within which an outline is taken for straight
 constexpr double kLeastRim = 1.5;  // px, of a radius below which there are no rims to be seen
@@ -253,6 +255,20 @@ Choices choices_of(const Straight& s, const RibbonOptions& options) {
 // Where a connector may be.
 bool in_tip(const Straight& s, int i) { return s.stations[i].arclength > (1.0 - kTipShare) * s.length; }
 
+// The columns, by station, that lie between the outlines since the user says so; -1: none.
+std::vector<int> columns_through(const Straight& s, const std::vector<Vector2>& places) {
+  std::vector<int> out(s.count(), -1);
+  for (const Vector2& place : places) {
+    const auto nearest =
+        std::min_element(s.stations.begin(), s.stations.end(), [&](const Station& a, const Station& b) {
+          return (a.at - place).squaredNorm() < (b.at - place).squaredNorm();
+        });
+    const int column = s.half + static_cast<int>(std::lround((place - nearest->at).dot(nearest->across) / s.du));
+    if (column >= 0 && column < s.columns) out[nearest - s.stations.begin()] = column;
+  }
+  return out;
+}
+
 // What speaks against a pair at station i. `sums`: of the odds of the columns before each.
 double cost_of(const Straight& s, const RibbonOptions& options, int i, const Outlines& pair,
                const std::vector<double>& sums) {
@@ -268,6 +284,7 @@ double cost_of(const Straight& s, const RibbonOptions& options, int i, const Out
 
 // The cheapest way of both outlines from station to station, each by one column at most (dynamic programming).
 std::vector<Outlines> cheapest_way(const Straight& s, const Choices& choices, const RibbonOptions& options) {
+  const std::vector<int> through = columns_through(s, options.through);
   constexpr int kMoves = 9, kStay = 4;  // by -1, 0 or 1 of the left and of the right outline
   const auto from = [&](const Outlines& pair, int move) {
     return Outlines{pair.a + move / 3 - 1, pair.b + move % 3 - 1};
@@ -291,7 +308,9 @@ std::vector<Outlines> cheapest_way(const Straight& s, const Choices& choices, co
         const double one = best[m] + kMove * ((move / 3 != 1) + (move % 3 != 1));
         if (one < least) least = one, by = static_cast<std::uint8_t>(move);
       }
-      next[n] = least + cost_of(s, options, i, choices.all[n], sums);
+      const auto [left, right] = choices.all[n];
+      const bool past = through[i] >= 0 && (through[i] < left || through[i] >= right);
+      next[n] = least + cost_of(s, options, i, choices.all[n], sums) + (past ? kPastPoint : 0.0);
       came[static_cast<std::size_t>(i) * many + n] = by;
     }
     std::swap(best, next);
