@@ -72,6 +72,12 @@ middle=$work/middle
 run mask "$middle" -o "$work/lit" --empty "cam0=$middle/truth/empty/cam0.png" --json
 expect_code 0 'the lit middle of a cable'
 warned || fail 'the lit middle of a cable: no warning'
+# and one that goes over from a black cable to a green one
+other=$work/other
+"$source_dir/tools/make_clutter" "$other" --seed 4009 --frames 1 --scale 0.5 || fail 'make_clutter'
+run mask "$other" -o "$work/goes_over" --json
+expect_code 0 'a mask that goes over to another cable'
+warned || fail 'a mask that goes over to another cable: no warning'
 # a box is of its frame, also where the scene is known: around all of them this one changes frame 1
 three=$work/three
 "$source_dir/tools/make_clutter" "$three" --seed 43 --frames 3 --scale 0.5 --grasp-error 14 || fail 'make_clutter'
