@@ -311,6 +311,29 @@ TEST_CASE("a ribbon finds outlines, connector and end; what has one side only, o
   masking::Axis leaving = straight(100.3);
   for (std::size_t i = 45; i < leaving.points.size(); ++i) leaving.points[i].at.x() -= 1.5 * (i - 45.0);
   CHECK(masking::score(masking::evidence(picture, leaving)) < masking::kDoubtful);
+  // another cable from a third of the length on, of colors that differ more than marks of this one would
+  std::vector<std::uint8_t> other = pixels;
+  for (int y = 100; y < 300; ++y)
+    for (int x = 90; x < 111; ++x)
+      for (int c = 0; c < 3; ++c) {
+        std::uint8_t& value = other[3 * (y * 200 + x) + c];
+        if (value < 150) value = static_cast<std::uint8_t>(value + 50 + (y - 100) / 2);
+      }
+  const masking::Picture over{other.data(), 200, 300, 3};
+  CHECK(masking::score(masking::evidence(over, ribbon.axis)) < masking::kDoubtful);
+  // a place beside the cable, of which the user says that it lies on the rope
+  masking::RibbonOptions pointed;
+  pointed.through = {{107.0, 120.5}};
+  const masking::Ribbon through = masking::find_ribbon({}, picture, rough, 0.225, pointed);
+  const auto beside = [](const masking::Ribbon& of) {  // px, by which the place is outside
+    const auto& points = of.axis.points;
+    const auto nearest = std::min_element(points.begin(), points.end(), [](const auto& a, const auto& b) {
+      return std::abs(a.at.y() - 120.5) < std::abs(b.at.y() - 120.5);
+    });
+    return 107.0 - nearest->at.x() - nearest->radius;
+  };
+  CHECK(beside(ribbon) > 3.0);
+  CHECK(beside(through) < 1.0);
 }
 
 TEST_CASE("the blur of a step is no thin rope") {
@@ -530,6 +553,28 @@ TEST_CASE("growth: an edge is no rope, the grasp is found 12 mm away, a rope at 
   CHECK(highest(clues) > 0.8);
   clues.down = Vector3::UnitY();
   CHECK(highest(clues) < 0.6);
+}
+
+TEST_CASE("growth runs through the user's points, whatever the picture shows") {
+  const chain::Chain rope =
+      chain::make_chain(0.23, 0.006, Vector3::UnitY(), Vector3::UnitZ(), 10, chain::Bending::planar, false);
+  const capture::Camera camera = wall_camera();
+  math::Pose base;
+  base.translation = Vector3(0.0, 0.0, 0.2);
+  const std::vector<std::uint8_t> pixels = wall_with_cable(100.0);
+  const math::Vector2 place(60.0, 160.0);                               // on the bare wall
+  const auto nearest = [&](const std::vector<math::Vector2>& points) {  // radii from the place
+    const masking::Shot shot{{pixels.data(), 200, 300, 3}, &camera, base, points, {}};
+    masking::Clues clues;
+    clues.bend_change = 0.1;
+    const masking::Grown grown = masking::grow(rope, {&shot, 1}, {}, clues);
+    double least = 1e9;
+    for (const masking::AxisPoint& p : masking::axis(rope, base, grown.theta, camera, 0.0, rope.length).points)
+      least = std::min(least, (p.at - place).norm() / p.radius);
+    return least;
+  };
+  CHECK(nearest({}) > 4.0);  // it follows the cable
+  CHECK(nearest({place}) < 2.0);
 }
 
 TEST_CASE("thin and thick ropes take no more memory and time than others") {

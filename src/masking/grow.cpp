@@ -52,8 +52,12 @@ constexpr double kSurprise = 1.0;          // nats, the mean of a random place, 
 constexpr double kMostSurprise = 4.0;      // nats
 constexpr double kFactsPerDiameter = 1.0;  // stations within a diameter see the same edges
 // what the user says
-constexpr double kOnRope = 60.0;    // nats for each point that the rope runs through,
-constexpr double kOnRopeRadii = 2;  // to within so many radii
+constexpr double kOnRope = 1e4;       // nats for each point that the rope runs through: more than pictures ever say,
+constexpr double kOnRopeRadii = 2.0;  // to within so many radii,
+constexpr double kFromMiddle = 0.32;  // radii, deviation of the rope's middle from a point
+// Weight of the picture's evidence where the user points, since it misleads there: a long edge counts many times, and
+// the rope's shape shall decide what lies between the points.
+constexpr double kTrustBesidePoints = 0.25;
 // Bounds memory and time for any rope: the colors known from other moments count for some 1,000 samples per side
 // (kKnownSamples, each of kBins rounded), and a chain adds 12 samples per station and 18 at the tip.
 constexpr int kMostSamples = 1 << 14;
@@ -194,12 +198,14 @@ struct Search {
       : chain(rope), shots(pictures), clues(given) {
     for (const Shot& shot : shots) small.push_back(reduced(chain, shot));
     for (const Shot& shot : shots) points += static_cast<int>(shot.on_rope.size());
+    if (points > 0) trust = kTrustBesidePoints;
   }
   const chain::Chain& chain;
   std::span<const Shot> shots;
   const Clues& clues;
   std::vector<Reduced> small;  // by shot
   int points = 0;              // on the rope, of all shots
+  double trust = 1.0;          // weight of the pictures' evidence
   double radius = 0.5 * chain.diameter;
   double spacing = std::max(kSpacing * radius, chain.length / kMostStations);  // m, between stations
   Vector3 second = chain.direction.cross(chain.bending_axis);
@@ -260,8 +266,10 @@ struct Search {
     return at.x() < box.x0 || at.y() < box.y0 || at.x() >= box.x1 || at.y() >= box.y1;
   }
 
-  // The number of the user's points that the link runs through; each shot's points count from `reached` bits on.
-  void reach_points(const Vector3& from, const Vector3& to, std::uint64_t& reached) const {
+  // Adds the user's points that the link runs through to `reached`, as bits in the order of the shots. `nearest`: by
+  // point, lowered to the distance of the link, radii.
+  void reach_points(const Vector3& from, const Vector3& to, std::uint64_t& reached,
+                    std::vector<double>* nearest = nullptr) const {
     int bit = 0;
     for (const Shot& shot : shots) {
       if (shot.on_rope.empty()) continue;
@@ -269,10 +277,12 @@ struct Search {
       const bool seen = a.z() > image_model::kNear && b.z() > image_model::kNear;
       const Vector2 u = seen ? capture::project(*shot.camera, a) : Vector2::Zero();
       const Vector2 v = seen ? capture::project(*shot.camera, b) : Vector2::Zero();
-      const double near = kOnRopeRadii * std::max(1.0, radius * shot.camera->fx / std::max(image_model::kNear, a.z()));
+      const double one = std::max(1.0, radius * shot.camera->fx / std::max(image_model::kNear, a.z()));
       for (const Vector2& point : shot.on_rope) {
         const double t = std::clamp((point - u).dot(v - u) / std::max(1e-9, (v - u).squaredNorm()), 0.0, 1.0);
-        if (seen && (u + t * (v - u) - point).norm() < near) reached |= std::uint64_t{1} << std::min(bit, 63);
+        const double away = (u + t * (v - u) - point).norm() / one;
+        if (seen && away < kOnRopeRadii) reached |= std::uint64_t{1} << std::min(bit, 63);
+        if (seen && nearest) (*nearest)[bit] = std::min((*nearest)[bit], away);
         ++bit;
       }
     }
@@ -336,7 +346,7 @@ struct Search {
       outlines += samples.outlines;
     }
     by_color += gain;
-    return gain / kSamplesPerFact + outlines;
+    return trust * (gain / kSamplesPerFact + outlines);
   }
 
   Matrix3 turned(const Matrix3& rotation, double first, double other) const {
@@ -372,9 +382,11 @@ struct Search {
   double whole(const VectorX& theta, const Vector3& shift, std::vector<Tally>& tallies) const {
     double sum = believed(shift);
     std::uint64_t reached = 0;
+    std::vector<double> nearest(points, kOnRopeRadii);
     Matrix3 rotation = Matrix3::Identity();
     Vector3 before = chain.direction, at = shift + chain.link_end(0) * chain.direction;
     if (chain.link_end(0) > 0.0) sum += link(tallies, shift, chain.direction, 0.0, chain.link_end(0), true);
+    if (points) reach_points(shift, at, reached, &nearest);
     const int axes = planar ? 1 : 2;
     for (int j = 1; j < chain.links(); ++j) {
       const int k = axes * (j - 1);
@@ -383,9 +395,10 @@ struct Search {
       sum += believed(j, theta, theta[k], planar ? 0.0 : theta[k + 1], before, along);
       sum += link(tallies, at, along, chain.link_start(j), chain.link_end(j), true);
       const Vector3 next = at + (chain.link_end(j) - chain.link_start(j)) * along;
-      if (points) reach_points(at, next, reached);
+      if (points) reach_points(at, next, reached, &nearest);
       before = along, at = next;
     }
+    for (const double radii : nearest) sum -= 0.5 * radii * radii / (kFromMiddle * kFromMiddle);
     return sum + hints(reached);
   }
 };
@@ -460,6 +473,8 @@ Grown grow(const chain::Chain& chain, std::span<const Shot> shots, std::span<con
     rope.score = search.believed(shift);
     if (chain.link_end(0) > 0.0)
       rope.score += search.link(rope.tallies, shift, chain.direction, 0.0, chain.link_end(0), true);
+    if (search.points) search.reach_points(shift, rope.tip, rope.reached);
+    rope.score += search.hints(rope.reached);
     beam.push_back(std::move(rope));
   }
   const std::size_t broad = beam.size() > 1 ? kBroadBeam : kBeam;
@@ -488,20 +503,25 @@ Grown grow(const chain::Chain& chain, std::span<const Shot> shots, std::span<con
     }
     std::stable_sort(candidates.begin(), candidates.end(),
                      [](const Candidate& a, const Candidate& b) { return a.score > b.score; });
+    // ropes that have reached fewer of the user's points than others may reach them yet, and have room of their own
     std::vector<Rope> next;
-    for (const Candidate& c : candidates) {
-      if (next.size() == broad) break;
-      const bool same = std::any_of(next.begin(), next.end(), [&](const Rope& rope) {
-        return (rope.tip - c.tip).norm() < kSameTip * chain.diameter;
-      });
-      if (same) continue;
-      Rope rope = beam[c.parent];
-      rope.theta[axes * (j - 1)] = c.first;
-      if (axes == 2) rope.theta[axes * (j - 1) + 1] = c.other;
-      const Matrix3 rotation = search.turned(rope.rotation, c.first, c.other);
-      search.link(rope.tallies, rope.tip, rotation * chain.direction, chain.link_start(j), chain.link_end(j), true);
-      rope.rotation = rotation, rope.tip = c.tip, rope.score = c.score, rope.reached = c.reached;
-      next.push_back(std::move(rope));
+    for (int points = search.points; points >= 0; --points) {
+      const std::size_t first = next.size();
+      for (const Candidate& c : candidates) {
+        if (next.size() == first + broad) break;
+        if (std::popcount(c.reached) != points) continue;
+        const bool same = std::any_of(next.begin() + first, next.end(), [&](const Rope& rope) {
+          return (rope.tip - c.tip).norm() < kSameTip * chain.diameter;
+        });
+        if (same) continue;
+        Rope rope = beam[c.parent];
+        rope.theta[axes * (j - 1)] = c.first;
+        if (axes == 2) rope.theta[axes * (j - 1) + 1] = c.other;
+        const Matrix3 rotation = search.turned(rope.rotation, c.first, c.other);
+        search.link(rope.tallies, rope.tip, rotation * chain.direction, chain.link_start(j), chain.link_end(j), true);
+        rope.rotation = rotation, rope.tip = c.tip, rope.score = c.score, rope.reached = c.reached;
+        next.push_back(std::move(rope));
+      }
     }
     beam = std::move(next);
   }
@@ -509,7 +529,7 @@ Grown grow(const chain::Chain& chain, std::span<const Shot> shots, std::span<con
   Grown out;
   for (const Rope& rope : beam)
     if ((rope.tip - beam[0].tip).norm() > std::max(kElsewhere * chain.diameter, kElsewhereShare * chain.length))
-      out.margin = std::min(out.margin, beam[0].score - rope.score);
+      out.margin = std::min(out.margin, (beam[0].score - rope.score) / search.trust);
 
   // refine the best: its beginning, single angles, pairs of angles that shift the rest of the rope, triples that move
   // one link

@@ -7,7 +7,7 @@
 // less counts, since one alone is a step, as at a window's edge, and no rope. Outlines: how seldom a place of this
 // picture, taken at random, contrasts as much with both sides at the rope's width. Where something hides the rope from
 // a camera there is only one population, which adds no evidence. What is known besides (gravity, by how much the grasp
-// may be off, a point on the rope) joins as a prior.
+// may be off) joins as a prior. Of two ropes the one that runs through more of the user's points is the better one.
 #pragma once
 #include <optional>
 #include <span>

@@ -9,6 +9,8 @@ using math::Vector2;
 
 namespace {
 
+constexpr double kClick = 2.0;  // px, by which a click misses
+
 // As it was given: CAMERA[:FRAME]:X,Y.
 std::string text_of(const std::string& hint, const std::string& camera, const std::optional<int>& frame,
                     const std::vector<double>& numbers) {
@@ -43,7 +45,8 @@ Help::Point point_of(const PointHint& hint, const capture::Capture& scene, int f
   if (!(hint.x >= 0.0 && hint.x <= camera.width && hint.y >= 0.0 && hint.y <= camera.height))
     throw InputError(where, "lies outside of the picture",
                      "it has " + size_text(camera.width, camera.height) + " pixels");
-  return {c, hint.frame.value_or(first), capture::undistort(camera, Vector2(hint.x, hint.y))};
+  const Vector2 recorded(hint.x, hint.y);
+  return {c, hint.frame.value_or(first), capture::undistort(camera, recorded), recorded, where};
 }
 
 Help::Region region_of(const BoxHint& hint, const capture::Capture& scene) {
@@ -74,9 +77,11 @@ capture::Image8 picture_of(const EmptyScene& hint, const capture::Camera& camera
 
 }  // namespace
 
-bool Help::points_at(int camera, int frame) const {
-  return std::any_of(points.begin(), points.end(),
-                     [&](const Point& point) { return point.camera == camera && point.frame == frame; });
+std::vector<Vector2> Help::points_in(int camera, int frame) const {
+  std::vector<Vector2> out;
+  for (const Point& point : points)
+    if (point.camera == camera && point.frame == frame) out.push_back(point.at);
+  return out;
 }
 
 Help help_of(const Hints& hints, const capture::Capture& scene, int first) {
@@ -89,6 +94,21 @@ Help help_of(const Hints& hints, const capture::Capture& scene, int first) {
     help.empty[c] = picture_of(hint, scene.cameras[c]);
   }
   return help;
+}
+
+void warn_of_missed_points(const Help& help, int camera, int frame, const capture::Image8& mask) {
+  for (const Help::Point& point : help.points) {
+    if (point.camera != camera || point.frame != frame) continue;
+    bool through = false;
+    for (int y = 0; y < mask.height && !through; ++y)
+      for (int x = 0; x < mask.width && !through; ++x)
+        through = mask.pixels[static_cast<std::size_t>(y) * mask.width + x] != 0 &&
+                  (Vector2(x + 0.5, y + 0.5) - point.recorded).norm() < kClick;
+    if (!through)
+      core::warn(point.text +
+                 ": the mask does not run through it: no rope of this length, as smooth as one at rest, was "
+                 "found that begins at the grasp and does; check the point, the length and the grasp");
+  }
 }
 
 }  // namespace chainsplat::masking

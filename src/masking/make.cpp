@@ -88,6 +88,21 @@ class Progress {
   std::atomic<std::int64_t> done_{0};
 };
 
+// Throws InputError of a point of the user's that the rope cannot reach.
+void require_within_reach(const Recording& recording, const chain::Chain& chain) {
+  const capture::Capture& scene = recording.capture;
+  for (const Help::Point& point : recording.help.points) {
+    const math::Pose base = scene.base.pose(scene.times[point.camera][point.frame]);
+    const Reach where = reach(chain, base, recording.pinholes[point.camera]);
+    const double away = (point.at - where.grasp).norm();
+    if (where.radius <= 0.0 || away <= where.radius) continue;
+    char text[120];
+    std::snprintf(text, sizeof text, "lies %.0f px from the grasp, and the rope reaches %.0f px at most", away,
+                  where.radius);
+    throw InputError(point.text, text, "point at the rope, or check its length, the base's poses and the camera");
+  }
+}
+
 // Frames that are evenly spread, and those in which the user points at the rope; by camera.
 std::vector<Samples> take_samples(const Recording& recording, Progress& progress) {
   const int cameras = static_cast<int>(recording.capture.cameras.size());
@@ -222,7 +237,9 @@ Summary make_video(const Recording& recording, const chain::Chain& chain, const 
       summary.inside +=
           share_inside(chain, scene.base.pose(view.time), chain::interpolate(states, view.time), camera, view);
       summary.empty += view.width == 0;
-      sink(view.camera, view.frame, recorded_mask(view, camera), view.width ? scores[i] : 0.0);
+      const capture::Image8 mask = recorded_mask(view, camera);
+      warn_of_missed_points(recording.help, view.camera, view.frame, mask);
+      sink(view.camera, view.frame, mask, view.width ? scores[i] : 0.0);
     }
   });
   summary.inside /= summary.frames;
@@ -246,6 +263,7 @@ Summary make(const Path& path, const capture::FrameRange& frames, const Hints& h
   if (total == 0) throw InputError(path.string(), "has no frame in the range asked for", "choose frames that it has");
 
   const chain::Chain chain = chain_for(scene);
+  require_within_reach(recording, chain);
   Progress progress(static_cast<std::int64_t>(total) * (kRounds + 2));
   const std::vector<Samples> samples = take_samples(recording, progress);
   return longest <= kStills ? make_stills(recording, chain, samples, sink)

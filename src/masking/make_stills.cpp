@@ -169,6 +169,7 @@ void find_ribbons(const Recording& recording, const chain::Chain& chain, std::ve
         ribbon.shadow = recording.capture.tabletop;
         ribbon.width_deviation = round ? kKnownWidth : still.broad ? kFirstBroadWidth : kFirstWidth;
         ribbon.rims = round + 1 == kRibbonRounds;
+        ribbon.through = recording.help.points_in(static_cast<int>(c), still.frame->frame);
         still.ribbon = find_ribbon(look, picture_of(*still.frame), still.along, chain.length, ribbon);
       });
       for (const Still& still : stills[c])
@@ -221,8 +222,9 @@ Summary make_stills(const Recording& recording, const chain::Chain& chain, const
       ++summary.frames;
       summary.empty += view.width == 0;
       summary.inside += view.width != 0;
-      sink(static_cast<int>(c), still.frame->frame, recorded_mask(view, recording.capture.cameras[c]),
-           score_of(recording.help, static_cast<int>(c), still));
+      const capture::Image8 mask = recorded_mask(view, recording.capture.cameras[c]);
+      warn_of_missed_points(recording.help, static_cast<int>(c), still.frame->frame, mask);
+      sink(static_cast<int>(c), still.frame->frame, mask, score_of(recording.help, static_cast<int>(c), still));
     }
   summary.inside /= summary.frames;
   return summary;

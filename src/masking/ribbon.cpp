@@ -31,7 +31,8 @@ constexpr double kWiderTip = 0.3;   // deviation of the width where a connector 
 constexpr double kTipShare = 0.15;  // of the length
 constexpr double kMove = 0.35;      // for each step of an outline across, from one station to the next
 constexpr double kLeastWidth = 0.5, kMostWidth = 2.9;  // of the usual one
-// finer than columns
+// of outlines that have a place of the user's not between them: more than all else together
+constexpr double kPastPoint = 1e6;
 constexpr double kSmooth = 2.0;    // radii on either side, within which an outline is taken for straight
 constexpr double kLeastRim = 1.5;  // px, of a radius below which there are no rims to be seen
 constexpr double kRimPiece = 8.0;  // px, or a radius: length over which colors about the outlines are averaged
@@ -48,6 +49,10 @@ constexpr double kLeastSpread = 6.0;        // gray levels, of the rope's colors
 constexpr int kParts = 6, kOtherParts = 3;  // of the rope; in so many others a color must come back,
 constexpr double kAlike = 14.0;             // to within so many gray levels
 constexpr double kUnlike = 4.0;             // and times their usual spread, from where on it is another color
+// gray levels, of a step of color along the rope, and times what its colors differ from those on their side of it: from
+// both on the rope goes over to something else there. Marks come back, and light changes by less (up to 29 on 90
+// stills).
+constexpr double kStepAlong = 40.0, kStepUnlike = 2.0;
 
 double square(double x) { return x * x; }
 
@@ -253,6 +258,20 @@ Choices choices_of(const Straight& s, const RibbonOptions& options) {
 // Where a connector may be.
 bool in_tip(const Straight& s, int i) { return s.stations[i].arclength > (1.0 - kTipShare) * s.length; }
 
+// The columns, by station, that lie between the outlines since the user says so; -1: none.
+std::vector<int> columns_through(const Straight& s, const std::vector<Vector2>& places) {
+  std::vector<int> out(s.count(), -1);
+  for (const Vector2& place : places) {
+    const auto nearest =
+        std::min_element(s.stations.begin(), s.stations.end(), [&](const Station& a, const Station& b) {
+          return (a.at - place).squaredNorm() < (b.at - place).squaredNorm();
+        });
+    const int column = s.half + static_cast<int>(std::lround((place - nearest->at).dot(nearest->across) / s.du));
+    if (column >= 0 && column < s.columns) out[nearest - s.stations.begin()] = column;
+  }
+  return out;
+}
+
 // What speaks against a pair at station i. `sums`: of the odds of the columns before each.
 double cost_of(const Straight& s, const RibbonOptions& options, int i, const Outlines& pair,
                const std::vector<double>& sums) {
@@ -268,6 +287,7 @@ double cost_of(const Straight& s, const RibbonOptions& options, int i, const Out
 
 // The cheapest way of both outlines from station to station, each by one column at most (dynamic programming).
 std::vector<Outlines> cheapest_way(const Straight& s, const Choices& choices, const RibbonOptions& options) {
+  const std::vector<int> through = columns_through(s, options.through);
   constexpr int kMoves = 9, kStay = 4;  // by -1, 0 or 1 of the left and of the right outline
   const auto from = [&](const Outlines& pair, int move) {
     return Outlines{pair.a + move / 3 - 1, pair.b + move % 3 - 1};
@@ -291,7 +311,9 @@ std::vector<Outlines> cheapest_way(const Straight& s, const Choices& choices, co
         const double one = best[m] + kMove * ((move / 3 != 1) + (move % 3 != 1));
         if (one < least) least = one, by = static_cast<std::uint8_t>(move);
       }
-      next[n] = least + cost_of(s, options, i, choices.all[n], sums);
+      const auto [left, right] = choices.all[n];
+      const bool past = through[i] >= 0 && (through[i] < left || through[i] >= right);
+      next[n] = least + cost_of(s, options, i, choices.all[n], sums) + (past ? kPastPoint : 0.0);
       came[static_cast<std::size_t>(i) * many + n] = by;
     }
     std::swap(best, next);
@@ -460,6 +482,28 @@ Ribbon find_ribbon(const Look& look, const Picture& picture, const Axis& along, 
   return out;
 }
 
+namespace {
+
+// The larger share of the colors along the rope where one step parts them, or 1 where none does.
+double before_step(const std::vector<Color>& colors) {
+  const int count = static_cast<int>(colors.size()), least = std::max(1, count / kParts);
+  double lowest = std::numeric_limits<double>::max(), share = 1.0;
+  for (int i = least; i <= count - least; ++i) {
+    Color means[2] = {};
+    for (int j = 0; j < count; ++j)
+      for (int c = 0; c < 3; ++c) means[j >= i][c] += colors[j][c] / static_cast<float>(j < i ? i : count - i);
+    double within = 0.0;
+    for (int j = 0; j < count; ++j) within += square(difference(colors[j], means[j >= i])) / count;
+    if (within >= lowest) continue;
+    lowest = within;
+    const bool step = difference(means[0], means[1]) > std::max(kStepAlong, kStepUnlike * std::sqrt(within));
+    share = step ? std::max(i, count - i) / (1.0 * count) : 1.0;
+  }
+  return share;
+}
+
+}  // namespace
+
 Evidence evidence(const Picture& picture, const Axis& axis) {
   Evidence out;
   const std::vector<AxisPoint>& points = axis.points;
@@ -524,6 +568,8 @@ Evidence evidence(const Picture& picture, const Axis& axis) {
     out.edges += seen / (1.0 * count);
     out.steady += (spread[i] < kUnlike * typical || elsewhere(i)) / (1.0 * count);
   }
+  const auto tip = sides[1].begin() + static_cast<std::ptrdiff_t>((1.0 - kTipShare) * count);  // a connector may be
+  out.steady = std::min(out.steady, before_step({sides[1].begin(), tip}));
   return out;
 }
 

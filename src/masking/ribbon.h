@@ -16,6 +16,7 @@ struct RibbonOptions {
   double slack = 0.01;           // m, by which the rope may end or come out of the gripper elsewhere
   bool shadow = false;           // it lies on something, on which it casts a shadow
   bool rims = false;             // outlines where the rims of a tube fit, instead of where colors change most
+  std::vector<math::Vector2> through = {};  // px: places that lie between the outlines
 };
 
 struct Ribbon {

@@ -46,21 +46,38 @@ expect_iou 0.8 cam0 'a point'
 run mask "$window" -o "$work/without" --empty "cam0=$window/truth/empty/cam0.png" --json
 expect_code 0 'an empty scene'
 expect_iou 0.75 cam0 'an empty scene'
-# what does not run through the user's point is warned of: a window's frame, in place of a black cable before the window
+# a black cable before a black window, whose frame is followed without help, and beyond one point: it is warned of. Three
+# points leave it no way along the frame (IoU 0.005, 0.3 and 0.6)
 frame=$work/frame
 "$source_dir/tools/make_clutter" "$frame" --seed 1202 --frames 1 --scale 0.5 || fail 'make_clutter'
 run mask "$frame" -o "$work/missed" --point cam0:339.7,177.9 --json
-expect_code 0 'a point that is missed'
-warned || fail 'a point that is missed: no warning'
+expect_code 0 'one point on a hardly seen cable'
+warned || fail 'one point on a hardly seen cable: no warning'
+grep -q 'does not run through' "$work/stderr" && fail 'one point on a hardly seen cable: it is missed'
+run mask "$frame" -o "$work/three_points" --point cam0:336.9,104.0 --point cam0:339.7,177.9 --point cam0:341.0,247.6 --json
+expect_code 0 'three points'
+expect_iou 0.5 cam0 'three points'
+# what no rope runs through is said, and so is what none can reach
 run mask "$still" -o "$work/off" --point cam0:20,20 --json
 expect_code 0 'a point beside the cable'
 warned || fail 'a point beside the cable: no warning'
+grep -q -e '--point cam0:20,20: the mask does not run through it' "$work/stderr" ||
+  fail 'a point beside the cable: no word about the point'
+cp -r "$still" "$work/short"
+sed 's/"length": [0-9.]*/"length": 0.05/' "$still/capture.json" >"$work/short/capture.json"
+expect_error 2 'from the grasp, and the rope reaches' mask "$work/short" -o "$work/none" --point cam0:20,20
 # and so is a mask of a white cable's lit middle alone
 middle=$work/middle
 "$source_dir/tools/make_clutter" "$middle" --seed 615 --frames 1 --scale 0.5 || fail 'make_clutter'
 run mask "$middle" -o "$work/lit" --empty "cam0=$middle/truth/empty/cam0.png" --json
 expect_code 0 'the lit middle of a cable'
 warned || fail 'the lit middle of a cable: no warning'
+# and one that goes over from a black cable to a green one
+other=$work/other
+"$source_dir/tools/make_clutter" "$other" --seed 4009 --frames 1 --scale 0.5 || fail 'make_clutter'
+run mask "$other" -o "$work/goes_over" --json
+expect_code 0 'a mask that goes over to another cable'
+warned || fail 'a mask that goes over to another cable: no warning'
 # a box is of its frame, also where the scene is known: around all of them this one changes frame 1
 three=$work/three
 "$source_dir/tools/make_clutter" "$three" --seed 43 --frames 3 --scale 0.5 --grasp-error 14 || fail 'make_clutter'
