@@ -135,8 +135,9 @@ VectorX left_by_motion(const chain::Chain& chain, const capture::Capture& captur
 
 MotionReadout readout_by_motion(const capture::Capture& capture) try {
   MotionReadout out;
-  if (capture.tabletop || capture.times.empty() || capture.times[0].size() < kLeastMoments) return out;
+  if (capture.tabletop) return out;
   const FirstFit fit = first_fit(capture, kFewJoints);
+  if (fit.sequence.states.time.size() < kLeastMoments) return out;
   const std::vector<VectorX> slopes = silhouette::readout_slopes(fit.chain, capture, fit.sequence);
   chain::States seen = fit.sequence.states;
   for (const silhouette::FrameFit& frame : fit.sequence.frames) seen.covariance.push_back(frame.covariance);
