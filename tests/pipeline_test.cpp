@@ -222,7 +222,7 @@ TEST_CASE("trainings that share a workspace have the bits of those that do not, 
   for (trajectory::Sample& sample : base) sample.time += 0.02;
   core::write_file(capture / "base.tum", trajectory::write_tum(base));
   pipeline::TrainOptions options = small();
-  options.frames = {3, 33};
+  options.frames = {3, 31};  // too few to look for a readout, which takes a while
   const auto late = [](const pipeline::TrainResult& result) {
     const capture::Correction* const found = capture::find(result.twin.corrections, "base", "time");
     return found ? found->value[0] : 0.0;
