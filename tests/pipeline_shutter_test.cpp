@@ -29,9 +29,11 @@ chain::Chain rope() {
                            chain::Bending::spatial, false);
 }
 
+enum class Rope { plain, loaded };  // with a payload, friction in bending and half the stiffness at its tip
+
 // The rope moved by the demo's base.
-const chain::States& swing() {
-  static const chain::States states = [] {
+const chain::States& swing(Rope kind) {
+  static const auto made = [](Rope of) {
     const chain::Chain chain = rope();
     dynamics::Parameters p;
     const int moving = chain.links() - 1;
@@ -42,6 +44,12 @@ const chain::States& swing() {
     p.damping.assign(chain.angles(), 2e-4);
     p.rest_angle.assign(chain.angles(), 0.0);
     p.radius = 0.5 * chain.diameter;
+    if (of == Rope::loaded) {
+      p.tip_mass = 0.015;
+      p.bending_friction.assign(chain.angles(), 3e-4);
+      p.bending_friction_angle.assign(chain.angles(), 0.03);
+      for (int k = 0; k < chain.angles(); ++k) p.stiffness[k] *= 1.0 - 0.5 * k / chain.angles();
+    }
     const dynamics::Model model = dynamics::make_model(chain, p);
     std::vector<double> times;
     const double first = demo().base.start(), last = demo().base.end();
@@ -51,16 +59,19 @@ const chain::States& swing() {
     initial.theta = dynamics::static_equilibrium(model, demo().base.pose(first)).theta;
     initial.thetadot = VectorX::Zero(chain.angles());
     return dynamics::rollout(model, demo().base, initial, times);
-  }();
-  return states;
+  };
+  static const chain::States plain = made(Rope::plain), loaded = made(Rope::loaded);
+  return kind == Rope::plain ? plain : loaded;
 }
 
-MatrixX nodes_at(double time) {
+MatrixX nodes_of(Rope kind, double time) {
   const chain::Chain chain = rope();
   const MatrixX nodes =
-      chain::nodes(chain, chain::link_motions(chain, chain::interpolate(swing(), time), demo().base.pose(time)));
+      chain::nodes(chain, chain::link_motions(chain, chain::interpolate(swing(kind), time), demo().base.pose(time)));
   return nodes.rightCols(nodes.cols() - 1);  // the grasp is twice there
 }
+
+MatrixX nodes_at(double time) { return nodes_of(Rope::plain, time); }
 
 double away(const Vector2& from, const Vector2& to, const Vector2& pixel) {
   const Vector2 step = to - from;
@@ -68,8 +79,8 @@ double away(const Vector2& from, const Vector2& to, const Vector2& pixel) {
 }
 
 // Rows [first, last) of what the camera sees at a time: a tube about the nodes that is cut off flat enough at its ends.
-void draw_rows(const capture::Camera& camera, double time, int first, int last, capture::View& view) {
-  const MatrixX nodes = nodes_at(time);
+void draw_rows(Rope kind, const capture::Camera& camera, double time, int first, int last, capture::View& view) {
+  const MatrixX nodes = nodes_of(kind, time);
   std::vector<Vector2> line;
   double radius = 0.0;
   for (Eigen::Index i = 0; i < nodes.cols(); ++i) {
@@ -91,7 +102,8 @@ void draw_rows(const capture::Camera& camera, double time, int first, int last, 
 }
 
 // All its rows, which take so long from the first to the last; at `time` the middle one is read.
-capture::View drawn(const capture::ViewPlace& place, const capture::Camera& camera, double time, double readout) {
+capture::View drawn(const capture::ViewPlace& place, const capture::Camera& camera, double time, double readout,
+                    Rope kind = Rope::plain) {
   capture::View view;
   static_cast<capture::ViewPlace&>(view) = place;
   view.time = time;
@@ -99,23 +111,23 @@ capture::View drawn(const capture::ViewPlace& place, const capture::Camera& came
   view.rgba.assign(std::size_t{4} * camera.width * camera.height, 0);
   constexpr int kTogether = 4;  // rows
   for (int v = 0; v < view.height; v += kTogether)
-    draw_rows(camera, time + ((v + 0.5 * kTogether) / camera.height - 0.5) * readout, v, v + kTogether, view);
+    draw_rows(kind, camera, time + ((v + 0.5 * kTogether) / camera.height - 0.5) * readout, v, v + kTogether, view);
   return view;
 }
 
 // The demo with the rope that swings in the place of its own. Its frames are stamped when their first rows are read.
-capture::Capture recorded(double readout) {
-  static std::map<double, capture::Capture> kept;
-  const auto found = kept.find(readout);
+capture::Capture recorded(double readout, Rope kind = Rope::plain) {
+  static std::map<std::pair<double, Rope>, capture::Capture> kept;
+  const auto found = kept.find({readout, kind});
   if (found != kept.end()) return found->second;
   capture::Capture out = demo();
   core::parallel_for(static_cast<std::int64_t>(out.views.size()), [&](std::int64_t i) {
     capture::PackedView& view = out.views[i];
     const double stamp = view.time;
-    view = capture::packed(drawn(view, out.cameras[view.camera], stamp + 0.5 * readout, readout));
+    view = capture::packed(drawn(view, out.cameras[view.camera], stamp + 0.5 * readout, readout, kind));
     view.time = stamp;
   });
-  return kept[readout] = out;
+  return kept[{readout, kind}] = out;
 }
 
 double overlap(const capture::View& a, const capture::View& b, const capture::Camera& camera) {
@@ -177,10 +189,26 @@ TEST_CASE("a rolling shutter is found where there is one") {
     capture::apply(found.corrections, again);
     CHECK(again.times == capture.times);
     CHECK(again.cameras[2].readout == capture.cameras[2].readout);
+    // what another recording gives stays
+    capture::Capture other = recorded(readout);
+    other.cameras[0].readout = 0.02;
+    other.sigma.push_back({"cam1", "readout", 0.0});
+    capture::apply(found.corrections, other);
+    CHECK(other.cameras[0].readout == 0.02);
+    CHECK(other.cameras[1].readout == 0.0);
+    CHECK(other.times[1] == demo().times[1]);
+    // and how sure it is counts: of one number for all cameras, beside nothing else that was corrected
+    REQUIRE(found.covariance.rows() == found.covariance.cols());
+    Eigen::Index numbers = 0;
+    for (const capture::Correction& c : found.corrections)
+      if (c.quantity->group != std::string("colors")) numbers += c.value.size();
+    CHECK(found.covariance.rows() == numbers);
   }
   capture::Capture right = recorded(0.0);
   CHECK_FALSE(rolling(pipeline::correct(right, {}, false)));
   CHECK(right.cameras[0].readout == 0.0);
+  capture::Capture loaded = recorded(0.0, Rope::loaded);  // other reasons to move otherwise than a plain rope
+  CHECK_FALSE(rolling(pipeline::correct(loaded, {}, false)));
 }
 
 TEST_CASE("a readout that is given, or to be taken as given, is not looked for") {

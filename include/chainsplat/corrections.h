@@ -94,7 +94,7 @@ void apply(const Corrections& corrections, Capture& capture);
 math::Pose grasp_in_base(const Corrections& corrections);
 // A camera's pose, corrected as the quantities say.
 math::Pose moved(const math::Pose& world_from_camera, const math::Vector3& rotation, const math::Vector3& translation);
-// The parts of it: one camera (without its clock), and a base whose clock and grasp were off.
+// The parts of it: one camera (without its clock and readout), and a base whose clock and grasp were off.
 Camera corrected(const Corrections& corrections, Camera camera);
 trajectory::Trajectory corrected(const Corrections& corrections, const trajectory::Trajectory& base, double first,
                                  double last);

@@ -127,7 +127,6 @@ Camera corrected(const Corrections& corrections, Camera camera) {
   camera.fy *= scale;
   if (const Correction* const gain = find(corrections, camera.name, "gain")) camera.gain += gain->value;
   if (const Correction* const bias = find(corrections, camera.name, "bias")) camera.bias += bias->value;
-  camera.readout += value_of(corrections, camera.name, "readout");
   if (!(camera.gain.minCoeff() > kLeastShare))
     throw InputError(camera.name, "the twin's correction leaves nothing of its colors", "train again");
   return camera;
@@ -159,15 +158,17 @@ void restore_lost(const VectorX& frames, int camera, Capture& capture) {
 
 void apply(const Corrections& corrections, Capture& capture) {
   if (!any_correction(corrections)) return;
+  const CorrectedQuantity& readout_of_camera = corrected_quantity("camera", "readout");
   double first = 1e300, last = -1e300;
   for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
     const Correction* const lost = find(corrections, capture.cameras[c].name, lost_frames().name);
     if (lost && lost->calibration == recording_text(capture)) restore_lost(lost->value, static_cast<int>(c), capture);
-    // a frame's time is that of its middle row
-    const double given = capture.cameras[c].readout;
-    const double readout = given + value_of(corrections, capture.cameras[c].name, "readout");
+    // one that this capture gives stays; else a frame's time moves to that of its middle row
+    double& readout = capture.cameras[c].readout;
+    const bool open = readout == 0.0 && prior_deviation(capture, static_cast<int>(c), readout_of_camera) > 0.0;
+    if (open) readout = value_of(corrections, capture.cameras[c].name, "readout");
     const double late =
-        value_of(corrections, capture.cameras[c].name, "time") - 0.5 * (std::abs(readout) - std::abs(given));
+        value_of(corrections, capture.cameras[c].name, "time") - (open ? 0.5 * std::abs(readout) : 0.0);
     if (late != 0.0) {
       for (double& time : capture.times[c]) time -= late;
       for (PackedView& view : capture.views)

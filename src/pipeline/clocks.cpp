@@ -5,6 +5,7 @@
 #include <cstdio>
 
 #include "chainsplat/identification.h"
+#include "chainsplat/run_folder.h"
 #include "chainsplat/shutter.h"
 
 namespace chainsplat::pipeline {
@@ -20,12 +21,12 @@ constexpr Eigen::Index kSurelyLost = 1;  // of one camera: where it lost more, s
 
 constexpr double kLeastReadout = 0.0015;  // s, one that is less is nothing
 constexpr double kLeastChange = 0.0005;   // s, of one that is known by then
-constexpr double kTriedReadout = 0.004;   // s
+constexpr double kTriedReadout = 0.004;   // s, by which the slope is found: the motion it adds is a few millimeters
 // What is left of them has so many independent parts at least, of its hundreds of frames and joints: what any of them
 // can pretend is that much less than all together.
 constexpr double kIndependent = 10.0;
-constexpr int kFewJoints = 8;
-constexpr std::size_t kLeastMoments = 30;
+constexpr int kFewJoints = 8;              // identified in half a second; more explain no more of a readout
+constexpr std::size_t kLeastMoments = 30;  // of fewer, parameters explain any motion
 
 }  // namespace
 
@@ -84,23 +85,16 @@ void read_at_once(capture::Capture& capture) {
 }
 
 capture::Capture with_readout(const capture::Capture& capture, double readout) {
-  capture::Capture out = capture;
-  capture::apply(readout_corrections(capture, {readout, 0.0}), out);
-  read_at_once(out);
-  return out;
-}
-
-capture::Corrections readout_corrections(const capture::Capture& capture, const Readout& readout) {
-  capture::Corrections out;
+  capture::Corrections corrections;
   for (const capture::Camera& camera : capture.cameras) {
-    capture::Correction correction;
+    capture::Correction& correction = corrections.emplace_back();
     correction.quantity = &capture::corrected_quantity("camera", "readout");
     correction.subject = camera.name;
-    correction.value = VectorX::Constant(1, readout.value);
-    correction.deviation = VectorX::Constant(1, readout.deviation);
-    correction.state = capture::CorrectionState::free;
-    out.push_back(std::move(correction));
+    correction.value = VectorX::Constant(1, readout);
   }
+  capture::Capture out = capture;
+  capture::apply(corrections, out);
+  read_at_once(out);
   return out;
 }
 
@@ -115,12 +109,11 @@ bool readout_is_open(const capture::Capture& capture, const std::vector<std::str
 namespace {
 
 // What is left of the distances of nodes, m, between the motion that outlines show and one that a rope of the best
-// parameters makes. `states`: of `chain`.
-VectorX left_by_motion(const chain::Chain& chain, const capture::Capture& capture, const chain::States& states) {
-  identification::Options options;
-  options.gravity = capture.gravity;
-  options.mass = capture.mass;
-  options.per_joint = options.ask_for_more = false;
+// parameters makes. `states`: of `chain`; `uniform`: with the same stiffness all along, which is quick.
+VectorX left_by_motion(const chain::Chain& chain, const capture::Capture& capture, const chain::States& states,
+                       bool uniform = true) {
+  identification::Options options = identification_options(twin_in_scene(capture), false, 0);
+  if (uniform) options.per_joint = options.ask_for_more = false;
   const chain::States moved = identification::identify(chain, capture.base, states, options).rollout;
   const auto nodes = [&](const VectorX& theta) { return chain::nodes(chain, chain::link_motions(chain, theta, {})); };
   std::vector<double> out;
@@ -153,6 +146,9 @@ MotionReadout readout_by_motion(const capture::Capture& capture) try {
   if (!(std::abs(value) >= (known ? kLeastChange : kLeastReadout))) return out;
   const double after = left(value).squaredNorm();
   if (!(after < (known ? 1.0 : 1.0 - kLeastExplained) * out.left)) return out;
+  // neither may a payload, friction in bending or stiffness that varies explain it
+  if (!known && !(after < (1.0 - kLeastExplained) * left_by_motion(fit.chain, capture, seen, false).squaredNorm()))
+    return out;
   out.left = after;
   out.more = Readout{value, std::sqrt(after / (kIndependent * slope.squaredNorm()))};
   return out;

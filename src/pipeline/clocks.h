@@ -31,9 +31,7 @@ struct MotionReadout {
 // What a readout must explain of that, since no model is right.
 constexpr double kLeastExplained = 0.3;
 MotionReadout readout_by_motion(const capture::Capture& capture);
-// `capture` with a readout of all cameras and views as if they read at once.
+// `capture`, of whose cameras none has a readout, with this one, and its views as if they read at once.
 capture::Capture with_readout(const capture::Capture& capture, double readout);
-// The corrections that say so.
-capture::Corrections readout_corrections(const capture::Capture& capture, const Readout& readout);
 
 }  // namespace chainsplat::pipeline

@@ -611,8 +611,9 @@ void add_readout(const Readout& readout, Corrected& out) {
   Eigen::Index numbers = 0;
   std::vector<Eigen::Index> at;
   for (capture::Correction& correction : out.corrections) {
-    const bool one = correction.quantity == &capture::corrected_quantity("camera", "readout");
-    if (one) {
+    // of which the covariance says nothing
+    if (correction.quantity->group == std::string("colors") || correction.quantity == &capture::lost_frames()) continue;
+    if (correction.quantity == &capture::corrected_quantity("camera", "readout")) {
       correction.value.setConstant(readout.value);
       correction.deviation.setConstant(readout.deviation);
       correction.state = capture::CorrectionState::free;
@@ -651,14 +652,13 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
       capture = with_readout(given, readout.value);
       fit = first_fit(capture);
     }
-    const capture::Capture by_now = capture;
     found = correct_all_but_readout(capture, fixed, fit);
     if (round == kReadoutRounds || impossible(found)) break;
     MotionReadout moved = readout_by_motion(capture);
     // Rows that are read late look like a base that is early: which of the two it is, the motion tells. A base that is
     // known to be late is not known well enough beside a readout.
     if (capture::value_of(found.corrections, "base", "time") != 0.0) {
-      capture::Capture by_given_clocks = by_now;
+      capture::Capture by_given_clocks = readout.value != 0.0 ? with_readout(given, readout.value) : given;
       std::vector<std::string> with_clocks = fixed;
       with_clocks.emplace_back("time");
       correct_all_but_readout(by_given_clocks, with_clocks, fit);

@@ -131,6 +131,7 @@ std::vector<capture::Camera> as_corrected(const capture::Corrections& correction
     const bool unknown = is_unverified(corrections, camera);
     if (unverified) unverified->push_back(unknown);
     if (!unknown) camera = capture::corrected(corrections, camera);
+    if (camera.readout == 0.0) camera.readout = capture::value_of(corrections, camera.name, "readout");
   }
   return cameras;
 }

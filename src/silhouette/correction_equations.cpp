@@ -278,6 +278,17 @@ void hold(const std::vector<char>& held, solve::ArrowEquations::Local& local) {
 
 }  // namespace
 
+std::vector<const capture::ViewPlace*> views_of(const capture::Capture& capture) {
+  std::vector<const capture::ViewPlace*> views;
+  for (const capture::PackedView& view : capture.views) views.push_back(&view);
+  return views;
+}
+
+MaskPoints mask_of(const capture::Capture& capture, int v) {
+  const capture::PackedView& view = capture.views[v];
+  return mask_points(capture::unpacked(view), capture.cameras[view.camera], Options{}.max_pixels);
+}
+
 TiltEquations tilt_equations(const Vector3& bending_axis, const Vector3& normal) {
   constexpr double kDeviation = 0.002;  // rad, of the bending plane from the table's
   constexpr double kWeight = 1.0 / (kDeviation * kDeviation);

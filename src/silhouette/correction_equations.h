@@ -71,6 +71,10 @@ struct CorrectionProblem {
   std::optional<Lying> lying = {};
 };
 
+// Of a capture: what CorrectionProblem and CorrectedFrame take of its views.
+std::vector<const capture::ViewPlace*> views_of(const capture::Capture& capture);
+MaskPoints mask_of(const capture::Capture& capture, int view);
+
 // The height at which a rope lies where its grasp is shifted, m, recorded base frame, and its table is higher, m, than
 // they were given.
 double height_with(const chain::Chain& chain, const Lying& lying, const math::Vector3& grasp_shift, double table_shift);

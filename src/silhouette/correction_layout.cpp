@@ -21,7 +21,7 @@ bool is_held(const capture::CorrectedQuantity& quantity, const capture::Capture&
   const bool clock = group == "time", alone = static_cast<int>(capture.cameras.size()) < kLeastCameras;
   if (std::find(held.begin(), held.end(), group) != held.end()) return true;
   if (alone && !clock && quantity.name != std::string("mask_offset")) return true;
-  if (quantity.name == std::string("readout")) return true;  // fit_readout()
+  if (quantity.name == std::string("readout")) return true;  // found by the motion
   if (clock && camera == 0) return true;  // the others count from its clock
   if (group == "table" && !options.lying) return true;
   if (clock && camera < 0 && capture.base.samples().size() < 2) return true;

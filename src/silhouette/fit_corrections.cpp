@@ -338,17 +338,6 @@ void choose_clock(const Layout& layout, MatrixX& covariance, capture::Correction
   covariance = MatrixX(change * covariance * change.transpose());
 }
 
-std::vector<const capture::ViewPlace*> views_of(const capture::Capture& capture) {
-  std::vector<const capture::ViewPlace*> views;
-  for (const capture::PackedView& view : capture.views) views.push_back(&view);
-  return views;
-}
-
-MaskPoints mask_of(const capture::Capture& capture, int v) {
-  const capture::PackedView& view = capture.views[v];
-  return mask_points(capture::unpacked(view), capture.cameras[view.camera], Options{}.max_pixels);
-}
-
 // Frames that show the rope: those in which as much of it is in the masks as in most. What is hidden follows from the
 // prior alone, which prefers straight ropes and would have shorter ones. All that show something where most hide a
 // part.

@@ -61,9 +61,7 @@ std::vector<ClockEquations> clock_equations(const chain::Chain& chain, const cap
                                             const SequenceFit& sequence) {
   const int cameras = static_cast<int>(capture.cameras.size());
   const Frames all = frames_of(capture);
-  std::vector<const capture::ViewPlace*> views;
-  for (const capture::PackedView& view : capture.views) views.push_back(&view);
-  CorrectionProblem problem{std::move(views),
+  CorrectionProblem problem{views_of(capture),
                             capture.cameras,
                             [&](double time) { return capture.base.at(time); },
                             {},
@@ -84,9 +82,8 @@ std::vector<ClockEquations> clock_equations(const chain::Chain& chain, const cap
     ClockEquations& out = equations[i];
     out.frame.assign(cameras, -1);
     for (const int v : frame.views) {
-      const capture::PackedView& view = capture.views[v];
-      frame.masks.push_back(mask_points(capture::unpacked(view), capture.cameras[view.camera], Options{}.max_pixels));
-      out.frame[view.camera] = view.frame;
+      frame.masks.push_back(mask_of(capture, v));
+      out.frame[capture.views[v].camera] = capture.views[v].frame;
     }
     const FrameEquations of = frame_equations(problem, frame, {}, chain, sequence.states.theta[f]);
     const auto solver = of.local.matrix.ldlt();

@@ -12,13 +12,11 @@ std::vector<VectorX> readout_slopes(const chain::Chain& chain, const capture::Ca
                                     const SequenceFit& sequence) {
   constexpr double kWidestRows = 30.0;  // px: outlines of another moment still count
   const Frames all = frames_of(capture);
-  std::vector<const capture::ViewPlace*> views;
-  for (const capture::PackedView& view : capture.views) views.push_back(&view);
   SharedPlaces readout;  // alone, in seconds
   readout.at.fill(-1);
   readout.at[kReadout] = 0;
   readout.unit[kReadout] = 1.0;
-  CorrectionProblem problem{std::move(views),
+  CorrectionProblem problem{views_of(capture),
                             capture.cameras,
                             [&](double time) { return capture.base.at(time); },
                             std::vector<SharedPlaces>(capture.cameras.size(), readout),
@@ -32,10 +30,7 @@ std::vector<VectorX> readout_slopes(const chain::Chain& chain, const capture::Ca
   core::parallel_for(static_cast<std::int64_t>(out.size()), [&](std::int64_t f) {
     if (all.views[f].empty() || !(sequence.frames[f].residual_pixels > 0.0)) return;
     CorrectedFrame frame{all.times[f], sequence.states.thetadot[f], all.views[f], {}};
-    for (const int v : frame.views) {
-      const capture::PackedView& view = capture.views[v];
-      frame.masks.push_back(mask_points(capture::unpacked(view), capture.cameras[view.camera], Options{}.max_pixels));
-    }
+    for (const int v : frame.views) frame.masks.push_back(mask_of(capture, v));
     const FrameEquations of = frame_equations(problem, frame, {}, chain, sequence.states.theta[f]);
     out[f] = -of.local.matrix.ldlt().solve(of.local.coupling.col(0));
   });

@@ -19,8 +19,8 @@ namespace {
 
 constexpr int kTile = 8;   // px; tiles without rope are not looked at
 constexpr int kSlack = 2;  // px, of the bilinear footprint and of rounding
-constexpr int kIterations =
-    4;  // of a pixel's row: each leaves the rope's speed in rows per row, a hundredth, of the error
+// Of a pixel's row. Each leaves of the error what the rope moves while a row is read, in rows: a hundredth and less.
+constexpr int kIterations = 4;
 constexpr double kShort = 1e-6;  // px, of a segment that is seen end-on or has no length
 
 // The rope in the image when the first, the middle and the last row are read: between, nodes go as parabolas.
