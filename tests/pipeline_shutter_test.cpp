@@ -78,9 +78,10 @@ double away(const Vector2& from, const Vector2& to, const Vector2& pixel) {
   return (pixel - from - std::clamp((pixel - from).dot(step) / step.squaredNorm(), 0.0, 1.0) * step).norm();
 }
 
-// Rows [first, last) of what the camera sees at a time: a tube about the nodes that is cut off flat enough at its ends.
-void draw_rows(Rope kind, const capture::Camera& camera, double time, int first, int last, capture::View& view) {
-  const MatrixX nodes = nodes_of(kind, time);
+using NodesAt = silhouette::NodesAt;
+
+// Rows [first, last) of what the camera sees: a tube about the nodes that is cut off flat enough at its ends.
+void draw_rows(const MatrixX& nodes, const capture::Camera& camera, int first, int last, capture::View& view) {
   std::vector<Vector2> line;
   double radius = 0.0;
   for (Eigen::Index i = 0; i < nodes.cols(); ++i) {
@@ -103,7 +104,7 @@ void draw_rows(Rope kind, const capture::Camera& camera, double time, int first,
 
 // All its rows, which take so long from the first to the last; at `time` the middle one is read.
 capture::View drawn(const capture::ViewPlace& place, const capture::Camera& camera, double time, double readout,
-                    Rope kind = Rope::plain) {
+                    const NodesAt& nodes) {
   capture::View view;
   static_cast<capture::ViewPlace&>(view) = place;
   view.time = time;
@@ -111,7 +112,7 @@ capture::View drawn(const capture::ViewPlace& place, const capture::Camera& came
   view.rgba.assign(std::size_t{4} * camera.width * camera.height, 0);
   constexpr int kTogether = 4;  // rows
   for (int v = 0; v < view.height; v += kTogether)
-    draw_rows(kind, camera, time + ((v + 0.5 * kTogether) / camera.height - 0.5) * readout, v, v + kTogether, view);
+    draw_rows(nodes(time + ((v + 0.5 * kTogether) / camera.height - 0.5) * readout), camera, v, v + kTogether, view);
   return view;
 }
 
@@ -124,10 +125,66 @@ capture::Capture recorded(double readout, Rope kind = Rope::plain) {
   core::parallel_for(static_cast<std::int64_t>(out.views.size()), [&](std::int64_t i) {
     capture::PackedView& view = out.views[i];
     const double stamp = view.time;
-    view = capture::packed(drawn(view, out.cameras[view.camera], stamp + 0.5 * readout, readout, kind));
+    view = capture::packed(drawn(view, out.cameras[view.camera], stamp + 0.5 * readout, readout,
+                                 [&](double time) { return nodes_of(kind, time); }));
     view.time = stamp;
   });
   return kept[{readout, kind}] = out;
+}
+
+// Three cameras over a table, with their rows in different directions, and a rope that a base moves about on it. It
+// bends as it likes: outlines alone are looked at here.
+capture::Capture on_table(double readout, double base_late) {
+  constexpr double kInterval = 1.0 / 30.0;
+  constexpr int kFrames = 60;
+  capture::Capture out;
+  out.name = "table";
+  out.tabletop = true;
+  out.length = 0.3, out.diameter = demo().diameter;
+  out.direction = Vector3::UnitX(), out.bending_axis = Vector3::UnitZ();
+  out.table = capture::Table{};
+  const auto base = [](double time) {
+    return math::Pose{math::Matrix3::Identity(),
+                      {0.08 * std::sin(5.5 * time), 0.06 * std::sin(3.7 * time), 0.5 * demo().diameter}};
+  };
+  std::vector<trajectory::Sample> samples;
+  for (double time = -0.2; time < kFrames * kInterval + 0.2; time += 1.0 / 120.0)
+    samples.push_back({time + base_late, base(time)});
+  out.base = trajectory::fit(std::move(samples), "the test's base");
+  const chain::Chain chain =
+      chain::make_chain(out.length, out.diameter, out.direction, out.bending_axis, 16, chain::Bending::planar, false);
+  const NodesAt nodes = [&](double time) {
+    VectorX theta(chain.angles());
+    for (int k = 0; k < chain.angles(); ++k) theta[k] = 0.2 * std::sin(5.0 * time - 0.3 * k);
+    const MatrixX all = chain::nodes(chain, chain::link_motions(chain, theta, base(time)));
+    return MatrixX(all.rightCols(all.cols() - 1));
+  };
+  for (int c = 0; c < 3; ++c) {
+    capture::Camera camera;
+    camera.name = "cam" + std::to_string(c);
+    camera.width = 400, camera.height = 400;
+    camera.fx = camera.fy = 420.0, camera.cx = camera.cy = 200.0;
+    const Vector3 target(0.13, 0.0, 0.0), eye = target + Vector3(0.2 * (c - 1), 0.15 * (c % 2) - 0.2, 0.7);
+    const Vector3 forward = (target - eye).normalized();
+    const Vector3 right = forward.cross(Vector3(std::cos(2.0 * c), std::sin(2.0 * c), 0.0)).normalized();
+    camera.world_from_camera.rotation << right, forward.cross(right), forward;
+    camera.world_from_camera.translation = eye;
+    out.cameras.push_back(camera);
+    out.times.emplace_back();
+    for (int k = 0; k < kFrames; ++k) {
+      capture::PackedView view;
+      view.camera = c, view.frame = k, view.time = k * kInterval;
+      out.times.back().push_back(view.time);
+      out.views.push_back(view);
+    }
+  }
+  core::parallel_for(static_cast<std::int64_t>(out.views.size()), [&](std::int64_t i) {
+    capture::PackedView& view = out.views[i];
+    const double stamp = view.time;
+    view = capture::packed(drawn(view, out.cameras[view.camera], stamp + 0.5 * readout, readout, nodes));
+    view.time = stamp;
+  });
+  return out;
 }
 
 double overlap(const capture::View& a, const capture::View& b, const capture::Camera& camera) {
@@ -158,7 +215,8 @@ TEST_CASE("rows that were read one after the other are put where they were at on
     capture::Camera camera = demo().cameras[0];
     for (double* const size : {&camera.fx, &camera.fy, &camera.cx, &camera.cy}) *size *= kLarger;
     camera.width *= kLarger, camera.height *= kLarger;
-    const capture::View right = drawn({}, camera, kTime, 0.0), late = drawn({}, camera, kTime, readout);
+    const capture::View right = drawn({}, camera, kTime, 0.0, nodes_at);
+    const capture::View late = drawn({}, camera, kTime, readout, nodes_at);
     camera.readout = readout;
     const capture::View mended = silhouette::as_read_at_once(late, camera, capture::Pixels::undistorted, nodes_at);
     CHECK(overlap(late, right, camera) < 0.88);
@@ -209,6 +267,36 @@ TEST_CASE("a rolling shutter is found where there is one") {
   CHECK(right.cameras[0].readout == 0.0);
   capture::Capture loaded = recorded(0.0, Rope::loaded);  // other reasons to move otherwise than a plain rope
   CHECK_FALSE(rolling(pipeline::correct(loaded, {}, false)));
+}
+
+TEST_CASE("outlines on a table tell rows that are read late from a base that is late") {
+  constexpr double kReadout = 0.03, kLate = 0.015;
+  capture::Capture rows = on_table(kReadout, 0.0);
+  const pipeline::Corrected of_rows = pipeline::correct(rows, {}, false);
+  const capture::Finding* const said = rolling(of_rows);
+  REQUIRE(said);
+  CHECK(said->value == doctest::Approx(1e3 * kReadout).epsilon(0.2));
+  CHECK(std::abs(said->value - 1e3 * kReadout) < 3.0 * said->deviation);
+  CHECK(std::abs(capture::value_of(of_rows.corrections, "base", "time")) < 0.002);
+  CHECK(rows.cameras[2].readout == doctest::Approx(1e-3 * said->value));
+  capture::Capture base = on_table(0.0, kLate);
+  const pipeline::Corrected of_base = pipeline::correct(base, {}, false);
+  CHECK_FALSE(rolling(of_base));
+  CHECK(base.cameras[0].readout == 0.0);
+  CHECK(1e3 * capture::value_of(of_base.corrections, "base", "time") == doctest::Approx(1e3 * kLate).epsilon(0.1));
+}
+
+TEST_CASE("a rolling shutter and a base that is late at a time are told apart by the motion") {
+  constexpr double kReadout = 0.025, kLate = 0.033;
+  capture::Capture both = recorded(kReadout);
+  std::vector<trajectory::Sample> samples = both.base.samples();
+  for (trajectory::Sample& sample : samples) sample.time += kLate;
+  both.base = trajectory::fit(std::move(samples), "a late base");
+  const pipeline::Corrected found = pipeline::correct(both, {}, false);
+  const capture::Finding* const said = rolling(found);
+  REQUIRE(said);
+  CHECK(said->value == doctest::Approx(1e3 * kReadout).epsilon(0.25));
+  CHECK(1e3 * capture::value_of(found.corrections, "base", "time") == doctest::Approx(1e3 * kLate).epsilon(0.15));
 }
 
 TEST_CASE("a readout that is given, or to be taken as given, is not looked for") {

@@ -99,7 +99,9 @@ struct Capture {
   std::vector<std::vector<double>> times;
   std::vector<PackedView> views;           // sorted by camera, then frame; only the frames asked for
   std::vector<PackedView> recorded;        // LoadOptions::recorded_too; empty: not kept
-  Pixels pixels = Pixels::undistorted;     // of the views
+  // Views that show what the one before shows although the base moved on: their masks are empty.
+  std::vector<ViewPlace> repeated;
+  Pixels pixels = Pixels::undistorted;  // of the views
   trajectory::Trajectory base;
   std::vector<GivenSigma> sigma;  // where the capture says so; else what corrected_quantities() says
   std::uint64_t hash = 0;         // of capture.json, the base file and the sizes of the image and mask files

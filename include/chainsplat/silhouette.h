@@ -129,6 +129,9 @@ struct CorrectionOptions {
   // Of the angles, relative to what outlines count as here. kAsRecognized: as in recognition. 1: the rope is held 50
   // times as straight, without which much that is wrong at a time would go into its length.
   double prior_weight = 1.0;
+  // Whether all cameras may read their rows one after the other, in the same time: for the cause "readout", not beside
+  // everything else, with which it trades.
+  bool readout = false;
   std::string only = {};  // the cause that is corrected, by its name; none: all there may be
   std::string then = {};  // the cause that is, from there on; none: the same
   // Known mistakes as the corrections that mend them, e.g. half a pixel. Quantities that are not in one of them are
@@ -159,6 +162,7 @@ struct CorrectionFit {
   double evidence = 0.0;
   std::vector<Cause> causes;
   double surprise = 0.0;               // of this fit, as a cause's
+  double unexplained = 0.0;            // half the outlines' weighted square residuals that it leaves, beside all priors
   std::vector<double> evidence_after;  // the same with each of the options' mistakes mended, and nothing else
   solve::Summary summary;              // the unknowns relative to their prior deviations, and rad
   std::vector<OutlineMisfit> misfits;  // by camera, after the corrections

@@ -371,10 +371,6 @@ CheckReport check(const Path& path) {
                          (capture.mass ? text("%.4g kg", *capture.mass) : std::string("mass not given")));
   if (!capture.mass)
     report.doubts.push_back("object.mass: is missing; masses and forces will be relative to a total mass of 1");
-  // of a rope that hangs training finds it
-  if (capture.tabletop &&
-      std::none_of(manifest.cameras.begin(), manifest.cameras.end(), [](const auto& c) { return c.readout_given; }))
-    report.facts.push_back("readout: not given, so global shutters; on a table a rolling one is not noticed");
   if (manifest.cameras.size() == 1) report.doubts.push_back("cameras: only one; depth along its rays is hardly seen");
   if (!capture.base.samples().empty()) check_base(manifest, report);
 

@@ -1,6 +1,7 @@
 #include <algorithm>
 
 #include "manifest.h"
+#include "src/capture/repeated.h"
 
 namespace chainsplat::capture {
 
@@ -44,6 +45,8 @@ Capture load_from(const Source& source, const LoadOptions& options) {
   throw_first(findings);
   Capture capture = std::move(manifest.capture);
   capture.pixels = options.pixels;
+  capture.repeated = empty_repeated(capture, views);
+  empty_repeated(capture, recorded);
   capture.views = std::move(views);
   capture.recorded = std::move(recorded);
   return capture;

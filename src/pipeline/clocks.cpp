@@ -19,6 +19,11 @@ namespace {
 constexpr int kMostLost = 30;            // frames of all cameras
 constexpr Eigen::Index kSurelyLost = 1;  // of one camera: where it lost more, some are missed or a few frames off
 
+// Of what identification leaves, in units of what is expected: right recordings leave 0.2, a readout of 15 ms 2.2,
+// and 1.1 where most of it was taken for the base's clock.
+constexpr double kExplained = 0.4;
+// What a readout must explain of that, since no model is right.
+constexpr double kLeastExplained = 0.3;
 constexpr double kLeastReadout = 0.0015;  // s, one that is less is nothing
 constexpr double kLeastChange = 0.0005;   // s, of one that is known by then
 constexpr double kTriedReadout = 0.004;   // s, by which the slope is found: the motion it adds is a few millimeters
@@ -108,52 +113,138 @@ bool readout_is_open(const capture::Capture& capture, const std::vector<std::str
 
 namespace {
 
-// What is left of the distances of nodes, m, between the motion that outlines show and one that a rope of the best
-// parameters makes. `states`: of `chain`; `uniform`: with the same stiffness all along, which is quick.
-VectorX left_by_motion(const chain::Chain& chain, const capture::Capture& capture, const chain::States& states,
-                       bool uniform = true) {
+struct Unexplained {
+  VectorX apart;        // m, of nodes, between the motion that outlines show and the one that a rope makes
+  double misfit = 0.0;  // identification::Estimates::misfit
+};
+
+// What a rope of the best parameters leaves. `states`: of `chain`; `uniform`: with the same stiffness all along, which
+// is quick.
+Unexplained left_by_motion(const chain::Chain& chain, const capture::Capture& capture, const chain::States& states,
+                           bool uniform = true) {
   identification::Options options = identification_options(twin_in_scene(capture), false, 0);
   if (uniform) options.per_joint = options.ask_for_more = false;
-  const chain::States moved = identification::identify(chain, capture.base, states, options).rollout;
+  const identification::Result found = identification::identify(chain, capture.base, states, options);
   const auto nodes = [&](const VectorX& theta) { return chain::nodes(chain, chain::link_motions(chain, theta, {})); };
   std::vector<double> out;
   for (std::size_t k = 0; k < states.theta.size(); ++k) {
-    const MatrixX apart = nodes(states.theta[k]) - nodes(moved.theta[k]);
+    const MatrixX apart = nodes(states.theta[k]) - nodes(found.rollout.theta[k]);
     out.insert(out.end(), apart.reshaped().begin(), apart.reshaped().end());
   }
-  return Eigen::Map<VectorX>(out.data(), static_cast<Eigen::Index>(out.size()));
+  return {Eigen::Map<VectorX>(out.data(), static_cast<Eigen::Index>(out.size())), found.estimates.misfit};
+}
+
+void shift_base(double late, capture::Capture& capture) {
+  std::vector<trajectory::Sample> samples = capture.base.samples();
+  for (trajectory::Sample& sample : samples) sample.time -= late;
+  capture.base = trajectory::fit(std::move(samples), "the base");
 }
 
 }  // namespace
 
-MotionReadout readout_by_motion(const capture::Capture& capture) try {
-  MotionReadout out;
-  if (capture.tabletop) return out;
+std::optional<Readout> more_by_motion(const capture::Capture& capture, bool clock_was_late) try {
   const FirstFit fit = first_fit(capture, kFewJoints);
-  if (fit.sequence.states.time.size() < kLeastMoments) return out;
-  const std::vector<VectorX> slopes = silhouette::readout_slopes(fit.chain, capture, fit.sequence);
-  chain::States seen = fit.sequence.states;
-  for (const silhouette::FrameFit& frame : fit.sequence.frames) seen.covariance.push_back(frame.covariance);
-  const auto left = [&](double readout) {
-    chain::States states = seen;
-    for (std::size_t k = 0; k < states.theta.size(); ++k) states.theta[k] += readout * slopes[k];
-    return left_by_motion(fit.chain, capture, states);
-  };
-  const VectorX before = left(0.0), slope = (left(kTriedReadout) - before) / kTriedReadout;
-  const double value = -before.dot(slope) / slope.squaredNorm();
-  out.before = out.left = before.squaredNorm();
-  const bool known = silhouette::has_rolling_shutter(capture.cameras);  // then every gain is one
-  if (!(std::abs(value) >= (known ? kLeastChange : kLeastReadout))) return out;
-  const double after = left(value).squaredNorm();
-  if (!(after < (known ? 1.0 : 1.0 - kLeastExplained) * out.left)) return out;
-  // neither may a payload, friction in bending or stiffness that varies explain it
-  if (!known && !(after < (1.0 - kLeastExplained) * left_by_motion(fit.chain, capture, seen, false).squaredNorm()))
+  if (fit.sequence.states.time.size() < kLeastMoments) return std::nullopt;
+  const auto seen_by = [](const FirstFit& of) {
+    chain::States out = of.sequence.states;
+    for (const silhouette::FrameFit& frame : of.sequence.frames) out.covariance.push_back(frame.covariance);
     return out;
-  out.left = after;
-  out.more = Readout{value, std::sqrt(after / (kIndependent * slope.squaredNorm()))};
-  return out;
+  };
+  const chain::States seen = seen_by(fit);
+  const Unexplained given = left_by_motion(fit.chain, capture, seen);
+  if (given.misfit < kExplained) return std::nullopt;
+  const std::vector<VectorX> slopes = silhouette::readout_slopes(fit.chain, capture, fit.sequence);
+  const auto left = [&](double readout, double base_late) {
+    capture::Capture with_clock = capture;
+    if (base_late != 0.0) shift_base(base_late, with_clock);
+    chain::States states = base_late != 0.0 ? seen_by(first_fit(with_clock, kFewJoints)) : seen;
+    for (std::size_t k = 0; k < states.theta.size(); ++k) states.theta[k] += readout * slopes[k];
+    return left_by_motion(fit.chain, with_clock, states).apart;
+  };
+  // a base's clock that was found as if there were no readout is as late as the grasp's rows: both vary then
+  const VectorX& before = given.apart;
+  MatrixX slope(before.size(), clock_was_late ? 2 : 1);
+  slope.col(0) = (left(kTriedReadout, 0.0) - before) / kTriedReadout;
+  if (clock_was_late) slope.col(1) = (left(0.0, kTriedReadout) - before) / kTriedReadout;
+  const MatrixX information = slope.transpose() * slope, inverse = information.inverse();
+  const VectorX clocks = -inverse * (slope.transpose() * before);
+  const auto left_by = [&](const VectorX& c) { return left(c[0], clock_was_late ? c[1] : 0.0); };
+  const bool known = silhouette::has_rolling_shutter(capture.cameras);  // then every gain is one
+  const double size = std::abs(clocks[0]);
+  if (!(size >= (known ? kLeastChange : kLeastReadout) && size <= capture::kLongestReadout)) return std::nullopt;
+  const double most = known ? 1.0 : 1.0 - kLeastExplained;
+  VectorX now = left_by(clocks);
+  if (!(now.squaredNorm() < most * before.squaredNorm())) return std::nullopt;
+  if (!known) {  // as it is then; by now the rows were read a few milliseconds later
+    capture::Capture mended = capture;
+    if (clock_was_late) shift_base(clocks[1], mended);
+    mended = with_readout(mended, clocks[0]);
+    const FirstFit again = first_fit(mended, kFewJoints);
+    const auto left_then = [&](bool uniform) {
+      return left_by_motion(again.chain, mended, seen_by(again), uniform).apart;
+    };
+    now = left_then(true);
+    // neither may a payload, friction in bending or stiffness that varies explain it
+    constexpr bool kUniform = false;
+    const double otherwise = left_by_motion(fit.chain, capture, seen, kUniform).apart.squaredNorm();
+    if (!(now.squaredNorm() < most * otherwise || left_then(kUniform).squaredNorm() < most * otherwise))
+      return std::nullopt;
+  }
+  const double after = now.squaredNorm();
+  return Readout{clocks[0], std::sqrt(after / kIndependent * inverse(0, 0))};
 } catch (const WorkError&) {
-  return {};  // no parameters move the rope at all: identification, which follows, says so
+  return std::nullopt;  // no parameters move the rope at all: identification, which follows, says so
+}
+
+namespace {
+
+// One way in which clocks may be wrong: that of the base, and the rows of all cameras.
+struct Clocks {
+  math::Vector2 late = math::Vector2::Zero();  // s, the base's clock and the readout
+  double deviation = 0.0;                      // s, of the readout
+  double surprise = 0.0;                       // -ln of how likely it is, but for a constant
+};
+
+}  // namespace
+
+Readout more_by_outlines(const capture::Capture& given, const std::vector<std::string>& fixed,
+                         capture::Corrections found) {
+  constexpr double kUnlikely = 0.02;  // share of one of them, below which it is left out
+  for (capture::Correction& correction : found)
+    if (correction.subject == "base") correction.value.setZero();
+  capture::Capture by_given_clocks = given;
+  capture::apply(found, by_given_clocks);
+  const FirstFit fit = first_fit(by_given_clocks);
+  silhouette::CorrectionOptions options;
+  options.held = fixed;
+  options.lying = silhouette::lying_on_table(by_given_clocks);
+  options.prior_weight = silhouette::kAsRecognized;
+  options.readout = true;
+  const std::string& camera = given.cameras[0].name;
+  const bool known = silhouette::has_rolling_shutter(given.cameras);
+  std::vector<Clocks> ways;
+  for (const char* const only : {"base.time", "readout", "base.time and readout"}) {
+    options.only = only;
+    const silhouette::CorrectionFit of = silhouette::fit_corrections(fit.chain, by_given_clocks, fit.sequence, options);
+    const capture::Correction& readout = *capture::find(of.corrections, camera, "readout");
+    const double least = known ? readout.deviation[0] : kLeastReadout;
+    const double value = std::abs(readout.value[0]) < least ? 0.0 : readout.value[0];
+    if (std::abs(value) > capture::kLongestReadout) continue;
+    ways.push_back({{capture::value_of(of.corrections, "base", "time"), value},
+                    readout.deviation[0],
+                    of.unexplained + of.surprise});
+  }
+  const Clocks best = *std::min_element(ways.begin(), ways.end(),
+                                        [](const Clocks& a, const Clocks& b) { return a.surprise < b.surprise; });
+  double all = 0.0;
+  for (const Clocks& way : ways) all += std::exp(best.surprise - way.surprise);
+  Readout out{best.late[1], best.deviation};
+  for (const Clocks& way : ways) {
+    const double share = std::exp(best.surprise - way.surprise) / all;
+    const math::Vector2 apart = way.late - best.late;
+    if (share >= kUnlikely) out.doubt += share * apart * apart.transpose();
+  }
+  return out;
 }
 
 }  // namespace chainsplat::pipeline

@@ -18,19 +18,18 @@ capture::Corrections restore_lost_frames(const chain::Chain& chain, capture::Cap
 // A readout that all cameras have.
 struct Readout {
   double value = 0.0, deviation = 0.0;  // s
+  // s^2, of the base's clock and the readout together, beside that: where something else may be true instead
+  Eigen::Matrix2d doubt = Eigen::Matrix2d::Zero();
 };
 // Whether it may be looked for: it is not given, and the base moves.
 bool readout_is_open(const capture::Capture& capture, const std::vector<std::string>& fixed);
-// How much longer they take than by now, where the motion of a rope that hangs shows it. `capture` is corrected in all
-// else.
-struct MotionReadout {
-  std::optional<Readout> more;  // none: no longer, as far as the motion tells
-  // m^2, what the motion leaves unexplained as it is by now, and with what it is then
-  double before = INFINITY, left = INFINITY;
-};
-// What a readout must explain of that, since no model is right.
-constexpr double kLeastExplained = 0.3;
-MotionReadout readout_by_motion(const capture::Capture& capture);
+// How much longer they take than by now, where the motion of a rope that hangs shows it; none: no longer, as far as it
+// tells. `capture` is corrected in all else; `clock_was_late`: the base's clock was.
+std::optional<Readout> more_by_motion(const capture::Capture& capture, bool clock_was_late);
+// How much longer by the outlines of a rope on a table, where rows lie otherwise in each camera: in the place of the
+// base's clock, or beside it. 0: its clock alone is likelier. `given`: what `found` was found from.
+Readout more_by_outlines(const capture::Capture& given, const std::vector<std::string>& fixed,
+                         capture::Corrections found);
 // `capture`, of whose cameras none has a readout, with this one, and its views as if they read at once.
 capture::Capture with_readout(const capture::Capture& capture, double readout);
 

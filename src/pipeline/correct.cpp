@@ -249,6 +249,23 @@ void judge_mass(const capture::Capture& given, std::vector<Finding>& verdict) {
             *given.mass, given.length, kMeters * given.diameter, density)});
 }
 
+// Pictures that stand for later ones, which are left out.
+void judge_repeated(const capture::Capture& given, std::vector<Finding>& verdict) {
+  for (std::size_t c = 0; c < given.cameras.size(); ++c) {
+    int count = 0, first = -1;
+    for (const capture::ViewPlace& view : given.repeated) {
+      if (view.camera != static_cast<int>(c)) continue;
+      if (count++ == 0) first = view.frame;
+    }
+    if (count == 0) continue;
+    verdict.push_back({"repeated-frames", given.cameras[c].name, static_cast<double>(count), 0.0, "frames", true, true,
+                       false, first,
+                       given.cameras[c].name + text(" repeats the picture before in %d frame%s (%d first) though the "
+                                                    "base moves on: left out",
+                                                    count, count > 1 ? "s" : "", first)});
+  }
+}
+
 // Turns of all cameras that shift their images by `shift` px to the right and down, as a larger cx and cy would.
 capture::Corrections shifted_images(const capture::Capture& given, double shift) {
   capture::Corrections out;
@@ -606,30 +623,43 @@ void add(Corrected found, Corrected& out) {
   out.verdict.insert(out.verdict.end(), found.verdict.begin(), found.verdict.end());
 }
 
-// Adds a readout that was found to what else was.
+// Adds a readout, that was found or may be there, to what else was.
 void add_readout(const Readout& readout, Corrected& out) {
+  if (readout.value == 0.0 && readout.doubt.isZero(0.0)) return;
   Eigen::Index numbers = 0;
-  std::vector<Eigen::Index> at;
+  std::vector<Eigen::Index> of_base, of_rows;
   for (capture::Correction& correction : out.corrections) {
     // of which the covariance says nothing
     if (correction.quantity->group == std::string("colors") || correction.quantity == &capture::lost_frames()) continue;
+    if (correction.quantity == &capture::corrected_quantity("base", "time")) {
+      of_base.push_back(numbers);
+      correction.deviation.setConstant(std::hypot(correction.deviation[0], std::sqrt(readout.doubt(0, 0))));
+    }
     if (correction.quantity == &capture::corrected_quantity("camera", "readout")) {
+      of_rows.push_back(numbers);
       correction.value.setConstant(readout.value);
-      correction.deviation.setConstant(readout.deviation);
+      correction.deviation.setConstant(std::hypot(readout.deviation, std::sqrt(readout.doubt(1, 1))));
       correction.state = capture::CorrectionState::free;
-      at.push_back(numbers);
     }
     numbers += correction.value.size();
   }
-  if (at.empty()) return;
+  if (of_rows.empty()) return;
   if (out.covariance.size() == 0) out.covariance = math::MatrixX::Zero(numbers, numbers);
-  for (const Eigen::Index a : at)
-    for (const Eigen::Index b : at) out.covariance(a, b) = readout.deviation * readout.deviation;
-  const Size size{kSeconds * readout.value, kSeconds * readout.deviation};
+  const double own = readout.value == 0.0 ? 0.0 : readout.deviation * readout.deviation;
+  const auto add = [&](const std::vector<Eigen::Index>& rows, const std::vector<Eigen::Index>& columns, double value) {
+    for (const Eigen::Index a : rows)
+      for (const Eigen::Index b : columns) out.covariance(a, b) += value;
+  };
+  add(of_base, of_base, readout.doubt(0, 0));
+  add(of_base, of_rows, readout.doubt(0, 1));
+  add(of_rows, of_base, readout.doubt(1, 0));
+  add(of_rows, of_rows, readout.doubt(1, 1) + own);
+  if (readout.value == 0.0) return;
+  const Size size{kSeconds * readout.value, kSeconds * std::hypot(readout.deviation, std::sqrt(readout.doubt(1, 1)))};
   out.verdict.push_back(
       {"rolling-shutter", "cameras", size.value, size.deviation, "ms", true, true, false, -1,
-       text("the cameras read their rows one after the other, in %.1f +- %.1f ms: corrected; give it as `readout`",
-            size.value, size.deviation)});
+       text("the cameras %s their rows one after the other, in %.1f +- %.1f ms: corrected; give it as `readout`",
+            certain(size) ? "read" : "may read", size.value, size.deviation)});
 }
 
 }  // namespace
@@ -639,6 +669,7 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   out.verdict = find_mistakes(capture);
   judge_mass(capture, out.verdict);
   if (!out.verdict.empty() && !anyway) return out;
+  judge_repeated(capture, out.verdict);
   FirstFit fit = first_fit(capture);
   if (!readout_is_open(capture, fixed)) {
     add(correct_all_but_readout(capture, fixed, fit), out);
@@ -647,32 +678,35 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   const capture::Capture given = capture;
   Readout readout;
   Corrected found;
-  for (int round = 0;; ++round) {
+  const auto correct_the_rest = [&] {
     if (readout.value != 0.0) {
       capture = with_readout(given, readout.value);
       fit = first_fit(capture);
     }
     found = correct_all_but_readout(capture, fixed, fit);
-    if (round == kReadoutRounds || impossible(found)) break;
-    MotionReadout moved = readout_by_motion(capture);
-    // Rows that are read late look like a base that is early: which of the two it is, the motion tells. A base that is
-    // known to be late is not known well enough beside a readout.
-    if (capture::value_of(found.corrections, "base", "time") != 0.0) {
-      capture::Capture by_given_clocks = readout.value != 0.0 ? with_readout(given, readout.value) : given;
-      std::vector<std::string> with_clocks = fixed;
-      with_clocks.emplace_back("time");
-      correct_all_but_readout(by_given_clocks, with_clocks, fit);
-      const MotionReadout other = readout_by_motion(by_given_clocks);
-      const bool better = other.left < (1.0 - kLeastExplained) * moved.before;
-      moved.more = better ? other.more : std::nullopt;
-    }
-    if (!moved.more) break;
-    readout = {readout.value + moved.more->value, moved.more->deviation};
-    core::say_more(text("correct: the rows are read in %.1f ms, by the motion", kSeconds * readout.value));
+  };
+  const auto more_readout = [&]() -> std::optional<Readout> {
+    if (impossible(found)) return std::nullopt;
+    const bool clock_was_late = capture::value_of(found.corrections, "base", "time") != 0.0;
+    if (!capture.tabletop) return more_by_motion(capture, clock_was_late);
+    if (readout.value == 0.0 && !capture::any_correction(found.corrections)) return std::nullopt;
+    return more_by_outlines(readout.value == 0.0 ? given : with_readout(given, readout.value), fixed,
+                            found.corrections);
+  };
+  correct_the_rest();
+  for (int round = 0; round < kReadoutRounds; ++round) {
+    const std::optional<Readout> more = more_readout();
+    if (more) readout.doubt = more->doubt;
+    if (!more || more->value == 0.0) break;
+    readout.value += more->value;
+    readout.deviation = more->deviation;
+    correct_the_rest();
   }
+  if (readout.value != 0.0)
+    core::say_more(text("correct: the rows are read in %.1f ms", kSeconds * readout.value));
   add(std::move(found), out);
-  if (readout.value == 0.0) return out;
   add_readout(readout, out);
+  if (readout.value == 0.0) return out;
   capture.views = given.views;
   for (capture::PackedView& view : capture.views) view.time = capture.times[view.camera][view.frame];
   read_at_once(capture);

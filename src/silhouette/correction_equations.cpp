@@ -32,6 +32,7 @@ struct PosedView {
   Vector6 base_twist;        // camera frame, of the base's own motion
   double mask_offset = 0.0;  // px
   double mask_start = 0.0;   // m
+  double readout = 0.0;      // s, beside what the view was freed of
 };
 
 // `i`: which of the frame's views.
@@ -49,6 +50,7 @@ void pose_view(const CorrectionProblem& fit, const CorrectedFrame& frame, std::s
   out.camera = capture::corrected(corrections, given);
   out.mask_offset = capture::value_of(corrections, given.name, "mask_offset");
   out.mask_start = capture::value_of(corrections, given.name, "mask_start");
+  out.readout = capture::value_of(corrections, given.name, "readout");
   out.frame = {&frame.masks[i], &out.camera, base.pose * capture::grasp_in_base(corrections)};
   out.problem.chain = &chain;
   ViewWork work;
@@ -185,6 +187,12 @@ std::vector<LinkSums> link_sums(const PosedView& view, int camera, const Correct
     double residual = p.distance - view.mask_offset;
     if (p.part != OutlinePoint::Part::start)
       residual -= p.gradient.dot(from_link(arcs, *p.segment, p.segment - segments.data(), p.x));
+    const int link = p.segment->link;
+    PointRow row;
+    row.head<3>() = p.x.cross(p.gradient);
+    row.segment<3>(3) = p.gradient;
+    const SharedRow shared = shared_row(view, p, row.head<6>().dot(speeds.col(link)), normal, down[link]);
+    residual -= view.readout * shared[kReadout];
     const double weight = kEvidence * p.length * tukey_weight(residual, fit.cut);
     frame.sizes.push_back(std::abs(residual));
     sums.length += p.length;
@@ -196,11 +204,6 @@ std::vector<LinkSums> link_sums(const PosedView& view, int camera, const Correct
     sums.first += weight * residual;
     sums.second += weight * residual * residual;
     frame.cost += 0.5 * weight * residual * residual;
-    const int link = p.segment->link;
-    PointRow row;
-    row.head<3>() = p.x.cross(p.gradient);
-    row.segment<3>(3) = p.gradient;
-    const SharedRow shared = shared_row(view, p, row.head<6>().dot(speeds.col(link)), normal, down[link]);
     row.tail<kSharedOfView>() = places.unit.cwiseProduct(shared);
     if (p.part == OutlinePoint::Part::start) {
       sums.start_weight += weight;

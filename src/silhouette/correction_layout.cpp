@@ -18,10 +18,11 @@ bool is_held(const capture::CorrectedQuantity& quantity, const capture::Capture&
              int camera, const CorrectionOptions& options) {
   const std::vector<std::string>& held = options.held;
   const std::string group = quantity.group;
-  const bool clock = group == "time", alone = static_cast<int>(capture.cameras.size()) < kLeastCameras;
+  const bool clock = quantity.name == std::string("time"),
+             alone = static_cast<int>(capture.cameras.size()) < kLeastCameras;
   if (std::find(held.begin(), held.end(), group) != held.end()) return true;
+  if (quantity.name == std::string("readout")) return !options.readout;
   if (alone && !clock && quantity.name != std::string("mask_offset")) return true;
-  if (quantity.name == std::string("readout")) return true;  // found by the motion
   if (clock && camera == 0) return true;  // the others count from its clock
   if (group == "table" && !options.lying) return true;
   if (clock && camera < 0 && capture.base.samples().size() < 2) return true;
@@ -40,12 +41,15 @@ bool of_colors(const capture::CorrectedQuantity& quantity) { return quantity.gro
 
 Layout layout_of(const capture::Capture& capture, const chain::Chain& chain, const CorrectionOptions& options) {
   Layout layout;
+  int readout = -1;  // of all cameras
   const auto add = [&](const capture::CorrectedQuantity& quantity, int camera) {
     const double deviation = capture::prior_deviation(capture, camera, quantity);
     const bool held = deviation == 0.0 || is_held(quantity, capture, chain, camera, options);
-    layout.columns.push_back({&quantity, camera, layout.numbers, held ? -1 : layout.size, deviation});
+    const bool again = !held && quantity.name == std::string("readout") && readout >= 0;
+    layout.columns.push_back({&quantity, camera, layout.numbers, held ? -1 : again ? readout : layout.size, deviation});
     layout.numbers += quantity.size;
-    if (!held) layout.size += quantity.size;
+    if (quantity.name == std::string("readout")) readout = layout.columns.back().first;
+    if (!held && !again) layout.size += quantity.size;
   };
   for (const auto& quantity : capture::corrected_quantities()) {
     if (of_colors(quantity)) continue;
@@ -116,7 +120,7 @@ std::vector<Direction> single_causes(const Layout& layout, const std::vector<cap
     std::vector<int> numbers;
     for (const Column& column : layout.columns)
       for (int i = 0; column.first >= 0 && belongs(column) && i < column.quantity->size; ++i)
-        numbers.push_back(column.first + i);
+        if (numbers.empty() || numbers.back() != column.first + i) numbers.push_back(column.first + i);
     if (numbers.empty()) return;
     MatrixX directions = MatrixX::Zero(layout.size, static_cast<Eigen::Index>(numbers.size()));
     for (std::size_t k = 0; k < numbers.size(); ++k) directions(numbers[k], static_cast<Eigen::Index>(k)) = 1.0;
@@ -137,6 +141,9 @@ std::vector<Direction> single_causes(const Layout& layout, const std::vector<cap
   add("diameter", of("object", "diameter"));
   add("table", of("table", "height"));
   add("focal", of("camera", "focal"));
+  add("readout", of("camera", "readout"));
+  add("base.time and readout",
+      [](const Column& column) { return is(column, "readout") || (column.camera < 0 && is(column, "time")); });
   for (int c = 0; c < static_cast<int>(cameras.size()); ++c) {
     add(cameras[c].name + ".pose", [=](const Column& column) {
       return column.camera == c && (is(column, "rotation") || is(column, "translation"));

@@ -312,7 +312,7 @@ MatrixX shared_covariance(const std::vector<FrameEquations>& frames, const Matri
 void choose_clock(const Layout& layout, MatrixX& covariance, capture::Corrections& corrections) {
   std::vector<int> clocks;
   for (int i = 0; i < static_cast<int>(layout.columns.size()); ++i)
-    if (std::string(layout.columns[i].quantity->group) == "time") clocks.push_back(i);
+    if (is(layout.columns[i], "time")) clocks.push_back(i);
   // a held clock other than the first camera's takes no part
   std::erase_if(clocks, [&](int i) { return layout.columns[i].first < 0 && layout.columns[i].camera != 0; });
   const auto time = [&](int i) { return corrections[i].value[0]; };
@@ -490,6 +490,7 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
   };
   out.evidence = evidence_of({});
   for (const capture::Corrections& mended : options.mistakes) out.evidence_after.push_back(evidence_of(mended));
+  for (const FrameEquations& frame : frames) out.unexplained += frame.cost;
   out.surprise = surprise_of(layout, directions, cost, x.head(m), untold);
   if (squares > 0.0) out.causes = causes_of(layout, capture.cameras, outlines, untold, x.head(m), squares);
   out.corrections = corrections_at(layout, capture.cameras, x.head(m));
