@@ -152,6 +152,7 @@ std::optional<Readout> more_by_motion(const capture::Capture& capture, bool cloc
   };
   const chain::States seen = seen_by(fit);
   const Unexplained given = left_by_motion(fit.chain, capture, seen);
+  const bool known = silhouette::has_rolling_shutter(capture.cameras);  // then every gain is one
   if (given.misfit < kExplained) return std::nullopt;
   const std::vector<VectorX> slopes = silhouette::readout_slopes(fit.chain, capture, fit.sequence);
   const auto left = [&](double readout, double base_late) {
@@ -169,7 +170,6 @@ std::optional<Readout> more_by_motion(const capture::Capture& capture, bool cloc
   const MatrixX information = slope.transpose() * slope, inverse = information.inverse();
   const VectorX clocks = -inverse * (slope.transpose() * before);
   const auto left_by = [&](const VectorX& c) { return left(c[0], clock_was_late ? c[1] : 0.0); };
-  const bool known = silhouette::has_rolling_shutter(capture.cameras);  // then every gain is one
   const double size = std::abs(clocks[0]);
   if (!(size >= (known ? kLeastChange : kLeastReadout) && size <= capture::kLongestReadout)) return std::nullopt;
   const double most = known ? 1.0 : 1.0 - kLeastExplained;
