@@ -623,7 +623,13 @@ void add(Corrected found, Corrected& out) {
   out.verdict.insert(out.verdict.end(), found.verdict.begin(), found.verdict.end());
 }
 
-// Adds a readout, that was found or may be there, to what else was.
+bool any_but_colors(const capture::Corrections& corrections) {
+  return std::any_of(corrections.begin(), corrections.end(), [](const capture::Correction& c) {
+    return c.quantity->group != std::string("colors") && !c.value.isZero(0.0);
+  });
+}
+
+// Adds a readout that was found, or may be there, to what else was.
 void add_readout(const Readout& readout, Corrected& out) {
   if (readout.value == 0.0 && readout.doubt.isZero(0.0)) return;
   Eigen::Index numbers = 0;
@@ -689,7 +695,7 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
     if (impossible(found)) return std::nullopt;
     const bool clock_was_late = capture::value_of(found.corrections, "base", "time") != 0.0;
     if (!capture.tabletop) return more_by_motion(capture, clock_was_late);
-    if (readout.value == 0.0 && !capture::any_correction(found.corrections)) return std::nullopt;
+    if (readout.value == 0.0 && !any_but_colors(found.corrections)) return std::nullopt;
     return more_by_outlines(readout.value == 0.0 ? given : with_readout(given, readout.value), fixed,
                             found.corrections);
   };

@@ -46,6 +46,7 @@ constexpr int kTimeStretches = 12;     // of time, whose scatter tells what the 
 constexpr double kHeld = 1e12;         // information that holds an unknown, in units of its deviation
 constexpr double kExact = 1e-4;        // of the prior's deviation, below which it was held so
 constexpr double kSameClock = 1e-9;    // s
+constexpr double kAgree = 0.003;       // s, by which clocks that are right differ at most
 constexpr double kMillimeter = 1e-3;   // m
 
 // Whether all masks may begin anywhere, or those begin at the grasp that do so nearly.
@@ -307,8 +308,8 @@ MatrixX shared_covariance(const std::vector<FrameEquations>& frames, const Matri
   return grown.asDiagonal() * robust * grown.asDiagonal();
 }
 
-// The clocks were counted from the first camera's. Afterwards that clock is right from which the others part least, so
-// that one that is wrong is found to be wrong, be it the first camera's.
+// The clocks were counted from the first camera's. Afterwards that camera's clock is right from which the others part
+// least, so that one that is wrong is found to be wrong, be it the first camera's.
 void choose_clock(const Layout& layout, MatrixX& covariance, capture::Corrections& corrections) {
   std::vector<int> clocks;
   for (int i = 0; i < static_cast<int>(layout.columns.size()); ++i)
@@ -326,16 +327,25 @@ void choose_clock(const Layout& layout, MatrixX& covariance, capture::Correction
     least = sum;
     best = i;
   }
-  if (best < 0 || layout.columns[best].first < 0) return;
-  // every clock minus that one
-  MatrixX change = MatrixX::Identity(covariance.rows(), covariance.rows());
-  const double shift = time(best);
-  for (const int i : clocks) {
-    change(layout.columns[i].number, layout.columns[best].number) -= 1.0;
-    corrections[i].value[0] -= shift;
-    corrections[i].state = i == best ? CorrectionState::held : CorrectionState::free;
+  if (best < 0) return;
+  if (layout.columns[best].first >= 0) {  // every clock minus that one
+    MatrixX change = MatrixX::Identity(covariance.rows(), covariance.rows());
+    const double shift = time(best);
+    for (const int i : clocks) {
+      change(layout.columns[i].number, layout.columns[best].number) -= 1.0;
+      corrections[i].value[0] -= shift;
+      corrections[i].state = i == best ? CorrectionState::held : CorrectionState::free;
+    }
+    covariance = MatrixX(change * covariance * change.transpose());
   }
-  covariance = MatrixX(change * covariance * change.transpose());
+
+  // Where it is not one of more than half of the clocks, that of the base may as well be the right one.
+  const auto agreeing = std::count_if(clocks.begin(), clocks.end(), [&](int i) { return std::abs(time(i)) < kAgree; });
+  const int last = clocks.back();
+  if (layout.columns[last].camera >= 0 || clocks.size() < 3 || 2 * agreeing > static_cast<int>(clocks.size())) return;
+  const double doubt = 0.5 * time(last) * time(last);
+  for (const int i : clocks)
+    for (const int j : clocks) covariance(layout.columns[i].number, layout.columns[j].number) += doubt;
 }
 
 // Frames that show the rope: those in which as much of it is in the masks as in most. What is hidden follows from the
