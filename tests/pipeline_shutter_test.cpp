@@ -92,8 +92,13 @@ void draw_rows(const MatrixX& nodes, const capture::Camera& camera, int first, i
   // rounded ends reach as far as the rope
   line.front() += radius * (line[1] - line[0]).normalized();
   line.back() += radius * (line[line.size() - 2] - line.back()).normalized();
+  Vector2 low = line.front(), high = line.front();
+  for (const Vector2& point : line) low = low.cwiseMin(point), high = high.cwiseMax(point);
+  const int left = std::max(0, static_cast<int>(low.x() - radius)),
+            right = std::min(view.width, static_cast<int>(high.x() + radius) + 1);
+  if (low.y() - radius > last || high.y() + radius < first) return;
   for (int v = first; v < last; ++v)
-    for (int u = 0; u < view.width; ++u) {
+    for (int u = left; u < right; ++u) {
       double least = INFINITY;
       for (std::size_t i = 0; i + 1 < line.size(); ++i)
         least = std::min(least, away(line[i], line[i + 1], Vector2(u + 0.5, v + 0.5)));

@@ -250,36 +250,34 @@ TEST_CASE("trainings that share a workspace have the bits of those that do not, 
     CHECK(shared.twin.chain.length == alone.twin.chain.length);
   }
 
-  SUBCASE("taken as given instead") {
-    options.fixed = {"time"};
-    const pipeline::TrainResult held = pipeline::train(capture, folder.path / "held", options, {}, workspace.get());
-    CHECK(late(held) == 0.0);
-  }
-  SUBCASE("other frames") {
-    options.frames = {3, 20};
-    const pipeline::TrainResult fewer = pipeline::train(capture, folder.path / "fewer", options, {}, workspace.get());
-    CHECK(fewer.twin.states.time.size() == 17);
-  }
-  SUBCASE("the base's file changes") {
-    core::write_file(capture / "base.tum", core::read_file(kDemo / "base.tum"));
-    const pipeline::TrainResult again = pipeline::train(capture, folder.path / "again", options, {}, workspace.get());
-    CHECK(std::abs(late(again)) < 0.004);
-  }
-  SUBCASE("a stop leaves a workspace that can be used") {
-    core::Listener stopping;
-    stopping.stop = [] { return true; };
-    CHECK_THROWS_AS(pipeline::train(capture, folder.path / "stopped", options, stopping, workspace.get()), Interrupted);
-    core::clear_stop();
-    pipeline::train(capture, folder.path / "after", options, {}, workspace.get());
-    CHECK(files_of(folder.path / "after") == files_of(folder.path / "alone"));
-  }
-  SUBCASE("a mask of the same size changes") {
-    const std::uint64_t before = capture::stamp(capture);
-    CHECK(capture::stamp(capture) == before);
-    const Path mask = std::filesystem::directory_iterator(capture / "masks" / "cam0")->path();
-    std::filesystem::last_write_time(mask, std::filesystem::last_write_time(mask) + std::chrono::seconds(5));
-    CHECK(capture::stamp(capture) != before);
-  }
+  // what changes is noticed: what is taken as given,
+  pipeline::TrainOptions held = options;
+  held.fixed = {"time"};
+  CHECK(late(pipeline::train(capture, folder.path / "held", held, {}, workspace.get())) == 0.0);
+
+  // which frames,
+  pipeline::TrainOptions fewer = options;
+  fewer.frames = {3, 20};
+  CHECK(pipeline::train(capture, folder.path / "fewer", fewer, {}, workspace.get()).twin.states.time.size() == 17);
+
+  // a stop, which leaves a workspace that can be used,
+  core::Listener stopping;
+  stopping.stop = [] { return true; };
+  CHECK_THROWS_AS(pipeline::train(capture, folder.path / "stopped", options, stopping, workspace.get()), Interrupted);
+  core::clear_stop();
+  pipeline::train(capture, folder.path / "after", options, {}, workspace.get());
+  CHECK(files_of(folder.path / "after") == files_of(folder.path / "alone"));
+
+  // a mask of the same size,
+  const std::uint64_t before = capture::stamp(capture);
+  CHECK(capture::stamp(capture) == before);
+  const Path mask = std::filesystem::directory_iterator(capture / "masks" / "cam0")->path();
+  std::filesystem::last_write_time(mask, std::filesystem::last_write_time(mask) + std::chrono::seconds(5));
+  CHECK(capture::stamp(capture) != before);
+
+  // and the base's file
+  core::write_file(capture / "base.tum", core::read_file(kDemo / "base.tum"));
+  CHECK(std::abs(late(pipeline::train(capture, folder.path / "again", options, {}, workspace.get()))) < 0.004);
 }
 
 TEST_CASE("a log has a record for every stage, and the lock is one process's") {
