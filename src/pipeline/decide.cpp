@@ -1,0 +1,234 @@
+#include "pipeline/decide.h"
+
+#include <algorithm>
+#include <cmath>
+
+#include "chainsplat/core.h"
+
+namespace chainsplat::pipeline {
+
+namespace {
+
+// Share by which the outlines' square residuals must be larger with what was given before anything is changed. Straight
+// links alone leave up to 0.1 on right recordings. Correcting all that may be wrong leaves half a millimeter on a
+// table, so that more must be wrong there (design.md, 'Corrections').
+constexpr double kNothingWrong = 0.15, kNothingWrongOnTable = 1.0;
+double nothing_wrong(const capture::Capture& capture) {
+  return capture.tabletop ? kNothingWrongOnTable : kNothingWrong;
+}
+constexpr double kLeastEvidence = kNothingWrong;  // below it no cause is looked for
+constexpr double kLeftOfHalfPixel = 0.2;          // of the evidence, at most, with half a pixel taken back
+// Any other thing alone is corrected if it leaves at most kLeftOfOne of the evidence, to which each of its numbers adds
+// kPerNumber, since many numbers explain a part of anything; and less than kRight, from which on more would be wrong.
+constexpr double kLeftOfOne = 0.25, kPerNumber = 0.03;
+constexpr double kRight = kNothingWrong, kRightOnTable = 0.5;
+constexpr double kAsWell = 0.05;  // evidence by which explanations of right recordings differ, since links are straight
+constexpr double kAboveTable = 0.001;  // m, from which on a rope is said to be held above its table
+
+bool is_half_pixel(const silhouette::CorrectionFit& fit) {
+  const auto least = std::min_element(fit.evidence_after.begin(), fit.evidence_after.end());
+  return fit.evidence > kLeastEvidence && *least < kLeftOfHalfPixel * fit.evidence;
+}
+
+// The one thing that explains what is wrong; null where it takes more. Of those that may be mistaken for each other it
+// is the likeliest.
+const silhouette::Cause* single_cause(const silhouette::CorrectionFit& fit, bool tabletop) {
+  if (fit.evidence < kLeastEvidence) return nullptr;
+  const silhouette::Cause* best = nullptr;
+  double least = kLeftOfOne * fit.evidence;
+  for (const silhouette::Cause& cause : fit.causes) {
+    const double left = cause.evidence + kPerNumber * cause.numbers * fit.evidence;
+    if (cause.evidence >= (tabletop ? kRightOnTable : kRight) || left >= least) continue;
+    best = &cause;
+    least = left;
+  }
+  if (!best) return nullptr;
+  const double as_well = best->evidence + kAsWell;
+  for (const silhouette::Cause& cause : fit.causes)
+    if (cause.in_doubt == best->in_doubt && cause.evidence <= as_well && cause.surprise < best->surprise) best = &cause;
+  return best;
+}
+
+// m above where it lies on the table, from which on corrections make up for how a rope is assumed to come down: held 15
+// mm above it, cameras were found to be off by 10 degrees. Faults of base and grasp alone are less.
+double high(const capture::Capture& capture) { return std::max(0.25 * capture.diameter, 0.005); }
+
+// Whether a rope that is not known to hang lies on its table, as far as table and grasp tell, with these corrections.
+bool lies(capture::Capture capture, const capture::Corrections& corrections) {
+  capture::apply(corrections, capture);
+  return std::abs(silhouette::height_by_table(capture)) <= kAboveTable;
+}
+
+// Corrections of one cause alone, or of it and what it may be mistaken for, whichever is likelier. The deviations say
+// how far the two are apart.
+silhouette::CorrectionFit fit_alone(const chain::Chain& chain, const capture::Capture& capture,
+                                    const silhouette::SequenceFit& sequence, const silhouette::Cause& cause,
+                                    silhouette::CorrectionOptions options) {
+  options.only = cause.name;
+  silhouette::CorrectionFit one = silhouette::fit_corrections(chain, capture, sequence, options);
+  if (cause.in_doubt == cause.name) return one;
+  options.then = cause.in_doubt;
+  silhouette::CorrectionFit other = silhouette::fit_corrections(chain, capture, sequence, options);
+  if (other.surprise < one.surprise) std::swap(one, other);
+  const double share = 1.0 / (1.0 + std::exp(other.surprise - one.surprise));  // how likely the other is
+  math::VectorX apart(one.covariance.rows());
+  Eigen::Index at = 0;
+  for (std::size_t i = 0; i < one.corrections.size(); ++i) {
+    capture::Correction& correction = one.corrections[i];
+    if (correction.state == capture::CorrectionState::held) {
+      correction.value.setZero();
+      correction.state = other.corrections[i].state;
+    }
+    const math::VectorX difference = other.corrections[i].value - correction.value;
+    correction.deviation = (correction.deviation.array().square() + share * difference.array().square()).sqrt();
+    apart.segment(at, difference.size()) = difference;
+    at += difference.size();
+  }
+  one.covariance += share * apart * apart.transpose();
+  return one;
+}
+
+// What is corrected when one thing explains all: `alone` was fitted with that one free, `all` with all. The deviations
+// of the others say what the recording tells of them.
+void keep_given(silhouette::CorrectionFit& alone, const silhouette::CorrectionFit& all) {
+  for (std::size_t i = 0; i < alone.corrections.size(); ++i) {
+    capture::Correction& correction = alone.corrections[i];
+    if (correction.state != capture::CorrectionState::held) continue;
+    correction.value.setZero();
+    correction.deviation = all.corrections[i].deviation;
+    correction.state = all.corrections[i].state;
+  }
+}
+
+capture::Capture with(const capture::Correction& correction, const capture::Capture& given) {
+  capture::Capture out = given;
+  capture::apply({correction}, out);
+  return out;
+}
+
+capture::Correction shift_of(const char* subject, const char* name, const math::VectorX& value) {
+  capture::Correction shift;
+  shift.quantity = &capture::corrected_quantity(subject, name);
+  shift.subject = subject;
+  shift.value = value;
+  return shift;
+}
+
+// How the rope and its table may be, and all corrections where they are so.
+struct Hypothesis {
+  std::optional<capture::Correction> shift;  // of table or grasp, where one of them was given wrong by much
+  silhouette::CorrectionFit fit;
+};
+
+Hypothesis supposing(const capture::Capture& given, const chain::Chain& chain, silhouette::CorrectionOptions options,
+                     std::optional<capture::Correction> shift) {
+  const capture::Capture capture = shift ? with(*shift, given) : given;
+  silhouette::CorrectionFit fit =
+      silhouette::fit_corrections(chain, capture, silhouette::fit_sequence(chain, capture), options);
+  return {std::move(shift), std::move(fit)};
+}
+
+// A rope that lies far beside the plane of its grasp, by table and grasp, is held so, or one of the two was given wrong
+// by as much. Outlines tell: where the table was, the rope is flat and in that plane; where the grasp was, it is flat
+// beside it; else it comes down as a rod of some stiffness does. They are judged by what is left with all corrections,
+// since wrong cameras hide the difference. None: it is held so, or may be. `sequence` is fitted to `chain`.
+constexpr std::array kReaches = {0.3, 0.5, 0.8, 1.25, 2.0};  // of ropes from 1 % to 16 times as stiff as usual
+constexpr double kClearly =
+    0.6;  // of the cost that is left with the rope held so; found: 0.26 to 0.42, or 0.88 and more
+std::optional<Hypothesis> misplaced(const capture::Capture& capture, const chain::Chain& chain,
+                                    const silhouette::SequenceFit& sequence,
+                                    const silhouette::CorrectionOptions& options) {
+  if (capture.cameras.size() < 2) return std::nullopt;  // one sees it as turns of the joints
+  const double height = options.lying->height, up = chain.bending_axis.dot(options.lying->normal);
+  chain::Chain held = chain;
+  silhouette::CorrectionOptions as_held = options;
+  as_held.lying.reset();  // its lift stays as it is
+  double cost = INFINITY;
+  for (const double reach : kReaches) {
+    held.lift = silhouette::lying_down(chain, height, reach);
+    cost = std::min(cost, supposing(capture, held, as_held, std::nullopt).fit.summary.final_cost);
+  }
+
+  chain::Chain flat = chain;
+  silhouette::CorrectionOptions as_flat = options;
+  std::optional<Hypothesis> best;
+  const auto consider = [&](const capture::Correction& shift) {
+    flat.lift = silhouette::lying_down(chain, as_flat.lying->height);
+    Hypothesis other = supposing(capture, flat, as_flat, shift);
+    if (other.fit.summary.final_cost < (best ? best->fit.summary.final_cost : kClearly * cost)) best = std::move(other);
+  };
+  if (!is_fixed(options.held, "table")) {
+    as_flat.lying->height = silhouette::fit_height(chain, capture, sequence, 0.0);
+    consider(shift_of("table", "height", math::VectorX::Constant(1, up * (as_flat.lying->height - height))));
+  }
+  if (!is_fixed(options.held, "grasp")) {
+    as_flat.lying->height = 0.0;
+    consider(shift_of("grasp", "translation", up * height * options.lying->normal));
+  }
+  return best;
+}
+
+}  // namespace
+
+bool is_fixed(const std::vector<std::string>& fixed, const char* group) {
+  return std::find(fixed.begin(), fixed.end(), group) != fixed.end();
+}
+
+// Turns of all cameras that shift their images by `shift` px to the right and down, as a larger cx and cy would.
+capture::Corrections shifted_images(const capture::Capture& given, double shift) {
+  capture::Corrections out;
+  for (const capture::Camera& camera : given.cameras) {
+    capture::Correction turn;
+    turn.quantity = &capture::corrected_quantity("camera", "rotation");
+    turn.subject = camera.name;
+    turn.value = math::Vector3(shift / camera.fy, -shift / camera.fx, 0.0);
+    out.push_back(std::move(turn));
+  }
+  return out;
+}
+
+std::optional<double> given_above_table(const capture::Capture& capture) {
+  const double above = std::abs(silhouette::height_by_table(capture));
+  if (above < kAboveTable || above > high(capture)) return std::nullopt;
+  return above;
+}
+
+std::optional<Decision> decide(const capture::Capture& capture, const chain::Chain& chain,
+                               const silhouette::SequenceFit& sequence, const silhouette::CorrectionOptions& options) {
+  silhouette::CorrectionOptions judging = options;
+  judging.prior_weight = silhouette::kAsRecognized;
+  Decision out;
+  out.fit = silhouette::fit_corrections(chain, capture, sequence, judging);
+  out.half_pixel = is_half_pixel(out.fit);
+  if (out.half_pixel) return out;
+
+  // one thing alone
+  if (const silhouette::Cause* const cause = single_cause(out.fit, capture.tabletop)) {
+    silhouette::CorrectionFit alone = fit_alone(chain, capture, sequence, *cause, judging);
+    // where a rope is held above its table, how it comes down is assumed, which other faults would make up for
+    if (lies(capture, alone.corrections)) {
+      core::say_more("correct: " + cause->name + " alone explains what is wrong");
+      keep_given(alone, out.fit);
+      out.fit = std::move(alone);
+      out.corrected = true;
+      return out;
+    }
+  }
+
+  // table or grasp by much, and others
+  if (options.lying && std::abs(options.lying->height) > high(capture)) {
+    std::optional<Hypothesis> found = misplaced(capture, chain, sequence, options);
+    if (!found) return std::nullopt;
+    out.fit = std::move(found->fit);
+    out.shift = std::move(found->shift);
+    out.corrected = out.shift->subject == "grasp" || out.fit.evidence >= nothing_wrong(capture);
+    return out;
+  }
+
+  // all that may be wrong
+  out.corrected = out.fit.evidence >= nothing_wrong(capture);
+  if (out.corrected) out.fit = silhouette::fit_corrections(chain, capture, sequence, options);
+  return out;
+}
+
+}  // namespace chainsplat::pipeline
