@@ -34,11 +34,12 @@ struct CameraRequest {
   Source calibration;  // intrinsics, and the pose where it has one
   Source pose;         // the camera's pose; empty: the calibration's, or by the rig from another camera's
   std::optional<math::Pose> world_from_camera;  // the same given as it is, OpenCV's axes unless `camera_axes` says else
-  std::string masks;            // a folder, pattern or video; 'alpha': the images' own alpha channel; empty: none
-  Path timestamps;              // a time per line, or a table with a column of times; empty: by rate and start
-  std::optional<double> rate;   // frames per second; none: the video's own
-  std::optional<double> start;  // s, of frame 0 by the base's clock; none: 0
-  bool find_start = false;      // from the masks instead
+  std::string masks;              // a folder, pattern or video; 'alpha': the images' own alpha channel; empty: none
+  Path timestamps;                // a time per line, or a table with a column of times; empty: by rate and start
+  std::optional<double> rate;     // frames per second; none: the video's own
+  std::optional<double> start;    // s, of frame 0 by the base's clock; none: 0
+  bool find_start = false;        // from the masks instead
+  std::optional<double> readout;  // s, Camera::readout; none: the calibration's, or not known
 };
 
 struct Options {

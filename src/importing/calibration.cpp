@@ -309,6 +309,7 @@ std::optional<Calibration> read_ours(const Json& entry) {
   const auto value = [&](const char* key) { return number(find(entry, {key})).value_or(0.0); };
   out.lens = {.fx = value("fx"), .fy = value("fy"), .cx = value("cx"), .cy = value("cy")};
   if (const auto k = list(find(entry, {"distortion"}))) out.lens.coefficients = *k;
+  out.readout = number(find(entry, {"readout"}));
   read_size(entry, out);
   if (const auto m = matrix(*find(entry, {"world_from_camera"})))
     if (const auto pose = rigid(*m))

@@ -25,6 +25,7 @@ struct Calibration {
   int width = 0, height = 0;      // px; 0: the file does not say
   Lens lens;                      // the center is already in our pixels (formats.md 1.3)
   bool half_pixel_added = false;  // the source counts pixel centers from (0, 0)
+  std::optional<double> readout;  // s, Camera::readout
   std::optional<FoundPose> pose;
   // Cameras of one rig, whose poses are known to each other: the frame they are given in, by a name of its own.
   std::string rig;

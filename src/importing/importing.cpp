@@ -51,10 +51,11 @@ struct Camera {
   MaskRule rule;
   Calibration calibration;
   std::optional<Undistortion> undistortion;
-  capture::Camera camera;     // as it will stand in the capture
-  std::vector<double> times;  // s, of all frames of the source, by the base's clock
-  bool stamped = false;       // by a file of times
-  double rate = 0.0;          // frames per second, where not stamped
+  capture::Camera camera;         // as it will stand in the capture
+  std::vector<double> times;      // s, of all frames of the source, by the base's clock
+  bool stamped = false;           // by a file of times
+  double rate = 0.0;              // frames per second, where not stamped
+  std::optional<double> readout;  // s, where it is known
   Take take;
 };
 
@@ -72,11 +73,13 @@ void find_clock(Camera& camera, const trajectory::Trajectory& base, double origi
   if (!found)
     throw InputError("`start`", "several starts of " + name + " fit its masks and the base's motion about as well",
                      "give the time of its frame 0, or record a motion that does not repeat itself");
-  for (int k = 0; k < camera.images.frames; ++k) camera.times.push_back(found->start + k / camera.rate);
+  // masks tell when the middle row is read, and stamps are of the first one
+  const double start = found->start - 0.5 * std::abs(camera.readout.value_or(0.0));
+  for (int k = 0; k < camera.images.frames; ++k) camera.times.push_back(start + k / camera.rate);
   notes.push_back(
       name +
       text(": %.6g frames per second, frame 0 at %.3f s, found from the masks, which the grasp then misses by %.1f px",
-           camera.rate, found->start + origin, found->miss));
+           camera.rate, start + origin, found->miss));
 }
 
 void set_times(Camera& camera, const Options& options, const std::vector<trajectory::Sample>& base, double origin,
@@ -129,6 +132,17 @@ void set_times(Camera& camera, const Options& options, const std::vector<traject
                                  : ", frame 0 at the base's time 0, which is assumed (`start`, `timestamps`)"));
 }
 
+void check_readout(const Camera& camera) {
+  if (!camera.readout || camera.times.size() < 2) return;
+  constexpr double kRounding = 1.0 + 1e-3;  // one that fills the interval may be given in few digits
+  const double interval = (camera.times.back() - camera.times.front()) / static_cast<double>(camera.times.size() - 1);
+  if (std::abs(*camera.readout) > kRounding * interval)
+    throw InputError(
+        "`readout`",
+        camera.request->name + text(": %.4g s are more than the %.4g s from frame to frame", *camera.readout, interval),
+        "give the time from reading the first row to reading the last, in s or with a unit");
+}
+
 // The frames that the base covers, which lasts from `from` to `to`, s; `origin`: of the clock, for what is said.
 void cut(Camera& camera, double from, double to, double origin, std::vector<std::string>& notes) {
   const std::vector<double>& times = camera.times;
@@ -178,6 +192,23 @@ void leave_out_far_poses(std::vector<trajectory::Sample>& base, const std::vecto
 
 // --- cameras ---------------------------------------------------------------------------------------------------------
 
+// How long its rows take, by the request or by the calibration.
+void read_readout(Camera& camera, std::vector<std::string>& notes) {
+  const CameraRequest& request = *camera.request;
+  const std::optional<double> readout = request.readout ? request.readout : camera.calibration.readout;
+  if (!readout) return;
+  const std::string where = request.readout ? "`readout`" : request.calibration.file.string();
+  if (!(std::abs(*readout) <= capture::kLongestReadout))
+    throw InputError(where, text("%g s is more than any camera takes from its first row to its last", *readout),
+                     text("give seconds within %g", capture::kLongestReadout));
+  if (camera.undistortion && *readout != 0.0)
+    throw InputError(where, request.name + "'s frames are undistorted, and their rows are then no camera's rows",
+                     "give the frames of a lens that is no fisheye, or a readout of 0, which stays unmended");
+  camera.readout = readout;
+  notes.push_back(request.name + (*readout == 0.0 ? ": all rows are read at once"
+                                                  : text(": its rows are read in %.4g ms", 1e3 * *readout)));
+}
+
 void read_optics(Camera& camera, std::vector<std::string>& notes) {
   const CameraRequest& request = *camera.request;
   Calibration& calibration = camera.calibration;
@@ -206,6 +237,7 @@ void read_optics(Camera& camera, std::vector<std::string>& notes) {
   }
   camera.camera.name = request.name;
   notes.push_back(note);
+  read_readout(camera, notes);
 }
 
 void read_masks(Camera& camera, std::vector<std::string>& notes) {
@@ -413,6 +445,7 @@ Json camera_json(const Camera& camera, const std::string& images, const std::str
   pose.topLeftCorner<3, 3>() = c.world_from_camera.rotation;
   pose.topRightCorner<3, 1>() = c.world_from_camera.translation;
   out["world_from_camera"] = list_of_numbers(Eigen::Map<const Eigen::VectorXd>(pose.data(), 16));
+  if (camera.readout) out["readout"] = *camera.readout;
   out["images"] = images;
   if (!masks.empty()) out["masks"] = masks;
   if (camera.stamped) {
@@ -639,6 +672,7 @@ Imported import_capture(const Path& out, const Options& given) {
   set_poses(cameras, base, options, notes);
   for (Camera& camera : cameras) {
     set_times(camera, options, base, origin, notes);
+    check_readout(camera);
     camera.take = {0, camera.images.frames};
     if (base.size() > 1) cut(camera, base.front().time, base.back().time, origin, notes);
   }

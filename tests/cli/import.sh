@@ -61,6 +61,20 @@ awk -v start="$start" 'BEGIN { exit !(start > 0.22 && start < 0.28) }' || fail "
 rm -r "$out"
 refused 'has none.*--masks' "${opencv[@]}" --start auto --base "$raw/robot.csv"
 
+# rows that are read one after the other: given, said and written; masks tell when the middle one is read
+run import "$out" "${opencv[@]}" --start auto --masks "$demo/masks/cam0" --base "$raw/robot.csv" --readout 20ms
+expect_code 0 'import --readout'
+expect_output 'cam0: its rows are read in 20 ms' 'import --readout'
+python3 -c 'import json, sys
+camera = json.load(open(sys.argv[1]))["cameras"][0]
+assert camera["readout"] == 0.02 and abs(camera["start"] - (float(sys.argv[2]) - 0.01)) < 1e-6, camera' \
+  "$out/capture.json" "$start" || fail 'import --readout: not what was given'
+rm -r "$out"
+readout=("${opencv[@]}" "${stamps[@]}" --base "$raw/robot.csv" --readout)
+refused 'readout: 0.5 s is more than any camera' "${readout[@]}" 0.5
+refused 'readout: cam0: 0.05 s are more than the 0.0333.* from frame to frame' "${readout[@]}" 50ms
+refused "readout: '20 px' has no unit" "${readout[@]}" '20 px'
+
 # what cannot be
 sed 's/image_width: 320/image_width: 640/' "$raw/cam0.yaml" >"$work/large.yaml"
 refused '640x240.*320x240' "${opencv[@]}" "${stamps[@]}" --base "$raw/robot.csv" --calibration cam0="$work/large.yaml"

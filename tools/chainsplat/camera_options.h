@@ -38,7 +38,8 @@ struct Unit {
   const char* name;
   double scale;
 };
-constexpr Unit kLengths[] = {{"m", 1.0}, {"cm", 1e-2}, {"mm", 1e-3}}, kMasses[] = {{"kg", 1.0}, {"g", 1e-3}};
+constexpr Unit kLengths[] = {{"m", 1.0}, {"cm", 1e-2}, {"mm", 1e-3}}, kMasses[] = {{"kg", 1.0}, {"g", 1e-3}},
+               kTimes[] = {{"s", 1.0}, {"ms", 1e-3}};
 
 inline double quantity(const std::string& text, const std::string& option, std::span<const Unit> units) {
   const std::size_t digit = text.find_last_of("0123456789.");

@@ -19,7 +19,7 @@ using Json = nlohmann::ordered_json;
 struct ImportRequest {
   std::string out, base, urdf, tool, base_world, camera_world, camera_axes, length, diameter, mass, direction,
       bending_axis, table, gravity, scenario;
-  std::vector<std::string> cameras, calibrations, poses_of, masks, timestamps, rates, starts;
+  std::vector<std::string> cameras, calibrations, poses_of, masks, timestamps, rates, starts, readouts;
   importing::Options options;
 };
 
@@ -69,6 +69,9 @@ void read_cameras(ImportRequest& request) {
                                               camera.find_start = text == "auto";
                                               if (!camera.find_start) camera.start = numbers(text, "--start", 1)[0];
                                             });
+  give_to_cameras<importing::CameraRequest>(
+      cameras, request.readouts, "--readout",
+      [](auto& camera, const std::string& text) { camera.readout = quantity(text, "--readout", kTimes); });
   give_to_cameras<importing::CameraRequest>(
       cameras, request.poses_of, "--pose", [](auto& camera, const std::string& text) {
         const importing::Source source = importing::read_source(text);
@@ -160,6 +163,11 @@ void add_import_command(Command app, const Globals& globals, Job& job) {
           "Time of its frame 0 by the base's clock (default 0); auto: found from the masks. With --timestamps added to "
           "them",
           "[NAME=]S|auto");
+  several(
+      "--readout", request->readouts,
+      "From reading its first row to reading its last, s or with a unit: 20ms; 0: a global shutter (default: found in "
+      "training)",
+      "[NAME=]S");
   importer
       .add_option(
           "--base", request->base,
