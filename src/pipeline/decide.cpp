@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <span>
 
 #include "chainsplat/core.h"
 
@@ -59,33 +60,78 @@ bool lies(capture::Capture capture, const capture::Corrections& corrections) {
   return std::abs(silhouette::height_by_table(capture)) <= kAboveTable;
 }
 
-// Corrections of one cause alone, or of it and what it may be mistaken for, whichever is likelier. The deviations say
-// how far the two are apart.
+// Whether two fits of the same unknowns found about the same.
+bool alike(const silhouette::CorrectionFit& a, const silhouette::CorrectionFit& b) {
+  for (std::size_t i = 0; i < a.corrections.size(); ++i) {
+    const math::VectorX apart = (a.corrections[i].value - b.corrections[i].value).cwiseAbs();
+    if ((apart.array() > a.corrections[i].deviation.cwiseMax(b.corrections[i].deviation).array()).any()) return false;
+  }
+  return true;
+}
+
+// Corrections by `cause` alone, and by all that it may be mistaken for together: from each of those on, since where
+// masks begin can make up for some of it in more ways than one.
+std::vector<silhouette::CorrectionFit> ways_of(const chain::Chain& chain, const capture::Capture& capture,
+                                               const silhouette::SequenceFit& sequence, const silhouette::Cause& cause,
+                                               const std::vector<silhouette::Cause>& causes,
+                                               silhouette::CorrectionOptions options) {
+  std::vector<silhouette::CorrectionFit> out;
+  const auto add = [&](const std::string& only, const std::string& then) {
+    options.only = only;
+    options.then = then;
+    silhouette::CorrectionFit fit = silhouette::fit_corrections(chain, capture, sequence, options);
+    if (std::none_of(out.begin(), out.end(), [&](const auto& other) { return alike(fit, other); }))
+      out.push_back(std::move(fit));
+  };
+  add(cause.name, {});
+  if (cause.in_doubt != cause.name) add(cause.name, cause.in_doubt);
+  for (const silhouette::Cause& other : causes)
+    if (other.in_doubt == cause.in_doubt && other.name != cause.name && other.name != cause.in_doubt)
+      add(other.name, cause.in_doubt);
+  return out;
+}
+
+math::VectorX numbers_of(const silhouette::CorrectionFit& fit) {
+  math::VectorX out(fit.covariance.rows());
+  Eigen::Index at = 0;
+  for (const capture::Correction& correction : fit.corrections) {
+    out.segment(at, correction.value.size()) = correction.value;
+    at += correction.value.size();
+  }
+  return out;
+}
+
+// Of these ways the likeliest. The deviations say how far the others are from it, each as likely as it is.
 silhouette::CorrectionFit fit_alone(const chain::Chain& chain, const capture::Capture& capture,
                                     const silhouette::SequenceFit& sequence, const silhouette::Cause& cause,
-                                    silhouette::CorrectionOptions options) {
-  options.only = cause.name;
-  silhouette::CorrectionFit one = silhouette::fit_corrections(chain, capture, sequence, options);
-  if (cause.in_doubt == cause.name) return one;
-  options.then = cause.in_doubt;
-  silhouette::CorrectionFit other = silhouette::fit_corrections(chain, capture, sequence, options);
-  if (other.surprise < one.surprise) std::swap(one, other);
-  const double share = 1.0 / (1.0 + std::exp(other.surprise - one.surprise));  // how likely the other is
-  math::VectorX apart(one.covariance.rows());
-  Eigen::Index at = 0;
-  for (std::size_t i = 0; i < one.corrections.size(); ++i) {
-    capture::Correction& correction = one.corrections[i];
-    if (correction.state == capture::CorrectionState::held) {
+                                    const std::vector<silhouette::Cause>& causes,
+                                    const silhouette::CorrectionOptions& options) {
+  std::vector<silhouette::CorrectionFit> ways = ways_of(chain, capture, sequence, cause, causes, options);
+  std::iter_swap(ways.begin(), std::min_element(ways.begin(), ways.end(),
+                                                [](const auto& a, const auto& b) { return a.surprise < b.surprise; }));
+  silhouette::CorrectionFit& one = ways.front();
+  for (const silhouette::CorrectionFit& other : ways)
+    for (std::size_t i = 0; i < one.corrections.size(); ++i) {
+      capture::Correction& correction = one.corrections[i];
+      if (correction.state != capture::CorrectionState::held) continue;
       correction.value.setZero();
       correction.state = other.corrections[i].state;
     }
-    const math::VectorX difference = other.corrections[i].value - correction.value;
-    correction.deviation = (correction.deviation.array().square() + share * difference.array().square()).sqrt();
-    apart.segment(at, difference.size()) = difference;
-    at += difference.size();
+  double all = 0.0;
+  for (const silhouette::CorrectionFit& way : ways) all += std::exp(one.surprise - way.surprise);
+  const math::VectorX taken = numbers_of(one);
+  for (const silhouette::CorrectionFit& way : ways) {
+    const double share = std::exp(one.surprise - way.surprise) / all;  // how likely it is
+    const math::VectorX apart = numbers_of(way) - taken;
+    one.covariance += share * apart * apart.transpose();
   }
-  one.covariance += share * apart * apart.transpose();
-  return one;
+  Eigen::Index at = 0;
+  for (capture::Correction& correction : one.corrections) {
+    const Eigen::Index size = correction.value.size();
+    correction.deviation = one.covariance.diagonal().segment(at, size).cwiseMax(0.0).cwiseSqrt();
+    at += size;
+  }
+  return std::move(one);
 }
 
 // What is corrected when one thing explains all: `alone` was fitted with that one free, `all` with all. The deviations
@@ -204,7 +250,7 @@ std::optional<Decision> decide(const capture::Capture& capture, const chain::Cha
 
   // one thing alone
   if (const silhouette::Cause* const cause = single_cause(out.fit, capture.tabletop)) {
-    silhouette::CorrectionFit alone = fit_alone(chain, capture, sequence, *cause, judging);
+    silhouette::CorrectionFit alone = fit_alone(chain, capture, sequence, *cause, out.fit.causes, judging);
     // where a rope is held above its table, how it comes down is assumed, which other faults would make up for
     if (lies(capture, alone.corrections)) {
       core::say_more("correct: " + cause->name + " alone explains what is wrong");

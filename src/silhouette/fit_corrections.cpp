@@ -5,7 +5,7 @@
 #include "chainsplat/core.h"
 #include "src/math/decompositions.h"
 #include "src/math/usual.h"
-#include "src/silhouette/correction_layout.h"
+#include "src/silhouette/correction_priors.h"
 
 namespace chainsplat::silhouette {
 
@@ -26,20 +26,9 @@ constexpr double kWidestCut = 30.0;          // px
 constexpr double kNarrowing = 0.6;           // of that cut from step to step
 constexpr double kWideEnd = 8.0;             // half widths: the reach of the free end as long as the cut is wide
 constexpr double kLeastSize = 0.5;           // share of the given length and diameter below which no correction goes
-// The priors' penalty is kTails / 2 ln(1 + |y|^2 / kTails) in units of their deviation: nearly a Gaussian's for what a
-// careful laboratory gets wrong, and for a fault ten times that nearly flat.
-constexpr double kTails = 2.0;
-// Least information of these priors, in that unit: beyond seven deviations they are Gaussian again, five times as wide.
-// Without it three cameras over a table went 4 degrees astray in a recording that was right, since straight links fit
-// the outlines better by a tenth from there.
-constexpr double kLeastWeight = 0.04;
-// m, deviation of where masks begin in a camera before which the fingers hold the rope, or which takes them for it;
-// every second camera does. In the others they begin at the grasp.
-constexpr double kHidden = 0.01;
 // A finger's edge that crosses the cut face leaves outlines that scatter by 1 / sqrt(12) of what it covers at one side,
 // and it covers half of that in the mean.
 constexpr double kCovered = 1.7321;
-constexpr double kSharp = 0.0014;  // m, start_deviations() above which it is not known whether it is the cut face
 constexpr double kRound = 0.25;  // deviation of how far the cut face reaches beyond its middle, of what a flat one does
 constexpr double kUnknownShare = 0.7;  // of the prior's deviation there above which a value is the prior's
 constexpr int kTimeStretches = 12;     // of time, whose scatter tells what the equations do not know
@@ -47,10 +36,6 @@ constexpr double kHeld = 1e12;         // information that holds an unknown, in 
 constexpr double kExact = 1e-4;        // of the prior's deviation, below which it was held so
 constexpr double kSameClock = 1e-9;    // s
 constexpr double kAgree = 0.003;       // s, by which clocks that are right differ at most
-constexpr double kMillimeter = 1e-3;   // m
-
-// Whether all masks may begin anywhere, or those begin at the grasp that do so nearly.
-enum class Starts { anywhere, at_grasp };
 
 // How little each camera's masks tell of where the rope leaves the gripper, m along it. Fingers have another shape than
 // the rope's cut face, so that the outline there scatters more than elsewhere; and no cut is quite flat.
@@ -73,35 +58,6 @@ std::vector<double> start_deviations(const std::vector<FrameEquations>& frames) 
     const double mean = s.start_first / s.start_weight, bulge = s.start_bulge / s.start_weight;
     const double excess = s.start_second / s.start_weight - mean * mean - s.second / s.weight;
     out[c] = std::hypot(kCovered * std::sqrt(std::max(0.0, excess)), kRound * bulge) * s.start_weight / s.start_speed;
-  }
-  return out;
-}
-
-// Information, 1/m^2, about where a camera's masks begin, at x m: of a mixture of two Gaussians.
-double start_information(double x, double deviation, Starts starts) {
-  const double narrow = 1.0 / (deviation * deviation), wide = std::min(narrow, 1.0 / (kHidden * kHidden));
-  if (starts == Starts::anywhere) return wide;
-  const double at_grasp = 1.0 / (1.0 + std::sqrt(wide / narrow) * std::exp(0.5 * x * x * (narrow - wide)));
-  return at_grasp * narrow + (1.0 - at_grasp) * wide;
-}
-
-// Information of the heavy-tailed prior about each shared unknown at x, in units of its deviation: most recordings are
-// right in most things, and wrong by much in a few. `start_deviations`: by camera.
-VectorX prior_weights(const Layout& layout, const VectorX& x, Starts starts,
-                      const std::vector<double>& start_deviations) {
-  VectorX out = VectorX::Ones(layout.size);
-  for (const Column& column : layout.columns) {
-    if (column.first < 0) continue;
-    if (is_mask_start(column)) {
-      const double unit = column.deviation, untold = start_deviations[column.camera];
-      out[column.first] = unit * unit *
-                          start_information(unit * x[column.first], std::hypot(unit, untold),
-                                            untold > kSharp ? Starts::anywhere : starts);
-      continue;
-    }
-    const int size = column.quantity->size;
-    const double weight = 1.0 / (1.0 + x.segment(column.first, size).squaredNorm() / kTails);
-    out.segment(column.first, size).setConstant(std::max(weight, kLeastWeight));
   }
   return out;
 }
@@ -190,71 +146,18 @@ solve::ArrowEquations arrow_of(const std::vector<FrameEquations>& frames, const 
   return arrow;
 }
 
-// The shared unknowns that say where masks begin, and the others.
-struct Parts {
-  std::vector<int> starts, others;
-};
-Parts parts_of(const Layout& layout) {
-  Parts out;
-  for (const Column& column : layout.columns)
-    for (int i = 0; column.first >= 0 && i < column.quantity->size; ++i)
-      (is_mask_start(column) ? out.starts : out.others).push_back(column.first + i);
-  return out;
-}
-
-// Where masks begin is free: fingers hide a piece of the rope in many recordings that are right. So the outlines'
-// `information` of all else is that with the starts at their best, which follow a change of the others by `follow`.
-struct Followed {
-  MatrixX cost;    // of all shared unknowns, 0 for the starts: the square of a change, by which residuals grow
-  MatrixX follow;  // starts x others
-};
-Followed cost_of_change(const Parts& parts, const MatrixX& information) {
-  Followed out{MatrixX::Zero(information.rows(), information.cols()), {}};
-  const auto& [starts, others] = parts;
-  out.cost(others, others) = MatrixX(information(others, others));
-  if (starts.empty()) return out;
-  const MatrixX pull = information(starts, others), own = information(starts, starts);
-  out.follow = -own.completeOrthogonalDecomposition().solve(pull);
-  out.cost(others, others) += pull.transpose() * out.follow;
-  return out;
-}
-
-// -ln of how likely it is, but for constants, that just these directions are wrong, and by x: of the heavy-tailed
-// prior's density there, of the mixture's about where masks begin (in units of 1 mm), and of the share that the
-// outlines leave of what the priors leave open. `cost`: that of cost_of_change().
-double surprise_of(const Layout& layout, const MatrixX& directions, const MatrixX& cost, const VectorX& x,
-                   const std::vector<double>& start_deviations) {
-  const MatrixX known = directions.transpose() * cost * directions;
-  double out = 0.5 * std::log((MatrixX::Identity(known.rows(), known.cols()) + known).determinant());
-  for (const Column& column : layout.columns) {
-    if (column.first < 0) continue;
-    if (!is_mask_start(column)) {
-      out += 0.5 * kTails * std::log1p(x.segment(column.first, column.quantity->size).squaredNorm() / kTails);
-      continue;
-    }
-    const double start = column.deviation * x[column.first], untold = start_deviations[column.camera];
-    const double narrow = std::hypot(column.deviation, untold), wide = std::max(narrow, kHidden);
-    const auto density = [&](double deviation) {
-      return kMillimeter / deviation * std::exp(-0.5 * start * start / (deviation * deviation));
-    };
-    out -= std::log(untold > kSharp ? density(wide) : 0.5 * (density(narrow) + density(wide)));
-  }
-  return out;
-}
-
 // Each thing that may be all that is wrong, and what it leaves of the evidence. `x`: all that was found.
 std::vector<Cause> causes_of(const Layout& layout, const std::vector<capture::Camera>& cameras,
                              const MatrixX& information, const std::vector<double>& start_deviations, const VectorX& x,
                              double squares) {
-  const Parts parts = parts_of(layout);
-  const auto [cost, follow] = cost_of_change(parts, information);
+  const auto [cost, follow, starts, others] = cost_of_change(layout, information);
   std::vector<Cause> out;
   for (const Direction& d : single_causes(layout, cameras)) {
     const MatrixX cost_of = d.directions.transpose() * cost;
     const VectorX along = MatrixX(cost_of * d.directions).completeOrthogonalDecomposition().solve(VectorX(cost_of * x));
     VectorX alone = d.directions * along;
     const VectorX left = x - alone;
-    if (!parts.starts.empty()) alone(parts.starts) = VectorX(x(parts.starts)) - follow * VectorX(left(parts.others));
+    if (!starts.empty()) alone(starts) = VectorX(x(starts)) - follow * VectorX(left(others));
     out.push_back({d.name, d.in_doubt, static_cast<int>(d.directions.cols()), left.dot(cost * left) / squares,
                    surprise_of(layout, d.directions, cost, alone, start_deviations)});
   }
@@ -493,7 +396,7 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
   const MatrixX covariance =
       shared_covariance(frames, outlines, known_at(capture, layout, x.head(m), starts, frames, held).information);
   const double squares = square_residuals(frames);
-  const MatrixX cost = cost_of_change(parts_of(layout), outlines).cost;
+  const MatrixX cost = cost_of_change(layout, outlines).cost;
   const auto evidence_of = [&](const capture::Corrections& mended) {
     const VectorX change = x.head(m) - shared_of(layout, capture.cameras, mended);
     return squares > 0.0 ? change.dot(cost * change) / squares : 0.0;
