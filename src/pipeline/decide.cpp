@@ -69,8 +69,9 @@ bool alike(const silhouette::CorrectionFit& a, const silhouette::CorrectionFit& 
   return true;
 }
 
-// Corrections by `cause` alone, and by all that it may be mistaken for together: from each of those on, since where
-// masks begin can make up for some of it in more ways than one.
+// Fits that may each be the right one: `cause` alone; and, beginning with each of the causes that look alike (a grasp
+// off along the rope, another length), all of them together. The last may end at different places, because it is not
+// known which cameras' masks begin at the grasp.
 std::vector<silhouette::CorrectionFit> ways_of(const chain::Chain& chain, const capture::Capture& capture,
                                                const silhouette::SequenceFit& sequence, const silhouette::Cause& cause,
                                                const std::vector<silhouette::Cause>& causes,
@@ -101,7 +102,7 @@ math::VectorX numbers_of(const silhouette::CorrectionFit& fit) {
   return out;
 }
 
-// Of these ways the likeliest. The deviations say how far the others are from it, each as likely as it is.
+// The likeliest of these fits. Its deviations count how far each other one is from it, by its probability.
 silhouette::CorrectionFit fit_alone(const chain::Chain& chain, const capture::Capture& capture,
                                     const silhouette::SequenceFit& sequence, const silhouette::Cause& cause,
                                     const std::vector<silhouette::Cause>& causes,

@@ -10,23 +10,25 @@ namespace chainsplat::silhouette {
 // Whether all masks may begin anywhere, or those begin at the grasp that do so nearly.
 enum class Starts { anywhere, at_grasp };
 
-// Information of the priors about each shared unknown at x, in units of its deviation. `start_deviations`: how little
-// each camera's masks tell of where the rope leaves the gripper, m along it.
+// Information of the priors about each shared unknown at x, in units of its deviation. Their tails are heavy, since
+// most recordings are right in most things, and wrong by much in a few. `start_deviations`: by camera, how little its
+// masks tell of where the rope leaves the gripper, m along it.
 math::VectorX prior_weights(const Layout& layout, const math::VectorX& x, Starts starts,
                             const std::vector<double>& start_deviations);
 
-// The square of a change of the shared unknowns, by which the outlines' residuals grow.
+// What a change of the shared unknowns costs where the beginnings of the masks follow it as well as they can.
 struct Followed {
-  math::MatrixX cost;    // of all shared unknowns, 0 for where masks begin, which is at its best
-  math::MatrixX follow;  // how that follows the others: starts x others
-  std::vector<int> starts, others;
+  math::MatrixX cost;    // of all shared unknowns, 0 for those of `starts`: xT cost x is what square residuals grow by
+  math::MatrixX follow;  // change of `starts` by that of `others`
+  std::vector<int> starts, others;  // the unknowns that say where masks begin, and the rest
 };
 // Where masks begin is free: fingers hide a piece of the rope in many recordings that are right. So the outlines'
 // `information` of all else is that with the starts at their best.
 Followed cost_of_change(const Layout& layout, const math::MatrixX& information);
 
-// -ln of how likely it is, but for constants, that just these directions are wrong, and by x: prior_surprise(), and of
-// the share that the outlines leave of what the priors leave open.
+// -ln of how likely it is, but for constants, that just these directions are wrong, and by x: of the priors' density
+// there (where masks begin in units of 1 mm), and of the share that the outlines leave of what the priors leave open.
+// `cost`: Followed::cost.
 double surprise_of(const Layout& layout, const math::MatrixX& directions, const math::MatrixX& cost,
                    const math::VectorX& x, const std::vector<double>& start_deviations);
 
