@@ -10,6 +10,7 @@
 
 #include "chainsplat/gpu.h"
 #include "reference_colors.h"
+#include "src/estimation/color.h"
 #include "src/estimation/predict.h"
 #include "src/estimation/setup.h"
 #include "src/math/decompositions.h"
@@ -608,7 +609,7 @@ TEST_CASE("a base whose stamps are late is found to be so while it moves") {
   CHECK(std::abs(state.setup.mean[0] - kLate) < 6e-3);  // in a second of motion
   CHECK(found[1].settling);                             // nobody knows yet that nothing pushes
   CHECK_FALSE(found.back().settling);
-  CHECK(state.setup.information(0, 0) > 1.0 / (3e-3 * 3e-3));
+  CHECK(state.setup.information(0, 0) > 1.0 / (5e-3 * 5e-3));
   const std::size_t last = found.size() - 1;
   CHECK(rms(shared_twin().chain, found[last].theta, shared_truth().theta[last]) < 5e-3);
   estimation::State right = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
@@ -627,36 +628,93 @@ TEST_CASE("while a base's clock is not known, it may begin to move a little befo
   estimation::State state = estimation::start(shared_twin(), {front_camera()}, base, 0.0);
   for (const double time : {0.5, kBegin - 0.09, kBegin + 0.09, 1.5}) CHECK_FALSE(may_go_otherwise(state, time));
   for (const double time : {kBegin - 0.05, kBegin + 0.05}) CHECK(may_go_otherwise(state, time));
-  const estimation::State live =
-      estimation::start(shared_twin(), {front_camera()}, base, 0.0, estimation::options_for_live_masks(false));
-  CHECK_FALSE(may_go_otherwise(live, kBegin));  // of which the clock is never known, and a touch would never be told
   state.setup.information(0, 0) = 1.0 / (2e-3 * 2e-3);
   CHECK_FALSE(may_go_otherwise(state, kBegin));
 }
 
-TEST_CASE("masks that are cut where the rope is expected teach nothing of the base's clock, which stays uncertain") {
-  constexpr double kLate = 0.02;
-  const auto late_base = [](double time) { return moving_base(time - kLate); };
-  const estimation::Options options = estimation::options_for_live_masks(false);
-  estimation::State state = estimation::start(shared_twin(), {front_camera()}, late_base, 0.0, options);
-  const MatrixX before = state.setup.information;
-  const auto found = follow(state, shared_views());
-  CHECK(state.setup.mean.isZero());
-  CHECK(state.setup.information == before);
-  const chain::Chain& chain = shared_twin().chain;
-  // how the angles change with the clock is told, so that those with the right one follow
-  estimation::State right = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0, options);
-  const auto known = follow(right, shared_views());
-  double off = 0.0, left = 0.0;
-  for (std::size_t f = 5; f < found.size(); ++f) {
-    CHECK(found[f].late_sigma == doctest::Approx(1.0 / 30.0));
-    const VectorX change = known[f].theta - found[f].theta;
-    off += change.squaredNorm();
-    left += (change - kLate * found[f].theta_by_late).squaredNorm();
+TEST_CASE("how a belief follows clock and camera is its derivative by them") {
+  using silhouette::SetupEquations;
+  constexpr double kSure = 1e9;  // times as much as is known beforehand: nothing is learned
+  constexpr int kFrames = 12;
+  estimation::CompareColors compare;
+  std::vector<capture::View> views = shared_views();
+  SUBCASE("by outlines") {}
+  SUBCASE("by outlines and colors") {
+    views = painted_views();
+    compare = compare_painted;
   }
-  CHECK(std::sqrt(left) < 0.3 * std::sqrt(off));
-  for (std::size_t f = 0; f < found.size(); ++f)
-    CHECK(rms(chain, found[f].theta, shared_truth().theta[f]) < 3.0 * deviation(chain, found[f]));
+  views.resize(kFrames);
+  const auto believing = [&](int unknown, double value) {
+    estimation::State state = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0, {}, {1}, compare);
+    state.setup.information *= kSure;
+    state.setup.mean[unknown] = value;
+    state.setup.right = state.setup.information * state.setup.mean;
+    const int camera = SetupEquations::kCameras;
+    state.cameras[0].world_from_camera =
+        capture::moved(state.cameras[0].world_from_camera, state.setup.mean.segment<3>(camera),
+                       state.setup.mean.segment<3>(camera + 3));
+    follow(state, views);
+    return state.belief.value();
+  };
+  const int n = shared_twin().chain.angles();
+  std::vector<int> unknowns{SetupEquations::kClock};
+  // along the rope a step on painted colors is no smooth function of the camera
+  for (const int i : {1, 2, 3}) unknowns.push_back(SetupEquations::kCameras + i);
+  for (const int i : {0, 4, 5})
+    if (!compare) unknowns.push_back(SetupEquations::kCameras + i);
+  for (const int unknown : unknowns) {
+    CAPTURE(unknown);
+    const double step = unknown == SetupEquations::kClock ? 1e-3 : 2e-4;
+    const estimation::Belief after = believing(unknown, step), before = believing(unknown, -step);
+    const VectorX slope = ((after.mean - before.mean) / (2.0 * step)).head(n);
+    const VectorX told = believing(unknown, 0.0).by_setup.col(unknown).head(n);
+    CHECK((told - slope).norm() < 0.2 * slope.norm());
+  }
+}
+
+TEST_CASE("what colors say of the setup is what the joint Gaussian says") {
+  constexpr int kAngles = 3, kState = 7, kSetup = 4, kPixels = 20;
+  const auto numbers = [](int rows, int columns, double phase) {
+    MatrixX out(rows, columns);
+    for (int i = 0; i < rows; ++i)
+      for (int j = 0; j < columns; ++j) out(i, j) = std::sin(phase + 1.7 * i + 0.6 * j * j + 0.3 * i * j);
+    return out;
+  };
+  const MatrixX by_setup = numbers(kState, kSetup, 0.1), half = numbers(kState, kState, 0.5);
+  const MatrixX covariance = half * half.transpose() + 0.1 * MatrixX::Identity(kState, kState);
+  const MatrixX known = 2.0 * MatrixX::Identity(kSetup, kSetup);  // information
+  const MatrixX by_angles = numbers(kPixels, kAngles, 1.0), by_rope = numbers(kPixels, kSetup, 2.0);
+  const VectorX residual = numbers(kPixels, 1, 3.0);
+
+  // state and setup at once, as one dense least squares of unit weights about the means before
+  MatrixX information = MatrixX::Zero(kState + kSetup, kState + kSetup), differs(kState, kState + kSetup);
+  MatrixX seen = MatrixX::Zero(kPixels, kState + kSetup);
+  differs << MatrixX::Identity(kState, kState), -by_setup;
+  seen.leftCols(kAngles) = by_angles;
+  seen.rightCols(kSetup) = by_rope;
+  information = differs.transpose() * covariance.inverse() * differs + seen.transpose() * seen;
+  information.bottomRightCorner(kSetup, kSetup) += known;
+  const MatrixX joint = information.inverse();
+  const VectorX change = -joint * seen.transpose() * residual;
+  const MatrixX setup = joint.bottomRightCorner(kSetup, kSetup);
+
+  estimation::ColorEvidence colors;
+  colors.normal = by_angles.transpose() * by_angles;
+  colors.coupling = by_angles.transpose() * by_rope;
+  colors.shared = by_rope.transpose() * by_rope;
+  colors.right = by_angles.transpose() * residual;
+  colors.shared_right = by_rope.transpose() * residual;
+  colors.gain =
+      covariance.leftCols(kAngles) *
+      (MatrixX::Identity(kAngles, kAngles) + colors.normal * covariance.topLeftCorner(kAngles, kAngles)).inverse();
+  MatrixX follows = by_setup;
+  silhouette::SetupEquations equations{MatrixX::Zero(kSetup, kSetup), VectorX::Zero(kSetup), {}};
+  estimation::add_colors(colors, follows, equations);
+  const MatrixX found = (known + equations.information).inverse();
+  CHECK((found - setup).norm() < 1e-9 * setup.norm());
+  CHECK((-found * equations.gradient - change.tail(kSetup)).norm() < 1e-9 * change.norm());
+  const MatrixX expected = joint.topRightCorner(kState, kSetup) * setup.inverse();
+  CHECK((follows - expected).norm() < 1e-9 * expected.norm());
 }
 
 TEST_CASE("a camera that the twin does not know is found to stand where it does") {
@@ -758,7 +816,7 @@ TEST_CASE("a mask that is too wide on a table is thought to be so on the rope's 
       twin, {camera}, [](double) { return trajectory::BaseMotion{}; }, 0.0);
   state.edge_offset = 0.5;
   estimation::Belief belief{0.0, VectorX::Zero(3 * n + 2), 1e-4 * MatrixX::Identity(3 * n + 2, 3 * n + 2),
-                            VectorX::Zero(3 * n + 2)};
+                            MatrixX::Zero(3 * n + 2, state.setup.mean.size())};
   belief.mean.tail(2) << 1.0, -1.0;  // forgotten by the time of the prediction
   const VectorX shift = moved_to(state, belief, 100.0, estimation::Contact::none).mean.tail(2);
   CHECK(shift[0] == doctest::Approx(0.0).epsilon(1e-6));
@@ -771,7 +829,8 @@ TEST_CASE("the predicted covariance is that of the predicted mean's derivative")
   const estimation::State state = estimation::start(shared_twin(), {front_camera()}, moving_base, 0.0);
   estimation::Belief belief;
   belief.time = 0.3;
-  belief.mean = belief.by_late = VectorX::Zero(3 * n);
+  belief.mean = VectorX::Zero(3 * n);
+  belief.by_setup = MatrixX::Zero(3 * n, state.setup.mean.size());
   for (int k = 0; k < 3 * n; ++k) belief.mean[k] = 0.1 * std::sin(1.0 + k);
   VectorX direction(3 * n);  // smooth along the rope: the variational equation is of second order in stiff modes only
   for (int k = 0; k < 3 * n; ++k) direction[k] = 1.0 + 0.3 * std::cos(0.2 * k);

@@ -41,16 +41,13 @@ struct Options {
   double color_share = 0.002;        // share of the information per pixel and channel that counts: channels are
                                      // correlated, so are some 5 x 5 pixels, and errors of the twin's colors last
   int color_steps = 1;               // number of Gauss-Newton steps on the colors
-  bool learns_setup = true;          // the base's clock, the grasp's turn and the poses of unknown cameras; else they
-                                     // stay as uncertain as they are at first
   int doubtful_frames = 0;           // at first, whose masks are not yet good enough to be sure
   silhouette::Options silhouette;    // the filter sets the prior
 };
 
 // Returns the options for masks that are made while the rope is followed. In free space the error of their outline
 // persists (a hand's edge, the rope's dark side), so that less of it is independent in each frame and colors count for
-// more. On a table the persistent part, the masks' shift, is in the belief instead. Such masks are cut where the rope
-// is expected: they say back what the setup is believed to be, so that nothing of it is learned.
+// more. On a table the persistent part, the masks' shift, is in the belief instead.
 Options options_for_live_masks(bool tabletop);
 
 // Compares the twin, with its links at `motions` (one list per view), with the colors inside the views' masks.

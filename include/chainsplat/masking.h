@@ -77,6 +77,12 @@ struct PreviewTile {
 // Returns the pictures side by side, each at most 640 px wide, with the mask's outline and the score.
 capture::Image8 contact_sheet(const std::vector<PreviewTile>& tiles);
 
+// What is known of a rope whose angles are unknown.
+struct LiveStart {
+  math::VectorX resting;         // rad, how it hangs or lies if nobody has touched it; empty: not known
+  double grasp_deviation = 0.0;  // m, by which it may seem to begin beside the base, since the camera stands elsewhere
+};
+
 // Masks of one camera's frames as they come, while the rope is followed. It learns the background where the rope is
 // not, and the colors of what is masked, in a thread of its own, which the next call waits for.
 class LiveMasks {
@@ -89,13 +95,15 @@ class LiveMasks {
   // Learns the rope's marks, which nothing that hides it has, from a drawn picture of the rope at these angles (an
   // undistorted crop with its coverage as alpha). `base`: world_from_base.
   void learn_marks(const capture::View& drawn, const math::Pose& base, const math::VectorX& theta);
+  // Tells where the camera is believed to stand from now on: at first, as it was given.
+  void see_from(const math::Pose& world_from_camera);
   // Tells before the next frame comes where mask() will be asked to look, which then has less to do.
   void expect(const math::Pose& base, const math::VectorX& theta);
   // Returns the undistorted crop of a recorded frame (RGB, of the camera's size) with its mask; an empty view (width 0)
   // where nothing is found. `theta`: the expected angles; none where they are unknown (in the first frame, or when the
-  // rope is lost).
-  capture::View mask(const capture::Image8& recorded, const math::Pose& base,
-                     const std::optional<math::VectorX>& theta);
+  // rope is lost): the rope is then found by what `start` knows of it.
+  capture::View mask(const capture::Image8& recorded, const math::Pose& base, const std::optional<math::VectorX>& theta,
+                     const LiveStart& start = {});
   int frames() const;  // that were masked
 
  private:

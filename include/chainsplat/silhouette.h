@@ -199,16 +199,17 @@ TiltEquations tilt_equations(const math::Vector3& bending_axis, const math::Vect
 // (rad, rotation vector in the base frame), and then for each camera of `posed`, by camera, how it is turned (rad,
 // rotation vector in its own frame) and where it stands (m, world). The frame's angles are unknown too, with the prior
 // of `options` (about theta, the frame's fit), and so is each camera's edge offset. With the tempered weights of
-// fit_corrections().
+// fit_corrections(). `expected`: n x m, how the prior's mean changes with the unknowns.
 struct SetupEquations {
   static constexpr int kClock = 0, kGrasp = 1, kCameras = 4, kPerCamera = 6;  // where they stand
   math::MatrixX information;                                                  // m x m
   math::VectorX gradient;  // m, of the cost: the change that the frame asks for is -information^-1 gradient
-  math::MatrixX angles;    // n x m, how the frame's angles change with the unknowns
+  math::MatrixX angles;    // n x m, how the frame's angles change with the unknowns, what is expected of them included
 };
 SetupEquations setup_equations(const chain::Chain& chain,
                                const std::function<trajectory::BaseMotion(double time)>& base,
                                std::span<const capture::View* const> views, const std::vector<capture::Camera>& cameras,
-                               const std::vector<char>& posed, const math::VectorX& theta, const Options& options);
+                               const std::vector<char>& posed, const math::VectorX& theta,
+                               const math::MatrixX& expected, const Options& options);
 
 }  // namespace chainsplat::silhouette

@@ -23,7 +23,7 @@ AdamFollower::AdamFollower(const twin::Twin& twin, const std::vector<capture::Ca
                            const AdamOptions& options)
     : state_(std::make_unique<State>()) {
   state_->given = given_by(twin, cameras, std::move(base), base_start);
-  state_->correction = base_correction(first_setup(state_->given, {}));
+  state_->correction = base_correction(first_setup(state_->given, {}).mean);
   state_->gradient = std::move(gradient);
   state_->options = options;
 }

@@ -115,6 +115,38 @@ Attempt measure_frame(State& state, Belief predicted, const Motion& motion,
   return out;
 }
 
+// The first frame: masks of cameras that are off bend the rope toward them, so that it is measured several times, each
+// time with the setup that the time before has found. All this counts once, when the frame is learned from.
+Attempt measure_first(State& state, const Belief& predicted, std::span<const capture::View* const> views) {
+  Attempt out = measure_frame(state, predicted, {}, views);
+  for (int round = 0; round < kFirstRounds && explains(out.measured.fit); ++round) {
+    const Setup before = state.setup;
+    const std::optional<silhouette::SetupEquations> looked =
+        look_at_setup(state, views, out.predicted, out.measured.fit.theta);
+    if (looked) learn_setup(state, *looked, out.predicted);
+    state.setup.information = before.information;
+    state.setup.right = before.right;
+    state.setup.frames = before.frames;
+    out = measure_frame(state, predicted, {}, views);
+  }
+  return out;
+}
+
+// The first frame as that of a rope that nobody touches: it hangs as the twin knows, and what is off is the camera.
+// None where this does not explain the frame, or no camera may be off; the setup is then as it was. On a table friction
+// holds a rope wherever it was laid.
+std::optional<Attempt> measure_resting(State& state, double time, std::span<const capture::View* const> views) {
+  const Given& given = state.given;
+  const bool may_be_off = std::find(state.setup.posed.begin(), state.setup.posed.end(), 1) != state.setup.posed.end();
+  if (!may_be_off || !given.identified || given.table_normal) return {};
+  const auto before = std::pair(state.setup, state.cameras);
+  Attempt out = measure_first(state, resting_belief(state, time), views);
+  const silhouette::FrameFit& fit = out.measured.fit;
+  if (out.measured.surprise <= kSurprise && explains(fit) && !has_more(fit)) return out;
+  std::tie(state.setup, state.cameras) = before;
+  return {};
+}
+
 // Whether the frame is believed: its masks are explained, and by a rope that is seen as a whole.
 bool judge(State& state, std::span<const capture::View* const> views, const Attempt& attempt, Estimate& out) {
   const silhouette::FrameFit& fit = attempt.measured.fit;
@@ -152,14 +184,21 @@ void learn(State& state, std::span<const capture::View* const> views, const Atte
   // What the outlines say of the setup is computed while the device compares colors. It reads nothing that the colors
   // change, so that the numbers are those of one after the other.
   const VectorX& theta = attempt.measured.fit.theta;
-  auto looked = std::async(state.compare_colors ? std::launch::async : std::launch::deferred,
-                           [&] { return look_at_setup(state, views, attempt.predicted, theta); });
-  if (state.compare_colors) look_at_colors(state, views, *state.belief, out);
+  auto looking = std::async(state.compare_colors ? std::launch::async : std::launch::deferred,
+                            [&] { return look_at_setup(state, views, attempt.predicted, theta); });
+  ColorEvidence colors;
+  if (state.compare_colors) colors = look_at_colors(state, views, *state.belief, out);
+  std::optional<silhouette::SetupEquations> looked = looking.get();
+  MatrixX& by_setup = state.belief->by_setup;
+  const auto n = theta.size();
+  if (looked) {
+    by_setup += attempt.measured.gain * (looked->angles - attempt.predicted.by_setup.topRows(n));
+    add_colors(colors, by_setup, *looked);
+  }
   if (first || out.likeness.value_or(1.0) >= kUnlike) state.last_like = out.time;
   learn_force(state, out.time);
   // where the fit may be wrong, a camera that is moved would make it right
-  if (const std::optional<silhouette::SetupEquations> seen = looked.get(); !out.doubtful)
-    learn_setup(state, seen, attempt.predicted, theta);
+  if (looked && !out.doubtful) learn_setup(state, *looked, attempt.predicted);
   const double gain = 1.0 / kOffsetFrames;
   state.edge_offset += gain * (attempt.measured.fit.edge_offset - state.edge_offset);
   state.edge_offset_variance =
@@ -169,15 +208,16 @@ void learn(State& state, std::span<const capture::View* const> views, const Atte
 // What is believed, with the uncertainty of the model's shape.
 void report(const State& state, std::span<const capture::View* const> views, Estimate& out) {
   const int n = state.given.model.chain.angles();
-  out.base = base_correction(state.setup);
+  out.base = base_correction(state.setup.mean);
   out.late_sigma = late_deviation(state.setup);
   out.theta = state.belief->mean.head(n);
-  out.theta_by_late = state.belief->by_late.head(n);
+  out.theta_by_late = state.belief->by_setup.col(silhouette::SetupEquations::kClock).head(n);
   out.thetadot = state.belief->mean.segment(n, n);
   out.covariance = state.belief->covariance.topLeftCorner(2 * n, 2 * n);
   if (out.doubtful) out.covariance.diagonal().head(n).array() += kDoubtAngle * kDoubtAngle;
   std::vector<double> shape = chain::shape_variances(state.given.model.chain, out.theta);
-  out.covariance.topLeftCorner(n, n) += state.setup.angles;
+  const MatrixX by_setup = state.belief->by_setup.topRows(2 * n);
+  out.covariance += by_setup * covariance(state.setup) * by_setup.transpose();
   out.centerline_sigma =
       centerline_deviation(state.given.model.chain, out.theta, out.covariance.topLeftCorner(n, n), shape);
   out.covariance.topLeftCorner(n, n) += chain::shape_covariance(state.given.model.chain, shape, out.theta);
@@ -208,17 +248,12 @@ Estimate update(State& state, std::span<const capture::View* const> views) {
   out.seen = std::any_of(views.begin(), views.end(), [](const capture::View* v) { return has_mask(*v); });
   bool believed = false;
   if (out.seen) {
-    Attempt attempt = measure_frame(state, predicted, motion, views);
-    // at first masks of cameras that are off bend the rope toward them; where they stand is learned from these, and
-    // counts once
     const auto given = first ? std::optional(std::pair(state.setup, state.cameras)) : std::nullopt;
-    for (int round = 0; first && round < kFirstRounds && explains(attempt.measured.fit); ++round) {
-      const Setup before = state.setup;
-      const VectorX& theta = attempt.measured.fit.theta;
-      learn_setup(state, look_at_setup(state, views, attempt.predicted, theta), attempt.predicted, theta);
-      state.setup.information = before.information;
-      state.setup.right = before.right;
-      state.setup.frames = before.frames;
+    Attempt attempt;
+    if (first) {
+      std::optional<Attempt> resting = measure_resting(state, view.time, views);
+      attempt = resting ? std::move(*resting) : measure_first(state, predicted, views);
+    } else {
       attempt = measure_frame(state, predicted, motion, views);
     }
     believed = judge(state, views, attempt, out);

@@ -59,12 +59,8 @@ Measured measure(const State& state, const Belief& predicted, std::span<const ca
   out.belief.mean = predicted.mean + gain * change;
   out.belief.mean(fitted) = found;
   out.belief.covariance = predicted.covariance - gain * (prior - posterior) * gain.transpose();
-  // what is seen stays where it is, whenever the base was there
-  VectorX staying = VectorX::Zero(expected.size());
-  staying.head(n) = staying_angles(state, out.fit.theta, time);
-  const VectorX by_late = predicted.by_late(fitted);
-  const VectorX by_late_found = staying + posterior * (information * (by_late - staying));
-  out.belief.by_late = predicted.by_late + gain * (by_late_found - by_late);
+  out.belief.by_setup = predicted.by_setup;
+  out.gain = gain.leftCols(n);
   symmetrize(out.belief.covariance);
   out.belief.covariance.diagonal().array() += kLeastVariance;
   return out;

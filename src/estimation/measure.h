@@ -6,7 +6,8 @@ namespace chainsplat::estimation {
 
 struct Measured {
   silhouette::FrameFit fit;
-  Belief belief;          // posterior
+  Belief belief;          // posterior; how it changes with the setup is still that of the prediction
+  math::MatrixX gain;     // by which the whole mean follows the angles
   double surprise = 0.0;  // squared innovation over its expectation
 };
 

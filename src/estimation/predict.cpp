@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "chainsplat/dynamics/parametrization.h"
+#include "src/estimation/setup.h"
 #include "src/estimation/unknown_force.h"
 
 namespace chainsplat::estimation {
@@ -23,6 +24,10 @@ constexpr double kFirstAngle = 0.15;  // rad
 constexpr double kFirstRate = 1.0;    // rad/s
 constexpr double kFirstForce = 0.3;   // N per kilogram of rope, for a constant force such as a wrong rest shape causes
 
+// The same of a rope that nobody touches: the errors of the twin's rest shape.
+constexpr double kRestingAngle = 0.02;  // rad
+constexpr double kRestingForce = 0.1;   // N per kilogram
+
 // The masks' shift on a table, where a contact shadow may count as rope: a strip of about a pixel shifts the mask by
 // half a pixel. In one camera it changes slowly while the rope lies in constant light.
 constexpr double kMaskShift = 0.2;        // px, standard deviation from the shift expected from the edge offset,
@@ -30,7 +35,7 @@ constexpr double kLowerSide = 0.8;        // which is this share of the offset, 
 constexpr double kMaskShiftMemory = 5.0;  // s
 
 constexpr double kLateStep = 0.01;   // s, to either side, of differences by the base's clock
-constexpr double kUnseenTurn = 0.1;  // diameters by which angles that move no link's end (twist) move the surface
+constexpr double kTurnStep = 0.001;  // rad, the same by the grasp
 
 // Returns the expected shift of each camera's masks, px in x and y. A camera above the table sees the rope's contact
 // with it, and the shadow there, on the rope's lower side, so that a mask that is too wide is too wide on that side.
@@ -72,7 +77,8 @@ Belief first_belief(const State& state, double time) {
   const int size = 3 * n + (given.table_normal ? 2 * static_cast<int>(state.cameras.size()) : 0);
   Belief belief;
   belief.time = time;
-  belief.mean = belief.by_late = VectorX::Zero(size);
+  belief.mean = VectorX::Zero(size);
+  belief.by_setup = MatrixX::Zero(size, state.setup.mean.size());
   const auto [theta, thetadot] = motion_from_rest(
       given, [&](double t) { return base_at(state, t); }, time);
   belief.mean.head(n) = theta;
@@ -90,12 +96,22 @@ Belief first_belief(const State& state, double time) {
   return belief;
 }
 
+Belief resting_belief(const State& state, double time) {
+  const int n = state.given.model.chain.angles();
+  Belief belief = first_belief(state, time);
+  belief.covariance.diagonal().head(n).setConstant(kRestingAngle * kRestingAngle);
+  belief.covariance.middleRows(2 * n, n) *= kRestingForce / kFirstForce;
+  belief.covariance.middleCols(2 * n, n) *= kRestingForce / kFirstForce;
+  return belief;
+}
+
 Motion move(const State& state, const Belief& belief, double time) {
   const Given& given = state.given;
   const int n = given.model.chain.angles();
   const double h = time - belief.time;
   Motion out;
   out.time = time;
+  out.by_setup = MatrixX::Zero(2 * n, state.setup.mean.size());
   // by the dynamics and their sensitivities
   if (given.identified) {
     dynamics::Model model = given.model;
@@ -117,9 +133,13 @@ Motion move(const State& state, const Belief& belief, double time) {
       out.thetadot_by_state = MatrixX::Zero(n, 3 * n);
       out.theta_by_state.leftCols(unknowns.size()) = sensitivities.theta.back();
       out.thetadot_by_state.leftCols(unknowns.size()) = sensitivities.thetadot.back();
-      const auto moved = [&](double late) {
-        const dynamics::BaseGrid off = dynamics::sample_base([&](double t) { return base_at(state, t + late); },
-                                                             belief.time, {time}, model.parameters.substeps);
+      const auto moved = [&](int unknown, double step) {
+        VectorX setup = state.setup.mean;
+        setup[unknown] += step;
+        const BaseCorrection correction = base_correction(setup);
+        const dynamics::BaseGrid off =
+            dynamics::sample_base([&](double t) { return corrected(given.base, correction, t); }, belief.time, {time},
+                                  model.parameters.substeps);
         VectorX end(2 * n);
         chain::States moving;
         if (dynamics::simulate(model, off, now, moving))
@@ -128,41 +148,24 @@ Motion move(const State& state, const Belief& belief, double time) {
           end << out.theta, out.thetadot;
         return end;
       };
-      const VectorX by_late = (moved(kLateStep) - moved(-kLateStep)) / (2.0 * kLateStep);
-      out.theta_by_late = by_late.head(n);
-      out.thetadot_by_late = by_late.tail(n);
+      const auto differ = [&](int unknown, double step) {
+        out.by_setup.col(unknown) = (moved(unknown, step) - moved(unknown, -step)) / (2.0 * step);
+      };
+      differ(silhouette::SetupEquations::kClock, kLateStep);
+      for (int i = 0; bends_in_plane(model.chain) && i < 3; ++i)
+        differ(silhouette::SetupEquations::kGrasp + i, kTurnStep);
       return out;
     }
   }
   // at constant rate, without dynamics or where their integration failed
   out.theta = belief.mean.head(n) + h * belief.mean.segment(n, n);
   out.thetadot = belief.mean.segment(n, n);
-  out.theta_by_late = out.thetadot_by_late = VectorX::Zero(n);
   out.theta_by_state = MatrixX::Zero(n, 3 * n);
   out.theta_by_state.leftCols(n).setIdentity();
   out.theta_by_state.middleCols(n, n) = h * MatrixX::Identity(n, n);
   out.thetadot_by_state = MatrixX::Zero(n, 3 * n);
   out.thetadot_by_state.middleCols(n, n).setIdentity();
   return out;
-}
-
-VectorX staying_angles(const State& state, const VectorX& theta, double time) {
-  const chain::Chain& chain = state.given.model.chain;
-  const Pose base = base_at(state, time).pose;
-  const Pose before = base_at(state, time - kLateStep).pose * base.inverse(),
-             after = base_at(state, time + kLateStep).pose * base.inverse();
-  const std::vector<Pose> motions = chain::link_motions(chain, theta, base);
-  const MatrixX nodes = chain::nodes(chain, motions);
-  const std::vector<MatrixX> jacobians =
-      chain::link_end_jacobians(chain, chain::world_axes(chain, theta, base), motions);
-  MatrixX normal = chain::displacement_metric(jacobians);
-  normal.diagonal().array() += std::pow(kUnseenTurn * chain.diameter, 2);
-  VectorX pull = VectorX::Zero(theta.size());
-  for (std::size_t i = 0; i < jacobians.size(); ++i) {
-    const Vector3 end = nodes.col(static_cast<Eigen::Index>(i) + 2);
-    pull -= jacobians[i].transpose() * (after * end - before * end) / (2.0 * kLateStep);
-  }
-  return normal.ldlt().solve(pull);
 }
 
 Belief predict(const State& state, const Belief& belief, const Motion& motion, Contact contact) {
@@ -188,9 +191,8 @@ Belief predict(const State& state, const Belief& belief, const Motion& motion, C
   out.mean << motion.theta, motion.thetadot, keep * belief.mean.segment(2 * n, n),
       keep_mask_shift * belief.mean.tail(size - 3 * n);
   if (size > 3 * n) out.mean.tail(size - 3 * n) += (1.0 - keep_mask_shift) * expected_mask_shifts(state, time);
-  out.by_late = transition * belief.by_late;
-  out.by_late.head(n) += motion.theta_by_late;
-  out.by_late.segment(n, n) += motion.thetadot_by_late;
+  out.by_setup = transition * belief.by_setup;
+  out.by_setup.topRows(2 * n) += motion.by_setup;
   out.covariance = transition * belief.covariance * transition.transpose();
   out.covariance.diagonal().tail(size - 3 * n).array() +=
       kMaskShift * kMaskShift * (1.0 - keep_mask_shift * keep_mask_shift);

@@ -14,6 +14,9 @@ std::pair<math::VectorX, math::VectorX> motion_from_rest(const Given& given, con
 // Returns a wide belief around that motion.
 Belief first_belief(const State& state, double time);
 
+// The same where nobody touches the rope.
+Belief resting_belief(const State& state, double time);
+
 // What may have happened to the rope in a step: nothing beyond the model, a force that changes as under a hand, or also
 // a blow, when the rope runs into something or is released.
 enum class Contact { none, touched, struck };
@@ -23,10 +26,6 @@ enum class Contact { none, touched, struck };
 Motion move(const State& state, const Belief& belief, double time);
 // Returns the belief at the time to which it was moved.
 Belief predict(const State& state, const Belief& belief, const Motion& motion, Contact contact);
-
-// Returns how angles that the cameras have seen, rad/s, change with how late the base's stamps are: the links' ends
-// stay in the world while the base moves.
-math::VectorX staying_angles(const State& state, const math::VectorX& theta, double time);
 
 // Whether the motion until that time is known already.
 bool is_ahead(const State& state, double time);

@@ -40,9 +40,6 @@ constexpr double kKnownClock = 0.005;        // s
 constexpr double kSureOfClock = 2.0;         // deviations
 constexpr double kBeforeFirst = 1.0 / 30.0;  // s, to the first frame from what was believed before
 
-// Whether the grasp's rotation is a number of its own: the first joint of a chain that bends in space takes it.
-bool bends_in_plane(const chain::Chain& chain) { return chain.angles() < chain.links(); }
-
 void add_table(const Given& given, Setup& setup) {
   if (!given.table_normal || !bends_in_plane(given.model.chain)) return;
   const Vector3 normal = given.base(given.base_start).pose.rotation.transpose() * *given.table_normal;
@@ -76,6 +73,13 @@ double displacement(const chain::Chain& chain, const VectorX& theta, const Vecto
   return std::sqrt(change.dot(chain::displacement_metric(jacobians) * change) / static_cast<double>(jacobians.size()));
 }
 
+// Nothing is said of these numbers.
+void leave_out(SetupEquations& frame, int at, int size) {
+  frame.information.middleRows(at, size).setZero();
+  frame.information.middleCols(at, size).setZero();
+  frame.gradient.segment(at, size).setZero();
+}
+
 void move_cameras(State& state) {
   int at = SetupEquations::kCameras;
   for (std::size_t c = 0; c < state.cameras.size(); ++c) {
@@ -107,8 +111,11 @@ Setup first_setup(const Given& given, const std::vector<char>& unverified) {
   setup.mean = setup.information.ldlt().solve(setup.right);
   setup.first_information = setup.information;
   setup.first_right = setup.right;
-  setup.angles = MatrixX::Zero(given.model.chain.angles(), given.model.chain.angles());
   return setup;
+}
+
+MatrixX covariance(const Setup& setup) {
+  return setup.information.ldlt().solve(MatrixX::Identity(setup.mean.size(), setup.mean.size()));
 }
 
 double late_deviation(const Setup& setup) {
@@ -116,14 +123,37 @@ double late_deviation(const Setup& setup) {
   return std::sqrt(setup.information.ldlt().solve(clock)[SetupEquations::kClock]);
 }
 
-BaseCorrection base_correction(const Setup& setup) {
-  return {setup.mean[SetupEquations::kClock],
-          {math::exp_so3(setup.mean.segment<3>(SetupEquations::kGrasp)), Vector3::Zero()}};
+BaseCorrection base_correction(const VectorX& mean) {
+  return {mean[SetupEquations::kClock], {math::exp_so3(mean.segment<3>(SetupEquations::kGrasp)), Vector3::Zero()}};
+}
+
+bool bends_in_plane(const chain::Chain& chain) { return chain.angles() < chain.links(); }
+
+std::vector<MatrixX> rope_twists(const State& state, double time) {
+  const auto turned = [](const Pose& frame, const Vector3& axis) {
+    return math::transform_twist(frame, (math::Vector6() << axis, Vector3::Zero()).finished());
+  };
+  const trajectory::BaseMotion base = base_at(state, time);
+  MatrixX shared = MatrixX::Zero(6, state.setup.mean.size());
+  shared.col(SetupEquations::kClock) = math::transform_twist(base.pose, base.velocity);
+  for (int i = 0; bends_in_plane(state.given.model.chain) && i < 3; ++i)
+    shared.col(SetupEquations::kGrasp + i) = turned(base.pose, Vector3::Unit(i));
+  std::vector<MatrixX> out(state.cameras.size(), shared);
+  int at = SetupEquations::kCameras;
+  for (std::size_t c = 0; c < state.cameras.size(); ++c) {
+    if (!state.setup.posed[c]) continue;
+    for (int i = 0; i < 3; ++i) {
+      out[c].col(at + i) = -turned(state.cameras[c].world_from_camera, Vector3::Unit(i));
+      out[c](3 + i, at + 3 + i) = -1.0;
+    }
+    at += SetupEquations::kPerCamera;
+  }
+  return out;
 }
 
 bool may_go_otherwise(const State& state, double time) {
   const double reach = kSureOfClock * clock_deviation(state);
-  if (!state.options.learns_setup || !state.given.identified || reach < kSureOfClock * kKnownClock) return false;
+  if (!state.given.identified || reach < kSureOfClock * kKnownClock) return false;
   const auto velocity = [&](double at) {
     const trajectory::BaseMotion base = base_at(state, at);
     return Vector3(base.pose.rotation * base.velocity.tail<3>());
@@ -138,11 +168,11 @@ std::vector<capture::Finding> findings(const State& state) {
   constexpr double kLeastShift = 0.001;  // m
   constexpr double kDegrees = 180.0 / std::numbers::pi;
   const Setup& setup = state.setup;
-  const MatrixX covariance = setup.information.ldlt().solve(MatrixX::Identity(setup.mean.size(), setup.mean.size()));
+  const MatrixX known = covariance(setup);
   std::vector<capture::Finding> out;
   char text[200];
   const double late = setup.mean[SetupEquations::kClock];
-  const double clock = std::sqrt(covariance(SetupEquations::kClock, SetupEquations::kClock));
+  const double clock = std::sqrt(known(SetupEquations::kClock, SetupEquations::kClock));
   if (std::abs(late) > std::max(kLeastClock, kSure * clock)) {
     std::snprintf(text, sizeof text, "the base's stamps are %.1f +- %.1f ms %s: followed with the time that fits",
                   1e3 * std::abs(late), 1e3 * clock, late > 0.0 ? "late" : "early");
@@ -155,7 +185,7 @@ std::vector<capture::Finding> findings(const State& state) {
     const auto size = [&](int first, double* deviation) {
       const Vector3 value = setup.mean.segment<3>(first);
       const Vector3 along = value.norm() > 0.0 ? value.normalized() : Vector3::UnitX();
-      *deviation = std::sqrt(along.dot(covariance.block<3, 3>(first, first) * along));
+      *deviation = std::sqrt(along.dot(known.block<3, 3>(first, first) * along));
       return value.norm();
     };
     double turn_deviation, shift_deviation;
@@ -182,38 +212,29 @@ std::optional<SetupEquations> look_at_setup(const State& state, std::span<const 
   if (!math::is_positive(factor)) return {};
   silhouette::Options options = state.options.silhouette;
   options.prior.mean = predicted.mean.head(n);
-  options.prior.information = factor.solve(MatrixX::Identity(n, n));
+  options.prior.information = factor.solve(MatrixX::Identity(n, n)) / state.options.new_share;  // as measure() does
   options.edge_offset = state.edge_offset;
   options.edge_offset_deviation = kWidth;
   SetupEquations frame = silhouette::setup_equations(
       chain, [&](double time) { return base_as_timed(state, time); }, views, state.cameras, state.setup.posed, theta,
-      options);
-  if (!frame.information.allFinite() || !frame.gradient.allFinite()) return {};
+      predicted.by_setup.topRows(n), options);
+  if (!frame.information.allFinite() || !frame.gradient.allFinite() || !frame.angles.allFinite()) return {};
+  if (!bends_in_plane(chain)) {
+    leave_out(frame, SetupEquations::kGrasp, 3);
+    frame.angles.middleCols<3>(SetupEquations::kGrasp).setZero();
+  }
   return frame;
 }
 
-void learn_setup(State& state, const std::optional<SetupEquations>& looked, const Belief& predicted,
-                 const VectorX& theta) {
-  if (!looked) return;
-  SetupEquations frame = *looked;
+void learn_setup(State& state, SetupEquations frame, const Belief& predicted) {
   Setup& setup = state.setup;
   const chain::Chain& chain = state.given.model.chain;
   const int n = chain.angles();
-  const auto leave_out = [&](int at, int size) {
-    frame.information.middleRows(at, size).setZero();
-    frame.information.middleCols(at, size).setZero();
-    frame.gradient.segment(at, size).setZero();
-    frame.angles.middleCols(at, size).setZero();
-  };
   // without dynamics nothing tells a rope that follows late from a base that is stamped late
   const bool moving = base_as_timed(state, predicted.time).velocity.tail<3>().norm() >= kMoving;
-  if (!state.given.identified || !moving) leave_out(SetupEquations::kClock, 1);
-  if (!bends_in_plane(chain)) leave_out(SetupEquations::kGrasp, 3);
+  if (!state.given.identified || !moving) leave_out(frame, SetupEquations::kClock, 1);
 
-  if (!state.options.learns_setup) {
-    frame.information.setZero();
-    frame.gradient.setZero();
-  } else if (setup.frames < kFrames) {
+  if (setup.frames < kFrames) {
     ++setup.frames;
   } else if (moving) {
     setup.information -= (setup.information - setup.first_information) / kFrames;
@@ -224,16 +245,18 @@ void learn_setup(State& state, const std::optional<SetupEquations>& looked, cons
   }
   setup.information += frame.information;
   setup.right += frame.information * setup.mean - frame.gradient;
-  const Eigen::LDLT<MatrixX> solver(setup.information);
-  VectorX mean = solver.solve(setup.right);
+  VectorX mean = setup.information.ldlt().solve(setup.right);
   mean[SetupEquations::kClock] = std::clamp(mean[SetupEquations::kClock], -kLatestClock, kLatestClock);
-  const VectorX change = frame.angles * (mean - setup.mean);
+  const VectorX change = mean - setup.mean;
   setup.mean = std::move(mean);
-  setup.angles = frame.angles * solver.solve(frame.angles.transpose());
   move_cameras(state);
-  if (state.belief) state.belief->mean.head(n) += change;
+  if (!state.belief) return;
+  const VectorX moved = state.belief->by_setup * change;
+  const VectorX theta = state.belief->mean.head(n);
+  state.belief->mean += moved;
   const double interval = setup.last == kNever ? kBeforeFirst : predicted.time - setup.last;
-  if (displacement(chain, theta, change) > kSettled * interval) setup.settling_until = predicted.time + kSettlingTime;
+  if (displacement(chain, theta, moved.head(n)) > kSettled * interval)
+    setup.settling_until = predicted.time + kSettlingTime;
 }
 
 }  // namespace chainsplat::estimation

@@ -10,17 +10,23 @@ namespace chainsplat::estimation {
 // whether no training has compared its pose with the rope; empty: none.
 Setup first_setup(const Given& given, const std::vector<char>& unverified);
 
-// What of it the base is mended by, and the standard deviation of how late its stamps are, s.
-BaseCorrection base_correction(const Setup& setup);
+// What of it the base is mended by, where `mean` is what is believed of it.
+BaseCorrection base_correction(const math::VectorX& mean);
+// The covariance of it, m x m, and the standard deviation of how late the base's stamps are, s.
+math::MatrixX covariance(const Setup& setup);
 double late_deviation(const Setup& setup);
+// Whether the grasp's rotation is learned: the first joint of a chain that bends in space takes it.
+bool bends_in_plane(const chain::Chain& chain);
+// How the whole rope moves before the cameras with each of its numbers, if no angle changes: twists about the world's
+// origin, 6 x m per camera. Cameras of which nothing is learned stay.
+std::vector<math::MatrixX> rope_twists(const State& state, double time);
 
-// What a frame that is explained says of the setup. The belief before it was `predicted`, and its masks found the
-// angles `theta`. None where it says nothing.
+// What a frame that is explained says of the setup, and how its angles follow it. The belief before it was `predicted`,
+// and its masks found the angles `theta`. None where it says nothing.
 std::optional<silhouette::SetupEquations> look_at_setup(const State& state, std::span<const capture::View* const> views,
                                                         const Belief& predicted, const math::VectorX& theta);
-// Takes that. The state's cameras and its belief, if it has one, move with the setup.
-void learn_setup(State& state, const std::optional<silhouette::SetupEquations>& looked, const Belief& predicted,
-                 const math::VectorX& theta);
+// Takes what it says. The state's cameras and its belief, if it has one, move with the setup.
+void learn_setup(State& state, silhouette::SetupEquations frame, const Belief& predicted);
 
 // Whether the base's velocity at this time, s, may be clearly another than its stamps say, because its clock is not
 // known well enough yet. A rope that follows such a base seems to be pushed.

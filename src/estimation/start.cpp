@@ -25,7 +25,6 @@ bool identified_shifts(const dynamics::Parameters& parameters) {
 
 Options options_for_live_masks(bool tabletop) {
   Options options;
-  options.learns_setup = false;
   if (tabletop) return options;
   // with the usual shares a pushed rope in free space was lost
   options.new_share = 0.1;
@@ -76,7 +75,7 @@ State start(const twin::Twin& twin, const std::vector<capture::Camera>& cameras,
 }
 
 trajectory::BaseMotion base_at(const State& state, double time) {
-  return corrected(state.given.base, base_correction(state.setup), time);
+  return corrected(state.given.base, base_correction(state.setup.mean), time);
 }
 
 }  // namespace chainsplat::estimation

@@ -32,7 +32,6 @@ struct Setup {
   math::VectorX mean;
   math::MatrixX information;        // of what is known beforehand and of all frames
   math::VectorX right;              // information times mean
-  math::MatrixX angles;             // rad^2, n x n: what the rest of its uncertainty adds to the last frame's angles
   math::MatrixX first_information;  // of what is known beforehand alone
   math::VectorX first_right;
   int frames = 0;                  // that count
@@ -46,7 +45,9 @@ struct Belief {
   double time = 0.0;  // s
   math::VectorX mean;
   math::MatrixX covariance;
-  math::VectorX by_late;  // per s: how the mean changes with how late the base's stamps are
+  // How the mean changes with the setup's m numbers, 3 n (and the shifts) x m. The covariance is that of a setup that
+  // is what it is believed to be; what is not known of it adds by_setup C by_setup^T.
+  math::MatrixX by_setup;
 };
 
 // The mean of a belief moved to a later time by the twin's dynamics, and its derivatives by the mean before, n x 3 n.
@@ -54,7 +55,8 @@ struct Motion {
   double time = 0.0;  // s
   math::VectorX theta, thetadot;
   math::MatrixX theta_by_state, thetadot_by_state;
-  math::VectorX theta_by_late, thetadot_by_late;  // rad/s, rad/s^2: by the base's clock, from the same mean before
+  math::MatrixX
+      by_setup;  // of theta and thetadot, 2 n x m: by the base's clock and the grasp, from the same mean before
 };
 
 // The filter between two frames.

@@ -46,6 +46,8 @@ constexpr double kFarthestGrasp = 2.5;                        // deviations that
 constexpr double kGraspStep = 0.7;                            // in steps of this many diameters,
 constexpr int kMostGraspSteps = 3;                            // but at most so many on either side
 constexpr std::array kGraspRefinements = {0.35, 0.18, 0.09};  // diameters
+// What an angle costs that is found and not known: the log of how much wider its prior is than what pictures tell.
+constexpr double kFoundAngle = 2.0;  // nats
 // evidence of the outlines
 constexpr int kRandomPlaces = 4000;
 constexpr double kSurprise = 1.0;          // nats, the mean of a random place, which counts as nothing
@@ -436,6 +438,31 @@ std::vector<Vector3> beginnings(const chain::Chain& chain, std::span<const Shot>
   return out;
 }
 
+// The directions in which the grasp is sought, base frame.
+std::vector<Vector3> view_axes(std::span<const Shot> shots) {
+  const Matrix3 axes = shots[0].camera_from_base.rotation.transpose();
+  std::vector<Vector3> out{axes.col(0), axes.col(1)};  // of one camera only across its view, as above
+  if (shots.size() > 1) out.push_back(axes.col(2));
+  return out;
+}
+
+// The score of a rope of that shape, and by how much its beginning is off.
+std::pair<double, Vector3> placed(const Search& search, const std::vector<Tally>& begin, const VectorX& theta) {
+  std::pair<double, Vector3> best{-std::numeric_limits<double>::infinity(), Vector3::Zero()};
+  const auto try_it = [&](const Vector3& shift) {
+    std::vector<Tally> tallies = begin;
+    const double score = search.whole(theta, shift, tallies);
+    if (score > best.first) best = {score, shift};
+  };
+  for (const Vector3& shift : beginnings(search.chain, search.shots, search.clues)) try_it(shift);
+  if (search.clues.grasp_deviation <= 0.0) return best;
+  for (const double step : kGraspRefinements)
+    for (int sweep = 0; sweep < kSweeps; ++sweep)
+      for (const Vector3& axis : view_axes(search.shots))
+        for (const double sign : {1.0, -1.0}) try_it(best.second + sign * step * search.chain.diameter * axis);
+  return best;
+}
+
 }  // namespace
 
 void add(Tally& tally, const Tally& other) {
@@ -542,13 +569,12 @@ Grown grow(const chain::Chain& chain, std::span<const Shot> shots, std::span<con
     const double score = search.whole(angles, moved, tallies);
     if (score > best) best = score, theta = angles, shift = moved;
   };
-  const Matrix3 view_axes = shots[0].camera_from_base.rotation.transpose();
   for (std::size_t round = 0; round < kRefinements.size(); ++round)
     for (int sweep = 0; sweep < kSweeps; ++sweep) {
       if (clues.grasp_deviation > 0.0)
-        for (int axis = 0; axis < (shots.size() > 1 ? 3 : 2); ++axis)
+        for (const Vector3& axis : view_axes(shots))
           for (const double sign : {1.0, -1.0})
-            try_it(theta, shift + sign * kGraspRefinements[round] * chain.diameter * view_axes.col(axis));
+            try_it(theta, shift + sign * kGraspRefinements[round] * chain.diameter * axis);
       for (int k = 0; k < chain.angles(); ++k)
         for (int shape = 0; shape < 3; ++shape) {
           if (k + shape * axes >= chain.angles()) continue;
@@ -562,6 +588,10 @@ Grown grow(const chain::Chain& chain, std::span<const Shot> shots, std::span<con
           }
         }
     }
+  if (clues.shape.size() == chain.angles()) {
+    const auto [score, begins] = placed(search, begin, clues.shape);
+    if (score > best - kFoundAngle * static_cast<double>(chain.angles())) theta = clues.shape, shift = begins;
+  }
   out.theta = theta;
   out.shift = shift;
   // the evidence and the tallies of this moment alone

@@ -29,6 +29,7 @@ struct Shot {
 struct Clues {
   math::Vector3 down = math::Vector3::Zero();   // unit, base frame, where it hangs at rest; zero: it need not
   math::Vector3 grasp = math::Vector3::Zero();  // m, base frame: the grasp is thought to be off by this,
+  math::VectorX shape;      // rad, angles that are likely, as of a rope that rests; empty: not known
   double bend_change = 0.0;      // rad, by which neighboring joints' angles differ, as in a stiff cable; 0: unknown
   double grasp_deviation = 0.0;  // m, and how sure that is; 0: it is exactly there
 };

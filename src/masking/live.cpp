@@ -80,7 +80,7 @@ struct LiveMasks::State {
     if (learning.valid()) learning.get();
   }
   void learn_first_frame(const Picture& picture, const math::Rectangle& box);
-  std::optional<math::VectorX> grown_in(const Picture& picture, const math::Pose& base) const;
+  std::optional<Grown> found_in(const Picture& picture, const math::Pose& base, const LiveStart& start) const;
   void learn_background(const Picture& picture, const math::Rectangle& box, const Tube& around);
   void learn_colors(const Picture& picture, const Reach& where, const Tube& around, const capture::View& mask);
 };
@@ -148,13 +148,17 @@ void LiveMasks::State::learn_first_frame(const Picture& picture, const math::Rec
   settle(look);
 }
 
-// The angles of a chain grown in this picture; none where nothing is a rope, and for chains with twist joints.
-std::optional<math::VectorX> LiveMasks::State::grown_in(const Picture& picture, const math::Pose& base) const {
+// The rope in this picture; none where nothing is a rope, and for chains with twist joints.
+std::optional<Grown> LiveMasks::State::found_in(const Picture& picture, const math::Pose& base,
+                                                const LiveStart& start) const {
   const int joints = chain.links() - 1;
   if (chain.angles() != joints && chain.angles() != 2 * joints) return {};
   const Shot shot{picture, &pinhole, pinhole.world_from_camera.inverse() * base, {}, {}};
-  const Grown grown = grow(chain, {&shot, 1}, {});
-  return grown.evidence > kLeastEvidence ? std::optional(grown.theta) : std::nullopt;
+  Clues clues;
+  clues.shape = start.resting;
+  clues.grasp_deviation = start.grasp_deviation;
+  Grown grown = grow(chain, {&shot, 1}, {}, clues);
+  return grown.evidence > kLeastEvidence ? std::optional(std::move(grown)) : std::nullopt;
 }
 
 // Learns the background in the box where the tube is not.
@@ -221,19 +225,35 @@ void LiveMasks::learn_marks(const capture::View& drawn, const math::Pose& base, 
   s.look.marks = marks(drawn, tube(s.chain, base, theta, s.pinhole, 0.0, s.chain.length, 0.0), s.chain);
 }
 
+void LiveMasks::see_from(const math::Pose& world_from_camera) {
+  State& s = *state_;
+  if (world_from_camera.rotation == s.pinhole.world_from_camera.rotation &&
+      world_from_camera.translation == s.pinhole.world_from_camera.translation)
+    return;
+  s.end_learning();
+  s.camera.world_from_camera = s.pinhole.world_from_camera = world_from_camera;
+  s.ahead.reset();
+}
+
 void LiveMasks::expect(const math::Pose& base, const math::VectorX& theta) {
   state_->ahead = State::Ahead{base, theta, state_->expected(base, theta)};
 }
 
-capture::View LiveMasks::mask(const capture::Image8& recorded, const math::Pose& base,
-                              const std::optional<math::VectorX>& theta) {
+capture::View LiveMasks::mask(const capture::Image8& recorded, const math::Pose& given,
+                              const std::optional<math::VectorX>& theta, const LiveStart& start) {
   State& s = *state_;
   s.end_learning();
+  math::Pose base = given;
   const Reach where = reach(s.chain, base, s.pinhole);
   if (where.box.empty()) return {};
   const Picture picture = s.straightened(recorded, where.box);
   if (s.frames == 0) s.learn_first_frame(picture, where.box);
-  const std::optional<math::VectorX> place = theta ? theta : s.grown_in(picture, base);
+  std::optional<math::VectorX> place = theta;
+  if (!theta)
+    if (std::optional<Grown> found = s.found_in(picture, base, start)) {
+      place = std::move(found->theta);
+      base.translation += base.rotation * found->shift;
+    }
   Tube tube;
   if (place) tube = s.ahead && s.ahead->is(base, *place) ? std::move(s.ahead->tube) : s.expected(base, *place);
   s.ahead.reset();

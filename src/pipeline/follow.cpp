@@ -84,6 +84,10 @@ void warm_up(const estimation::CompareColors& compare_colors, const std::vector<
   }
 }
 
+// m, by which a rope may seem to begin beside its grasp, where a camera is not known to stand where it is said to: a
+// turn of half a degree moves what is a meter away by 9 mm.
+constexpr double kSeemsOff = 0.008;
+
 std::string name_of(const SourceOptions& source) {
   return source.source.string() + (source.camera.empty() ? "" : ":" + source.camera);
 }
@@ -105,6 +109,7 @@ struct Tracker::Implementation {
   Kinds follower;
   std::optional<bool> masked_before;                       // by the first picture
   std::optional<masking::LiveMasks> live;                  // masks made here
+  bool unsure_of_pose = false;                             // a camera's pose was not compared with the rope
   std::array<int, 4> masked = {0, 0, 0, 0};                // crop of the last mask: x0, y0, width, height
   int marked = -1;                                         // frames that were masked when marks were learned last
   double last = -std::numeric_limits<double>::infinity();  // s, of the last frame
@@ -125,6 +130,9 @@ struct Tracker::Implementation {
   const std::vector<capture::Camera>& cameras() const {
     return std::visit([](const auto& f) -> const std::vector<capture::Camera>& { return f.cameras(); }, follower);
   }
+  math::Pose believed_base(double time) const {
+    return std::visit([&](const auto& f) { return f.base_at(time); }, follower).pose;
+  }
   const math::VectorX& rest() const {
     return std::visit([](const auto& f) -> const math::VectorX& { return f.rest(); }, follower);
   }
@@ -133,7 +141,11 @@ struct Tracker::Implementation {
 Tracker::Implementation::Implementation(const twin::Twin& followed, const std::vector<capture::Camera>& cameras,
                                         const std::vector<char>& unverified, dynamics::BaseFunction given, double start,
                                         const TrackerOptions& wanted)
-    : options(wanted), twin(followed), base(std::move(given)), follower(make_follower(cameras, unverified, start)) {}
+    : options(wanted),
+      twin(followed),
+      base(std::move(given)),
+      follower(make_follower(cameras, unverified, start)),
+      unsure_of_pose(std::find(unverified.begin(), unverified.end(), 1) != unverified.end()) {}
 
 Tracker::Implementation::Kinds Tracker::Implementation::make_follower(const std::vector<capture::Camera>& cameras,
                                                                       const std::vector<char>& unverified,
@@ -273,10 +285,11 @@ capture::View Tracker::mask(const capture::Image8& picture, double time) {
     return view;
   };
   if (!t.live) return marked(bright_view(picture, camera));
-  const math::Pose pose = t.base(time).pose;
   const std::optional<math::VectorX> theta = t.expected(time);
+  const math::Pose pose = t.believed_base(time);
+  t.live->see_from(camera.world_from_camera);
   t.learn_marks(pose, theta.value_or(t.rest()));  // marks stay on the rope wherever it lies
-  capture::View view = t.live->mask(picture, pose, theta);
+  capture::View view = t.live->mask(picture, pose, theta, {t.rest(), t.unsure_of_pose ? kSeemsOff : 0.0});
   t.masked = {view.x0, view.y0, view.width, view.height};
   return marked(std::move(view));
 }
@@ -284,10 +297,13 @@ capture::View Tracker::mask(const capture::Image8& picture, double time) {
 void Tracker::between_frames(std::optional<double> next) {
   Implementation& t = *implementation_;
   if (const std::optional<math::VectorX> theta = t.live ? t.expected(t.last) : std::nullopt)
-    t.learn_marks(t.base(t.last).pose, *theta);
+    t.learn_marks(t.believed_base(t.last), *theta);
   if (!next || !(*next > t.last)) return;
   const std::optional<math::VectorX> theta = t.expected(*next);  // the follower keeps what it took to know them
-  if (theta && t.live) t.live->expect(t.base(*next).pose, *theta);
+  if (theta && t.live) {
+    t.live->see_from(t.cameras()[0].world_from_camera);
+    t.live->expect(t.believed_base(*next), *theta);
+  }
 }
 
 const twin::Twin& Tracker::twin() const { return implementation_->twin; }

@@ -326,7 +326,8 @@ FrameEquations frame_equations(const CorrectionProblem& problem, const Corrected
 SetupEquations setup_equations(const chain::Chain& chain,
                                const std::function<trajectory::BaseMotion(double time)>& base,
                                std::span<const capture::View* const> views, const std::vector<capture::Camera>& cameras,
-                               const std::vector<char>& posed, const VectorX& theta, const Options& options) {
+                               const std::vector<char>& posed, const VectorX& theta, const MatrixX& expected,
+                               const Options& options) {
   const int n = chain.angles();
   const MatrixX prior = kEvidence * options.prior.information;
   CorrectionProblem problem{{views.begin(), views.end()}, cameras, base, {}, 0, {}, prior, {}, kLargestCut, kEndReach};
@@ -356,7 +357,20 @@ SetupEquations setup_equations(const chain::Chain& chain,
     frame.masks.push_back(mask_points(*views[v], cameras.at(views[v]->camera), Options{}.max_pixels));
     frame.views.push_back(static_cast<int>(v));
   }
-  const FrameEquations equations = frame_equations(problem, frame, {}, chain, theta);
+  FrameEquations equations = frame_equations(problem, frame, {}, chain, theta);
+  CHAINSPLAT_CHECK(expected.rows() == n && expected.cols() == m, "how the prior's mean changes");
+  // the angles are what is expected of them with these unknowns, and a difference from it, which the prior is of
+  MatrixX follows = MatrixX::Zero(n, m + widths);
+  follows.leftCols(m) = expected;
+  for (int k = 0; k < n; ++k)
+    if (problem.held[k]) follows.row(k).setZero();
+  MatrixX outlines = equations.local.matrix - prior;
+  for (int k = 0; k < n; ++k)
+    if (problem.held[k]) outlines.row(k).setZero();
+  const MatrixX crossed = follows.transpose() * equations.local.coupling;
+  equations.shared += crossed + crossed.transpose() + follows.transpose() * outlines * follows;
+  equations.shared_gradient += follows.transpose() * (equations.local.gradient - prior * theta);
+  equations.local.coupling += outlines * follows;
   // what ends with this frame, its angles and the edge offsets, is eliminated
   const double known = 1.0 / (options.edge_offset_deviation * options.edge_offset_deviation);
   MatrixX own(n + widths, n + widths), coupling(n + widths, m);
@@ -369,7 +383,7 @@ SetupEquations setup_equations(const chain::Chain& chain,
       (equations.shared_gradient.tail(widths).array() - known * options.edge_offset).matrix();
   const MatrixX moved = own.ldlt().solve(coupling);
   return {equations.shared.topLeftCorner(m, m) - moved.transpose() * coupling,
-          equations.shared_gradient.head(m) - moved.transpose() * gradient, -moved.topRows(n)};
+          equations.shared_gradient.head(m) - moved.transpose() * gradient, expected - moved.topRows(n)};
 }
 
 }  // namespace chainsplat::silhouette
