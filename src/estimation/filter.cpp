@@ -51,6 +51,7 @@ constexpr int kFirstRounds = 3;      // of masks and setup in turn, in the first
 // Share of the masks that the rope covers, below which something else is in them, and the rope is sought elsewhere,
 // too; there it must cover so much more.
 constexpr double kUnexplained = 0.8, kBetter = 0.1;
+constexpr int kFirstFrames = 8;        // of which the setup is learned though the colors are unlike: a camera is off
 constexpr double kDoubtAngle = 0.2;    // rad, added to the deviations of a doubtful rope's angles
 constexpr double kDoubtMemory = 0.15;  // s without a reason to doubt, after which a rope is not doubtful any more
 constexpr double kLongUnlike = 0.2;    // s of such frames, after which the rope counts as lost
@@ -163,9 +164,8 @@ bool judge(State& state, std::span<const capture::View* const> views, const Atte
   const bool hidden = !state.whole && out.time - state.hidden_since < kLongHidden;
   const double fresh = std::min(1.0 / kSurpriseFrames, (out.time - state.setup.last) / kSurpriseTime);
   state.surprising += fresh * ((out.surprise > kSurprise && !out.lost ? 1.0 : 0.0) - state.surprising);
-  const bool doubt = !state.whole || folded || has_more(fit) || state.surprising > kMostSurprising ||
-                     state.frames < state.options.doubtful_frames;
-  if (doubt) state.last_doubt = out.time;
+  if (!state.whole || folded || has_more(fit) || state.surprising > kMostSurprising) state.last_misfit = out.time;
+  if (state.last_misfit == out.time || state.frames < state.options.doubtful_frames) state.last_doubt = out.time;
   out.doubtful = out.time - state.last_doubt < kDoubtMemory;
   ++state.frames;
   const bool believed = !out.lost && !folded && !hidden;
@@ -197,8 +197,9 @@ void learn(State& state, std::span<const capture::View* const> views, const Atte
   }
   if (first || out.likeness.value_or(1.0) >= kUnlike) state.last_like = out.time;
   learn_force(state, out.time);
-  // where the fit may be wrong, a camera that is moved would make it right
-  if (looked && !out.doubtful) learn_setup(state, *looked, attempt.predicted);
+  // where the fit may be wrong, a camera that is moved would make it right; at first it is the camera that may be wrong
+  const bool fits = out.time - state.last_misfit >= kDoubtMemory;
+  if (looked && fits && (!out.doubtful || state.frames <= kFirstFrames)) learn_setup(state, *looked, attempt.predicted);
   const double gain = 1.0 / kOffsetFrames;
   state.edge_offset += gain * (attempt.measured.fit.edge_offset - state.edge_offset);
   state.edge_offset_variance =

@@ -72,7 +72,8 @@ struct State {
   math::VectorX place;                     // shares of the links' ends in the unknown force, as learned in contact
   double last_seen = kNever;               // s, last frame in which the masks showed the rope
   double last_like = kNever;               // s, last frame in which the colors in the masks were like the twin's
-  double last_doubt = kNever;              // s, last frame that gave reason to doubt
+  double last_misfit = kNever;             // s, last frame whose masks may be another rope's, or not all of it
+  double last_doubt = kNever;              // s, last frame that gave reason to doubt, its colors included
   int frames = 0;                          // in which something was seen
   bool lost = false;                       // in the last frame
   bool whole = false;                      // the masks have shown the whole rope since it was found
