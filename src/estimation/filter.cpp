@@ -51,7 +51,7 @@ constexpr int kFirstRounds = 3;      // of masks and setup in turn, in the first
 // Share of the masks that the rope covers, below which something else is in them, and the rope is sought elsewhere,
 // too; there it must cover so much more.
 constexpr double kUnexplained = 0.8, kBetter = 0.1;
-constexpr int kFirstFrames = 8;        // of which the setup is learned though the colors are unlike: a camera is off
+constexpr int kFirstFrames = 8;        // frames that teach the setup even if their colors are unlike the twin's
 constexpr double kDoubtAngle = 0.2;    // rad, added to the deviations of a doubtful rope's angles
 constexpr double kDoubtMemory = 0.15;  // s without a reason to doubt, after which a rope is not doubtful any more
 constexpr double kLongUnlike = 0.2;    // s of such frames, after which the rope counts as lost

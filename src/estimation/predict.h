@@ -14,7 +14,7 @@ std::pair<math::VectorX, math::VectorX> motion_from_rest(const Given& given, con
 // Returns a wide belief around that motion.
 Belief first_belief(const State& state, double time);
 
-// The same where nobody touches the rope.
+// The same for a rope that is known to hang untouched: a narrow belief.
 Belief resting_belief(const State& state, double time);
 
 // What may have happened to the rope in a step: nothing beyond the model, a force that changes as under a hand, or also

@@ -10,15 +10,16 @@ namespace chainsplat::estimation {
 // whether no training has compared its pose with the rope; empty: none.
 Setup first_setup(const Given& given, const std::vector<char>& unverified);
 
-// What of it the base is mended by, where `mean` is what is believed of it.
+// What the base's motion is corrected by, from the setup's mean.
 BaseCorrection base_correction(const math::VectorX& mean);
 // The covariance of it, m x m, and the standard deviation of how late the base's stamps are, s.
 math::MatrixX covariance(const Setup& setup);
 double late_deviation(const Setup& setup);
 // Whether the grasp's rotation is learned: the first joint of a chain that bends in space takes it.
 bool bends_in_plane(const chain::Chain& chain);
-// How the whole rope moves before the cameras with each of its numbers, if no angle changes: twists about the world's
-// origin, 6 x m per camera. Cameras of which nothing is learned stay.
+// How the rope moves relative to each camera with each of the setup's numbers, if no angle changes: one twist per
+// number (world frame, angular part first), 6 x m per camera. A camera whose pose is not learned has no columns of its
+// own.
 std::vector<math::MatrixX> rope_twists(const State& state, double time);
 
 // What a frame that is explained says of the setup, and how its angles follow it. The belief before it was `predicted`,

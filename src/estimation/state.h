@@ -45,8 +45,8 @@ struct Belief {
   double time = 0.0;  // s
   math::VectorX mean;
   math::MatrixX covariance;
-  // How the mean changes with the setup's m numbers, 3 n (and the shifts) x m. The covariance is that of a setup that
-  // is what it is believed to be; what is not known of it adds by_setup C by_setup^T.
+  // How the mean changes with the setup's m numbers: as many rows as the mean, m columns. `covariance` is that of a
+  // setup that is exactly as believed; with the setup's own covariance C, by_setup C by_setup^T comes on top.
   math::MatrixX by_setup;
 };
 
@@ -55,8 +55,7 @@ struct Motion {
   double time = 0.0;  // s
   math::VectorX theta, thetadot;
   math::MatrixX theta_by_state, thetadot_by_state;
-  math::MatrixX
-      by_setup;  // of theta and thetadot, 2 n x m: by the base's clock and the grasp, from the same mean before
+  math::MatrixX by_setup;  // of theta and thetadot, 2 n x m; from the same mean before, by how the base moves alone
 };
 
 // The filter between two frames.
