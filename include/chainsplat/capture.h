@@ -29,6 +29,7 @@ struct Camera {
   double readout = 0.0;
   // recorded = gain * color + bias of red, green and blue, colors in 0..1, as corrections say (formats.md 2.1.1)
   math::Vector3 gain = math::Vector3::Ones(), bias = math::Vector3::Zero();
+  double mask_offset = 0.0;  // px, by which its masks are wider than the rope on each side, as corrections say
   bool distorted() const;
 };
 

@@ -114,10 +114,15 @@ std::vector<double> lying_down(const chain::Chain& chain, double height, double 
 struct LostFrame {
   int camera = 0, frame = 0;
 };
-// The first one that outlines show, as a jump of the camera's clock against the base's and the other cameras'.
-// `sequence` is fitted to `chain`. Mathematics.md 6.14.
-std::optional<LostFrame> first_lost_frame(const chain::Chain& chain, const capture::Capture& capture,
-                                          const SequenceFit& sequence);
+// What outlines show of it, as jumps of a camera's clock against the base's and the other cameras' (mathematics.md 6.14).
+struct LostFrames {
+  // Each may be one that is lost, the likeliest first. Once it is restored, the others look otherwise.
+  std::vector<LostFrame> likely;
+  // Mean square distance of the outlines about the clocks as they are, px^2: less where one was restored that was lost.
+  double misfit = 0.0;
+};
+// `sequence` is fitted to `chain`.
+LostFrames find_lost_frames(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& sequence);
 
 constexpr double kAsRecognized = 0.02;
 struct CorrectionOptions {

@@ -127,6 +127,7 @@ Camera corrected(const Corrections& corrections, Camera camera) {
   camera.fy *= scale;
   if (const Correction* const gain = find(corrections, camera.name, "gain")) camera.gain += gain->value;
   if (const Correction* const bias = find(corrections, camera.name, "bias")) camera.bias += bias->value;
+  camera.mask_offset += value_of(corrections, camera.name, "mask_offset");
   if (!(camera.gain.minCoeff() > kLeastShare))
     throw InputError(camera.name, "the twin's correction leaves nothing of its colors", "train again");
   return camera;

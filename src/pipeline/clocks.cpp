@@ -16,7 +16,11 @@ using math::VectorX;
 
 namespace {
 
-constexpr int kMostLost = 30;            // frames of all cameras
+constexpr int kMostLost = 30;         // frames of all cameras
+constexpr std::ptrdiff_t kTried = 3;  // places where one may be lost, before it is taken that none is
+// What all frames together miss the outlines by, of what most do: more, and not all that is lost is restored where it
+// was.
+constexpr double kAllFound = 3.0;
 constexpr Eigen::Index kSurelyLost = 1;  // of one camera: where it lost more, some are missed or a few frames off
 
 // Of what identification leaves, in units of what is expected: right recordings leave 0.2, a readout of 15 ms 2.2,
@@ -33,23 +37,75 @@ constexpr double kIndependent = 10.0;
 constexpr int kFewJoints = 8;              // identified in half a second; more explain no more of a readout
 constexpr std::size_t kLeastMoments = 30;  // of fewer, parameters explain any motion
 
+// Frames that cameras lost, and what outlines show where these alone are restored.
+struct Restored {
+  std::vector<silhouette::LostFrame> lost;
+  silhouette::SequenceFit sequence;
+  silhouette::LostFrames found;
+};
+Restored restored(const chain::Chain& chain, capture::Capture capture, std::vector<silhouette::LostFrame> lost) {
+  for (const silhouette::LostFrame& one : lost)
+    capture::restore_lost(VectorX::Constant(1, one.frame), one.camera, capture);
+  silhouette::SequenceFit sequence = silhouette::fit_sequence(chain, capture);
+  silhouette::LostFrames found = silhouette::find_lost_frames(chain, capture, sequence);
+  return {std::move(lost), std::move(sequence), std::move(found)};
+}
+
+// Takes it where the outlines fit better.
+bool improve(Restored& now, Restored other) {
+  if (!(other.found.misfit < now.found.misfit)) return false;
+  now = std::move(other);
+  return true;
+}
+
+// One more, the likeliest that makes the outlines fit better.
+bool add_lost_frame(const chain::Chain& chain, const capture::Capture& capture, Restored& now) {
+  const std::vector<silhouette::LostFrame> likely = now.found.likely;
+  const auto last = likely.begin() + std::min<std::ptrdiff_t>(kTried, std::ssize(likely));
+  return std::any_of(likely.begin(), last, [&](const silhouette::LostFrame& one) {
+    std::vector<silhouette::LostFrame> lost = now.lost;
+    lost.push_back(one);
+    return improve(now, restored(chain, capture, std::move(lost)));
+  });
+}
+
+// Moves each to where the outlines show it once the others are restored: before, they hid it.
+void move_lost_frames(const chain::Chain& chain, const capture::Capture& capture, Restored& now) {
+  for (std::size_t i = 0; i < now.lost.size(); ++i) {
+    std::vector<silhouette::LostFrame> others = now.lost;
+    others.erase(others.begin() + static_cast<std::ptrdiff_t>(i));
+    const Restored without = restored(chain, capture, others);
+    std::ptrdiff_t tried = 0;
+    for (const silhouette::LostFrame& one : without.found.likely) {
+      if (one.camera != now.lost[i].camera || one.frame == now.lost[i].frame) continue;
+      std::vector<silhouette::LostFrame> lost = others;
+      lost.insert(lost.begin() + static_cast<std::ptrdiff_t>(i), one);
+      if (improve(now, restored(chain, capture, std::move(lost))) || ++tried == kTried) break;
+    }
+  }
+}
+
+// Mean square distance of the outlines of a frame, px^2, in the median.
+double usual_misfit(const silhouette::SequenceFit& sequence) {
+  std::vector<double> squares;
+  for (const silhouette::FrameFit& frame : sequence.frames)
+    if (frame.residual_pixels > 0.0) squares.push_back(frame.residual_pixels * frame.residual_pixels);
+  return squares.empty() ? 0.0 : math::median(squares);
+}
+
 }  // namespace
 
 capture::Corrections restore_lost_frames(const chain::Chain& chain, capture::Capture& capture,
                                          silhouette::SequenceFit& sequence, std::vector<Finding>& verdict) {
-  std::vector<std::vector<double>> lost(capture.cameras.size());
   if (capture.cameras.size() < 2) return {};
-  const std::vector<std::vector<double>> given = capture.times;
-  for (int count = 0; count < kMostLost; ++count) {
-    const auto one = silhouette::first_lost_frame(chain, capture, sequence);
-    if (!one) break;
-    lost[one->camera].push_back(one->frame);
-    capture::restore_lost(math::VectorX::Constant(1, one->frame), one->camera, capture);
-    sequence = silhouette::fit_sequence(chain, capture);
-  }
-  // all at once, as apply() does it later: the same stamps to the bit
-  capture.times = given;
-  for (capture::PackedView& view : capture.views) view.time = given[view.camera][view.frame];
+  silhouette::LostFrames found = silhouette::find_lost_frames(chain, capture, sequence);
+  Restored now{{}, std::move(sequence), std::move(found)};
+  for (int count = 0; count < kMostLost && add_lost_frame(chain, capture, now); ++count) continue;
+  move_lost_frames(chain, capture, now);
+  sequence = std::move(now.sequence);
+  const bool all_found = now.found.misfit <= kAllFound * usual_misfit(sequence);
+  std::vector<std::vector<double>> lost(capture.cameras.size());
+  for (const silhouette::LostFrame& one : now.lost) lost[one.camera].push_back(one.frame);
   capture::Corrections out;
   for (std::size_t c = 0; c < lost.size(); ++c) {
     if (lost[c].empty()) continue;
@@ -63,7 +119,7 @@ capture::Corrections restore_lost_frames(const chain::Chain& chain, capture::Cap
     capture::restore_lost(correction.value, static_cast<int>(c), capture);
     const auto count = correction.value.size();
     const int first = static_cast<int>(lost[c].front());
-    const bool sure = count <= kSurelyLost;
+    const bool sure = count <= kSurelyLost && all_found;
     char many[32] = "a frame", text[240];
     if (count > 1) std::snprintf(many, sizeof many, "%d frames, one", static_cast<int>(count));
     std::snprintf(

@@ -76,6 +76,7 @@ FrameSource open_stream(const SourceOptions& options) {
   double rate = options.rate > 0.0 ? options.rate : calibration.rate, start = calibration.start;
   FrameSource source;
   source.cameras = as_corrected(options.corrections, {calibration.camera}, &source.unverified);
+  source.cameras[0].mask_offset = 0.0;  // that of the masks which the twin was made of
   const double late = capture::value_of(options.corrections, calibration.camera.name, "time");
   const double half_readout = 0.5 * std::abs(source.cameras[0].readout);  // a frame's time is that of its middle row
   const auto reader = std::make_shared<capture::VideoReader>(

@@ -18,6 +18,55 @@ constexpr double kBlobReach = 3.0;  // diameters from the chain within which a b
 // than 0.05.
 constexpr double kEvidence = kAsRecognized;
 
+// Curvature of the rope along each segment by the directions of its neighbors, camera frame, 1/m.
+std::vector<Vector3> curvatures(const std::vector<Segment>& segments) {
+  const int count = static_cast<int>(segments.size());
+  std::vector<Vector3> out;
+  for (int i = 0; i < count; ++i) {
+    const Segment &before = segments[std::max(0, i - 1)], &after = segments[std::min(count - 1, i + 1)];
+    const Vector3 turn = (after.b - after.a).normalized() - (before.b - before.a).normalized();
+    const double apart = (0.5 * (after.a + after.b) - 0.5 * (before.a + before.b)).norm();
+    out.push_back(apart > 0.0 ? Vector3(turn / apart) : Vector3::Zero());
+  }
+  return out;
+}
+
+// From the middle of an arc's chord to its own, m.
+Vector3 bow(const Vector3& chord, const Vector3& curvature) { return -0.125 * chord.squaredNorm() * curvature; }
+
+// Bends the posed chain: each straight link becomes an arc that is as long, in straight pieces. Returns their
+// curvatures, camera frame, 1/m, by which a piece is an arc still.
+std::vector<Vector3> bend(ViewWork& work) {
+  constexpr double kTurn = 0.15;  // rad, of a piece at most
+  constexpr int kMostPieces = 8;
+  const std::vector<Vector3> of_links = curvatures(work.segments);
+  std::vector<Segment> pieces;
+  std::vector<Vector3> out;
+  Vector3 shift = Vector3::Zero();  // arcs reach less far than their links
+  for (std::size_t i = 0; i < work.segments.size(); ++i) {
+    const Segment& link = work.segments[i];
+    const Vector3 straight = link.b - link.a, &curvature = of_links[i];
+    const double turn = curvature.norm() * straight.norm();
+    const Vector3 chord = (1.0 - turn * turn / 24.0) * straight, middle = bow(chord, curvature);
+    const int count = std::clamp(static_cast<int>(std::ceil(turn / kTurn)), 1, kMostPieces);
+    const auto at = [&](int k) {
+      const double t = static_cast<double>(k) / count;
+      return Vector3(link.a + shift + t * chord + 4.0 * t * (1.0 - t) * middle);
+    };
+    for (int k = 0; k < count; ++k) {
+      Segment piece = link;
+      const Vector3 from = at(k), to = at(k + 1);
+      if (std::min(from.z(), to.z()) < kNear) continue;
+      place(piece, *work.view->camera, from, to);
+      pieces.push_back(std::move(piece));
+      out.push_back(curvature);
+    }
+    shift += chord - straight;
+  }
+  work.segments = std::move(pieces);
+  return out;
+}
+
 // The rope in one view, posed with the corrections, and how what the view depends on moves it. Its parts point at each
 // other.
 struct PosedView {
@@ -27,12 +76,12 @@ struct PosedView {
 
   capture::Camera camera;
   FrameView frame;
-  Problem problem;           // of this view alone
-  MatrixX twists;            // 6 x angles, camera frame
-  Vector6 base_twist;        // camera frame, of the base's own motion
-  double mask_offset = 0.0;  // px
-  double mask_start = 0.0;   // m
-  double readout = 0.0;      // s, beside what the view was freed of
+  Problem problem;                 // of this view alone; its segments are pieces of arcs
+  std::vector<Vector3> curvature;  // of each, camera frame, 1/m
+  MatrixX twists;                  // 6 x angles, camera frame
+  Vector6 base_twist;              // camera frame, of the base's own motion
+  double mask_start = 0.0;         // m
+  double readout = 0.0;            // s, beside what the view was freed of
 };
 
 // `i`: which of the frame's views.
@@ -48,7 +97,6 @@ void pose_view(const CorrectionProblem& fit, const CorrectedFrame& frame, std::s
   const trajectory::BaseMotion base = fit.base(view.time - late + base_late);
 
   out.camera = capture::corrected(corrections, given);
-  out.mask_offset = capture::value_of(corrections, given.name, "mask_offset");
   out.mask_start = capture::value_of(corrections, given.name, "mask_start");
   out.readout = capture::value_of(corrections, given.name, "readout");
   out.frame = {&frame.masks[i], &out.camera, base.pose * capture::grasp_in_base(corrections)};
@@ -66,6 +114,7 @@ void pose_view(const CorrectionProblem& fit, const CorrectedFrame& frame, std::s
   pose(out.problem, theta + after * frame.thetadot);
   choose_blobs(out.problem, kBlobReach);
   find_hidden(out.problem, kHiddenReach, fit.cut);
+  out.curvature = bend(out.problem.views[0]);
   for (int k = 0; k < chain.angles(); ++k)
     out.twists.col(k) = math::transform_twist(out.problem.views[0].camera_from_base, out.problem.axes.col(k));
 }
@@ -98,49 +147,6 @@ SharedRow shared_row(const PosedView& view, const OutlinePoint& p, double angle_
   row[kLength] = start ? 0.0 : g.dot(from_grasp) / chain.length;
   row[kDiameter] = p.half_width / chain.diameter + 0.5 * row[kTableHeight];  // a thicker rope lies higher
   return row;
-}
-
-// Curvature of the rope along each segment by the directions of its neighbors, camera frame, 1/m.
-std::vector<Vector3> curvatures(const std::vector<Segment>& segments) {
-  const int count = static_cast<int>(segments.size());
-  std::vector<Vector3> out;
-  for (int i = 0; i < count; ++i) {
-    const Segment &before = segments[std::max(0, i - 1)], &after = segments[std::min(count - 1, i + 1)];
-    const Vector3 turn = (after.b - after.a).normalized() - (before.b - before.a).normalized();
-    const double apart = (0.5 * (after.a + after.b) - 0.5 * (before.a + before.b)).norm();
-    out.push_back(apart > 0.0 ? Vector3(turn / apart) : Vector3::Zero());
-  }
-  return out;
-}
-
-// The rope as arcs that are as long as the straight links, camera frame.
-struct Arcs {
-  std::vector<Vector3> curvature;  // 1/m, by segment
-  std::vector<Vector3> before;     // m, where the segment begins: the arcs before it reach less far than their links
-};
-
-// m, by which an arc that is as long as its link reaches less far.
-Vector3 shorter(const Segment& segment, const Vector3& curvature) {
-  const Vector3 link = segment.b - segment.a;
-  return -curvature.squaredNorm() * link.squaredNorm() / 24.0 * link;
-}
-
-Arcs arcs_of(const std::vector<Segment>& segments) {
-  Arcs out{curvatures(segments), {}};
-  Vector3 before = Vector3::Zero();
-  for (std::size_t i = 0; i < segments.size(); ++i) {
-    out.before.push_back(before);
-    before += shorter(segments[i], out.curvature[i]);
-  }
-  return out;
-}
-
-// How far the rope is from the point x of a straight link, m.
-Vector3 from_link(const Arcs& arcs, const Segment& segment, std::ptrdiff_t index, const Vector3& x) {
-  const Vector3 link = segment.b - segment.a, &curvature = arcs.curvature[index];
-  const double t = std::clamp((x - segment.a).dot(link) / link.squaredNorm(), 0.0, 1.0);
-  const Vector3 along = arcs.before[index] + t * shorter(segment, curvature);
-  return along - 0.5 * t * (1.0 - t) * link.squaredNorm() * curvature;
 }
 
 // A row of the least squares: how fast the distance of a point from the outline changes with the twist of its link
@@ -181,12 +187,12 @@ std::vector<LinkSums> link_sums(const PosedView& view, int camera, const Correct
     down[link] = lying_slope(chain, chain.link_lift(chain.links() - 1), link);
   const Vector3 normal = fit.lying ? fit.lying->normal : Vector3::Zero();
   const std::vector<Segment>& segments = view.problem.views[0].segments;
-  const Arcs arcs = arcs_of(segments);
   const auto add = [&](const OutlinePoint& p) {
     if (p.part == OutlinePoint::Part::before_grasp) return;  // the gripper's, or a cut face that is not round
-    double residual = p.distance - view.mask_offset;
-    if (p.part != OutlinePoint::Part::start)
-      residual -= p.gradient.dot(from_link(arcs, *p.segment, p.segment - segments.data(), p.x));
+    const Vector3 chord = p.segment->b - p.segment->a;
+    const double t = std::clamp((p.x - p.segment->a).dot(chord) / chord.squaredNorm(), 0.0, 1.0);
+    const Vector3 beside = 4.0 * t * (1.0 - t) * bow(chord, view.curvature[p.segment - segments.data()]);
+    double residual = p.distance - view.camera.mask_offset - p.gradient.dot(beside);
     const int link = p.segment->link;
     PointRow row;
     row.head<3>() = p.x.cross(p.gradient);

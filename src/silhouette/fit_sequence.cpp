@@ -144,11 +144,19 @@ void each_frame(const Sequence& s, const Fit& fit) {
   }
 }
 
+// Whether a fit shows clearly more of the masks, and nearer to their outline. What is hidden costs a right fit more
+// than one that is folded into what is seen.
+bool explains_more(const FrameFit& a, const FrameFit& b) {
+  return a.covered > b.covered + kLessCovered && kMoreResidual * a.residual_pixels < b.residual_pixels;
+}
+
 // Fits a frame once more, and keeps what is clearly better.
 void try_again(Sequence& s, int f, const std::vector<FrameView>& views, const VectorX& from, bool warm) {
   FrameSolution again = solve_frame(s.chain, views, from, warm, s.each);
   FrameSolution& old = s.solutions[f];
-  if (again.cost < kBetter * old.cost && !explains_less(again.fit, old.fit)) old = std::move(again);
+  const bool cheaper =
+      again.cost < kBetter * old.cost && !explains_less(again.fit, old.fit) && !explains_more(old.fit, again.fit);
+  if (cheaper || explains_more(again.fit, old.fit)) old = std::move(again);
 }
 
 // Frame after frame, each from the one before; from scratch at first and where the rope is lost.

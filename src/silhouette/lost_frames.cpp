@@ -1,6 +1,7 @@
 // Frames that a camera lost, as jumps of its clock against the base's and the other cameras'.
 #include <algorithm>
 #include <cmath>
+#include <utility>
 
 #include "chainsplat/core.h"
 #include "src/silhouette/correction_equations.h"
@@ -67,7 +68,7 @@ std::vector<ClockEquations> clock_equations(const chain::Chain& chain, const cap
                             {},
                             0,
                             {},
-                            joint_prior(chain, {}),
+                            kAsRecognized * joint_prior(chain, {}),
                             {},
                             kWidestCut};
   problem.places = places_of_clocks(capture, problem.shared);
@@ -136,19 +137,24 @@ Candidate jump_before(const std::vector<ClockEquations>& equations, std::size_t 
 
 }  // namespace
 
-std::optional<LostFrame> first_lost_frame(const chain::Chain& chain, const capture::Capture& capture,
-                                          const SequenceFit& sequence) {
+LostFrames find_lost_frames(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& sequence) {
   const std::vector<ClockEquations> equations = clock_equations(chain, capture, sequence);
-  Candidate best;
-  std::size_t found = 0;
-  for (std::size_t i = 1; i < equations.size() && (best.gain == 0.0 || i < found + kAfter); ++i) {
-    const Candidate one = jump_before(equations, i);
-    if (one.gain <= best.gain) continue;
-    if (best.gain == 0.0) found = i;
-    best = one;
+  LostFrames out;
+  double cost = 0.0, weight = 0.0;
+  for (const ClockEquations& frame : equations) cost += frame.cost, weight += frame.weight;
+  if (weight > 0.0) out.misfit = 2.0 * cost / weight;
+  std::vector<std::pair<std::size_t, Candidate>> found;  // and before which frame
+  for (std::size_t i = 1; i < equations.size(); ++i)
+    if (const Candidate one = jump_before(equations, i); one.gain > 0.0) found.emplace_back(i, one);
+  while (!found.empty()) {
+    const auto [at, best] = *std::max_element(
+        found.begin(), found.end(), [](const auto& a, const auto& b) { return a.second.gain < b.second.gain; });
+    out.likely.push_back(best.lost);
+    std::erase_if(found, [at = at](const auto& other) {
+      return std::max(at, other.first) - std::min(at, other.first) <= kAfter;
+    });
   }
-  if (best.gain == 0.0) return std::nullopt;
-  return best.lost;
+  return out;
 }
 
 }  // namespace chainsplat::silhouette

@@ -151,6 +151,7 @@ void add_coarse(ViewWork& work, double cut) {
 
 void add_fine(Problem& problem, ViewWork& work, double offset, double cut, FineSums& total) {
   constexpr double kWorst = kLargestCut * kLargestCut;
+  offset += work.view->camera->mask_offset;
   const auto each = [&](const Edge& edge) {
     total.length += edge.weight;
     total.capped_square += edge.weight * kWorst;
@@ -217,6 +218,17 @@ void assemble(Problem& problem) {
 
 }  // namespace
 
+void place(Segment& s, const capture::Camera& camera, const Vector3& a, const Vector3& b) {
+  s.a = a;
+  s.b = b;
+  s.from = image_of(camera, a);
+  s.step = image_of(camera, b) - s.from;
+  const double length2 = std::max(s.step.squaredNorm(), 1e-12);
+  s.per_length2 = 1.0 / length2;
+  s.tangent = s.step / std::sqrt(length2);
+  s.normal = Vector2(-s.tangent.y(), s.tangent.x());
+}
+
 void pose(Problem& problem, const VectorX& theta) {
   const chain::Chain& chain = *problem.chain;
   const std::vector<Pose> motions = chain::link_motions(chain, theta, Pose{});
@@ -228,15 +240,10 @@ void pose(Problem& problem, const VectorX& theta) {
     for (int link = 0; link < chain.links(); ++link) {
       Segment s;
       s.link = link;
-      s.a = work.camera_from_base * Vector3(nodes.col(link));
-      s.b = work.camera_from_base * Vector3(nodes.col(link + 1));
-      if (!(chain.link_end(link) > chain.link_start(link)) || s.a.z() < kNear || s.b.z() < kNear) continue;
-      s.from = image_of(camera, s.a);
-      s.step = image_of(camera, s.b) - s.from;
-      const double length2 = std::max(s.step.squaredNorm(), 1e-12);
-      s.per_length2 = 1.0 / length2;
-      s.tangent = s.step / std::sqrt(length2);
-      s.normal = Vector2(-s.tangent.y(), s.tangent.x());
+      const Vector3 a = work.camera_from_base * Vector3(nodes.col(link));
+      const Vector3 b = work.camera_from_base * Vector3(nodes.col(link + 1));
+      if (!(chain.link_end(link) > chain.link_start(link)) || a.z() < kNear || b.z() < kNear) continue;
+      place(s, camera, a, b);
       s.hidden = !work.hidden.empty() && work.hidden[link];
       work.segments.push_back(s);
     }

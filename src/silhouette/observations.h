@@ -33,6 +33,8 @@ struct Segment {
   double per_length2 = 0.0;  // 1 / |step|^2
   bool hidden = false;       // ViewWork::hidden
 };
+// Sets where it lies, m in the camera frame, and its image; both ends are in front of the camera.
+void place(Segment& segment, const capture::Camera& camera, const math::Vector3& a, const math::Vector3& b);
 
 // Normal equations of one view by link, in camera coordinates: a row is (x cross g, g, derivatives by the edge offset
 // and by the mask's shift in x and y), mathematics.md 2.3.

@@ -107,8 +107,17 @@ void for_each_outline_point(const chain::Chain& chain, const ViewWork& work, con
   const Segment &first = work.segments.front(), &last = work.segments.back();
   std::optional<EndDisk> end, start;
   if (last.link + 1 == chain.links() && !last.hidden) end = end_disk(camera, last, last.b, 1.0, radius);
-  if (ends.mask_start && chain.link_start(first.link) <= 0.0 && !first.hidden)
-    start = end_disk(camera, first, first.a + *ends.mask_start * (first.b - first.a).normalized(), -1.0, radius);
+  const Segment* begins = &first;
+  if (ends.mask_start && chain.link_start(first.link) <= 0.0) {
+    double beyond = *ends.mask_start;  // m, from where the segment begins
+    for (double length = (begins->b - begins->a).norm(); beyond > length && begins != &last;) {
+      beyond -= length;
+      ++begins;
+      length = (begins->b - begins->a).norm();
+    }
+    if (!begins->hidden)
+      start = end_disk(camera, *begins, begins->a + beyond * (begins->b - begins->a).normalized(), -1.0, radius);
+  }
   // whether a piece of outline shows the disk; visits it
   const auto shows = [&](const Edge& edge, const EndDisk& disk, const Segment& segment, OutlinePoint::Part part) {
     const Vector2 from_disk = edge.point - disk.center;
@@ -125,7 +134,7 @@ void for_each_outline_point(const chain::Chain& chain, const ViewWork& work, con
       const Edge& edge = mask.edges[i];
       each(edge);
       if (end && shows(edge, *end, last, OutlinePoint::Part::end)) continue;
-      if (start && shows(edge, *start, first, OutlinePoint::Part::start)) continue;
+      if (start && shows(edge, *start, *begins, OutlinePoint::Part::start)) continue;
       const Nearest at = nearest(work.segments, edge.point);
       if (past_end(work, at)) continue;
       const Segment& s = work.segments[at.segment];
