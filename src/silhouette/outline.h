@@ -107,16 +107,12 @@ void for_each_outline_point(const chain::Chain& chain, const ViewWork& work, con
   const Segment &first = work.segments.front(), &last = work.segments.back();
   std::optional<EndDisk> end, start;
   if (last.link + 1 == chain.links() && !last.hidden) end = end_disk(camera, last, last.b, 1.0, radius);
-  const Segment* begins = &first;
+  const Segment* begins = &first;  // where the mask should begin, which may be beyond the first segment
   if (ends.mask_start && chain.link_start(first.link) <= 0.0) {
-    double beyond = *ends.mask_start;  // m, from where the segment begins
-    for (double length = (begins->b - begins->a).norm(); beyond > length && begins != &last;) {
-      beyond -= length;
-      ++begins;
-      length = (begins->b - begins->a).norm();
-    }
-    if (!begins->hidden)
-      start = end_disk(camera, *begins, begins->a + beyond * (begins->b - begins->a).normalized(), -1.0, radius);
+    const auto along = [&] { return Vector3(begins->b - begins->a); };
+    double beyond = *ends.mask_start;  // m, from the segment's own beginning
+    for (; begins != &last && beyond > along().norm(); ++begins) beyond -= along().norm();
+    if (!begins->hidden) start = end_disk(camera, *begins, begins->a + beyond * along().normalized(), -1.0, radius);
   }
   // whether a piece of outline shows the disk; visits it
   const auto shows = [&](const Edge& edge, const EndDisk& disk, const Segment& segment, OutlinePoint::Part part) {
