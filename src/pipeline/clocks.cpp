@@ -18,8 +18,8 @@ namespace {
 
 constexpr int kMostLost = 30;         // frames of all cameras
 constexpr std::ptrdiff_t kTried = 3;  // places where one may be lost, before it is taken that none is
-// What all frames together miss the outlines by, of what most do: more, and not all that is lost is restored where it
-// was.
+// Where the outlines' mean square over all frames is more than so many times that of the median frame, some lost frame
+// was missed or restored in the wrong place.
 constexpr double kAllFound = 3.0;
 constexpr Eigen::Index kSurelyLost = 1;  // of one camera: where it lost more, some are missed or a few frames off
 

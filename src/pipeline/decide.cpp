@@ -27,7 +27,8 @@ constexpr double kAsWell = 0.05;  // evidence by which explanations of right rec
 constexpr double kAboveTable = 0.001;  // m, from which on a rope is said to be held above its table
 
 // A rope that is held straight by its prior misses the outlines more than one that is as free as in recognition: by 1.0
-// to 1.2 times, and by 3 where it goes around the gripper. Then what else is varied would make up for its bends.
+// to 1.2 times, and by 3 where it goes around the gripper. There the corrections would make up for the bends that the
+// prior does not allow.
 constexpr double kBentMore = 1.5;
 
 // Mean square residual of the outlines, px^2, of those that are cut off, too.
