@@ -6,6 +6,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "src/silhouette/correction_priors.h"
+
 namespace {
 
 using namespace chainsplat;
@@ -32,6 +34,33 @@ capture::Capture with_late_base(double late) {
   for (trajectory::Sample& sample : samples) sample.pose = base.pose(sample.time - late);
   capture.base = trajectory::fit(samples, "test");
   return capture;
+}
+
+TEST_CASE("priors of where masks begin are densities, and seldom before the grasp") {
+  const capture::CorrectedQuantity& start = capture::corrected_quantity("camera", "mask_start");
+  const silhouette::Layout layout{{{&start, 0, 0, 0, start.deviation}}, 1, 1};
+  const math::MatrixX none = math::MatrixX::Zero(1, 0), cost = math::MatrixX::Zero(1, 1);
+  constexpr double kStep = 1e-4;                     // mm
+  for (const double untold : {0.0, 0.001, 0.003}) {  // m; the last one tells nothing of the cut face
+    const auto surprise = [&](double at) {           // mm
+      const math::VectorX x = math::VectorX::Constant(1, 1e-3 * at / start.deviation);
+      return silhouette::surprise_of(layout, none, cost, x, {untold});
+    };
+    double before = 0.0, all = 0.0;
+    for (double at = -100.0; at < 100.0; at += 0.01) {
+      all += 0.01 * std::exp(-surprise(at));
+      if (at < -3.0 * std::hypot(0.5, 1e3 * untold)) before += 0.01 * std::exp(-surprise(at));
+    }
+    CHECK(all == doctest::Approx(1.0).epsilon(1e-3));
+    CHECK(before < 0.02);
+    for (const double at : {-12.0, -3.0, -1.0, -0.2, 0.3, 1.0, 2.5, 15.0}) {
+      const silhouette::SharedPrior prior = silhouette::shared_prior(
+          layout, math::VectorX::Constant(1, 1e-3 * at / start.deviation), silhouette::Starts::at_grasp, {untold});
+      const double slope = (surprise(at + kStep) - surprise(at - kStep)) / (2e-3 * kStep);  // 1/m
+      CHECK(prior.gradient[0] == doctest::Approx(start.deviation * slope).epsilon(1e-5));
+      CHECK(prior.information[0] > 0.0);
+    }
+  }
 }
 
 TEST_CASE("nothing is found wrong with a recording that is right") {

@@ -22,34 +22,58 @@ constexpr double kLeastWeight = 0.04;
 // m, deviation of where masks begin in a camera before which the fingers hold the rope, or which takes them for it;
 // every second camera does. In the others they begin at the grasp.
 constexpr double kHidden = 0.01;
+// Share of those that begin before the grasp: there is rope only where a gripper holds it behind its end.
+constexpr double kBefore = 0.02;
 constexpr double kSharp = 0.0014;     // m, start_deviations() above which it is not known whether it is the cut face
 constexpr double kMillimeter = 1e-3;  // m
 
-// Information, 1/m^2, about where a camera's masks begin, at x m: of a mixture of two Gaussians.
-double start_information(double x, double deviation, Starts starts) {
-  const double narrow = 1.0 / (deviation * deviation), wide = std::min(narrow, 1.0 / (kHidden * kHidden));
-  if (starts == Starts::anywhere) return wide;
-  const double at_grasp = 1.0 / (1.0 + std::sqrt(wide / narrow) * std::exp(0.5 * x * x * (narrow - wide)));
-  return at_grasp * narrow + (1.0 - at_grasp) * wide;
+double gaussian(double x, double deviation) {
+  constexpr double kRootOf2Pi = 2.5066282746310002;
+  return std::exp(-0.5 * x * x / (deviation * deviation)) / (kRootOf2Pi * deviation);
+}
+
+// What is known of where a camera's masks begin, at x m from the grasp.
+struct StartPrior {
+  double density;      // 1/m
+  double gradient;     // 1/m, of -ln density
+  double information;  // 1/m^2, of its curvature what is not negative
+};
+
+// `untold`: start_deviations(); `deviation`: of where masks begin that begin at the grasp.
+StartPrior start_prior(double x, double deviation, double untold) {
+  const double near = std::hypot(deviation, untold), far = std::max(near, kHidden);
+  // beyond the grasp, but for kBefore of them, as well as `near` tells it
+  const double u = x / near, after = kBefore + (1.0 - 2.0 * kBefore) * 0.5 * std::erfc(-u * M_SQRT1_2);
+  const double rise = (1.0 - 2.0 * kBefore) * near * gaussian(x, near) / after;  // of ln after, by u
+  const double at_grasp = untold > kSharp ? 0.0 : 0.5;
+  const double density_near = at_grasp * gaussian(x, near),
+               density_far = (1.0 - at_grasp) * 2.0 * gaussian(x, far) * after;
+  const double density = density_near + density_far, share = density_near / density;
+  return {
+      density, share * x / (near * near) + (1.0 - share) * (x / (far * far) - rise / near),
+      share / (near * near) + (1.0 - share) * (1.0 / (far * far) + std::max(0.0, rise * (u + rise)) / (near * near))};
 }
 
 }  // namespace
 
-VectorX prior_weights(const Layout& layout, const VectorX& x, Starts starts,
-                      const std::vector<double>& start_deviations) {
-  VectorX out = VectorX::Ones(layout.size);
+SharedPrior shared_prior(const Layout& layout, const VectorX& x, Starts starts,
+                         const std::vector<double>& start_deviations) {
+  SharedPrior out{VectorX::Ones(layout.size), x};
   for (const Column& column : layout.columns) {
     if (column.first < 0) continue;
     if (is_mask_start(column)) {
-      const double unit = column.deviation, untold = start_deviations[column.camera];
-      out[column.first] = unit * unit *
-                          start_information(unit * x[column.first], std::hypot(unit, untold),
-                                            untold > kSharp ? Starts::anywhere : starts);
+      const double unit = column.deviation, start = unit * x[column.first];
+      const double wide = std::max(unit, kHidden);
+      const StartPrior known = starts == Starts::anywhere ? StartPrior{0.0, start / (wide * wide), 1.0 / (wide * wide)}
+                                                          : start_prior(start, unit, start_deviations[column.camera]);
+      out.information[column.first] = unit * unit * known.information;
+      out.gradient[column.first] = unit * known.gradient;
       continue;
     }
     const int size = column.quantity->size;
     const double weight = 1.0 / (1.0 + x.segment(column.first, size).squaredNorm() / kTails);
-    out.segment(column.first, size).setConstant(std::max(weight, kLeastWeight));
+    out.information.segment(column.first, size).setConstant(std::max(weight, kLeastWeight));
+    out.gradient.segment(column.first, size) *= std::max(weight, kLeastWeight);
   }
   return out;
 }
@@ -78,12 +102,8 @@ double surprise_of(const Layout& layout, const MatrixX& directions, const Matrix
       out += 0.5 * kTails * std::log1p(x.segment(column.first, column.quantity->size).squaredNorm() / kTails);
       continue;
     }
-    const double start = column.deviation * x[column.first], untold = start_deviations[column.camera];
-    const double narrow = std::hypot(column.deviation, untold), wide = std::max(narrow, kHidden);
-    const auto density = [&](double deviation) {
-      return kMillimeter / deviation * std::exp(-0.5 * start * start / (deviation * deviation));
-    };
-    out -= std::log(untold > kSharp ? density(wide) : 0.5 * (density(narrow) + density(wide)));
+    const double start = column.deviation * x[column.first];
+    out -= std::log(kMillimeter * start_prior(start, column.deviation, start_deviations[column.camera]).density);
   }
   return out;
 }

@@ -10,11 +10,14 @@ namespace chainsplat::silhouette {
 // Whether all masks may begin anywhere, or those begin at the grasp that do so nearly.
 enum class Starts { anywhere, at_grasp };
 
-// Information of the priors about each shared unknown at x, in units of its deviation. Their tails are heavy, since
+// What the priors tell of each shared unknown at x, in units of its deviation. Their tails are heavy, since
 // most recordings are right in most things, and wrong by much in a few. `start_deviations`: by camera, how little its
 // masks tell of where the rope leaves the gripper, m along it.
-math::VectorX prior_weights(const Layout& layout, const math::VectorX& x, Starts starts,
-                            const std::vector<double>& start_deviations);
+struct SharedPrior {
+  math::VectorX information, gradient;  // curvature (never negative) and derivative of the penalty
+};
+SharedPrior shared_prior(const Layout& layout, const math::VectorX& x, Starts starts,
+                         const std::vector<double>& start_deviations);
 
 // What a change of the shared unknowns costs where the beginnings of the masks follow it as well as they can.
 struct Followed {

@@ -128,8 +128,8 @@ void add_table(const capture::Capture& capture, const Layout& layout, const Vect
 
 Known known_at(const capture::Capture& capture, const Layout& layout, const VectorX& x, Starts starts,
                const std::vector<FrameEquations>& frames, const MatrixX& held) {
-  const VectorX weights = prior_weights(layout, x, starts, start_deviations(frames));
-  Known known{MatrixX(weights.asDiagonal()) + held, weights.cwiseProduct(x) + held * x};
+  const SharedPrior prior = shared_prior(layout, x, starts, start_deviations(frames));
+  Known known{MatrixX(prior.information.asDiagonal()) + held, prior.gradient + held * x};
   add_table(capture, layout, x, known);
   return known;
 }
@@ -391,7 +391,7 @@ CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture&
 
   const std::vector<FrameEquations> frames = all_equations(problem, layout, chain, x);
   const std::vector<double> untold = start_deviations(frames);
-  const VectorX prior = prior_weights(layout, x.head(m), starts, untold);
+  const VectorX prior = shared_prior(layout, x.head(m), starts, untold).information;
   const MatrixX outlines = outline_information(frames);
   const MatrixX covariance =
       shared_covariance(frames, outlines, known_at(capture, layout, x.head(m), starts, frames, held).information);
