@@ -496,7 +496,15 @@ TEST_CASE("a rope has as many joints as its bends ask for and its masks can tell
     CHECK(joints_at(2.24 * choice.bow) == 12);
     CHECK(joints_at(1.01 * choice.bow) == 12);
     CHECK(joints_at(0.99 * choice.bow) == 16);
+    CHECK(joints_at(0.1 * choice.bow) == 24);  // 16 would leave 0.105 mm
+    const auto bend_by = [&](double ratio) {
+      for (VectorX& theta : fit.states.theta)
+        for (int i = 0; i < fine.angles(); ++i)
+          if (!chain::is_twist(fine, i)) theta[i] *= ratio;
+    };
+    bend_by(0.9);  // 0.095 mm
     CHECK(joints_at(0.1 * choice.bow) == 16);
+    bend_by(1.0 / 0.9);
     // twice the frames that say nothing change nothing; four times as many that do halve what is open
     const double before = silhouette::choose_joints(fine, fit).deviation;
     for (int f = 0; f < 4; ++f) {

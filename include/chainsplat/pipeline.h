@@ -35,7 +35,7 @@ inline constexpr std::size_t kLeastFrames = 3;  // that identification needs (ch
 enum class Stage { recognize, identify, rollout, evaluate };
 
 struct TrainOptions {
-  std::optional<int> joints;  // none: 8, 12 or 16, as many as the rope's bends ask for (paper: 8)
+  std::optional<int> joints;  // none: 8, 12, 16 or 24, as many as the rope's bends ask for (paper: 8)
   std::optional<chain::Bending>
       bending;         // none: planar on a table; in free space spatial unless the rope stays in a plane
   bool twist = false;  // also a twist axis per joint

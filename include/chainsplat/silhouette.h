@@ -79,8 +79,8 @@ BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::C
                              const SequenceFit& fit);
 
 // design.md, 'Recognition', --joints auto: the fewest of 8, 12 and 16 joints with whose straight links the rope's curve
-// is followed as closely as all masks together can tell, else 16. `fit` is that of `chain`, whose joints are evenly
-// spaced.
+// is followed as closely as all masks together can tell, else 16, or 24 where 16 leave more than a tenth of a
+// millimeter. `fit` is that of `chain`, whose joints are evenly spaced.
 struct JointChoice {
   int joints = 0;
   int tried = 0;           // joints of `chain`

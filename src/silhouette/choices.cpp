@@ -12,11 +12,11 @@ using math::VectorX;
 
 namespace {
 
-// How far the masks are from a sequence's fits, in the median over the frames that show anything.
-struct Misfit {
+// How well a sequence's fits explain the masks, in the median over the frames that show anything.
+struct Explained {
   double residual = 0.0, covered = 0.0, inside = 0.0;
 };
-Misfit misfit(const SequenceFit& fit) {
+Explained explained_by(const SequenceFit& fit) {
   std::vector<double> residual, covered, inside;
   for (const FrameFit& frame : fit.frames) {
     if (frame.residual_pixels <= 0.0) continue;
@@ -81,7 +81,7 @@ BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::C
     const chain::Chain& s = spatial_chain;
     const chain::Chain planar = chain::make_chain(s.length, s.diameter, s.direction, s.bending_axis, s.links() - 1,
                                                   chain::Bending::planar, false, s.joint_arclength[0]);
-    const Misfit with = misfit(fit), without = misfit(fit_sequence(planar, capture));
+    const Explained with = explained_by(fit), without = explained_by(fit_sequence(planar, capture));
     const bool worse = without.residual > kClearly * with.residual + kClearlyPixels ||
                        without.covered + without.inside < with.covered + with.inside - kClearlyShare;
     if (!worse) choice.bending = chain::Bending::planar;
@@ -90,7 +90,11 @@ BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::C
 }
 
 JointChoice choose_joints(const chain::Chain& chain, const SequenceFit& fit) {
-  constexpr std::array kCounts{8, 12, 16};
+  constexpr std::array kCounts{8, 12, 16, 24};
+  // More than 16 joints cost half as much time again in all that follows. They pay where straight links would leave the
+  // rope by this much, m, which no rope does that does not go around its gripper.
+  constexpr int kUsual = 16;
+  constexpr double kWorthMore = 1e-4;
   constexpr int kPoints = 25;  // along the centerline
   std::vector<chain::MaterialPoint> points;
   for (const double arclength : chain::equal_arclengths(chain, kPoints))
@@ -118,7 +122,8 @@ JointChoice choose_joints(const chain::Chain& chain, const SequenceFit& fit) {
   for (const int count : kCounts) {
     choice.joints = count;
     const double finer = static_cast<double>(count) / joints;
-    if (choice.bow <= choice.deviation * finer * finer) break;
+    const double enough = count >= kUsual ? std::max(choice.deviation, kWorthMore) : choice.deviation;
+    if (choice.bow <= enough * finer * finer) break;
   }
   return choice;
 }

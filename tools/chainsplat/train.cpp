@@ -87,7 +87,7 @@ void add_recognition_options(Command command, TrainRequest& request) {
   command.add_flag("--resume", options.resume, "Continue in a run folder that was left unfinished");
   command
       .add_option("--joints", request.joints,
-                  "Joints along the rope, 1 to 64 (default: 8, 12 or 16, as many as its bends ask for)")
+                  "Joints along the rope, 1 to 64 (default: 8, 12, 16 or 24, as many as its bends ask for)")
       .type_name("N|auto");
   command
       .add_option(
