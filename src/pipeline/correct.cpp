@@ -3,10 +3,11 @@
 #include <cmath>
 #include <optional>
 
-#include "pipeline/clocks.h"
 #include "pipeline/decide.h"
 #include "pipeline/judge_capture.h"
+#include "pipeline/lost_frames.h"
 #include "pipeline/mistakes.h"
+#include "pipeline/readout.h"
 #include "pipeline/stages.h"
 
 namespace chainsplat::pipeline {

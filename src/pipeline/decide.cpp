@@ -31,9 +31,9 @@ constexpr double kAboveTable = 0.001;  // m, from which on a rope is said to be 
 // prior does not allow.
 constexpr double kBentMore = 1.5;
 
-// Mean square residual of the outlines, px^2, of those that are cut off, too.
-double misfit(const silhouette::CorrectionFit& fit) {
-  constexpr double kCut = 2.5;  // px
+// Mean square residual of the outlines, px^2, with those that are cut off at the cut.
+double mean_square(const silhouette::CorrectionFit& fit) {
+  constexpr double kCut = 2.5;  // px, the least that outlines are cut off at (mathematics.md 6.10, 'Weights')
   double out = 0.0;
   for (const silhouette::OutlineMisfit& of : fit.misfits) out += of.rms * of.rms + of.cut * kCut * kCut;
   return out;
@@ -289,7 +289,7 @@ std::optional<Decision> decide(const capture::Capture& capture, const chain::Cha
   out.corrected = out.fit.evidence >= nothing_wrong(capture);
   if (!out.corrected) return out;
   silhouette::CorrectionFit straight = silhouette::fit_corrections(chain, capture, sequence, options);
-  if (misfit(straight) <= kBentMore * misfit(out.fit))
+  if (mean_square(straight) <= kBentMore * mean_square(out.fit))
     out.fit = std::move(straight);
   else
     core::say_more("correct: the rope bends more than ropes usually do");

@@ -1,7 +1,5 @@
-// clocks.h - when each frame, and each row of it, was taken: frames that cameras lost, and rows that were read one
-// after the other.
+// readout.h - when each row of a frame was taken, where cameras read them one after the other (mathematics.md 6.15).
 #pragma once
-#include <cmath>
 #include <optional>
 #include <string>
 #include <vector>
@@ -9,11 +7,6 @@
 #include "pipeline/stages.h"
 
 namespace chainsplat::pipeline {
-
-// Restores frames that cameras lost, one after the other, and fits `sequence`, which is that of `chain`, again after
-// each. Where there are too many the recording is left as it is by then.
-capture::Corrections restore_lost_frames(const chain::Chain& chain, capture::Capture& capture,
-                                         silhouette::SequenceFit& sequence, std::vector<capture::Finding>& verdict);
 
 // A readout that all cameras have.
 struct Readout {
