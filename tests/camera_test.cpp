@@ -20,6 +20,7 @@
 namespace chainsplat {
 namespace {
 
+using test::contains;
 using test::error_of;
 
 constexpr int kWidth = 16, kHeight = 6;
@@ -92,8 +93,6 @@ double error(const capture::Image8& rgb, bool full, const Samples& samples) {
     }
   return most;
 }
-
-bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
 // The next moment of the camera's clock.
 void tick() { std::fflush(stdout); }

@@ -22,14 +22,13 @@ namespace chainsplat {
 namespace {
 
 using capture::Image8;
+using test::contains;
 using test::error_of;
 
-bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
-
-struct Folder {  // a folder of this test, removed at the end
+struct StreamFolder {  // a folder of this test, removed at the end
   Path path = std::filesystem::temp_directory_path() / ("chainsplat_stream_test_" + std::to_string(::getpid()));
-  Folder() { std::filesystem::create_directories(path); }
-  ~Folder() { std::filesystem::remove_all(path); }
+  StreamFolder() { std::filesystem::create_directories(path); }
+  ~StreamFolder() { std::filesystem::remove_all(path); }
   Path write(const std::string& name, const std::string& bytes) const {
     std::ofstream(path / name, std::ios::binary) << bytes;
     return path / name;
@@ -82,7 +81,7 @@ TEST_CASE("Y4M has the colors that libav makes of it") {
     bool gray;
     double most;  // levels; libav's fast path for 4:2:0 and 4:2:2 is itself up to 2.5 off
   };
-  const Folder folder;
+  const StreamFolder folder;
   for (const Case& c :
        {Case{"", 2, 2, false, 3.0}, Case{" C420jpeg", 2, 2, false, 3.0}, Case{" C420mpeg2", 2, 2, false, 3.0},
         Case{" C420paldv", 2, 2, false, 3.0}, Case{" C422", 2, 1, false, 3.0}, Case{" C444", 1, 1, false, 1.0},
@@ -111,7 +110,7 @@ TEST_CASE("Y4M has the colors that libav makes of it") {
 }
 
 TEST_CASE("odd sizes, rates, frames passed over, and what a header says of a recording") {
-  const Folder folder;
+  const StreamFolder folder;
   const Path file = folder.write("a.y4m", y4m("H5 W7 F25:2 C420", 7, 5, 2, 2, false, 4));
   capture::VideoReader reader(file);
   Image8 rgb;
@@ -132,7 +131,7 @@ TEST_CASE("odd sizes, rates, frames passed over, and what a header says of a rec
 }
 
 TEST_CASE("a pipe is read as what it holds") {
-  const Folder folder;
+  const StreamFolder folder;
   const std::string stream = y4m("W8 H4 F30:1 C444", 8, 4, 1, 1, false, 3);
   capture::write_video(folder.path / "a.mkv.mp4", 30.0, {Image8{8, 4, 3, std::vector<std::uint8_t>(96, 70)}});
   const Path pipe = folder.path / "pipe";
@@ -163,7 +162,7 @@ TEST_CASE("a pipe is read as what it holds") {
 }
 
 TEST_CASE("streams that are not what they claim are refused with a line") {
-  const Folder folder;
+  const StreamFolder folder;
   const std::string good = "W8 H4 F30:1 C420jpeg";
   struct Case {
     std::string stream, line;
@@ -211,7 +210,7 @@ TEST_CASE("streams that are not what they claim are refused with a line") {
 }
 
 TEST_CASE("bare frames have the size that is asked for, however small") {
-  const Folder folder;
+  const StreamFolder folder;
   std::string bytes;
   for (int i = 0; i < 30; ++i) bytes += static_cast<char>(i);
   const Path file = folder.write("a.rgb", bytes);

@@ -30,6 +30,7 @@ using capture::PackedView;
 using capture::View;
 using math::Vector2;
 using math::Vector3;
+using test::contains;
 using test::error_of;
 using Json = nlohmann::ordered_json;
 
@@ -64,8 +65,6 @@ struct Warnings {  // collects the library's warnings
     return false;
   }
 };
-
-bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
 bool any_contains(const std::vector<std::string>& lines, const std::string& part) {
   for (const std::string& line : lines)

@@ -17,4 +17,6 @@ inline std::string error_of(const std::function<void()>& act) {
   return "";
 }
 
+inline bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
+
 }  // namespace chainsplat::test

@@ -13,23 +13,23 @@ using math::VectorX;
 
 namespace {
 
-constexpr double kMass = 0.3, kLength = 0.5, kStiffness = 0.6;  // kg, rope alone; m; N m/rad
-constexpr double kMoment = 0.03, kAngle = 0.02;                 // N m, rad
-constexpr double kPayload = 0.2, kReach = 0.08;                 // kg, m
-constexpr double kNoise = 5e-4;                                 // m, of a marker's coordinate
+constexpr double kRopeMass = 0.3, kRopeLength = 0.5, kStiffness = 0.6;  // kg, rope alone; m; N m/rad
+constexpr double kMoment = 0.03, kAngle = 0.02;                         // N m, rad
+constexpr double kPayload = 0.2, kReach = 0.08;                         // kg, m
+constexpr double kNoise = 5e-4;                                         // m, of a marker's coordinate
 
-struct Scene {
+struct LoadedScene {
   chain::Chain chain;
   trajectory::Trajectory base;
   Markers markers;
 };
 
 // A rope bent aside and let go while its base stands still, then swings a little: six joints, three markers.
-Scene make_scene(double moment, double payload) {
-  Scene s;
-  s.chain = chain::make_chain(kLength, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 6, chain::Bending::planar, false);
+LoadedScene make_loaded_scene(double moment, double payload) {
+  LoadedScene s;
+  s.chain = chain::make_chain(kRopeLength, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 6, chain::Bending::planar, false);
   dynamics::Parameters p;
-  p.link_mass.assign(6, kMass / 6), p.tip_mass = payload, p.tip_length = payload > 0.0 ? kReach : 0.0;
+  p.link_mass.assign(6, kRopeMass / 6), p.tip_mass = payload, p.tip_length = payload > 0.0 ? kReach : 0.0;
   for (auto* zeros : {&p.viscous_friction, &p.coulomb_friction, &p.air_linear, &p.air_quadratic}) zeros->assign(6, 0.0);
   p.stiffness.assign(6, kStiffness), p.damping.assign(6, 0.01), p.rest_angle.assign(6, 0.03);
   p.stiffness[0] *= 2.0, p.damping[0] *= 2.0;
@@ -65,7 +65,7 @@ Scene make_scene(double moment, double payload) {
 
 Options options_of(double payload) {
   Options options;
-  options.mass = kMass + payload;
+  options.mass = kRopeMass + payload;
   return options;
 }
 
@@ -82,7 +82,7 @@ double logit(double part) { return std::log(part / (1.0 - part)); }
 }  // namespace
 
 TEST_CASE("a rope with friction in bending gets it, and its numbers; one without gets none") {
-  const Scene braked = make_scene(kMoment, 0.0);
+  const LoadedScene braked = make_loaded_scene(kMoment, 0.0);
   Options options = options_of(0.0);
   options.tip_mass = 0.0;
   const Result result = identify(braked.chain, braked.base, braked.markers, options);
@@ -98,11 +98,11 @@ TEST_CASE("a rope with friction in bending gets it, and its numbers; one without
   CHECK(smooth.node_rms > 3.0 * result.node_rms);
   // what is expected of a marker's coordinate: its deviation, and half a hundredth of the length for what the chain
   // lacks
-  const double expected = std::hypot(kNoise, 0.005 * kLength);
+  const double expected = std::hypot(kNoise, 0.005 * kRopeLength);
   for (const Result& one : {result, smooth})
     CHECK(one.estimates.misfit == doctest::Approx(one.node_rms / std::sqrt(3.0) / expected).epsilon(1e-6));
 
-  const Scene free = make_scene(0.0, 0.0);
+  const LoadedScene free = make_loaded_scene(0.0, 0.0);
   options.ask_for_more = true;
   const Result none = identify(free.chain, free.base, free.markers, options);
   CHECK(none.parameters.bending_friction.empty());
@@ -112,8 +112,8 @@ TEST_CASE("a rope with friction in bending gets it, and its numbers; one without
 }
 
 TEST_CASE("a payload is believed where it was weighed, and found where it was not") {
-  const Scene s = make_scene(0.0, kPayload);
-  const double part = kPayload / (kMass + kPayload);
+  const LoadedScene s = make_loaded_scene(0.0, kPayload);
+  const double part = kPayload / (kRopeMass + kPayload);
   Options options = options_of(kPayload);
   options.tip_mass = kPayload;
   const Result weighed = identify(s.chain, s.base, s.markers, options);
@@ -129,7 +129,7 @@ TEST_CASE("a payload is believed where it was weighed, and found where it was no
 }
 
 TEST_CASE("how far a payload reaches is used where it is given, and doubted where it is not") {
-  const Scene s = make_scene(0.0, kPayload);
+  const LoadedScene s = make_loaded_scene(0.0, kPayload);
   Options options = options_of(kPayload);
   options.tip_mass = kPayload;
   // log of the stiffness over the true one, and its standard error
@@ -155,7 +155,7 @@ TEST_CASE("how far a payload reaches is used where it is given, and doubted wher
 }
 
 TEST_CASE("the initial state of a known rope is found from the first marks") {
-  const Scene s = make_scene(kMoment, kPayload);
+  const LoadedScene s = make_loaded_scene(kMoment, kPayload);
   Options options = options_of(kPayload);
   options.tip_mass = kPayload;
   const Result result = identify(s.chain, s.base, s.markers, options);
@@ -173,7 +173,7 @@ TEST_CASE("the initial state of a known rope is found from the first marks") {
     double sum = 0.0;
     for (std::size_t k = 0; k < later.time.size(); ++k)
       sum += (chain::centerline(s.chain, chain::link_motions(s.chain, states.theta[k], s.base.pose(later.time[k])),
-                                {kLength}) -
+                                {kRopeLength}) -
               later.world[k].col(2))
                  .squaredNorm();
     return std::sqrt(sum / later.time.size());

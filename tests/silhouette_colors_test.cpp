@@ -20,7 +20,7 @@ struct Recording {
   chain::States states;
 };
 
-const Recording& demo() {
+const Recording& demo_recording() {
   static const Recording recording = [] {
     Recording out;
     out.capture = capture::load(Path(CHAINSPLAT_SOURCE_DIR) / "assets/demo_free_30");
@@ -46,7 +46,8 @@ void expose(capture::Capture& capture, int camera, const Vector3& gain, const Ve
 }
 
 TEST_CASE("cameras that see alike are found to") {
-  const silhouette::CameraColors found = silhouette::fit_camera_colors(demo().chain, demo().capture, demo().states);
+  const silhouette::CameraColors found =
+      silhouette::fit_camera_colors(demo_recording().chain, demo_recording().capture, demo_recording().states);
   CHECK(found.patches > 500);
   for (int c = 0; c < 3; ++c)
     for (int i = 0; i < 3; ++i) {
@@ -58,12 +59,14 @@ TEST_CASE("cameras that see alike are found to") {
 }
 
 TEST_CASE("gain and bias that were put in are what is found beyond the cameras' own difference") {
-  const silhouette::CameraColors own = silhouette::fit_camera_colors(demo().chain, demo().capture, demo().states);
+  const silhouette::CameraColors own =
+      silhouette::fit_camera_colors(demo_recording().chain, demo_recording().capture, demo_recording().states);
   const std::array<Vector3, 3> gain = {Vector3(0.8, 0.8, 0.8), Vector3(1.1, 1.0, 0.9), Vector3(1.0, 1.0, 1.0)};
   const std::array<Vector3, 3> bias = {Vector3(0, 0, 0), Vector3(0.03, 0.03, 0.03), Vector3(0, 0, 0)};
-  capture::Capture capture = demo().capture;
+  capture::Capture capture = demo_recording().capture;
   for (int c = 0; c < 3; ++c) expose(capture, c, gain[c], bias[c]);
-  const silhouette::CameraColors found = silhouette::fit_camera_colors(demo().chain, capture, demo().states);
+  const silhouette::CameraColors found =
+      silhouette::fit_camera_colors(demo_recording().chain, capture, demo_recording().states);
   // what two cameras make of one color, whatever is common to all
   constexpr double kColor = 0.3;
   const auto seen = [&](const silhouette::CameraColors& colors, int camera, int channel) {
@@ -80,19 +83,21 @@ TEST_CASE("gain and bias that were put in are what is found beyond the cameras' 
 }
 
 TEST_CASE("one camera, and cameras that are exact by the capture, are taken as they are") {
-  capture::Capture alone = demo().capture;
+  capture::Capture alone = demo_recording().capture;
   alone.cameras.resize(1);
   std::erase_if(alone.views, [](const capture::PackedView& view) { return view.camera != 0; });
-  const silhouette::CameraColors one = silhouette::fit_camera_colors(demo().chain, alone, demo().states);
+  const silhouette::CameraColors one =
+      silhouette::fit_camera_colors(demo_recording().chain, alone, demo_recording().states);
   CHECK(one.patches == 0);
   CHECK(one.gain.isOnes(1e-9));
   CHECK(one.bias.isZero(1e-9));
 
-  capture::Capture exact = demo().capture;
+  capture::Capture exact = demo_recording().capture;
   expose(exact, 1, Vector3::Constant(0.8), Vector3::Zero());
   for (const capture::Camera& camera : exact.cameras)
     for (const char* const quantity : {"gain", "bias"}) exact.sigma.push_back({camera.name, quantity, 0.0});
-  const silhouette::CameraColors held = silhouette::fit_camera_colors(demo().chain, exact, demo().states);
+  const silhouette::CameraColors held =
+      silhouette::fit_camera_colors(demo_recording().chain, exact, demo_recording().states);
   CHECK(held.gain.isOnes(1e-4));
 }
 

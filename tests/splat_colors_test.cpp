@@ -22,7 +22,7 @@ using splat::ColorSums;
 
 namespace {
 
-gpu::Device& device(bool least = false) {
+gpu::Device& compared_device(bool least = false) {
   static const auto open = [](bool with) {
     gpu::DeviceOptions options;
     options.validation = true;
@@ -34,9 +34,9 @@ gpu::Device& device(bool least = false) {
 }
 
 // Every test case ends with this check.
-void check_silent() {
+void check_devices_silent() {
   for (const bool least : {false, true}) {
-    const std::vector<std::string> texts = gpu::validation_texts(device(least));
+    const std::vector<std::string> texts = gpu::validation_texts(compared_device(least));
     CHECK_MESSAGE(texts.empty(), (texts.empty() ? std::string() : texts.front()));
   }
 }
@@ -44,7 +44,7 @@ void check_silent() {
 // A bent rope, 0.3 m long and 2 cm thick, with colors that vary along and around it, in front of cameras on three
 // sides. They observe it at slightly different angles, with another exposure and noise; hide_middle() covers its
 // middle.
-struct Scene {
+struct ColorScene {
   chain::Chain chain;
   splat::Gaussians gaussians;
   std::vector<capture::Camera> cameras;
@@ -76,8 +76,8 @@ std::vector<std::uint8_t> looked_at(const splat::Picture& picture, const Exposur
   return rgba;
 }
 
-Scene make_scene() {
-  Scene scene;
+ColorScene make_scene() {
+  ColorScene scene;
   scene.chain =
       chain::make_chain(0.3, 0.02, -Vector3::UnitZ(), Vector3::UnitY(), 6, chain::Bending::spatial, false, 0.02);
   const int rows = 75, around = 8, links = scene.chain.links();
@@ -117,7 +117,7 @@ Scene make_scene() {
 }
 
 // Draws what the cameras observe at `theta_seen`. The crops have different sizes; the third is small and cuts the rope.
-void observe(Scene& scene, splat::Engine& engine, const VectorX& theta_seen, const Exposure& exposure) {
+void observe(ColorScene& scene, splat::Engine& engine, const VectorX& theta_seen, const Exposure& exposure) {
   const std::array<std::array<int, 4>, 3> crops{{{0, 0, 200, 240}, {30, 5, 141, 223}, {60, 60, 77, 101}}};
   core::Random random(5);
   scene.views.clear();
@@ -132,7 +132,7 @@ void observe(Scene& scene, splat::Engine& engine, const VectorX& theta_seen, con
   }
 }
 
-void hide_middle(Scene& scene) {
+void hide_middle(ColorScene& scene) {
   for (std::size_t v = 0; v < scene.views.size(); ++v)
     for (int y = scene.views[v].height / 2; y < scene.views[v].height / 2 + 25; ++y)
       for (int x = 0; x < scene.views[v].width; ++x) scene.observed[v][4 * (y * scene.views[v].width + x) + 3] = 0;
@@ -140,7 +140,7 @@ void hide_middle(Scene& scene) {
 
 // Largest difference of two sums, relative to the largest wanted entry of its kind. Twists are taken about the links'
 // starts, where all moments are of one size and all forces of another.
-double worst_difference(const Scene& scene, const splat::ViewSpec& view, const ColorSums& got,
+double worst_difference(const ColorScene& scene, const splat::ViewSpec& view, const ColorSums& got,
                         const ColorSums& wanted) {
   double worst = 0.0;
   std::array<double, 9> scales{};
@@ -165,7 +165,7 @@ double worst_difference(const Scene& scene, const splat::ViewSpec& view, const C
   return worst;
 }
 
-void check_sums(const Scene& scene, const splat::ViewSpec& view, const ColorSums& got, const ColorSums& wanted) {
+void check_sums(const ColorScene& scene, const splat::ViewSpec& view, const ColorSums& got, const ColorSums& wanted) {
   constexpr double kSums = 2e-5;  // for sums of some thousand floats, and an exposure computed from such sums
   CHECK(got.pixels == wanted.pixels);
   CHECK(got.gain == doctest::Approx(wanted.gain).epsilon(kSums));
@@ -187,8 +187,8 @@ bool same_bits(const ColorSums& a, const ColorSums& b) {
 }
 
 TEST_CASE("the device's color sums are those of a host in double") {
-  Scene scene = make_scene();
-  splat::Engine engine(device());
+  ColorScene scene = make_scene();
+  splat::Engine engine(compared_device());
   VectorX moved = scene.theta;
   for (int k = 0; k < moved.size(); ++k) moved[k] += 0.01 * std::sin(2.1 * k);
   observe(scene, engine, moved, {1.2, -0.04, 0.02});
@@ -211,7 +211,7 @@ TEST_CASE("the device's color sums are those of a host in double") {
     splat::Settings settings;
     settings.tile = variant.tile;
     settings.pixels_per_lane = variant.pixels_per_lane;
-    splat::Engine other(device(variant.least), settings);
+    splat::Engine other(compared_device(variant.least), settings);
     other.set_gaussians(scene.gaussians);
     const auto got = other.color_sums(scene.chain, scene.views, scene.observed_pointers());
     REQUIRE(got.size() == scene.views.size());
@@ -224,12 +224,12 @@ TEST_CASE("the device's color sums are those of a host in double") {
     const auto again = other.color_sums(scene.chain, scene.views, scene.observed_pointers());
     for (std::size_t v = 0; v < got.size(); ++v) CHECK(same_bits(got[v], again[v]));
   }
-  check_silent();
+  check_devices_silent();
 }
 
 TEST_CASE("tiles with more Gaussians than their lists first have room for") {
-  Scene scene = make_scene();
-  splat::Engine engine(device());
+  ColorScene scene = make_scene();
+  splat::Engine engine(compared_device());
   observe(scene, engine, scene.theta, {1.1, 0.02, 0.02});
   // replace every Gaussian by twenty fainter ones, slightly apart
   const splat::Gaussians once = scene.gaussians;
@@ -248,9 +248,9 @@ TEST_CASE("tiles with more Gaussians than their lists first have room for") {
       scene.gaussians.link_logits[once.links * i + j] = once.link_logits[once.links * from + j];
   }
   engine.set_gaussians(scene.gaussians);
-  const std::uint64_t submitted = device().submitted;
+  const std::uint64_t submitted = compared_device().submitted;
   const auto got = engine.color_sums(scene.chain, scene.views, scene.observed_pointers());
-  CHECK(device().submitted > submitted + 1);  // the first submission overflowed and was run again
+  CHECK(compared_device().submitted > submitted + 1);  // the first submission overflowed and was run again
   const auto pictures = engine.draw(scene.gaussians, scene.views, true);
   for (std::size_t v = 0; v < got.size(); ++v) {
     CAPTURE(v);
@@ -258,12 +258,12 @@ TEST_CASE("tiles with more Gaussians than their lists first have room for") {
                reference::color_sums(scene.chain, scene.views[v], scene.observed[v], pictures[v]));
     CHECK(got[v].pixels > 300);
   }
-  check_silent();
+  check_devices_silent();
 }
 
 TEST_CASE("the right side is the slope of the drawn loss") {
-  Scene scene = make_scene();
-  splat::Engine engine(device());
+  ColorScene scene = make_scene();
+  splat::Engine engine(compared_device());
   VectorX moved = scene.theta;
   for (int k = 0; k < moved.size(); ++k) moved[k] += 0.004 * std::sin(2.1 * k);
   observe(scene, engine, moved, {});
@@ -309,12 +309,12 @@ TEST_CASE("the right side is the slope of the drawn loss") {
     }
     CHECK((looked_up - slope).norm() <= 0.05 * slope.norm());
   }
-  check_silent();
+  check_devices_silent();
 }
 
 TEST_CASE("a step on the colors finds a small motion of the rope") {
-  Scene scene = make_scene();
-  splat::Engine engine(device());
+  ColorScene scene = make_scene();
+  splat::Engine engine(compared_device());
   VectorX moved = scene.theta;
   for (int k = 0; k < moved.size(); ++k) moved[k] += 0.006 * std::sin(1.7 * k + 0.5);  // up to 2 px
   observe(scene, engine, moved, {0.9, 0.05, 0.0});
@@ -340,17 +340,17 @@ TEST_CASE("a step on the colors finds a small motion of the rope") {
   }
   CHECK(errors[1] < 0.3 * errors[0]);
   CHECK(errors[2] < 0.12 * errors[0]);
-  check_silent();
+  check_devices_silent();
 }
 
 TEST_CASE("following needs no new memory, whatever the crops' sizes, and nothing shown gives nothing") {
-  Scene scene = make_scene();
+  ColorScene scene = make_scene();
   for (const bool least : {false, true}) {
-    splat::Engine engine(device(least));
+    splat::Engine engine(compared_device(least));
     observe(scene, engine, scene.theta, {});
     engine.set_gaussians(scene.gaussians);
     engine.color_sums(scene.chain, {scene.views.data(), 1}, {scene.observed_pointers().data(), 1});  // the largest crop
-    const std::uint64_t bytes = device(least).buffer_bytes, submitted = device(least).submitted;
+    const std::uint64_t bytes = compared_device(least).buffer_bytes, submitted = compared_device(least).submitted;
     int calls = 0;
     for (int cut = 0; cut < 60; cut += 7, ++calls) {
       splat::ViewSpec view = scene.views[0];
@@ -362,9 +362,9 @@ TEST_CASE("following needs no new memory, whatever the crops' sizes, and nothing
                     scene.observed[0].begin() + 4 * (y * 200 + view.width));
       const std::vector<std::uint8_t>* const one = &part;
       CHECK(engine.color_sums(scene.chain, {&view, 1}, {&one, 1})[0].pixels > 100);
-      CHECK(device(least).buffer_bytes == bytes);
+      CHECK(compared_device(least).buffer_bytes == bytes);
     }
-    CHECK(device(least).submitted == submitted + calls);  // one submission per frame, transfers included
+    CHECK(compared_device(least).submitted == submitted + calls);  // one submission per frame, transfers included
 
     std::vector<std::uint8_t> no_mask(4u * 200 * 240, 0);
     const splat::ViewSpec empty{&scene.cameras[0], 3, 4, 0, 0, scene.views[0].motions};
@@ -380,7 +380,7 @@ TEST_CASE("following needs no new memory, whatever the crops' sizes, and nothing
     }
     CHECK(engine.color_sums(scene.chain, {}, {}).empty());
   }
-  check_silent();
+  check_devices_silent();
 }
 
 }  // namespace

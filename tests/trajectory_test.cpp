@@ -15,6 +15,7 @@
 using namespace chainsplat;
 using math::Vector3;
 using math::Vector6;
+using test::contains;
 using test::error_of;
 using trajectory::Sample;
 using trajectory::Trajectory;
@@ -29,8 +30,6 @@ struct Folder {  // a folder of this test, removed at the end
   Folder() { std::filesystem::create_directories(path); }
   ~Folder() { std::filesystem::remove_all(path); }
 };
-
-bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
 // A smooth motion that turns about a changing axis and moves along all three.
 math::Pose analytic_pose(double t) {

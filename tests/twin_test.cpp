@@ -11,12 +11,11 @@
 #include "small_twin.h"
 
 using namespace chainsplat;
+using test::contains;
 using test::error_of;
 using Json = nlohmann::json;
 
 namespace {
-
-bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
 // Equality bit by bit; NaN equals NaN.
 bool same(double a, double b) { return std::memcmp(&a, &b, sizeof a) == 0 || (std::isnan(a) && std::isnan(b)); }
