@@ -11,19 +11,20 @@ namespace chainsplat::pipeline {
 namespace {
 
 // Share by which the outlines' square residuals must be larger with what was given before anything is changed. Straight
-// links alone leave up to 0.1 on right recordings. Correcting all that may be wrong leaves half a millimeter on a
-// table, so that more must be wrong there (design.md, 'Corrections').
-constexpr double kNothingWrong = 0.15, kNothingWrongOnTable = 1.0;
-double nothing_wrong(const capture::Capture& capture) {
-  return capture.tabletop ? kNothingWrongOnTable : kNothingWrong;
-}
+// links alone leave up to 0.1 on right recordings. Correcting all that may be wrong costs up to a millimeter on a
+// table, and an end that is round, or a readout that is not known yet, looks like some of it: more must be wrong there.
+constexpr double kNothingWrong = 0.15, kNothingWrongOnTable = 0.7;
+// The same of a rope that is held straight by its prior: right recordings of ropes on tables have up to 0.8.
+constexpr double kNothingWrongHeldStraight = 1.0;
 constexpr double kLeastEvidence = kNothingWrong;  // below it no cause is looked for
 constexpr double kLeftOfHalfPixel = 0.2;          // of the evidence, at most, with half a pixel taken back
-// Any other thing alone is corrected if it leaves at most kLeftOfOne of the evidence, to which each of its numbers adds
-// kPerNumber, since many numbers explain a part of anything; and less than kRight, from which on more would be wrong.
+// Any other thing alone is corrected if it leaves at most kLeftOfOne of the evidence, but for kAsRight, which is there
+// when nothing is wrong. Each of its numbers adds kPerNumber, since many numbers explain a part of anything. What it
+// leaves must be less than kRight, from which on more would be wrong; a round end leaves 0.25 on a table.
 constexpr double kLeftOfOne = 0.25, kPerNumber = 0.03;
-constexpr double kRight = kNothingWrong, kRightOnTable = 0.5;
-constexpr double kAsWell = 0.05;  // evidence by which explanations of right recordings differ, since links are straight
+constexpr double kRight = kNothingWrong, kRightOnTable = 0.3;
+// Evidence of right recordings, and by which explanations of them differ, since links are straight.
+constexpr double kAsRight = 0.05;
 constexpr double kAboveTable = 0.001;  // m, from which on a rope is said to be held above its table
 
 // A rope that is held straight by its prior misses the outlines more than one that is as free as in recognition: by 1.0
@@ -49,15 +50,15 @@ bool is_half_pixel(const silhouette::CorrectionFit& fit) {
 const silhouette::Cause* single_cause(const silhouette::CorrectionFit& fit, bool tabletop) {
   if (fit.evidence < kLeastEvidence) return nullptr;
   const silhouette::Cause* best = nullptr;
-  double least = kLeftOfOne * fit.evidence;
+  double least = kLeftOfOne * (fit.evidence - kAsRight);
   for (const silhouette::Cause& cause : fit.causes) {
-    const double left = cause.evidence + kPerNumber * cause.numbers * fit.evidence;
+    const double left = std::max(0.0, cause.evidence - kAsRight) + kPerNumber * cause.numbers * fit.evidence;
     if (cause.evidence >= (tabletop ? kRightOnTable : kRight) || left >= least) continue;
     best = &cause;
     least = left;
   }
   if (!best) return nullptr;
-  const double as_well = best->evidence + kAsWell;
+  const double as_well = best->evidence + kAsRight;
   for (const silhouette::Cause& cause : fit.causes)
     if (cause.in_doubt == best->in_doubt && cause.evidence <= as_well && cause.surprise < best->surprise) best = &cause;
   return best;
@@ -281,13 +282,14 @@ std::optional<Decision> decide(const capture::Capture& capture, const chain::Cha
     if (!found) return std::nullopt;
     out.fit = std::move(found->fit);
     out.shift = std::move(found->shift);
-    out.corrected = out.shift->subject == "grasp" || out.fit.evidence >= nothing_wrong(capture);
+    out.corrected = out.shift->subject == "grasp" || out.fit.evidence >= kNothingWrongHeldStraight;
     return out;
   }
 
   // all that may be wrong
-  out.corrected = out.fit.evidence >= nothing_wrong(capture);
-  if (!out.corrected) return out;
+  out.corrected = out.fit.evidence >= (capture.tabletop ? kNothingWrongOnTable : kNothingWrong);
+  // friction holds whatever bends a rope on a table was laid in
+  if (!out.corrected || capture.tabletop) return out;
   silhouette::CorrectionFit straight = silhouette::fit_corrections(chain, capture, sequence, options);
   if (mean_square(straight) <= kBentMore * mean_square(out.fit))
     out.fit = std::move(straight);
