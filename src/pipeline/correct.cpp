@@ -111,12 +111,11 @@ Corrected correct_all_but_readout(capture::Capture& capture, const std::vector<s
     out.corrections = std::move(lost);
     return out;
   }
-  auto& [fit, corrected, half_pixel, shift] = *decision;
+  auto& [fit, corrected, half_pixel, doubted, shift] = *decision;
   tell_fit("correct", fit.summary);
   out.corrections = std::move(fit.corrections);
-  if (corrected)
-    out.covariance = std::move(fit.covariance);
-  else
+  if (corrected || doubted) out.covariance = std::move(fit.covariance);
+  if (!corrected)
     for (capture::Correction& correction : out.corrections) correction.value.setZero();
   if (half_pixel) correct_half_pixel(fit, options, out);
   if (shift)

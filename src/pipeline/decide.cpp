@@ -116,6 +116,17 @@ math::VectorX numbers_of(const silhouette::CorrectionFit& fit) {
   return out;
 }
 
+// It is off by `apart` with this probability.
+void add_doubt(const math::VectorX& apart, double probability, silhouette::CorrectionFit& fit) {
+  fit.covariance += probability * apart * apart.transpose();
+  Eigen::Index at = 0;
+  for (capture::Correction& correction : fit.corrections) {
+    const Eigen::Index size = correction.value.size();
+    correction.deviation = fit.covariance.diagonal().segment(at, size).cwiseMax(0.0).cwiseSqrt();
+    at += size;
+  }
+}
+
 // The likeliest of these fits. Its deviations count how far each other one is from it, by its probability.
 silhouette::CorrectionFit fit_alone(const chain::Chain& chain, const capture::Capture& capture,
                                     const silhouette::SequenceFit& sequence, const silhouette::Cause& cause,
@@ -135,17 +146,8 @@ silhouette::CorrectionFit fit_alone(const chain::Chain& chain, const capture::Ca
   double all = 0.0;
   for (const silhouette::CorrectionFit& way : ways) all += std::exp(one.surprise - way.surprise);
   const math::VectorX taken = numbers_of(one);
-  for (const silhouette::CorrectionFit& way : ways) {
-    const double share = std::exp(one.surprise - way.surprise) / all;  // how likely it is
-    const math::VectorX apart = numbers_of(way) - taken;
-    one.covariance += share * apart * apart.transpose();
-  }
-  Eigen::Index at = 0;
-  for (capture::Correction& correction : one.corrections) {
-    const Eigen::Index size = correction.value.size();
-    correction.deviation = one.covariance.diagonal().segment(at, size).cwiseMax(0.0).cwiseSqrt();
-    at += size;
-  }
+  for (const silhouette::CorrectionFit& way : ways)
+    add_doubt(numbers_of(way) - taken, std::exp(one.surprise - way.surprise) / all, one);
   return std::move(one);
 }
 
@@ -288,6 +290,8 @@ std::optional<Decision> decide(const capture::Capture& capture, const chain::Cha
 
   // all that may be wrong
   out.corrected = out.fit.evidence >= (capture.tabletop ? kNothingWrongOnTable : kNothingWrong);
+  out.doubted = !out.corrected && out.fit.evidence >= kNothingWrong;
+  if (out.doubted) add_doubt(numbers_of(out.fit), 1.0, out.fit);
   // friction holds whatever bends a rope on a table was laid in
   if (!out.corrected || capture.tabletop) return out;
   silhouette::CorrectionFit straight = silhouette::fit_corrections(chain, capture, sequence, options);

@@ -16,8 +16,9 @@ inline constexpr std::array kHalfPixels = {0.5, -0.5};
 // What is corrected, and by which fit.
 struct Decision {
   silhouette::CorrectionFit fit;
-  bool corrected = false;                    // by what it found; else nothing is, but for the next two
-  bool half_pixel = false;                   // by this alone
+  bool corrected = false;   // by what it found; else nothing is, but for the next two
+  bool half_pixel = false;  // by this alone
+  bool doubted = false;     // nothing is, but may have to be: the fit's deviations are of what was given
   std::optional<capture::Correction> shift;  // beside what it found: of table or grasp
 };
 

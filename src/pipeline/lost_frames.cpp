@@ -20,7 +20,8 @@ struct Restored {
   silhouette::SequenceFit sequence;
   silhouette::LostFrames found;
 };
-// `capture` is as before afterwards: a copy of a long one with all its pictures is as large as the rest of the memory.
+// Changes the times of `capture` and puts them back: a copy with all its pictures would double the memory that a long
+// recording needs.
 Restored restored(const chain::Chain& chain, capture::Capture& capture, std::vector<silhouette::LostFrame> lost) {
   const std::vector<std::vector<double>> times = capture.times;
   std::vector<double> of_views;

@@ -91,8 +91,8 @@ BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::C
 
 JointChoice choose_joints(const chain::Chain& chain, const SequenceFit& fit) {
   constexpr std::array kCounts{8, 12, 16, 24};
-  // More than 16 joints cost half as much time again in all that follows. They pay where straight links would leave the
-  // rope by this much, m, which no rope does that does not go around its gripper.
+  // More than 16 joints cost half as much time again in all that follows. They pay where 16 straight links would leave
+  // the rope by this much, m. Of all ropes measured only those that go around their gripper bend so much.
   constexpr int kUsual = 16;
   constexpr double kWorthMore = 1e-4;
   constexpr int kPoints = 25;  // along the centerline
