@@ -217,6 +217,8 @@ TEST_CASE("a grasp that is given too high above its table is lowered, and one th
     const pipeline::Corrected nothing = pipeline::correct(right, {}, false);
     CHECK(capture::find(nothing.corrections, "grasp", "translation")->value.isZero(0.0));
     CHECK(!finding(nothing.verdict, "grasp", "table"));
+    // it comes down otherwise than is assumed: what may be wrong instead counts in the deviations
+    if (held > 0.0) CHECK((nothing.covariance.size() > 0 && nothing.covariance.diagonal().maxCoeff() > 0.0));
   }
   capture::Capture high = lying(0.0);
   const std::vector<capture::Camera> given = high.cameras;
