@@ -60,6 +60,12 @@ TEST_CASE("priors of where masks begin are densities, and seldom before the gras
       CHECK(prior.gradient[0] == doctest::Approx(start.deviation * slope).epsilon(1e-5));
       CHECK(prior.information[0] > 0.0);
     }
+    for (const double at : {-3000.0, 3000.0}) {  // a camera that is far off puts them there
+      const silhouette::SharedPrior prior = silhouette::shared_prior(
+          layout, math::VectorX::Constant(1, 1e-3 * at / start.deviation), silhouette::Starts::at_grasp, {untold});
+      CHECK(std::isfinite(surprise(at)));
+      CHECK(at * prior.gradient[0] > 0.0);  // back to the grasp
+    }
   }
 }
 

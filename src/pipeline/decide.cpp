@@ -28,8 +28,8 @@ constexpr double kAsRight = 0.05;
 constexpr double kAboveTable = 0.001;  // m, from which on a rope is said to be held above its table
 
 // A rope that is held straight by its prior misses the outlines more than one that is as free as in recognition: by 1.0
-// to 1.2 times, and by 3 where it goes around the gripper. There the corrections would make up for the bends that the
-// prior does not allow.
+// to 1.2 times, and by 3 where it goes around the gripper (measured on tables). There the corrections of one that hangs
+// would make up for the bends that the prior does not allow.
 constexpr double kBentMore = 1.5;
 
 // Mean square residual of the outlines, px^2, with those that are cut off at the cut.

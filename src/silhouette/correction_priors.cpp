@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 #include "src/math/decompositions.h"
 
@@ -48,7 +49,9 @@ StartPrior start_prior(double x, double deviation, double untold) {
   const double at_grasp = untold > kSharp ? 0.0 : 0.5;
   const double density_near = at_grasp * gaussian(x, near),
                density_far = (1.0 - at_grasp) * 2.0 * gaussian(x, far) * after;
-  const double density = density_near + density_far, share = density_near / density;
+  // not 0 however far it is
+  const double density = std::max(density_near + density_far, std::numeric_limits<double>::min());
+  const double share = density_near / density;
   return {
       density, share * x / (near * near) + (1.0 - share) * (x / (far * far) - rise / near),
       share / (near * near) + (1.0 - share) * (1.0 / (far * far) + std::max(0.0, rise * (u + rise)) / (near * near))};
