@@ -79,6 +79,10 @@ class BoardRenderer {
     const int width = camera_.width, height = camera_.height;
     std::vector<float> light(static_cast<std::size_t>(width) * height, kBackground);
     const math::Vector3 origin = board_from_camera.translation;
+    // Rays of one pixel differ by a pixel's diagonal, which moves the place where they meet the page by less than this
+    // times t^2 and the length of the direction, with twice as much for lenses that stretch: where the first one passes
+    // the page farther away than that, so do all.
+    const double spread = 4.0 * M_SQRT2 / std::min(camera_.fx, camera_.fy) / std::max(origin.z(), 1e-6);
     for (std::size_t i = 0; i < light.size(); ++i) {
       double sum = 0.0;
       for (int s = 0; s < kSamples; ++s) {
@@ -86,12 +90,18 @@ class BoardRenderer {
         const math::Vector3 direction = board_from_camera.rotation * math::Vector3(r[0], r[1], 1.0);
         const double t = -origin.z() / direction.z();
         const double x = origin.x() + t * direction.x(), y = origin.y() + t * direction.y();
-        const bool page = t > 0 && origin.z() > 0 && std::abs(x) < half_x_ + margin_ && std::abs(y) < half_y_ + margin_;
+        const bool ahead = t > 0 && origin.z() > 0;
+        const bool page = ahead && std::abs(x) < half_x_ + margin_ && std::abs(y) < half_y_ + margin_;
         sum += !page ? kBackground : black(x, y) ? kBlack : kWhite;
+        const double near = spread * t * t * direction.norm();
+        if (s == 0 && ahead && (std::abs(x) > half_x_ + margin_ + near || std::abs(y) > half_y_ + margin_ + near)) {
+          sum = kSamples * kBackground;
+          break;
+        }
       }
       light[i] = static_cast<float>(sum / kSamples);
     }
-    if (blur > 0.0) light = blurred(blurred(light, width, height, blur, 1), width, height, blur, width);
+    if (blur > 0.0) light = blurred(blurred(light, width, height, blur, true), width, height, blur, false);
     capture::Image8 out{width, height, 1, {}};
     for (const float value : light)
       out.pixels.push_back(static_cast<std::uint8_t>(std::clamp(value + noise * random.normal(), 0.0, 255.0) + 0.5));
@@ -123,23 +133,27 @@ class BoardRenderer {
     }
     return {static_cast<float>(x), static_cast<float>(y)};
   }
-  static std::vector<float> blurred(const std::vector<float>& in, int width, int height, double sigma, int stride) {
+  static std::vector<float> blurred(const std::vector<float>& in, int width, int height, double sigma, bool across) {
     const int reach = static_cast<int>(std::ceil(4.0 * sigma));
     std::vector<double> kernel;
     double sum = 0.0;
     for (int i = -reach; i <= reach; ++i)
       kernel.push_back(std::exp(-0.5 * i * i / (sigma * sigma))), sum += kernel.back();
     std::vector<float> out(in.size());
-    for (int y = 0; y < height; ++y)
-      for (int x = 0; x < width; ++x) {
-        double value = 0.0;
-        for (int i = -reach; i <= reach; ++i) {
-          const int at =
-              stride == 1 ? std::clamp(x + i, 0, width - 1) + y * width : x + std::clamp(y + i, 0, height - 1) * width;
-          value += kernel[i + reach] * in[at];
-        }
-        out[static_cast<std::size_t>(y) * width + x] = static_cast<float>(value / sum);
+    std::vector<double> row(width);
+    for (int y = 0; y < height; ++y) {
+      std::fill(row.begin(), row.end(), 0.0);
+      for (int i = -reach; i <= reach; ++i) {  // tap by tap along a row, so that only its ends are clamped
+        const double weight = kernel[i + reach];
+        const float* const from =
+            in.data() + static_cast<std::size_t>(across ? y : std::clamp(y + i, 0, height - 1)) * width;
+        const int shift = across ? i : 0, first = std::max(0, -shift), last = std::min(width, width - shift);
+        for (int x = 0; x < first; ++x) row[x] += weight * from[0];
+        for (int x = first; x < last; ++x) row[x] += weight * from[x + shift];
+        for (int x = last; x < width; ++x) row[x] += weight * from[width - 1];
       }
+      for (int x = 0; x < width; ++x) out[static_cast<std::size_t>(y) * width + x] = static_cast<float>(row[x] / sum);
+    }
     return out;
   }
 

@@ -1,4 +1,5 @@
-// Whole recordings with known truth, rendered: blurred, noisy, through bent lenses, by clocks that are off.
+// Whole recordings with known truth, rendered: blurred, noisy, through bent lenses, by clocks that are off. Each case
+// renders a recording and runs all of calibrate over it, so all are of the suite "whole".
 #include <doctest/doctest.h>
 #include <unistd.h>
 
@@ -23,7 +24,8 @@ namespace {
 
 constexpr double kDegrees = 180.0 / std::numbers::pi;
 constexpr double kBlur = 0.8, kNoise = 3.0;  // px, gray levels
-constexpr double kRate = 10.0;               // Hz
+constexpr double kRate = 5.0;                // Hz
+constexpr int kFrames = 38;                  // of the robot that moves the board
 
 struct Folder {
   Path path = std::filesystem::temp_directory_path() / ("chainsplat_calibration_" + std::to_string(getpid()));
@@ -69,24 +71,47 @@ Board true_board() {
 
 const Pose kFlangeFromBoard{math::exp_so3({0.05, -0.08, 0.3}), {0.012, -0.02, 0.055}};
 
-void render(const Path& folder, const capture::Camera& camera, const Board& board, int frames,
-            const std::function<Pose(int)>& world_from_board, std::uint64_t seed) {
+// The true camera and board, in which no case differs: where a pixel's light comes from is worked out once.
+const test::BoardRenderer& renderer_of(int camera) {
+  static const std::array<test::BoardRenderer, 2> both{test::BoardRenderer(true_cameras()[0], true_board()),
+                                                       test::BoardRenderer(true_cameras()[1], true_board())};
+  return both[camera];
+}
+
+Path frame_in(const Path& folder, int frame, const char* ending) {
+  char name[32];
+  std::snprintf(name, sizeof name, "%06d%s", frame, ending);
+  return folder / name;
+}
+
+// As plain PGM: to compress noise takes as long as to render it.
+void render(const Path& folder, int camera, int frames, const std::function<Pose(int)>& world_from_board,
+            std::uint64_t seed) {
   std::filesystem::create_directories(folder);
-  const test::BoardRenderer renderer(camera, board);
+  const Pose camera_from_world = true_cameras()[camera].world_from_camera.inverse();
   core::parallel_for(frames, [&](std::int64_t i) {
     core::Random random(seed + 1000 * static_cast<std::uint64_t>(i));
-    const Pose camera_from_board = camera.world_from_camera.inverse() * world_from_board(static_cast<int>(i));
-    char name[32];
-    std::snprintf(name, sizeof name, "%06d.png", static_cast<int>(i));
-    capture::write_png(folder / name, renderer.image(camera_from_board, kBlur, kNoise, random));
+    const Pose camera_from_board = camera_from_world * world_from_board(static_cast<int>(i));
+    const capture::Image8 image = renderer_of(camera).image(camera_from_board, kBlur, kNoise, random);
+    core::write_file(frame_in(folder, static_cast<int>(i), ".pgm"),
+                     "P5 " + std::to_string(image.width) + " " + std::to_string(image.height) + " 255\n" +
+                         std::string(image.pixels.begin(), image.pixels.end()));
   });
+}
+
+// Every so many frames of a rendered recording, as one of its own.
+void thin_out(const Path& from, const Path& to, int frames, int step) {
+  std::filesystem::create_directories(to);
+  for (int i = 0; i * step < frames; ++i)
+    std::filesystem::create_hard_link(frame_in(from, i * step, ".pgm"), frame_in(to, i, ".pgm"));
 }
 
 std::string slurp(const Path& file) { return core::read_file(file); }
 
 }  // namespace
 
-TEST_CASE("a robot that moves a board: lenses, poses, the board on the flange, and clocks") {
+TEST_CASE("a robot that moves a board: lenses, poses, the board on the flange, and clocks" *
+          doctest::test_suite("whole")) {
   const Folder folder;
   const std::vector<capture::Camera> cameras = true_cameras();
   const Board board = true_board();
@@ -94,7 +119,7 @@ TEST_CASE("a robot that moves a board: lenses, poses, the board on the flange, a
   core::write_file(folder.path / "board.json", write_board(board));
   for (int c = 0; c < 2; ++c)
     render(
-        folder.path / cameras[c].name, cameras[c], board, 75,
+        folder.path / cameras[c].name, c, kFrames,
         [&](int i) { return flange_at(1.0 + i / kRate + clocks[c], 1.0) * kFlangeFromBoard; }, 17 + c);
   // the log has a robot's errors: 0.1 mm and 0.01 degrees at 100 Hz
   std::vector<trajectory::Sample> log;
@@ -166,21 +191,30 @@ TEST_CASE("a robot that moves a board: lenses, poses, the board on the flange, a
         0.05);
   CHECK(result.robot_position < 3e-4);
 
+  // every second frame is enough for what follows
+  Options fewer = options;
+  for (CameraRequest& request : fewer.cameras) {
+    const Path thinned = folder.path / "half" / request.name;
+    thin_out(request.images, thinned, kFrames, 2);
+    request.images = thinned, request.rate = kRate / 2;
+  }
   // another number of threads gives the same bytes
   {
     const int threads = core::threads();
+    const Calibration by_default = calibrate(folder.path / "half/out", fewer);
+    const std::string before = slurp(folder.path / "half/out/calibration.json"),
+                      picture = slurp(by_default.pictures[1]);
     core::set_threads(threads == 1 ? 2 : 1);
-    Options again = options;
+    Options again = fewer;
     again.force = true;
-    const std::string before = slurp(folder.path / "out" / "calibration.json"), picture = slurp(result.pictures[1]);
-    calibrate(folder.path / "out", again);
+    calibrate(folder.path / "half/out", again);
     core::set_threads(threads);
-    CHECK(slurp(folder.path / "out" / "calibration.json") == before);
-    CHECK(slurp(result.pictures[1]) == picture);
+    CHECK(slurp(folder.path / "half/out/calibration.json") == before);
+    CHECK(slurp(by_default.pictures[1]) == picture);
   }
   // a start that nobody knows is found
   {
-    Options unknown = options;
+    Options unknown = fewer;
     for (CameraRequest& request : unknown.cameras) request.start.reset(), request.find_start = true;
     const Calibration found = calibrate(folder.path / "auto", unknown);
     for (int c = 0; c < 2; ++c) CHECK(std::abs(found.cameras[c].start - 1.0 - clocks[c]) < 0.002);
@@ -200,6 +234,8 @@ TEST_CASE("a robot that moves a board: lenses, poses, the board on the flange, a
     core::write_file(folder.path / "other.json", write_board(other));
     Options of_other = options;
     of_other.board = folder.path / "other.json";
+    of_other.cameras[0].images = folder.path / "few";
+    thin_out(options.cameras[0].images, of_other.cameras[0].images, kFrames, 15);
     const std::string line = error_of([&] { calibrate(folder.path / "other", of_other); });
     CHECK(line.find("cam0 never sees the board in") != std::string::npos);
     CHECK(line.find("but the tags 0, 1, 2, 3, 4, 5, 6, 7, ..., and the board has 100 to 111") != std::string::npos);
@@ -209,14 +245,14 @@ TEST_CASE("a robot that moves a board: lenses, poses, the board on the flange, a
   CHECK(error_of([&] { calibrate(folder.path, options); }).find("is no calibration") != std::string::npos);
 }
 
-TEST_CASE("a robot that turns the board about one axis only does not tell where the cameras are, and it is said") {
+TEST_CASE("a robot that turns the board about one axis only does not tell where the cameras are, and it is said" *
+          doctest::test_suite("whole")) {
   const Folder folder;
   const std::vector<capture::Camera> cameras = true_cameras();
   const Board board = true_board();
   core::write_file(folder.path / "board.json", write_board(board));
   render(
-      folder.path / "cam0", cameras[0], board, 40, [&](int i) { return flange_at(i / kRate, 0.0) * kFlangeFromBoard; },
-      5);
+      folder.path / "cam0", 0, 20, [&](int i) { return flange_at(i / kRate, 0.0) * kFlangeFromBoard; }, 5);
   std::vector<trajectory::Sample> log;
   for (int i = 0; i <= 450; ++i) log.push_back({0.01 * i, flange_at(0.01 * i, 0.0)});
   core::write_file(folder.path / "robot.tum", trajectory::write_tum(log));
@@ -231,14 +267,19 @@ TEST_CASE("a robot that turns the board about one axis only does not tell where 
   CHECK(std::filesystem::exists(folder.path / "out" / "calibration.json"));
 }
 
-TEST_CASE("a hand that holds a board: cameras relative to the first, or to the board where it lay first") {
+TEST_CASE("a hand that holds a board: cameras relative to the first, or to the board where it lay first" *
+          doctest::test_suite("whole")) {
   const Folder folder;
   const std::vector<capture::Camera> cameras = true_cameras();
   const Board board = true_board();
   core::write_file(folder.path / "board.json", write_board(board));
-  // held still for two frames in each of 30 places
+  // held still for two frames in each of 20 places, of which half are enough for the second world
+  constexpr int kBoth = 40;
   const auto place = [&](int i) { return flange_at(0.77 * (i / 2), 1.0); };
-  for (int c = 0; c < 2; ++c) render(folder.path / cameras[c].name, cameras[c], board, 60, place, 70 + c);
+  for (int c = 0; c < 2; ++c) {
+    render(folder.path / cameras[c].name, c, kBoth, place, 70 + c);
+    thin_out(folder.path / cameras[c].name, folder.path / "half" / cameras[c].name, kBoth / 2, 1);
+  }
   Options options;
   options.board = folder.path / "board.json";
   for (const capture::Camera& camera : cameras) {
@@ -248,6 +289,8 @@ TEST_CASE("a hand that holds a board: cameras relative to the first, or to the b
   }
   for (const World world : {World::camera, World::board}) {
     options.world = world;
+    if (world == World::board)
+      for (CameraRequest& request : options.cameras) request.images = folder.path / "half" / request.name;
     const Calibration result = calibrate(folder.path / (world == World::camera ? "camera" : "board"), options);
     for (const Finding& finding : result.findings) MESSAGE(finding.text);
     CHECK(result.trusted());
@@ -271,7 +314,7 @@ TEST_CASE("a hand that holds a board: cameras relative to the first, or to the b
   }
 }
 
-TEST_CASE("cameras that never share a view, and poor views, are said") {
+TEST_CASE("cameras that never share a view, and poor views, are said" * doctest::test_suite("whole")) {
   const Folder folder;
   const std::vector<capture::Camera> cameras = true_cameras();
   const Board board = true_board();
@@ -284,7 +327,7 @@ TEST_CASE("cameras that never share a view, and poor views, are said") {
   };
   for (int c = 0; c < 2; ++c)
     render(
-        folder.path / cameras[c].name, cameras[c], board, 6,
+        folder.path / cameras[c].name, c, 6,
         [&](int i) {
           return i / 3 == c ? place(c, i % 3) : Pose{Matrix3::Identity(), {0, 0, 1e4}};
         },
@@ -305,7 +348,7 @@ TEST_CASE("cameras that never share a view, and poor views, are said") {
   CHECK(std::filesystem::exists(folder.path / "out" / "cam0.json"));
   // nothing to be seen
   render(
-      folder.path / "empty", cameras[0], board, 2,
+      folder.path / "empty", 0, 2,
       [](int) {
         return Pose{Matrix3::Identity(), {0, 0, 1e4}};
       },
