@@ -111,7 +111,8 @@ TEST_CASE("a rope with friction in bending gets it, and its numbers; one without
   CHECK(none.estimates.values == before.estimates.values);
 }
 
-TEST_CASE("a payload is believed where it was weighed, and found where it was not") {
+// Identifications of several whole recordings: of the suite "whole".
+TEST_CASE("a payload is believed where it was weighed, and found where it was not" * doctest::test_suite("whole")) {
   const LoadedScene s = make_loaded_scene(0.0, kPayload);
   const double part = kPayload / (kRopeMass + kPayload);
   Options options = options_of(kPayload);
@@ -193,7 +194,8 @@ TEST_CASE("the initial state of a known rope is found from the first marks") {
   CHECK_NOTHROW(fit_initial(s.chain, rigid, s.base, later));
 }
 
-TEST_CASE("how stiff a rope is in torsion is found where it bends in space") {
+// Identifications of several whole recordings: of the suite "whole".
+TEST_CASE("how stiff a rope is in torsion is found where it bends in space" * doctest::test_suite("whole")) {
   constexpr int kJoints = 5;
   constexpr double kRatio = 0.45, kAngleNoise = 2e-3;  // GJ/EI, far below a round rod's; rad
   const chain::Chain chain =

@@ -164,7 +164,9 @@ TEST_CASE("derivatives along smooth modes are those of the parameters") {
   }
 }
 
-TEST_CASE("a rope of many joints is identified: its stiffness, its motion, and again from markers") {
+// A rope of many joints is identified twice, from whole recordings: of the suite "whole".
+TEST_CASE("a rope of many joints is identified: its stiffness, its motion, and again from markers" *
+          doctest::test_suite("whole")) {
   const chain::Chain chain = hanging(40, chain::Bending::planar);
   const dynamics::Parameters truth = rod(chain);
   std::vector<trajectory::Sample> samples;

@@ -89,7 +89,8 @@ constexpr double kDegree = M_PI / 180.0;
 
 }  // namespace
 
-TEST_CASE("the parameters of a simulated hanging rope are found again through noise") {
+// Several identifications of whole recordings: of the suite "whole".
+TEST_CASE("the parameters of a simulated hanging rope are found again through noise" * doctest::test_suite("whole")) {
   const Scene s = scene(false, chain::Bending::spatial, 0.5 * kDegree);
   Options options;
   options.mass = 0.06;
@@ -192,7 +193,8 @@ TEST_CASE("the given mass only scales what has a unit of force") {
   CHECK(node_rms(s.chain, scaled.rollout, unit.rollout) < 2e-4);
 }
 
-TEST_CASE("frames that are declared uncertain do not count") {
+// Several identifications of whole recordings: of the suite "whole".
+TEST_CASE("frames that are declared uncertain do not count" * doctest::test_suite("whole")) {
   Scene s = scene(false, chain::Bending::planar, 0.0, 60);
   for (std::size_t k = 20; k < 40; ++k) s.seen.theta[k].array() += 0.3;
   const Result misled = identify(s.chain, s.base, s.seen, {});
@@ -313,7 +315,9 @@ TEST_CASE("markers alone tell the motion between and beyond them") {
   CHECK_THROWS_AS(fit_markers(s.chain, s.base, markers), InputError);
 }
 
-TEST_CASE("two recordings of one rope give one set of parameters, better known than from one") {
+// Several identifications of whole recordings: of the suite "whole".
+TEST_CASE("two recordings of one rope give one set of parameters, better known than from one" *
+          doctest::test_suite("whole")) {
   const Scene slow = scene(false, chain::Bending::planar, 0.5 * kDegree, 60);
   Scene other = scene(false, chain::Bending::planar, 0.0, 60);
   // another motion of the same rope: let go from the side

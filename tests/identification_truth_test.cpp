@@ -202,7 +202,9 @@ void print(const Case& what, const Study& s) {
 
 }  // namespace
 
-TEST_CASE("on truth with noise, starts three times off end in one minimum with honest standard errors") {
+// Identifications of several recordings from several starts: of the suite "whole".
+TEST_CASE("on truth with noise, starts three times off end in one minimum with honest standard errors" *
+          doctest::test_suite("whole")) {
   for (const Case& what : kCases) {
     CAPTURE(what.name);
     const Study s = study(what, 1);

@@ -105,7 +105,9 @@ TEST_CASE("windows are where the rope moves, apart, and as long as asked for") {
   CHECK(some[0][1] == 3);
 }
 
-TEST_CASE("windows of a long recording tell what the rope is, and the rollout is that of all of it") {
+// A long recording is identified four times: of the suite "whole".
+TEST_CASE("windows of a long recording tell what the rope is, and the rollout is that of all of it" *
+          doctest::test_suite("whole")) {
   const Scene s = scene(20.0);
   Options options;
   options.mass = 0.06;
@@ -115,7 +117,7 @@ TEST_CASE("windows of a long recording tell what the rope is, and the rollout is
   CHECK(windows.rollout.time == s.seen.time);
   CHECK(windows.parameters.stiffness[2] / 0.012 == doctest::Approx(1.0).epsilon(0.1));
   CHECK(windows.parameters.damping[2] / 8e-4 == doctest::Approx(1.0).epsilon(0.25));
-  CHECK(largest_distance(s.chain, windows.rollout, s.clean) < 2e-3); 
+  CHECK(largest_distance(s.chain, windows.rollout, s.clean) < 2e-3);
   CHECK(windows.initial.time == 0.0);
   CHECK(windows.initial.theta[0] == doctest::Approx(0.05).epsilon(0.1));
 

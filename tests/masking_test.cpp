@@ -197,7 +197,8 @@ TEST_CASE("what hides the rope has not its marks, though its colors are thought 
   CHECK(finger_share().second > 0.9);
 }
 
-TEST_CASE("masks of the demo capture without a prompt") {
+// All of the masking over a whole recording: of the suite "whole".
+TEST_CASE("masks of the demo capture without a prompt" * doctest::test_suite("whole")) {
   double sum = 0.0, least = 1.0;
   int frames = 0, poor = 0;
   const masking::Summary summary =
@@ -220,7 +221,8 @@ TEST_CASE("masks of the demo capture without a prompt") {
   CHECK(least > 0.8);
 }
 
-TEST_CASE("masks while the base rests: nothing that moves is needed") {
+// All of the masking over a whole recording: of the suite "whole".
+TEST_CASE("masks while the base rests: nothing that moves is needed" * doctest::test_suite("whole")) {
   double sum = 0.0;
   const capture::FrameRange pause{22, 28};  // the gripper turns around
   const masking::Summary summary = masking::make(

@@ -1,4 +1,5 @@
-// Conventions and exposures that a capture was given or recorded wrongly, put into the demo by hand.
+// Conventions and exposures that a capture was given or recorded wrongly, put into the demo by hand. Cases that correct
+// more than one whole recording are of the suite "whole".
 #include <doctest/doctest.h>
 
 #include <algorithm>
@@ -23,7 +24,7 @@ const capture::Finding* finding(const std::vector<capture::Finding>& verdict, co
   return nullptr;
 }
 
-TEST_CASE("half a pixel is named and taken back, and is not found where there is none") {
+TEST_CASE("half a pixel is named and taken back, and is not found where there is none" * doctest::test_suite("whole")) {
   for (const double shift : {-0.5, 0.5}) {
     capture::Capture capture = demo();
     for (capture::Camera& camera : capture.cameras) camera.cx += shift, camera.cy += shift;
@@ -50,7 +51,7 @@ TEST_CASE("half a pixel is named and taken back, and is not found where there is
   }
 }
 
-TEST_CASE("a base that no camera sees is a problem, not a crash") {
+TEST_CASE("a base that no camera sees is a problem, not a crash" * doctest::test_suite("whole")) {
   for (const double far : {30.0, 5e5}) {  // m, no unit's factor
     capture::Capture capture = demo();
     std::vector<trajectory::Sample> samples = capture.base.samples();
@@ -121,7 +122,7 @@ double size_of(const pipeline::Corrected& found, const char* subject, const char
   return capture::find(found.corrections, subject, quantity)->value.norm();
 }
 
-TEST_CASE("one thing that explains all that is wrong is corrected alone") {
+TEST_CASE("one thing that explains all that is wrong is corrected alone" * doctest::test_suite("whole")) {
   const auto late = [](capture::Capture& capture, double seconds) {
     std::vector<trajectory::Sample> samples = capture.base.samples();
     for (trajectory::Sample& sample : samples) sample.time += seconds;
@@ -160,7 +161,8 @@ TEST_CASE("a thicker rope lies higher on its table, which is no other table") {
   CHECK(size_of(found, "grasp", "translation") == 0.0);
 }
 
-TEST_CASE("a grasp that is off along the rope and a wrong length are told apart where masks begin") {
+TEST_CASE("a grasp that is off along the rope and a wrong length are told apart where masks begin" *
+          doctest::test_suite("whole")) {
   constexpr double kOff = 0.004;  // m
   const auto drawn = [] {
     capture::Capture capture = demo();
@@ -210,7 +212,8 @@ void raise_grasp(double height, capture::Capture& capture) {
   capture.base = trajectory::fit(samples, "base.tum");
 }
 
-TEST_CASE("a grasp that is given too high above its table is lowered, and one that is truly held so high stays") {
+TEST_CASE("a grasp that is given too high above its table is lowered, and one that is truly held so high stays" *
+          doctest::test_suite("whole")) {
   constexpr double kOff = 0.003;  // m
   for (const double held : {0.0, kOff}) {
     capture::Capture right = lying(held);
@@ -233,7 +236,8 @@ TEST_CASE("a grasp that is given too high above its table is lowered, and one th
     CHECK(high.cameras[c].world_from_camera.translation == given[c].world_from_camera.translation);
 }
 
-TEST_CASE("a rope held high above its table, a grasp given so high and a table given so low are told apart") {
+TEST_CASE("a rope held high above its table, a grasp given so high and a table given so low are told apart" *
+          doctest::test_suite("whole")) {
   constexpr double kFar = 0.012;  // m
   for (const double reach : {1.0, 1.6}) {
     capture::Capture held = lying(kFar, reach);
@@ -267,7 +271,7 @@ TEST_CASE("a rope held high above its table, a grasp given so high and a table g
     CHECK((correction.subject == "table" || is_of_masks(correction) || correction.value.isZero(0.0)));
 }
 
-TEST_CASE("frames that cameras lost are named, and their clocks go on where they were") {
+TEST_CASE("frames that cameras lost are named, and their clocks go on where they were" * doctest::test_suite("whole")) {
   capture::Capture right = demo();
   pipeline::correct(right, {}, false);
   const std::vector<std::vector<double>> times = right.times;
@@ -299,7 +303,8 @@ TEST_CASE("frames that cameras lost are named, and their clocks go on where they
   }
 }
 
-TEST_CASE("where the grasp is to be taken as given, one that is above the table is named") {
+TEST_CASE("where the grasp is to be taken as given, one that is above the table is named" *
+          doctest::test_suite("whole")) {
   for (const double high : {0.0, 0.0025}) {  // m
     capture::Capture capture = on_table(-high);
     const pipeline::Corrected found = pipeline::correct(capture, {"grasp", "table"}, false);

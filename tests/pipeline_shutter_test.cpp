@@ -1,4 +1,5 @@
-// A rope that swings, seen by cameras whose rows are drawn each at its own time.
+// A rope that swings, seen by cameras whose rows are drawn each at its own time. Cases that look for a readout draw and
+// correct whole recordings, so they are of the suite "whole".
 #include "chainsplat/shutter.h"
 
 #include <doctest/doctest.h>
@@ -231,7 +232,7 @@ TEST_CASE("rows that were read one after the other are put where they were at on
   }
 }
 
-TEST_CASE("a rolling shutter is found where there is one") {
+TEST_CASE("a rolling shutter is found where there is one" * doctest::test_suite("whole")) {
   {
     constexpr double readout = 0.025;
     capture::Capture capture = recorded(readout);
@@ -274,7 +275,7 @@ TEST_CASE("a rolling shutter is found where there is one") {
   CHECK_FALSE(rolling(pipeline::correct(loaded, {}, false)));
 }
 
-TEST_CASE("outlines on a table tell rows that are read late from a base that is late") {
+TEST_CASE("outlines on a table tell rows that are read late from a base that is late" * doctest::test_suite("whole")) {
   constexpr double kReadout = 0.03, kLate = 0.015;
   capture::Capture rows = on_table(kReadout, 0.0);
   const pipeline::Corrected of_rows = pipeline::correct(rows, {}, false);
@@ -291,7 +292,8 @@ TEST_CASE("outlines on a table tell rows that are read late from a base that is 
   CHECK(1e3 * capture::value_of(of_base.corrections, "base", "time") == doctest::Approx(1e3 * kLate).epsilon(0.1));
 }
 
-TEST_CASE("a rolling shutter and a base that is late at a time are told apart by the motion") {
+TEST_CASE("a rolling shutter and a base that is late at a time are told apart by the motion" *
+          doctest::test_suite("whole")) {
   constexpr double kReadout = 0.025, kLate = 0.033;
   capture::Capture both = recorded(kReadout);
   std::vector<trajectory::Sample> samples = both.base.samples();
@@ -304,7 +306,7 @@ TEST_CASE("a rolling shutter and a base that is late at a time are told apart by
   CHECK(1e3 * capture::value_of(found.corrections, "base", "time") == doctest::Approx(1e3 * kLate).epsilon(0.15));
 }
 
-TEST_CASE("a readout that is given, or to be taken as given, is not looked for") {
+TEST_CASE("a readout that is given, or to be taken as given, is not looked for" * doctest::test_suite("whole")) {
   capture::Capture held = recorded(0.025);
   CHECK_FALSE(rolling(pipeline::correct(held, {"time"}, false)));
   capture::Capture exact = recorded(0.025);

@@ -1,4 +1,4 @@
-// What the program does, by calls.
+// What the program does, by calls. Cases that train twins are of the suite "whole".
 #include "chainsplat/pipeline.h"
 
 #include <doctest/doctest.h>
@@ -116,7 +116,8 @@ TEST_CASE("a wrong request writes nothing, and an error keeps its three fields")
   CHECK(!std::filesystem::exists(folder.path / "run"));
 }
 
-TEST_CASE("train by a call, stopped by the listener and gone on with, then evaluate, roll out and follow") {
+TEST_CASE("train by a call, stopped by the listener and gone on with, then evaluate, roll out and follow" *
+          doctest::test_suite("whole")) {
   const test::TemporaryFolder folder("train");
   const Path whole = folder.path / "whole", stopped = folder.path / "stopped";
 
@@ -213,7 +214,8 @@ TEST_CASE("train by a call, stopped by the listener and gone on with, then evalu
                        doctest::Contains("`contact`: never comes nearer"), InputError);
 }
 
-TEST_CASE("trainings that share a workspace have the bits of those that do not, and notice a capture that changes") {
+TEST_CASE("trainings that share a workspace have the bits of those that do not, and notice a capture that changes" *
+          doctest::test_suite("whole")) {
   const test::TemporaryFolder folder("workspace");
   // the base's clock is late, so that there is something to correct
   const Path capture = folder.path / "capture";

@@ -101,7 +101,9 @@ TEST_CASE("choices of the paper's mode are read as they are written") {
     CHECK_THROWS_WITH_AS(read_paper_choices(wrong, "jobs.toml: x"), doctest::Contains("jobs.toml: x: "), InputError);
 }
 
-TEST_CASE("the paper's procedure goes on after a stop with the same bits, growth included") {
+// A recording is recognized twice by all of the procedure, so this is of the suite "whole".
+TEST_CASE("the paper's procedure goes on after a stop with the same bits, growth included" *
+          doctest::test_suite("whole")) {
   const Path folder = std::filesystem::temp_directory_path() / ("chainsplat_paper_" + std::to_string(getpid()));
   std::filesystem::remove_all(folder);
   const gpu::DevicePtr device = gpu::open_device();

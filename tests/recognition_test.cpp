@@ -46,7 +46,9 @@ double centerline_rms(const chain::Chain& chain, const capture::Capture& capture
 
 }  // namespace
 
-TEST_CASE("the demo's first frames are recognized to half a millimeter, the same each time") {
+// A recording is recognized twice, so this is of the suite "whole".
+TEST_CASE("the demo's first frames are recognized to half a millimeter, the same each time" *
+          doctest::test_suite("whole")) {
   capture::LoadOptions load;
   load.last = 12;
   const capture::Capture capture = capture::load(kDemo, load);

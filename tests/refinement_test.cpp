@@ -130,7 +130,8 @@ TEST_CASE("combined angles are where the two sides' cost is least") {
   }
 }
 
-TEST_CASE("a camera alone sees depth better with the dynamics; twice the same") {
+// Two twins are trained, so this is of the suite "whole".
+TEST_CASE("a camera alone sees depth better with the dynamics; twice the same" * doctest::test_suite("whole")) {
   const gpu::DevicePtr device = gpu::open_device({.selector = {}, .validation = true});
   capture::LoadOptions load;
   load.camera = "cam0";
