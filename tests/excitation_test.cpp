@@ -70,7 +70,9 @@ Recording record(const dynamics::Model& model, const dynamics::BaseFunction& mot
 
 }  // namespace
 
-TEST_CASE("the proposed motion keeps the limits, tells more than the old one, and identification confirms it") {
+// A motion is searched for and two recordings are identified: of the suite "whole".
+TEST_CASE("the proposed motion keeps the limits, tells more than the old one, and identification confirms it" *
+          doctest::test_suite("whole")) {
   const dynamics::Model model = rope();
   identification::Options options;
   options.mass = 0.062;

@@ -20,10 +20,10 @@ expect_code 2 'check, no masks'
 expect_output '^problem: .*make them: chainsplat mask' 'check, no masks'
 
 # some frames into a folder, compared with the capture's own
-run mask "$demo" -o "$work/masks" --frames 0:40
+run mask "$demo" -o "$work/masks" --frames 0:16
 expect_code 0 'mask -o'
 expect_output '^cam1: IoU 0\.[789]' 'mask -o'
-[ "$(find "$work/masks" -name '*.png' | wc -l)" -eq 120 ] || fail 'mask -o: not 120 masks'
+[ "$(find "$work/masks" -name '*.png' | wc -l)" -eq 48 ] || fail 'mask -o: not 48 masks'
 expect_error 2 'not empty.*--force' mask "$demo" -o "$work/masks"
 expect_error 2 'cam0 has masks already.*--force' mask "$demo"
 expect_error 2 '--frames.*-o' mask "$capture" --frames 0:8
