@@ -317,7 +317,7 @@ TEST_CASE("where the grasp is to be taken as given, one that is above the table 
   }
 }
 
-TEST_CASE("a darker camera is named, and its pictures stay as they are") {
+TEST_CASE("a darker camera is named, and its pictures stay as they are" * doctest::test_suite("whole")) {
   constexpr double kDark = 0.7;
   capture::Capture capture = demo();
   for (capture::PackedView& view : capture.views) {

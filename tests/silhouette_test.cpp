@@ -60,21 +60,29 @@ capture::View draw(const Chain& chain, const VectorX& theta, const Pose& base, c
   const std::vector<Pose> motions = chain::link_motions(chain, theta, base);
   const Vector3 a = chain.bending_axis, b = chain.direction.cross(a);
   const Pose camera_from_world = c.world_from_camera.inverse();
+  std::vector<Vector3> normals;
+  for (int i = 0; i < kAround; ++i) {
+    const double angle = 2 * kPi * i / kAround;
+    normals.push_back(std::cos(angle) * a + std::sin(angle) * b);
+  }
+  int top = h, bottom = 0;  // rows that the rope is in
   const auto plot = [&](double s, double radius) {
     const Pose motion = camera_from_world * motions[chain::link_at(chain, s)];
-    for (int i = 0; i < kAround; ++i) {
-      const double angle = 2 * kPi * i / kAround;
-      const Vector3 x = motion * (s * chain.direction + radius * (std::cos(angle) * a + std::sin(angle) * b));
+    const Vector3 center = s * chain.direction;
+    for (const Vector3& normal : normals) {
+      const Vector3 x = motion * (center + radius * normal);
       const int u = static_cast<int>(kFine * (c.fx * x.x() / x.z() + c.cx));
       const int v = static_cast<int>(kFine * (c.fy * x.y() / x.z() + c.cy));
-      if (u >= 0 && v >= 0 && u < w && v < h) fine[static_cast<std::size_t>(v) * w + u] = 1;
+      if (u < 0 || v < 0 || u >= w || v >= h) continue;
+      fine[static_cast<std::size_t>(v) * w + u] = 1;
+      top = std::min(top, v), bottom = std::max(bottom, v + 1);
     }
   };
   const double last = std::nextafter(chain.length, 0.0);
   for (int i = 0; i <= kAlong; ++i) plot(last * i / kAlong, 0.5 * chain.diameter);
   for (int i = 0; i <= kRings; ++i) plot(last, 0.5 * chain.diameter * i / kRings);
   // fill between surface points: a row's inside is what lies between hits less than a tube's width apart
-  for (int y = 0; y < h; ++y) {
+  for (int y = top; y < bottom; ++y) {
     int before = -1;
     for (int x = 0; x < w; ++x) {
       std::uint8_t& pixel = fine[static_cast<std::size_t>(y) * w + x];
@@ -90,7 +98,7 @@ capture::View draw(const Chain& chain, const VectorX& theta, const Pose& base, c
   view.width = c.width;
   view.height = c.height;
   view.rgba.assign(4 * static_cast<std::size_t>(c.width) * c.height, 0);
-  for (int y = 0; y < c.height; ++y) {
+  for (int y = top / kFine; y * kFine < bottom; ++y) {
     for (int x = 0; x < c.width; ++x) {
       int sum = 0;
       for (int dy = 0; dy < kFine; ++dy)

@@ -3,6 +3,7 @@
 // device it reports lanes that meet at different operations, reads from a lane that does not take part, indices outside
 // a buffer and groups that wait forever. Lanes can run in either order, so that a missing barrier is noticed.
 #pragma once
+#include <setjmp.h>
 #include <ucontext.h>
 
 #include <algorithm>
@@ -94,7 +95,9 @@ constexpr uint specialized(uint otherwise) {
 enum class Waits { no, at_subgroup, at_group, at_end };
 
 struct Lane {
-  ucontext_t context{};
+  ucontext_t context{};  // where it begins
+  jmp_buf at{};          // where it goes on
+  bool begun = false;
   std::vector<std::byte> stack;
   uvec3 invocation{0};           // in the work group
   uint subgroup = 0, place = 0;  // its subgroup, and the lane's number in it
@@ -112,7 +115,7 @@ struct Group {
   std::vector<std::uint8_t> there;  // [subgroup][place]: whether the lane took part in it
   uint width = 1, subgroups = 0;
   uvec3 group{0}, groups{0};
-  ucontext_t scheduler{};
+  jmp_buf scheduler{};
   Lane* now = nullptr;
   void (*body)(void*) = nullptr;
   void* kernel = nullptr;
@@ -122,8 +125,16 @@ struct Group {
     now->waits = at;
     now->operation = operation;
     now->line = line;
-    Lane* const self = now;
-    swapcontext(&self->context, &scheduler);
+    // swapcontext() would ask the system for the mask of signals each time, which takes longer than the kernels do
+    if (_setjmp(now->at) == 0) _longjmp(scheduler, 1);
+  }
+  // Runs a lane until it waits.
+  void let_run(Lane& lane) {
+    now = &lane;
+    if (_setjmp(scheduler) != 0) return;
+    if (lane.begun) _longjmp(lane.at, 1);
+    lane.begun = true;
+    setcontext(&lane.context);
   }
 };
 
@@ -137,7 +148,7 @@ inline void lane_main() {
     group.error = error.what();
   }
   group.now->waits = Waits::at_end;
-  swapcontext(&group.now->context, &group.scheduler);
+  _longjmp(group.scheduler, 1);
 }
 
 // Lets the lanes `chosen` (indices) continue if all of them wait at the same operation of the kind `at`; false if not.
@@ -187,6 +198,7 @@ inline void run_group(Group& group, const Layout& layout, uint size) {
     lane.waits = Waits::no;
     members[lane.subgroup].push_back(k);
     lane.stack.resize(Group::kStackBytes);
+    lane.begun = false;
     getcontext(&lane.context);
     lane.context.uc_stack.ss_sp = lane.stack.data();
     lane.context.uc_stack.ss_size = lane.stack.size();
@@ -198,8 +210,7 @@ inline void run_group(Group& group, const Layout& layout, uint size) {
     for (uint k = 0; k < size; ++k) {
       Lane& lane = group.lanes[layout.backward ? size - 1 - k : k];
       if (lane.waits != Waits::no) continue;
-      group.now = &lane;
-      swapcontext(&group.scheduler, &lane.context);
+      group.let_run(lane);
       if (!group.error.empty()) fail(group.error);
     }
     bool moved = release(group, everyone, Waits::at_group), left = false;
