@@ -354,10 +354,12 @@ TEST_CASE("Adam on the rendering loss finds the rope from near, and says nothing
   splat::Engine engine(*device);
   const VectorX truth = shared_truth().theta[12];
   capture::View view;
-  view.width = camera.width;
-  view.height = camera.height;
+  // as of a capture, a cut-out about the rope
+  const Box box = box_of(chain::nodes(chain, chain::link_motions(chain, truth, base)), 3.0 * chain.diameter, camera);
+  view.x0 = box.left, view.width = box.right - box.left;
+  view.y0 = box.top, view.height = box.bottom - box.top;
   const auto spec = [&](const std::vector<Pose>& motions) {
-    return splat::ViewSpec{&camera, 0, 0, view.width, view.height, motions};
+    return splat::ViewSpec{&camera, view.x0, view.y0, view.width, view.height, motions};
   };
   const splat::ViewSpec true_spec = spec(chain::link_motions(chain, truth, base));
   const splat::Picture picture = engine.draw(gaussians, {&true_spec, 1}).front();

@@ -585,7 +585,8 @@ TEST_CASE("feedback on a table copes with another friction and keeps tight limit
   CHECK(seeing < 0.75 * blind);  // two of the plans use all of the jerk and leave no room to correct
 }
 
-TEST_CASE("a target that moves by centimeters is followed on a table") {
+// Three motions are planned and each is carried out three times, with a plan at every moment: of the suite "whole".
+TEST_CASE("a target that moves by centimeters is followed on a table" * doctest::test_suite("whole")) {
   // far from the motion so far full steps overshoot by meters
   Problem problem = problem_of(chain::Bending::planar, true);
   Options options;

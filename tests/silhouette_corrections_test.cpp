@@ -80,7 +80,9 @@ TEST_CASE("nothing is found wrong with a recording that is right") {
   }
 }
 
-TEST_CASE("a late base, a wrong length and a turned camera are each found to be what they are") {
+// Corrections are fitted to whole recordings: of the suite "whole".
+TEST_CASE("a late base, a wrong length and a turned camera are each found to be what they are" *
+          doctest::test_suite("whole")) {
   constexpr double kLate = 1.0 / 30.0, kRatio = 0.97, kTurn = 0.5 * kDegree;
   const silhouette::CorrectionFit late = fit(with_late_base(kLate));
   CHECK(late.evidence > 2.0);
@@ -127,7 +129,9 @@ TEST_CASE("a rope that bends in a plane tells how the gripper turned it, and a t
   CHECK(std::abs(table.value[0] + turn[0]) < std::abs(after.value[0] + turn[0]));
 }
 
-TEST_CASE("where masks begin parts cameras that are all too low from a longer rope, unless fingers hide it") {
+// Corrections are fitted to whole recordings: of the suite "whole".
+TEST_CASE("where masks begin parts cameras that are all too low from a longer rope, unless fingers hide it" *
+          doctest::test_suite("whole")) {
   const auto length_error = [](const capture::Capture& capture, const silhouette::CorrectionOptions& options = {}) {
     return std::abs(capture::value_of(fit(capture, options).corrections, "object", "length"));
   };

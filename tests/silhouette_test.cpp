@@ -416,7 +416,9 @@ TEST_CASE("a rope whose end goes behind the gripper is not turned back on itself
   }
 }
 
-TEST_CASE("what no camera sees of a rope goes on as it did, and makes the rope neither shorter nor longer") {
+// Corrections are fitted to whole recordings: of the suite "whole".
+TEST_CASE("what no camera sees of a rope goes on as it did, and makes the rope neither shorter nor longer" *
+          doctest::test_suite("whole")) {
   const Chain planar = rope(Bending::planar);
   constexpr int kFrames = 60;
   constexpr double kGripper = 22.0;            // px, radius of what hides
