@@ -64,7 +64,7 @@ std::vector<Image8> read_all(const Path& file) {
 
 std::vector<Image8> read_by_libav(const Path& file) {
   const auto& videos = core::own_library<capture::media::VideoLibrary>("chainsplat_videos", "build it");
-  capture::media::Decoder* const decoder = videos.open(file, 1);
+  capture::media::Decoder* const decoder = videos.open(file, -1, 1);
   std::vector<Image8> out(1);
   while (videos.next(*decoder, &out.back())) out.emplace_back();
   out.pop_back();
@@ -136,17 +136,17 @@ TEST_CASE("a pipe is read as what it holds") {
   capture::write_video(folder.path / "a.mkv.mp4", 30.0, {Image8{8, 4, 3, std::vector<std::uint8_t>(96, 70)}});
   const Path pipe = folder.path / "pipe";
   REQUIRE(::mkfifo(pipe.c_str(), 0600) == 0);
-  const auto send = [&](const std::string& bytes) {
-    return std::thread([&pipe, bytes] {
+  const auto send = [&](const std::string& bytes, std::size_t piece) {
+    return std::thread([&pipe, bytes, piece] {
       const int file = ::open(pipe.c_str(), O_WRONLY);
-      for (std::size_t at = 0; at < bytes.size(); at += 50) {  // comes in pieces
-        [[maybe_unused]] const ssize_t sent = ::write(file, &bytes[at], std::min<std::size_t>(50, bytes.size() - at));
-        std::this_thread::sleep_for(std::chrono::milliseconds(1));
+      for (std::size_t at = 0; at < bytes.size(); at += piece) {
+        [[maybe_unused]] const ssize_t sent = ::write(file, &bytes[at], std::min(piece, bytes.size() - at));
+        if (piece < bytes.size()) std::this_thread::sleep_for(std::chrono::milliseconds(1));
       }
       ::close(file);
     });
   };
-  std::thread writer = send(stream);
+  std::thread writer = send(stream, 50);
   const std::vector<Image8> piped = read_all(pipe);
   writer.join();
   REQUIRE(piped.size() == 3);
@@ -154,11 +154,14 @@ TEST_CASE("a pipe is read as what it holds") {
   // 10 bits a sample are libav's
   std::string deep = "YUV4MPEG2 W8 H4 F30:1 C420p10 XYSCSS=420P10\nFRAME\n";
   for (int i = 0; i < 8 * 4 * 3 / 2; ++i) deep += std::string("\0\2", 2);  // 512 of 1023
-  writer = send(deep);
-  const std::vector<Image8> left = read_all(pipe);
-  writer.join();
-  REQUIRE(left.size() == 1);
-  CHECK(std::abs(left[0].pixels[0] - 130) <= 1);
+  // and a writer that has ended before libav begins leaves all in the pipe
+  for (const std::size_t piece : {std::size_t{50}, deep.size()}) {
+    writer = send(deep, piece);
+    const std::vector<Image8> left = read_all(pipe);
+    writer.join();
+    REQUIRE(left.size() == 1);
+    CHECK(std::abs(left[0].pixels[0] - 130) <= 1);
+  }
 }
 
 TEST_CASE("streams that are not what they claim are refused with a line") {

@@ -78,13 +78,16 @@ namespace {
 // A compressed video.
 class Video {
  public:
-  Video(const Path& file, int threads) : decoder_(videos().open(file, threads), videos().close) {}
+  // `pipe`: what `file` is opened as already, where it is a pipe.
+  Video(const Path& file, Descriptor pipe, int threads)
+      : pipe_(std::move(pipe)), decoder_(videos().open(file, pipe_.number(), threads), videos().close) {}
   bool next(Image8* rgb) { return videos().next(*decoder_, rgb); }
   int frames() const { return videos().frames(*decoder_); }
   double rate() const { return videos().rate(*decoder_); }
   double time() const { return videos().time(*decoder_); }
 
  private:
+  Descriptor pipe_;
   std::unique_ptr<media::Decoder, void (*)(media::Decoder*)> decoder_;
 };
 
@@ -95,7 +98,8 @@ std::variant<CameraDevice, FrameStream, Video> open_source(const Path& file, int
   if (std::filesystem::is_character_file(file, error)) return CameraDevice(file, format);
   Descriptor opened(::open(file.c_str(), O_RDONLY | O_CLOEXEC));
   if (opened.number() >= 0 && is_y4m(opened.number())) return FrameStream(std::move(opened), file.string());
-  return Video(file, threads);  // with a pipe still open here: its writer must not lose its last reader
+  if (!std::filesystem::is_fifo(file, error)) opened = Descriptor();
+  return Video(file, std::move(opened), threads);
 }
 
 }  // namespace

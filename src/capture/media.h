@@ -41,7 +41,9 @@ struct Encoder;  // a video that is being written
 
 struct VideoLibrary {
   const char* version;
-  Decoder* (*open)(const Path& file, int threads);
+  // `pipe`: the descriptor of what is open already, since a pipe cannot be opened again when its writer has ended; else
+  // -1. It must stay open as long as the decoder.
+  Decoder* (*open)(const Path& file, int pipe, int threads);
   void (*close)(Decoder* decoder);
   bool (*next)(Decoder& decoder, Image8* rgb);  // null: without the conversion to RGB
   int (*frames)(const Decoder& decoder);

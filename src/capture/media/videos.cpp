@@ -49,7 +49,6 @@ Owned<AVFrame> padded_frame(int width, int height, AVPixelFormat format) {
 constexpr const char* kContainers =
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,ogg,flv,asf,h264,hevc,m4v,mpegvideo,obu,ivf,mjpeg,"
     "yuv4mpegpipe";
-constexpr const char* kProtocols = "file";
 
 std::string error_text(int code) {
   char text[AV_ERROR_MAX_STRING_SIZE] = {};
@@ -81,15 +80,18 @@ double claimed_rate(const AVStream& video) {
   return rate.num > 0 && rate.den > 0 ? av_q2d(rate) : 0.0;
 }
 
-Opened open_recording(const Path& file) {
+// `pipe`: as in media::VideoLibrary::open.
+Opened open_recording(const Path& file, int pipe = -1) {
   std::error_code error;
   if (!std::filesystem::exists(file, error)) throw InputError(file.string(), "does not exist", "check the path");
   AVFormatContext* raw = nullptr;
   AVDictionary* only = nullptr;
   av_dict_set(&only, "format_whitelist", kContainers, 0);
-  av_dict_set(&only, "protocol_whitelist", kProtocols, 0);
+  const std::string protocol = pipe < 0 ? "file" : "pipe";
+  av_dict_set(&only, "protocol_whitelist", protocol.c_str(), 0);
   // with the protocol in front, no file name is taken for an address
-  int code = avformat_open_input(&raw, ("file:" + file.string()).c_str(), nullptr, &only);
+  const std::string address = protocol + ":" + (pipe < 0 ? file.string() : std::to_string(pipe));
+  int code = avformat_open_input(&raw, address.c_str(), nullptr, &only);
   av_dict_free(&only);
   if (code < 0)
     throw InputError(file.string(), "is not a readable video (" + error_text(code) + ")",
@@ -211,12 +213,12 @@ void Decoder::convert(Image8& rgb) {
 
 namespace {
 
-Decoder* open(const Path& file, int threads) {
+Decoder* open(const Path& file, int pipe, int threads) {
   // open the input and a decoder for it
   prepare();
   auto self = std::make_unique<Decoder>();
   self->file = file;
-  self->input = open_recording(file);
+  self->input = open_recording(file, pipe);
   const AVCodecParameters& parameters = *self->input.video().codecpar;
   const AVCodec* codec = avcodec_find_decoder(parameters.codec_id);
   if (!codec)
