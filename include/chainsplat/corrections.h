@@ -35,8 +35,8 @@ const std::vector<CorrectedQuantity>& corrected_quantities();
 // times. The stamps of those after it are early by a frame. Known of one recording, which Correction::calibration names
 // then.
 const CorrectedQuantity& lost_frames();
-// A name of a recording, by its hash.
-std::string recording_text(const Capture& capture);
+// A recording by its Capture::hash: 16 hexadecimal digits.
+std::string hash_text(std::uint64_t hash);
 // The one of this name; `subject` as in CorrectedQuantity.
 const CorrectedQuantity& corrected_quantity(const std::string& subject, const std::string& name);
 // Its standard deviation before anything was seen, in its unit: what the capture says, or else what a careful

@@ -82,8 +82,6 @@ std::string covariance_csv(const chain::States& states);
 // Empty where the file is missing. Throws InputError where it does not fit the states or holds no covariances.
 std::vector<math::MatrixX> read_covariances(const Path& file, const chain::States& states);
 
-std::string hash_text(std::uint64_t hash);
-
 // { "recognized": M, "rollout": M }; null pointers are left out.
 std::string metrics_json(const eval::Metrics* recognized, const eval::Metrics* rollout);
 

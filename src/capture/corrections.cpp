@@ -45,9 +45,9 @@ const CorrectedQuantity& lost_frames() {
   return quantity;
 }
 
-std::string recording_text(const Capture& capture) {
+std::string hash_text(std::uint64_t hash) {
   char text[17];
-  std::snprintf(text, sizeof text, "%016llx", static_cast<unsigned long long>(capture.hash));
+  std::snprintf(text, sizeof text, "%016llx", static_cast<unsigned long long>(hash));
   return text;
 }
 
@@ -163,7 +163,7 @@ void apply(const Corrections& corrections, Capture& capture) {
   double first = 1e300, last = -1e300;
   for (std::size_t c = 0; c < capture.cameras.size(); ++c) {
     const Correction* const lost = find(corrections, capture.cameras[c].name, lost_frames().name);
-    if (lost && lost->calibration == recording_text(capture)) restore_lost(lost->value, static_cast<int>(c), capture);
+    if (lost && lost->calibration == hash_text(capture.hash)) restore_lost(lost->value, static_cast<int>(c), capture);
     // one that this capture gives stays; else a frame's time moves to that of its middle row
     double& readout = capture.cameras[c].readout;
     const bool open = readout == 0.0 && prior_deviation(capture, static_cast<int>(c), readout_of_camera) > 0.0;

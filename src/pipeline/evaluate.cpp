@@ -114,7 +114,7 @@ Evaluation evaluate(const Path& run, const Path& capture, const EvaluateOptions&
   load.depth = true;
   capture::Capture recorded = capture::load(capture, load);
   capture::apply(twin.corrections, recorded);
-  const bool own = twin.provenance.capture_hash == hash_text(recorded.hash);
+  const bool own = twin.provenance.capture_hash == capture::hash_text(recorded.hash);
   if (!own) {
     core::say("another capture than the twin's own: only the rollout is evaluated, from rest");
     twin.states = {};

@@ -52,7 +52,7 @@ capture::Capture load_own_capture(const twin::Twin& twin, const Path& run) {
   capture::LoadOptions load;
   if (const auto& frames = twin.provenance.frames) load.first = frames->first, load.last = frames->last;
   capture::Capture capture = capture::load((run / *twin.provenance.path).lexically_normal(), load);
-  if (twin.provenance.capture_hash != hash_text(capture.hash))
+  if (twin.provenance.capture_hash != capture::hash_text(capture.hash))
     throw InputError(capture.folder.string(), "has changed since " + run.string() + " was made", "train it again");
   capture::apply(twin.corrections, capture);
   silhouette::read_at_once(capture, twin.chain, twin.states);

@@ -99,7 +99,7 @@ capture::Corrections restore_lost_frames(const chain::Chain& chain, capture::Cap
     correction.subject = capture.cameras[c].name;
     correction.value = Eigen::Map<math::VectorX>(lost[c].data(), static_cast<Eigen::Index>(lost[c].size()));
     correction.deviation = math::VectorX::Zero(correction.value.size());
-    correction.calibration = capture::recording_text(capture);
+    correction.calibration = capture::hash_text(capture.hash);
     capture::restore_lost(correction.value, static_cast<int>(c), capture);
     const auto count = correction.value.size();
     const int first = static_cast<int>(lost[c].front());

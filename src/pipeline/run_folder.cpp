@@ -152,7 +152,7 @@ std::optional<capture::Capture> own_recording(const twin::Twin& twin, const Path
   capture::LoadOptions load;
   load.last = 0;
   capture::Capture facts = capture::load(folder, load);
-  if (twin.provenance.capture_hash != hash_text(facts.hash))
+  if (twin.provenance.capture_hash != capture::hash_text(facts.hash))
     throw InputError(folder.string(), "is not the capture that the twin was made from, or has changed since",
                      "name the capture of this run");
   capture::apply(twin.corrections, facts);
@@ -229,12 +229,6 @@ std::vector<math::MatrixX> read_covariances(const Path& file, const chain::State
   if (covariances.size() != states.time.size())
     throw InputError(file.string(), "has not as many rows as states.csv", mend);
   return covariances;
-}
-
-std::string hash_text(std::uint64_t hash) {
-  char text[32];
-  std::snprintf(text, sizeof text, "%016llx", static_cast<unsigned long long>(hash));
-  return text;
 }
 
 std::string metrics_json(const eval::Metrics* recognized, const eval::Metrics* rollout) {
