@@ -9,6 +9,7 @@
 #include <map>
 
 #include "chainsplat/dynamics.h"
+#include "pipeline/readout.h"
 #include "pipeline/stages.h"
 
 using namespace chainsplat;
@@ -230,6 +231,15 @@ TEST_CASE("rows that were read one after the other are put where they were at on
     camera.readout = 0.0;
     CHECK(silhouette::as_read_at_once(late, camera, capture::Pixels::undistorted, nodes_at).rgba == late.rgba);
   }
+}
+
+TEST_CASE("no readout is longer than from frame to frame of the quickest camera, whatever was lost") {
+  capture::Capture capture;
+  CHECK(pipeline::longest_readout(capture) == capture::kLongestReadout);
+  capture.times = {{0.0, 0.1, 0.2, 0.3}, {0.0, 0.02, 0.04, 0.1, 0.1001, 0.12, 0.14}, {}, {0.5}};
+  CHECK(pipeline::longest_readout(capture) == doctest::Approx(1.2 * 0.02));
+  capture.times = {{0.0, 1.0, 2.0}};
+  CHECK(pipeline::longest_readout(capture) == capture::kLongestReadout);
 }
 
 TEST_CASE("a rolling shutter is found where there is one" * doctest::test_suite("whole")) {

@@ -194,20 +194,16 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   judge_mass(capture, out.verdict);
   if (!out.verdict.empty() && !anyway) return out;
   judge_repeated(capture, out.verdict);
-  FirstFit fit = first_fit(capture);
   if (!readout_is_open(capture, fixed)) {
-    add(correct_all_but_readout(capture, fixed, fit), out);
+    add(correct_all_but_readout(capture, fixed, first_fit(capture)), out);
     return out;
   }
   const capture::Capture given = capture;
   Readout readout;
   Corrected found;
   const auto correct_the_rest = [&] {
-    if (readout.value != 0.0) {
-      capture = with_readout(given, readout.value);
-      fit = first_fit(capture);
-    }
-    found = correct_all_but_readout(capture, fixed, fit);
+    capture = readout.value == 0.0 ? given : with_readout(given, readout.value);
+    found = correct_all_but_readout(capture, fixed, first_fit(capture));
   };
   const auto more_readout = [&]() -> std::optional<Readout> {
     if (impossible(found)) return std::nullopt;
@@ -217,6 +213,7 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
     return more_by_outlines(readout.value == 0.0 ? given : with_readout(given, readout.value), fixed,
                             found.corrections);
   };
+  const double longest = longest_readout(given);
   correct_the_rest();
   for (int round = 0; round < kReadoutRounds; ++round) {
     const std::optional<Readout> more = more_readout();
@@ -224,7 +221,10 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
     if (!more || more->value == 0.0) break;
     readout.value += more->value;
     readout.deviation = more->deviation;
+    const bool possible = std::abs(readout.value) <= longest;
+    if (!possible) readout = {};  // what is left is not of rows, then, and no part of it was
     correct_the_rest();
+    if (!possible) break;
   }
   if (readout.value != 0.0)
     core::say_more(text("correct: the rows are read in %.1f ms", kSeconds * readout.value));

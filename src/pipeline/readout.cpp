@@ -6,6 +6,7 @@
 #include "chainsplat/identification.h"
 #include "chainsplat/run_folder.h"
 #include "chainsplat/shutter.h"
+#include "pipeline/decide.h"
 
 namespace chainsplat::pipeline {
 
@@ -55,8 +56,19 @@ capture::Capture with_readout(const capture::Capture& capture, double readout) {
   return out;
 }
 
+double longest_readout(const capture::Capture& capture) {
+  constexpr double kBeside = 1.2;  // what is found has an error, too
+  double out = capture::kLongestReadout;
+  for (const std::vector<double>& times : capture.times) {
+    std::vector<double> apart;  // stamps jitter, and a frame may be lost
+    for (std::size_t k = 1; k < times.size(); ++k) apart.push_back(times[k] - times[k - 1]);
+    if (!apart.empty()) out = std::min(out, kBeside * math::median(apart));
+  }
+  return out;
+}
+
 bool readout_is_open(const capture::Capture& capture, const std::vector<std::string>& fixed) {
-  if (std::find(fixed.begin(), fixed.end(), "time") != fixed.end() || capture.base.samples().size() < 2) return false;
+  if (is_fixed(fixed, "time") || capture.base.samples().size() < 2) return false;
   for (std::size_t c = 0; c < capture.cameras.size(); ++c)
     if (capture::prior_deviation(capture, static_cast<int>(c), capture::corrected_quantity("camera", "readout")) == 0.0)
       return false;

@@ -16,6 +16,8 @@ struct Readout {
 };
 // Whether it may be looked for: it is not given, and the base moves.
 bool readout_is_open(const capture::Capture& capture, const std::vector<std::string>& fixed);
+// What no readout that is found may exceed (s): no camera reads a frame longer than until its next one.
+double longest_readout(const capture::Capture& capture);
 // How much longer they take than by now, where the motion of a rope that hangs shows it; none: no longer, as far as it
 // tells. `capture` is corrected in all else; `clock_was_late`: the base's clock was.
 std::optional<Readout> more_by_motion(const capture::Capture& capture, bool clock_was_late);

@@ -11,6 +11,7 @@
 #include "chainsplat/run_folder.h"
 #include "chainsplat/shutter.h"
 #include "chainsplat/silhouette.h"
+#include "pipeline/decide.h"
 #include "pipeline/workspace.h"
 
 namespace chainsplat::pipeline {
@@ -47,9 +48,8 @@ recognition::Options recognition_options(const Training& t) {
   options.joints = t.options.joints;
   options.bending = t.options.bending;
   options.twist = t.options.twist;
-  options.height = std::none_of(t.options.fixed.begin(), t.options.fixed.end(), [](const std::string& group) {
-    return group == "all" || group == "grasp";  // the rope lies where the grasp says
-  });
+  // else the rope lies where the grasp says
+  options.height = !is_fixed(t.options.fixed, "all") && !is_fixed(t.options.fixed, "grasp");
   options.every = t.options.every;
   options.mode = t.options.mode == twin::Mode::paper ? recognition::Mode::paper : recognition::Mode::fast;
   options.paper = recognition::read_paper_choices(t.options.paper, "`paper`");
@@ -88,7 +88,7 @@ twin::Twin new_twin(const Training& t) {
   twin.provenance.payload = scene.payload;
   twin.provenance.version = CHAINSPLAT_VERSION;
   twin.provenance.capture = t.capture.name;
-  twin.provenance.capture_hash = hash_text(t.capture.hash);
+  twin.provenance.capture_hash = capture::hash_text(t.capture.hash);
   // from the run folder, so that the two can be moved together
   if (!t.recording)
     twin.provenance.path =
@@ -167,7 +167,7 @@ void load_capture(Training& t) {
 // Throws InputError where the run folder's twin is not what is asked for now.
 void check_same_work(const Training& t) {
   const twin::Provenance &had = t.twin.provenance, wanted = recognition_provenance(t.options);
-  if (had.capture_hash != hash_text(t.capture.hash))
+  if (had.capture_hash != capture::hash_text(t.capture.hash))
     throw InputError(t.run.string(), "was made from another capture (" + had.capture + ") or it has changed since",
                      "name that one, or begin again with `force`");
   if (!asked_for(t, Stage::recognize)) return;
@@ -292,7 +292,7 @@ void correct_capture(Training& t) {
   }
   read_at_once(t.capture);
   const std::vector<std::string>& fixed = t.options.fixed;
-  if (t.options.mode == twin::Mode::paper || std::find(fixed.begin(), fixed.end(), "all") != fixed.end()) return;
+  if (t.options.mode == twin::Mode::paper || is_fixed(fixed, "all")) return;
   core::report({"recognize", 0, 0, NAN, NAN, "cameras, clocks, grasp and size"});
   Corrected found = corrected_by_now(t);
   t.twin.corrections = std::move(found.corrections);
