@@ -10,6 +10,7 @@
 #include "chainsplat/text.h"
 #include "files.h"
 #include "look.h"
+#include "src/math/decompositions.h"
 #include "start.h"
 #include "verdict.h"
 
@@ -219,7 +220,7 @@ double turn_about_others(const Bundle& bundle) {
       moments += turn * turn.transpose(), count += 1.0;
     }
   if (count == 0.0) return 0.0;
-  const Eigen::SelfAdjointEigenSolver<Matrix3> axes(moments / count);
+  const Eigen::SelfAdjointEigenSolver<Matrix3> axes(Matrix3(moments / count));
   return std::sqrt(std::max(axes.eigenvalues()(1), 0.0));
 }
 

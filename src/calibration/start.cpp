@@ -46,9 +46,9 @@ std::optional<Matrix3> homography(const std::vector<Vector2>& board, const std::
         b.transpose(), -p.y() * b.transpose();
     sum += row.transpose() * row;
   }
-  const Eigen::SelfAdjointEigenSolver<Eigen::Matrix<double, 9, 9>> axes(sum);
+  const Eigen::SelfAdjointEigenSolver<MatrixX> axes{MatrixX(sum)};
   if (!(axes.eigenvalues()(1) > 1e-10 * axes.eigenvalues()(8))) return {};
-  const Eigen::Matrix<double, 9, 1> h = axes.eigenvectors().col(0);
+  const VectorX h = axes.eigenvectors().col(0);
   const Matrix3 out =
       from_image.inverse() * Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>>(h.data()) * from_board;
   if (!out.allFinite()) return {};
@@ -173,14 +173,16 @@ std::optional<HandEye> hand_eye(const std::vector<Placed>& views, const trajecto
         for (int c = 0; c < 3; ++c) sum.block<3, 3>(3 * r, 3 * c) += a(c, r) * f.transpose();
     }
     if (count < 3) return {};
-    const Eigen::JacobiSVD<MatrixX> svd(sum, Eigen::ComputeFullU | Eigen::ComputeFullV);
+    const Eigen::SelfAdjointEigenSolver<MatrixX> right_vectors(MatrixX(sum.transpose() * sum));
+    const VectorX right_vector = right_vectors.eigenvectors().rightCols<1>();
+    const VectorX left_vector = VectorX(sum * right_vector).normalized();
     const auto rotation = [](const VectorX& v) {
       const Matrix3 m = Eigen::Map<const Matrix3>(v.data());
       const double det = m.determinant();
       return math::orthonormalized((det < 0 ? -1.0 : 1.0) * m / std::cbrt(std::max(std::abs(det), 1e-12)));
     };
-    out.flange_from_board.rotation = rotation(svd.matrixU().col(0));
-    out.world_from_camera.rotation = rotation(svd.matrixV().col(0));
+    out.flange_from_board.rotation = rotation(left_vector);
+    out.world_from_camera.rotation = rotation(right_vector);
     // t_c - R_f t_b = t_f - R_c t_i
     MatrixX normal = MatrixX::Identity(6, 6) * 1e-9;
     VectorX right = VectorX::Zero(6);

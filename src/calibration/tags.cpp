@@ -15,6 +15,8 @@
 #include <cmath>
 #include <memory>
 
+#include "src/math/decompositions.h"
+
 namespace chainsplat::calibration {
 
 using math::Vector2;

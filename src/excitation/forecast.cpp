@@ -2,6 +2,7 @@
 #include <cmath>
 
 #include "chainsplat/excitation.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::excitation {
 namespace {
@@ -45,8 +46,8 @@ Forecast forecast(const dynamics::Model& model, std::span<const dynamics::Unknow
         spread, told.topLeftCorner(size, size).cwiseProduct(covariance).sum() / static_cast<double>(points.size()));
   }
   const MatrixX cross = sum.topRightCorner(size, 2 * n);
-  out.information =
-      sum.topLeftCorner(size, size) - cross * sum.bottomRightCorner(2 * n, 2 * n).ldlt().solve(cross.transpose());
+  out.information = sum.topLeftCorner(size, size) -
+                    cross * MatrixX(sum.bottomRightCorner(2 * n, 2 * n)).ldlt().solve(MatrixX(cross.transpose()));
   out.spread = std::sqrt(spread);
   return out;
 }

@@ -58,7 +58,7 @@ struct Forces {
 };
 
 Forces solve_each(const MatrixX& jacobian, const MatrixX& residual, const Factor& factor, const Matrix3& prior) {
-  const MatrixX weighted = factor.solve(jacobian.transpose());  // n x 3
+  const MatrixX weighted = factor.solve(MatrixX(jacobian.transpose()));  // n x 3
   Forces out;
   out.information = jacobian * weighted + prior.inverse();
   out.covariance = out.information.inverse();

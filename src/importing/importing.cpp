@@ -15,6 +15,7 @@
 #include "document.h"
 #include "media.h"
 #include "picture.h"
+#include "src/math/decompositions.h"
 #include "table.h"
 
 namespace chainsplat::importing {

@@ -3,6 +3,7 @@
 #include <cmath>
 
 #include "chainsplat/report.h"
+#include "src/math/decompositions.h"
 
 namespace chainsplat::report {
 

@@ -2,6 +2,7 @@
 #include <cmath>
 
 #include "chainsplat/core.h"
+#include "src/math/decompositions.h"
 #include "src/silhouette/frame.h"
 #include "src/silhouette/smooth_in_time.h"
 

@@ -4,6 +4,7 @@
 #include <utility>
 
 #include "chainsplat/core.h"
+#include "src/math/decompositions.h"
 #include "src/silhouette/correction_equations.h"
 #include "src/silhouette/frame.h"
 
@@ -123,7 +124,7 @@ Candidate jump_before(const std::vector<ClockEquations>& equations, std::size_t 
   Candidate best;
   for (Eigen::Index c = 0; c < cameras; ++c) {
     if (equations[i].frame[c] < 0) continue;
-    const VectorX response = constant.solve(coupling.col(c));
+    const VectorX response = constant.solve(VectorX(coupling.col(c)));
     const double curvature = coupling(c, c) - coupling.col(c).dot(response), slope = after[c] - response.dot(gradient);
     if (!(curvature > 0.0)) continue;
     const double frames = -slope / curvature;  // later by so many frames from there on

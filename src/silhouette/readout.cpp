@@ -1,6 +1,7 @@
 // What changes in outlines when cameras take longer to read their rows.
 #include "chainsplat/core.h"
 #include "chainsplat/shutter.h"
+#include "src/math/decompositions.h"
 #include "src/silhouette/correction_equations.h"
 #include "src/silhouette/frame.h"
 
@@ -32,7 +33,7 @@ std::vector<VectorX> readout_slopes(const chain::Chain& chain, const capture::Ca
     CorrectedFrame frame{all.times[f], sequence.states.thetadot[f], all.views[f], {}};
     for (const int v : frame.views) frame.masks.push_back(mask_of(capture, v));
     const FrameEquations of = frame_equations(problem, frame, {}, chain, sequence.states.theta[f]);
-    out[f] = -of.local.matrix.ldlt().solve(of.local.coupling.col(0));
+    out[f] = -of.local.matrix.ldlt().solve(VectorX(of.local.coupling.col(0)));
   });
   return out;
 }

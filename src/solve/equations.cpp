@@ -49,12 +49,12 @@ Eliminated eliminate(const ArrowEquations& arrow, const Damping* rule, double da
 // -matrix^-1 gradient of what is damped already.
 bool solve_damped(const MatrixX& matrix, const VectorX& gradient, const Damping& rule, VectorX& step) {
   if (rule.rule != Damping::Rule::shift) {
-    step = matrix.ldlt().solve(-gradient);
+    step = -matrix.ldlt().solve(gradient);
     return true;
   }
   const Eigen::LLT<MatrixX> factor(matrix);
   if (factor.info() != Eigen::Success) return false;
-  step = factor.solve(-gradient);
+  step = -factor.solve(gradient);
   return true;
 }
 
