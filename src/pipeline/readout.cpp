@@ -153,7 +153,7 @@ std::optional<Readout> more_by_motion(const capture::Capture& capture, bool cloc
   const MatrixX information = slope.transpose() * slope, inverse = information.inverse();
   const VectorX clocks = -inverse * (slope.transpose() * before);
   const double readout = clocks[0], base_late = clock_was_late ? clocks[1] : 0.0, size = std::abs(readout);
-  if (!(size >= (known ? kLeastChange : kLeastReadout) && size <= capture::kLongestReadout)) return std::nullopt;
+  if (!(size >= (known ? kLeastChange : kLeastReadout) && size <= longest_readout(capture))) return std::nullopt;
   const double most = known ? 1.0 : 1.0 - kLeastExplained;
   std::optional<VectorX> now = left(readout, base_late);
   if (!(now->squaredNorm() < most * before.squaredNorm())) return std::nullopt;
@@ -191,6 +191,7 @@ Readout more_by_outlines(const capture::Capture& given, const std::vector<std::s
   options.readout = true;
   const std::string& camera = given.cameras[0].name;
   const bool known = silhouette::has_rolling_shutter(given.cameras);
+  const double longest = longest_readout(given);
   std::vector<Clocks> ways;
   for (const char* const only : {"base.time", "readout", "base.time and readout"}) {
     options.only = only;
@@ -198,7 +199,7 @@ Readout more_by_outlines(const capture::Capture& given, const std::vector<std::s
     const capture::Correction& readout = *capture::find(of.corrections, camera, "readout");
     const double least = known ? readout.deviation[0] : kLeastReadout;
     const double value = std::abs(readout.value[0]) < least ? 0.0 : readout.value[0];
-    if (std::abs(value) > capture::kLongestReadout) continue;
+    if (std::abs(value) > longest) continue;
     ways.push_back({{capture::value_of(of.corrections, "base", "time"), value},
                     readout.deviation[0],
                     of.unexplained + of.surprise});
