@@ -162,7 +162,8 @@ std::optional<HandEye> hand_eye(const std::vector<Placed>& views, const trajecto
   HandEye out;
   for (int round = 0; round < 4; ++round) {
     // R_c R_i = R_f R_b, i the view, f the flange, c the camera, b the board: vec(R_c) and vec(R_b) are the singular
-    // vectors of sum R_i^T (x) R_f^T for its largest value
+    // vectors of sum R_i^T (x) R_f^T for its largest value, of which the right one is an eigenvector of the sum's
+    // square
     MatrixX sum = MatrixX::Zero(9, 9);
     int count = 0;
     for (std::size_t i = 0; i < views.size(); ++i) {

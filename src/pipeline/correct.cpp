@@ -222,7 +222,7 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
     readout.value += more->value;
     readout.deviation = more->deviation;
     const bool possible = std::abs(readout.value) <= longest;
-    if (!possible) readout = {};  // what is left is not of rows, then, and no part of it was
+    if (!possible) readout = {};  // something else is wrong, and its first rounds were taken for a readout, too
     correct_the_rest();
     if (!possible) break;
   }

@@ -57,12 +57,12 @@ capture::Capture with_readout(const capture::Capture& capture, double readout) {
 }
 
 double longest_readout(const capture::Capture& capture) {
-  constexpr double kBeside = 1.2;  // what is found has an error, too
+  constexpr double kMargin = 1.2;  // for the error of a readout that is found
   double out = capture::kLongestReadout;
   for (const std::vector<double>& times : capture.times) {
     std::vector<double> apart;  // stamps jitter, and a frame may be lost
     for (std::size_t k = 1; k < times.size(); ++k) apart.push_back(times[k] - times[k - 1]);
-    if (!apart.empty()) out = std::min(out, kBeside * math::median(apart));
+    if (!apart.empty()) out = std::min(out, kMargin * math::median(apart));
   }
   return out;
 }
