@@ -115,6 +115,28 @@ TEST_CASE("a plane that the views do not tell is told") {
   }
 }
 
+TEST_CASE("what may leave the plane counts in the deviations, as far as ropes do leave it") {
+  constexpr int kDraws = 4000;
+  for (const auto& [deviation, expected] : {std::pair{3e-3, 3e-3}, {0.1, 8e-3}, {1e-3, 0.0}}) {  // m, of 0.4 m
+    twin::Twin twin = make_twin(0.0, 0.0);
+    twin.states.covariance.assign(kFrames, math::MatrixX::Zero(kJoints, kJoints));
+    pipeline::judge_bending(twin, {chain::Bending::planar, 0.0, deviation});
+    // by how much the links' ends move where angles are drawn from the covariance
+    const math::MatrixX root = twin.states.covariance.back().cwiseSqrt(),
+                        straight =
+                            chain::nodes(twin.chain, chain::link_motions(twin.chain, math::VectorX::Zero(kJoints), {}));
+    std::mt19937 random(3);
+    std::normal_distribution<double> normal;
+    double square = 0.0;
+    for (int draw = 0; draw < kDraws; ++draw) {
+      const math::VectorX theta = root * math::VectorX::NullaryExpr(kJoints, [&](auto) { return normal(random); });
+      const math::MatrixX moved = chain::nodes(twin.chain, chain::link_motions(twin.chain, theta, {})) - straight;
+      square += moved.squaredNorm() / (kDraws * kJoints);
+    }
+    CHECK(std::sqrt(square) == doctest::Approx(expected).epsilon(0.05));
+  }
+}
+
 TEST_CASE("a rope that no camera sees in a part is told, with the frame, and its corrections are not trusted") {
   twin::Twin twin = make_twin(0.1, 0.0);
   capture::Capture capture;

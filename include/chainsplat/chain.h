@@ -91,6 +91,9 @@ double neighbor_difference(const Chain& chain, double of_eight);
 // 6.11). It belongs to every covariance that is told, and to none that weights measurements by their noise.
 std::vector<double> shape_variances(const Chain& chain, const VectorX& theta);
 MatrixX shape_covariance(const Chain& chain, const std::vector<double>& variances, const VectorX& theta);
+// The covariance of independent errors of all angles, alike at every joint, by which the links' ends move by
+// `deviation`, m, RMS over the rope: rad^2, n x n (mathematics.md 6.11).
+MatrixX bend_covariance(const Chain& chain, double deviation, const VectorX& theta);
 
 // Link that carries the material point at `arclength` (a joint belongs to the link it starts).
 int link_at(const Chain& chain, double arclength);

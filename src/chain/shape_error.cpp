@@ -40,4 +40,10 @@ MatrixX shape_covariance(const Chain& chain, const std::vector<double>& variance
   return factor.solve(MatrixX::Identity(n, n));
 }
 
+MatrixX bend_covariance(const Chain& chain, double deviation, const VectorX& theta) {
+  const std::vector<MatrixX> jacobians = link_end_jacobians(chain, theta, Pose{});
+  const double square = displacement_metric(jacobians).trace() / static_cast<double>(jacobians.size());  // m^2/rad^2
+  return MatrixX::Identity(chain.angles(), chain.angles()) * (deviation * deviation / square);
+}
+
 }  // namespace chainsplat::chain

@@ -26,6 +26,8 @@ constexpr double kStill = 2.0;  // of an angle's variation over its noise; swing
 constexpr std::size_t kFramesOfMotion = 15;  // half a second
 // Share of the length by which a rope may leave its plane unseen before that is told: what three cameras are off by.
 constexpr double kUnseen = 0.005;
+// Share of the length by which ropes do leave it: simulated ones that are moved in a plane by 1 %, bent cables by 3 %.
+constexpr double kLeavesPlane = 0.02;
 // Share of a rope's points that no camera shows in a frame which is told. Simulated ropes whose end is to be seen leave
 // up to 0.06; those whose end or middle goes behind the gripper in all cameras, 0.2.
 constexpr double kOutOfSight = 0.1;
@@ -172,6 +174,9 @@ void judge_bending(twin::Twin& twin, const silhouette::BendingChoice& choice) {
       kMillimeters * unseen);
   twin.verdict.push_back({kOutOfPlane, "object", kMillimeters * choice.out_of_plane_rms,
                           kMillimeters * choice.deviation, "mm", false, true, false, -1, text});
+  const double deviation = std::min(unseen, kLeavesPlane * twin.chain.length);
+  for (std::size_t k = 0; k < twin.states.covariance.size(); ++k)
+    twin.states.covariance[k] += chain::bend_covariance(twin.chain, deviation, twin.states.theta[k]);
 }
 
 void judge_motion(twin::Twin& twin, const trajectory::Trajectory& base) {
