@@ -179,7 +179,6 @@ struct CorrectionFit {
 // Poses, focal lengths and clocks of the cameras, the base's clock, the grasp's place and the rope's size, together
 // with the angles of up to `frames` frames, from the masks' outlines. Gauss-Newton on the arrow system from `fit`;
 // it must have a frame with a residual, and may be a few pixels off: what is cut as foreign starts wide and narrows.
-// Of one camera only its masks and the base's clock are varied: nothing tells its distance from the rope's size.
 // Deviations are the larger of what the equations say and of what the scatter between stretches of time says.
 CorrectionFit fit_corrections(const chain::Chain& chain, const capture::Capture& capture, const SequenceFit& fit,
                               const CorrectionOptions& options = {});

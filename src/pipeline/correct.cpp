@@ -127,7 +127,7 @@ Corrected correct_all_but_readout(capture::Capture& capture, const std::vector<s
   judge_outlines(fit, capture, out.verdict);
   judge_folds(fit, out.verdict);
   capture::apply(out.corrections, capture);
-  // where one camera alone sees how the rope comes down, or the grasp is to be taken as given
+  // where the grasp is to be taken as given
   if (capture::find(out.corrections, "grasp", "translation")->state == capture::CorrectionState::held)
     if (const std::optional<double> above = given_above_table(capture)) judge_height(*above, out.verdict);
   correct_colors(fit, fixed, capture, out);

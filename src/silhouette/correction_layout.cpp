@@ -12,17 +12,13 @@ using math::VectorX;
 
 namespace {
 
-constexpr int kLeastCameras = 2;  // from which poses and sizes can be told apart
-
 bool is_held(const capture::CorrectedQuantity& quantity, const capture::Capture& capture, const chain::Chain& chain,
              int camera, const CorrectionOptions& options) {
   const std::vector<std::string>& held = options.held;
   const std::string group = quantity.group;
-  const bool clock = quantity.name == std::string("time"),
-             alone = static_cast<int>(capture.cameras.size()) < kLeastCameras;
+  const bool clock = quantity.name == std::string("time");
   if (std::find(held.begin(), held.end(), group) != held.end()) return true;
   if (quantity.name == std::string("readout")) return !options.readout;
-  if (alone && !clock && quantity.name != std::string("mask_offset")) return true;
   if (clock && camera == 0) return true;  // the others count from its clock
   if (group == "table" && !options.lying) return true;
   if (clock && camera < 0 && capture.base.samples().size() < 2) return true;
