@@ -69,8 +69,8 @@ struct SequenceFit {
 SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capture, const Options& options = {});
 
 // design.md, 'Recognition', --bending auto: planar on a table, or where a spatial fit is out of plane by less than 1 mm
-// or 3 deviations RMS, or where of one camera a planar fit explains the outlines of a motion as well, or those of a few
-// stills nearly as well; else spatial.
+// or 3 deviations RMS, or where of one camera a planar fit explains the outlines nearly as well (of a rope that is
+// carried: as well); else spatial.
 struct BendingChoice {
   chain::Bending bending = chain::Bending::spatial;
   double out_of_plane_rms = 0.0;  // m; 0 when not measured

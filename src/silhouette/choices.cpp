@@ -1,4 +1,5 @@
 // What a rope's first fit decides of its chain: in how many directions its joints bend, and how many there are.
+#include <algorithm>
 #include <array>
 #include <cmath>
 
@@ -8,6 +9,7 @@ namespace chainsplat::silhouette {
 
 using math::MatrixX;
 using math::Pose;
+using math::Vector3;
 using math::VectorX;
 
 namespace {
@@ -28,17 +30,31 @@ Explained explained_by(const SequenceFit& fit) {
   return {math::median(residual), math::median(covered), math::median(inside)};
 }
 
-// Whether a planar fit of so many frames of one camera explains so much less than one in space that the rope leaves its
-// plane. The width of the masks alone tells depth, and errors of the outline that are alike along the rope look like a
-// bend: of single pictures the planar one must be clearly worse. Of a motion it is enough that it is worse: of
-// ropes that left their plane by 50 mm it had 1.14 to 1.67 times the residual, of others at most 1.05 times.
-bool explains_less(const Explained& planar, const Explained& spatial, std::size_t frames) {
+// Whether a gripper carries the rope through many pictures. A rope at rest is one still, however often it is shown.
+bool is_carried(const capture::Capture& capture, const SequenceFit& fit) {
+  constexpr std::size_t kFrames = 20;  // that are seen
+  constexpr double kWay = 0.25;        // of the length, from where the grasp was at first
+  std::size_t seen = 0;
+  double way = 0.0;
+  const Vector3 first = capture.base.pose(fit.states.time.front()).translation;
+  for (std::size_t f = 0; f < fit.frames.size(); ++f) {
+    if (fit.frames[f].residual_pixels <= 0.0) continue;
+    ++seen;
+    way = std::max(way, (capture.base.pose(fit.states.time[f]).translation - first).norm());
+  }
+  return seen >= kFrames && way >= kWay * capture.length;
+}
+
+// Whether a planar fit of one camera explains so much less than one in space that the rope leaves its plane. The width
+// of the masks alone tells depth, and errors of the outline that are alike along the rope look like a bend: of stills
+// the planar fit must be clearly worse. Of a rope that is carried it is enough that it is worse: of ropes that left
+// their plane by 50 mm it had 1.14 to 1.67 times the residual, of others at most 1.05 times.
+bool explains_less(const Explained& planar, const Explained& spatial, bool carried) {
   constexpr double kClearly = 1.5, kClearlyPixels = 0.3, kClearlyShare = 0.15;
-  constexpr std::size_t kMotion = 20;  // frames
   constexpr double kWorse = 1.1, kAsMuch = 0.05;
   const double share = spatial.covered + spatial.inside - planar.covered - planar.inside;
   if (planar.residual > kClearly * spatial.residual + kClearlyPixels || share > kClearlyShare) return true;
-  return frames >= kMotion && planar.residual > kWorse * spatial.residual && share > -kAsMuch;
+  return carried && planar.residual > kWorse * spatial.residual && share > -kAsMuch;
 }
 
 bool one_camera(const capture::Capture& capture) {
@@ -93,7 +109,7 @@ BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::C
     const chain::Chain planar = chain::make_chain(s.length, s.diameter, s.direction, s.bending_axis, s.links() - 1,
                                                   chain::Bending::planar, false, s.joint_arclength[0]);
     const Explained with = explained_by(fit), without = explained_by(fit_sequence(planar, capture));
-    if (!explains_less(without, with, fit.frames.size())) choice.bending = chain::Bending::planar;
+    if (!explains_less(without, with, is_carried(capture, fit))) choice.bending = chain::Bending::planar;
   }
   return choice;
 }
