@@ -5,7 +5,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "chainsplat/silhouette.h"
+#include "chainsplat/correction_fit.h"
 #include "pipeline/stages.h"
 
 using namespace chainsplat;

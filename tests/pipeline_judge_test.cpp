@@ -120,7 +120,7 @@ TEST_CASE("what may leave the plane counts in the deviations, as far as ropes do
   for (const auto& [deviation, expected] : {std::pair{3e-3, 3e-3}, {0.1, 8e-3}, {1e-3, 0.0}}) {  // m, of 0.4 m
     twin::Twin twin = make_twin(0.0, 0.0);
     twin.states.covariance.assign(kFrames, math::MatrixX::Zero(kJoints, kJoints));
-    pipeline::judge_bending(twin, {chain::Bending::planar, 0.0, deviation});
+    pipeline::widen_by_unseen_bends(twin, {chain::Bending::planar, 0.0, deviation});
     // by how much the links' ends move where angles are drawn from the covariance
     const math::MatrixX root = twin.states.covariance.back().cwiseSqrt(),
                         straight =

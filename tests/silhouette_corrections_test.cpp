@@ -1,5 +1,5 @@
 // What a recording was given wrongly, put into the demo capture by hand and looked for.
-#include "chainsplat/silhouette.h"
+#include "chainsplat/correction_fit.h"
 
 #include <doctest/doctest.h>
 

@@ -1,5 +1,6 @@
 // The silhouette fit against masks drawn from a known chain (surface points, no code in common with the fit) and
 // against the truth of the demo capture.
+#include "chainsplat/correction_fit.h"
 #include "chainsplat/silhouette.h"
 
 #include <doctest/doctest.h>

@@ -81,6 +81,8 @@ MatrixX displacement_metric(const std::vector<MatrixX>& jacobians, const VectorX
 // between 0 and 1 tells them apart.
 bool is_twist(const Chain& chain, int angle);
 bool has_twist(const Chain& chain);
+// Does the rope leave a plane: do its joints turn about more than one axis? A planar chain has one angle per joint.
+bool bends_in_space(const Chain& chain);
 // A deviation of the difference of neighboring joints' angles, given for eight joints, for this chain: a rope's
 // curvature changes along it whatever the number of its joints, so that the difference goes with the square of a link's
 // length.

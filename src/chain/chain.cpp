@@ -131,6 +131,8 @@ bool has_twist(const Chain& chain) {
   return false;
 }
 
+bool bends_in_space(const Chain& chain) { return chain.angles() >= chain.links(); }
+
 double neighbor_difference(const Chain& chain, double of_eight) {
   const double finer = 8.0 / (chain.links() - 1);
   return of_eight * finer * finer;

@@ -152,7 +152,7 @@ Motion move(const State& state, const Belief& belief, double time) {
         out.by_setup.col(unknown) = (moved(unknown, step) - moved(unknown, -step)) / (2.0 * step);
       };
       differ(silhouette::SetupEquations::kClock, kLateStep);
-      for (int i = 0; bends_in_plane(model.chain) && i < 3; ++i)
+      for (int i = 0; !chain::bends_in_space(model.chain) && i < 3; ++i)
         differ(silhouette::SetupEquations::kGrasp + i, kTurnStep);
       return out;
     }

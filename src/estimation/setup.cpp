@@ -41,7 +41,7 @@ constexpr double kSureOfClock = 2.0;         // deviations
 constexpr double kBeforeFirst = 1.0 / 30.0;  // s, to the first frame from what was believed before
 
 void add_table(const Given& given, Setup& setup) {
-  if (!given.table_normal || !bends_in_plane(given.model.chain)) return;
+  if (!given.table_normal || chain::bends_in_space(given.model.chain)) return;
   const Vector3 normal = given.base(given.base_start).pose.rotation.transpose() * *given.table_normal;
   const silhouette::TiltEquations tilt = silhouette::tilt_equations(given.model.chain.bending_axis, normal);
   setup.information.block<3, 3>(SetupEquations::kGrasp, SetupEquations::kGrasp) += tilt.information;
@@ -127,8 +127,6 @@ BaseCorrection base_correction(const VectorX& mean) {
   return {mean[SetupEquations::kClock], {math::exp_so3(mean.segment<3>(SetupEquations::kGrasp)), Vector3::Zero()}};
 }
 
-bool bends_in_plane(const chain::Chain& chain) { return chain.angles() < chain.links(); }
-
 std::vector<MatrixX> rope_twists(const State& state, double time) {
   const auto turned = [](const Pose& frame, const Vector3& axis) {
     return math::transform_twist(frame, (math::Vector6() << axis, Vector3::Zero()).finished());
@@ -136,7 +134,7 @@ std::vector<MatrixX> rope_twists(const State& state, double time) {
   const trajectory::BaseMotion base = base_at(state, time);
   MatrixX shared = MatrixX::Zero(6, state.setup.mean.size());
   shared.col(SetupEquations::kClock) = math::transform_twist(base.pose, base.velocity);
-  for (int i = 0; bends_in_plane(state.given.model.chain) && i < 3; ++i)
+  for (int i = 0; !chain::bends_in_space(state.given.model.chain) && i < 3; ++i)
     shared.col(SetupEquations::kGrasp + i) = turned(base.pose, Vector3::Unit(i));
   std::vector<MatrixX> out(state.cameras.size(), shared);
   int at = SetupEquations::kCameras;
@@ -219,7 +217,7 @@ std::optional<SetupEquations> look_at_setup(const State& state, std::span<const 
       chain, [&](double time) { return base_as_timed(state, time); }, views, state.cameras, state.setup.posed, theta,
       predicted.by_setup.topRows(n), options);
   if (!frame.information.allFinite() || !frame.gradient.allFinite() || !frame.angles.allFinite()) return {};
-  if (!bends_in_plane(chain)) {
+  if (chain::bends_in_space(chain)) {
     leave_out(frame, SetupEquations::kGrasp, 3);
     frame.angles.middleCols<3>(SetupEquations::kGrasp).setZero();
   }

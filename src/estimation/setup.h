@@ -1,7 +1,7 @@
 // setup.h - what is learned of the base's clock, the grasp and the cameras while a rope is followed
 // (mathematics.md 6.8).
 #pragma once
-#include "chainsplat/silhouette.h"
+#include "chainsplat/correction_fit.h"
 #include "src/estimation/state.h"
 
 namespace chainsplat::estimation {
@@ -15,8 +15,6 @@ BaseCorrection base_correction(const math::VectorX& mean);
 // The covariance of it, m x m, and the standard deviation of how late the base's stamps are, s.
 math::MatrixX covariance(const Setup& setup);
 double late_deviation(const Setup& setup);
-// Whether the grasp's rotation is learned: the first joint of a chain that bends in space takes it.
-bool bends_in_plane(const chain::Chain& chain);
 // How the rope moves relative to each camera with each of the setup's numbers, if no angle changes: one twist per
 // number (world frame, angular part first), 6 x m per camera. A camera whose pose is not learned has no columns of its
 // own.

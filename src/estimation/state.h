@@ -2,6 +2,7 @@
 #pragma once
 #include <limits>
 
+#include "chainsplat/correction_fit.h"
 #include "chainsplat/dynamics/rolling.h"
 #include "chainsplat/estimation.h"
 

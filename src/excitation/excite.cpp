@@ -35,7 +35,7 @@ struct Candidate {
 
 std::vector<Axis> default_axes(const Problem& problem) {
   if (problem.tabletop) return {Axis::x, Axis::y, Axis::yaw};
-  return problem.model.chain.angles() > problem.model.chain.links() - 1 ? std::vector<Axis>{Axis::x, Axis::y}
+  return chain::bends_in_space(problem.model.chain) ? std::vector<Axis>{Axis::x, Axis::y}
                                                                         : std::vector<Axis>{Axis::x};
 }
 

@@ -211,7 +211,7 @@ struct Search {
   double radius = 0.5 * chain.diameter;
   double spacing = std::max(kSpacing * radius, chain.length / kMostStations);  // m, between stations
   Vector3 second = chain.direction.cross(chain.bending_axis);
-  bool planar = chain.angles() == chain.links() - 1;
+  bool planar = !chain::bends_in_space(chain);
   mutable Samples samples;
   mutable std::int64_t looked_at = 0;  // number of samples so far
   mutable double by_color = 0.0;       // nats of the colors alone so far

@@ -78,7 +78,7 @@ FirstFit first_fit(const capture::Capture& capture, int joints) {
   out.chain.lift = silhouette::lying_down(out.chain, silhouette::height_by_table(capture));
   out.sequence = silhouette::fit_sequence(out.chain, capture);
   // one camera does not see depth, into which a chain that bends in space would fold
-  if (!capture.tabletop && capture.cameras.size() == 1 &&
+  if (!capture.tabletop && silhouette::seen_by_one(capture) &&
       silhouette::choose_bending(out.chain, capture, out.sequence).bending == chain::Bending::planar) {
     out.chain = chain_of(chain::Bending::planar);
     out.sequence = silhouette::fit_sequence(out.chain, capture);

@@ -201,7 +201,7 @@ constexpr double kClearly =
 std::optional<Hypothesis> misplaced(const capture::Capture& capture, const chain::Chain& chain,
                                     const silhouette::SequenceFit& sequence,
                                     const silhouette::CorrectionOptions& options) {
-  if (capture.cameras.size() < 2) return std::nullopt;  // one sees it as turns of the joints
+  if (silhouette::seen_by_one(capture)) return std::nullopt;  // one sees it as turns of the joints
   const double height = options.lying->height, up = chain.bending_axis.dot(options.lying->normal);
   chain::Chain held = chain;
   silhouette::CorrectionOptions as_held = options;
@@ -291,7 +291,7 @@ std::optional<Decision> decide(const capture::Capture& capture, const chain::Cha
   // all that may be wrong
   out.corrected = out.fit.evidence >= (capture.tabletop ? kNothingWrongOnTable : kNothingWrong);
   // one camera takes depth from the rope's width, so that what is wrong by a little is never seen
-  const bool by_width = capture.cameras.size() == 1 && chain.angles() >= chain.links();
+  const bool by_width = silhouette::seen_by_one(capture) && chain::bends_in_space(chain);
   out.doubted = !out.corrected && (out.fit.evidence >= kNothingWrong || by_width);
   if (out.doubted) add_doubt(numbers_of(out.fit), 1.0, out.fit);
   // friction holds whatever bends a rope on a table was laid in

@@ -5,7 +5,7 @@
 #include <string>
 #include <vector>
 
-#include "chainsplat/silhouette.h"
+#include "chainsplat/correction_fit.h"
 
 namespace chainsplat::pipeline {
 

@@ -4,7 +4,7 @@
 #include <vector>
 
 #include "chainsplat/camera_colors.h"
-#include "chainsplat/silhouette.h"
+#include "chainsplat/correction_fit.h"
 
 namespace chainsplat::pipeline {
 

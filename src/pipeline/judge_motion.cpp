@@ -134,6 +134,12 @@ double hidden_share(const twin::Twin& twin, const capture::Capture& capture, std
   return static_cast<double>(std::count(seen.begin(), seen.end(), 0)) / static_cast<double>(along.size());
 }
 
+// m RMS by which the rope may leave the plane of a planar twin without being seen to; 0 where that is little.
+double unseen_bend(const twin::Twin& twin, const silhouette::BendingChoice& choice) {
+  const double unseen = std::hypot(choice.out_of_plane_rms, choice.deviation);
+  return choice.bending != chain::Bending::planar || unseen < kUnseen * twin.chain.length ? 0.0 : unseen;
+}
+
 }  // namespace
 
 void judge_hidden(twin::Twin& twin, const capture::Capture& capture) {
@@ -163,8 +169,8 @@ void judge_hidden(twin::Twin& twin, const capture::Capture& capture) {
 }
 
 void judge_bending(twin::Twin& twin, const silhouette::BendingChoice& choice) {
-  const double unseen = std::hypot(choice.out_of_plane_rms, choice.deviation);  // m
-  if (choice.bending != chain::Bending::planar || unseen < kUnseen * twin.chain.length) return;
+  const double unseen = unseen_bend(twin, choice);
+  if (unseen == 0.0) return;
   char text[320];
   std::snprintf(
       text, sizeof text,
@@ -174,7 +180,11 @@ void judge_bending(twin::Twin& twin, const silhouette::BendingChoice& choice) {
       kMillimeters * unseen);
   twin.verdict.push_back({kOutOfPlane, "object", kMillimeters * choice.out_of_plane_rms,
                           kMillimeters * choice.deviation, "mm", false, true, false, -1, text});
-  const double deviation = std::min(unseen, kLeavesPlane * twin.chain.length);
+}
+
+void widen_by_unseen_bends(twin::Twin& twin, const silhouette::BendingChoice& choice) {
+  const double deviation = std::min(unseen_bend(twin, choice), kLeavesPlane * twin.chain.length);
+  if (deviation == 0.0) return;
   for (std::size_t k = 0; k < twin.states.covariance.size(); ++k)
     twin.states.covariance[k] += chain::bend_covariance(twin.chain, deviation, twin.states.theta[k]);
 }

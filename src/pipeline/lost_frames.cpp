@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cstdio>
 
+#include "chainsplat/correction_fit.h"
+
 namespace chainsplat::pipeline {
 
 namespace {

@@ -49,10 +49,11 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
 
 // What the twin and its capture say of how to identify it.
 identification::Options identification_options(const twin::Twin& twin, bool paper, std::uint64_t seed);
-// Adds to the verdict what the views left open about the plane that a planar twin bends in, where that is much, and
-// adds to the states' covariances as much of it as ropes do: seen from the side, what leaves the plane looks like
-// bends.
+// Adds to the verdict what the views left open about the plane that a planar twin bends in, where that is much.
 void judge_bending(twin::Twin& twin, const silhouette::BendingChoice& choice);
+// Adds that to the states' covariances, as far as ropes do leave their plane (mathematics.md 6.11): seen from the side,
+// what leaves the plane looks like bends.
+void widen_by_unseen_bends(twin::Twin& twin, const silhouette::BendingChoice& choice);
 // Adds to the verdict where the recognized rope is in no camera's mask, as behind a gripper: what is recognized there
 // is a guess. `capture`: its views.
 void judge_hidden(twin::Twin& twin, const capture::Capture& capture);

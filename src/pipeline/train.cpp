@@ -378,6 +378,7 @@ void recognize(Training& t) {
     char text[96];
     std::snprintf(text, sizeof text, " bending (out of plane: %.2f mm)", 1e3 * found.bending.out_of_plane_rms);
     judge_bending(t.twin, found.bending);
+    widen_by_unseen_bends(t.twin, found.bending);
     core::say((found.bending.bending == chain::Bending::planar ? "planar" : "spatial") + std::string(text));
   }
   if (found.joints.joints > 0) {

@@ -57,15 +57,15 @@ bool explains_less(const Explained& planar, const Explained& spatial, bool carri
   return carried && planar.residual > kWorse * spatial.residual && share > -kAsMuch;
 }
 
-bool one_camera(const capture::Capture& capture) {
+}  // namespace
+
+bool seen_by_one(const capture::Capture& capture) {
   const Frames frames = frames_of(capture);
   double views = 0.0, count = 0.0;
   for (const std::vector<int>& of_frame : frames.views)
     if (!of_frame.empty()) views += static_cast<double>(of_frame.size()), ++count;
   return views < kFewViews * count;
 }
-
-}  // namespace
 
 BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::Capture& capture,
                              const SequenceFit& fit) {
@@ -104,7 +104,7 @@ BendingChoice choose_bending(const chain::Chain& spatial_chain, const capture::C
   choice.deviation = std::sqrt(variance / weights);
   if (choice.out_of_plane_rms < std::max(kSmall, kDeviations * choice.deviation)) {
     choice.bending = chain::Bending::planar;
-  } else if (one_camera(capture)) {
+  } else if (seen_by_one(capture)) {
     const chain::Chain& s = spatial_chain;
     const chain::Chain planar = chain::make_chain(s.length, s.diameter, s.direction, s.bending_axis, s.links() - 1,
                                                   chain::Bending::planar, false, s.joint_arclength[0]);

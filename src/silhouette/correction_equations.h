@@ -4,6 +4,7 @@
 #include <functional>
 #include <vector>
 
+#include "chainsplat/correction_fit.h"
 #include "src/silhouette/outline.h"
 
 namespace chainsplat::silhouette {

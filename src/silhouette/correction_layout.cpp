@@ -23,15 +23,13 @@ bool is_held(const capture::CorrectedQuantity& quantity, const capture::Capture&
   if (group == "table" && !options.lying) return true;
   if (clock && camera < 0 && capture.base.samples().size() < 2) return true;
   // the first joint of a chain that bends in space takes the grasp's rotation, that of a planar one does not
-  return group == "grasp" && quantity.name == std::string("rotation") && bends_in_space(chain);
+  return group == "grasp" && quantity.name == std::string("rotation") && chain::bends_in_space(chain);
 }
 
 }  // namespace
 
 bool is(const Column& column, const char* name) { return column.quantity->name == std::string(name); }
 bool is_mask_start(const Column& column) { return is(column, "mask_start"); }
-
-bool bends_in_space(const chain::Chain& chain) { return chain.angles() >= chain.links(); }
 
 bool of_colors(const capture::CorrectedQuantity& quantity) { return quantity.group == std::string("colors"); }
 

@@ -25,7 +25,6 @@ struct Layout {
   int size = 0;     // of those that are not held
 };
 
-bool bends_in_space(const chain::Chain& chain);
 // Outlines say nothing of these.
 bool of_colors(const capture::CorrectedQuantity& quantity);
 

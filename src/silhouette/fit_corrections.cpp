@@ -457,7 +457,7 @@ std::vector<MatrixX> covariances_by_corrections(const chain::Chain& chain, const
                             {},
                             kLargestCut,
                             kEndReach,
-                            bends_in_space(chain) ? std::nullopt : lying_on_table(capture)};
+                            chain::bends_in_space(chain) ? std::nullopt : lying_on_table(capture)};
   for (int k = 0; k < n; ++k) problem.held.push_back(chain::is_twist(chain, k));
   std::vector<MatrixX> out(states.time.size(), MatrixX::Zero(n, n));
   core::parallel_for(static_cast<std::int64_t>(out.size()), [&](std::int64_t k) {
