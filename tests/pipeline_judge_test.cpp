@@ -1,7 +1,9 @@
 #include <doctest/doctest.h>
+#include <array>
 #include <cmath>
 #include <random>
 
+#include "pipeline/judge_capture.h"
 #include "pipeline/stages.h"
 
 using namespace chainsplat;
@@ -90,6 +92,45 @@ TEST_CASE("a fit that leaves more than the angles' errors is doubted, however li
       CHECK(found->text.find("2.3 times") != std::string::npos);
     }
   }
+}
+
+TEST_CASE("what is held although the outlines say otherwise is told, and not trusted where it moves the rope") {
+  const capture::Finding length = {
+      "length", "object", 3.0,   0.2, "%",
+      true,     true,     false, -1,  "the rope is 3.0 +- 0.2 % longer than 0.300 m: corrected"};
+  CHECK(pipeline::group_of(length) == "length");
+  const capture::Finding held = pipeline::not_corrected(length);
+  CHECK_FALSE(held.corrected);
+  CHECK_FALSE(held.trusted);
+  CHECK(held.value == length.value);
+  CHECK(held.text ==
+        "the rope is 3.0 +- 0.2 % longer than 0.300 m: held as given, which the outlines contradict: do not trust "
+        "this twin");
+
+  capture::Finding unsure = length;  // within three deviations
+  unsure.deviation = 1.2;
+  CHECK(pipeline::not_corrected(unsure).trusted);
+  CHECK(pipeline::not_corrected(unsure).text.ends_with(": held as given"));
+
+  const capture::Finding dark = {
+      "camera-color", "cam0", -20.0, 1.0, "%",
+      true,           true,   false, -1,  "cam0's pictures are 20 +- 1 % darker than all cameras' mean: corrected"};
+  CHECK(pipeline::group_of(dark) == "colors");
+  CHECK(pipeline::not_corrected(dark).trusted);
+
+  // every group by a finding of its own, and those that are about nothing that may be held
+  for (const auto& [code, subject, group] : {std::array{"base-time", "base", "time"},
+                                             {"camera-time", "cam1", "time"},
+                                             {"camera-pose", "cam1", "cameras"},
+                                             {"focal", "cam1", "focal"},
+                                             {"grasp", "grasp", "grasp"},
+                                             {"table", "table", "table"},
+                                             {"grasp", "table", "table"},
+                                             {"diameter", "object", "diameter"},
+                                             {"mask-offset", "cam0", "masks"},
+                                             {"outline-misfit", "cam0", ""},
+                                             {"fold", "object", ""}})
+    CHECK(pipeline::group_of({code, subject, 1.0, 0.0, "1", true, true, false, -1, ""}) == group);
 }
 
 TEST_CASE("a plane that the views do not tell is told") {

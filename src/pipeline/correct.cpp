@@ -237,6 +237,19 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   return out;
 }
 
+std::vector<Finding> contradictions(capture::Capture capture, const std::vector<std::string>& fixed) {
+  const bool all = is_fixed(fixed, "all");
+  std::vector<Finding> out;
+  for (Finding& found : correct(capture, {}, false).verdict) {
+    const std::string group = group_of(found);
+    if (found.impossible && all)
+      out.push_back(std::move(found));
+    else if (found.corrected && !group.empty() && (all || is_fixed(fixed, group.c_str())))
+      out.push_back(not_corrected(std::move(found)));
+  }
+  return out;
+}
+
 Examination examine(const Path& path, const core::Listener& listener) {
   const core::ListenerScope scope(listener);
   capture::Capture capture = capture::load(path);

@@ -1,6 +1,7 @@
 #include "pipeline/judge_capture.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdarg>
 #include <cstdio>
@@ -239,6 +240,35 @@ void judge_readout(double readout, double deviation, std::vector<Finding>& verdi
       {"rolling-shutter", "cameras", size.value, size.deviation, "ms", true, true, false, -1,
        text("the cameras %s their rows one after the other, in %.1f +- %.1f ms: corrected; give it as `readout`",
             certain(size) ? "read" : "may read", size.value, size.deviation)});
+}
+
+std::string group_of(const Finding& found) {
+  static const std::array<std::pair<const char*, const char*>, 11> groups = {{{"base-time", "time"},
+                                                                              {"camera-time", "time"},
+                                                                              {"rolling-shutter", "time"},
+                                                                              {"lost-frames", "time"},
+                                                                              {"camera-pose", "cameras"},
+                                                                              {"half-pixel", "cameras"},
+                                                                              {"focal", "focal"},
+                                                                              {"mask-offset", "masks"},
+                                                                              {"length", "length"},
+                                                                              {"diameter", "diameter"},
+                                                                              {"camera-color", "colors"}}};
+  if (found.code == "grasp" || found.code == "table") return found.subject;
+  const auto at = std::find_if(groups.begin(), groups.end(), [&](const auto& one) { return found.code == one.first; });
+  return at == groups.end() ? "" : at->second;
+}
+
+Finding not_corrected(Finding found) {
+  const std::string group = group_of(found);
+  const bool moves_rope = group != "colors" && group != "masks";
+  const bool sure = moves_rope && std::abs(found.value) > kCertain * found.deviation;
+  const std::size_t end = found.text.find(": corrected");
+  found.text = found.text.substr(0, end) + ": held as given" +
+               (sure ? ", which the outlines contradict: do not trust this twin" : "");
+  found.corrected = false;
+  found.trusted = found.trusted && !sure;
+  return found;
 }
 
 void judge_height(double above, std::vector<Finding>& verdict) {

@@ -34,6 +34,11 @@ void judge_mass(const capture::Capture& given, std::vector<capture::Finding>& ve
 void judge_repeated(const capture::Capture& given, std::vector<capture::Finding>& verdict);
 // Seconds.
 void judge_readout(double readout, double deviation, std::vector<capture::Finding>& verdict);
+// What was found of a quantity that is held as given: a correction that is not made. No twin is trusted that goes by
+// what the outlines surely contradict; colors and the width of masks move no rope.
+capture::Finding not_corrected(capture::Finding found);
+// The group of corrected_quantities() that a finding is of; "" of those that are about none.
+std::string group_of(const capture::Finding& found);
 // A grasp that is `above` meters from where the rope would lie on its table, and no outline tells which is wrong.
 void judge_height(double above, std::vector<capture::Finding>& verdict);
 // Meters. How such a rope comes down to its table is assumed, and nothing else could be checked.

@@ -47,6 +47,10 @@ struct Corrected {
 };
 Corrected correct(capture::Capture& capture, const std::vector<std::string>& fixed, bool anyway);
 
+// What the recording says of the groups in `fixed`, which may be "all", where it says something else than was given:
+// findings that are not corrected. With "all" what is impossible, too.
+std::vector<capture::Finding> contradictions(capture::Capture capture, const std::vector<std::string>& fixed);
+
 // What the twin and its capture say of how to identify it.
 identification::Options identification_options(const twin::Twin& twin, bool paper, std::uint64_t seed);
 // Adds to the verdict what the views left open about the plane that a planar twin bends in, where that is much.

@@ -253,10 +253,21 @@ void check_work(Training& t) {
   if (t.continued && t.joint) check_joint(t.twin, t.run);
 }
 
-// Corrects the capture, or gives it what an earlier training found.
+// Corrects the capture but for what is held, and says where the recording contradicts that.
+Corrected correct_but_held(Training& t) {
+  const std::vector<std::string>& fixed = t.options.fixed;
+  std::vector<capture::Finding> held;
+  if (!fixed.empty()) held = contradictions(t.capture, fixed);
+  Corrected out;
+  if (!is_fixed(fixed, "all")) out = correct(t.capture, fixed, t.options.anyway);
+  out.verdict.insert(out.verdict.end(), held.begin(), held.end());
+  return out;
+}
+
+// The same, or what an earlier training found.
 Corrected corrected_by_now(Training& t) {
   const std::vector<std::string>& fixed = t.options.fixed;
-  if (!t.workspace) return correct(t.capture, fixed, t.options.anyway);
+  if (!t.workspace) return correct_but_held(t);
   Workspace& kept = *t.workspace;
   const bool rolling = silhouette::has_rolling_shutter(t.capture.cameras);  // as given: the views are made for that
   std::string key = t.options.anyway ? "anyway" : "else";
@@ -266,7 +277,7 @@ Corrected corrected_by_now(Training& t) {
     kept.correction_key.clear();
     kept.said_correcting.clear();
     const core::SaidScope scope(kept.said_correcting);
-    kept.corrected = correct(t.capture, fixed, t.options.anyway);
+    kept.corrected = correct_but_held(t);
     views = std::move(t.capture.views), recorded = std::move(t.capture.recorded);
     kept.mended = t.capture;
     kept.correction_key = key;
@@ -291,8 +302,7 @@ void correct_capture(Training& t) {
     return;
   }
   read_at_once(t.capture);
-  const std::vector<std::string>& fixed = t.options.fixed;
-  if (t.options.mode == twin::Mode::paper || is_fixed(fixed, "all")) return;
+  if (t.options.mode == twin::Mode::paper) return;
   core::report({"recognize", 0, 0, NAN, NAN, "cameras, clocks, grasp and size"});
   Corrected found = corrected_by_now(t);
   t.twin.corrections = std::move(found.corrections);

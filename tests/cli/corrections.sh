@@ -67,6 +67,10 @@ expect_code 0 'recognize with everything fixed'
 python3 -c "
 import json; twin = json.load(open('$work/fixed/twin.json'))
 assert 'corrections' not in twin and abs(twin['chain']['length'] - 0.291) < 1e-9" || fail 'with --fixed all the length changed'
+# what is held is looked at all the same
+[ "$(verdict "$work/fixed/twin.json" length | cut -d' ' -f2-)" = 'False False' ] ||
+  fail 'a twin of a wrong length that was held is trusted'
+grep -q 'held as given' "$work/stdout" || fail 'recognize --fixed all does not say what it holds wrongly'
 run recognize "$work/capture" -o "$work/no" --fixed camera
 expect_code 2 'a group that is none'
 finish
