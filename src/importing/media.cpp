@@ -119,6 +119,8 @@ Media open_media(const Path& path) {
     media.files = {path};
   } else {
     if (!fs::exists(path, error)) throw InputError(path.string(), "does not exist", "check the path");
+    if (!fs::is_regular_file(path, error))
+      throw InputError(path.string(), "is a pipe or a device, which can be read once", "record it into a file first");
     const capture::VideoFacts facts = capture::video_facts(path);
     if (facts.frames < 1) throw InputError(path.string(), "has no frame", "write the video again");
     media.video = true;

@@ -97,6 +97,9 @@ refused 'table' "${opencv[@]/#free/tabletop}" "${stamps[@]}" --base "$raw/robot.
 # Kalibr alone does not know the robot
 refused 'to each other.*--pose cam0=' --camera cam0="$demo/cam0.mp4" --camera cam1="$demo/cam1.mp4" --calibration "$kalibr/camchain.yaml" \
   --timestamps "$kalibr/frames_ns.txt" --base "$kalibr/gripper.tum" --direction=-z "${rope[@]}"
+# a video is read more than once
+mkfifo "$work/pipe"
+refused 'pipe.*can be read once.*into a file' "${opencv[@]/#cam0=*.mp4/cam0=$work/pipe}" "${stamps[@]}" --base "$raw/robot.csv"
 # a pose of which the file does not say which way it maps: the view tells, where it can
 python3 - "$demo/capture.json" "$work" <<'END'
 import json, sys
