@@ -20,6 +20,9 @@ constexpr double kMoreResidual = 2.0;        // times the median, and
 constexpr double kMoreResidualPixels = 0.5;  // px more
 constexpr double kLost = 0.6;                // share covered or inside under which a frame is sought from scratch
 constexpr double kBetter = 0.9;              // share of the old cost that a new fit must stay under
+constexpr double kMuchBetter = 0.6;          // the same, where the new one leaves its neighbors and the old does not
+// Way from frame to frame by which a rope leaves its neighbors: times the usual one, and share of the length.
+constexpr double kJump = 3.0, kJumpShare = 0.03;
 
 constexpr double kCommonOffsetDeviation = 0.1;  // px, of the masks' offset learned from all frames
 
@@ -82,6 +85,7 @@ struct Sequence {
   std::vector<char> seen;                // by frame: a mask shows something
   std::vector<FrameSolution> solutions;  // by frame
   Options each;                          // for one frame
+  double far = 0.0;                      // m, way_between() that no rope goes from frame to frame; 0: not known yet
 
   int count() const { return static_cast<int>(times.size()); }
   VectorX straight() const { return VectorX::Zero(chain.angles()); }
@@ -151,12 +155,38 @@ bool explains_more(const FrameFit& a, const FrameFit& b) {
   return a.covered > b.covered + kLessCovered && kMoreResidual * a.residual_pixels < b.residual_pixels;
 }
 
-// Fits a frame once more, and keeps what is clearly better.
+// m, RMS over the nodes: how far the rope goes from one shape to another, relative to the base.
+double way_between(const chain::Chain& chain, const VectorX& from, const VectorX& to) {
+  const auto nodes = [&](const VectorX& theta) { return chain::nodes(chain, chain::link_motions(chain, theta, {})); };
+  return std::sqrt((nodes(to) - nodes(from)).colwise().squaredNorm().mean());
+}
+
+double far_of(const Sequence& s) {
+  std::vector<double> ways;
+  for (int f = 1; f < s.count(); ++f)
+    if (s.seen[f] && s.seen[f - 1])
+      ways.push_back(way_between(s.chain, s.solutions[f - 1].fit.theta, s.solutions[f].fit.theta));
+  return std::max(kJumpShare * s.chain.length, ways.empty() ? 0.0 : kJump * math::median(ways));
+}
+
+// Whether such a shape at a frame is far from those before and after it.
+bool leaves_neighbors(const Sequence& s, int f, const VectorX& theta) {
+  if (s.far == 0.0) return false;
+  const auto is_near = [&](int other) {
+    return other >= 0 && other < s.count() && s.seen[other] &&
+           way_between(s.chain, s.solutions[other].fit.theta, theta) <= s.far;
+  };
+  return !is_near(f - 1) && !is_near(f + 1);
+}
+
+// Fits a frame once more, and keeps what is clearly better. A rope in a loop may as well be laid the other way round
+// into its masks, and where a part of it is hidden even better: not where the frames beside it say otherwise.
 void try_again(Sequence& s, int f, const std::vector<FrameView>& views, const VectorX& from, bool warm) {
   FrameSolution again = solve_frame(s.chain, views, from, warm, s.each);
   FrameSolution& old = s.solutions[f];
-  const bool cheaper =
-      again.cost < kBetter * old.cost && !explains_less(again.fit, old.fit) && !explains_more(old.fit, again.fit);
+  const bool leaves = leaves_neighbors(s, f, again.fit.theta) && !leaves_neighbors(s, f, old.fit.theta);
+  const bool cheaper = again.cost < (leaves ? kMuchBetter : kBetter) * old.cost && !explains_less(again.fit, old.fit) &&
+                       !explains_more(old.fit, again.fit);
   if (cheaper || explains_more(again.fit, old.fit)) old = std::move(again);
 }
 
@@ -237,6 +267,7 @@ SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capt
   capture::require_pixels(capture, capture::Pixels::undistorted);
   Sequence s = make_sequence(chain, capture, options);
   fit_forward(s);
+  s.far = far_of(s);
   repair(s);
   share_edge_offset(s);
   warn_of_unseen(s, capture.name);
