@@ -111,17 +111,18 @@ Corrected correct_all_but_readout(capture::Capture& capture, const std::vector<s
     out.corrections = std::move(lost);
     return out;
   }
-  auto& [fit, corrected, half_pixel, doubted, shift] = *decision;
+  auto& [fit, corrected, half_pixel, doubt, shift] = *decision;
   tell_fit("correct", fit.summary);
   out.corrections = std::move(fit.corrections);
-  if (corrected || doubted) out.covariance = std::move(fit.covariance);
+  if (corrected || doubt > 0.0) out.covariance = (corrected ? 1.0 : doubt) * fit.covariance;
   if (!corrected)
     for (capture::Correction& correction : out.corrections) correction.value.setZero();
   if (half_pixel) correct_half_pixel(fit, options, out);
   if (shift)
     for (capture::Correction& correction : out.corrections)
       if (correction.subject == shift->subject && correction.quantity == shift->quantity) correction.value += shift->value;
-  judge_clocks(out.corrections, capture, out.verdict);
+  judge_base_clock(out.corrections, out.verdict);
+  judge_camera_clocks(out.corrections, capture, out.verdict);
   if (!half_pixel) judge_cameras(out.corrections, capture, out.verdict);
   judge_rope(out.corrections, capture, out.verdict);
   judge_outlines(fit, capture, out.verdict);

@@ -16,8 +16,11 @@ namespace {
 constexpr double kNothingWrong = 0.15, kNothingWrongOnTable = 0.7;
 // The same of a rope that is held straight by its prior: right recordings of ropes on tables have up to 0.8.
 constexpr double kNothingWrongHeldStraight = 1.0;
-constexpr double kLeastEvidence = kNothingWrong;  // below it no cause is looked for
-constexpr double kLeftOfHalfPixel = 0.2;          // of the evidence, at most, with half a pixel taken back
+// Below it no cause is looked for alone, and nothing is doubted; from kNothingWrong on it is sure that something is
+// wrong. Right recordings of ropes that hang have up to 0.063, of ropes on tables up to 0.12, because a round end looks
+// like a grasp or a length that is off: these are not looked for below kNothingWrong there.
+constexpr double kLeastEvidence = 0.08;
+constexpr double kLeftOfHalfPixel = 0.2;  // of the evidence, at most, with half a pixel taken back
 // Any other thing alone is corrected if it leaves at most kLeftOfOne of the evidence, but for kAsRight, which is there
 // when nothing is wrong. Each of its numbers adds kPerNumber, since many numbers explain a part of anything. What it
 // leaves must be less than kRight, from which on more would be wrong; a round end leaves 0.25 on a table.
@@ -42,8 +45,10 @@ double mean_square(const silhouette::CorrectionFit& fit) {
 
 bool is_half_pixel(const silhouette::CorrectionFit& fit) {
   const auto least = std::min_element(fit.evidence_after.begin(), fit.evidence_after.end());
-  return fit.evidence > kLeastEvidence && *least < kLeftOfHalfPixel * fit.evidence;
+  return fit.evidence > kNothingWrong && *least < kLeftOfHalfPixel * fit.evidence;
 }
+
+bool looks_like_an_end(const silhouette::Cause& cause) { return cause.in_doubt.starts_with("grasp and length"); }
 
 // The one thing that explains what is wrong; null where it takes more. Of those that may be mistaken for each other it
 // is the likeliest.
@@ -54,6 +59,7 @@ const silhouette::Cause* single_cause(const silhouette::CorrectionFit& fit, bool
   for (const silhouette::Cause& cause : fit.causes) {
     const double left = std::max(0.0, cause.evidence - kAsRight) + kPerNumber * cause.numbers * fit.evidence;
     if (cause.evidence >= (tabletop ? kRightOnTable : kRight) || left >= least) continue;
+    if (tabletop && fit.evidence < kNothingWrong && looks_like_an_end(cause)) continue;
     best = &cause;
     least = left;
   }
@@ -292,8 +298,10 @@ std::optional<Decision> decide(const capture::Capture& capture, const chain::Cha
   out.corrected = out.fit.evidence >= (capture.tabletop ? kNothingWrongOnTable : kNothingWrong);
   // one camera takes depth from the rope's width, so that what is wrong by a little is never seen
   const bool by_width = silhouette::seen_by_one(capture) && chain::bends_in_space(chain);
-  out.doubted = !out.corrected && (out.fit.evidence >= kNothingWrong || by_width);
-  if (out.doubted) add_doubt(numbers_of(out.fit), 1.0, out.fit);
+  if (!out.corrected)
+    out.doubt =
+        by_width ? 1.0 : std::clamp((out.fit.evidence - kLeastEvidence) / (kNothingWrong - kLeastEvidence), 0.0, 1.0);
+  if (out.doubt > 0.0) add_doubt(numbers_of(out.fit), 1.0, out.fit);
   // friction holds whatever bends a rope on a table was laid in
   if (!out.corrected || capture.tabletop) return out;
   silhouette::CorrectionFit straight = silhouette::fit_corrections(chain, capture, sequence, options);

@@ -18,7 +18,7 @@ struct Decision {
   silhouette::CorrectionFit fit;
   bool corrected = false;   // by what it found; else nothing is, but for the next two
   bool half_pixel = false;  // by this alone
-  bool doubted = false;     // nothing is, but may have to be: the fit's deviations are of what was given
+  double doubt = 0.0;       // where nothing is: how likely it is, 0 to 1, that something has to be, by the fit
   std::optional<capture::Correction> shift;  // beside what it found: of table or grasp
 };
 

@@ -64,16 +64,27 @@ std::string text(const char* format, ...) {
   return line;
 }
 
-void judge_clocks(const capture::Corrections& found, const capture::Capture& given, std::vector<Finding>& verdict) {
-  const auto say = [&](const std::string& code, const std::string& subject, const std::string& words) {
-    const Size late = size_of(capture::find(found, subject, "time"), kSeconds);
-    if (!worth_saying(late, kClock)) return;
-    verdict.push_back({code, subject, late.value, late.deviation, "ms", true, true, false, -1,
-                       words + text(" %s %.1f +- %.1f ms %s: corrected", is(late), std::abs(late.value), late.deviation,
-                                    late.value > 0.0 ? "late" : "early")});
-  };
-  say("base-time", "base", "the base's clock");
-  for (const capture::Camera& camera : given.cameras) say("camera-time", camera.name, camera.name + "'s clock");
+namespace {
+
+void judge_clock(const capture::Corrections& found, const std::string& code, const std::string& subject,
+                 const std::string& words, std::vector<Finding>& verdict) {
+  const Size late = size_of(capture::find(found, subject, "time"), kSeconds);
+  if (!worth_saying(late, kClock)) return;
+  verdict.push_back({code, subject, late.value, late.deviation, "ms", true, true, false, -1,
+                     words + text(" %s %.1f +- %.1f ms %s: corrected", is(late), std::abs(late.value), late.deviation,
+                                  late.value > 0.0 ? "late" : "early")});
+}
+
+}  // namespace
+
+void judge_base_clock(const capture::Corrections& found, std::vector<Finding>& verdict) {
+  judge_clock(found, "base-time", "base", "the base's clock", verdict);
+}
+
+void judge_camera_clocks(const capture::Corrections& found, const capture::Capture& given,
+                         std::vector<Finding>& verdict) {
+  for (const capture::Camera& camera : given.cameras)
+    judge_clock(found, "camera-time", camera.name, camera.name + "'s clock", verdict);
 }
 
 void judge_cameras(const capture::Corrections& found, const capture::Capture& given, std::vector<Finding>& verdict) {

@@ -12,8 +12,9 @@ inline constexpr double kMeters = 1e3, kSeconds = 1e3;  // to mm and ms, in whic
 inline constexpr double kCertain = 3.0;  // standard deviations from which a correction is told as certain
 
 // Each of these adds lines to the verdict. `given`: the capture before it was corrected; `found`: all corrections.
-void judge_clocks(const capture::Corrections& found, const capture::Capture& given,
-                  std::vector<capture::Finding>& verdict);
+void judge_base_clock(const capture::Corrections& found, std::vector<capture::Finding>& verdict);
+void judge_camera_clocks(const capture::Corrections& found, const capture::Capture& given,
+                         std::vector<capture::Finding>& verdict);
 // Poses, focal lengths and the width of masks.
 void judge_cameras(const capture::Corrections& found, const capture::Capture& given,
                    std::vector<capture::Finding>& verdict);
