@@ -152,6 +152,33 @@ TEST_CASE("one thing that explains all that is wrong is corrected alone" * docte
   }
 }
 
+TEST_CASE("a base that is late by less than outlines tell is found by the rope's motion, and is no rolling shutter" *
+          doctest::test_suite("whole")) {
+  for (const double late : {-0.004, 0.008}) {
+    CAPTURE(late);
+    capture::Capture capture = demo();
+    std::vector<trajectory::Sample> samples = capture.base.samples();
+    for (trajectory::Sample& sample : samples) sample.time += late;
+    capture.base = trajectory::fit(samples, "base.tum");
+    const pipeline::Corrected found = pipeline::correct(capture, {}, false);
+    const capture::Correction& clock = *capture::find(found.corrections, "base", "time");
+    CHECK(std::abs(clock.value[0] - late) < 0.002);
+    CHECK(std::abs(clock.value[0] - late) < 3.0 * clock.deviation[0]);
+    CHECK(clock.state == capture::CorrectionState::free);
+    const capture::Finding* const said = finding(found.verdict, "base-time", "base");
+    REQUIRE(said);
+    CHECK(said->value == doctest::Approx(1e3 * clock.value[0]));
+    CHECK(!finding(found.verdict, "rolling-shutter", "cameras"));
+    CHECK(found.covariance.diagonal().maxCoeff() >= clock.deviation[0] * clock.deviation[0] * (1.0 - 1e-9));
+    // a twin mends the recording again in the same way
+    capture::Capture again = demo();
+    again.base = trajectory::fit(std::move(samples), "base.tum");
+    capture::apply(found.corrections, again);
+    for (const double t : {0.3, 1.0, 1.7})
+      CHECK((again.base.pose(t).translation - capture.base.pose(t).translation).norm() < 1e-6);
+  }
+}
+
 TEST_CASE("a thicker rope lies higher on its table, which is no other table") {
   capture::Capture capture = lying(0.0);
   capture.diameter *= 1.1;

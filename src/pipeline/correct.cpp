@@ -152,9 +152,9 @@ bool any_but_colors(const capture::Corrections& corrections) {
   });
 }
 
-// Adds a readout that was found, or may be there, to what else was.
+// Adds clocks that were found beside what else was, or may be wrong.
 void add_readout(const Readout& readout, Corrected& out) {
-  if (readout.value == 0.0 && readout.doubt.isZero(0.0)) return;
+  if (readout.value == 0.0 && readout.late == 0.0 && readout.doubt.isZero(0.0)) return;
   Eigen::Index numbers = 0;
   std::vector<Eigen::Index> of_base, of_rows;
   for (capture::Correction& correction : out.corrections) {
@@ -162,7 +162,12 @@ void add_readout(const Readout& readout, Corrected& out) {
     if (correction.quantity->group == std::string("colors") || correction.quantity == &capture::lost_frames()) continue;
     if (correction.quantity == &capture::corrected_quantity("base", "time")) {
       of_base.push_back(numbers);
-      correction.deviation.setConstant(std::hypot(correction.deviation[0], std::sqrt(readout.doubt(0, 0))));
+      // what outlines leave open counts where they told it, too
+      const double by_outlines = readout.late != 0.0 && correction.value[0] == 0.0 ? 0.0 : correction.deviation[0];
+      correction.value.array() += readout.late;
+      correction.deviation.setConstant(
+          std::hypot(by_outlines, readout.late_deviation, std::sqrt(readout.doubt(0, 0))));
+      if (readout.late != 0.0) correction.state = capture::CorrectionState::free;
     }
     if (correction.quantity == &capture::corrected_quantity("camera", "readout")) {
       of_rows.push_back(numbers);
@@ -179,7 +184,7 @@ void add_readout(const Readout& readout, Corrected& out) {
     for (const Eigen::Index a : rows)
       for (const Eigen::Index b : columns) out.covariance(a, b) += value;
   };
-  add(of_base, of_base, readout.doubt(0, 0));
+  add(of_base, of_base, readout.doubt(0, 0) + readout.late_deviation * readout.late_deviation);
   add(of_base, of_rows, readout.doubt(0, 1));
   add(of_rows, of_base, readout.doubt(1, 0));
   add(of_rows, of_rows, readout.doubt(1, 1) + own);
@@ -203,7 +208,7 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   Readout readout;
   Corrected found;
   const auto correct_the_rest = [&] {
-    capture = readout.value == 0.0 ? given : with_readout(given, readout.value);
+    capture = readout.value == 0.0 && readout.late == 0.0 ? given : with_readout(given, readout);
     found = correct_all_but_readout(capture, fixed, first_fit(capture));
   };
   const auto more_readout = [&]() -> std::optional<Readout> {
@@ -211,7 +216,7 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
     const bool clock_was_late = capture::value_of(found.corrections, "base", "time") != 0.0;
     if (!capture.tabletop) return more_by_motion(capture, clock_was_late);
     if (readout.value == 0.0 && !any_but_colors(found.corrections)) return std::nullopt;
-    return more_by_outlines(readout.value == 0.0 ? given : with_readout(given, readout.value), fixed,
+    return more_by_outlines(readout.value == 0.0 ? given : with_readout(given, readout), fixed,
                             found.corrections);
   };
   const double longest = longest_readout(given);
@@ -219,9 +224,11 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   for (int round = 0; round < kReadoutRounds; ++round) {
     const std::optional<Readout> more = more_readout();
     if (more) readout.doubt = more->doubt;
-    if (!more || more->value == 0.0) break;
+    if (!more || (more->value == 0.0 && more->late == 0.0)) break;
     readout.value += more->value;
+    readout.late += more->late;
     readout.deviation = more->deviation;
+    readout.late_deviation = std::max(readout.late_deviation, more->late_deviation);
     const bool possible = std::abs(readout.value) <= longest;
     if (!possible) readout = {};  // something else is wrong, and its first rounds were taken for a readout, too
     correct_the_rest();
@@ -231,6 +238,11 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
     core::say_more(text("correct: the rows are read in %.1f ms", kSeconds * readout.value));
   add(std::move(found), out);
   add_readout(readout, out);
+  if (readout.late != 0.0) {
+    core::say_more(text("correct: by the rope's motion the base is %.1f ms late", kSeconds * readout.late));
+    std::erase_if(out.verdict, [](const Finding& one) { return one.code == "base-time"; });
+    judge_base_clock(out.corrections, out.verdict);
+  }
   if (readout.value == 0.0) return out;
   capture.views = given.views;
   for (capture::PackedView& view : capture.views) view.time = capture.times[view.camera][view.frame];

@@ -18,11 +18,11 @@ namespace {
 // Of what identification leaves, in units of what is expected: right recordings leave 0.2, a readout of 15 ms 2.2,
 // and 1.1 where most of it was taken for the base's clock.
 constexpr double kExplained = 0.4;
-// What a readout must explain of that, since no model is right.
+// What a readout, or a clock, must explain of that, since no model is right.
 constexpr double kLeastExplained = 0.3;
-constexpr double kLeastReadout = 0.0015;  // s, one that is less is nothing
-constexpr double kLeastChange = 0.0005;   // s, of one that is known by then
-constexpr double kTriedReadout = 0.004;   // s, by which the slope is found: the motion it adds is a few millimeters
+constexpr double kLeastClock = 0.0015;   // s, one that is less is nothing
+constexpr double kLeastChange = 0.0005;  // s, of one that is known by then
+constexpr double kTriedClock = 0.004;    // s, by which the slope is found: the motion it adds is a few millimeters
 // What is left of them has so many independent parts at least, of its hundreds of frames and joints: what any of them
 // can pretend is that much less than all together.
 constexpr double kIndependent = 10.0;
@@ -42,15 +42,28 @@ void read_at_once(capture::Capture& capture) {
   }
 }
 
-capture::Capture with_readout(const capture::Capture& capture, double readout) {
+namespace {
+
+capture::Correction clock_of(const std::string& subject, const capture::CorrectedQuantity& quantity, double value) {
+  capture::Correction out;
+  out.quantity = &quantity;
+  out.subject = subject;
+  out.value = VectorX::Constant(1, value);
+  return out;
+}
+
+capture::Capture with_base_late(capture::Capture capture, double late) {
+  capture::apply({clock_of("base", capture::corrected_quantity("base", "time"), late)}, capture);
+  return capture;
+}
+
+}  // namespace
+
+capture::Capture with_readout(const capture::Capture& capture, const Readout& readout) {
   capture::Corrections corrections;
-  for (const capture::Camera& camera : capture.cameras) {
-    capture::Correction& correction = corrections.emplace_back();
-    correction.quantity = &capture::corrected_quantity("camera", "readout");
-    correction.subject = camera.name;
-    correction.value = VectorX::Constant(1, readout);
-  }
-  capture::Capture out = capture;
+  for (const capture::Camera& camera : capture.cameras)
+    corrections.push_back(clock_of(camera.name, capture::corrected_quantity("camera", "readout"), readout.value));
+  capture::Capture out = readout.late == 0.0 ? capture : with_base_late(capture, readout.late);
   capture::apply(corrections, out);
   read_at_once(out);
   return out;
@@ -98,26 +111,18 @@ Unexplained left_by_motion(const chain::Chain& chain, const capture::Capture& ca
   return {Eigen::Map<VectorX>(out.data(), static_cast<Eigen::Index>(out.size())), found.estimates.misfit};
 }
 
-void shift_base(double late, capture::Capture& capture) {
-  std::vector<trajectory::Sample> samples = capture.base.samples();
-  for (trajectory::Sample& sample : samples) sample.time -= late;
-  capture.base = trajectory::fit(std::move(samples), "the base");
-}
-
 chain::States states_of(const FirstFit& fit) {
   chain::States out = fit.sequence.states;
   for (const silhouette::FrameFit& frame : fit.sequence.frames) out.covariance.push_back(frame.covariance);
   return out;
 }
 
-// What is left where all is fitted again with this readout, and the base as late; none where a payload, friction in
-// bending or stiffness that varies explain what was left without it: less than `most` of that must be left.
-std::optional<VectorX> left_only_by_readout(const capture::Capture& capture, const FirstFit& fit,
-                                            const chain::States& seen, double readout, double base_late, double most) {
+// What is left where all is fitted again by these clocks; none where a payload, friction in bending or stiffness that
+// varies explain what was left without them: less than `most` of that must be left.
+std::optional<VectorX> left_only_by_clocks(const capture::Capture& capture, const FirstFit& fit,
+                                           const chain::States& seen, const Readout& clocks, double most) {
   constexpr bool kUniform = false;
-  capture::Capture mended = capture;
-  if (base_late != 0.0) shift_base(base_late, mended);
-  mended = with_readout(mended, readout);
+  const capture::Capture mended = with_readout(capture, clocks);
   const FirstFit again = first_fit(mended, kFewJoints);
   const chain::States states = states_of(again);
   VectorX left = left_by_motion(again.chain, mended, states).apart;
@@ -126,6 +131,32 @@ std::optional<VectorX> left_only_by_readout(const capture::Capture& capture, con
         left_by_motion(again.chain, mended, states, kUniform).apart.squaredNorm() < most * otherwise))
     return std::nullopt;
   return left;
+}
+
+enum class Wrong { rows, base, both };
+
+// The Gauss-Newton step of the readout and, where it varies, the base's clock.
+struct Step {
+  MatrixX information;  // by s^2
+  VectorX pull;         // by s
+  double square;        // of what is left without a step
+
+  // Of the information about those that are wrong; 0 elsewhere.
+  MatrixX inverse(Wrong wrong) const {
+    if (wrong == Wrong::both) return information.inverse();
+    const Eigen::Index i = wrong == Wrong::rows ? 0 : 1;
+    MatrixX out = MatrixX::Zero(information.rows(), information.cols());
+    out(i, i) = 1.0 / information(i, i);
+    return out;
+  }
+  double left(Wrong wrong) const { return square - pull.dot(inverse(wrong) * pull); }
+};
+
+// One of the two alone, or both where that leaves less than `most` of what the better one leaves. A base's clock that
+// was found as if there were no readout is as late as the grasp's rows: then it is no readout alone.
+Wrong likeliest(const Step& step, bool clock_was_late, double most) {
+  const Wrong one = clock_was_late || step.left(Wrong::base) < step.left(Wrong::rows) ? Wrong::base : Wrong::rows;
+  return step.left(Wrong::both) < most * step.left(one) ? Wrong::both : one;
 }
 
 }  // namespace
@@ -138,29 +169,43 @@ std::optional<Readout> more_by_motion(const capture::Capture& capture, bool cloc
   const bool known = silhouette::has_rolling_shutter(capture.cameras);  // then every gain is one
   if (given.misfit < kExplained) return std::nullopt;
   const std::vector<VectorX> slopes = silhouette::readout_slopes(fit.chain, capture, fit.sequence);
-  const auto left = [&](double readout, double base_late) {
-    capture::Capture with_clock = capture;
-    if (base_late != 0.0) shift_base(base_late, with_clock);
-    chain::States states = base_late != 0.0 ? states_of(first_fit(with_clock, kFewJoints)) : seen;
-    for (std::size_t k = 0; k < states.theta.size(); ++k) states.theta[k] += readout * slopes[k];
-    return left_by_motion(fit.chain, with_clock, states).apart;
+  const auto left = [&](const Readout& clocks) {
+    const bool moved = clocks.late != 0.0;
+    const capture::Capture mended = moved ? with_base_late(capture, clocks.late) : capture::Capture();
+    chain::States states = moved ? states_of(first_fit(mended, kFewJoints)) : seen;
+    for (std::size_t k = 0; k < states.theta.size(); ++k) states.theta[k] += clocks.value * slopes[k];
+    return left_by_motion(fit.chain, moved ? mended : capture, states).apart;
   };
-  // a base's clock that was found as if there were no readout is as late as the grasp's rows: both vary then
   const VectorX& before = given.apart;
-  MatrixX slope(before.size(), clock_was_late ? 2 : 1);
-  slope.col(0) = (left(kTriedReadout, 0.0) - before) / kTriedReadout;
-  if (clock_was_late) slope.col(1) = (left(0.0, kTriedReadout) - before) / kTriedReadout;
-  const MatrixX information = slope.transpose() * slope, inverse = information.inverse();
-  const VectorX clocks = -inverse * (slope.transpose() * before);
-  const double readout = clocks[0], base_late = clock_was_late ? clocks[1] : 0.0, size = std::abs(readout);
-  if (!(size >= (known ? kLeastChange : kLeastReadout) && size <= longest_readout(capture))) return std::nullopt;
+  MatrixX slope(before.size(), 1);
+  slope.col(0) = (left({kTriedClock}) - before) / kTriedClock;
+  bool clock_varies = clock_was_late || !known;
+  if (clock_varies) {
+    const VectorX by_clock = (left({0.0, 0.0, kTriedClock}) - before) / kTriedClock;
+    clock_varies = !by_clock.isZero(0.0);  // of a base at rest no clock is late
+    if (clock_varies) slope.conservativeResize(Eigen::NoChange, 2), slope.col(1) = by_clock;
+  }
+  const Step step{slope.transpose() * slope, -slope.transpose() * before, before.squaredNorm()};
   const double most = known ? 1.0 : 1.0 - kLeastExplained;
-  std::optional<VectorX> now = left(readout, base_late);
-  if (!(now->squaredNorm() < most * before.squaredNorm())) return std::nullopt;
-  // by now the rows were read a few milliseconds later
-  if (!known) now = left_only_by_readout(capture, fit, seen, readout, base_late, most);
+  const Wrong wrong = !clock_varies ? Wrong::rows : known ? Wrong::both : likeliest(step, clock_was_late, most);
+  const MatrixX inverse = step.inverse(wrong);
+  Readout found;
+  found.value = inverse.row(0) * step.pull;
+  if (clock_varies) found.late = inverse.row(1) * step.pull;
+  if (wrong == Wrong::base && clock_was_late) return std::nullopt;  // as late as outlines tell
+  const double size = std::abs(wrong == Wrong::base ? found.late : found.value);
+  if (!(size >= (known ? kLeastChange : kLeastClock) && std::abs(found.value) <= longest_readout(capture)))
+    return std::nullopt;
+  std::optional<VectorX> now = left(found);
+  if (!(now->squaredNorm() < most * step.square)) return std::nullopt;
+  // by now the rows were read, or the base is, a few milliseconds later
+  if (!known) now = left_only_by_clocks(capture, fit, seen, found, most);
   if (!now) return std::nullopt;
-  return Readout{readout, std::sqrt(now->squaredNorm() / kIndependent * inverse(0, 0))};
+  const double unit = now->squaredNorm() / kIndependent;
+  found.deviation = std::sqrt(unit * inverse(0, 0));
+  if (clock_varies) found.late_deviation = std::sqrt(unit * inverse(1, 1));
+  if (clock_was_late) found.late = found.late_deviation = 0.0;  // outlines tell it once the rows are mended
+  return found;
 } catch (const WorkError&) {
   return std::nullopt;  // no parameters move the rope at all: identification, which follows, says so
 }
@@ -197,7 +242,7 @@ Readout more_by_outlines(const capture::Capture& given, const std::vector<std::s
     options.only = only;
     const silhouette::CorrectionFit of = silhouette::fit_corrections(fit.chain, by_given_clocks, fit.sequence, options);
     const capture::Correction& readout = *capture::find(of.corrections, camera, "readout");
-    const double least = known ? readout.deviation[0] : kLeastReadout;
+    const double least = known ? readout.deviation[0] : kLeastClock;
     const double value = std::abs(readout.value[0]) < least ? 0.0 : readout.value[0];
     if (std::abs(value) > longest) continue;
     ways.push_back({{capture::value_of(of.corrections, "base", "time"), value},
