@@ -23,6 +23,9 @@ constexpr double kBetter = 0.9;              // share of the old cost that a new
 constexpr double kMuchBetter = 0.6;          // the same, where the new one leaves its neighbors and the old does not
 // Way from frame to frame by which a rope leaves its neighbors: times the usual one, and share of the length.
 constexpr double kJump = 3.0, kJumpShare = 0.03;
+constexpr int kRecent = 30;         // frames before one that tell how far the rope goes
+constexpr double kBelieved = 0.04;  // rad, deviation of an angle from that of the frame before
+constexpr double kCostsMore = 1.5;  // times the cost of a fit that leaves the frame before
 
 constexpr double kCommonOffsetDeviation = 0.1;  // px, of the masks' offset learned from all frames
 
@@ -161,9 +164,10 @@ double way_between(const chain::Chain& chain, const VectorX& from, const VectorX
   return std::sqrt((nodes(to) - nodes(from)).colwise().squaredNorm().mean());
 }
 
-double far_of(const Sequence& s) {
+// Of the frames [first, last).
+double far_of(const Sequence& s, int first, int last) {
   std::vector<double> ways;
-  for (int f = 1; f < s.count(); ++f)
+  for (int f = first + 1; f < last; ++f)
     if (s.seen[f] && s.seen[f - 1])
       ways.push_back(way_between(s.chain, s.solutions[f - 1].fit.theta, s.solutions[f].fit.theta));
   return std::max(kJumpShare * s.chain.length, ways.empty() ? 0.0 : kJump * math::median(ways));
@@ -173,7 +177,7 @@ double far_of(const Sequence& s) {
 bool leaves_neighbors(const Sequence& s, int f, const VectorX& theta) {
   if (s.far == 0.0) return false;
   const auto is_near = [&](int other) {
-    return other >= 0 && other < s.count() && s.seen[other] &&
+    return other >= 0 && other < s.count() && s.seen[other] && s.solutions[other].fit.theta.size() > 0 &&
            way_between(s.chain, s.solutions[other].fit.theta, theta) <= s.far;
   };
   return !is_near(f - 1) && !is_near(f + 1);
@@ -190,6 +194,19 @@ void try_again(Sequence& s, int f, const std::vector<FrameView>& views, const Ve
   if (cheaper || explains_more(again.fit, old.fit)) old = std::move(again);
 }
 
+// Where the rope leaves the frame before, whose angles are `before`: fits it once more with the belief that it does
+// not, and keeps that though it costs somewhat more.
+void follow(Sequence& s, int f, const std::vector<FrameView>& views, const VectorX& before) {
+  FrameSolution& old = s.solutions[f];
+  if (way_between(s.chain, before, old.fit.theta) <= s.far) return;
+  Options believed = s.each;
+  believed.prior.mean = before;
+  believed.prior.information = MatrixX::Identity(before.size(), before.size()) / (kBelieved * kBelieved);
+  FrameSolution again = solve_frame(s.chain, views, before, true, believed);
+  if (way_between(s.chain, before, again.fit.theta) <= s.far && again.cost < kCostsMore * old.cost)
+    old = std::move(again);
+}
+
 // Frame after frame, each from the one before; from scratch at first and where the rope is lost.
 void fit_forward(Sequence& s) {
   const int first = static_cast<int>(std::find(s.seen.begin(), s.seen.end(), 1) - s.seen.begin());
@@ -197,6 +214,8 @@ void fit_forward(Sequence& s) {
   each_frame(s, [&](int f, const std::vector<FrameView>& views) {
     s.solutions[f] = solve_frame(s.chain, views, start, f > first, s.each);
     const FrameFit& fit = s.solutions[f].fit;
+    s.far = far_of(s, std::max(0, f - kRecent), f);
+    if (f > first + 1 && s.seen[f]) follow(s, f, views, start);
     if (f > first && s.seen[f] && fit.covered < kLost) try_again(s, f, views, s.straight(), false);
     if (s.seen[f]) start = s.solutions[f].fit.theta;
   });
@@ -267,7 +286,7 @@ SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capt
   capture::require_pixels(capture, capture::Pixels::undistorted);
   Sequence s = make_sequence(chain, capture, options);
   fit_forward(s);
-  s.far = far_of(s);
+  s.far = far_of(s, 0, s.count());
   repair(s);
   share_edge_offset(s);
   warn_of_unseen(s, capture.name);
