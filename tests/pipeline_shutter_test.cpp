@@ -279,10 +279,13 @@ TEST_CASE("a rolling shutter is found where there is one" * doctest::test_suite(
     CHECK(found.covariance.rows() == numbers);
   }
   capture::Capture right = recorded(0.0);
-  CHECK_FALSE(rolling(pipeline::correct(right, {}, false)));
-  CHECK(right.cameras[0].readout == 0.0);
   capture::Capture loaded = recorded(0.0, Rope::loaded);  // other reasons to move otherwise than a plain rope
-  CHECK_FALSE(rolling(pipeline::correct(loaded, {}, false)));
+  for (capture::Capture* const one : {&right, &loaded}) {
+    const pipeline::Corrected found = pipeline::correct(*one, {}, false);
+    CHECK_FALSE(rolling(found));
+    CHECK(one->cameras[0].readout == 0.0);
+    CHECK(capture::value_of(found.corrections, "base", "time") == 0.0);
+  }
 }
 
 TEST_CASE("outlines on a table tell rows that are read late from a base that is late" * doctest::test_suite("whole")) {
