@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 
 #include "chainsplat/core.h"
 #include "src/math/decompositions.h"
@@ -88,6 +89,7 @@ struct Sequence {
   std::vector<char> seen;                // by frame: a mask shows something
   std::vector<FrameSolution> solutions;  // by frame
   Options each;                          // for one frame
+  std::vector<double> ways;              // m, way_between() the frame before and this one; below 0: not known
   double far = 0.0;                      // m, way_between() that no rope goes from frame to frame; 0: not known yet
 
   int count() const { return static_cast<int>(times.size()); }
@@ -102,6 +104,7 @@ Sequence make_sequence(const chain::Chain& chain, const capture::Capture& captur
   s.each.prior = {};
   s.seen.assign(count, 0);
   s.solutions.resize(count);
+  s.ways.assign(count, -1.0);
   for (std::size_t f = 0; f < count; ++f)
     s.seen[f] = std::any_of(s.views[f].begin(), s.views[f].end(),
                             [&](int v) { return capture::shows_object(capture.views[v]); });
@@ -164,12 +167,11 @@ double way_between(const chain::Chain& chain, const VectorX& from, const VectorX
   return std::sqrt((nodes(to) - nodes(from)).colwise().squaredNorm().mean());
 }
 
-// Of the frames [first, last).
+// By the ways to the frames [first, last).
 double far_of(const Sequence& s, int first, int last) {
   std::vector<double> ways;
-  for (int f = first + 1; f < last; ++f)
-    if (s.seen[f] && s.seen[f - 1])
-      ways.push_back(way_between(s.chain, s.solutions[f - 1].fit.theta, s.solutions[f].fit.theta));
+  std::copy_if(s.ways.begin() + first, s.ways.begin() + last, std::back_inserter(ways),
+               [](double w) { return w >= 0.0; });
   return std::max(kJumpShare * s.chain.length, ways.empty() ? 0.0 : kJump * math::median(ways));
 }
 
@@ -217,7 +219,9 @@ void fit_forward(Sequence& s) {
     s.far = far_of(s, std::max(0, f - kRecent), f);
     if (f > first + 1 && s.seen[f]) follow(s, f, views, start);
     if (f > first && s.seen[f] && fit.covered < kLost) try_again(s, f, views, s.straight(), false);
-    if (s.seen[f]) start = s.solutions[f].fit.theta;
+    if (!s.seen[f]) return;
+    if (f > first && s.seen[f - 1]) s.ways[f] = way_between(s.chain, start, s.solutions[f].fit.theta);
+    start = s.solutions[f].fit.theta;
   });
 }
 
