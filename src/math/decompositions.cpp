@@ -1,3 +1,4 @@
+// Of decompositions.h: Cholesky and LU.
 #include "src/math/decompositions.h"
 
 namespace Eigen {
@@ -14,33 +15,7 @@ template void LLT<MatrixXd>::_solve_impl_transposed<true>(const VectorXd&, Vecto
 template void LLT<MatrixXd>::_solve_impl_transposed<true>(const MatrixXd&, MatrixXd&) const;
 template void LLT<MatrixXd>::_solve_impl_transposed<true>(const MatrixXd::IdentityReturnType&, MatrixXd&) const;
 
-template class ColPivHouseholderQR<MatrixXd>;
-template ColPivHouseholderQR<MatrixXd>& ColPivHouseholderQR<MatrixXd>::compute<MatrixXd>(const EigenBase<MatrixXd>&);
-template void ColPivHouseholderQR<MatrixXd>::_solve_impl(const VectorXd&, VectorXd&) const;
-template void ColPivHouseholderQR<MatrixXd>::_solve_impl(const MatrixXd&, MatrixXd&) const;
-
-template class HouseholderQR<MatrixXd>;
-template void HouseholderQR<MatrixXd>::_solve_impl(const VectorXd&, VectorXd&) const;
-template void HouseholderQR<MatrixXd>::_solve_impl(const MatrixXd&, MatrixXd&) const;
-
-template class CompleteOrthogonalDecomposition<MatrixXd>;
-template CompleteOrthogonalDecomposition<MatrixXd>& CompleteOrthogonalDecomposition<MatrixXd>::compute<MatrixXd>(
-    const EigenBase<MatrixXd>&);
-template void CompleteOrthogonalDecomposition<MatrixXd>::_solve_impl(const VectorXd&, VectorXd&) const;
-template void CompleteOrthogonalDecomposition<MatrixXd>::_solve_impl(const MatrixXd&, MatrixXd&) const;
-
 template class PartialPivLU<MatrixXd>;
-
-template class SelfAdjointEigenSolver<MatrixXd>;
-template SelfAdjointEigenSolver<MatrixXd>& SelfAdjointEigenSolver<MatrixXd>::compute<MatrixXd>(
-    const EigenBase<MatrixXd>&, int);
-template class GeneralizedSelfAdjointEigenSolver<MatrixXd>;
-template class SelfAdjointEigenSolver<Matrix2d>;
-template SelfAdjointEigenSolver<Matrix2d>& SelfAdjointEigenSolver<Matrix2d>::compute<Matrix2d>(
-    const EigenBase<Matrix2d>&, int);
-template class SelfAdjointEigenSolver<Matrix3d>;
-template SelfAdjointEigenSolver<Matrix3d>& SelfAdjointEigenSolver<Matrix3d>::compute<Matrix3d>(
-    const EigenBase<Matrix3d>&, int);
 
 template class LDLT<Matrix3d>;
 template LDLT<Matrix3d>& LDLT<Matrix3d>::compute<Matrix3d>(const EigenBase<Matrix3d>&);

@@ -1,7 +1,7 @@
 // decompositions.h - Eigen's decompositions of matrices of any size, and those of small ones that are costly to
-// compile, compiled once, in decompositions.cpp. Every source that factors a matrix includes this, else it compiles the
-// same code again (design.md, 'Compile time'). The instances are for plain matrices: a sum or product is to be
-// evaluated first, as in MatrixX(a + b).ldlt().
+// compile, compiled once, in decompositions.cpp, orthogonal_decompositions.cpp and eigenvalues.cpp. Every source that
+// factors a matrix includes this, else it compiles the same code again (design.md, 'Compile time'). The instances are
+// for plain matrices: a sum or product is to be evaluated first, as in MatrixX(a + b).ldlt().
 #pragma once
 #include <Eigen/Dense>
 
