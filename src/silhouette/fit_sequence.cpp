@@ -89,7 +89,7 @@ struct Sequence {
   std::vector<char> seen;                // by frame: a mask shows something
   std::vector<FrameSolution> solutions;  // by frame
   Options each;                          // for one frame
-  std::vector<double> ways;              // m, way_between() the frame before and this one; below 0: not known
+  std::vector<double> ways = {};         // m, way_between() the frame before and this one; below 0: not known
   double far = 0.0;                      // m, way_between() that no rope goes from frame to frame; 0: not known yet
 
   int count() const { return static_cast<int>(times.size()); }
