@@ -42,10 +42,10 @@ std::string y4m(const std::string& header, int width, int height, int across, in
   std::string out = "YUV4MPEG2 " + header + "\n";
   for (int k = 0; k < frames; ++k) {
     out += k == 1 ? "FRAME Ixyz\n" : "FRAME\n";
-    for (int i = 0; i < width * height; ++i) out += static_cast<char>(random.uniform(0.0, 256.0));
+    for (int i = 0; i < width * height; ++i) out += static_cast<char>(static_cast<int>(random.uniform(0.0, 256.0)));
     for (int plane = 0; plane < 2 && !gray; ++plane) {
       std::string block(static_cast<std::size_t>(width) * height, '\0');  // wider than needed
-      for (char& level : block) level = static_cast<char>(random.uniform(64.0, 192.0));
+      for (char& level : block) level = static_cast<char>(static_cast<int>(random.uniform(64.0, 192.0)));
       for (int y = 0; y < (height + down - 1) / down; ++y)
         for (int x = 0; x < (width + across - 1) / across; ++x) out += block[y * down / 4 * width + x * across / 4];
     }

@@ -535,7 +535,7 @@ TEST_CASE("a rope that swung into something is found where one camera does not s
     for (int k = 0; k < n; k += 2) state.thetadot[k] = -1.0;
     const estimation::State before = estimation::start(twin, {front_camera()}, moving_base, 0.0);
     estimation::Belief belief{state.time, VectorX::Zero(3 * n), 1e-4 * MatrixX::Identity(3 * n, 3 * n),
-                              VectorX::Zero(3 * n)};
+                              MatrixX::Zero(3 * n, before.setup.mean.size())};
     belief.mean.segment(n, n) = state.thetadot;
     strike(model, moving_base(state.time), link, state);
     const double time = state.time + kInterval;
