@@ -68,8 +68,8 @@ double ssim(const std::vector<float>& a_rgb, const std::vector<float>& b_rgb, in
   const int samples = 3 * width, margin = 3 * kSsimReach;
   std::vector<float> line(static_cast<std::size_t>(kMoments) * (samples + 2 * margin));
   std::vector<float> rows(static_cast<std::size_t>(kTaps) * kMoments * samples), column(kMoments * samples);
-  const auto filtered = [&](int y, int m) {
-    return rows.data() + (static_cast<std::size_t>((y + kTaps) % kTaps) * kMoments + m) * samples;  // of no pixel: none
+  const auto filtered = [&](int y, int m) {  // no element is named: of a picture without a pixel there is none
+    return rows.data() + (static_cast<std::size_t>((y + kTaps) % kTaps) * kMoments + m) * samples;
   };
   const auto filter_row = [&](int y) {
     for (int m = 0; m < kMoments; ++m) std::fill_n(filtered(y, m), samples, 0.0f);
