@@ -9,7 +9,7 @@
 #include <map>
 
 #include "chainsplat/dynamics.h"
-#include "pipeline/readout.h"
+#include "pipeline/clocks.h"
 #include "pipeline/stages.h"
 
 using namespace chainsplat;

@@ -3,11 +3,11 @@
 #include <cmath>
 #include <optional>
 
+#include "pipeline/clocks.h"
 #include "pipeline/decide.h"
 #include "pipeline/judge_capture.h"
 #include "pipeline/lost_frames.h"
 #include "pipeline/mistakes.h"
-#include "pipeline/readout.h"
 #include "pipeline/stages.h"
 
 namespace chainsplat::pipeline {
@@ -16,7 +16,7 @@ namespace {
 
 using capture::Finding;
 
-constexpr int kReadoutRounds = 3;  // of a readout and all else in turn; the first leaves a tenth or two of it
+constexpr int kClockRounds = 3;  // of a readout and all else in turn; the first leaves a tenth or two of it
 
 // Half a pixel is the only correction.
 void correct_half_pixel(const silhouette::CorrectionFit& fit, const silhouette::CorrectionOptions& options,
@@ -89,7 +89,7 @@ FirstFit first_fit(const capture::Capture& capture, int joints) {
 namespace {
 
 // What is left to correct of a capture whose rows were read at once.
-Corrected correct_all_but_readout(capture::Capture& capture, const std::vector<std::string>& fixed, FirstFit fit_by_now) {
+Corrected correct_all_but_clocks(capture::Capture& capture, const std::vector<std::string>& fixed, FirstFit fit_by_now) {
   Corrected out;
   auto& [chain, sequence] = fit_by_now;
   if (std::none_of(sequence.frames.begin(), sequence.frames.end(),
@@ -153,8 +153,8 @@ bool any_but_colors(const capture::Corrections& corrections) {
 }
 
 // Adds clocks that were found beside what else was, or may be wrong.
-void add_readout(const Readout& readout, Corrected& out) {
-  if (readout.value == 0.0 && readout.late == 0.0 && readout.doubt.isZero(0.0)) return;
+void add_clocks(const Clocks& clocks, Corrected& out) {
+  if (clocks.readout == 0.0 && clocks.late == 0.0 && clocks.doubt.isZero(0.0)) return;
   Eigen::Index numbers = 0;
   std::vector<Eigen::Index> of_base, of_rows;
   for (capture::Correction& correction : out.corrections) {
@@ -163,33 +163,33 @@ void add_readout(const Readout& readout, Corrected& out) {
     if (correction.quantity == &capture::corrected_quantity("base", "time")) {
       of_base.push_back(numbers);
       // what outlines leave open counts where they told it, too
-      const double by_outlines = readout.late != 0.0 && correction.value[0] == 0.0 ? 0.0 : correction.deviation[0];
-      correction.value.array() += readout.late;
+      const double by_outlines = clocks.late != 0.0 && correction.value[0] == 0.0 ? 0.0 : correction.deviation[0];
+      correction.value.array() += clocks.late;
       correction.deviation.setConstant(
-          std::hypot(by_outlines, readout.late_deviation, std::sqrt(readout.doubt(0, 0))));
-      if (readout.late != 0.0) correction.state = capture::CorrectionState::free;
+          std::hypot(by_outlines, clocks.late_deviation, std::sqrt(clocks.doubt(0, 0))));
+      if (clocks.late != 0.0) correction.state = capture::CorrectionState::free;
     }
     if (correction.quantity == &capture::corrected_quantity("camera", "readout")) {
       of_rows.push_back(numbers);
-      correction.value.setConstant(readout.value);
-      correction.deviation.setConstant(std::hypot(readout.deviation, std::sqrt(readout.doubt(1, 1))));
+      correction.value.setConstant(clocks.readout);
+      correction.deviation.setConstant(std::hypot(clocks.readout_deviation, std::sqrt(clocks.doubt(1, 1))));
       correction.state = capture::CorrectionState::free;
     }
     numbers += correction.value.size();
   }
   if (of_rows.empty()) return;
   if (out.covariance.size() == 0) out.covariance = math::MatrixX::Zero(numbers, numbers);
-  const double own = readout.value == 0.0 ? 0.0 : readout.deviation * readout.deviation;
+  const double own = clocks.readout == 0.0 ? 0.0 : clocks.readout_deviation * clocks.readout_deviation;
   const auto add = [&](const std::vector<Eigen::Index>& rows, const std::vector<Eigen::Index>& columns, double value) {
     for (const Eigen::Index a : rows)
       for (const Eigen::Index b : columns) out.covariance(a, b) += value;
   };
-  add(of_base, of_base, readout.doubt(0, 0) + readout.late_deviation * readout.late_deviation);
-  add(of_base, of_rows, readout.doubt(0, 1));
-  add(of_rows, of_base, readout.doubt(1, 0));
-  add(of_rows, of_rows, readout.doubt(1, 1) + own);
-  if (readout.value == 0.0) return;
-  judge_readout(readout.value, std::hypot(readout.deviation, std::sqrt(readout.doubt(1, 1))), out.verdict);
+  add(of_base, of_base, clocks.doubt(0, 0) + clocks.late_deviation * clocks.late_deviation);
+  add(of_base, of_rows, clocks.doubt(0, 1));
+  add(of_rows, of_base, clocks.doubt(1, 0));
+  add(of_rows, of_rows, clocks.doubt(1, 1) + own);
+  if (clocks.readout == 0.0) return;
+  judge_readout(clocks.readout, std::hypot(clocks.readout_deviation, std::sqrt(clocks.doubt(1, 1))), out.verdict);
 }
 
 }  // namespace
@@ -200,50 +200,50 @@ Corrected correct(capture::Capture& capture, const std::vector<std::string>& fix
   judge_mass(capture, out.verdict);
   if (!out.verdict.empty() && !anyway) return out;
   judge_repeated(capture, out.verdict);
-  if (!readout_is_open(capture, fixed)) {
-    add(correct_all_but_readout(capture, fixed, first_fit(capture)), out);
+  if (!clocks_are_open(capture, fixed)) {
+    add(correct_all_but_clocks(capture, fixed, first_fit(capture)), out);
     return out;
   }
   const capture::Capture given = capture;
-  Readout readout;
+  Clocks clocks;
   Corrected found;
   const auto correct_the_rest = [&] {
-    capture = readout.value == 0.0 && readout.late == 0.0 ? given : with_readout(given, readout);
-    found = correct_all_but_readout(capture, fixed, first_fit(capture));
+    capture = clocks.readout == 0.0 && clocks.late == 0.0 ? given : with_clocks(given, clocks);
+    found = correct_all_but_clocks(capture, fixed, first_fit(capture));
   };
-  const auto more_readout = [&]() -> std::optional<Readout> {
+  const auto more_clocks = [&]() -> std::optional<Clocks> {
     if (impossible(found)) return std::nullopt;
     const bool clock_was_late = capture::value_of(found.corrections, "base", "time") != 0.0;
     if (!capture.tabletop) return more_by_motion(capture, clock_was_late);
-    if (readout.value == 0.0 && !any_but_colors(found.corrections)) return std::nullopt;
-    return more_by_outlines(readout.value == 0.0 ? given : with_readout(given, readout), fixed,
+    if (clocks.readout == 0.0 && !any_but_colors(found.corrections)) return std::nullopt;
+    return more_by_outlines(clocks.readout == 0.0 ? given : with_clocks(given, clocks), fixed,
                             found.corrections);
   };
   const double longest = longest_readout(given);
   correct_the_rest();
-  for (int round = 0; round < kReadoutRounds; ++round) {
-    const std::optional<Readout> more = more_readout();
-    if (more) readout.doubt = more->doubt;
-    if (!more || (more->value == 0.0 && more->late == 0.0)) break;
-    readout.value += more->value;
-    readout.late += more->late;
-    readout.deviation = more->deviation;
-    readout.late_deviation = std::max(readout.late_deviation, more->late_deviation);
-    const bool possible = std::abs(readout.value) <= longest;
-    if (!possible) readout = {};  // something else is wrong, and its first rounds were taken for a readout, too
+  for (int round = 0; round < kClockRounds; ++round) {
+    const std::optional<Clocks> more = more_clocks();
+    if (more) clocks.doubt = more->doubt;
+    if (!more || (more->readout == 0.0 && more->late == 0.0)) break;
+    clocks.readout += more->readout;
+    clocks.late += more->late;
+    clocks.readout_deviation = more->readout_deviation;
+    clocks.late_deviation = std::max(clocks.late_deviation, more->late_deviation);
+    const bool possible = std::abs(clocks.readout) <= longest;
+    if (!possible) clocks = {};  // something else is wrong, and its first rounds were taken for a readout, too
     correct_the_rest();
     if (!possible) break;
   }
-  if (readout.value != 0.0)
-    core::say_more(text("correct: the rows are read in %.1f ms", kSeconds * readout.value));
+  if (clocks.readout != 0.0)
+    core::say_more(text("correct: the rows are read in %.1f ms", kSeconds * clocks.readout));
   add(std::move(found), out);
-  add_readout(readout, out);
-  if (readout.late != 0.0) {
-    core::say_more(text("correct: by the rope's motion the base is %.1f ms late", kSeconds * readout.late));
+  add_clocks(clocks, out);
+  if (clocks.late != 0.0) {
+    core::say_more(text("correct: by the rope's motion the base is %.1f ms late", kSeconds * clocks.late));
     std::erase_if(out.verdict, [](const Finding& one) { return one.code == "base-time"; });
     judge_base_clock(out.corrections, out.verdict);
   }
-  if (readout.value == 0.0) return out;
+  if (clocks.readout == 0.0) return out;
   capture.views = given.views;
   for (capture::PackedView& view : capture.views) view.time = capture.times[view.camera][view.frame];
   read_at_once(capture);

@@ -1,4 +1,4 @@
-#include "pipeline/readout.h"
+#include "pipeline/clocks.h"
 
 #include <algorithm>
 #include <cmath>
@@ -59,11 +59,11 @@ capture::Capture with_base_late(capture::Capture capture, double late) {
 
 }  // namespace
 
-capture::Capture with_readout(const capture::Capture& capture, const Readout& readout) {
+capture::Capture with_clocks(const capture::Capture& capture, const Clocks& clocks) {
   capture::Corrections corrections;
   for (const capture::Camera& camera : capture.cameras)
-    corrections.push_back(clock_of(camera.name, capture::corrected_quantity("camera", "readout"), readout.value));
-  capture::Capture out = readout.late == 0.0 ? capture : with_base_late(capture, readout.late);
+    corrections.push_back(clock_of(camera.name, capture::corrected_quantity("camera", "readout"), clocks.readout));
+  capture::Capture out = clocks.late == 0.0 ? capture : with_base_late(capture, clocks.late);
   capture::apply(corrections, out);
   read_at_once(out);
   return out;
@@ -80,7 +80,7 @@ double longest_readout(const capture::Capture& capture) {
   return out;
 }
 
-bool readout_is_open(const capture::Capture& capture, const std::vector<std::string>& fixed) {
+bool clocks_are_open(const capture::Capture& capture, const std::vector<std::string>& fixed) {
   if (is_fixed(fixed, "time") || capture.base.samples().size() < 2) return false;
   for (std::size_t c = 0; c < capture.cameras.size(); ++c)
     if (capture::prior_deviation(capture, static_cast<int>(c), capture::corrected_quantity("camera", "readout")) == 0.0)
@@ -130,11 +130,11 @@ double outlines_miss(const silhouette::SequenceFit& sequence) {
 // changed alone and outlines, which begin at the grasp, do not agree: bases 2.5 to 5 ms late made them miss by 2 to 5 %
 // more.
 std::optional<VectorX> left_only_by_clocks(const capture::Capture& capture, const FirstFit& fit,
-                                           const chain::States& seen, const Readout& clocks, double most) {
+                                           const chain::States& seen, const Clocks& clocks, double most) {
   constexpr bool kUniform = false;
-  const capture::Capture mended = with_readout(capture, clocks);
+  const capture::Capture mended = with_clocks(capture, clocks);
   const FirstFit again = first_fit(mended, kFewJoints);
-  if (clocks.value == 0.0 && outlines_miss(again.sequence) >= outlines_miss(fit.sequence)) return std::nullopt;
+  if (clocks.readout == 0.0 && outlines_miss(again.sequence) >= outlines_miss(fit.sequence)) return std::nullopt;
   const chain::States states = states_of(again);
   VectorX left = left_by_motion(again.chain, mended, states).apart;
   const double otherwise = left_by_motion(fit.chain, capture, seen, kUniform).apart.squaredNorm();
@@ -172,7 +172,7 @@ Wrong likeliest(const Step& step, bool clock_was_late, double most) {
 
 }  // namespace
 
-std::optional<Readout> more_by_motion(const capture::Capture& capture, bool clock_was_late) try {
+std::optional<Clocks> more_by_motion(const capture::Capture& capture, bool clock_was_late) try {
   const FirstFit fit = first_fit(capture, kFewJoints);
   if (fit.sequence.states.time.size() < kLeastMoments) return std::nullopt;
   const chain::States seen = states_of(fit);
@@ -180,11 +180,11 @@ std::optional<Readout> more_by_motion(const capture::Capture& capture, bool cloc
   const bool known = silhouette::has_rolling_shutter(capture.cameras);  // then every gain is one
   if (given.misfit < kExplained) return std::nullopt;
   const std::vector<VectorX> slopes = silhouette::readout_slopes(fit.chain, capture, fit.sequence);
-  const auto left = [&](const Readout& clocks) {
+  const auto left = [&](const Clocks& clocks) {
     const bool moved = clocks.late != 0.0;
     const capture::Capture mended = moved ? with_base_late(capture, clocks.late) : capture::Capture();
     chain::States states = moved ? states_of(first_fit(mended, kFewJoints)) : seen;
-    for (std::size_t k = 0; k < states.theta.size(); ++k) states.theta[k] += clocks.value * slopes[k];
+    for (std::size_t k = 0; k < states.theta.size(); ++k) states.theta[k] += clocks.readout * slopes[k];
     return left_by_motion(fit.chain, moved ? mended : capture, states).apart;
   };
   const VectorX& before = given.apart;
@@ -200,12 +200,12 @@ std::optional<Readout> more_by_motion(const capture::Capture& capture, bool cloc
   const double most = known ? 1.0 : 1.0 - kLeastExplained;
   const Wrong wrong = !clock_varies ? Wrong::rows : known ? Wrong::both : likeliest(step, clock_was_late, most);
   const MatrixX inverse = step.inverse(wrong);
-  Readout found;
-  found.value = inverse.row(0) * step.pull;
+  Clocks found;
+  found.readout = inverse.row(0) * step.pull;
   if (clock_varies) found.late = inverse.row(1) * step.pull;
   if (wrong == Wrong::base && clock_was_late) return std::nullopt;  // as late as outlines tell
-  const double size = std::abs(wrong == Wrong::base ? found.late : found.value);
-  if (!(size >= (known ? kLeastChange : kLeastClock) && std::abs(found.value) <= longest_readout(capture)))
+  const double size = std::abs(wrong == Wrong::base ? found.late : found.readout);
+  if (!(size >= (known ? kLeastChange : kLeastClock) && std::abs(found.readout) <= longest_readout(capture)))
     return std::nullopt;
   std::optional<VectorX> now = left(found);
   if (!(now->squaredNorm() < most * step.square)) return std::nullopt;
@@ -213,7 +213,7 @@ std::optional<Readout> more_by_motion(const capture::Capture& capture, bool cloc
   if (!known) now = left_only_by_clocks(capture, fit, seen, found, most);
   if (!now) return std::nullopt;
   const double unit = now->squaredNorm() / kIndependent;
-  found.deviation = std::sqrt(unit * inverse(0, 0));
+  found.readout_deviation = std::sqrt(unit * inverse(0, 0));
   if (clock_varies) found.late_deviation = std::sqrt(unit * inverse(1, 1));
   if (clock_was_late) found.late = found.late_deviation = 0.0;  // outlines tell it once the rows are mended
   return found;
@@ -223,8 +223,8 @@ std::optional<Readout> more_by_motion(const capture::Capture& capture, bool cloc
 
 namespace {
 
-// One way in which clocks may be wrong: that of the base, and the rows of all cameras.
-struct Clocks {
+// One way in which the base's clock and the rows of all cameras may be wrong.
+struct Way {
   math::Vector2 late = math::Vector2::Zero();  // s, the base's clock and the readout
   double deviation = 0.0;                      // s, of the readout
   double surprise = 0.0;                       // -ln of how likely it is, but for a constant
@@ -232,8 +232,8 @@ struct Clocks {
 
 }  // namespace
 
-Readout more_by_outlines(const capture::Capture& given, const std::vector<std::string>& fixed,
-                         capture::Corrections found) {
+Clocks more_by_outlines(const capture::Capture& given, const std::vector<std::string>& fixed,
+                        capture::Corrections found) {
   constexpr double kUnlikely = 0.02;  // share of one of them, below which it is left out
   for (capture::Correction& correction : found)
     if (correction.subject == "base") correction.value.setZero();
@@ -248,7 +248,7 @@ Readout more_by_outlines(const capture::Capture& given, const std::vector<std::s
   const std::string& camera = given.cameras[0].name;
   const bool known = silhouette::has_rolling_shutter(given.cameras);
   const double longest = longest_readout(given);
-  std::vector<Clocks> ways;
+  std::vector<Way> ways;
   for (const char* const only : {"base.time", "readout", "base.time and readout"}) {
     options.only = only;
     const silhouette::CorrectionFit of = silhouette::fit_corrections(fit.chain, by_given_clocks, fit.sequence, options);
@@ -260,12 +260,12 @@ Readout more_by_outlines(const capture::Capture& given, const std::vector<std::s
                     readout.deviation[0],
                     of.unexplained + of.surprise});
   }
-  const Clocks best = *std::min_element(ways.begin(), ways.end(),
-                                        [](const Clocks& a, const Clocks& b) { return a.surprise < b.surprise; });
+  const Way best =
+      *std::min_element(ways.begin(), ways.end(), [](const Way& a, const Way& b) { return a.surprise < b.surprise; });
   double all = 0.0;
-  for (const Clocks& way : ways) all += std::exp(best.surprise - way.surprise);
-  Readout out{best.late[1], best.deviation};
-  for (const Clocks& way : ways) {
+  for (const Way& way : ways) all += std::exp(best.surprise - way.surprise);
+  Clocks out{best.late[1], best.deviation};
+  for (const Way& way : ways) {
     const double share = std::exp(best.surprise - way.surprise) / all;
     const math::Vector2 apart = way.late - best.late;
     if (share >= kUnlikely) out.doubt += share * apart * apart.transpose();
