@@ -20,6 +20,9 @@ constexpr double kNothingWrongHeldStraight = 1.0;
 // wrong. Right recordings of ropes that hang have up to 0.063, of ropes on tables up to 0.12, because a round end looks
 // like a grasp or a length that is off: these are not looked for below kNothingWrong there.
 constexpr double kLeastEvidence = 0.08;
+// How likely it is, at least, that something is wrong: a base that is 4 ms off on a table has no more evidence than a
+// right recording has, and as many recordings of a careful laboratory may be off by so little.
+constexpr double kAlwaysDoubted = 0.1;
 constexpr double kLeftOfHalfPixel = 0.2;  // of the evidence, at most, with half a pixel taken back
 // Any other thing alone is corrected if it leaves at most kLeftOfOne of the evidence, but for kAsRight, which is there
 // when nothing is wrong. Each of its numbers adds kPerNumber, since many numbers explain a part of anything. What it
@@ -128,9 +131,15 @@ void add_doubt(const math::VectorX& apart, double probability, silhouette::Corre
   Eigen::Index at = 0;
   for (capture::Correction& correction : fit.corrections) {
     const Eigen::Index size = correction.value.size();
-    correction.deviation = fit.covariance.diagonal().segment(at, size).cwiseMax(0.0).cwiseSqrt();
+    correction.deviation =
+        (correction.deviation.cwiseAbs2() + probability * apart.segment(at, size).cwiseAbs2()).cwiseSqrt();
     at += size;
   }
+}
+
+// How likely it is that something is wrong which nothing corrects, by the evidence that is left.
+double doubt_of(double evidence) {
+  return std::clamp((evidence - kLeastEvidence) / (kNothingWrong - kLeastEvidence), kAlwaysDoubted, 1.0);
 }
 
 // The likeliest of these fits. Its deviations count how far each other one is from it, by its probability.
@@ -277,7 +286,10 @@ std::optional<Decision> decide(const capture::Capture& capture, const chain::Cha
     // where a rope is held above its table, how it comes down is assumed, which other faults would make up for
     if (lies(capture, alone.corrections)) {
       core::say_more("correct: " + cause->name + " alone explains what is wrong");
+      const double left = cause->evidence;  // the cause is a part of out.fit
+      const math::VectorX apart = numbers_of(out.fit) - numbers_of(alone);
       keep_given(alone, out.fit);
+      add_doubt(apart, doubt_of(left), alone);
       out.fit = std::move(alone);
       out.corrected = true;
       return out;
@@ -298,9 +310,7 @@ std::optional<Decision> decide(const capture::Capture& capture, const chain::Cha
   out.corrected = out.fit.evidence >= (capture.tabletop ? kNothingWrongOnTable : kNothingWrong);
   // one camera takes depth from the rope's width, so that what is wrong by a little is never seen
   const bool by_width = silhouette::seen_by_one(capture) && chain::bends_in_space(chain);
-  if (!out.corrected)
-    out.doubt =
-        by_width ? 1.0 : std::clamp((out.fit.evidence - kLeastEvidence) / (kNothingWrong - kLeastEvidence), 0.0, 1.0);
+  if (!out.corrected) out.doubt = by_width ? 1.0 : doubt_of(out.fit.evidence);
   if (out.doubt > 0.0) add_doubt(numbers_of(out.fit), 1.0, out.fit);
   // friction holds whatever bends a rope on a table was laid in
   if (!out.corrected || capture.tabletop) return out;
