@@ -125,23 +125,26 @@ double outlines_miss(const silhouette::SequenceFit& sequence) {
   return sum / std::max(1.0, count);
 }
 
-// What is left where all is fitted again by these clocks; none where a payload, friction in bending or stiffness that
-// varies explain what was left without them: less than `most` of that must be left. And none where the base's clock is
-// changed alone and outlines, which begin at the grasp, do not agree: bases 2.5 to 5 ms late made them miss by 2 to 5 %
-// more.
-std::optional<VectorX> left_only_by_clocks(const capture::Capture& capture, const FirstFit& fit,
-                                           const chain::States& seen, const Clocks& clocks, double most) {
+// All fitted again by other clocks.
+struct Refit {
+  VectorX left;                 // what these leave
+  bool told_otherwise = false;  // a payload, friction in bending or stiffness that varies explain as much without them
+};
+
+// None where the base's clock is changed alone and outlines, which begin at the grasp, do not agree: bases 2.5 to 5 ms
+// late made them miss by 2 to 5 % more. What is left must be less than `most` of what other explanations leave.
+std::optional<Refit> refit(const capture::Capture& capture, const FirstFit& fit, const chain::States& seen,
+                           const Clocks& clocks, double most) {
   constexpr bool kUniform = false;
   const capture::Capture mended = with_clocks(capture, clocks);
   const FirstFit again = first_fit(mended, kFewJoints);
   if (clocks.readout == 0.0 && outlines_miss(again.sequence) >= outlines_miss(fit.sequence)) return std::nullopt;
   const chain::States states = states_of(again);
-  VectorX left = left_by_motion(again.chain, mended, states).apart;
+  Refit out{left_by_motion(again.chain, mended, states).apart, false};
   const double otherwise = left_by_motion(fit.chain, capture, seen, kUniform).apart.squaredNorm();
-  if (!(left.squaredNorm() < most * otherwise ||
-        left_by_motion(again.chain, mended, states, kUniform).apart.squaredNorm() < most * otherwise))
-    return std::nullopt;
-  return left;
+  out.told_otherwise = !(out.left.squaredNorm() < most * otherwise ||
+                         left_by_motion(again.chain, mended, states, kUniform).apart.squaredNorm() < most * otherwise);
+  return out;
 }
 
 enum class Wrong { rows, base, both };
@@ -168,6 +171,15 @@ struct Step {
 Wrong likeliest(const Step& step, bool clock_was_late, double most) {
   const Wrong one = clock_was_late || step.left(Wrong::base) < step.left(Wrong::rows) ? Wrong::base : Wrong::rows;
   return step.left(Wrong::both) < most * step.left(one) ? Wrong::both : one;
+}
+
+// Nothing is changed, but it may be so.
+Clocks perhaps(const Clocks& found) {
+  constexpr double kAsLikelyAsNot = 0.5;
+  const math::Vector2 apart(found.late, found.readout);
+  Clocks out;
+  out.doubt = kAsLikelyAsNot * apart * apart.transpose();
+  return out;
 }
 
 }  // namespace
@@ -207,12 +219,15 @@ std::optional<Clocks> more_by_motion(const capture::Capture& capture, bool clock
   const double size = std::abs(wrong == Wrong::base ? found.late : found.readout);
   if (!(size >= (known ? kLeastChange : kLeastClock) && std::abs(found.readout) <= longest_readout(capture)))
     return std::nullopt;
-  std::optional<VectorX> now = left(found);
-  if (!(now->squaredNorm() < most * step.square)) return std::nullopt;
-  // by now the rows were read, or the base is, a few milliseconds later
-  if (!known) now = left_only_by_clocks(capture, fit, seen, found, most);
-  if (!now) return std::nullopt;
-  const double unit = now->squaredNorm() / kIndependent;
+  VectorX now = left(found);
+  if (!(now.squaredNorm() < most * step.square)) return std::nullopt;
+  if (!known) {  // by now the rows were read, or the base is, a few milliseconds later
+    std::optional<Refit> by_clocks = refit(capture, fit, seen, found, most);
+    if (!by_clocks) return std::nullopt;
+    if (by_clocks->told_otherwise) return perhaps(found);
+    now = std::move(by_clocks->left);
+  }
+  const double unit = now.squaredNorm() / kIndependent;
   found.readout_deviation = std::sqrt(unit * inverse(0, 0));
   if (clock_varies) found.late_deviation = std::sqrt(unit * inverse(1, 1));
   if (clock_was_late) found.late = found.late_deviation = 0.0;  // outlines tell it once the rows are mended
