@@ -20,6 +20,9 @@ constexpr double kNothingWrongHeldStraight = 1.0;
 // wrong. Right recordings of ropes that hang have up to 0.063, of ropes on tables up to 0.12, because a round end looks
 // like a grasp or a length that is off: these are not looked for below kNothingWrong there.
 constexpr double kLeastEvidence = 0.08;
+// But a clock alone explains at most 0.014 of right recordings. From this on it is looked for on tables; where a rope
+// hangs, its motion tells a clock far better (clocks.h).
+constexpr double kLeastByClock = 0.025;
 // How likely it is, at least, that something is wrong: a base that is 4 ms off on a table has no more evidence than a
 // right recording has, and as many recordings of a careful laboratory may be off by so little.
 constexpr double kAlwaysDoubted = 0.1;
@@ -53,24 +56,10 @@ bool is_half_pixel(const silhouette::CorrectionFit& fit) {
 
 bool looks_like_an_end(const silhouette::Cause& cause) { return cause.in_doubt.starts_with("grasp and length"); }
 
-// The one thing that explains what is wrong; null where it takes more. Of those that may be mistaken for each other it
-// is the likeliest.
-const silhouette::Cause* single_cause(const silhouette::CorrectionFit& fit, bool tabletop) {
-  if (fit.evidence < kLeastEvidence) return nullptr;
-  const silhouette::Cause* best = nullptr;
-  double least = kLeftOfOne * (fit.evidence - kAsRight);
-  for (const silhouette::Cause& cause : fit.causes) {
-    const double left = std::max(0.0, cause.evidence - kAsRight) + kPerNumber * cause.numbers * fit.evidence;
-    if (cause.evidence >= (tabletop ? kRightOnTable : kRight) || left >= least) continue;
-    if (tabletop && fit.evidence < kNothingWrong && looks_like_an_end(cause)) continue;
-    best = &cause;
-    least = left;
-  }
-  if (!best) return nullptr;
-  const double as_well = best->evidence + kAsRight;
-  for (const silhouette::Cause& cause : fit.causes)
-    if (cause.in_doubt == best->in_doubt && cause.evidence <= as_well && cause.surprise < best->surprise) best = &cause;
-  return best;
+// Whether there is so much evidence that this cause, if it explains it, is likelier than nothing.
+bool is_looked_for(const silhouette::Cause& cause, double evidence, bool tabletop) {
+  if (tabletop && cause.name.ends_with(".time") && evidence - cause.evidence >= kLeastByClock) return true;
+  return evidence >= (tabletop && looks_like_an_end(cause) ? kNothingWrong : kLeastEvidence);
 }
 
 // m above where it lies on the table, from which on corrections make up for how a rope is assumed to come down: held 15
@@ -269,6 +258,23 @@ std::optional<double> given_above_table(const capture::Capture& capture) {
   const double above = std::abs(silhouette::height_by_table(capture));
   if (above < kAboveTable || above > high(capture)) return std::nullopt;
   return above;
+}
+
+const silhouette::Cause* single_cause(const silhouette::CorrectionFit& fit, bool tabletop) {
+  const silhouette::Cause* best = nullptr;
+  double least = kLeftOfOne * (fit.evidence - kAsRight);
+  for (const silhouette::Cause& cause : fit.causes) {
+    if (!is_looked_for(cause, fit.evidence, tabletop)) continue;
+    const double left = std::max(0.0, cause.evidence - kAsRight) + kPerNumber * cause.numbers * fit.evidence;
+    if (cause.evidence >= (tabletop ? kRightOnTable : kRight) || left >= least) continue;
+    best = &cause;
+    least = left;
+  }
+  if (!best) return nullptr;
+  const double as_well = best->evidence + kAsRight;
+  for (const silhouette::Cause& cause : fit.causes)
+    if (cause.in_doubt == best->in_doubt && cause.evidence <= as_well && cause.surprise < best->surprise) best = &cause;
+  return best;
 }
 
 std::optional<Decision> decide(const capture::Capture& capture, const chain::Chain& chain,

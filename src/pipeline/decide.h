@@ -27,6 +27,10 @@ struct Decision {
 std::optional<Decision> decide(const capture::Capture& capture, const chain::Chain& chain,
                                const silhouette::SequenceFit& sequence, const silhouette::CorrectionOptions& options);
 
+// The one thing that explains what is wrong; null where nothing is, or where it takes more. Of those that may be
+// mistaken for each other it is the likeliest.
+const silhouette::Cause* single_cause(const silhouette::CorrectionFit& fit, bool tabletop);
+
 // Turns of all cameras that shift their images by `shift` px to the right and down, as a larger cx and cy would.
 capture::Corrections shifted_images(const capture::Capture& given, double shift);
 
