@@ -21,8 +21,8 @@ bool clocks_are_open(const capture::Capture& capture, const std::vector<std::str
 // What no readout that is found may exceed (s): no camera reads a frame longer than until its next one.
 double longest_readout(const capture::Capture& capture);
 // How much longer cameras take to read their rows than by now, or how much later the base is, where the motion of a
-// rope that hangs shows it; none: neither, as far as it tells. `capture` is corrected in all else; `clock_was_late`:
-// also in the base's clock.
+// rope that hangs shows it; none: neither, as far as it tells; a doubt alone: perhaps, but other parameters explain as
+// much. `capture` is corrected in all else; `clock_was_late`: also in the base's clock.
 std::optional<Clocks> more_by_motion(const capture::Capture& capture, bool clock_was_late);
 // How much longer they take by the outlines of a rope on a table, where rows lie otherwise in each camera: in the place
 // of the base's clock, or beside it. 0: the base's clock alone is likelier. `given`: what `found` was found from.
