@@ -218,6 +218,26 @@ TEST_CASE("a corrected length makes the mass per length less sure, and a negativ
   CHECK_THROWS_WITH_AS(twin::load(folder.path), doctest::Contains("sigma: is negative"), InputError);
 }
 
+TEST_CASE("corrections have the same bytes when they were read, in whatever order they were found") {
+  const test::TemporaryFolder folder("twin");
+  twin::Twin twin = full_twin();
+  for (const char* const name : {"gain", "readout", "rotation", "bias", "time"}) {
+    capture::Correction c;
+    c.quantity = &capture::corrected_quantity("camera", name);
+    c.subject = "cam0";
+    c.value = c.deviation = math::VectorX::Constant(c.quantity->size, 0.001);
+    c.calibration = "0123456789abcdef";
+    twin.corrections.push_back(std::move(c));
+  }
+  const auto written = [&] {
+    twin::save(twin, folder.path);
+    return core::read_file(folder.path / "twin.json");
+  };
+  const std::string once = written();
+  twin.corrections = twin::load(folder.path).corrections;
+  CHECK(written() == once);
+}
+
 TEST_CASE("a chain alone is read from a whole file or from its part, held as another rope") {
   const test::TemporaryFolder folder("chain");
   const twin::Twin twin = full_twin();

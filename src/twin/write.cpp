@@ -84,7 +84,15 @@ nlohmann::ordered_json to_json(const std::vector<capture::Finding>& verdict) {
   return out;
 }
 
-nlohmann::ordered_json to_json(const capture::Corrections& corrections) {
+nlohmann::ordered_json to_json(const capture::Corrections& given) {
+  // As they are read, so that a run that was interrupted has the same bytes as one that was not.
+  const auto& order = capture::corrected_quantities();
+  const auto place = [&](const capture::Correction& c) {
+    return c.quantity == &capture::lost_frames() ? order.size() : static_cast<std::size_t>(c.quantity - order.data());
+  };
+  capture::Corrections corrections = given;
+  std::stable_sort(corrections.begin(), corrections.end(),
+                   [&](const auto& a, const auto& b) { return place(a) < place(b); });
   Json out{{"cameras", Json::object()}};
   for (const capture::Correction& c : corrections) {
     const bool camera = std::string(c.quantity->subject) == "camera";
