@@ -292,10 +292,9 @@ std::optional<Decision> decide(const capture::Capture& capture, const chain::Cha
     // where a rope is held above its table, how it comes down is assumed, which other faults would make up for
     if (lies(capture, alone.corrections)) {
       core::say_more("correct: " + cause->name + " alone explains what is wrong");
-      const double left = cause->evidence;  // the cause is a part of out.fit
       const math::VectorX apart = numbers_of(out.fit) - numbers_of(alone);
       keep_given(alone, out.fit);
-      add_doubt(apart, doubt_of(left), alone);
+      add_doubt(apart, doubt_of(cause->evidence), alone);
       out.fit = std::move(alone);
       out.corrected = true;
       return out;
