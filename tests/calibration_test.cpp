@@ -276,7 +276,7 @@ TEST_CASE("the joint fit finds what made the corners, from a start that is far o
 TEST_CASE("standard deviations are those of repeated fits") {
   const trajectory::Trajectory robot = made_robot();
   core::Random random(5);
-  constexpr double kNoise = 0.1, kRobotPosition = 3e-4, kRobotRotation = 5e-4;  // px, m, rad
+  constexpr double kPixelNoise = 0.1, kRobotPosition = 3e-4, kRobotRotation = 5e-4;  // px, m, rad
   const Bundle truth = made_bundle(2, 25, &robot, random);
   std::vector<double> scores;
   constexpr int kFits = 24;
@@ -292,7 +292,7 @@ TEST_CASE("standard deviations are those of repeated fits") {
             truth.cameras[view.camera].world_from_camera.inverse() * board_in_world(truth, real, view);
         for (Seen& seen : view.corners)
           seen.pixel = *pixel_of(truth.cameras[view.camera], camera_from_board * seen.point) +
-                       kNoise * Vector2(random.normal(), random.normal());
+                       kPixelNoise * Vector2(random.normal(), random.normal());
       }
     }
     fit(bundle, 40);

@@ -241,21 +241,22 @@ TEST_CASE("more training leaves what was guessed, and the colors of what was see
 }
 
 TEST_CASE("colors stay beyond the directions from which they were seen, and are what they were at these") {
-  constexpr double kSlope = 0.4;  // of a color per unit of direction
-  constexpr int kWidest = 30;     // degrees to either side of the bending axis, from which cameras look
+  constexpr double kPerDirection = 0.4;  // of a color per unit of direction
+  constexpr int kWidest = 30;            // degrees to either side of the bending axis, from which cameras look
   Rope rope(0.0);
   rope.views.clear();
   for (int at = -kWidest; at <= kWidest; at += 5) rope.look_from(at * kDegree);
   splat::Gaussians& g = rope.gaussians;
   for (int i = 0; i < g.count; ++i)
     for (int c = 0; c < 3; ++c)
-      g.sh[12 * i + 3 + c] = static_cast<float>(kSlope / 0.4886025);  // with -y of the direction
+      g.sh[12 * i + 3 + c] = static_cast<float>(kPerDirection / 0.4886025);  // with -y of the direction
   g.guessed[0] = 1;
   const splat::Gaussians before = g;
   recognition::hold_colors(rope.chain, rope.views, g);
   REQUIRE(g.degree == 2);
   CHECK(splat::sh_color(g, 0, -rope.normal(1.0)) == splat::sh_color(before, 0, -rope.normal(1.0)));
-  // the bending axis is y: seen from `at` the color has kSlope cos(at) more, and the held ones those of 30 degrees
+  // the bending axis is y: seen from `at` the color has kPerDirection cos(at) more, and the held ones those of 30
+  // degrees
   double seen = 0.0, held = 0.0, went_on = 0.0;
   int count = 0;
   for (int i = 1; i < g.count; ++i) {
@@ -274,7 +275,7 @@ TEST_CASE("colors stay beyond the directions from which they were seen, and are 
   REQUIRE(count > 100);
   MESSAGE("at most off: seen " << seen << ", held " << held << ", of those that would go on " << went_on);
   CHECK(went_on > 0.3);
-  CHECK(seen < 0.05 * kSlope);
+  CHECK(seen < 0.05 * kPerDirection);
   CHECK(held < 0.3 * went_on);
 }
 
