@@ -3,6 +3,8 @@
 
 #include <doctest/doctest.h>
 
+#include <cmath>
+
 using namespace chainsplat;
 
 TEST_CASE("material turns about its link's axis, and nowhere else") {
@@ -58,4 +60,33 @@ TEST_CASE("a chain that lies beside its grasp's plane moves by the same axes") {
       CHECK((slope - jacobian.col(k)).norm() < 1e-9);
     }
   }
+}
+
+TEST_CASE("curvature changes little along a rope, from its clamp on") {
+  const auto cost = [](const chain::Chain& chain, const math::VectorX& theta) {
+    return theta.dot(chain::curvature_information(chain, 0.1) * theta);
+  };
+  const auto chain_of = [](int joints, chain::Bending bending) {
+    return chain::make_chain(0.3, 0.02, {1, 0, 0}, {0, 0, 1}, joints, bending, false);
+  };
+  // of a bend that fades from the clamp, its integral over each joint's piece: the first pair costs nothing
+  for (const int joints : {8, 16, 24}) {
+    const chain::Chain planar = chain_of(joints, chain::Bending::planar);
+    math::VectorX first_two = math::VectorX::Zero(joints);
+    double at = 0.0;
+    for (int j = 1; j <= 2; ++j) {
+      const double to = at + chain::bent_length(planar, j), fades = 0.18 * planar.length;
+      first_two[j - 1] = 20.0 * fades * (std::exp(-at / fades) - std::exp(-to / fades));
+      at = to;
+    }
+    math::VectorX second = math::VectorX::Zero(joints);
+    second[1] = first_two[1];  // alone it differs from both of its neighbors
+    CHECK(cost(planar, first_two) == doctest::Approx(0.5 * cost(planar, second)).epsilon(0.02));
+  }
+  // in space the first joint is turned as the gripper holds the rope
+  const chain::Chain spatial = chain_of(6, chain::Bending::spatial);
+  CHECK(std::abs(cost(spatial, math::VectorX::Constant(12, 0.2))) < 1e-12);
+  math::VectorX about_one = math::VectorX::Zero(12);
+  about_one[4] = 0.3;
+  CHECK(cost(spatial, about_one) == doctest::Approx(2.0 * 0.3 * 0.3 / 0.01));
 }

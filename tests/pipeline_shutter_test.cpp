@@ -163,6 +163,7 @@ capture::Capture on_table(double readout, double base_late) {
   const NodesAt nodes = [&](double time) {
     VectorX theta(chain.angles());
     for (int k = 0; k < chain.angles(); ++k) theta[k] = 0.2 * std::sin(5.0 * time - 0.3 * k);
+    theta[0] *= 0.5;  // the joint at the clamp stands for half a link
     const MatrixX all = chain::nodes(chain, chain::link_motions(chain, theta, base(time)));
     return MatrixX(all.rightCols(all.cols() - 1));
   };

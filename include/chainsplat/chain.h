@@ -87,6 +87,11 @@ bool bends_in_space(const Chain& chain);
 // curvature changes along it whatever the number of its joints, so that the difference goes with the square of a link's
 // length.
 double neighbor_difference(const Chain& chain, double of_eight);
+// Information (n x n, 1/rad^2) that a rope's curvature changes little along it: neighboring angles about one axis differ
+// by this deviation, rad. The first joint of a planar chain is at the clamp and stands for half a link (bent_length), but
+// for the half that bends most, so that it is held near 0.65 of the second (of 16). In space it counts as the others,
+// because it also takes up how the gripper holds the rope, which is an unknown of planar chains (mathematics.md 6.1).
+MatrixX curvature_information(const Chain& chain, double deviation);
 
 // What straight links and a tube of constant width cannot follow: the variance, m^2 per coordinate, of the position of
 // every link's end (links 1..), and the covariance of the angles that follows from it, rad^2, n x n (mathematics.md

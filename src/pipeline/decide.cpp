@@ -17,13 +17,13 @@ constexpr double kNothingWrong = 0.15, kNothingWrongOnTable = 0.7;
 // The same of a rope that is held straight by its prior: right recordings of ropes on tables have up to 0.8.
 constexpr double kNothingWrongHeldStraight = 1.0;
 // Below it no cause is looked for alone, and nothing is doubted; from kNothingWrong on it is sure that something is
-// wrong. Right recordings of ropes that hang have up to 0.063, of ropes on tables up to 0.12, because a round end looks
-// like a grasp or a length that is off: these are not looked for below kNothingWrong there.
+// wrong. Right recordings have up to 0.064.
 constexpr double kLeastEvidence = 0.08;
-// But a clock alone explains at most 0.014 of right recordings. From this on it is looked for on tables; where a rope
-// hangs, its motion tells a clock far better (clocks.h).
-constexpr double kLeastByClock = 0.025;
-// How likely it is, at least, that something is wrong: a base that is 4 ms off on a table has no more evidence than a
+// But a clock alone explains at most 0.0019 of right recordings on tables, and 0.005 of those that are wrong in
+// anything but a clock: from this on it is looked for there. Where a rope hangs, its motion tells a clock far better
+// (clocks.h).
+constexpr double kLeastByClock = 0.007;
+// How likely it is, at least, that something is wrong: a base that is 2 ms off on a table has no more evidence than a
 // right recording has, and as many recordings of a careful laboratory may be off by so little.
 constexpr double kAlwaysDoubted = 0.1;
 constexpr double kLeftOfHalfPixel = 0.2;  // of the evidence, at most, with half a pixel taken back
@@ -33,7 +33,7 @@ constexpr double kLeftOfHalfPixel = 0.2;  // of the evidence, at most, with half
 constexpr double kLeftOfOne = 0.25, kPerNumber = 0.03;
 constexpr double kRight = kNothingWrong, kRightOnTable = 0.3;
 // Evidence of right recordings, and by which explanations of them differ, since links are straight.
-constexpr double kAsRight = 0.05;
+constexpr double kAsRight = 0.06;
 constexpr double kAboveTable = 0.001;  // m, from which on a rope is said to be held above its table
 
 // A rope that is held straight by its prior misses the outlines more than one that is as free as in recognition: by 1.0
@@ -54,12 +54,10 @@ bool is_half_pixel(const silhouette::CorrectionFit& fit) {
   return fit.evidence > kNothingWrong && *least < kLeftOfHalfPixel * fit.evidence;
 }
 
-bool looks_like_an_end(const silhouette::Cause& cause) { return cause.in_doubt.starts_with("grasp and length"); }
-
 // Whether there is so much evidence that this cause, if it explains it, is likelier than nothing.
 bool is_looked_for(const silhouette::Cause& cause, double evidence, bool tabletop) {
   if (tabletop && cause.name.ends_with(".time") && evidence - cause.evidence >= kLeastByClock) return true;
-  return evidence >= (tabletop && looks_like_an_end(cause) ? kNothingWrong : kLeastEvidence);
+  return evidence >= kLeastEvidence;
 }
 
 // m above where it lies on the table, from which on corrections make up for how a rope is assumed to come down: held 15
@@ -262,10 +260,11 @@ std::optional<double> given_above_table(const capture::Capture& capture) {
 
 const silhouette::Cause* single_cause(const silhouette::CorrectionFit& fit, bool tabletop) {
   const silhouette::Cause* best = nullptr;
-  double least = kLeftOfOne * (fit.evidence - kAsRight);
+  double least = INFINITY;
   for (const silhouette::Cause& cause : fit.causes) {
     if (!is_looked_for(cause, fit.evidence, tabletop)) continue;
     const double left = std::max(0.0, cause.evidence - kAsRight) + kPerNumber * cause.numbers * fit.evidence;
+    if (left >= kLeftOfOne * (fit.evidence - std::min(kAsRight, cause.evidence))) continue;
     if (cause.evidence >= (tabletop ? kRightOnTable : kRight) || left >= least) continue;
     best = &cause;
     least = left;

@@ -133,26 +133,6 @@ solve::Options solver_options(const RefineOptions& options) {
   return out;
 }
 
-// Adds to the equations; returns the cost.
-double smoothness(const chain::Chain& chain, const math::VectorX& theta, double sigma,
-                  solve::NormalEquations& equations) {
-  // differences of neighboring joints' angles about the same axis direction
-  const int a_joint = chain.angles() / (chain.links() - 1);
-  const double weight = 1.0 / (sigma * sigma);
-  double cost = 0.0;
-  for (int k = a_joint; k < chain.angles(); ++k) {
-    const double difference = theta[k] - theta[k - a_joint];
-    cost += 0.5 * weight * difference * difference;
-    equations.matrix(k, k) += weight;
-    equations.matrix(k - a_joint, k - a_joint) += weight;
-    equations.matrix(k, k - a_joint) -= weight;
-    equations.matrix(k - a_joint, k) -= weight;
-    equations.gradient[k] += weight * difference;
-    equations.gradient[k - a_joint] -= weight * difference;
-  }
-  return cost;
-}
-
 }  // namespace
 
 Refined refine_angles(const chain::Chain& chain, const capture::Capture& capture, const std::vector<FrameViews>& frames,
@@ -161,6 +141,8 @@ Refined refine_angles(const chain::Chain& chain, const capture::Capture& capture
   const solve::Options solver = solver_options(options);
   std::vector<FrameState> work(selected.size());
   for (std::size_t f = 0; f < selected.size(); ++f) work[f].descent = solve::begin(states.theta[selected[f]], solver);
+  const math::MatrixX alike =
+      chain::curvature_information(chain, chain::neighbor_difference(chain, options.smooth_sigma));
 
   for (;;) {
     // draw every trial
@@ -203,7 +185,10 @@ Refined refine_angles(const chain::Chain& chain, const capture::Capture& capture
         cost += view_equations.cost;
         ++s;
       }
-      cost += smoothness(chain, descent.trial, chain::neighbor_difference(chain, options.smooth_sigma), next);
+      const math::VectorX bends = alike * descent.trial;
+      cost += 0.5 * descent.trial.dot(bends);
+      next.matrix += alike;
+      next.gradient += bends;
       if (!prior.mean.empty()) {
         const math::VectorX away = descent.trial - prior.mean[selected[f]];
         const math::VectorX pull = prior.information[selected[f]] * away;

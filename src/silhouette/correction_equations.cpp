@@ -18,8 +18,10 @@ constexpr double kBlobReach = 3.0;  // diameters from the chain within which a b
 // than 0.05.
 constexpr double kEvidence = kAsRecognized;
 
-// Curvature of the rope along each segment by the directions of its neighbors, camera frame, 1/m.
-std::vector<Vector3> curvatures(const std::vector<Segment>& segments) {
+// Curvature of the rope along each segment by the directions of its neighbors, camera frame, 1/m. Before the first one
+// is the clamp, where the rope has the direction `at_grasp`; where that is not known (empty), the first segment is
+// curved as the joint after it.
+std::vector<Vector3> curvatures(const std::vector<Segment>& segments, const std::optional<Vector3>& at_grasp) {
   const int count = static_cast<int>(segments.size());
   std::vector<Vector3> out;
   for (int i = 0; i < count; ++i) {
@@ -28,6 +30,10 @@ std::vector<Vector3> curvatures(const std::vector<Segment>& segments) {
     const double apart = (0.5 * (after.a + after.b) - 0.5 * (before.a + before.b)).norm();
     out.push_back(apart > 0.0 ? Vector3(turn / apart) : Vector3::Zero());
   }
+  if (at_grasp && count > 1) {
+    const Vector3 first = segments[0].b - segments[0].a, next = segments[1].b - segments[1].a;
+    out[0] = (0.5 * (first.normalized() + next.normalized()) - *at_grasp) / first.norm();
+  }
   return out;
 }
 
@@ -35,11 +41,11 @@ std::vector<Vector3> curvatures(const std::vector<Segment>& segments) {
 Vector3 bow(const Vector3& chord, const Vector3& curvature) { return -0.125 * chord.squaredNorm() * curvature; }
 
 // Bends the posed chain: each straight link becomes an arc that is as long, in straight pieces. Returns their
-// curvatures, camera frame, 1/m, by which a piece is an arc still.
-std::vector<Vector3> bend(ViewWork& work) {
+// curvatures, camera frame, 1/m, by which a piece is an arc still. `at_grasp`: see curvatures().
+std::vector<Vector3> bend(ViewWork& work, const std::optional<Vector3>& at_grasp) {
   constexpr double kTurn = 0.15;  // rad, of a piece at most
   constexpr int kMostPieces = 8;
-  const std::vector<Vector3> of_links = curvatures(work.segments);
+  const std::vector<Vector3> of_links = curvatures(work.segments, at_grasp);
   std::vector<Segment> pieces;
   std::vector<Vector3> out;
   Vector3 shift = Vector3::Zero();  // arcs reach less far than their links
@@ -114,7 +120,10 @@ void pose_view(const CorrectionProblem& fit, const CorrectedFrame& frame, std::s
   pose(out.problem, theta + after * frame.thetadot);
   choose_blobs(out.problem, kBlobReach);
   find_hidden(out.problem, kHiddenReach, fit.cut);
-  out.curvature = bend(out.problem.views[0]);
+  // in space the first joint also takes up how the gripper holds the rope
+  std::optional<Vector3> at_grasp;
+  if (!chain::bends_in_space(chain)) at_grasp = out.problem.views[0].camera_from_base.rotation * chain.direction;
+  out.curvature = bend(out.problem.views[0], at_grasp);
   for (int k = 0; k < chain.angles(); ++k)
     out.twists.col(k) = math::transform_twist(out.problem.views[0].camera_from_base, out.problem.axes.col(k));
 }

@@ -48,13 +48,6 @@ constexpr double kClearly = 0.02;    // difference of shares covered and inside
 constexpr double kExplained = 0.97;  // share of the masks; where less is, what was taken for hidden may be there
 constexpr double kAllowed = 9.0;     // square deviations of the given prior per number, up to which it allows a fit
 
-// Index of the angle before k about the same axis, -1 for the first.
-int neighbor(const chain::Chain& chain, int k) {
-  for (int l = k - 1; l >= 0; --l)
-    if (std::abs(chain.axes[l].head<3>().dot(chain.axes[k].head<3>())) > kSameAxis) return l;
-  return -1;
-}
-
 // What is believed before looking, as information.
 struct Belief {
   MatrixX joints;         // between neighbors, and that angles are small
@@ -158,17 +151,11 @@ std::vector<VectorX> cold_starts(const chain::Chain& chain, const VectorX& start
 
 MatrixX joint_prior(const chain::Chain& chain, const Options& options) {
   const int n = chain.angles();
-  const double deviation = chain::neighbor_difference(chain, kJointDifference);
-  const double difference = options.joint_smoothness > 0.0 ? options.joint_smoothness : 1.0 / (deviation * deviation);
+  const double deviation = options.joint_smoothness > 0.0 ? 1.0 / std::sqrt(options.joint_smoothness)
+                                                          : chain::neighbor_difference(chain, kJointDifference);
   MatrixX information = MatrixX::Identity(n, n) / (kJointSize * kJointSize);
-  for (int k = 0; k < n; ++k) {
-    const int l = neighbor(chain, k);
-    if (l < 0) continue;
-    information(k, k) += difference;
-    information(l, l) += difference;
-    information(k, l) -= difference;
-    information(l, k) -= difference;
-  }
+  information += chain::curvature_information(chain, deviation);
+  const double difference = 1.0 / (deviation * deviation);
   // no moment bends the free end
   for (int k = 0; k < n; ++k)
     if (chain.child_link[k] + 1 == chain.links()) information(k, k) += difference;
