@@ -67,7 +67,7 @@ double rate_of(std::string_view text) {
 
 // The first bytes of a file or pipe, which stay to be read. Of a pipe they are copied into another one.
 std::string first_bytes(int file) {
-  std::array<char, kLongestLine> bytes;
+  std::array<char, kLongestLine> bytes{};
   struct stat facts {};
   ssize_t count = -1;
   if (::fstat(file, &facts) == 0 && S_ISFIFO(facts.st_mode)) {

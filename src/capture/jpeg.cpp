@@ -15,8 +15,8 @@ namespace {
 
 // libjpeg ends a failed call by a function that must not return: it jumps back to where the call began.
 struct Errors {
-  jpeg_error_mgr manager;
-  std::jmp_buf begin;
+  jpeg_error_mgr manager{};
+  std::jmp_buf begin{};
   bool damaged = false;  // there were warnings, and what is missing was filled in
 };
 
@@ -75,7 +75,7 @@ std::string jpeg(const Image8& image, int quality) {
   state.err = prepare(errors);
   if (setjmp(errors.begin) != 0) {
     jpeg_destroy_compress(&state);
-    std::free(bytes);
+    std::free(bytes);  // NOLINT: it is libjpeg's
     throw WorkError("picture", "libjpeg cannot write it", "use a picture of at most 65,500 pixels a side");
   }
   jpeg_create_compress(&state);
@@ -95,7 +95,7 @@ std::string jpeg(const Image8& image, int quality) {
   jpeg_finish_compress(&state);
   std::string out(reinterpret_cast<char*>(bytes), size);
   jpeg_destroy_compress(&state);
-  std::free(bytes);
+  std::free(bytes);  // NOLINT: it is libjpeg's
   return out;
 }
 

@@ -8,7 +8,7 @@ namespace chainsplat::capture {
 
 PackedView packed(const View& view) {
   PackedView out;
-  static_cast<ViewPlace&>(out) = view;
+  static_cast<ViewPlace&>(out) = static_cast<const ViewPlace&>(view);
   const auto at = [&](int x, int y) { return static_cast<std::size_t>(y) * view.width + x; };
   set_runs(out, [&](int x, int y) {
     const std::uint8_t* const p = &view.rgba[4 * at(x, y)];
@@ -32,7 +32,7 @@ bool shows_object(const PackedView& view) {
 
 View unpacked(const PackedView& view) {
   View out;
-  static_cast<ViewPlace&>(out) = view;
+  static_cast<ViewPlace&>(out) = static_cast<const ViewPlace&>(view);
   const std::size_t pixels = static_cast<std::size_t>(view.width) * view.height;
   out.rgba.assign(4 * pixels, 0);
   if (!view.depth.empty()) out.depth.assign(pixels, 0.0f);

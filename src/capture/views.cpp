@@ -286,7 +286,7 @@ void check_masks(const Manifest& manifest, const CameraSource& source, const Ran
   for (int k = range.first; k < range.last; ++k) {
     const PackedView& view = range.views[k - range.first];
     visible += view.width > 0;
-    covered += static_cast<double>(view.rgba.size() / 4);
+    covered += static_cast<double>(view.rgba.size()) / 4.0;
   }
   covered /= static_cast<double>(range.last - range.first) * source.camera.width * source.camera.height;
   if (covered > kMostCovered)

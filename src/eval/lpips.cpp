@@ -33,7 +33,8 @@ constexpr std::array kShift{-0.030, -0.088, -0.188};
 constexpr std::array kScale{0.458, 0.448, 0.450};
 constexpr double kLeastNorm = 1e-10;  // added to norms of features, of which all channels may be 0; LPIPS's own
 
-static_assert(std::size(kLpipsWeights) == std::accumulate(kLpipsChannels.begin(), kLpipsChannels.end(), 0u));
+static_assert(static_cast<int>(std::size(kLpipsWeights)) ==
+              std::accumulate(kLpipsChannels.begin(), kLpipsChannels.end(), 0));
 
 constexpr const char* kMakeTrunk = "make it with tools/lpips_trunk";
 

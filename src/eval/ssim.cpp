@@ -30,7 +30,7 @@ using Taps = std::array<const float*, kTaps>;
 // the mean over an image by 1e-7. The taps are written out so that the compiler vectorizes over i.
 void filter(const Taps& in, float* out, int first, int last) {
   static_assert(kSsimReach == 5);
-  std::array<float, kSsimReach + 1> w;
+  std::array<float, kSsimReach + 1> w{};
   for (int t = 0; t <= kSsimReach; ++t) w[t] = static_cast<float>(kSsimWindow[t]);
   const auto [a, b, c, d, e, middle, f, g, h, i, j] = in;
   for (int x = first; x < last; ++x)

@@ -65,7 +65,7 @@ std::vector<Color> lit_beside(const Strip& strip, bool right) {
 
 // How often a color has these remainders where it is darkened to each of kLights.
 struct Darkened {
-  std::array<std::array<double, kRemainders.size() + 1>, kLights.size()> counts;
+  std::array<std::array<double, kRemainders.size() + 1>, kLights.size()> counts{};
   double samples = kLittleKnown;
   Darkened() {
     for (auto& row : counts) row.fill(kLittleKnown / static_cast<double>(row.size()));

@@ -91,7 +91,8 @@ FirstFit first_fit(const capture::Capture& capture, int joints) {
 namespace {
 
 // What is left to correct of a capture whose rows were read at once.
-Corrected correct_all_but_clocks(capture::Capture& capture, const std::vector<std::string>& fixed, FirstFit fit_by_now) {
+Corrected correct_all_but_clocks(capture::Capture& capture, const std::vector<std::string>& fixed,
+                                 FirstFit&& fit_by_now) {
   Corrected out;
   auto& [chain, sequence] = fit_by_now;
   if (std::none_of(sequence.frames.begin(), sequence.frames.end(),

@@ -185,8 +185,8 @@ struct Hypothesis {
   silhouette::CorrectionFit fit;
 };
 
-Hypothesis supposing(const capture::Capture& given, const chain::Chain& chain, silhouette::CorrectionOptions options,
-                     std::optional<capture::Correction> shift) {
+Hypothesis supposing(const capture::Capture& given, const chain::Chain& chain,
+                     const silhouette::CorrectionOptions& options, std::optional<capture::Correction> shift) {
   const capture::Capture capture = shift ? with(*shift, given) : given;
   silhouette::CorrectionFit fit =
       silhouette::fit_corrections(chain, capture, silhouette::fit_sequence(chain, capture), options);

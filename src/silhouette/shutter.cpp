@@ -162,7 +162,7 @@ capture::View as_read_at_once(const capture::View& view, const capture::Camera& 
       math::intersection(math::grown({view.x0, view.y0, view.x0 + view.width, view.y0 + view.height}, reach),
                          {0, 0, camera.width, camera.height});
   capture::View out;
-  static_cast<capture::ViewPlace&>(out) = view;
+  static_cast<capture::ViewPlace&>(out) = static_cast<const capture::ViewPlace&>(view);
   out.x0 = crop.x0, out.y0 = crop.y0, out.width = crop.x1 - crop.x0, out.height = crop.y1 - crop.y0;
   const std::size_t size = static_cast<std::size_t>(out.width) * out.height;
   out.rgba.assign(4 * size, 0);
