@@ -400,6 +400,28 @@ void hide(capture::Capture& capture, const Vector3& point, double radius, const 
   }
 }
 
+TEST_CASE("a rope does not leave the frames beside it for one that shows another thing") {
+  const Chain planar = rope(Bending::planar);
+  constexpr int kFrames = 20, kOther = 11;
+  const auto swing = [&](double t) -> VectorX { return bent(planar, 0.8 * std::sin(2.0 * t) + 0.2); };
+  capture::Capture other = film(planar, kFrames, swing);
+  for (capture::PackedView& packed : other.views)
+    if (packed.frame == kOther)
+      packed = capture::packed(draw(planar, bent(planar, -1.8), base_pose(), other.cameras[packed.camera],
+                                    packed.camera, packed.frame, packed.time));
+  std::string warning;
+  core::Listener listener;
+  listener.warning = [&](const std::string& text) { warning += text; };
+  core::set_listener(listener);
+  const silhouette::SequenceFit fit = silhouette::fit_sequence(planar, other);
+  core::set_listener({});
+  CHECK(warning.find("1 of 20 frames show no rope near") != std::string::npos);
+  for (int f = 0; f < kFrames; ++f) {
+    CAPTURE(f);
+    CHECK(rms(points(planar, fit.states.theta[f], base_pose()), points(planar, swing(f / 30.0), base_pose())) < 1e-3);
+  }
+}
+
 TEST_CASE("a rope whose end goes behind the gripper is not turned back on itself in front of it") {
   const Chain planar = rope(Bending::planar);
   constexpr int kFrames = 40;

@@ -57,8 +57,9 @@ FrameFit fit_frame(const chain::Chain& chain, const math::Pose& base, std::span<
 
 // Every time of the first camera that has views, in order; other cameras' nearest frame within half an interval joins
 // it (with the base pose of its own time). Frames without any mask pixel keep the prediction from their neighbors (and
-// are named in one warning). Frames whose fit is far worse than the others' are fitted again from the frame after them.
-// Throws InputError when no mask shows anything.
+// are named in one warning), as do single ones whose masks show no rope near that of the frames beside them. Frames
+// whose fit is far worse than the others' are fitted again from the frame after them. Throws InputError when no mask
+// shows anything.
 struct SequenceFit {
   chain::States states;          // theta (smoothed over time) and thetadot
   std::vector<FrameFit> frames;  // each frame's own fit

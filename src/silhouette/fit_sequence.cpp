@@ -196,15 +196,20 @@ void try_again(Sequence& s, int f, const std::vector<FrameView>& views, const Ve
   if (cheaper || explains_more(again.fit, old.fit)) old = std::move(again);
 }
 
+// A frame's fit with the belief that the rope is near these angles.
+FrameSolution solve_near(const Sequence& s, const std::vector<FrameView>& views, const VectorX& theta) {
+  Options believed = s.each;
+  believed.prior.mean = theta;
+  believed.prior.information = MatrixX::Identity(theta.size(), theta.size()) / (kBelieved * kBelieved);
+  return solve_frame(s.chain, views, theta, true, believed);
+}
+
 // Where the rope leaves the frame before, whose angles are `before`: fits it once more with the belief that it does
 // not, and keeps that though it costs somewhat more.
 void follow(Sequence& s, int f, const std::vector<FrameView>& views, const VectorX& before) {
   FrameSolution& old = s.solutions[f];
   if (way_between(s.chain, before, old.fit.theta) <= s.far) return;
-  Options believed = s.each;
-  believed.prior.mean = before;
-  believed.prior.information = MatrixX::Identity(before.size(), before.size()) / (kBelieved * kBelieved);
-  FrameSolution again = solve_frame(s.chain, views, before, true, believed);
+  FrameSolution again = solve_near(s, views, before);
   if (way_between(s.chain, before, again.fit.theta) <= s.far && again.cost < kCostsMore * old.cost)
     old = std::move(again);
 }
@@ -255,6 +260,27 @@ void repair(Sequence& s) {
     if (bad(f)) try_again(s, f, masks_of(s, f, f + 1)[0].views, s.solutions[f - 1].fit.theta, true);
 }
 
+// No rope leaves the frames beside it, which are alike, and comes back from one to the next: where it was found so,
+// something else was taken for it. It is sought near them, whatever that costs more. Where nothing is found there
+// either, such a frame does not count as seen. Returns those.
+std::vector<int> stay(Sequence& s) {
+  std::vector<int> unseen;
+  for (int f = 1; f + 1 < s.count(); ++f) {
+    if (!s.seen[f - 1] || !s.seen[f] || !s.seen[f + 1]) continue;
+    const VectorX &before = s.solutions[f - 1].fit.theta, &after = s.solutions[f + 1].fit.theta;
+    if (!leaves_neighbors(s, f, s.solutions[f].fit.theta) || way_between(s.chain, before, after) > s.far) continue;
+    const VectorX middle = 0.5 * (before + after);
+    FrameSolution again = solve_near(s, masks_of(s, f, f + 1)[0].views, middle);
+    if (leaves_neighbors(s, f, again.fit.theta)) {
+      again = solve_frame(s.chain, {}, middle, true, s.each);
+      s.seen[f] = 0;
+      unseen.push_back(f);
+    }
+    s.solutions[f] = std::move(again);
+  }
+  return unseen;
+}
+
 // One camera tells depth by the width of the mask: how much wider than the rope masks are is learned from all frames,
 // which are then fitted with that.
 void share_edge_offset(Sequence& s) {
@@ -274,14 +300,11 @@ void share_edge_offset(Sequence& s) {
   });
 }
 
-void warn_of_unseen(const Sequence& s, const std::string& name) {
-  const auto unseen = std::count(s.seen.begin(), s.seen.end(), 0);
-  if (unseen == 0) return;
-  const auto first = std::find(s.seen.begin(), s.seen.end(), 0) - s.seen.begin();
-  const auto last = s.seen.rend() - std::find(s.seen.rbegin(), s.seen.rend(), 0) - 1;
-  core::warn(name + ": " + std::to_string(unseen) + " of " + std::to_string(s.count()) +
-             " frames have no mask pixel in any camera (first " + std::to_string(first) + ", last " +
-             std::to_string(last) + "); their angles follow from the frames around them");
+void warn_of(const Sequence& s, const std::vector<int>& frames, const std::string& what) {
+  if (frames.empty()) return;
+  core::warn(s.capture.name + ": " + std::to_string(frames.size()) + " of " + std::to_string(s.count()) + " frames " +
+             what + " (first " + std::to_string(frames.front()) + ", last " + std::to_string(frames.back()) +
+             "); their angles follow from the frames around them");
 }
 
 }  // namespace
@@ -292,8 +315,12 @@ SequenceFit fit_sequence(const chain::Chain& chain, const capture::Capture& capt
   fit_forward(s);
   s.far = far_of(s, 0, s.count());
   repair(s);
+  std::vector<int> empty;
+  for (int f = 0; f < s.count(); ++f)
+    if (!s.seen[f]) empty.push_back(f);
+  warn_of(s, empty, "have no mask pixel in any camera");
+  warn_of(s, stay(s), "show no rope near that of the frames beside them");
   share_edge_offset(s);
-  warn_of_unseen(s, capture.name);
 
   SequenceFit out;
   out.states.time = s.times;
