@@ -1,4 +1,7 @@
 #include "src/silhouette/correction_equations.h"
+
+#include <optional>
+
 #include "src/math/decompositions.h"
 
 namespace chainsplat::silhouette {
